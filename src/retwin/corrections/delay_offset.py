@@ -1,0 +1,311 @@
+"""`DelayOffset`: the paper's correction operator (section 4.2.4) and its inverse.
+
+Movements come late by TDe samples, and the position that is reached is off by TPE. Both are told by
+knots: movement m begins at `start + TDe`, still off by the last movement's TPE, and ends at
+`settle + TDe`, off by its own. Between knots time and offset are linear, so the path is continuous
+whatever z is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from retwin.corrections.protocol import Context, Discrepancy, Head
+from retwin.segments import Segments
+from retwin.trajectories import Channels
+
+__all__ = ["DelayOffset"]
+
+ITERATIONS = 25
+CHUNK = 128
+
+
+@dataclass(frozen=True)
+class DelayOffset:
+    """z = (TDe, TPE) per movement: delay in samples, offset of the steady part in output units.
+
+    Parameters
+    ----------
+    delay_range: least and greatest delay that `infer` looks for, in samples.
+    known_delay: standard deviation in samples above which a delay counts as not identified.
+    """
+
+    delay_range: tuple[float, float] = (-5.0, 30.0)
+    known_delay: float = 2.0
+    resolution: ClassVar[str] = "segment"
+
+    def latent(self, outputs: Channels) -> Channels:
+        """`delay` in samples, then one offset per output in its unit."""
+        return Channels(
+            ("delay", *(f"offset_{name}" for name in outputs.names)), ("samples", *outputs.units)
+        )
+
+    def heads(self, outputs: Channels) -> tuple[Head, ...]:
+        """A mixture for the delay, another for the offset (section 4.2.3)."""
+        return ("delay", 1), ("offset", len(outputs))
+
+    def apply(self, context: Context, z: Tensor) -> Tensor:
+        """The corrected path (n, T, d_y), continuous, for z (n, M, 1 + d_y)."""
+        if context.segments.most == 0:
+            return context.path
+        knots = _Knots.of(context.segments, z[..., 0].to(context.path))
+        offset = knots.between(knots.spread(z[..., 1:].to(context.path)))
+        return _read(context.path, knots.source_time()) + offset
+
+    @torch.no_grad()
+    def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
+        """The most plausible z under heavy-tailed noise (robust Gauss–Newton, batched).
+
+        Offsets start from the median of the settled part, delays from a grid; both are then refined
+        together, because a late movement and a wrong position trade off where they meet. Samples
+        that fit badly lose their weight (Tukey), so glitches do not move z.
+        """
+        parts = [
+            self._infer(
+                context[slice(i, i + CHUNK)], observed[i : i + CHUNK], mask[i : i + CHUNK]
+            )
+            for i in range(0, len(context), CHUNK)
+        ]
+        return Discrepancy(
+            *(torch.cat([getattr(p, name) for p in parts]) for name in Discrepancy.__annotations__)
+        )
+
+    def _infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
+        path = context.path.double()
+        observed = observed.double()
+        seen = mask.all(dim=-1).double()
+        n, most, width = len(context), context.segments.most, path.shape[-1]
+        valid = torch.as_tensor(context.segments.valid)
+        z = torch.zeros(n, most, 1 + width, dtype=torch.float64)
+        if most == 0:
+            empty = torch.zeros(n, 0, 1 + width, 1 + width, dtype=torch.float64)
+            nothing = torch.zeros(n, 0, 1 + width, dtype=torch.bool)
+            return Discrepancy(z, empty, nothing, (observed - path).norm(dim=-1).median(dim=1).values)
+        z[..., 1:] = _settled_offset(context.segments, observed - path, seen, self.delay_range[1])
+        model = _Model(context.segments, path, observed, seen)
+        z[..., 0] = self._best_delay(model, z)
+        moving = _moving(context.segments, z[..., 0], path.shape[1])
+        low, high = self.delay_range
+        damping = torch.full((n,), 1e-3, dtype=torch.float64)
+        for _ in range(ITERATIONS):
+            residual, jacobian = model.linearised(z)
+            noise = _scale(residual, seen, moving)
+            step = _solve(jacobian, residual, model.weight(residual, noise), damping)
+            step = step.reshape(z.shape)
+            # A few samples per step at most: the path is only piecewise smooth in the delay.
+            step[..., 0] = step[..., 0].clamp(-5.0, 5.0)
+            trial = z + step * valid[..., None]
+            trial[..., 0] = trial[..., 0].clamp(low, high)
+            better = model.cost(trial, noise) <= model.cost(z, noise)
+            z = torch.where(better[:, None, None], trial, z)
+            damping = torch.where(better, damping / 3, damping * 5).clamp(1e-9, 1e6)
+        return self._certainty(model, z, moving)
+
+    def _best_delay(self, model: _Model, z: Tensor) -> Tensor:
+        """The delay (n, M) on a grid of one sample that fits the motion best, by absolute error."""
+        low, high = self.delay_range
+        segments = model.segments
+        grid = torch.arange(low, high + 1.0, 1.0, dtype=torch.float64)
+        start, settle = torch.as_tensor(segments.start), torch.as_tensor(segments.settle)
+        time = torch.arange(segments.steps, dtype=torch.float64)
+        near = (time >= (start + low)[..., None]) & (time <= (settle + high)[..., None])
+        costs = []
+        for delay in grid:
+            trial = z.clone()
+            trial[..., 0] = delay
+            error = model.residual(trial).norm(dim=-1) * model.seen
+            costs.append((near * error[:, None]).sum(dim=-1))
+        best = torch.stack(costs).argmin(dim=0)
+        return grid[best] * torch.as_tensor(segments.valid)
+
+    def _certainty(self, model: _Model, z: Tensor, moving: Tensor) -> Discrepancy:
+        n, most, size = z.shape
+        valid = torch.as_tensor(model.segments.valid)
+        residual, jacobian = model.linearised(z)
+        noise = _scale(residual, model.seen, moving)
+        weight = model.weight(residual, noise)
+        # Neighbouring errors are alike (polling, drift): each sample tells only a part.
+        weight = weight / _correlation_time(residual, weight)[:, None]
+        normal = torch.einsum("ntci,nt,ntcj->nij", jacobian, weight, jacobian)
+        # A prior a hundred times wider than anything plausible: what is not seen stays at it.
+        wide = torch.full((size,), 100 * residual.abs().amax().item() + 1e-9)
+        wide[0] = 100.0 * (self.delay_range[1] - self.delay_range[0])
+        prior = torch.diag(wide.double().square().reciprocal().repeat(most))
+        whole = torch.linalg.inv(normal + prior).reshape(n, most, size, most, size)
+        index = torch.arange(most)
+        covariance = whole[:, index, :, index].transpose(0, 1)
+        deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+        at_edge = (z[..., 0] <= self.delay_range[0]) | (z[..., 0] >= self.delay_range[1])
+        late = (deviation[..., 0] <= self.known_delay) & ~at_edge
+        off = (deviation[..., 1:] <= 0.1 * wide[1:]).all(dim=-1, keepdim=True)
+        identified = torch.cat([late[..., None], off.expand(-1, -1, size - 1)], dim=-1)
+        steady = torch.where(moving, torch.inf, noise).amin(dim=1)
+        return Discrepancy(z, covariance, identified & valid[..., None], steady)
+
+
+@dataclass(frozen=True, eq=False)
+class _Knots:
+    """Where the pieces of the warped time join, and for each sample its piece and place in it."""
+
+    source: Tensor  # (n, 2 M), time of each knot in the uncorrected path
+    target: Tensor  # (n, 2 M), time of each knot in the corrected path
+    right: Tensor  # (n, T), index of the knot that follows each sample
+    share: Tensor  # (n, T), place between the knot before (0) and after (1)
+    time: Tensor  # (T,)
+
+    @classmethod
+    def of(cls, segments: Segments, delay: Tensor) -> _Knots:
+        kind = {"dtype": delay.dtype}
+        source = torch.stack(
+            [torch.as_tensor(segments.start, **kind), torch.as_tensor(segments.settle, **kind)], -1
+        ).flatten(1)
+        # A movement cannot begin before the last one has ended, however the delays differ.
+        target = (source + delay.repeat_interleave(2, dim=1)).cummax(dim=1).values
+        time = torch.arange(segments.steps, **kind)
+        right = torch.searchsorted(target, time.expand(len(target), -1).contiguous(), right=True)
+        last = target.shape[1] - 1
+        begin = target.gather(1, (right - 1).clamp(0, last))
+        end = target.gather(1, right.clamp(0, last))
+        share = (time - begin) / (end - begin).clamp_min(1e-9)
+        return cls(source, target, right, share.clamp(0, 1), time)
+
+    def between(self, values: Tensor) -> Tensor:
+        """Values (n, 2 M, k) of the knots, linear between them and constant outside: (n, T, k)."""
+        last = values.shape[1] - 1
+        index = self.right[..., None].expand(-1, -1, values.shape[2])
+        before = values.gather(1, (index - 1).clamp(0, last))
+        after = values.gather(1, index.clamp(0, last))
+        return before + self.share[..., None] * (after - before)
+
+    def source_time(self) -> Tensor:
+        """When in the uncorrected path each sample (n, T) is read."""
+        inner = self.between(self.source[..., None])[..., 0]
+        early = (self.time - self.target[:, :1]).clamp_max(0)
+        late = (self.time - self.target[:, -1:]).clamp_min(0)
+        return inner + early + late
+
+    @staticmethod
+    def spread(offset: Tensor) -> Tensor:
+        """Offsets (n, M, k) on the knots (n, 2 M, k): the last one's at the start, then its own."""
+        before = torch.cat([torch.zeros_like(offset[:, :1]), offset[:, :-1]], dim=1)
+        return torch.stack([before, offset], dim=2).flatten(1, 2)
+
+
+def _read(path: Tensor, when: Tensor) -> Tensor:
+    """The path (n, T, d) at the fractional samples `when` (n, T), held beyond its ends."""
+    when = when.clamp(0, path.shape[1] - 1)
+    below = when.detach().floor().long().clamp_max(max(path.shape[1] - 2, 0))
+    index = below[..., None].expand(-1, -1, path.shape[2])
+    before, after = path.gather(1, index), path.gather(1, index + 1)
+    return before + (when - below)[..., None] * (after - before)
+
+
+class _Model:
+    """The corrected path as a function of z, its residual and its derivative."""
+
+    def __init__(
+        self, segments: Segments, path: Tensor, observed: Tensor, seen: Tensor
+    ) -> None:
+        self.segments = segments
+        self.path = path
+        self.observed = observed
+        self.seen = seen
+        self.slope = torch.gradient(path, dim=1)[0]
+
+    def residual(self, z: Tensor) -> Tensor:
+        """Observed minus corrected (n, T, d_y)."""
+        knots = _Knots.of(self.segments, z[..., 0])
+        offset = knots.between(knots.spread(z[..., 1:]))
+        return self.observed - _read(self.path, knots.source_time()) - offset
+
+    def weight(self, residual: Tensor, noise: Tensor) -> Tensor:
+        """Tukey's biweight (n, T) on the length of the residual, over the noise's variance."""
+        size = residual.norm(dim=-1) / noise / TUKEY
+        return self.seen * (1 - size.clamp_max(1).square()).square() / noise.square()
+
+    def cost(self, z: Tensor, noise: Tensor) -> Tensor:
+        """Tukey's loss (n,) at a given noise scale (n, T)."""
+        size = self.residual(z).norm(dim=-1) / noise / TUKEY
+        return (self.seen * (1 - (1 - size.clamp_max(1).square()) ** 3)).sum(dim=1)
+
+    def linearised(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Residual (n, T, d_y) and the derivative (n, T, d_y, M (1 + d_y)) of the corrected path."""
+        knots = _Knots.of(self.segments, z[..., 0])
+        n, most, size = z.shape
+        values = knots.spread(z[..., 1:])
+        when = knots.source_time()
+        residual = self.observed - _read(self.path, when) - knots.between(values)
+        unit = torch.eye(most, dtype=z.dtype).expand(n, -1, -1)
+        reach = knots.between(knots.spread(unit))  # (n, T, M): share of each movement's offset
+        late = knots.between(unit.repeat_interleave(2, dim=1))  # share of each movement's delay
+        rise = torch.gradient(knots.between(values), dim=1)[0]
+        velocity = _read(self.slope, when) + rise
+        jacobian = torch.zeros(*residual.shape, most, size, dtype=z.dtype)
+        jacobian[..., 0] = -velocity[..., None] * late[:, :, None]
+        for channel in range(size - 1):
+            jacobian[:, :, channel, :, 1 + channel] = reach
+        return residual, jacobian.flatten(3)
+
+
+TUKEY = 4.685  # 95 % efficiency under Gaussian noise
+
+
+def _moving(segments: Segments, delay: Tensor, steps: int) -> Tensor:
+    """(n, T) True where a movement is under way, with some samples around it."""
+    time = torch.arange(steps, dtype=torch.float64)
+    begin = (torch.as_tensor(segments.start) + delay - 5)[..., None]
+    end = (torch.as_tensor(segments.settle) + delay + 10)[..., None]
+    return ((time >= begin) & (time <= end)).any(dim=1)
+
+
+def _scale(residual: Tensor, seen: Tensor, moving: Tensor) -> Tensor:
+    """A robust scale (n, T) of the residual's length: its median in motion, and at rest.
+
+    A model of movements is always worse than one of rest; one scale would throw motion away.
+    """
+    length = residual.norm(dim=-1)
+    extent = length.amax(dim=1, keepdim=True).clamp_min(1e-9)
+    scales = []
+    for part in (moving, ~moving):
+        within = torch.where((seen > 0) & part, length, torch.nan)
+        middle = 1.4826 * torch.nanmedian(within, dim=1, keepdim=True).values
+        scales.append(torch.nan_to_num(middle).maximum(1e-4 * extent))
+    steady = scales[1].maximum(0.01 * scales[0])
+    return torch.where(moving, scales[0].maximum(steady), steady)
+
+
+def _solve(jacobian: Tensor, residual: Tensor, weight: Tensor, damping: Tensor) -> Tensor:
+    """A damped weighted least-squares step (n, parameters)."""
+    weighted = jacobian * weight[..., None, None]
+    normal = torch.einsum("ntci,ntcj->nij", weighted, jacobian)
+    right = torch.einsum("ntci,ntc->ni", weighted, residual)
+    # Delays and offsets differ by orders of magnitude: damp in units of their own curvature.
+    unit = normal.diagonal(dim1=-2, dim2=-1).sqrt()
+    unit = torch.where(unit > 0, unit, torch.ones_like(unit))
+    scaled = normal / unit[:, :, None] / unit[:, None, :]
+    ridge = torch.diag_embed((damping[:, None] + 1e-9).expand_as(unit))
+    return torch.linalg.solve(scaled + ridge, right / unit) / unit
+
+
+def _correlation_time(residual: Tensor, weight: Tensor) -> Tensor:
+    """Samples (n,) per independent one, from the lag-one correlation of the residual."""
+    kept = residual * weight.sqrt()[..., None]
+    power = kept.square().sum(dim=(1, 2)).clamp_min(1e-30)
+    alike = ((kept[:, 1:] * kept[:, :-1]).sum(dim=(1, 2)) / power).clamp(0, 0.999)
+    return (1 + alike) / (1 - alike)
+
+
+def _settled_offset(
+    segments: Segments, residual: Tensor, seen: Tensor, margin: float
+) -> Tensor:
+    """Median residual (n, M, d_y) of each steady part, late movements left out if any remain."""
+    time = torch.arange(residual.shape[1], dtype=torch.float64)
+    settle, stop = torch.as_tensor(segments.settle), torch.as_tensor(segments.stop)
+    begin = settle + torch.minimum(torch.full_like(settle, margin), (stop - settle) / 2)
+    inside = (time >= begin[..., None]) & (time < stop[..., None]) & (seen[:, None] > 0)
+    values = torch.where(inside[..., None], residual[:, None], torch.nan)
+    return torch.nan_to_num(torch.nanmedian(values, dim=2).values)

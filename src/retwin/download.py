@@ -1,0 +1,157 @@
+"""Public data files: fetched once, checked against their SHA-256, kept in a cache."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from retwin.errors import InputError
+from retwin.storage import sha256 as sha256_of
+
+__all__ = ["REGISTRY", "Known", "fetch"]
+
+CACHE_VARIABLE = "RETWIN_CACHE"
+TIMEOUT = 30.0
+"""Seconds without an answer until a download is given up."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """A public file: its address, its SHA-256, and its name below the cache folder."""
+
+    url: str
+    sha256: str
+    file: str
+
+
+REGISTRY: dict[str, Known] = {
+    "armpi": Known(
+        url="https://raw.githubusercontent.com/JialingRichard/Digital-Twin-Fault-Diagnosis/"
+        "HEAD/mydataset/my_dataset_test.mat",
+        sha256="5d87fcdba86f6000dee5b7ec31a6e9a72276a9c4ff0b3a67d39a821cc5931b67",
+        file="armpi/my_dataset_test.mat",
+    ),
+}
+
+
+def fetch(
+    name: str,
+    *,
+    folder: str | os.PathLike[str] | None = None,
+    url: str | None = None,
+    sha256: str | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Path:
+    """The path of a public file, downloaded when it is not in the cache yet.
+
+    The cache is `folder`, else the environment variable RETWIN_CACHE, else the user's cache folder.
+    The file lies there as `armpi/my_dataset_test.mat` and the like, so that the cache can serve as
+    RETWIN_DATA. `url` names another place to get it from; the SHA-256 stays the known one. A name
+    that is not in `REGISTRY` needs both `url` and `sha256`. A cached file whose SHA-256 is wrong is
+    fetched again. `progress` is called with the share that is done.
+
+    Raises
+    ------
+    InputError: an unknown name without `url` and `sha256`, or an address that is not http(s).
+    OSError: no network, no such file there, or a folder that cannot be written.
+    RuntimeError: what came has another SHA-256; nothing of it is kept.
+    """
+    known = _known(name, url, sha256)
+    if not known.url.startswith(("http://", "https://")):
+        raise InputError(
+            "url",
+            expected="an address that begins with https:// or http://",
+            got=known.url,
+            remedy="give the address of the file",
+        )
+    # These take half a second to import, and only a download needs them.
+    import pooch
+
+    place = Path(folder or os.environ.get(CACHE_VARIABLE) or pooch.os_cache("retwin"))
+    target = place / known.file
+    if target.is_file() and sha256_of(target) == known.sha256:
+        return target
+    bar = _Bar(progress) if progress is not None else False
+    try:
+        with _quiet(pooch.get_logger()):
+            pooch.retrieve(
+                known.url,
+                known_hash=f"sha256:{known.sha256}",
+                fname=target.name,
+                path=target.parent,
+                downloader=pooch.HTTPDownloader(progressbar=bar, timeout=TIMEOUT),
+            )
+    except (OSError, ValueError) as error:
+        _tidy(target.parent, place)
+        if not isinstance(error, OSError):
+            raise RuntimeError(
+                f"fetch {name}: what {known.url} gave does not have the SHA-256 {known.sha256}, so "
+                "it was thrown away; try again, or give another url"
+            ) from None
+        reason = " ".join(str(error).split())[:200]
+        raise OSError(
+            f"fetch {name}: cannot get {known.url} into {place} ({reason}); check the network, or "
+            f"put the file there by hand as {known.file}"
+        ) from None
+    return target
+
+
+def _known(name: str, url: str | None, sha256: str | None) -> Known:
+    """The registered file with what the caller overrides, or a file that only the caller knows."""
+    known = REGISTRY.get(name)
+    if known is not None:
+        return Known(url or known.url, sha256 or known.sha256, known.file)
+    plain = Path(name).name == name and name not in ("", ".", "..")
+    if url is None or sha256 is None or not plain:
+        raise InputError(
+            "name",
+            expected=f"one of {', '.join(sorted(REGISTRY))}",
+            got=repr(name),
+            remedy="choose one of these, or give a file name with its url and sha256",
+        )
+    return Known(url, sha256, name)
+
+
+def _tidy(folder: Path, place: Path) -> None:
+    """Remove the folder below the cache that was made for a file which did not come."""
+    if folder != place:
+        with suppress(OSError):  # it holds something, or was never made
+            folder.rmdir()
+
+
+class _Bar:
+    """What pooch expects of a progress bar, told as the share that is done."""
+
+    total = 0
+
+    def __init__(self, progress: Callable[[float], None]) -> None:
+        self._progress = progress
+        self._done = 0
+
+    def update(self, count: int) -> None:
+        """`count` more bytes have come; a server may not say how many there will be."""
+        self._done += count
+        if self.total:
+            self._progress(min(1.0, self._done / self.total))
+
+    def reset(self) -> None:
+        """Begin anew."""
+        self._done = 0
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+@contextmanager
+def _quiet(logger: logging.Logger) -> Iterator[None]:
+    """Keep pooch's own lines off the screen, for this download only."""
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)

@@ -1,0 +1,195 @@
+"""Faults: each turns commands, or the actuators' response, into what a faulty actuator does.
+
+A fault with an open severity is a class of faults; `drawn` fixes the severity from a seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.errors import InputError
+from retwin.segments import Segments
+
+__all__ = ["Fault", "SteadyStateError", "Stuck", "draw_faults", "faulty_commands", "frozen_response"]
+
+
+@runtime_checkable
+class Fault(Protocol):
+    """What goes wrong in one trajectory."""
+
+    @property
+    def label(self) -> str:
+        """The class name of this fault."""
+        ...
+
+    def drawn(self, rng: np.random.Generator, *, steps: int, movements: int) -> Fault:
+        """The same fault with every open severity fixed."""
+        ...
+
+    def command(self, commands: NDArray, segments: Segments) -> NDArray:
+        """What the actuators are effectively told: (T, d_u) in and out; `segments` of one."""
+        ...
+
+    def response(self, response: NDArray) -> NDArray:
+        """What the actuators effectively do: (T, d_u) in and out."""
+        ...
+
+
+@dataclass(frozen=True)
+class Stuck:
+    """The actuator's response is held from sample `onset` on.
+
+    Parameters
+    ----------
+    actuator: which, counted from 0.
+    onset: 0-based sample from which the response stays as it is; a pair (low, high) is drawn
+        uniformly. The published protocol freezes at sample 49.
+    label: class name.
+    """
+
+    actuator: int
+    onset: int | tuple[int, int] = 49
+    label: str = "Stuck"
+
+    def drawn(self, rng: np.random.Generator, *, steps: int, movements: int) -> Stuck:
+        """The same fault with its onset fixed."""
+        if isinstance(self.onset, int):
+            return self
+        low, high = self.onset
+        return replace(self, onset=int(rng.integers(low, min(high, steps - 1) + 1)))
+
+    def command(self, commands: NDArray, segments: Segments) -> NDArray:
+        """Commands are not touched: the actuator does not follow them."""
+        return commands
+
+    def response(self, response: NDArray) -> NDArray:
+        """The response with the actuator held from the onset on."""
+        onset = self.onset
+        if not isinstance(onset, int):
+            raise _open(self)
+        held = response.copy()
+        held[onset:, self.actuator] = held[min(onset, len(held) - 1), self.actuator]
+        return held
+
+
+@dataclass(frozen=True)
+class SteadyStateError:
+    """A bias on the actuator's reference, one per movement.
+
+    The bias is reached along the movement's ramp: the reference goes from the biased old target to
+    the biased new one, as in the published data. The actuator starts at rest, without bias.
+
+    Parameters
+    ----------
+    actuator: which, counted from 0.
+    size: least and greatest size of a drawn bias, in units of the command; its sign is random.
+    bias: one per movement; empty leaves it open.
+    label: class name.
+    """
+
+    actuator: int
+    size: tuple[float, float] = (10.0, 50.0)
+    bias: tuple[float, ...] = ()
+    label: str = "Steady_state_error"
+
+    def drawn(
+        self, rng: np.random.Generator, *, steps: int, movements: int
+    ) -> SteadyStateError:
+        """The same fault with one bias per movement."""
+        if self.bias:
+            return self
+        count = max(movements, 1)
+        drawn = rng.uniform(*self.size, size=count) * rng.choice([-1.0, 1.0], size=count)
+        return replace(self, bias=tuple(drawn.tolist()))
+
+    def command(self, commands: NDArray, segments: Segments) -> NDArray:
+        """The commands with the biased reference of one actuator."""
+        if not self.bias:
+            raise _open(self)
+        valid = segments.valid[0]
+        if not valid.any():
+            bias: NDArray | float = self.bias[0]
+        else:
+            levels = np.resize(self.bias, valid.sum())
+            clean = commands[:, self.actuator]
+            bias = _along(clean, segments.start[0][valid], segments.settle[0][valid], levels)
+        biased = commands.copy()
+        biased[:, self.actuator] += bias
+        return biased
+
+    def response(self, response: NDArray) -> NDArray:
+        """The actuator follows its (biased) reference."""
+        return response
+
+
+def _along(clean: NDArray, start: NDArray, settle: NDArray, levels: NDArray) -> NDArray:
+    """The bias over time: it moves from level to level as the command moves to its target."""
+    time = np.arange(len(clean), dtype=float)
+    bias = np.zeros(len(clean))
+    before = 0.0
+    for begin, end, level in zip(start, settle, levels, strict=True):
+        inside = time >= begin
+        first, last = np.interp([begin, end], time, clean)
+        if first != last:
+            share = (clean[inside] - first) / (last - first)
+            share[time[inside] >= end] = 1.0
+        else:
+            share = (time[inside] - begin) / max(end - begin, 1.0)
+        bias[inside] = before + (level - before) * np.clip(share, 0.0, 1.0)
+        before = level
+    return bias
+
+
+def _open(fault: Fault) -> InputError:
+    return InputError(
+        "faults",
+        expected="a severity that is fixed",
+        got=repr(fault),
+        remedy="call draw_faults first, or give the severity",
+    )
+
+
+def draw_faults(
+    faults: Sequence[Fault | None], segments: Segments, rng: np.random.Generator
+) -> list[Fault | None]:
+    """Fix the severity of every fault, one per trajectory (None: healthy)."""
+    if len(faults) != len(segments):
+        raise InputError(
+            "faults",
+            expected=f"one per trajectory, {len(segments)}",
+            got=f"{len(faults)}",
+            remedy="give None for a healthy trajectory",
+        )
+    counts = segments.valid.sum(axis=1)
+    return [
+        None if fault is None else fault.drawn(rng, steps=segments.steps, movements=int(count))
+        for fault, count in zip(faults, counts, strict=True)
+    ]
+
+
+def faulty_commands(
+    commands: NDArray, faults: Sequence[Fault | None], segments: Segments
+) -> NDArray:
+    """Commands (n, T, d_u) with every fault's effect on the reference."""
+    out = commands.copy()
+    for i, fault in enumerate(faults):
+        if fault is not None:
+            out[i] = fault.command(commands[i], segments[i])
+    return out
+
+
+def frozen_response(response: NDArray, faults: Sequence[Fault | None]) -> NDArray:
+    """Response (n, T, d_u) of the actuators with every fault's effect on it.
+
+    A twin whose actuators are not visible applies this to its commands: the command is then held.
+    """
+    out = response.copy()
+    for i, fault in enumerate(faults):
+        if fault is not None:
+            out[i] = fault.response(response[i])
+    return out

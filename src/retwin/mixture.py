@@ -1,0 +1,159 @@
+"""Conditional Gaussian mixtures (Eq. 6): context in, torch `Distribution` out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.distributions import Categorical, Distribution, MixtureSameFamily, MultivariateNormal, constraints
+
+__all__ = ["Blocks", "GaussianMixture", "MixtureHead"]
+
+FLOOR = 0.05
+"""Least standard deviation of a component, in standard units: no component shrinks onto a point."""
+
+
+class GaussianMixture(MixtureSameFamily):
+    """A mixture of K multivariate normals with full covariance (Eq. 6).
+
+    Parameters
+    ----------
+    logits: (..., K), unnormalised log weights π.
+    mean: (..., K, D), μ.
+    factor: (..., K, D, D), Cholesky factor of Σ.
+    """
+
+    def __init__(self, logits: Tensor, mean: Tensor, factor: Tensor) -> None:
+        self.factor = factor
+        super().__init__(
+            Categorical(logits=logits, validate_args=False),
+            MultivariateNormal(mean, scale_tril=factor, validate_args=False),
+            validate_args=False,
+        )
+
+    def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
+        """The draw (..., D) that this noise stands for: uniform (...) in [0, 1), normal (..., D).
+
+        Noise is an input, so that the same noise gives the same draw anywhere.
+        """
+        weights = self.mixture_distribution.probs
+        steps = weights.cumsum(dim=-1)
+        chosen = (uniform[..., None] >= steps).sum(dim=-1).clamp_max(weights.shape[-1] - 1)
+        size = normal.shape[-1]
+        mean = self.component_distribution.loc.gather(
+            -2, chosen[..., None, None].expand(*chosen.shape, 1, size)
+        )[..., 0, :]
+        factor = self.factor.gather(
+            -3, chosen[..., None, None, None].expand(*chosen.shape, 1, size, size)
+        )[..., 0, :, :]
+        return mean + (factor @ normal[..., None])[..., 0]
+
+    def marginal_cdf(self, value: Tensor) -> Tensor:
+        """P(z_d <= value_d) of each component of z on its own, (..., D): the PIT of a value."""
+        deviation = self.factor.square().sum(dim=-1).sqrt()
+        distance = (value[..., None, :] - self.component_distribution.loc) / deviation
+        return (self.mixture_distribution.probs[..., None] * torch.special.ndtr(distance)).sum(-2)
+
+
+class Blocks(Distribution):
+    """Independent distributions side by side: the distribution of their joined values (..., D)."""
+
+    arg_constraints: dict[str, constraints.Constraint] = {}
+    support = constraints.real_vector
+
+    def __init__(self, blocks: Sequence[GaussianMixture]) -> None:
+        self.blocks = list(blocks)
+        self.widths = [block.event_shape[0] for block in self.blocks]
+        super().__init__(
+            self.blocks[0].batch_shape, torch.Size([sum(self.widths)]), validate_args=False
+        )
+
+    @property
+    def mean(self) -> Tensor:
+        """The mixture mean z̄ (Eq. 8), (..., D)."""
+        return torch.cat([block.mean for block in self.blocks], dim=-1)
+
+    @property
+    def variance(self) -> Tensor:
+        """Variance of each component of z, (..., D)."""
+        return torch.cat([block.variance for block in self.blocks], dim=-1)
+
+    def block_log_prob(self, value: Tensor) -> Tensor:
+        """Log density of each block at its part of `value`, (..., blocks)."""
+        parts = value.split(self.widths, dim=-1)
+        return torch.stack(
+            [block.log_prob(part) for block, part in zip(self.blocks, parts, strict=True)], dim=-1
+        )
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log density at `value` (..., D)."""
+        return self.block_log_prob(value).sum(dim=-1)
+
+    def sample(
+        self, sample_shape: Sequence[int] = (), *, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Draws (*sample_shape, ..., D) from `generator`, or from torch's global one."""
+        shape = torch.Size(sample_shape) + self.batch_shape
+        uniform = torch.rand(*shape, len(self.blocks), generator=generator)
+        normal = torch.randn(*shape, self.event_shape[0], generator=generator)
+        parts = zip(self.blocks, uniform.unbind(-1), normal.split(self.widths, -1), strict=True)
+        draws = []
+        for block, u, e in parts:
+            wide = block.expand(shape) if sample_shape else block
+            draws.append(GaussianMixture.from_noise(wide, u, e))
+        return torch.cat(draws, dim=-1)
+
+    def marginal_cdf(self, value: Tensor) -> Tensor:
+        """P(z_d <= value_d) of each component of z on its own, (..., D)."""
+        parts = value.split(self.widths, dim=-1)
+        return torch.cat(
+            [block.marginal_cdf(part) for block, part in zip(self.blocks, parts, strict=True)], -1
+        )
+
+
+class MixtureHead(nn.Module):
+    """Encoded context (..., H) in, `GaussianMixture` over `width` components of z out."""
+
+    def __init__(self, features: int, width: int, components: int) -> None:
+        super().__init__()
+        self.width = width
+        self.components = components
+        self.lower = width * (width + 1) // 2
+        self.linear = nn.Linear(features, components * (1 + width + self.lower))
+
+    def forward(self, encoded: Tensor, shift: Tensor, scale: Tensor) -> GaussianMixture:
+        """The mixture in physical units: standard units times `scale` plus `shift`, both (D,)."""
+        raw = self.linear(encoded).unflatten(-1, (self.components, -1))
+        logits, mean, lower = raw.split([1, self.width, self.lower], dim=-1)
+        factor = raw.new_zeros(*raw.shape[:-1], self.width, self.width)
+        row, column = torch.tril_indices(self.width, self.width)
+        factor[..., row, column] = lower
+        diagonal = nn.functional.softplus(factor.diagonal(dim1=-2, dim2=-1)) + FLOOR
+        factor = factor.tril(-1) + torch.diag_embed(diagonal)
+        return GaussianMixture(logits[..., 0], mean * scale + shift, scale[:, None] * factor)
+
+    @torch.no_grad()
+    def initialise(self, values: NDArray, seed: int) -> None:
+        """Start at the clusters (k-means++) of standard z (n, D), the same for every context.
+
+        A cluster of few points takes most of its spread from the whole: it is no law yet.
+        """
+        from sklearn.cluster import KMeans
+
+        count = min(self.components, len(np.unique(values, axis=0)))
+        found = KMeans(count, n_init=5, random_state=seed).fit(values)
+        whole = values.var(axis=0)
+        bias = torch.zeros(self.components, 1 + self.width + self.lower)
+        diagonal = [i * (i + 1) // 2 + i for i in range(self.width)]
+        for k in range(self.components):
+            members = values[found.labels_ == k % count]
+            spread = (len(members) * members.var(axis=0) + 2 * whole) / (len(members) + 2)
+            deviation = torch.as_tensor(np.sqrt(spread).clip(2 * FLOOR) - FLOOR)
+            bias[k, 0] = np.log(len(members) / len(values))
+            bias[k, 1 : 1 + self.width] = torch.as_tensor(found.cluster_centers_[k % count])
+            bias[k, 1 + self.width :][diagonal] = torch.log(torch.expm1(deviation)).float()
+        self.linear.bias.copy_(bias.flatten())
+        self.linear.weight.mul_(0.1)

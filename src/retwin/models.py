@@ -1,0 +1,60 @@
+"""Fitted models on disk: a folder of safetensors weights and a JSON description, never pickle."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from retwin.errors import InputError
+from retwin.storage import write_atomically
+
+__all__ = ["read_model", "write_model"]
+
+SCHEMA = 1
+
+
+def write_model(
+    folder: str | Path, kind: str, about: dict[str, Any], weights: dict[str, Tensor]
+) -> None:
+    """Write `folder`/model.json and `folder`/weights.safetensors, moved into place when whole."""
+    from safetensors.torch import save_file
+
+    with write_atomically(folder) as temporary:
+        temporary.mkdir()
+        text = json.dumps({"schema": SCHEMA, "kind": kind, **about}, indent=1)
+        (temporary / "model.json").write_text(text, encoding="utf-8")
+        save_file({k: v.contiguous() for k, v in weights.items()}, temporary / "weights.safetensors")
+
+
+def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Description and weights of a model folder.
+
+    Raises InputError when the folder is missing, damaged, newer, or holds another kind of model.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    folder = Path(folder)
+    remedy = "give the folder of a saved model, or save it again"
+    try:
+        about = json.loads((folder / "model.json").read_text(encoding="utf-8"))
+        weights = load_file(folder / "weights.safetensors")
+    except (OSError, ValueError, SafetensorError) as error:
+        raise InputError(
+            str(folder),
+            expected=f"a {kind} model (model.json and weights.safetensors)",
+            got=f"{type(error).__name__}: {str(error).splitlines()[0]}",
+            remedy=remedy,
+        ) from None
+    found = (about.get("schema"), about.get("kind")) if isinstance(about, dict) else (None, None)
+    if found != (SCHEMA, kind):
+        raise InputError(
+            str(folder),
+            expected=f"a {kind} model of schema {SCHEMA}",
+            got=f"kind {found[1]!r}, schema {found[0]!r}",
+            remedy=remedy,
+        )
+    return about, weights

@@ -1,0 +1,347 @@
+"""Residual Generator (RG), Eq. 6–10: the distribution of the gap z, given what was commanded."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from retwin.corrections import Context, Correction, DelayOffset, Discrepancy, from_config, to_config
+from retwin.errors import InputError
+from retwin.mixture import Blocks, MixtureHead
+from retwin.models import read_model, write_model
+from retwin.networks import Standardise
+from retwin.segments import Segments
+from retwin.surrogate import Surrogate
+from retwin.training import Fit, Training, isolated, train
+from retwin.trajectories import Channels, Trajectories
+from retwin.twins.protocol import HEALTHY, Progress
+
+__all__ = ["Mixture", "ResidualModel", "fit_residual", "infer_discrepancy", "segment"]
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """How the residual model looks and learns.
+
+    Parameters
+    ----------
+    components: K of Eq. 6, for each head.
+    hidden: widths of the shared encoder.
+    dropout: of the encoder.
+    smoothness, boundedness: λ_s and λ_b of Eq. 10, on z in standard units.
+    training: epochs, rate, patience.
+    """
+
+    components: int = 3
+    hidden: tuple[int, ...] = (32, 32)
+    dropout: float = 0.1
+    smoothness: float = 0.01
+    boundedness: float = 1.0
+    training: Training = Training(
+        epochs=300, batch=64, rate=3e-3, decay="step", patience=40, weight_decay=1e-2
+    )
+
+
+class ResidualModel(nn.Module):
+    """Call it on a `Context`: out comes a torch `Distribution` over z (n, M, d_z).
+
+    Holds its correction operator, so that it knows what z means.
+    """
+
+    bounds: Tensor
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(
+        self,
+        correction: Correction,
+        mixture: Mixture,
+        *,
+        inputs: Channels,
+        outputs: Channels,
+        segmentation: str = "commands",
+    ) -> None:
+        super().__init__()
+        self.correction = correction
+        self.mixture = mixture
+        self.inputs = inputs
+        self.outputs = outputs
+        self.segmentation = segmentation
+        self.latent = correction.latent(outputs)
+        self.fitted: Fit | None = None
+        features = 3 * (len(inputs) + len(outputs)) + 2
+        self.before = Standardise(features)
+        layers: list[nn.Module] = []
+        width = features
+        for following in mixture.hidden:
+            layers += [nn.Linear(width, following), nn.SiLU(), nn.Dropout(mixture.dropout)]
+            width = following
+        self.encoder = nn.Sequential(*layers)
+        self.heads = nn.ModuleList(
+            MixtureHead(width, size, mixture.components) for _, size in correction.heads(outputs)
+        )
+        for name in ("bounds", "shift", "scale"):
+            self.register_buffer(name, torch.ones(len(self.latent)))
+
+    def forward(self, context: Context) -> Blocks:
+        """q_ψ(z | u, ŷ), in physical units."""
+        return self.distribution(describe(context))
+
+    def distribution(self, features: Tensor) -> Blocks:
+        """q_ψ for described movements (..., F), see `describe`."""
+        encoded = self.encoder(self.before(features))
+        sizes = [head.width for head in self.heads]
+        parts = zip(self.heads, self.shift.split(sizes), self.scale.split(sizes), strict=True)
+        return Blocks([head(encoded, shift, scale) for head, shift, scale in parts])
+
+    @torch.no_grad()
+    def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:
+        """Draws of z (n, M, d_z), clipped at the bounds b: regularising z̄ does not bound samples."""
+        drawn = self(context).sample(generator=generator)
+        return drawn.clamp(-self.bounds, self.bounds)
+
+    def save(self, folder: str | Path) -> None:
+        """Write weights and description, see `retwin.models`."""
+        about = {
+            "correction": to_config(self.correction),
+            "mixture": asdict(self.mixture),
+            "inputs": vars(self.inputs),
+            "outputs": vars(self.outputs),
+            "segmentation": self.segmentation,
+            "fitted": None if self.fitted is None else asdict(self.fitted),
+        }
+        write_model(folder, "residual", about, self.state_dict())
+
+    @classmethod
+    def load(cls, folder: str | Path) -> ResidualModel:
+        """Read what `save` wrote; InputError when it is not a residual model or damaged."""
+        about, weights = read_model(folder, "residual")
+        mixture = dict(about["mixture"])
+        mixture["hidden"] = tuple(mixture["hidden"])
+        mixture["training"] = Training(**mixture["training"])
+        model = cls(
+            from_config(about["correction"]),
+            Mixture(**mixture),
+            inputs=Channels.of(about["inputs"]),
+            outputs=Channels.of(about["outputs"]),
+            segmentation=about["segmentation"],
+        )
+        model.load_state_dict(weights)
+        model.fitted = Fit.of(about["fitted"])
+        return model.eval()
+
+
+def describe(context: Context) -> Tensor:
+    """What the RG may know of each movement, (n, M, F).
+
+    Commands and nominal output before, amid and after the motion; length of the motion and of the
+    steady part in s. Always of the clean commands: the RG is not told of faults.
+    """
+    segments = context.segments
+    start, settle, stop = (
+        torch.as_tensor(times) for times in (segments.start, segments.settle, segments.stop)
+    )
+    last = segments.steps - 1
+    columns = []
+    for when in (start, (start + settle) / 2, settle):
+        index = when.round().long().clamp(0, last)[..., None]
+        for values in (context.commands, context.nominal):
+            columns.append(values.gather(1, index.expand(-1, -1, values.shape[2])))
+    lengths = torch.stack([settle - start, stop - settle], dim=-1) / context.rate
+    return torch.cat([*columns, lengths.to(context.nominal)], dim=-1)
+
+
+def segment(trajectories: Trajectories, how: str = "commands") -> Segments:
+    """Movements by `how`: "commands" from command events, "path" from the nominal path's speed."""
+    if how not in ("commands", "path"):
+        raise InputError(
+            "segmentation",
+            expected="'commands' or 'path'",
+            got=repr(how),
+            remedy="use 'path' for a twin without command events",
+        )
+    if how == "commands":
+        return Segments.from_commands(trajectories.commands)
+    return Segments.from_path(trajectories.nominal)
+
+
+def infer_discrepancy(
+    surrogate: Surrogate,
+    trajectories: Trajectories,
+    correction: Correction,
+    *,
+    segments: Segments | None = None,
+) -> tuple[Context, Discrepancy]:
+    """z* of measured trajectories: what g must add to the surrogate to explain them (for Eq. 7)."""
+    segments = segment(trajectories) if segments is None else segments
+    context = Context.of(surrogate, trajectories.commands, segments, rate=trajectories.rate)
+    found = correction.infer(
+        context,
+        torch.as_tensor(trajectories.observed.copy()),
+        torch.as_tensor(trajectories.mask.copy()),
+    )
+    return context, found
+
+
+def fit_residual(
+    surrogate: Surrogate,
+    calibration: Trajectories,
+    correction: Correction = DelayOffset(),  # noqa: B008 - a frozen config
+    mixture: Mixture = Mixture(),  # noqa: B008 - a frozen config
+    *,
+    seed: int,
+    calibrate_on: str = "healthy",
+    bounds: NDArray | None = None,
+    segments: Segments | str = "commands",
+    progress: Progress | None = None,
+) -> ResidualModel:
+    """Fit the RG to measured trajectories, outputs only (Eq. 7–10).
+
+    Parameters
+    ----------
+    surrogate: the IBG.
+    calibration: real trajectories with commands; by default only the healthy ones are used, since
+        the offset would absorb the fault of others. As few as six do; fewer than three leave no
+        trajectory to validate on (a warning).
+    correction: what z means.
+    calibrate_on: "healthy" or "all".
+    bounds: b of Eq. 9, (d_z,); by default 1.25 times the largest |z*|.
+    segments: "commands", "path", or the movements themselves, one row per trajectory.
+
+    Raises
+    ------
+    InputError: no trajectory to calibrate on, no movement in any, an unknown `calibrate_on`.
+    """
+    keep = _chosen(calibration, calibrate_on)
+    used = calibration[keep]
+    rule = segments if isinstance(segments, str) else "given"
+    parts = segment(used, segments) if isinstance(segments, str) else segments[keep]
+    if not parts.valid.any():
+        raise InputError(
+            "calibration",
+            expected="trajectories with movements",
+            got="commands that never change",
+            remedy="give segments='path', or the movements themselves",
+        )
+    context, found = infer_discrepancy(surrogate, used, correction, segments=parts)
+    with isolated(seed):
+        model = ResidualModel(
+            correction, mixture, inputs=used.inputs, outputs=used.outputs, segmentation=rule
+        )
+    features = describe(context)
+    valid = torch.as_tensor(parts.valid)
+    _prepare(model, features, found, valid, bounds, seed)
+    data = (features, found.z.float(), _known(model, found), valid)
+    train_rows, valid_rows = _validation_split(used, seed)
+    result = train(
+        model,
+        _objective(mixture),
+        tuple(each[train_rows] for each in data),
+        None if valid_rows is None else tuple(each[valid_rows] for each in data),
+        mixture.training,
+        seed=seed,
+        progress=progress,
+    )
+    model.fitted = Fit.from_training(
+        result, {"trajectories": float(len(used)), "movements": float(valid.sum())}
+    )
+    return model.eval()
+
+
+def _chosen(calibration: Trajectories, calibrate_on: str) -> NDArray:
+    if calibrate_on not in ("healthy", "all"):
+        raise InputError(
+            "calibrate_on",
+            expected="'healthy' or 'all'",
+            got=repr(calibrate_on),
+            remedy="'all' lets the offset absorb faults; use it for comparison only",
+        )
+    everything = np.ones(len(calibration), dtype=bool)
+    keep = calibration.labels == HEALTHY if calibrate_on == "healthy" else everything
+    if not keep.any():
+        raise InputError(
+            "calibration",
+            expected=f"at least one trajectory labelled {HEALTHY!r}",
+            got=f"labels {sorted(calibration.known_labels) or 'none'}",
+            remedy="label healthy trajectories, or calibrate on 'all'",
+        )
+    if keep.sum() < 3:
+        warnings.warn(
+            f"calibration: {keep.sum()} trajectories to calibrate on, at least three are needed to "
+            "hold one out; training runs to its last epoch without validation",
+            stacklevel=3,
+        )
+    return np.flatnonzero(keep)
+
+
+def _known(model: ResidualModel, found: Discrepancy) -> Tensor:
+    """(n, M, heads): whether the outputs tell that block of z."""
+    sizes = [head.width for head in model.heads]
+    parts = found.identified.split(sizes, dim=-1)
+    return torch.stack([part.all(dim=-1) for part in parts], dim=-1)
+
+
+@torch.no_grad()
+def _prepare(
+    model: ResidualModel,
+    features: Tensor,
+    found: Discrepancy,
+    valid: Tensor,
+    bounds: NDArray | None,
+    seed: int,
+) -> None:
+    """Standardise, bound and start the model from the data it is trained on."""
+    model.before.fit(features[valid])
+    begin = 0
+    for head in model.heads:
+        part = slice(begin, begin + head.width)
+        begin += head.width
+        known = found.identified[..., part].all(dim=-1) & valid
+        values = found.z[..., part][known if known.any() else valid].float()
+        # Robust: a few missed movements must not set the unit in which the others are told.
+        shift = values.median(dim=0).values
+        scale = 1.4826 * (values - shift).abs().median(dim=0).values
+        spread = values.std(dim=0, correction=0)
+        scale = torch.maximum(scale, 0.1 * spread).clamp_min(1e-9)
+        model.shift[part], model.scale[part] = shift, scale
+        model.bounds[part] = 1.25 * values.abs().amax(dim=0).clamp_min(1e-9)
+        head.initialise(((values - shift) / scale).double().numpy(), seed)
+    if bounds is not None:
+        model.bounds.copy_(torch.as_tensor(bounds, dtype=torch.float32))
+
+
+def _validation_split(used: Trajectories, seed: int) -> tuple[Tensor, Tensor | None]:
+    """Rows to train on, and about a fifth of the trajectories (one at least) to validate on."""
+    if len(used) < 3:
+        return torch.arange(len(used)), None
+    order = torch.as_tensor(np.random.default_rng(seed).permutation(len(used)))
+    held = max(1, round(0.2 * len(used)))
+    return order[held:], order[:held]
+
+
+def _objective(mixture: Mixture) -> Callable[[nn.Module, tuple[Tensor, ...]], Tensor]:
+    """L_RG of Eq. 10, averaged over movements."""
+
+    def loss(model: Any, batch: tuple[Tensor, ...]) -> Tensor:
+        features, z, known, valid = batch
+        law = model.distribution(features)
+        # Unknown blocks are left out of the likelihood; a placeholder keeps them finite.
+        told = law.block_log_prob(z)
+        nll = -torch.where(known, told, 0.0).sum() / known.sum().clamp_min(1) * known.shape[-1]
+        mean = law.mean
+        step = (mean[:, 1:] - mean[:, :-1]) / model.scale
+        both = valid[:, 1:] & valid[:, :-1]
+        rough = (step.square().sum(-1) * both).sum() / both.sum().clamp_min(1)
+        beyond = torch.relu(mean.abs() - model.bounds) / model.scale
+        outside = (beyond.square().sum(-1) * valid).sum() / valid.sum().clamp_min(1)
+        return nll + mixture.smoothness * rough + mixture.boundedness * outside
+
+    return loss

@@ -1,0 +1,226 @@
+"""Ideal Behavior Generator (IBG), Eq. 5: a fast neural twin, G_φ(u) ≈ ŷ."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from retwin.errors import InputError
+from retwin.faults import Fault, draw_faults, faulty_commands, frozen_response
+from retwin.models import read_model, write_model
+from retwin.networks import MLP, Network, Standardise, from_config, to_config
+from retwin.segments import Segments
+from retwin.training import Fit, Training, isolated, train
+from retwin.trajectories import Channels, Source, Trajectories
+from retwin.twins.protocol import Progress, checked_commands, fault_labels
+
+__all__ = ["Surrogate", "fit_surrogate"]
+
+# Larger chunks leave the processor's cache (measured: 16–64 trajectories of 1000 samples).
+CHUNK = 32
+
+
+class Surrogate(nn.Module):
+    """A trained neural twin: call it on a tensor, or `simulate` as any `Twin`.
+
+    Parameters
+    ----------
+    network: the config its module was built from.
+    inputs, outputs: channels of commands and outputs.
+    rate: samples per second it was trained at.
+    """
+
+    def __init__(
+        self, network: Network, *, inputs: Channels, outputs: Channels, rate: float
+    ) -> None:
+        super().__init__()
+        self.config = network
+        self.inputs = inputs
+        self.outputs = outputs
+        self.rate = rate
+        self.before = Standardise(len(inputs))
+        self.after = Standardise(len(outputs))
+        self.network = network.build(len(inputs), len(outputs))
+        self.fitted: Fit | None = None
+
+    def forward(self, commands: Tensor) -> Tensor:
+        """Outputs (n, T, d_y) for commands (n, T, d_u), both in physical units."""
+        return self.after.inverse(self.network(self.before(commands)))
+
+    @torch.no_grad()
+    def predict(self, commands: NDArray, *, progress: Progress | None = None) -> NDArray:
+        """Outputs (n, T, d_y), float32, for commands (n, T, d_u); in chunks that fit the cache."""
+        out = np.empty((*commands.shape[:2], len(self.outputs)), dtype=np.float32)
+        for begin in range(0, len(commands), CHUNK):
+            part = slice(begin, begin + CHUNK)
+            out[part] = self(torch.as_tensor(commands[part], dtype=torch.float32)).numpy()
+            if progress is not None:
+                progress(min(1.0, (begin + CHUNK) / len(commands)))
+        return out
+
+    def simulate(
+        self,
+        commands: NDArray,
+        *,
+        faults: Sequence[Fault | None] | None = None,
+        seed: int,
+        progress: Progress | None = None,
+    ) -> Trajectories:
+        """What the surrogate says, see `Twin.simulate`; frozen responses are held commands."""
+        commands = checked_commands(commands, self.inputs).astype(np.float32, copy=False)
+        nominal = self.predict(commands)
+        observed, labels = nominal, None
+        if faults is not None:
+            segments = Segments.from_commands(commands)
+            drawn = draw_faults(faults, segments, np.random.default_rng(seed))
+            faulty = frozen_response(faulty_commands(commands, drawn, segments), drawn)
+            observed = self.predict(faulty, progress=progress)
+            labels = fault_labels(drawn)
+        return Trajectories(
+            commands=commands,
+            nominal=nominal,
+            observed=observed,
+            labels=labels,
+            rate=self.rate,
+            inputs=self.inputs,
+            outputs=self.outputs,
+            provenance=(Source(f"Surrogate seed={seed}"),),
+            emulated=True,
+        )
+
+    def save(self, folder: str | Path) -> None:
+        """Write weights and description; see `read_model` for the layout."""
+        write_model(
+            folder,
+            "surrogate",
+            {
+                "network": to_config(self.config),
+                "inputs": vars(self.inputs),
+                "outputs": vars(self.outputs),
+                "rate": self.rate,
+                "fitted": None if self.fitted is None else asdict(self.fitted),
+            },
+            self.state_dict(),
+        )
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Surrogate:
+        """Read what `save` wrote; InputError when it is not a surrogate or damaged."""
+        about, weights = read_model(folder, "surrogate")
+        surrogate = cls(
+            from_config(about["network"]),
+            inputs=Channels.of(about["inputs"]),
+            outputs=Channels.of(about["outputs"]),
+            rate=about["rate"],
+        )
+        surrogate.load_state_dict(weights)
+        surrogate.fitted = Fit.of(about["fitted"])
+        return surrogate.eval()
+
+
+DEFAULTS = {
+    "MLP": Training(epochs=20, batch=256, rate=5e-3),
+    "LSTM": Training(epochs=30, batch=32, rate=3e-3),
+    "TCN": Training(epochs=30, batch=32, rate=3e-3),
+}
+
+
+def fit_surrogate(
+    twin: Trajectories,
+    network: Network = MLP(),  # noqa: B008 - a frozen config
+    *,
+    seed: int,
+    training: Training | None = None,
+    progress: Progress | None = None,
+) -> Surrogate:
+    """Train an IBG on what a twin says its nominal output is (Eq. 5).
+
+    Parameters
+    ----------
+    twin: commands and nominal outputs; faults in `observed` do not matter. A tenth of the
+        trajectories is held out for validation and another tenth for the reported error.
+    network: `MLP` (no memory, the default), `LSTM` or `TCN`.
+    seed: same seed, same weights on the same machine.
+    training: epochs, batch, rate; by default what suits the network.
+
+    The result's `fitted.figures` hold, for every output, `rmse_NAME` in its unit and `nrmse_NAME`
+    (over its standard deviation) on held-out trajectories.
+
+    Raises
+    ------
+    InputError: fewer than ten trajectories, or a set without commands.
+    """
+    if len(twin) < 10 or twin.commands.shape[2] == 0:
+        raise InputError(
+            "twin",
+            expected="at least ten trajectories with commands",
+            got=f"{len(twin)} trajectories with {twin.commands.shape[2]} command channels",
+            remedy="load the file with its case, which recovers commands, or simulate more",
+        )
+    order = np.random.default_rng(seed).permutation(len(twin))
+    tenth = max(1, len(twin) // 10)
+    test, valid, train_part = order[:tenth], order[tenth : 2 * tenth], order[2 * tenth :]
+    with isolated(seed):
+        surrogate = Surrogate(network, inputs=twin.inputs, outputs=twin.outputs, rate=twin.rate)
+    rows = (
+        _samples if isinstance(network, MLP) else _windows
+    )
+    fitted = rows(twin, train_part, seed)
+    surrogate.before.fit(fitted[0])
+    surrogate.after.fit(fitted[1])
+
+    def loss(module: nn.Module, batch: tuple[Tensor, ...]) -> Tensor:
+        commands, nominal = batch
+        error = module.network(module.before(commands)) - module.after(nominal)
+        return error.square().mean()
+
+    result = train(
+        surrogate,
+        loss,
+        fitted,
+        rows(twin, valid, seed + 1),
+        training or DEFAULTS[type(network).__name__],
+        seed=seed,
+        progress=progress,
+    )
+    error = surrogate.predict(twin.commands[test]) - twin.nominal[test]
+    rmse = np.sqrt(np.square(error, dtype=np.float64).mean(axis=(0, 1)))
+    spread = twin.nominal[test].std(axis=(0, 1), dtype=np.float64)
+    figures = {"held_out": float(tenth)}
+    for name, error_of, spread_of in zip(twin.outputs.names, rmse, spread, strict=True):
+        figures[f"rmse_{name}"] = float(error_of)
+        figures[f"nrmse_{name}"] = float(error_of / spread_of) if spread_of > 0 else 0.0
+    surrogate.fitted = Fit.from_training(result, figures)
+    return surrogate
+
+
+SAMPLES = 200_000
+
+
+def _samples(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, Tensor]:
+    """Distinct samples of those trajectories, at most SAMPLES: a hold says the same all over."""
+    commands = twin.commands[part].reshape(-1, twin.commands.shape[2])
+    nominal = twin.nominal[part].reshape(-1, twin.nominal.shape[2])
+    fresh = np.ones(len(commands), dtype=bool)
+    fresh[1:] = (commands[1:] != commands[:-1]).any(axis=1)
+    index = np.flatnonzero(fresh)
+    if len(index) > SAMPLES:
+        index = np.random.default_rng(seed).choice(index, SAMPLES, replace=False, shuffle=False)
+    return (
+        torch.as_tensor(commands[index], dtype=torch.float32),
+        torch.as_tensor(nominal[index], dtype=torch.float32),
+    )
+
+
+def _windows(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, Tensor]:
+    """Whole trajectories."""
+    return (
+        torch.as_tensor(twin.commands[part], dtype=torch.float32),
+        torch.as_tensor(twin.nominal[part], dtype=torch.float32),
+    )

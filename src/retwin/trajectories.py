@@ -1,0 +1,368 @@
+"""`Trajectories`: the one data type, frozen and checked at the border."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from retwin.errors import InputError
+
+__all__ = ["Channels", "Source", "Trajectories"]
+
+UNLABELLED = ""
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Names and units of the columns of an array."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.names) != len(self.units) or len(set(self.names)) != len(self.names):
+            raise InputError(
+                "channels",
+                expected="one unit per name and no name twice",
+                got=f"names {list(self.names)}, units {list(self.units)}",
+                remedy="name every channel once and give each a unit ('1' when it has none)",
+            )
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @classmethod
+    def of(cls, values: Mapping[str, Sequence[str]]) -> Channels:
+        """The channels that `vars` of one gave, JSON lists or tuples alike."""
+        return cls(tuple(values["names"]), tuple(values["units"]))
+
+    @classmethod
+    def numbered(cls, prefix: str, count: int, unit: str = "1") -> Channels:
+        """Channels `prefix`1 … `prefix`count, all with the same unit."""
+        return cls(tuple(f"{prefix}{i + 1}" for i in range(count)), (unit,) * count)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where data came from: a file name and its SHA-256, or the maker's name with a seed."""
+
+    name: str
+    sha256: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """A set of trajectories on one time grid.
+
+    Attributes
+    ----------
+    commands: (n, T, d_u), what the actuators were told; d_u = 0 when a file does not say.
+    nominal: (n, T, d_y), the ideal output for the clean commands.
+    observed: (n, T, d_y), the measured or simulated output; 0 where it is missing.
+    mask: (n, T, d_y) bool, True where `observed` is a measurement.
+    labels: (n,) class names, "" where unlabelled.
+    ids: (n,) unique names.
+    rate: samples per second.
+    inputs, outputs: names and units of the command and output channels.
+    provenance: the files or makers the data came from.
+    emulated: True when `observed` was made by a model of the real system, not measured.
+
+    Arrays are read-only. Shorter trajectories are padded: mask False, commands held.
+    NaN in `observed` means missing and goes to the mask.
+
+    Raises
+    ------
+    InputError: shapes that disagree, NaN or infinite commands or nominal outputs, infinite
+        observations, a rate that is not positive, ids that repeat.
+    """
+
+    commands: NDArray
+    nominal: NDArray
+    observed: NDArray
+    rate: float
+    # None asks for the default; after the checks these are never None, so their types say so.
+    mask: NDArray = None  # type: ignore[assignment]
+    labels: NDArray = None  # type: ignore[assignment]
+    ids: NDArray = None  # type: ignore[assignment]
+    inputs: Channels = None  # type: ignore[assignment]
+    outputs: Channels = None  # type: ignore[assignment]
+    provenance: tuple[Source, ...] = field(default=())
+    emulated: bool = False
+
+    def __post_init__(self) -> None:
+        commands = _floating("commands", self.commands)
+        nominal = _floating("nominal", self.nominal)
+        observed = _floating("observed", self.observed)
+        _check_shapes(commands, nominal, observed)
+        _check_finite("commands", commands)
+        _check_finite("nominal", nominal)
+        if np.isinf(observed).any():
+            raise InputError(
+                "observed",
+                expected="finite measurements (NaN where one is missing)",
+                got=f"an infinite value in {_first_bad(np.isinf(observed))}",
+                remedy="replace infinite measurements by NaN",
+            )
+        mask = np.isfinite(observed) if self.mask is None else np.asarray(self.mask, bool)
+        if mask.shape != observed.shape:
+            raise InputError(
+                "mask",
+                expected=f"the shape of observed, {observed.shape}",
+                got=str(mask.shape),
+                remedy="give one flag per measurement",
+            )
+        missing = np.isnan(observed)
+        if missing.any():
+            mask = mask & ~missing
+        if not mask.all():
+            observed = np.where(mask, observed, observed.dtype.type(0))
+        if not (isinstance(self.rate, Real) and np.isfinite(self.rate) and self.rate > 0):
+            raise InputError(
+                "rate",
+                expected="a positive number of samples per second",
+                got=repr(self.rate),
+                remedy="give the sample rate in Hz",
+            )
+        n = len(commands)
+        labels = _names("labels", self.labels, [UNLABELLED] * n)
+        ids = _names("ids", self.ids, [f"{i:05d}" for i in range(n)])
+        if len(set(ids.tolist())) != n:
+            raise InputError(
+                "ids",
+                expected="one unique name per trajectory",
+                got="a name that repeats",
+                remedy="leave ids out to have them numbered",
+            )
+        inputs = self.inputs or Channels.numbered("u", commands.shape[2])
+        outputs = self.outputs or Channels.numbered("y", nominal.shape[2])
+        for name, channels, width in (
+            ("inputs", inputs, commands.shape[2]),
+            ("outputs", outputs, nominal.shape[2]),
+        ):
+            if len(channels) != width:
+                raise InputError(
+                    name,
+                    expected=f"{width} channels, as the array has columns",
+                    got=f"{len(channels)}: {list(channels.names)}",
+                    remedy="name every column",
+                )
+        checked = {
+            "commands": commands,
+            "nominal": nominal,
+            "observed": observed,
+            "mask": mask,
+            "labels": labels,
+            "ids": ids,
+        }
+        for name, array in checked.items():
+            array = array.view()
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        object.__setattr__(self, "rate", float(self.rate))
+        object.__setattr__(self, "inputs", inputs)
+        object.__setattr__(self, "outputs", outputs)
+        object.__setattr__(self, "provenance", tuple(self.provenance))
+
+    def __len__(self) -> int:
+        return len(self.commands)
+
+    def __repr__(self) -> str:
+        kind = " emulated" if self.emulated else ""
+        return (
+            f"Trajectories({len(self)}{kind}, {self.steps} samples at {self.rate:g} Hz, "
+            f"commands {self.commands.shape[2]}, outputs {self.nominal.shape[2]})"
+        )
+
+    @property
+    def steps(self) -> int:
+        """Samples per trajectory, T."""
+        return self.commands.shape[1]
+
+    @property
+    def residual(self) -> NDArray:
+        """(n, T, d_y) observed minus nominal (Eq. 11), 0 where nothing was measured."""
+        return np.where(self.mask, self.observed - self.nominal, 0).astype(self.nominal.dtype)
+
+    @property
+    def known_labels(self) -> frozenset[str]:
+        """The class names that occur."""
+        return frozenset(self.labels.tolist()) - {UNLABELLED}
+
+    def __getitem__(self, index: slice | Sequence[int] | NDArray) -> Trajectories:
+        """The trajectories at `index`: a slice, whole numbers or flags."""
+        if not isinstance(index, slice):
+            index = np.atleast_1d(index)
+            if index.size == 0:
+                index = index.astype(int)  # an empty list is float to numpy, which indexes nothing
+        return self.replace(
+            commands=self.commands[index],
+            nominal=self.nominal[index],
+            observed=self.observed[index],
+            mask=self.mask[index],
+            labels=self.labels[index],
+            ids=self.ids[index],
+        )
+
+    def replace(self, **changes: Any) -> Trajectories:
+        """A copy with some attributes changed, checked again."""
+        return replace(self, **changes)
+
+    def with_label(self, label: str) -> Trajectories:
+        """Those of class `label`."""
+        return self[self.labels == label]
+
+    def split(self, fraction: float, *, seed: int) -> tuple[Trajectories, Trajectories]:
+        """Two disjoint parts by trajectory, stratified by class, `fraction` in the first.
+
+        Raises InputError when `fraction` is not strictly between 0 and 1.
+        """
+        if not 0 < fraction < 1:
+            raise InputError(
+                "fraction",
+                expected="a number strictly between 0 and 1",
+                got=repr(fraction),
+                remedy="give the share of the first part",
+            )
+        rng = np.random.default_rng(seed)
+        first = np.zeros(len(self), dtype=bool)
+        taken = 0.0
+        for label in np.unique(self.labels):
+            members = rng.permutation(np.flatnonzero(self.labels == label))
+            # Carry the rounding over, so that the whole share is right and not only each class's.
+            taken += fraction * len(members)
+            count = int(np.clip(round(taken), 0, len(members)))
+            taken -= count
+            first[members[:count]] = True
+        return self[first], self[~first]
+
+    def folds(self, count: int, *, seed: int) -> list[tuple[NDArray, NDArray]]:
+        """`count` pairs (calibration, test) of sorted indices, stratified by class.
+
+        Every trajectory is in exactly one test part. Raises InputError when `count` is below 2 or
+        above the number of trajectories.
+        """
+        if not (isinstance(count, Integral) and 2 <= count <= len(self)):
+            raise InputError(
+                "folds",
+                expected=f"a whole number from 2 to {len(self)}, the number of trajectories",
+                got=repr(count),
+                remedy="give fewer folds or more data",
+            )
+        rng = np.random.default_rng(seed)
+        fold = np.empty(len(self), dtype=int)
+        dealt = 0
+        for label in np.unique(self.labels):
+            members = rng.permutation(np.flatnonzero(self.labels == label))
+            fold[members] = (dealt + np.arange(len(members))) % count
+            dealt += len(members)
+        return [(np.flatnonzero(fold != k), np.flatnonzero(fold == k)) for k in range(count)]
+
+    @staticmethod
+    def concatenate(sets: Sequence[Trajectories]) -> Trajectories:
+        """All trajectories of several sets, renumbered when ids repeat.
+
+        Raises InputError when rates, lengths or channels differ, or there is no set.
+        """
+        if not sets:
+            raise InputError(
+                "sets",
+                expected="at least one set of trajectories",
+                got="none",
+                remedy="give the sets to join",
+            )
+        first = sets[0]
+        for other in sets[1:]:
+            for name in ("rate", "steps", "inputs", "outputs"):
+                if getattr(other, name) != getattr(first, name):
+                    raise InputError(
+                        name,
+                        expected=f"the same in every set, {getattr(first, name)}",
+                        got=f"{getattr(other, name)}",
+                        remedy="resample or rename before joining",
+                    )
+
+        def joined(name: str) -> NDArray:
+            return np.concatenate([getattr(each, name) for each in sets])
+
+        ids = joined("ids")
+        return first.replace(
+            commands=joined("commands"),
+            nominal=joined("nominal"),
+            observed=joined("observed"),
+            mask=joined("mask"),
+            labels=joined("labels"),
+            ids=ids if len(set(ids.tolist())) == len(ids) else None,
+            provenance=tuple(dict.fromkeys(s for each in sets for s in each.provenance)),
+            emulated=any(each.emulated for each in sets),
+        )
+
+
+def _floating(name: str, array: ArrayLike) -> NDArray:
+    array = np.asarray(array)
+    if array.dtype.kind in "iub":
+        array = array.astype(np.float64)
+    if array.dtype.kind != "f" or array.ndim != 3:
+        raise InputError(
+            name,
+            expected="numbers of shape (trajectories, samples, channels)",
+            got=f"{array.dtype} of shape {array.shape}",
+            remedy="stack the trajectories into one three-dimensional array",
+        )
+    return array
+
+
+def _check_shapes(commands: NDArray, nominal: NDArray, observed: NDArray) -> None:
+    if nominal.shape != observed.shape:
+        raise InputError(
+            "observed",
+            expected=f"the shape of nominal, {nominal.shape}",
+            got=str(observed.shape),
+            remedy="give observed and nominal the same channels and samples",
+        )
+    if commands.shape[:2] != nominal.shape[:2]:
+        raise InputError(
+            "commands",
+            expected=f"{nominal.shape[0]} trajectories of {nominal.shape[1]} samples, as nominal",
+            got=str(commands.shape),
+            remedy="sample commands and outputs on the same grid",
+        )
+    if nominal.shape[1] < 2 or nominal.shape[2] < 1:
+        raise InputError(
+            "nominal",
+            expected="at least two samples and one channel",
+            got=str(nominal.shape),
+            remedy="give the outputs over time",
+        )
+
+
+def _check_finite(name: str, array: NDArray) -> None:
+    bad = ~np.isfinite(array)
+    if bad.any():
+        raise InputError(
+            name,
+            expected="finite numbers",
+            got=f"NaN or an infinite value in {_first_bad(bad)}",
+            remedy=f"{name} are known inputs: repair or drop that trajectory",
+        )
+
+
+def _first_bad(bad: NDArray) -> str:
+    trajectory, sample, channel = np.argwhere(bad)[0]
+    return f"trajectory {trajectory}, sample {sample}, channel {channel}"
+
+
+def _names(name: str, given: ArrayLike | None, default: list[str]) -> NDArray:
+    names = np.asarray(default if given is None else given, dtype=np.str_)
+    if names.shape != (len(default),):
+        raise InputError(
+            name,
+            expected=f"{len(default)} names, one per trajectory",
+            got=f"shape {names.shape}",
+            remedy="give one name per trajectory",
+        )
+    return names

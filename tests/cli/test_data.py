@@ -1,0 +1,189 @@
+"""`retwin data`: what is printed and written, and that bad input passes on as InputError."""
+
+import json
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from retwin import download
+from retwin.cli import data
+from retwin.errors import InputError
+from retwin.storage import load, save, sha256
+from retwin.trajectories import Channels, Source, Trajectories
+
+CLASSES = ("Healthy", "Broken [red]")
+
+
+class Case:
+    """The least that a case must have."""
+
+    inputs = Channels(("left", "right"), ("V", "V"))
+    outputs = Channels(("x", "y", "z"), ("m", "m", "m"))
+    rate = 100.0
+    classes = CLASSES
+
+    def complete(self, trajectories, *, progress=None):
+        """Commands are the first two nominal outputs."""
+        return trajectories.replace(commands=trajectories.nominal[..., :2], inputs=self.inputs)
+
+
+@pytest.fixture
+def file(tmp_path):
+    rng = np.random.default_rng(0)
+    observed = rng.normal(size=(10, 20, 3))
+    observed[0, :6] = np.nan
+    made = Trajectories(
+        commands=np.zeros((10, 20, 0)),
+        nominal=rng.normal(size=(10, 20, 3)),
+        observed=observed,
+        rate=100.0,
+        labels=[CLASSES[i % 2] for i in range(10)],
+        provenance=(Source("robot.mat", "ab12"),),
+    )
+    save(made, tmp_path / "set.npz")
+    return tmp_path / "set.npz"
+
+
+@pytest.fixture
+def cases(monkeypatch):
+    """`retwin.cases.get` that knows one case."""
+    import retwin
+
+    asked = []
+
+    def get(name):
+        asked.append(name)
+        return Case()
+
+    module = SimpleNamespace(get=get)
+    monkeypatch.setitem(sys.modules, "retwin.cases", module)
+    monkeypatch.setattr(retwin, "cases", module, raising=False)
+    return asked
+
+
+def run(*arguments, fails=None):
+    result = CliRunner(env={"COLUMNS": "120"}).invoke(data.app, [str(a) for a in arguments])
+    if fails is None:
+        assert result.exception is None, result.output
+        assert result.exit_code == 0
+    else:
+        assert isinstance(result.exception, fails)
+    return result
+
+
+def test_info_prints_a_table(file):
+    shown = run("info", file).output
+    for fact in (
+        sha256(file),
+        "Broken [red]",
+        "20 (0.2 s)",
+        "100 Hz",
+        "y1 [1], y2 [1], y3 [1]",
+        "3.00%",
+        "robot.mat ab12",
+    ):
+        assert fact in shown
+
+
+def test_info_as_json(file, cases):
+    (told,) = json.loads(run("info", file, "--case", "armpi", "--json").stdout)
+    assert cases == ["armpi"]
+    assert told["sha256"] == sha256(file)
+    assert told["trajectories"] == 10
+    assert told["per_class"] == {"Broken [red]": 5, "Healthy": 5}
+    assert (told["samples"], told["rate"]) == (20, 100)
+    assert told["inputs"] == [{"name": "left", "unit": "V"}, {"name": "right", "unit": "V"}]
+    assert told["missing"] == pytest.approx(18 / 600)
+    assert told["emulated"] is False
+    assert told["provenance"] == [{"name": "robot.mat", "sha256": "ab12"}]
+
+
+def test_info_of_several_files_and_unlabelled_ones(file, tmp_path):
+    save(load(file).replace(labels=None), tmp_path / "bare.npz")
+    told = json.loads(run("info", file, tmp_path / "bare.npz", "--json").stdout)
+    assert [one["per_class"] for one in told] == [{"Broken [red]": 5, "Healthy": 5}, {"": 10}]
+    assert "unlabelled" in run("info", tmp_path / "bare.npz").output
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".zarr"])
+def test_convert_keeps_everything_and_completes(file, tmp_path, suffix, cases):
+    target = tmp_path / f"new{suffix}"
+    shown = run("convert", file, target, "--case", "armpi").output
+    assert str(target) in shown
+    written = load(target)
+    assert written.outputs == Case.outputs
+    np.testing.assert_array_equal(written.commands, written.nominal[..., :2])
+    np.testing.assert_array_equal(written.observed, load(file).observed)
+    assert written.provenance == (Source("robot.mat", "ab12"),)
+
+
+def test_convert_of_csv_takes_a_rate(tmp_path):
+    (tmp_path / "set" / "Healthy").mkdir(parents=True)
+    (tmp_path / "set" / "Healthy" / "a.csv").write_text("1,2\n3,4\n")
+    run("convert", tmp_path / "set", tmp_path / "a.npz", "--rate", 4)
+    assert load(tmp_path / "a.npz").rate == 4
+    result = run("convert", tmp_path / "set", tmp_path / "b.npz", fails=InputError)
+    assert "--rate or --case" in str(result.exception)
+    assert not (tmp_path / "b.npz").exists()
+
+
+def test_bad_targets_are_refused_before_anything_is_read(tmp_path):
+    nowhere = tmp_path / "none.npz"
+    result = run("convert", nowhere, tmp_path / "a.csv", fails=InputError)
+    assert ".npz or .zarr" in str(result.exception)
+    first, second = ("--out-first", tmp_path / "a.npz"), ("--out-second", tmp_path / "b.txt")
+    result = run("split", nowhere, *first, *second, fails=InputError)
+    assert "b.txt" in str(result.exception)
+    result = run("split", nowhere, *first, "--out-second", tmp_path / "a.npz", fails=InputError)
+    assert "another name" in str(result.exception)
+
+
+def test_split_writes_two_disjoint_parts(file, tmp_path):
+    parts = ("--out-first", tmp_path / "a.npz", "--out-second", tmp_path / "b.npz")
+    run("split", file, "--fraction", 0.6, "--seed", 3, *parts)
+    first, second = load(tmp_path / "a.npz"), load(tmp_path / "b.npz")
+    expected, _ = load(file).split(0.6, seed=3)
+    assert first.ids.tolist() == expected.ids.tolist()
+    assert len(first) == 6
+    assert sorted([*first.ids, *second.ids]) == load(file).ids.tolist()
+    sums = sha256(tmp_path / "a.npz"), sha256(tmp_path / "b.npz")
+    run("split", file, "--fraction", 0.6, "--seed", 3, *parts)
+    assert (sha256(tmp_path / "a.npz"), sha256(tmp_path / "b.npz")) == sums
+    result = run("split", file, "--fraction", 1.5, *parts, fails=InputError)
+    assert "fraction" in str(result.exception)
+
+
+def test_fetch_prints_the_path(tmp_path, monkeypatch):
+    asked = {}
+
+    def fetch(name, *, folder, progress):
+        asked.update(name=name, folder=folder)
+        progress(1.0)
+        return tmp_path / "armpi" / "x.mat"
+
+    monkeypatch.setattr(download, "fetch", fetch)
+    result = run("fetch", "armpi", "--folder", tmp_path)
+    assert result.stdout.strip() == str(tmp_path / "armpi" / "x.mat")
+    assert asked == {"name": "armpi", "folder": tmp_path}
+    run("fetch", "armpi")
+    assert asked["folder"] is None
+
+
+def test_input_errors_pass_on_to_the_caller(tmp_path):
+    result = run("info", tmp_path / "none.mat", fails=InputError)
+    assert "existing file or folder" in str(result.exception)
+
+
+@pytest.mark.parametrize("command", ["info", "convert", "split", "fetch"])
+def test_help_shows_an_example(command):
+    shown = run(command, "--help").output
+    assert f"retwin data {command}" in shown.replace("\n", " ").split("Example:")[1]
+
+
+def test_nothing_but_the_answer_goes_to_stdout_and_stderr(file):
+    result = run("info", file, "--json")
+    assert json.loads(result.stdout)
+    assert result.stderr == ""
