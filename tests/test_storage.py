@@ -4,6 +4,7 @@ import builtins
 import io
 import json
 import os
+import shutil
 import struct
 import sys
 import warnings
@@ -24,6 +25,8 @@ from retwin.storage import check_target, load, save, sha256, write_atomically
 from retwin.storage.mat5 import Opaque, read_mat5
 from retwin.trajectories import Channels, Source, Trajectories
 
+INPUTS = Channels(("left", "right"), ("V", "V"))
+OUTPUTS = Channels(("x", "y", "z"), ("m", "m", "m"))
 ARRAYS = ("commands", "nominal", "observed", "mask", "labels", "ids")
 
 
@@ -31,8 +34,8 @@ ARRAYS = ("commands", "nominal", "observed", "mask", "labels", "ids")
 class Case:
     """A small case: two commands, three outputs, recovery that is easy to recognise."""
 
-    inputs: Channels = Channels(("left", "right"), ("V", "V"))
-    outputs: Channels = Channels(("x", "y", "z"), ("m", "m", "m"))
+    inputs: Channels = INPUTS
+    outputs: Channels = OUTPUTS
     rate: float = 100.0
     classes: tuple[str, ...] = ("Healthy", "Broken")
 
@@ -669,6 +672,16 @@ def test_zarr_with_a_lost_or_damaged_chunk(tmp_path):
     refused("a.zarr", tmp_path / "a.zarr")
 
 
+@pytest.mark.parametrize("part", ["shape", "chunk_shape"])
+def test_zarr_of_a_size_that_was_not_written_takes_no_memory(tmp_path, part):
+    save(example(), tmp_path / "a.zarr")
+    file = tmp_path / "a.zarr/nominal/zarr.json"
+    told = json.loads(file.read_text())
+    (told if part == "shape" else told["chunk_grid"]["configuration"])[part] = [10**9, 20, 3]
+    file.write_text(json.dumps(told))
+    refused(r"nominal.*\(4, 20, 3\), got.*1000000000", tmp_path / "a.zarr")
+
+
 def test_zarr_folder_by_any_name_and_case_of_suffix(tmp_path):
     save(example(), tmp_path / "a.zarr")
     os.rename(tmp_path / "a.zarr", tmp_path / "renamed")
@@ -867,6 +880,29 @@ def test_damaged_files_are_refused_or_read(tmp_path, sound, name, how):
         assert_same(read, example())  # checksums leave no wrong numbers
 
 
+@settings(
+    max_examples=40,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(which=st.integers(0, 8), how=damage)
+def test_damaged_zarr_folders_are_refused_or_read(tmp_path, which, how):
+    folder = tmp_path / "a.zarr"
+    save(example(), folder)
+    files = sorted(file for file in folder.rglob("*") if file.is_file())
+    assert len(files) == 9
+    files[which].write_bytes(damaged(files[which].read_bytes(), *how))
+    try:
+        read = load(folder)
+    except InputError as error:
+        assert "\n" not in str(error)
+        return
+    finally:
+        shutil.rmtree(folder)
+    for name in ("commands", "nominal", "observed"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(example(), name))
+
+
 @pytest.mark.parametrize("name", ["a.mat", "b.mat", "c.npz"])
 def test_every_truncation_near_the_ends_is_refused(tmp_path, sound, name):
     file, data = tmp_path / name, sound[name]
@@ -894,11 +930,12 @@ def test_no_single_flipped_bit_crashes_the_reader(compressed):
                 outcomes.add("read")
             except (ValueError, zlib.error) as error:  # Damaged is a ValueError
                 outcomes.add(type(error).__name__)
-    assert "Damaged" in outcomes
-    assert outcomes <= {"read", "Damaged", "NewerMat", "UnicodeDecodeError", "error"}
+    assert {"read", "Damaged", "NewerMat"} <= outcomes
 
 
-tables = st.sampled_from("f4 f8 i1 u1 i2 u2 i4 u4 i8 u8 c16".split()).flatmap(
+tables = st.sampled_from(
+    ("f4", "f8", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "c16")
+).flatmap(
     lambda kind: st.tuples(st.integers(0, 3), st.integers(1, 3), st.integers(0, 2**16)).map(
         lambda shape: (
             np.random.default_rng(shape[2]).integers(0, 100, (shape[0] + 1, shape[1])).astype(kind)
@@ -979,6 +1016,9 @@ def test_the_arms_files(tmp_path, name, n, dtype):
     file = Path(os.environ["RETWIN_DATA"]) / "armpi" / name
     if not file.exists():
         pytest.skip(f"{name} is not in RETWIN_DATA")
+    mine, theirs = read_mat5(file.read_bytes()), loadmat(file)
+    for key, value in mine.items():
+        assert_like_scipy(value, theirs[key])
     read = load(file, rate=100)
     assert read.nominal.shape == read.observed.shape == (n, 1000, 3)
     assert read.nominal.dtype == read.observed.dtype == dtype

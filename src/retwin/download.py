@@ -8,15 +8,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from retwin.errors import InputError
+from retwin.storage import Progress
 from retwin.storage import sha256 as sha256_of
 
 __all__ = ["REGISTRY", "Known", "fetch"]
 
 CACHE_VARIABLE = "RETWIN_CACHE"
+# Seconds without an answer until a download is given up.
 TIMEOUT = 30.0
-"""Seconds without an answer until a download is given up."""
+CHUNK = 64 * 1024
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ def fetch(
     folder: str | os.PathLike[str] | None = None,
     url: str | None = None,
     sha256: str | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Path:
     """The path of a public file, downloaded when it is not in the cache yet.
 
@@ -68,14 +71,13 @@ def fetch(
             got=known.url,
             remedy="give the address of the file",
         )
-    # These take half a second to import, and only a download needs them.
+    # It takes half a second to import, and only a download needs it.
     import pooch
 
     place = Path(folder or os.environ.get(CACHE_VARIABLE) or pooch.os_cache("retwin"))
     target = place / known.file
     if target.is_file() and sha256_of(target) == known.sha256:
         return target
-    bar = _Bar(progress) if progress is not None else False
     try:
         with _quiet(pooch.get_logger()):
             pooch.retrieve(
@@ -83,19 +85,20 @@ def fetch(
                 known_hash=f"sha256:{known.sha256}",
                 fname=target.name,
                 path=target.parent,
-                downloader=pooch.HTTPDownloader(progressbar=bar, timeout=TIMEOUT),
+                downloader=_downloader(progress),
             )
-    except (OSError, ValueError) as error:
+    except OSError as error:
         _tidy(target.parent, place)
-        if not isinstance(error, OSError):
-            raise RuntimeError(
-                f"fetch {name}: what {known.url} gave does not have the SHA-256 {known.sha256}, so "
-                "it was thrown away; try again, or give another url"
-            ) from None
         reason = " ".join(str(error).split())[:200]
         raise OSError(
             f"fetch {name}: cannot get {known.url} into {place} ({reason}); check the network, or "
             f"put the file there by hand as {known.file}"
+        ) from None
+    except ValueError:
+        _tidy(target.parent, place)
+        raise RuntimeError(
+            f"fetch {name}: what {known.url} gave does not have the SHA-256 {known.sha256}, so it "
+            "was thrown away; try again, or give another url"
         ) from None
     return target
 
@@ -123,27 +126,22 @@ def _tidy(folder: Path, place: Path) -> None:
             folder.rmdir()
 
 
-class _Bar:
-    """What pooch expects of a progress bar, told as the share that is done."""
+def _downloader(progress: Progress | None) -> Callable[[str, str, Any], None]:
+    """What pooch calls to bring `url` to a file. Its own leaves the connection open on errors."""
 
-    total = 0
+    def bring(url: str, output: str, _: Any) -> None:
+        import requests
 
-    def __init__(self, progress: Callable[[float], None]) -> None:
-        self._progress = progress
-        self._done = 0
+        with requests.get(url, stream=True, timeout=TIMEOUT) as answer, open(output, "wb") as file:
+            answer.raise_for_status()
+            # A server may not say how much will come.
+            size = int(answer.headers.get("content-length", 0))
+            for chunk in answer.iter_content(CHUNK):
+                file.write(chunk)
+                if progress is not None and size:
+                    progress(min(1.0, file.tell() / size))
 
-    def update(self, count: int) -> None:
-        """`count` more bytes have come; a server may not say how many there will be."""
-        self._done += count
-        if self.total:
-            self._progress(min(1.0, self._done / self.total))
-
-    def reset(self) -> None:
-        """Begin anew."""
-        self._done = 0
-
-    def close(self) -> None:
-        """Nothing to close."""
+    return bring
 
 
 @contextmanager

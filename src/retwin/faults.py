@@ -155,9 +155,12 @@ def _open(fault: Fault) -> InputError:
 
 
 def draw_faults(
-    faults: Sequence[Fault | None], segments: Segments, rng: np.random.Generator
+    faults: Sequence[Fault | None], segments: Segments, seed: int
 ) -> list[Fault | None]:
-    """Fix the severity of every fault, one per trajectory (None: healthy)."""
+    """Fix the severity of every fault, one per trajectory (None: healthy).
+
+    The same seed gives the same severities whatever the twin, so twins can be compared on them.
+    """
     if len(faults) != len(segments):
         raise InputError(
             "faults",
@@ -165,6 +168,7 @@ def draw_faults(
             got=f"{len(faults)}",
             remedy="give None for a healthy trajectory",
         )
+    rng = np.random.default_rng(seed)
     counts = segments.valid.sum(axis=1)
     return [
         None if fault is None else fault.drawn(rng, steps=segments.steps, movements=int(count))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +18,24 @@ __all__ = ["read_model", "write_model"]
 SCHEMA = 1
 
 
+@contextmanager
 def write_model(
     folder: str | Path, kind: str, about: dict[str, Any], weights: dict[str, Tensor]
-) -> None:
-    """Write `folder`/model.json and `folder`/weights.safetensors, moved into place when whole."""
+) -> Iterator[Path]:
+    """Write `folder`/model.json and `folder`/weights.safetensors, moved into place when whole.
+
+    Inside the `with` block more can be put into the folder that is given.
+    """
     from safetensors.torch import save_file
 
     with write_atomically(folder) as temporary:
         temporary.mkdir()
         text = json.dumps({"schema": SCHEMA, "kind": kind, **about}, indent=1)
-        (temporary / "model.json").write_text(text, encoding="utf-8")
-        save_file({k: v.contiguous() for k, v in weights.items()}, temporary / "weights.safetensors")
+        (temporary / "model.json").write_text(text + "\n", encoding="utf-8")
+        if weights:
+            contiguous = {name: weight.contiguous() for name, weight in weights.items()}
+            save_file(contiguous, temporary / "weights.safetensors")
+        yield temporary
 
 
 def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -41,7 +50,8 @@ def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str,
     remedy = "give the folder of a saved model, or save it again"
     try:
         about = json.loads((folder / "model.json").read_text(encoding="utf-8"))
-        weights = load_file(folder / "weights.safetensors")
+        file = folder / "weights.safetensors"
+        weights = load_file(file) if file.exists() else {}
     except (OSError, ValueError, SafetensorError) as error:
         raise InputError(
             str(folder),

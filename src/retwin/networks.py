@@ -179,8 +179,8 @@ class _LastStep(nn.Module):
 class CNN:
     """Three convolutions over time, then mean and maximum over time, then a dense layer."""
 
-    channels: tuple[int, ...] = (64, 128, 128)
-    kernel: int = 7
+    channels: tuple[int, ...] = (32, 64, 64)
+    kernel: int = 5
     dropout: float = 0.2
 
     def build(self, inputs: int, outputs: int) -> nn.Module:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,7 @@ class ResidualModel(nn.Module):
         self.outputs = outputs
         self.segmentation = segmentation
         self.latent = correction.latent(outputs)
+        self.timing: NDArray = np.empty((0, 0))
         self.fitted: Fit | None = None
         features = 3 * (len(inputs) + len(outputs)) + 2
         self.before = Standardise(features)
@@ -90,6 +91,20 @@ class ResidualModel(nn.Module):
         )
         for name in ("bounds", "shift", "scale"):
             self.register_buffer(name, torch.ones(len(self.latent)))
+
+    def context(
+        self,
+        surrogate: Surrogate,
+        commands: NDArray,
+        segments: Segments | None = None,
+        *,
+        faulty: NDArray | None = None,
+    ) -> Context:
+        """What this model is called on, for commands (n, T, d_u), movements found by its rule."""
+        if segments is None or self.segmentation == "path":
+            nominal = surrogate.predict(commands) if self.segmentation == "path" else commands
+            segments = segment(commands, nominal, self.segmentation)
+        return Context.of(surrogate, commands, segments, rate=surrogate.rate, faulty=faulty)
 
     def forward(self, context: Context) -> Blocks:
         """q_ψ(z | u, ŷ), in physical units."""
@@ -116,9 +131,11 @@ class ResidualModel(nn.Module):
             "inputs": vars(self.inputs),
             "outputs": vars(self.outputs),
             "segmentation": self.segmentation,
+            "timing": [[None if np.isnan(t) else t for t in row] for row in self.timing],
             "fitted": None if self.fitted is None else asdict(self.fitted),
         }
-        write_model(folder, "residual", about, self.state_dict())
+        with write_model(folder, "residual", about, self.state_dict()):
+            pass
 
     @classmethod
     def load(cls, folder: str | Path) -> ResidualModel:
@@ -135,6 +152,7 @@ class ResidualModel(nn.Module):
             segmentation=about["segmentation"],
         )
         model.load_state_dict(weights)
+        model.timing = np.array(about["timing"], dtype=float)
         model.fitted = Fit.of(about["fitted"])
         return model.eval()
 
@@ -159,18 +177,16 @@ def describe(context: Context) -> Tensor:
     return torch.cat([*columns, lengths.to(context.nominal)], dim=-1)
 
 
-def segment(trajectories: Trajectories, how: str = "commands") -> Segments:
-    """Movements by `how`: "commands" from command events, "path" from the nominal path's speed."""
-    if how not in ("commands", "path"):
+def segment(commands: NDArray, nominal: NDArray, rule: str = "commands") -> Segments:
+    """Movements by `rule`: "commands" from command events, "path" from the nominal path's speed."""
+    if rule not in ("commands", "path"):
         raise InputError(
-            "segmentation",
+            "segments",
             expected="'commands' or 'path'",
-            got=repr(how),
+            got=repr(rule),
             remedy="use 'path' for a twin without command events",
         )
-    if how == "commands":
-        return Segments.from_commands(trajectories.commands)
-    return Segments.from_path(trajectories.nominal)
+    return Segments.from_commands(commands) if rule == "commands" else Segments.from_path(nominal)
 
 
 def infer_discrepancy(
@@ -181,7 +197,8 @@ def infer_discrepancy(
     segments: Segments | None = None,
 ) -> tuple[Context, Discrepancy]:
     """z* of measured trajectories: what g must add to the surrogate to explain them (for Eq. 7)."""
-    segments = segment(trajectories) if segments is None else segments
+    if segments is None:
+        segments = Segments.from_commands(trajectories.commands)
     context = Context.of(surrogate, trajectories.commands, segments, rate=trajectories.rate)
     found = correction.infer(
         context,
@@ -222,8 +239,10 @@ def fit_residual(
     """
     keep = _chosen(calibration, calibrate_on)
     used = calibration[keep]
-    rule = segments if isinstance(segments, str) else "given"
-    parts = segment(used, segments) if isinstance(segments, str) else segments[keep]
+    if isinstance(segments, str):
+        rule, parts = segments, segment(used.commands, used.nominal, segments)
+    else:
+        rule, parts = "commands", segments[keep]
     if not parts.valid.any():
         raise InputError(
             "calibration",
@@ -250,8 +269,10 @@ def fit_residual(
         seed=seed,
         progress=progress,
     )
-    model.fitted = Fit.from_training(
-        result, {"trajectories": float(len(used)), "movements": float(valid.sum())}
+    onsets = Segments.from_commands(calibration.commands)
+    model.timing = np.where(onsets.valid, onsets.start, np.nan)
+    model.fitted = replace(
+        result, figures={"trajectories": float(len(used)), "movements": float(valid.sum())}
     )
     return model.eval()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +59,7 @@ class Surrogate(nn.Module):
         out = np.empty((*commands.shape[:2], len(self.outputs)), dtype=np.float32)
         for begin in range(0, len(commands), CHUNK):
             part = slice(begin, begin + CHUNK)
-            out[part] = self(torch.as_tensor(commands[part], dtype=torch.float32)).numpy()
+            out[part] = self(torch.tensor(commands[part], dtype=torch.float32)).numpy()
             if progress is not None:
                 progress(min(1.0, (begin + CHUNK) / len(commands)))
         return out
@@ -78,7 +78,7 @@ class Surrogate(nn.Module):
         observed, labels = nominal, None
         if faults is not None:
             segments = Segments.from_commands(commands)
-            drawn = draw_faults(faults, segments, np.random.default_rng(seed))
+            drawn = draw_faults(faults, segments, seed)
             faulty = frozen_response(faulty_commands(commands, drawn, segments), drawn)
             observed = self.predict(faulty, progress=progress)
             labels = fault_labels(drawn)
@@ -91,23 +91,19 @@ class Surrogate(nn.Module):
             inputs=self.inputs,
             outputs=self.outputs,
             provenance=(Source(f"Surrogate seed={seed}"),),
-            emulated=True,
         )
 
     def save(self, folder: str | Path) -> None:
         """Write weights and description; see `read_model` for the layout."""
-        write_model(
-            folder,
-            "surrogate",
-            {
-                "network": to_config(self.config),
-                "inputs": vars(self.inputs),
-                "outputs": vars(self.outputs),
-                "rate": self.rate,
-                "fitted": None if self.fitted is None else asdict(self.fitted),
-            },
-            self.state_dict(),
-        )
+        about = {
+            "network": to_config(self.config),
+            "inputs": vars(self.inputs),
+            "outputs": vars(self.outputs),
+            "rate": self.rate,
+            "fitted": None if self.fitted is None else asdict(self.fitted),
+        }
+        with write_model(folder, "surrogate", about, self.state_dict()):
+            pass
 
     @classmethod
     def load(cls, folder: str | Path) -> Surrogate:
@@ -196,7 +192,7 @@ def fit_surrogate(
     for name, error_of, spread_of in zip(twin.outputs.names, rmse, spread, strict=True):
         figures[f"rmse_{name}"] = float(error_of)
         figures[f"nrmse_{name}"] = float(error_of / spread_of) if spread_of > 0 else 0.0
-    surrogate.fitted = Fit.from_training(result, figures)
+    surrogate.fitted = replace(result, figures=figures)
     return surrogate
 
 
@@ -221,6 +217,6 @@ def _samples(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, Tens
 def _windows(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, Tensor]:
     """Whole trajectories."""
     return (
-        torch.as_tensor(twin.commands[part], dtype=torch.float32),
-        torch.as_tensor(twin.nominal[part], dtype=torch.float32),
+        torch.tensor(twin.commands[part], dtype=torch.float32),
+        torch.tensor(twin.nominal[part], dtype=torch.float32),
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import BatchSampler, DataLoader, RandomSampler, SequentialSampler, TensorDataset
 
-__all__ = ["Fit", "Training", "TrainingResult", "isolated", "train"]
+__all__ = ["Fit", "Training", "isolated", "train"]
 
 Loss = Callable[[nn.Module, tuple[Tensor, ...]], Tensor]
 """Network and batch in, mean loss out."""
@@ -47,16 +46,6 @@ class Training:
 
 
 @dataclass(frozen=True)
-class TrainingResult:
-    """How training went: losses per epoch, the epoch kept, the reason it stopped, seconds."""
-
-    history: dict[str, list[float]]
-    best_epoch: int
-    reason: str
-    seconds: float
-
-
-@dataclass(frozen=True)
 class Fit:
     """What a fitted model remembers of its training, saved with it.
 
@@ -66,19 +55,12 @@ class Fit:
     history: losses per epoch, "train" and "validation".
     best_epoch: the epoch whose weights were kept.
     reason: why training stopped.
-    seconds: how long it took; not part of what a seed determines.
     """
 
     figures: dict[str, float]
     history: dict[str, list[float]]
     best_epoch: int
     reason: str
-    seconds: float
-
-    @classmethod
-    def from_training(cls, result: TrainingResult, figures: dict[str, float]) -> Fit:
-        """Training's result with the figures reached."""
-        return cls(figures, result.history, result.best_epoch, result.reason, result.seconds)
 
     @classmethod
     def of(cls, values: dict[str, Any] | None) -> Fit | None:
@@ -106,7 +88,7 @@ def train(
     *,
     seed: int,
     progress: Callable[[float], None] | None = None,
-) -> TrainingResult:
+) -> Fit:
     """Train `network` in place on tensors whose first axis is the example; keep the best weights.
 
     Without a validation set the last weights are kept and nothing stops early. A batch whose loss
@@ -117,7 +99,6 @@ def train(
     steps = max(1, math.ceil(len(training_set[0]) / how.batch))
     module, keeper = _lightning_parts(network, loss, how, steps, progress)
     generator = torch.Generator().manual_seed(seed)
-    started = time.perf_counter()
     with isolated(seed), _quiet():
         trainer = Trainer(
             max_epochs=how.epochs,
@@ -147,7 +128,7 @@ def train(
         if keeper.stopped
         else f"all {epochs} epochs done"
     )
-    return TrainingResult(keeper.history, best, reason, time.perf_counter() - started)
+    return Fit({}, keeper.history, best, reason)
 
 
 def _lightning_parts(

@@ -70,7 +70,7 @@ class Trajectories:
     rate: samples per second.
     inputs, outputs: names and units of the command and output channels.
     provenance: the files or makers the data came from.
-    emulated: True when `observed` was made by a model of the real system, not measured.
+    emulated: True when `observed` stands for a real system's measurements but a model made it.
 
     Arrays are read-only. Shorter trajectories are padded: mask False, commands held.
     NaN in `observed` means missing and goes to the mask.

@@ -68,12 +68,19 @@ class Context:
         faulty: NDArray | Tensor | None = None,
     ) -> Context:
         """The context of those commands; the surrogate is asked once, or twice with faults."""
-        clean = torch.as_tensor(commands, dtype=torch.float32)
+        clean = _own(commands)
         nominal = surrogate(clean)
         if faulty is None:
             return cls(surrogate, clean, clean, nominal, nominal, segments, rate)
-        told = torch.as_tensor(faulty, dtype=torch.float32)
+        told = _own(faulty)
         return cls(surrogate, clean, told, nominal, surrogate(told), segments, rate)
+
+
+def _own(values: NDArray | Tensor) -> Tensor:
+    """A float32 tensor with memory of its own: arrays of `Trajectories` are read-only."""
+    if isinstance(values, Tensor):
+        return values.float()
+    return torch.tensor(values, dtype=torch.float32)
 
 
 @dataclass(frozen=True, eq=False)

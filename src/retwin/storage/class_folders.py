@@ -58,7 +58,7 @@ def read_class_folders(
             progress((i + 1) / len(files))
     raws, inputs = _commands_of_case(raws, case, radians=read is _read_dataset)
     return assemble(
-        raws, source=Source(path.name, sha256(path)), case=case, rate=rate, inputs=inputs
+        raws, source=Source(path.resolve().name, sha256(path)), case=case, rate=rate, inputs=inputs
     )
 
 

@@ -32,7 +32,7 @@ def arrays_of(trajectories: Trajectories) -> dict[str, NDArray]:
 
 
 def header_of(trajectories: Trajectories, arrays: Mapping[str, NDArray]) -> dict[str, Any]:
-    """What the arrays do not say, as JSON values, and their SHA-256."""
+    """What the arrays do not say, as JSON values, and their shapes and SHA-256."""
     return {
         "format": FORMAT,
         "schema": SCHEMA,
@@ -41,7 +41,10 @@ def header_of(trajectories: Trajectories, arrays: Mapping[str, NDArray]) -> dict
         "outputs": _channels(trajectories.outputs),
         "provenance": [{"name": s.name, "sha256": s.sha256} for s in trajectories.provenance],
         "emulated": trajectories.emulated,
-        "sha256": {name: _digest(arrays[name]) for name in NAMES},
+        "arrays": {
+            name: {"shape": list(arrays[name].shape), "sha256": _digest(arrays[name])}
+            for name in NAMES
+        },
     }
 
 
@@ -70,7 +73,7 @@ def restore(header: Mapping[str, Any], arrays: Mapping[str, NDArray], where: str
     Raises InputError when the arrays are not those that were written.
     """
     for name in NAMES:
-        if header["sha256"][name] != _digest(arrays[name]):
+        if header["arrays"][name]["sha256"] != _digest(arrays[name]):
             raise InputError(
                 where,
                 expected=f"the array {name!r} as it was written",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ __all__ = ["read_zarr", "write_zarr"]
 
 CHUNK = 128
 KEY = "retwin"
+TEXTS = ("labels", "ids")
 
 
 def write_zarr(trajectories: Trajectories, path: Path) -> None:
@@ -26,14 +28,14 @@ def write_zarr(trajectories: Trajectories, path: Path) -> None:
     zarr = _zarr()
     arrays = arrays_of(trajectories)
     group = zarr.open_group(str(path), mode="w", zarr_format=3)
-    group.attrs[KEY] = header_of(trajectories, arrays)
+    header = header_of(trajectories, arrays)
+    # Zarr has no specification of texts of fixed width, and of texts of any width a damaged chunk
+    # can take gigabytes to refuse: they go into the attributes.
+    texts = {name: arrays.pop(name).tolist() for name in TEXTS}
+    group.attrs[KEY] = header | texts
     for name, array in arrays.items():
-        text = array.dtype.kind == "U"
         chunks = (CHUNK, *(max(1, size) for size in array.shape[1:]))
-        # Texts of fixed width have no Zarr specification, texts of any width have.
-        target = group.create_array(
-            name, shape=array.shape, dtype=str if text else array.dtype, chunks=chunks
-        )
+        target = group.create_array(name, shape=array.shape, dtype=array.dtype, chunks=chunks)
         if array.size:
             target[...] = array
 
@@ -49,9 +51,10 @@ def read_zarr(path: Path) -> Trajectories:
         group = zarr.open_group(str(path), mode="r")
         header: Any = dict(group.attrs).get(KEY)
         check_header(header, path.name)
-        arrays = {name: np.asarray(group[name][...]) for name in NAMES}
-        for name in ("labels", "ids"):
-            arrays[name] = np.array(arrays[name].tolist(), dtype=np.str_)
+        arrays = {name: np.array(header[name], dtype=np.str_) for name in TEXTS}
+        for name in set(NAMES) - set(TEXTS):
+            _check_size(group[name], header["arrays"][name]["shape"], f"{path.name}: {name}")
+            arrays[name] = np.asarray(group[name][...])
         return restore(header, arrays, path.name)
     except InputError:
         raise
@@ -62,6 +65,18 @@ def read_zarr(path: Path) -> Trajectories:
             got=f"{path.name}, which is damaged or of another kind ({brief(error)})",
             remedy="get or make the folder again",
         ) from None
+
+
+def _check_size(array: Any, shape: list[int], where: str) -> None:
+    """Refuse a size that was not written, before memory is taken for it."""
+    largest = CHUNK * math.prod(max(1, size) for size in shape[1:])
+    if list(array.shape) != shape or math.prod(array.chunks) > largest:
+        raise InputError(
+            where,
+            expected=f"shape {tuple(shape)}",
+            got=f"shape {array.shape} in chunks of {array.chunks}",
+            remedy="the folder is damaged: get or make it again",
+        )
 
 
 def _zarr() -> Any:

@@ -96,7 +96,7 @@ class KinematicTwin:
         commands = checked_commands(commands, self.inputs)
         faults = [None] * len(commands) if faults is None else faults
         segments = Segments.from_commands(commands)
-        drawn = draw_faults(faults, segments, np.random.default_rng(seed))
+        drawn = draw_faults(faults, segments, seed)
         nominal = np.empty((*commands.shape[:2], len(self.outputs)), dtype=commands.dtype)
         observed = np.empty_like(nominal)
         for begin in range(0, len(commands), CHUNK):
@@ -115,5 +115,4 @@ class KinematicTwin:
             inputs=self.inputs,
             outputs=self.outputs,
             provenance=(Source(f"KinematicTwin seed={seed}"),),
-            emulated=True,
         )

@@ -1,0 +1,88 @@
+"""`Case`: what one system binds together, so that the rest of retwin need not know the system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.corrections import Correction
+from retwin.faults import Fault
+from retwin.trajectories import Channels, Trajectories
+from retwin.twins.protocol import Progress, Twin
+
+__all__ = ["Case", "CommandSampler"]
+
+
+class CommandSampler(Protocol):
+    """Draws commands as an operator would give them."""
+
+    def sample(
+        self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
+    ) -> NDArray:
+        """Commands (count, T, d_u).
+
+        `timing` (k, M): onsets in samples seen in real trajectories, to draw from; NaN where a
+        trajectory has fewer movements.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Case:
+    """One system.
+
+    Attributes
+    ----------
+    name, title: for the command line, and for people.
+    faults: class name to fault, `None` for healthy, in the fixed order of the classes.
+    twin: the simulator that is to be updated.
+    emulator: a stand-in for the real system, for trying things out; its data are "emulated".
+    sampler: draws commands.
+    correction: the shape that the gap may take, by default.
+    sensor_rate: samples per second that the measuring chain really takes.
+    recover: fills in commands that a file does not hold; None when files hold them.
+    published: the figures of a paper to show beside ours: source to metric to text.
+    """
+
+    name: str
+    title: str
+    faults: Mapping[str, Fault | None]
+    twin: Twin
+    emulator: Twin | None
+    sampler: CommandSampler
+    correction: Correction
+    sensor_rate: float
+    recover: Callable[[Trajectories, Progress | None], Trajectories] | None = None
+    published: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Class names in their fixed order."""
+        return tuple(self.faults)
+
+    @property
+    def inputs(self) -> Channels:
+        """Command channels."""
+        return self.twin.inputs
+
+    @property
+    def outputs(self) -> Channels:
+        """Output channels."""
+        return self.twin.outputs
+
+    @property
+    def rate(self) -> float:
+        """Samples per second of the data."""
+        return self.twin.rate
+
+    def complete(
+        self, trajectories: Trajectories, *, progress: Progress | None = None
+    ) -> Trajectories:
+        """`trajectories` with commands, recovered if the file has none and the case knows how."""
+        if trajectories.commands.shape[2] or self.recover is None:
+            return trajectories
+        return self.recover(trajectories, progress)

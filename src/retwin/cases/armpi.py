@@ -1,0 +1,155 @@
+"""The robot arm of the paper: a Hiwonder ArmPi FPV, four motors in, end-effector position out."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.case import Case
+from retwin.cases.armpi_recovery import RAMPS, ramp_commands, recover_commands
+from retwin.corrections import DelayOffset
+from retwin.faults import Fault, SteadyStateError, Stuck
+from retwin.trajectories import Channels, Trajectories
+from retwin.twins.arm import YawPitchArm
+from retwin.twins.emulated import EmulatedArm
+from retwin.twins.kinematic import KinematicTwin, ServoLag
+from retwin.twins.protocol import HEALTHY, Progress
+
+__all__ = ["ARM", "ArmSampler", "armpi"]
+
+ARM = YawPitchArm(base=0.028505 + 0.0361, links=(0.10048, 0.094714, 0.05071))
+INPUTS = Channels(tuple(f"motor_{i}" for i in range(1, 5)), ("0.24 deg",) * 4)
+OUTPUTS = Channels(("x", "y", "z"), ("m",) * 3)
+RATE = 100.0
+STRAIGHT = 500.0
+DEGREES = 0.24
+"""One command unit; a motor's angle in degrees is 120 - 0.24 units."""
+
+TWIN = KinematicTwin(
+    ARM,
+    centre=STRAIGHT,
+    scale=-np.deg2rad(DEGREES),
+    lag=ServoLag(proportional=-0.47, integral=45.0),
+    inputs=INPUTS,
+    outputs=OUTPUTS,
+    rate=RATE,
+)
+
+# Table 1 and section 5 of the paper: 90 real trajectories, LSTM, 10 runs.
+PUBLISHED = {
+    "dt": {
+        "macro_f1": "0.644 ± 0.036",
+        "balanced_accuracy": "0.673 ± 0.036",
+        "auroc": "0.931 ± 0.008",
+        "healthy_recall": "0.06",
+        "generate": "8.5 h",
+    },
+    "ibg_rg": {
+        "macro_f1": "0.753 ± 0.026",
+        "balanced_accuracy": "0.754 ± 0.025",
+        "auroc": "0.945 ± 0.006",
+        "healthy_recall": "0.62",
+        "generate": "4–5 min",
+    },
+}
+
+
+@dataclass(frozen=True)
+class ArmSampler:
+    """Commands as in the published data: every motor ramps to a new target, then all hold.
+
+    Parameters
+    ----------
+    movements: per trajectory.
+    steps: samples per trajectory.
+    period: samples from one onset to the next.
+    amplitude: greatest angle of a target from straight, in degrees, per motor.
+    speed: greatest speed of a motor, in degrees per sample.
+    """
+
+    movements: int = 5
+    steps: int = 1000
+    period: int = 200
+    amplitude: tuple[float, ...] = (80.0, 50.0, 50.0, 50.0)
+    speed: float = 2.72
+
+    def sample(
+        self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
+    ) -> NDArray:
+        """Commands (count, steps, 4) in units; see `CommandSampler`."""
+        shape = (count, self.movements, len(self.amplitude))
+        ramps = rng.choice(RAMPS, size=shape)
+        goals = rng.uniform(-1, 1, size=shape) * self.amplitude
+        targets = np.empty(shape)
+        now = np.zeros((count, len(self.amplitude)))
+        for movement in range(self.movements):
+            reach = self.speed * ramps[:, movement]
+            now = now + np.clip(goals[:, movement] - now, -reach, reach)
+            now = DEGREES * np.round(now / DEGREES)
+            targets[:, movement] = STRAIGHT - now / DEGREES
+        if timing is None or len(timing) == 0:
+            onsets = np.tile(self.period * np.arange(self.movements, dtype=float), (count, 1))
+        else:
+            onsets = self._onsets(timing[rng.integers(len(timing), size=count)])
+        start = np.full((count, len(self.amplitude)), STRAIGHT)
+        made = ramp_commands(start, targets, ramps, onsets, self.steps)
+        return made.astype(np.float32)
+
+    def _onsets(self, drawn: NDArray) -> NDArray:
+        """Onsets of as many movements as this sampler makes, continued at its period."""
+        onsets = np.full((len(drawn), self.movements), np.nan)
+        width = min(drawn.shape[1], self.movements)
+        onsets[:, :width] = drawn[:, :width]
+        for movement in range(self.movements):
+            before = onsets[:, movement - 1] + self.period if movement else np.zeros(len(drawn))
+            gap = np.isnan(onsets[:, movement])
+            onsets[gap, movement] = before[gap]
+        return onsets
+
+
+def recover(trajectories: Trajectories, progress: Progress | None = None) -> Trajectories:
+    """Commands from the desired path (`nominal`); says how many movements stay ambiguous."""
+    found = recover_commands(trajectories.nominal, arm=ARM, progress=progress)
+    unsure = found.ambiguous.any(axis=1)
+    if unsure.any():
+        warnings.warn(
+            f"commands of {unsure.sum()} of {len(unsure)} trajectories are not certain: "
+            f"{', '.join(trajectories.ids[unsure][:5])}{' …' if unsure.sum() > 5 else ''}",
+            stacklevel=2,
+        )
+    return trajectories.replace(
+        commands=found.commands.astype(np.float32), inputs=INPUTS, outputs=OUTPUTS
+    )
+
+
+def _faults(random_onset: bool) -> dict[str, Fault | None]:
+    """The nine classes in their fixed order; the published protocol freezes at sample 49."""
+    onset: int | tuple[int, int] = (0, 799) if random_onset else 49
+    motors = range(4)
+    stuck = {f"Motor_{i + 1}_Stuck": Stuck(i, onset) for i in motors}
+    biased = {f"Motor_{i + 1}_Steady_state_error": SteadyStateError(i) for i in motors}
+    return {HEALTHY: None, **stuck, **biased}
+
+
+def armpi(*, random_onset: bool = False) -> Case:
+    """The case of the paper.
+
+    Parameters
+    ----------
+    random_onset: draw the onset of a stuck motor uniformly instead of freezing at sample 49.
+    """
+    return Case(
+        name="armpi",
+        title="ArmPi FPV robot arm",
+        faults=_faults(random_onset),
+        twin=TWIN,
+        emulator=EmulatedArm(TWIN),
+        sampler=ArmSampler(),
+        correction=DelayOffset(),
+        sensor_rate=10.0,
+        recover=recover,
+        published=PUBLISHED,
+    )

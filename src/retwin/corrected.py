@@ -1,0 +1,165 @@
+"""`CorrectedTwin`: surrogate, residual model and correction in series (Eq. 4); and `generate`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from retwin.case import Case
+from retwin.errors import InputError
+from retwin.faults import Fault, draw_faults, faulty_commands, frozen_response
+from retwin.models import read_model, write_model
+from retwin.residual import ResidualModel
+from retwin.segments import Segments
+from retwin.surrogate import Surrogate
+from retwin.trajectories import Channels, Source, Trajectories
+from retwin.twins.protocol import Progress, Twin, checked_commands, fault_labels
+
+__all__ = ["CorrectedTwin", "generate"]
+
+CHUNK = 128
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectedTwin:
+    """The updated twin, ỹ = g(ŷ, z) with z from the residual model; satisfies `Twin` again.
+
+    Attributes
+    ----------
+    surrogate: the IBG.
+    residual: the RG; it holds the correction g.
+    """
+
+    surrogate: Surrogate
+    residual: ResidualModel
+
+    @property
+    def inputs(self) -> Channels:
+        """Command channels."""
+        return self.surrogate.inputs
+
+    @property
+    def outputs(self) -> Channels:
+        """Output channels."""
+        return self.surrogate.outputs
+
+    @property
+    def rate(self) -> float:
+        """Samples per second."""
+        return self.surrogate.rate
+
+    @property
+    def timing(self) -> NDArray:
+        """(k, M) onsets in samples of the trajectories it was calibrated on."""
+        return self.residual.timing
+
+    def simulate(
+        self,
+        commands: NDArray,
+        *,
+        faults: Sequence[Fault | None] | None = None,
+        seed: int,
+        progress: Progress | None = None,
+    ) -> Trajectories:
+        """See `Twin.simulate`. Faults act on the commands, then z is drawn and g applied.
+
+        z is drawn for the clean commands: the RG is not told of faults.
+        """
+        commands = checked_commands(commands, self.inputs).astype(np.float32, copy=False)
+        faults = [None] * len(commands) if faults is None else faults
+        segments = Segments.from_commands(commands)
+        drawn = draw_faults(faults, segments, seed)
+        generator = torch.Generator().manual_seed(seed)
+        nominal = np.empty((*commands.shape[:2], len(self.outputs)), dtype=np.float32)
+        observed = np.empty_like(nominal)
+        for begin in range(0, len(commands), CHUNK):
+            part = slice(begin, begin + CHUNK)
+            told = faulty_commands(commands[part], drawn[part], segments[part])
+            held = frozen_response(told, drawn[part])
+            nominal[part], observed[part] = self._corrected(
+                commands[part], held, segments[part], generator
+            )
+            if progress is not None:
+                progress(min(1.0, (begin + CHUNK) / len(commands)))
+        return Trajectories(
+            commands=commands,
+            nominal=nominal,
+            observed=observed,
+            labels=fault_labels(drawn),
+            rate=self.rate,
+            inputs=self.inputs,
+            outputs=self.outputs,
+            provenance=(Source(f"CorrectedTwin seed={seed}"),),
+        )
+
+    @torch.no_grad()
+    def _corrected(
+        self, commands: NDArray, held: NDArray, segments: Segments, generator: torch.Generator
+    ) -> tuple[NDArray, NDArray]:
+        context = self.residual.context(self.surrogate, commands, segments, faulty=held)
+        z = self.residual.sample(context, generator=generator)
+        corrected = self.residual.correction.apply(context, z)
+        return context.nominal.numpy(), corrected.numpy()
+
+    def save(self, folder: str | Path) -> None:
+        """Write one folder with `surrogate` and `residual` inside, or nothing."""
+        with write_model(folder, "corrected", {}, {}) as inside:
+            self.surrogate.save(inside / "surrogate")
+            self.residual.save(inside / "residual")
+
+    @classmethod
+    def load(cls, folder: str | Path) -> CorrectedTwin:
+        """Read what `save` wrote; InputError when it is not a corrected twin or damaged."""
+        read_model(folder, "corrected")
+        folder = Path(folder)
+        return cls(Surrogate.load(folder / "surrogate"), ResidualModel.load(folder / "residual"))
+
+
+def generate(
+    twin: Twin,
+    case: Case,
+    *,
+    per_class: int,
+    seed: int,
+    timing: NDArray | None = None,
+    progress: Progress | None = None,
+) -> Trajectories:
+    """A balanced labelled set of any size from any twin.
+
+    Parameters
+    ----------
+    twin: plain, learned or corrected.
+    case: says which classes there are, which fault each is, and what commands look like.
+    per_class: trajectories per class.
+    seed: same seed, same bytes on the same machine.
+    timing: (k, M) onsets in samples to draw the command timing from; by default what a corrected
+        twin saw when it was calibrated, else the sampler's own.
+
+    Raises
+    ------
+    InputError: `per_class` below 1.
+    """
+    if per_class < 1:
+        raise InputError(
+            "per_class",
+            expected="a whole number of at least 1",
+            got=repr(per_class),
+            remedy="say how many trajectories each class gets",
+        )
+    if timing is None and isinstance(twin, CorrectedTwin):
+        timing = twin.timing
+    for_commands, for_twin = np.random.SeedSequence(seed).spawn(2)
+    faults = [fault for fault in case.faults.values() for _ in range(per_class)]
+    commands = case.sampler.sample(
+        len(faults), rng=np.random.default_rng(for_commands), timing=timing
+    )
+    made = twin.simulate(
+        commands, faults=faults, seed=int(for_twin.generate_state(1)[0]), progress=progress
+    )
+    # The case names its classes; a fault only says what it is.
+    return made.replace(labels=np.repeat(case.classes, per_class))
