@@ -1,0 +1,94 @@
+"""retwin updates digital twins so that they behave like the real machine.
+
+Only the real machine's outputs need to be measured. Five nouns, a verb each: `Trajectories`
+(`load`, `save`), `Twin` (`simulate`), `Surrogate` (`fit_surrogate`), `ResidualModel` with its
+`Correction` (`fit_residual`), `Diagnoser` (`fit_diagnoser`).
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+# Name to module, loaded when first asked for: `import retwin` must not wait for torch.
+_HOME = {
+    "CNN": "networks",
+    "Case": "case",
+    "Channels": "trajectories",
+    "Context": "corrections",
+    "CorrectedTwin": "corrected",
+    "Correction": "corrections",
+    "DelayOffset": "corrections",
+    "Diagnoser": "diagnosis",
+    "Discrepancy": "corrections",
+    "Fault": "faults",
+    "InputError": "errors",
+    "KinematicTwin": "twins.kinematic",
+    "LSTM": "networks",
+    "LSTMClassifier": "networks",
+    "MLP": "networks",
+    "Mixture": "residual",
+    "NetworkDiagnoser": "diagnosis",
+    "ResidualModel": "residual",
+    "Scores": "statistics",
+    "Segments": "segments",
+    "SteadyStateError": "faults",
+    "Stuck": "faults",
+    "StudyData": "study",
+    "StudyPlan": "study",
+    "Surrogate": "surrogate",
+    "TCN": "networks",
+    "Training": "training",
+    "Trajectories": "trajectories",
+    "Twin": "twins.protocol",
+    "evaluate": "statistics",
+    "fetch": "download",
+    "fit_diagnoser": "diagnosis",
+    "fit_residual": "residual",
+    "fit_surrogate": "surrogate",
+    "generate": "corrected",
+    "infer_discrepancy": "residual",
+    "load": "storage",
+    "run_study": "study",
+    "save": "storage",
+    "write_report": "report",
+}
+
+__all__ = ["__version__", "cases", *sorted(_HOME)]  # noqa: PLE0604
+
+
+def __getattr__(name: str) -> Any:
+    if name == "cases":
+        return importlib.import_module("retwin.cases")
+    if name in _HOME:
+        return getattr(importlib.import_module(f"retwin.{_HOME[name]}"), name)
+    raise AttributeError(f"module 'retwin' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+if TYPE_CHECKING:
+    from retwin import cases
+    from retwin.case import Case
+    from retwin.corrected import CorrectedTwin, generate
+    from retwin.corrections import Context, Correction, DelayOffset, Discrepancy
+    from retwin.diagnosis import Diagnoser, NetworkDiagnoser, fit_diagnoser
+    from retwin.download import fetch
+    from retwin.errors import InputError
+    from retwin.faults import Fault, SteadyStateError, Stuck
+    from retwin.networks import CNN, LSTM, MLP, TCN, LSTMClassifier
+    from retwin.report import write_report
+    from retwin.residual import Mixture, ResidualModel, fit_residual, infer_discrepancy
+    from retwin.segments import Segments
+    from retwin.statistics import Scores, evaluate
+    from retwin.storage import load, save
+    from retwin.study import StudyData, StudyPlan, run_study
+    from retwin.surrogate import Surrogate, fit_surrogate
+    from retwin.training import Training
+    from retwin.trajectories import Channels, Trajectories
+    from retwin.twins.kinematic import KinematicTwin
+    from retwin.twins.protocol import Twin

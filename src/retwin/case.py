@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.corrections import Correction
-from retwin.faults import Fault
+from retwin.faults import Fault, Stuck
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins.protocol import Progress, Twin
 
@@ -19,6 +19,11 @@ __all__ = ["Case", "CommandSampler"]
 
 class CommandSampler(Protocol):
     """Draws commands as an operator would give them."""
+
+    @property
+    def steps(self) -> int:
+        """Samples per trajectory, T."""
+        ...
 
     def sample(
         self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
@@ -78,6 +83,15 @@ class Case:
     def rate(self) -> float:
         """Samples per second of the data."""
         return self.twin.rate
+
+    def with_random_onset(self) -> Case:
+        """The same case with every fault that has an onset drawing it over the first four fifths."""
+        onset = (0, 4 * self.sampler.steps // 5)
+        faults = {
+            name: replace(fault, onset=onset) if isinstance(fault, Stuck) else fault
+            for name, fault in self.faults.items()
+        }
+        return replace(self, faults=faults)
 
     def complete(
         self, trajectories: Trajectories, *, progress: Progress | None = None

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from retwin.case import Case
 from retwin.errors import InputError
 from retwin.faults import Fault, draw_faults, faulty_commands, frozen_response
-from retwin.models import read_model, write_model
+from retwin.models import read_about, write_model
 from retwin.residual import ResidualModel
 from retwin.segments import Segments
 from retwin.surrogate import Surrogate
@@ -33,10 +33,12 @@ class CorrectedTwin:
     ----------
     surrogate: the IBG.
     residual: the RG; it holds the correction g.
+    case: name of the case it was fitted for, for the command line.
     """
 
     surrogate: Surrogate
     residual: ResidualModel
+    case: str = ""
 
     @property
     def inputs(self) -> Channels:
@@ -108,16 +110,17 @@ class CorrectedTwin:
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with `surrogate` and `residual` inside, or nothing."""
-        with write_model(folder, "corrected", {}, {}) as inside:
+        with write_model(folder, "corrected", {"case": self.case}, {}) as inside:
             self.surrogate.save(inside / "surrogate")
             self.residual.save(inside / "residual")
 
     @classmethod
     def load(cls, folder: str | Path) -> CorrectedTwin:
         """Read what `save` wrote; InputError when it is not a corrected twin or damaged."""
-        read_model(folder, "corrected")
+        case = read_about(folder, "corrected")["case"]
         folder = Path(folder)
-        return cls(Surrogate.load(folder / "surrogate"), ResidualModel.load(folder / "residual"))
+        surrogate = Surrogate.load(folder / "surrogate")
+        return cls(surrogate, ResidualModel.load(folder / "residual"), case)
 
 
 def generate(

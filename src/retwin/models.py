@@ -68,3 +68,8 @@ def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str,
             remedy=remedy,
         )
     return about, weights
+
+
+def read_about(folder: str | Path, kind: str) -> dict[str, Any]:
+    """The description of a model folder without its weights; raises as `read_model` does."""
+    return read_model(folder, kind)[0]

@@ -6,6 +6,7 @@ networks map (n, T, inputs) to (n, T, outputs); classifiers map (n, T, inputs) t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any, Protocol
@@ -17,14 +18,17 @@ from torch.nn import functional
 from retwin.errors import InputError
 
 __all__ = [
+    "CLASSIFIERS",
     "CNN",
     "LSTM",
     "MLP",
+    "SURROGATES",
     "TCN",
     "LSTMClassifier",
     "Network",
     "Standardise",
     "from_config",
+    "named",
     "to_config",
 ]
 
@@ -209,6 +213,22 @@ class _Pooled(nn.Module):
 
 
 _CONFIGS = {config.__name__: config for config in (MLP, LSTM, TCN, LSTMClassifier, CNN)}
+
+
+SURROGATES: dict[str, Network] = {"mlp": MLP(), "lstm": LSTM(), "tcn": TCN()}
+CLASSIFIERS: dict[str, Network] = {"cnn": CNN(), "lstm": LSTMClassifier()}
+
+
+def named(name: str, known: Mapping[str, Network]) -> Network:
+    """The network of that name in SURROGATES or CLASSIFIERS; InputError when there is none."""
+    if name not in known:
+        raise InputError(
+            "network",
+            expected=f"one of {', '.join(known)}",
+            got=repr(name),
+            remedy="check the spelling",
+        )
+    return known[name]
 
 
 def to_config(network: Any) -> dict[str, Any]:

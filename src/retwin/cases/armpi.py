@@ -125,26 +125,16 @@ def recover(trajectories: Trajectories, progress: Progress | None = None) -> Tra
     )
 
 
-def _faults(random_onset: bool) -> dict[str, Fault | None]:
-    """The nine classes in their fixed order; the published protocol freezes at sample 49."""
-    onset: int | tuple[int, int] = (0, 799) if random_onset else 49
+def armpi() -> Case:
+    """The case of the paper: nine classes in their fixed order, the published fault protocol."""
     motors = range(4)
-    stuck = {f"Motor_{i + 1}_Stuck": Stuck(i, onset) for i in motors}
+    stuck = {f"Motor_{i + 1}_Stuck": Stuck(i) for i in motors}
     biased = {f"Motor_{i + 1}_Steady_state_error": SteadyStateError(i) for i in motors}
-    return {HEALTHY: None, **stuck, **biased}
-
-
-def armpi(*, random_onset: bool = False) -> Case:
-    """The case of the paper.
-
-    Parameters
-    ----------
-    random_onset: draw the onset of a stuck motor uniformly instead of freezing at sample 49.
-    """
+    faults: dict[str, Fault | None] = {HEALTHY: None, **stuck, **biased}
     return Case(
         name="armpi",
         title="ArmPi FPV robot arm",
-        faults=_faults(random_onset),
+        faults=faults,
         twin=TWIN,
         emulator=EmulatedArm(TWIN),
         sampler=ArmSampler(),

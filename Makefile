@@ -1,0 +1,33 @@
+# make install | demo | test | lint | bench
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: install demo test lint bench clean
+
+install: .venv/installed
+
+.venv/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[scale,dev]"
+	touch $@
+
+# The main job: on the real robot if RETWIN_DATA is set, else on an emulated one.
+demo: install
+	$(BIN)/retwin demo --out demo
+
+# A worker per core, one torch thread each: more threads than cores cost several times the time.
+test: install
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: install
+	$(BIN)/python benchmarks/generation.py
+	$(BIN)/python benchmarks/fitting.py
+	$(BIN)/python benchmarks/importing.py
+
+clean:
+	rm -rf .venv demo

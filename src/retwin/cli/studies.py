@@ -1,0 +1,147 @@
+"""`retwin study`, `report` and `demo`: the comparison of sources, and its page."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from retwin.cli.terminal import bar
+from retwin.errors import InputError
+
+__all__ = ["demo", "report", "study"]
+
+COLUMNS = {
+    "macro_f1": "macro-F1",
+    "balanced_accuracy": "balanced acc.",
+    "auroc": "AUROC",
+    "healthy_recall": "healthy recall",
+}
+
+
+def study(
+    case: Annotated[str, typer.Argument(help="Built-in case or package.module:object.")],
+    out: Annotated[Path, typer.Option(help="Folder; called again, the study goes on there.")],
+    twin_data: Annotated[Path | None, typer.Option(help="Trajectories of the twin.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Real set to calibrate on.")] = None,
+    test: Annotated[Path | None, typer.Option(help="Real set to test on.")] = None,
+    real: Annotated[Path | None, typer.Option(help="One real set, split into folds.")] = None,
+    folds: Annotated[int, typer.Option(help="Folds of --real.")] = 3,
+    sources: Annotated[str, typer.Option(help="Names joined by commas, or all.")] = "all",
+    classifier: Annotated[str | None, typer.Option(help="cnn or lstm.")] = None,
+    runs: Annotated[int | None, typer.Option(help="Runs; the preset's if not given.")] = None,
+    seed: Annotated[int, typer.Option(help="Same seed, same result.")] = 0,
+    preset: Annotated[str, typer.Option(help="quick or paper.")] = "quick",
+    rate: Annotated[float | None, typer.Option(help="Hz that the classifier looks at.")] = None,
+    per_class: Annotated[int, typer.Option(help="Generated trajectories per class.")] = 400,
+    calibrate_on: Annotated[str, typer.Option(help="healthy or all.")] = "healthy",
+    random_onset: Annotated[bool, typer.Option(help="Draw the onset of stuck motors.")] = False,
+    processes: Annotated[int | None, typer.Option(help="Jobs at a time; one per core.")] = None,
+) -> None:
+    """Compare sources of training data on real trajectories."""
+    import retwin as rt
+    from retwin.study import SOURCES, StudyData, StudyPlan
+
+    system = rt.cases.get(case)
+    if random_onset:
+        system = system.with_random_onset()
+    plan = StudyPlan(
+        sources=tuple(SOURCES if sources == "all" else sources.split(",")),
+        preset=preset,
+        classifier=classifier,
+        runs=runs,
+        seed=seed,
+        folds=folds,
+        rate=rate,
+        per_class=per_class,
+        calibrate_on=calibrate_on,
+    )
+    _run(system, plan, StudyData(twin_data, calibration, test, real), out, processes)
+
+
+def report(folder: Annotated[Path, typer.Argument(help="Folder of a study.")]) -> None:
+    """Write the report page again from a study's results."""
+    from retwin.report import write_report
+
+    Console().print(str(write_report(folder)), soft_wrap=True)
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("demo"),
+    runs: Annotated[int, typer.Option(help="Runs.")] = 2,
+    seed: Annotated[int, typer.Option(help="Same seed, same result.")] = 0,
+) -> None:
+    """The whole job on the robot arm: real data in `RETWIN_DATA` if set, else emulated ones."""
+    import retwin as rt
+    from retwin.study import StudyData, StudyPlan
+
+    data, folds = StudyData(), 3
+    folder = os.environ.get("RETWIN_DATA")
+    if folder:
+        arm = Path(folder) / "armpi"
+        given = [arm / name for name in ("real_a.mat", "my_dataset_test.mat")]
+        real = next((file for file in given if file.exists()), None)
+        if real is None or not (arm / "sim.mat").exists():
+            raise InputError(
+                "RETWIN_DATA",
+                expected="a folder with armpi/sim.mat and armpi/real_a.mat (or my_dataset_test.mat)",
+                got=folder,
+                remedy="set it to the folder of the public data, or unset it",
+            )
+        data = StudyData(twin=arm / "sim.mat", real=real)
+    plan = StudyPlan(runs=runs, seed=seed, folds=folds)
+    _run(rt.cases.get("armpi"), plan, data, out, None)
+
+
+def _run(case: Any, plan: Any, data: Any, out: Path, processes: int | None) -> None:
+    from retwin.report import write_report
+    from retwin.study import run_study
+
+    command = shlex.join(["retwin", *sys.argv[1:]])
+    with bar("study") as tell:
+        results = run_study(
+            case, plan, data, out, processes=processes, report=tell, command=command
+        )
+        tell("report", 1.0)
+        page = write_report(out)
+    console = Console()
+    console.print(_table(results))
+    for line in _gaps(results):
+        console.print(line)
+    console.print(f"Report: {page}", soft_wrap=True)
+
+
+def _table(results: Mapping[str, Any]) -> Table:
+    n, runs = results["data"]["test"]["n"], results["runs"]
+    kind = "EMULATED robot (no real measurements)" if results["emulated"] else results["title"]
+    table = Table(title=f"{kind}: {n} test trajectories, {runs} runs, {results['classifier']}")
+    table.add_column("training data")
+    for title in COLUMNS.values():
+        table.add_column(title, justify="right")
+    for name, source in results["sources"].items():
+        cells = [f"{np.mean(source[m]):.3f} ± {np.std(source[m]):.3f}" for m in COLUMNS]
+        table.add_row(f"{source['title']} ({name})", *cells)
+    for name, figures in results["published"].items():
+        table.add_row(f"paper: {name}", *(figures.get(m, "") for m in COLUMNS), style="dim")
+    return table
+
+
+def _gaps(results: Mapping[str, Any]) -> list[str]:
+    """What each source gains over the plain twin, with the interval over test trajectories."""
+    told = []
+    for row in results["comparisons"]:
+        if row["b"] == "dt" and row["metric"] == "macro_f1":
+            low, high = row["bootstrap_ci95"]
+            told.append(
+                f"{row['a']} - dt, macro-F1: {row['mean_diff']:+.3f} "
+                f"(95 % bootstrap interval {low:+.3f} to {high:+.3f})"
+            )
+    return told

@@ -1,0 +1,73 @@
+"""What every command shares: progress bars, warnings and errors on stderr, exit codes."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+__all__ = ["FAILED", "BAD_INPUT", "INTERRUPTED", "bar", "complain", "show_warnings"]
+
+FAILED = 1
+BAD_INPUT = 2
+INTERRUPTED = 130
+
+
+@contextmanager
+def bar(what: str) -> Iterator[Callable[[str, float], None]]:
+    """A bar on stderr, told what is going on and the share done; gone when the work is done.
+
+    Without a terminal a line is printed at every tenth, so that a log shows life.
+    """
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines(console, what)
+        return
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as bars:
+        task = bars.add_task(what, total=1.0)
+
+        def tell(text: str, share: float) -> None:
+            bars.update(task, completed=share, description=f"{what}: {text}" if text else what)
+
+        yield tell
+
+
+def _lines(console: Console, what: str) -> Callable[[str, float], None]:
+    shown = {"text": "", "tenth": -1}
+
+    def tell(text: str, share: float) -> None:
+        tenth = int(10 * share)
+        if tenth != shown["tenth"]:
+            shown["tenth"] = tenth
+            console.print(f"{what}: {escape(text)} {share:.0%}", highlight=False)
+
+    return tell
+
+
+def complain(text: str) -> None:
+    """One line on stderr, never wrapped."""
+    Console(stderr=True, soft_wrap=True).print(f"[red]error:[/] {escape(text)}", highlight=False)
+
+
+@contextmanager
+def show_warnings() -> Iterator[None]:
+    """Our warnings as one line on stderr each, without the source line Python would add."""
+    console = Console(stderr=True, soft_wrap=True)
+
+    def show(message: Warning | str, *_: object, **__: object) -> None:
+        console.print(f"[yellow]warning:[/] {escape(str(message))}", highlight=False)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", UserWarning)
+        warnings.showwarning = show
+        yield

@@ -1,0 +1,180 @@
+"""What a page is made of: sections of prose, tables, plots, matrices and folded lists.
+
+A section is made by a small function `(Results) -> Section | None`; None when its data are not
+there. The template shows each block by its `kind`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from retwin.report.results import Results
+
+__all__ = [
+    "Block",
+    "Cell",
+    "Column",
+    "Facts",
+    "Fold",
+    "Forest",
+    "Key",
+    "Matrices",
+    "Matrix",
+    "Panel",
+    "Plot",
+    "Prose",
+    "Section",
+    "SectionMaker",
+    "Table",
+]
+
+
+@dataclass(frozen=True)
+class Prose:
+    """A paragraph; `quiet` for notes."""
+
+    text: str
+    quiet: bool = False
+    kind: ClassVar[str] = "prose"
+
+
+@dataclass(frozen=True)
+class Forest:
+    """A difference and its interval on an axis, all as shares of the axis' width in percent."""
+
+    low: float
+    at: float
+    high: float
+    zero: float
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell: text, a smaller line under it, emphasis, the colour of a source, a picture."""
+
+    text: str
+    below: str = ""
+    best: bool = False
+    slot: int | None = None
+    forest: Forest | None = None
+    tone: str = ""
+
+
+@dataclass(frozen=True)
+class Column:
+    """Heading of a column; `group` spans neighbours of the same group."""
+
+    text: str
+    group: str = ""
+    numeric: bool = True
+    paper: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells; the first cell of a row heads it, a row of one cell heads those below it."""
+
+    caption: str
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Cell]]
+    kind: ClassVar[str] = "table"
+
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """Runs of columns of one group: its name and how many columns it spans."""
+        runs: list[tuple[str, int]] = []
+        for column in self.columns:
+            if runs and column.group and runs[-1][0] == column.group:
+                runs[-1] = (column.group, runs[-1][1] + 1)
+            else:
+                runs.append((column.group, 1))
+        return runs
+
+
+@dataclass(frozen=True)
+class Key:
+    """Entry of a legend: the mark (line, dash, dot, bar, diamond), its colour token, its text."""
+
+    text: str
+    colour: str
+    mark: str = "line"
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One plotly picture: `data` and `layout`, in which `@name` stands for a colour."""
+
+    spec: dict[str, Any]
+    alt: str
+    title: str = ""
+    note: str = ""
+    height: int = 340
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure of one or more panels; `name` is also that of its PNG."""
+
+    name: str
+    caption: str
+    panels: Sequence[Panel]
+    keys: Sequence[Key] = ()
+    width: int | None = None
+    kind: ClassVar[str] = "plot"
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """Confusion counts of one source, with each row's shares in whole percent."""
+
+    title: str
+    slot: int
+    below: str
+    counts: Sequence[Sequence[int]]
+    shares: Sequence[Sequence[int]]
+
+
+@dataclass(frozen=True)
+class Matrices:
+    """Confusion matrices side by side."""
+
+    name: str
+    caption: str
+    classes: Sequence[str]
+    matrices: Sequence[Matrix]
+    kind: ClassVar[str] = "matrices"
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Pairs of a term and what it is; `code` pairs are shown to be copied."""
+
+    pairs: Sequence[tuple[str, str]]
+    code: Sequence[tuple[str, str]] = ()
+    kind: ClassVar[str] = "facts"
+
+
+@dataclass(frozen=True)
+class Fold:
+    """A list that opens on demand."""
+
+    summary: str
+    items: Sequence[str]
+    kind: ClassVar[str] = "fold"
+
+
+Block = Prose | Table | Plot | Matrices | Facts | Fold
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading, its anchor, and what stands under it."""
+
+    key: str
+    title: str
+    blocks: Sequence[Block]
+
+
+SectionMaker = Callable[[Results], Section | None]

@@ -1,0 +1,279 @@
+"""Plotly pictures as plain data; `@name` stands for a colour that the page looks up."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from retwin.report.blocks import Key, Panel, Plot
+from retwin.report.curves import Latent, Roc
+from retwin.report.results import Results
+from retwin.report.words import METRICS, mean_and_spread, number, order, slot, source_name, span
+
+__all__ = [
+    "DASHES",
+    "caption",
+    "latent_names",
+    "latent_plot",
+    "missing",
+    "published_value",
+    "roc_plot",
+    "scores_plot",
+]
+
+DASHES = ("solid", "dash", "dot", "dashdot")
+FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
+
+
+def caption(results: Results, text: str) -> str:
+    """What to see; with emulated data it begins by saying so."""
+    return f"Emulated robot, no real measurements. {text}" if results.emulated else text
+
+
+def _axis(title: str, **more: Any) -> dict[str, Any]:
+    return {
+        "title": {"text": html.escape(title, quote=False), "standoff": 8},
+        "gridcolor": "@grid",
+        "linecolor": "@rule",
+        "zeroline": False,
+        "fixedrange": True,
+        "automargin": True,
+        "ticks": "outside",
+        "tickcolor": "@rule",
+        "ticklen": 4,
+        **more,
+    }
+
+
+def _spec(data: list[dict[str, Any]], x: dict[str, Any], y: dict[str, Any]) -> dict[str, Any]:
+    layout = {
+        "xaxis": x,
+        "yaxis": y,
+        "font": {"family": FONT, "size": 13, "color": "@muted"},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "margin": {"l": 8, "r": 12, "t": 8, "b": 8},
+        "showlegend": False,
+        "dragmode": False,
+        "hoverlabel": {"font": {"family": FONT, "size": 13}},
+    }
+    return {"data": data, "layout": layout}
+
+
+def published_value(text: str) -> tuple[float, float] | None:
+    """Mean and spread from a text like `0.753 ± 0.026`; None if it is no score."""
+    found = re.fullmatch(r"\s*([01]?\.\d+)\s*(?:±\s*([01]?\.\d+))?\s*", text)
+    return (float(found[1]), float(found[2] or 0)) if found else None
+
+
+def scores_plot(results: Results, metrics: Sequence[str]) -> Plot | None:
+    """Means, intervals and the paper's numbers on one axis; only for scores within 0 and 1."""
+    sources = order(list(results.sources))
+    bounded = [name for name in metrics if name not in ("rmse", "nrmse", "crps")]
+    if not bounded:
+        return None
+    data: list[dict[str, Any]] = []
+    for place, source in enumerate(sources):
+        lane = 0.62 * ((place + 0.5) / len(sources) - 0.5)
+        data += _score_traces(results, source, bounded, lane)
+    names = [html.escape(METRICS[name].name, quote=False) for name in bounded]
+    ticks = list(range(len(bounded)))
+    y = _axis("", tickvals=ticks, ticktext=names, range=[len(bounded) - 0.5, -0.5], showgrid=False)
+    y |= {"ticks": "", "tickfont": {"color": "@ink"}}
+    x = _axis("score", rangemode="normal", tickformat=".1f", dtick=0.1)
+    keys = [Key(source_name(name), f"c{slot(name)}", "dot") for name in sources]
+    text = "Dots are means over runs, bars the 95 % bootstrap interval over test trajectories"
+    if any(trace["name"].endswith("(paper)") for trace in data):
+        keys.append(Key("paper’s mean ± sd over its runs", "muted", "diamond"))
+        text += "; open diamonds are the paper’s numbers, in the colour of their source"
+    panel = Panel(_spec(data, x, y), text, height=90 + 26 * len(bounded) * max(len(sources), 2))
+    see = ". See whether the bars of two sources part, and whether the order is the paper’s."
+    return Plot("scores", caption(results, text + see), [panel], keys)
+
+
+def _score_traces(
+    results: Results, source: str, metrics: Sequence[str], lane: float
+) -> list[dict[str, Any]]:
+    one, colour = results.sources[source], f"@c{slot(source)}"
+    name = html.escape(source_name(source), quote=False)
+    shown = [metric for metric in metrics if metric in one.scores]
+    means = [float(np.nanmean(one.scores[metric])) for metric in shown]
+    ends = [one.intervals.get(m, (mean, mean)) for m, mean in zip(shown, means, strict=True)]
+    traces: list[dict[str, Any]] = [
+        {
+            "type": "scatter",
+            "mode": "markers",
+            "name": name,
+            "x": means,
+            "y": [metrics.index(metric) + lane for metric in shown],
+            "error_x": {
+                "type": "data",
+                "symmetric": False,
+                "array": [max(end[1] - mean, 0) for end, mean in zip(ends, means, strict=True)],
+                "arrayminus": [max(mean - end[0], 0) for end, mean in zip(ends, means, strict=True)],
+                "color": colour,
+                "thickness": 2,
+                "width": 0,
+            },
+            "marker": {"color": colour, "size": 10},
+            "text": [f"{mean_and_spread(one.scores[m])} [{span(one.intervals.get(m))}]" for m in shown],
+            "hovertemplate": f"{name}<br>%{{text}}<extra></extra>",
+        }
+    ]
+    told = results.published.get(source, {})
+    paper = [(m, published_value(told[m])) for m in metrics if m in told]
+    known = [(metric, value) for metric, value in paper if value is not None]
+    if known:
+        traces.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "name": f"{name} (paper)",
+                "x": [value[0] for _, value in known],
+                "y": [metrics.index(metric) + lane + 0.12 for metric, _ in known],
+                "error_x": {
+                    "type": "data",
+                    "array": [value[1] for _, value in known],
+                    "color": colour,
+                    "thickness": 1,
+                    "width": 3,
+                },
+                "marker": {"color": colour, "size": 9, "symbol": "diamond-open"},
+                "hovertemplate": f"{name}, paper<br>%{{x:.3f}}<extra></extra>",
+            }
+        )
+    return traces
+
+
+def roc_plot(results: Results, curves: dict[str, Roc]) -> Plot:
+    """Micro-averaged ROC: the mean over runs and one standard deviation around it."""
+    data: list[dict[str, Any]] = [
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "name": "chance",
+            "x": [0, 1],
+            "y": [0, 1],
+            "line": {"color": "@rule", "width": 1},
+            "hoverinfo": "skip",
+        }
+    ]
+    keys = []
+    for place, (source, curve) in enumerate(curves.items()):
+        dash = DASHES[place % len(DASHES)]
+        data += _roc_traces(source, curve, dash)
+        area = mean_and_spread(curve.areas)
+        keys.append(Key(f"{source_name(source)}: area {area}", f"c{slot(source)}", dash))
+    x = _axis("false positive rate", range=[-0.01, 1.01], dtick=0.2)
+    y = _axis("true positive rate", range=[-0.01, 1.01], dtick=0.2)
+    text = (
+        f"Micro-averaged ROC, mean over {results.runs} runs; shading: ± one standard deviation. "
+        "The further up and to the left, the better a source’s classifier separates the classes "
+        "at any threshold; where bands overlap, the runs do not."
+        if results.runs > 1
+        else "Micro-averaged ROC of the one run, so there is no band. The further up and to the "
+        "left, the better a source’s classifier separates the classes at any threshold."
+    )
+    panel = Panel(_spec(data, x, y), "Micro-averaged ROC curves", height=460)
+    return Plot("roc", caption(results, text), [panel], keys, width=640)
+
+
+def _roc_traces(source: str, curve: Roc, dash: str) -> list[dict[str, Any]]:
+    colour = f"@c{slot(source)}"
+    low, high = (_short(edge) for edge in curve.band)
+    x = _short(curve.rate)
+    name = html.escape(source_name(source), quote=False)
+    traces: list[dict[str, Any]] = []
+    if len(curve.areas) > 1:
+        traces.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "name": f"{name} ± sd",
+                "x": x + x[::-1],
+                "y": high + low[::-1],
+                "fill": "toself",
+                "fillcolor": f"{colour}/0.18",
+                "line": {"width": 0},
+                "hoverinfo": "skip",
+            }
+        )
+    traces.append(
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "name": name,
+            "x": x,
+            "y": _short(curve.mean),
+            "line": {"color": colour, "width": 2.2, "dash": dash},
+            "hovertemplate": f"{name}<br>%{{y:.3f}} at %{{x:.2f}}<extra></extra>",
+        }
+    )
+    return traces
+
+
+def latent_names(name: str) -> tuple[str, str]:
+    """Title of a panel and quantity on its axis."""
+    if name.startswith("delay"):
+        return f"TDe{name[5:].replace('_', ' ')}", "delay"
+    if name.startswith("offset_"):
+        return f"TPE {name[7:].replace('_', ' ')}", f"offset {name[7:].replace('_', ' ')}"
+    return name.replace("_", " "), name.replace("_", " ")
+
+
+def missing(latent: Latent) -> str:
+    """How many values the range leaves out."""
+    seen, said = latent.outside
+    if not seen and not said:
+        return f"All {latent.counts[0]} observed and {latent.counts[1]} predicted values are shown."
+    return (
+        f"Outside the range shown: {seen} of {latent.counts[0]} observed, "
+        f"{said} of {latent.counts[1]} predicted."
+    )
+
+
+def latent_plot(results: Results, name: str, text: str, shown: Sequence[Latent]) -> Plot:
+    """Observed as bars, predicted as a stepped line, a panel per latent."""
+    keys = [Key("observed", "observed", "bar"), Key("predicted", f"c{slot('ibg_rg')}")]
+    panels = [_latent_panel(each) for each in shown]
+    width = 640 if len(panels) == 1 else None
+    return Plot(name, caption(results, text), panels, keys, width=width)
+
+
+def _latent_panel(latent: Latent) -> Panel:
+    title, axis = latent_names(latent.name)
+    unit = f", {latent.unit}" if latent.unit else ""
+    edges = _short(latent.edges, 5)
+    data: list[dict[str, Any]] = [
+        {
+            "type": "bar",
+            "name": "observed",
+            "x": _short((latent.edges[1:] + latent.edges[:-1]) / 2, 5),
+            "y": _short(latent.observed, 5),
+            "width": float(np.diff(latent.edges).mean()),
+            "marker": {"color": "@observed", "line": {"width": 0}},
+            "hovertemplate": "observed<br>%{y:.1%} near %{x:.3g}<extra></extra>",
+        },
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "name": "predicted",
+            "x": [edges[0], *edges],
+            "y": [0, *_short(latent.predicted, 5), 0],
+            "line": {"shape": "hv", "color": f"@c{slot('ibg_rg')}", "width": 2.2},
+            "hovertemplate": "predicted<br>%{y:.1%} from %{x:.3g}<extra></extra>",
+        },
+    ]
+    # A step to each bin's share at its left edge: the first point only lifts the line from zero.
+    x = _axis(f"{axis}{unit}", range=[edges[0], edges[-1]], nticks=7)
+    y = _axis("share per bin", tickformat=".0%", rangemode="tozero", nticks=6)
+    alt = f"{title}, observed and predicted, {number(edges[0], 1)} to {number(edges[-1], 1)}{unit}"
+    return Panel(_spec(data, x, y), alt, title, missing(latent), height=300)
+
+
+def _short(values: Any, digits: int = 4) -> list[float]:
+    return [float(f"{value:.{digits}g}") for value in np.asarray(values, dtype=float)]

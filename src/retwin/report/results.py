@@ -1,0 +1,248 @@
+"""What a study left behind: `results.json` and `arrays.npz`, read and checked."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from retwin.errors import InputError
+
+__all__ = ["SCHEMA", "Comparison", "Dataset", "Fidelity", "Results", "Source", "read_results"]
+
+SCHEMA = 1
+SCORES = (
+    "macro_f1",
+    "balanced_accuracy",
+    "auroc",
+    "healthy_recall",
+    "accuracy",
+    "auroc_micro",
+    "ece",
+    "rmse",
+    "nrmse",
+    "crps",
+    "coverage50",
+    "coverage90",
+)
+"""Every score of a source that the page knows, in the order in which it is shown."""
+
+
+class Part(BaseModel):
+    """A part of results.json: read-only, and unknown keys are left to later versions."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class Dataset(Part):
+    """One of the data sets: where from, how much, and which trajectories."""
+
+    name: str = ""
+    sha256: str = ""
+    n: int | None = None
+    used: list[str] | None = None
+    ids: list[str] = []
+    labels: list[str] = []
+
+
+class Data(Part):
+    """The three roles that data play."""
+
+    twin: Dataset = Dataset()
+    calibration: Dataset = Dataset()
+    test: Dataset = Dataset()
+    protocol: str = ""
+
+
+class Source(Part):
+    """Scores (one value per run) and costs of one source of training data."""
+
+    scores: dict[str, list[float]]
+    intervals: dict[str, tuple[float, float]] = {}
+    confusion: list[list[int]] | None = None
+    real_data: str | None = None
+    fault_protocol_known: bool | None = None
+    twin_runs: int | None = None
+    update_s: float | None = None
+    generate_s: float | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gather(cls, values: Any) -> Any:
+        """Scores stand beside the other keys in the file; None stands for a missing value."""
+        if not isinstance(values, dict):
+            return values
+        found = {name: values[name] for name in SCORES if values.get(name)}
+        scores = {
+            name: [math.nan if run is None else run for run in runs]
+            if isinstance(runs, list)
+            else runs
+            for name, runs in found.items()
+        }
+        intervals = values.get("intervals") or {}
+        if isinstance(intervals, dict):
+            intervals = {k: v for k, v in intervals.items() if v is not None and None not in v}
+        return {**values, "scores": scores, "intervals": intervals}
+
+
+class Comparison(Part):
+    """One pair of sources on one score: a minus b."""
+
+    a: str
+    b: str
+    metric: str
+    mean_diff: float
+    t: float | None = None
+    df: float | None = None
+    p: float | None = None
+    p_holm: float | None = None
+    bootstrap_ci95: tuple[float, float] | None = None
+
+    def seen_from(self, name: str) -> Comparison:
+        """The same comparison with `name` first."""
+        if self.a == name:
+            return self
+        interval = self.bootstrap_ci95
+        turned = {
+            "a": self.b,
+            "b": self.a,
+            "mean_diff": -self.mean_diff,
+            "t": None if self.t is None else -self.t,
+            "bootstrap_ci95": None if interval is None else (-interval[1], -interval[0]),
+        }
+        return self.model_copy(update=turned)
+
+
+class Agreement(Part):
+    """A Kolmogorov-Smirnov test on one latent."""
+
+    name: str
+    statistic: float
+    p: float | None = None
+
+
+class Fidelity(Part):
+    """How well the predicted discrepancy agrees with the observed one."""
+
+    latent: list[str] = []
+    units: list[str] = []
+    held_out: int | None = None
+    ks: list[Agreement] = []
+    coverage90: dict[str, float | None] = {}
+
+
+class Surrogate(Part):
+    """Error of the surrogate against the twin."""
+
+    rmse: dict[str, float] = {}
+    unit: str = ""
+    nrmse: dict[str, float] = {}
+
+
+class Results(Part):
+    """results.json, with the arrays beside it (empty when there are none)."""
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
+
+    case: str
+    title: str = ""
+    preset: str = ""
+    classifier: str = ""
+    runs: int
+    classes: list[str] = []
+    emulated: bool = False
+    data: Data = Data()
+    sources: dict[str, Source] = Field(min_length=1)
+    published: dict[str, dict[str, str]] = {}
+    comparisons: list[Comparison] = []
+    surrogate: Surrogate = Surrogate()
+    fidelity: Fidelity = Fidelity()
+    timing: dict[str, Any] = {}
+    provenance: dict[str, Any] = {}
+    arrays: dict[str, NDArray] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_none(cls, values: Any) -> Any:
+        """A key that is null counts as absent."""
+        if isinstance(values, dict):
+            return {key: value for key, value in values.items() if value is not None}
+        return values
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Results:
+        size = len(self.classes)
+        for name, source in self.sources.items():
+            rows = source.confusion
+            if rows is not None and [len(row) for row in rows] != [size] * size:
+                raise ValueError(f"confusion of {name} is not {size} × {size}")
+            shape = self.probabilities(name).shape
+            wanted = (len(self.data.test.labels), size)
+            if shape != (0,) and shape[1:] != wanted:
+                raise ValueError(f"probabilities/{name} has shape {shape}, not (runs, *{wanted})")
+        strange = set(self.data.test.labels) - set(self.classes)
+        if strange and self.classes:
+            raise ValueError(f"test label {min(strange)!r} is none of the classes")
+        return self
+
+    def probabilities(self, source: str) -> NDArray:
+        """(runs, n_test, classes), or empty."""
+        return self.arrays.get(f"probabilities/{source}", np.empty(0))
+
+    @property
+    def truth(self) -> NDArray:
+        """Class index of every test trajectory."""
+        return np.array([self.classes.index(label) for label in self.data.test.labels], dtype=int)
+
+
+def read_results(folder: str | os.PathLike[str]) -> Results:
+    """The results of a study from its folder.
+
+    Raises
+    ------
+    InputError: results.json is missing, damaged, of another schema, or does not agree with
+        arrays.npz. A missing arrays.npz is no error: what needs it is left out.
+    """
+    path = Path(folder) / "results.json"
+    if not path.is_file():
+        raise _bad("folder", "a folder with results.json", f"{folder}, which has none")
+    try:
+        content = json.loads(path.read_bytes())
+    except (ValueError, OSError) as error:
+        raise _bad("results.json", "JSON", f"{path} ({error})") from error
+    schema = content.get("schema") if isinstance(content, dict) else None
+    if schema != SCHEMA:
+        raise InputError(
+            "results.json",
+            expected=f"schema {SCHEMA}",
+            got=f"schema {schema!r}",
+            remedy="make the report with the retwin that made the results",
+        )
+    try:
+        return Results.model_validate({**content, "arrays": _read_arrays(path.parent)})
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "results.json"
+        raise _bad(where, "what schema 1 says", first["msg"]) from error
+
+
+def _read_arrays(folder: Path) -> dict[str, NDArray]:
+    path = folder / "arrays.npz"
+    if not path.exists():
+        return {}
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except Exception as error:  # whatever zip, numpy or the disk finds wrong with it
+        raise _bad("arrays.npz", "arrays of a study", f"{path} ({error})") from error
+
+
+def _bad(argument: str, expected: str, got: str) -> InputError:
+    remedy = "run `retwin study` with this folder as --out again"
+    return InputError(argument, expected=expected, got=got, remedy=remedy)

@@ -1,0 +1,311 @@
+"""What the scores say: the verdict, Table 1 beside the paper's numbers, the comparisons."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from retwin.report.blocks import Cell, Column, Forest, Prose, Section, Table
+from retwin.report.curves import ece_floor
+from retwin.report.plots import scores_plot
+from retwin.report.results import Comparison, Results
+from retwin.report.words import (
+    METRICS,
+    mean_and_spread,
+    number,
+    order,
+    p_value,
+    real_data,
+    signed,
+    slot,
+    source_name,
+    span,
+)
+
+__all__ = ["comparisons", "further_scores", "outcome", "scores", "verdict"]
+
+MAIN = ("macro_f1", "balanced_accuracy", "auroc", "healthy_recall", "rmse", "nrmse", "crps")
+MORE = ("accuracy", "auroc_micro", "ece", "coverage50", "coverage90")
+
+
+def outcome(comparison: Comparison) -> str:
+    """`better` or `worse` when the interval leaves zero out, `open` when not, else nothing."""
+    interval = comparison.bootstrap_ci95
+    direction = METRICS[comparison.metric].better if comparison.metric in METRICS else 0
+    if interval is None or direction == 0 or not np.isfinite(interval).all():
+        return ""
+    if interval[0] <= 0 <= interval[1]:
+        return "open"
+    return "better" if (interval[0] > 0) == (direction > 0) else "worse"
+
+
+def verdict(results: Results) -> list[str]:
+    """Up to three plain sentences; "better" only where the bootstrap interval leaves zero out."""
+    pair = _headline(results.comparisons)
+    if pair is None:
+        return []
+    found = {each.metric: each for each in _between(results.comparisons, *pair)}
+    metric = next((name for name in METRICS if name in found and outcome(found[name])), None)
+    if metric is None:
+        return []
+    sentences = [_first(results, found[metric])]
+    others = [each for name, each in found.items() if name in MAIN and name != metric]
+    sentences += _second(others)
+    alone = _between(results.comparisons, "ibg_rg", "ibg")
+    sentences += [_third(each) for each in alone if each.metric == metric and outcome(each)]
+    return sentences[:3]
+
+
+def _headline(found: Sequence[Comparison]) -> tuple[str, str] | None:
+    """The paper's method against the plain twin, else the first pair in the file."""
+    if _between(found, "ibg_rg", "dt"):
+        return "ibg_rg", "dt"
+    return (found[0].a, found[0].b) if found else None
+
+
+def _between(found: Sequence[Comparison], a: str, b: str) -> list[Comparison]:
+    return [each.seen_from(a) for each in found if {each.a, each.b} == {a, b}]
+
+
+def _first(results: Results, found: Comparison) -> str:
+    a, b = source_name(found.a), source_name(found.b)
+    name = METRICS[found.metric].name
+    means = [
+        number(float(np.nanmean(results.sources[each].scores[found.metric])))
+        if each in results.sources and found.metric in results.sources[each].scores
+        else "–"
+        for each in (found.a, found.b)
+    ]
+    result = outcome(found)
+    count = results.data.test.n or len(results.data.test.labels)
+    on = f"{count} test trajectories" if count else "the test trajectories"
+    what = f"{name} {means[0]} against {means[1]}"
+    difference = f"{signed(found.mean_diff)}, 95 % interval {span(found.bootstrap_ci95, sign=True)}"
+    if result == "open":
+        return (
+            f"{a} and {b} cannot be told apart on {on}: {what}, "
+            f"and the interval of the difference includes zero ({difference})."
+        )
+    return f"{a} is {result} than {b} on {on}: {what} ({difference})."
+
+
+def _second(found: Sequence[Comparison]) -> list[str]:
+    """The other main scores of the same pair, grouped by what their intervals say."""
+    said = []
+    for result, words in (("better", "also better"), ("worse", "worse"), ("open", "undecided")):
+        each = [
+            f"{METRICS[one.metric].name.replace('Healthy', 'healthy').replace('Bal', 'bal')} "
+            f"({signed(one.mean_diff)}, {span(one.bootstrap_ci95, sign=True)})"
+            for one in found
+            if outcome(one) == result
+        ]
+        if each:
+            said.append(f"{words}: {', '.join(each)}")
+    text = "; ".join(said)
+    return [f"{text[0].upper()}{text[1:]}."] if text else []
+
+
+def _third(found: Comparison) -> str:
+    """What the residual model adds to the surrogate alone."""
+    meaning = {
+        "better": "so the residual model itself helps",
+        "worse": "so the residual model itself does harm",
+        "open": "so it is not shown that the residual model itself helps",
+    }[outcome(found)]
+    name = METRICS[found.metric].name
+    return (
+        f"Against {source_name('ibg')}, with the same commands and faults, the difference in "
+        f"{name} is {signed(found.mean_diff)} ({span(found.bootstrap_ci95, sign=True)}), {meaning}."
+    )
+
+
+def scores(results: Results) -> Section | None:
+    """Table 1 beside the paper's, and the same as a picture."""
+    table = _score_table(results, MAIN)
+    if table is None:
+        return None
+    blocks: list = [table]
+    picture = scores_plot(results, [name for name in MAIN if _has(results, name)])
+    if picture is not None:
+        blocks.append(picture)
+    return Section("scores", "Scores", blocks)
+
+
+def _score_table(results: Results, metrics: Sequence[str]) -> Table | None:
+    shown = [name for name in metrics if _has(results, name)]
+    if not shown:
+        return None
+    columns = [Column("Training data", numeric=False), Column("Real data used", numeric=False)]
+    for name in shown:
+        columns += _score_columns(results, name)
+    best = {name: _best(results, name) for name in shown}
+    rows = []
+    for source in order(list(results.sources)):
+        one = results.sources[source]
+        known = "fault protocol known" if one.fault_protocol_known else ""
+        row = [Cell(source_name(source), slot=slot(source)), Cell(real_data(one.real_data), known)]
+        for name in shown:
+            below = f"[{span(one.intervals[name])}]" if name in one.intervals else ""
+            text = mean_and_spread(one.scores.get(name, []))
+            row.append(Cell(text, below, best=source in best[name]))
+            if _in_paper(results, name):
+                row.append(Cell(results.published.get(source, {}).get(name, "–")))
+        rows.append(row)
+    return Table(_score_caption(results, shown), columns, rows)
+
+
+def _score_columns(results: Results, name: str) -> list[Column]:
+    title = METRICS[name].name
+    if not _in_paper(results, name):
+        return [Column(title)]
+    return [Column("this study", group=title), Column("paper", group=title, paper=True)]
+
+
+def _score_caption(results: Results, shown: Sequence[str]) -> str:
+    runs = f"mean ± standard deviation over {results.runs} runs"
+    text = runs if results.runs > 1 else "one run, so no spread over runs"
+    if any(each.intervals for each in results.sources.values()):
+        text += "; in brackets the 95 % bootstrap interval over test trajectories"
+    text = f"{text[0].upper()}{text[1:]}. Bold: the best mean of a column, whoever has it."
+    if any(_in_paper(results, name) for name in shown):
+        text += (
+            " The paper's numbers (its Table 1) are from its own test set and classifier, so "
+            "compare the gap between rows before the level."
+        )
+    if any(each.fault_protocol_known for each in results.sources.values()):
+        text += (
+            " “Fault protocol known”: the training faults follow the published onset and sizes, "
+            "which would not be known in the field."
+        )
+    return text
+
+
+def _has(results: Results, metric: str) -> bool:
+    return any(metric in each.scores for each in results.sources.values())
+
+
+def _in_paper(results: Results, metric: str) -> bool:
+    return any(metric in results.published.get(source, {}) for source in results.sources)
+
+
+def _best(results: Results, metric: str) -> list[str]:
+    """The sources with the best mean; none when there is nothing to choose from."""
+    means = {
+        name: float(np.nanmean(each.scores[metric]))
+        for name, each in results.sources.items()
+        if metric in each.scores and np.isfinite(each.scores[metric]).any()
+    }
+    better = METRICS[metric].better
+    if len(means) < 2 or better == 0:
+        return []
+    top = max(better * mean for mean in means.values())
+    return [name for name, mean in means.items() if better * mean == top]
+
+
+def further_scores(results: Results) -> Section | None:
+    """Scores that the paper does not give, and how far the ECE can be trusted."""
+    table = _score_table(results, MORE)
+    if table is None:
+        return None
+    floors = {name: _floor(results, name) for name in order(list(results.sources))}
+    if _has(results, "ece") and any(floor is not None for floor in floors.values()):
+        columns = [*table.columns, Column("ECE floor")]
+        rows = [
+            [*row, Cell(number(floor))]
+            for row, floor in zip(table.rows, floors.values(), strict=True)
+        ]
+        table = Table(table.caption, columns, rows)
+    blocks: list = [table]
+    if _has(results, "ece"):
+        blocks.append(Prose(_floor_note(results), quiet=True))
+    return Section("further", "Further scores", blocks)
+
+
+def _floor(results: Results, source: str) -> float | None:
+    probabilities = results.probabilities(source)
+    usable = probabilities.size and np.isfinite(probabilities).all()
+    return ece_floor(probabilities) if usable else None
+
+
+def _floor_note(results: Results) -> str:
+    count = results.data.test.n or len(results.data.test.labels)
+    return (
+        "The expected calibration error (ECE, top label, 10 bins of equal mass) cannot reach zero "
+        f"on {count or 'few'} trajectories. The floor is what a perfectly calibrated classifier "
+        "with the same confidences would show on average; the ECE says something only where it "
+        "lies clearly above. As a rule of thumb it is about 0.04 with 90 trajectories and 0.06 "
+        "with 36."
+    )
+
+
+def comparisons(results: Results) -> Section | None:
+    """Every pair on every score: Welch over runs, bootstrap over trajectories."""
+    found = [each for each in results.comparisons if each.metric in METRICS]
+    if not found:
+        return None
+    columns = [
+        Column("Score", numeric=False),
+        Column("Difference"),
+        Column("95 % interval"),
+        Column("", numeric=False),
+        Column("Reading", numeric=False),
+        Column("t (df)", group="Welch’s test over runs"),
+        Column("p", group="Welch’s test over runs"),
+        Column("p, Holm", group="Welch’s test over runs"),
+    ]
+    shown = [each.bootstrap_ci95 for each in found if each.bootstrap_ci95 is not None]
+    low, high = min([0.0, *(lo for lo, _ in shown)]), max([0.0, *(hi for _, hi in shown)])
+    rows: list[list[Cell]] = []
+    last: tuple[str, str] | None = None
+    for each in _by_pair(found):
+        if (each.a, each.b) != last:
+            rows.append([Cell(f"{source_name(each.a)} minus {source_name(each.b)}")])
+        last = each.a, each.b
+        rows.append(_comparison_row(each, low, high))
+    table = Table(_comparison_caption(results), columns, rows)
+    return Section("comparisons", "Comparisons", [table])
+
+
+def _by_pair(found: Sequence[Comparison]) -> list[Comparison]:
+    """What was learned most stands first in a pair; pairs together, scores in their order."""
+    ranked = order(list(dict.fromkeys(name for each in found for name in (each.a, each.b))))
+    turned = [each.seen_from(max(each.a, each.b, key=ranked.index)) for each in found]
+    metrics = list(METRICS)
+    return sorted(
+        turned,
+        key=lambda e: (-ranked.index(e.a), ranked.index(e.b), metrics.index(e.metric)),
+    )
+
+
+def _comparison_row(each: Comparison, low: float, high: float) -> list[Cell]:
+    forest = None
+    if each.bootstrap_ci95 is not None and high > low:
+        lower, at, upper, zero = (
+            100 * (value - low) / (high - low)
+            for value in (each.bootstrap_ci95[0], each.mean_diff, each.bootstrap_ci95[1], 0.0)
+        )
+        forest = Forest(lower, min(max(at, 0), 100), upper, zero)
+    result = outcome(each)
+    reading = "undecided" if result == "open" else result or "–"
+    return [
+        Cell(METRICS[each.metric].name),
+        Cell(signed(each.mean_diff)),
+        Cell(span(each.bootstrap_ci95, sign=True)),
+        Cell("", forest=forest, slot=slot(each.a)),
+        Cell(reading, tone=result),
+        Cell(f"{number(each.t, 2)} ({number(each.df, 1)})" if each.t is not None else "–"),
+        Cell(p_value(each.p)),
+        Cell(p_value(each.p_holm)),
+    ]
+
+
+def _comparison_caption(results: Results) -> str:
+    return (
+        "“Better” and “worse” are said only where the 95 % paired bootstrap interval over test "
+        "trajectories leaves zero out; the bars draw these intervals on one axis, with a line at "
+        "zero. Welch’s test asks whether the mean over runs differs, so it sees the chance in "
+        f"training ({results.runs} runs) but not the choice of test trajectories. Holm’s "
+        "correction covers the paper’s three scores; the intervals are not corrected for their "
+        "number."
+    )

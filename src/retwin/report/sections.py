@@ -1,0 +1,318 @@
+"""The sections of the page, in their order; each is left out when its data are not there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from retwin.report.blocks import (
+    Block,
+    Cell,
+    Column,
+    Facts,
+    Fold,
+    Matrices,
+    Matrix,
+    Prose,
+    Section,
+    SectionMaker,
+    Table,
+)
+from retwin.report.curves import Latent, Roc, latents, micro_roc
+from retwin.report.plots import caption, latent_names, latent_plot, roc_plot
+from retwin.report.results import Dataset, Results
+from retwin.report.scores import comparisons, further_scores, scores
+from retwin.report.words import (
+    class_name,
+    duration,
+    label,
+    number,
+    order,
+    p_value,
+    quantity,
+    real_data,
+    slot,
+    source_name,
+)
+
+__all__ = ["SECTIONS", "discrepancy_groups", "recalls", "roc_curves"]
+
+
+def confusion(results: Results) -> Section | None:
+    """Confusion matrices side by side (the paper's figure 3)."""
+    shown = []
+    for source in order(list(results.sources)):
+        counts = results.sources[source].confusion
+        if counts is None or not results.classes:
+            continue
+        shares = [[round(100 * share) for share in row] for row in recalls(counts)]
+        right = sum(counts[i][i] for i in range(len(counts)))
+        total = sum(map(sum, counts))
+        below = f"{right} of {total} right ({100 * right / max(total, 1):.0f} %)"
+        shown.append(Matrix(source_name(source), slot(source), below, counts, shares))
+    if not shown:
+        return None
+    runs = f"summed over {results.runs} runs" if results.runs > 1 else "of the one run"
+    text = (
+        f"Counts {runs}; rows are the true class, columns the answer, colour the share of the "
+        "row. A good classifier has only its diagonal; the first row shows false alarms on "
+        "healthy trajectories."
+    )
+    if results.published:
+        text += " The paper’s figure 3."
+    if any("teady_state_error" in name for name in results.classes):
+        text += " M1 is motor 1; bias is a steady-state error."
+    names = [class_name(name) for name in results.classes]
+    block = Matrices("confusion", caption(results, text), names, shown)
+    return Section("confusion", "Which faults are confused", [block])
+
+
+def recalls(counts: Sequence[Sequence[int]]) -> list[list[float]]:
+    """Share of its row that each count is; a class without trajectories has none."""
+    table = np.asarray(counts, dtype=float)
+    rows: list[list[float]] = (table / np.maximum(table.sum(axis=1, keepdims=True), 1)).tolist()
+    return rows
+
+
+def roc_curves(results: Results) -> dict[str, Roc]:
+    """Micro-averaged ROC of every source that has probabilities."""
+    found = {}
+    for source in order(list(results.sources)):
+        probabilities = results.probabilities(source)
+        if probabilities.size and results.classes and np.isfinite(probabilities).all():
+            found[source] = micro_roc(probabilities, results.truth)
+    return found
+
+
+def roc(results: Results) -> Section | None:
+    """ROC with bands (the paper's figure 4)."""
+    curves = roc_curves(results)
+    if not curves:
+        return None
+    return Section("roc", "ROC", [roc_plot(results, curves)])
+
+
+def discrepancy_groups(results: Results) -> list[tuple[str, str, list[Latent]]]:
+    """Name, caption and latents of each figure: delays apart from the rest."""
+    found = latents(results)
+    delays = [each for each in found if each.name.startswith("delay")]
+    others = [each for each in found if not each.name.startswith("delay")]
+    paper = bool(results.published)
+    see = "Where the line follows the bars, the model draws what the {0} did, spread included."
+    see = see.format("emulated robot" if results.emulated else "real system")
+    groups = []
+    if delays:
+        text = f"Timing discrepancy (TDe), observed and predicted. {see}"
+        groups.append(("tde", f"{text}{' The paper’s figure 5.' if paper else ''}", delays))
+    if others:
+        offsets = all(each.name.startswith("offset") for each in others)
+        name = "Position error (TPE) per axis" if offsets else "Discrepancy"
+        text = f"{name}, observed and predicted. {see}"
+        groups.append(("tpe", f"{text}{' The paper’s figure 6.' if paper else ''}", others))
+    return groups
+
+
+def discrepancy(results: Results) -> Section | None:
+    """Observed against predicted discrepancy (figures 5 and 6), and tests of the agreement."""
+    blocks: list[Block] = [
+        latent_plot(results, name, text, shown)
+        for name, text, shown in discrepancy_groups(results)
+    ]
+    table = _agreement(results)
+    if table is not None:
+        blocks.append(table)
+    if not blocks:
+        return None
+    return Section("discrepancy", "Observed and predicted discrepancy", blocks)
+
+
+def _agreement(results: Results) -> Table | None:
+    told = results.fidelity
+    tests = {each.name: each for each in told.ks}
+    names = [name for name in told.latent if name in tests or name in told.coverage90]
+    names += [name for name in {**tests, **told.coverage90} if name not in names]
+    if not names:
+        return None
+    rows = []
+    for name in names:
+        test = tests.get(name)
+        rows.append(
+            [
+                Cell(latent_names(name)[0]),
+                Cell(number(test.statistic) if test else "–"),
+                Cell(p_value(test.p) if test else "–"),
+                Cell(number(told.coverage90.get(name), 2)),
+            ]
+        )
+    columns = [
+        Column("Component", numeric=False),
+        Column("KS distance"),
+        Column("p"),
+        Column("in the 90 % interval"),
+    ]
+    held = f" on {told.held_out} held-out movements" if told.held_out else ""
+    text = (
+        f"Agreement of the predicted with the observed discrepancy{held}. KS distance: the "
+        "greatest gap between the two cumulative distributions, 0 is best; a small p says that "
+        "they differ. The share inside the predicted 90 % interval should be 0.90: below, the "
+        "model is too sure; above, too wide."
+    )
+    return Table(caption(results, text), columns, rows)
+
+
+def surrogate(results: Results) -> Section | None:
+    """Error of the surrogate against the twin, per output."""
+    told = results.surrogate
+    if not told.rmse:
+        return None
+    factor, unit = quantity(told.unit)
+    columns = [Column("Output", numeric=False), Column(f"RMSE, {unit}" if unit else "RMSE")]
+    if told.nrmse:
+        columns.append(Column("NRMSE, %"))
+    rows = []
+    for name, value in told.rmse.items():
+        row = [Cell(name), Cell(number(factor * value))]
+        if told.nrmse:
+            relative = told.nrmse.get(name)
+            row.append(Cell("–" if relative is None else number(100 * relative, 2)))
+        rows.append(row)
+    runs = f", mean over {results.runs} runs" if results.runs > 1 else ""
+    text = (
+        f"Error of the surrogate (IBG) on twin trajectories that it was not fitted to{runs}. It "
+        "should be small beside the discrepancy above, or the residual model learns the "
+        "surrogate’s errors instead of the robot’s."
+        if latents(results)
+        else f"Error of the surrogate (IBG) on twin trajectories that it was not fitted to{runs}."
+    )
+    return Section("surrogate", "Surrogate error", [Table(text, columns, rows)])
+
+
+def time(results: Results) -> Section | None:
+    """What each source costs, and how long the stages took."""
+    blocks: list[Block] = []
+    costs = _costs(results)
+    if costs is not None:
+        blocks.append(costs)
+    numbers = {
+        key: float(value)
+        for key, value in results.timing.items()
+        if isinstance(value, int | float) and math.isfinite(value)
+    }
+    stages = {key: value for key, value in numbers.items() if key != "total_s"}
+    rows = [[Cell(label(key)), Cell(duration(value))] for key, value in stages.items()]
+    if "total_s" in numbers:
+        rows.append([Cell("Whole study"), Cell(duration(numbers["total_s"]))])
+    if rows:
+        columns = [Column("Stage", numeric=False), Column("Time")]
+        blocks.append(Table("Wall-clock time of this study’s stages.", columns, rows))
+    return Section("time", "Time", blocks) if blocks else None
+
+
+def _costs(results: Results) -> Table | None:
+    told = results.timing.get("generate_3600_s")
+    bulk = told if isinstance(told, dict) else {}
+    sources = order(list(results.sources))
+    paper = any("generate" in results.published.get(source, {}) for source in sources)
+    parts = results.sources
+    shown = {
+        "Twin runs": [
+            "–" if parts[each].twin_runs is None else f"{parts[each].twin_runs:,}".replace(",", " ")
+            for each in sources
+        ],
+        "Updating": [duration(parts[each].update_s) for each in sources],
+        "Generating": [duration(parts[each].generate_s) for each in sources],
+        "3600 trajectories": [duration(bulk.get(each)) for each in sources],
+    }
+    kept = {name: texts for name, texts in shown.items() if set(texts) != {"–"}}
+    if not kept:
+        return None
+    columns = [Column("Training data", numeric=False), Column("Real data used", numeric=False)]
+    columns += [Column(name) for name in kept]
+    columns += [Column("paper, 3600", paper=True)] if paper else []
+    rows = []
+    for place, each in enumerate(sources):
+        row = [Cell(source_name(each), slot=slot(each)), Cell(real_data(parts[each].real_data))]
+        row += [Cell(texts[place]) for texts in kept.values()]
+        if paper:
+            row.append(Cell(results.published.get(each, {}).get("generate", "–")))
+        rows.append(row)
+    text = "What a source costs: simulations, fitting what it is made with, and making data."
+    if paper:
+        text += (
+            " The paper’s times are from another machine (Apple M1 Pro) and another twin, so "
+            "only the order of magnitude compares."
+        )
+    return Table(text, columns, rows)
+
+
+def provenance(results: Results) -> Section | None:
+    """Data, versions, and the command that makes this report again."""
+    blocks: list[Block] = []
+    told = dict(results.provenance)
+    command = told.pop("command", None)
+    if command:
+        blocks.append(Prose("This command makes the same study again:"))
+        blocks.append(Facts([], [("", str(command))]))
+    data = _data_table(results)
+    if data is not None:
+        blocks.append(data)
+    setup = {"preset": results.preset, "classifier": results.classifier, "runs": results.runs}
+    facts = {**setup, **told}
+    pairs = [(label(key), str(value)) for key, value in facts.items() if value not in (None, "")]
+    blocks.append(Facts(pairs))
+    used = results.data.calibration.used
+    if used:
+        blocks.append(Fold(f"{len(used)} calibration trajectories used", used))
+    if results.data.test.ids:
+        count = len(results.data.test.ids)
+        blocks.append(Fold(f"{count} test trajectories", results.data.test.ids))
+    return Section("provenance", "Where this comes from", blocks)
+
+
+def _data_table(results: Results) -> Table | None:
+    told = results.data
+    roles = (
+        ("Twin", told.twin),
+        ("Calibration", told.calibration),
+        ("Test", told.test),
+    )
+    rows = [_data_row(role, each) for role, each in roles if each.n is not None or each.sha256]
+    if not rows:
+        return None
+    columns = [
+        Column("Role", numeric=False),
+        Column("File", numeric=False),
+        Column("Trajectories"),
+        Column("used"),
+        Column("SHA-256", numeric=False),
+    ]
+    text = "The data, known by their SHA-256."
+    if told.protocol:
+        text += f" Protocol: {told.protocol.rstrip('.')}."
+    return Table(caption(results, text), columns, rows)
+
+
+def _data_row(role: str, each: Dataset) -> list[Cell]:
+    return [
+        Cell(role),
+        Cell(each.name or "–"),
+        Cell("–" if each.n is None else str(each.n)),
+        Cell("all" if each.used is None else str(len(each.used))),
+        Cell(each.sha256 or "–", tone="code"),
+    ]
+
+
+SECTIONS: tuple[SectionMaker, ...] = (
+    scores,
+    comparisons,
+    confusion,
+    roc,
+    discrepancy,
+    surrogate,
+    further_scores,
+    time,
+    provenance,
+)
+"""What the page shows, in this order; a new section is one more function in this list."""

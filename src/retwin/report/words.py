@@ -1,0 +1,194 @@
+"""Words, numbers and colours: how sources, classes and values are shown everywhere alike."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+__all__ = [
+    "CHROME",
+    "METRICS",
+    "PALETTE",
+    "Metric",
+    "class_name",
+    "duration",
+    "label",
+    "mean_and_spread",
+    "number",
+    "order",
+    "p_value",
+    "quantity",
+    "real_data",
+    "signed",
+    "slot",
+    "source_name",
+    "span",
+]
+
+# Source to human name; the place in this list also fixes the colour (see `slot`).
+SOURCES = {
+    "ibg_rg": "IBG + RG",
+    "dt": "Digital twin",
+    "ibg": "IBG alone",
+    "ibg_rg_command": "IBG + RG, command space",
+    "dt_noise": "IBG + output noise",
+    "randomised": "Randomised twin",
+    "mean_corrected": "IBG + RG mean",
+    "pi_ls": "Least squares",
+    "pi_bayes": "Bayesian identification",
+    "dann": "Domain-adversarial",
+    "dann_transductive": "Domain-adversarial, transductive",
+    "fine_tuned": "Fine-tuned",
+    "inversion": "Fault inversion",
+    "inversion_cnn": "Inversion with classifier",
+}
+ORDER = ("dt", "ibg", "dt_noise", "randomised", "mean_corrected", "ibg_rg", *SOURCES)
+
+# Okabe and Ito's colours, (light, dark), readable on the page's two backgrounds.
+PALETTE = (
+    ("#0068a8", "#62b6ee"),
+    ("#d05a00", "#f29350"),
+    ("#00875f", "#45c79b"),
+    ("#b2508a", "#e29bc4"),
+    ("#8a6d00", "#dcc04b"),
+    ("#3f9cd0", "#a3d5f5"),
+    ("#6b6b6b", "#b9b9b9"),
+    ("#8b3a2b", "#d98f80"),
+)
+# Everything else that has a colour: name to (light, dark).
+CHROME = {
+    "ink": ("#1b1f24", "#e7eaee"),
+    "muted": ("#5a636e", "#a2abb6"),
+    "grid": ("#e4e7eb", "#2d333b"),
+    "rule": ("#c9ced6", "#434b56"),
+    "paper": ("#ffffff", "#14181d"),
+    "wash": ("#f5f6f8", "#1c2127"),
+    "observed": ("#9aa3ae", "#727c89"),
+    "alarm": ("#8f2d00", "#ffb37a"),
+    "alarm_wash": ("#fff1e6", "#3a2312"),
+}
+REAL_DATA = {
+    "none": "none",
+    "healthy": "healthy calibration",
+    "unlabelled": "unlabelled calibration",
+    "labelled": "labelled calibration",
+    "transductive": "test outputs, no labels",
+    "timing": "timing of commands",
+}
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a score is called, and which way is better: 1 up, -1 down, 0 a target to meet."""
+
+    name: str
+    better: int = 1
+
+
+METRICS = {
+    "macro_f1": Metric("Macro-F1"),
+    "balanced_accuracy": Metric("Balanced accuracy"),
+    "auroc": Metric("AUROC"),
+    "healthy_recall": Metric("Healthy recall"),
+    "accuracy": Metric("Accuracy"),
+    "auroc_micro": Metric("Micro AUROC"),
+    "ece": Metric("ECE", -1),
+    "rmse": Metric("RMSE", -1),
+    "nrmse": Metric("NRMSE", -1),
+    "crps": Metric("CRPS", -1),
+    "coverage50": Metric("Coverage of the 50 % band", 0),
+    "coverage90": Metric("Coverage of the 90 % band", 0),
+}
+
+
+def source_name(source: str) -> str:
+    """For people; an unknown source keeps its name."""
+    return SOURCES.get(source, source)
+
+
+def slot(source: str) -> int:
+    """Place of the source's colour in `PALETTE`, the same in every report."""
+    names = list(SOURCES)
+    place = names.index(source) if source in SOURCES else sum(source.encode())
+    return place % len(PALETTE)
+
+
+def order(sources: Sequence[str]) -> list[str]:
+    """Known sources first, from the plain twin to what was learned most; then the others."""
+    known = {name: place for place, name in reversed(list(enumerate(ORDER)))}
+    return sorted(sources, key=lambda name: known.get(name, len(ORDER)))
+
+
+def class_name(name: str) -> str:
+    """Short: `Motor_1_Steady_state_error` is `M1 bias`."""
+    short = re.sub(r"^([A-Za-z])[a-z]*_(\d+)_", r"\1\2 ", name)
+    short = re.sub(r"steady_state_error$", "bias", short, flags=re.IGNORECASE).replace("_", " ")
+    return re.sub(r"(?<= )\w+$", lambda word: word.group().lower(), short)
+
+
+def label(key: str) -> str:
+    """`surrogate_fit_s` as `Surrogate fit`."""
+    words = re.sub(r"_s$", "", key).replace("_", " ").strip()
+    return words[:1].upper() + words[1:]
+
+
+def real_data(text: str | None) -> str:
+    """Which real data a source saw."""
+    return "not said" if text is None else REAL_DATA.get(text, text)
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Fixed digits with a true minus; a dash for what is not there."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return f"{value:.{digits}f}".replace("-", "−")
+
+
+def signed(value: float, digits: int = 3) -> str:
+    """With its sign, also when positive."""
+    text = number(value, digits)
+    return f"+{text}" if value > 0 else text
+
+
+def span(interval: Sequence[float] | None, *, sign: bool = False) -> str:
+    """`0.69 to 0.81`."""
+    if interval is None:
+        return "–"
+    show = signed if sign else number
+    return f"{show(interval[0])} to {show(interval[1])}"
+
+
+def mean_and_spread(values: Sequence[float]) -> str:
+    """Mean ± standard deviation over runs; one run has no spread."""
+    finite = np.asarray(values, dtype=float)
+    finite = finite[np.isfinite(finite)]
+    if len(finite) < 2:
+        return number(float(finite[0]) if len(finite) else None)
+    return f"{number(float(finite.mean()))} ± {number(float(finite.std(ddof=1)))}"
+
+
+def p_value(p: float | None) -> str:
+    """Three digits, or `< 0.001`."""
+    return "< 0.001" if p is not None and p < 0.001 else number(p)
+
+
+def duration(seconds: float | None) -> str:
+    """In the unit that suits it."""
+    if seconds is None or not math.isfinite(seconds):
+        return "–"
+    if seconds < 0.1:
+        return f"{1000 * seconds:.2g} ms"
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    if seconds < 7200:
+        return f"{seconds / 60:.1f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def quantity(unit: str) -> tuple[float, str]:
+    """Factor and unit to show lengths in millimetres; other units stay."""
+    return (1000.0, "mm") if unit == "m" else (1.0, unit)

@@ -1,0 +1,216 @@
+"""The study: sources × runs → results.json, resumable (PROTOCOL)."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from retwin.case import Case
+from retwin.corrected import generate
+from retwin.errors import InputError
+from retwin.storage import load, save, sha256, write_atomically
+from retwin.study.jobs import Roles, Work
+from retwin.study.plan import PRESETS, SOURCES, StudyPlan
+from retwin.study.pool import run_jobs
+from retwin.study.results import write_results
+from retwin.trajectories import Trajectories
+
+__all__ = ["PRESETS", "SOURCES", "StudyData", "StudyPlan", "run_study"]
+
+Report = Callable[[str, float], None]
+"""Called with what is going on and the share that is done."""
+
+EMULATED_PER_CLASS = 10
+
+
+@dataclass(frozen=True)
+class StudyData:
+    """Where a study's data are; see PROTOCOL, roles of data.
+
+    Parameters
+    ----------
+    twin: recorded or simulated trajectories; None simulates them with the case's twin.
+    calibration, test: two real sets.
+    real: one real set, split into folds; every trajectory is tested once. Without any real set the
+        case's emulator makes one, which is labelled "emulated" everywhere.
+    """
+
+    twin: Path | None = None
+    calibration: Path | None = None
+    test: Path | None = None
+    real: Path | None = None
+
+    def __post_init__(self) -> None:
+        if (self.calibration is None) != (self.test is None) or (self.real and self.test):
+            raise InputError(
+                "real data",
+                expected="either calibration and test, or real alone",
+                got=", ".join(k for k, v in vars(self).items() if v and k != "twin"),
+                remedy="give --calibration FILE --test FILE, or --real FILE --folds K",
+            )
+
+
+def run_study(
+    case: Case,
+    plan: StudyPlan,
+    data: StudyData,
+    out: str | Path,
+    *,
+    processes: int | None = None,
+    report: Report | None = None,
+    command: str = "",
+) -> dict[str, Any]:
+    """Run or resume a study; writes `results.json` and `arrays.npz` in `out` and returns the former.
+
+    Parameters
+    ----------
+    case: the system.
+    plan: what is compared, and the seed.
+    data: where the data are.
+    out: folder; a second call with the same plan and data goes on where the first one stopped.
+    processes: jobs at a time, one thread each; by default one per core.
+    report: told what is going on.
+    command: how the study was called, for the record.
+
+    Raises
+    ------
+    InputError: bad data; or `out` holds another study.
+    """
+    out = Path(out)
+    tell = report or (lambda text, share: None)
+    digests = _digests(data)
+    _claim(out, case, plan, digests)
+    work_folder = out / "work"
+    about, roles = _prepare(case, plan, data, digests, work_folder, tell)
+    work = Work(work_folder, case, plan, roles)
+    run_jobs(work, processes or os.cpu_count() or 1, tell)
+    tell("scores", 1.0)
+    provenance = {"command": command, "seed": plan.seed, "plan": asdict(plan)}
+    return write_results(work, out, about=about, provenance=provenance)
+
+
+def _digests(data: StudyData) -> dict[str, dict[str, str]]:
+    """Name and SHA-256 of every file given."""
+    return {
+        role: {"name": path.name, "sha256": sha256(path)}
+        for role, path in vars(data).items()
+        if path is not None
+    }
+
+
+def _claim(out: Path, case: Case, plan: StudyPlan, digests: Mapping[str, Any]) -> None:
+    """Write down which study `out` holds, or make sure that it is this one."""
+    faults = {name: repr(fault) for name, fault in case.faults.items()}
+    ours = json.loads(
+        json.dumps({"case": case.name, "faults": faults, "plan": asdict(plan), "data": digests})
+    )
+    file = out / "study.json"
+    if file.exists():
+        try:
+            theirs = json.loads(file.read_text("utf-8"))
+        except ValueError:
+            theirs = None
+        if theirs != ours:
+            raise InputError(
+                "out",
+                expected="a new folder, or the folder of this very study",
+                got=f"{out}, which holds a study with another plan or other data",
+                remedy="give another folder, or remove this one",
+            )
+        return
+    if out.exists() and any(out.iterdir()):
+        raise InputError(
+            "out",
+            expected="a new folder, or the folder of this very study",
+            got=f"{out}, which holds other files",
+            remedy="give another folder",
+        )
+    with write_atomically(file) as part:
+        part.write_text(json.dumps(ours, indent=1), encoding="utf-8")
+
+
+def _prepare(
+    case: Case,
+    plan: StudyPlan,
+    data: StudyData,
+    digests: Mapping[str, dict[str, str]],
+    folder: Path,
+    tell: Report,
+) -> tuple[dict[str, Any], Roles]:
+    """Put twin and real data, with commands, where the jobs find them; decide the roles."""
+    twin_file, roles_file = folder / "twin.npz", folder / "roles.json"
+    if not roles_file.exists():
+        real, roles = _real(case, plan, data, tell)
+        save(real, folder / "real.npz")
+        with write_atomically(roles_file) as part:
+            part.write_text(json.dumps(roles.folds), encoding="utf-8")
+    roles = Roles.of(json.loads(roles_file.read_text("utf-8")))
+    if not twin_file.exists():
+        save(_twin(case, plan, data, tell), twin_file)
+    twin = load(twin_file)
+    simulated = {"name": f"simulated by {type(case.twin).__name__}", "sha256": ""}
+    emulated = {"name": f"emulated by {type(case.emulator).__name__}", "sha256": ""}
+    one = digests.get("real", emulated)
+    about = {
+        "twin": {**digests.get("twin", simulated), "n": len(twin)},
+        "calibration": digests.get("calibration", one),
+        "test": digests.get("test", one),
+        "protocol": (
+            "one calibration set, one test set"
+            if data.test
+            else f"{plan.folds} folds: every trajectory is tested once, by models that never saw it"
+        ),
+    }
+    return about, roles
+
+
+def _twin(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> Trajectories:
+    def progress(share: float) -> None:
+        tell("twin data", share)
+
+    if data.twin is not None:
+        return _labelled(load(data.twin, case=case, progress=progress), case, "twin-data")
+    seed = plan.seed_of("twin", 0)
+    return generate(case.twin, case, per_class=plan.per_class, seed=seed, progress=progress)
+
+
+def _real(
+    case: Case, plan: StudyPlan, data: StudyData, tell: Report
+) -> tuple[Trajectories, Roles]:
+    def read(path: Path) -> Trajectories:
+        found = load(path, case=case, progress=lambda share: tell(path.name, share))
+        return _labelled(found, case, path.name)
+
+    if data.calibration is not None and data.test is not None:
+        calibration, test = read(data.calibration), read(data.test)
+        both = Trajectories.concatenate([calibration, test])
+        return both, Roles.of([(range(len(calibration)), range(len(calibration), len(both)))])
+    if data.real is not None:
+        real = read(data.real)
+    elif case.emulator is not None:
+        seed = plan.seed_of("emulated", 0)
+        real = generate(case.emulator, case, per_class=EMULATED_PER_CLASS, seed=seed)
+    else:
+        raise InputError(
+            "real data",
+            expected="measured trajectories",
+            got=f"none, and the case {case.name!r} has no emulator",
+            remedy="give --real FILE --folds K",
+        )
+    return real, Roles.of(real.folds(plan.folds, seed=plan.seed_of("folds", 0)))
+
+
+def _labelled(trajectories: Trajectories, case: Case, name: str) -> Trajectories:
+    unknown = set(trajectories.labels.tolist()) - set(case.classes)
+    if unknown:
+        raise InputError(
+            name,
+            expected=f"trajectories labelled with the classes {', '.join(case.classes)}",
+            got=f"{sorted(unknown)}",
+            remedy="label every trajectory; a study scores against labels",
+        )
+    return trajectories

@@ -1,0 +1,246 @@
+"""The work of a study as jobs that each leave one result on disk; a job whose result is there is done.
+
+Killed at any moment and called again, a study goes on with the jobs that are missing. Results are
+moved into place whole, and every job draws from a seed of its own, so the order does not matter.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.case import Case
+from retwin.corrected import CorrectedTwin, generate
+from retwin.diagnosis import fit_diagnoser
+from retwin.models import read_about
+from retwin.residual import ResidualModel, fit_residual, infer_discrepancy
+from retwin.segments import Segments
+from retwin.storage import load, write_atomically
+from retwin.study.plan import SOURCES, StudyPlan
+from retwin.surrogate import Surrogate, fit_surrogate
+from retwin.trajectories import Trajectories
+from retwin.twins.protocol import HEALTHY, Progress
+
+__all__ = ["Job", "Roles", "Work"]
+
+DRAWS = 20
+"""Samples of the residual model per held-out movement, for the distributions in the report."""
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Which real trajectories calibrate and which test, by index into the study's real set."""
+
+    folds: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
+
+    @classmethod
+    def of(cls, folds: Iterable[tuple[Iterable[int], Iterable[int]]]) -> Roles:
+        """From any pairs (calibration, test) of indices."""
+        return cls(tuple((_indices(calibration), _indices(test)) for calibration, test in folds))
+
+    @property
+    def tested(self) -> list[int]:
+        """Every tested trajectory, in the order of the folds."""
+        return [i for _, test in self.folds for i in test]
+
+
+def _indices(values: Iterable[int]) -> tuple[int, ...]:
+    return tuple(int(value) for value in values)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One piece of work: kind ("surrogate", "residual", "diagnosis"), run, fold and source."""
+
+    kind: str
+    run: int
+    fold: int = 0
+    source: str = ""
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        parts = [f"run {self.run + 1}", self.kind, self.source]
+        return " ".join(part for part in parts if part)
+
+
+@dataclass(frozen=True)
+class Work:
+    """A study's folder of intermediate results, and how each is made."""
+
+    folder: Path
+    case: Case
+    plan: StudyPlan
+    roles: Roles
+
+    def jobs(self) -> list[list[Job]]:
+        """All jobs, in stages: those of one stage need only what earlier stages made."""
+        runs = range(self.plan.number_of_runs)
+        chosen = {name: SOURCES[name] for name in self.plan.sources}
+        folds = range(len(self.roles.folds))
+        surrogates = any(source.surrogate for source in chosen.values())
+        residuals = any(source.residual for source in chosen.values())
+        return [
+            [Job("surrogate", run) for run in runs if surrogates],
+            [Job("residual", run, fold) for run in runs for fold in folds if residuals],
+            [
+                Job("diagnosis", run, fold, name)
+                for run in runs
+                for name, source in chosen.items()
+                for fold in (folds if source.per_fold else (0,))
+            ],
+        ]
+
+    def path(self, job: Job) -> Path:
+        """Where a job's result lies."""
+        if job.kind == "surrogate":
+            return self.folder / f"run-{job.run}" / "surrogate"
+        base = self.folder / f"run-{job.run}" / f"fold-{job.fold}"
+        return base / "residual" if job.kind == "residual" else base / f"{job.source}.npz"
+
+    def do(self, job: Job, progress: Progress | None = None) -> None:
+        """Make a job's result, unless it is there."""
+        if self.path(job).exists():
+            return
+        started = time.perf_counter()
+        made = {
+            "surrogate": self._surrogate,
+            "residual": self._residual,
+            "diagnosis": self._diagnosis,
+        }[job.kind](job, progress)
+        timing = {"seconds": time.perf_counter() - started, **made}
+        with write_atomically(self._timing(job)) as part:
+            part.write_text(json.dumps(timing), encoding="utf-8")
+
+    def timing(self, job: Job) -> dict[str, float]:
+        """Seconds a job took, whole and in parts; empty if it was cut off before it could say."""
+        file = self._timing(job)
+        found: dict[str, float] = json.loads(file.read_text("utf-8")) if file.exists() else {}
+        return found
+
+    def _timing(self, job: Job) -> Path:
+        path = self.path(job)
+        return path.with_name(f"{path.stem}.timing.json")
+
+    def twin_data(self) -> Trajectories:
+        """What the twin says, with commands."""
+        return load(self.folder / "twin.npz")
+
+    def real_data(self) -> Trajectories:
+        """All real trajectories, with commands."""
+        return load(self.folder / "real.npz")
+
+    def _surrogate(self, job: Job, progress: Progress | None) -> dict[str, float]:
+        seed = self.plan.seed_of("surrogate", job.run)
+        fit_surrogate(self.twin_data(), seed=seed, progress=progress).save(self.path(job))
+        return {}
+
+    def _residual(self, job: Job, progress: Progress | None) -> dict[str, float]:
+        residual = fit_residual(
+            self._fitted_surrogate(job.run),
+            self.real_data()[list(self.roles.folds[job.fold][0])],
+            self.case.correction,
+            seed=self.plan.seed_of("residual", job.run, job.fold),
+            calibrate_on=self.plan.calibrate_on,
+            progress=progress,
+        )
+        residual.save(self.path(job))
+        return {}
+
+    def _diagnosis(self, job: Job, progress: Progress | None) -> dict[str, float]:
+        started = time.perf_counter()
+        training = self._training_set(job)
+        generated = time.perf_counter() - started
+        diagnoser = fit_diagnoser(
+            training,
+            self.plan.network,
+            seed=self.plan.seed_of("diagnoser", job.run, job.fold),
+            classes=self.case.classes,
+            rate=self.plan.rate or self.case.sensor_rate,
+            how=self.plan.training,
+            progress=progress,
+        )
+        per_fold = SOURCES[job.source].per_fold
+        test = list(self.roles.folds[job.fold][1]) if per_fold else self.roles.tested
+        probabilities = diagnoser.predict_proba(self.real_data()[test])
+        with write_atomically(self.path(job)) as part:
+            np.savez(part, tested=np.array(test), probabilities=probabilities)
+        return {"generate": generated, "trajectories": float(len(training))}
+
+    def _training_set(self, job: Job) -> Trajectories:
+        """The labelled set that this source trains the diagnoser on."""
+        if job.source == "dt":
+            return self.twin_data()
+        surrogate = self._fitted_surrogate(job.run)
+        twin: Surrogate | CorrectedTwin = surrogate
+        if SOURCES[job.source].residual:
+            twin = CorrectedTwin(surrogate, self.fitted_residual(job.run, job.fold))
+        # One seed for all sources of a run: the same commands and the same faults.
+        return generate(
+            twin,
+            self.case,
+            per_class=self.plan.per_class,
+            seed=self.plan.seed_of("generate", job.run, job.fold),
+            timing=self._timing_of_commands(job.fold),
+        )
+
+    def _timing_of_commands(self, fold: int) -> NDArray:
+        """Onsets (k, M) in the calibration set, NaN where there is none."""
+        commands = self.real_data()[list(self.roles.folds[fold][0])].commands
+        segments = Segments.from_commands(commands)
+        return np.where(segments.valid, segments.start, np.nan)
+
+    def _fitted_surrogate(self, run: int) -> Surrogate:
+        return Surrogate.load(self.path(Job("surrogate", run)))
+
+    def fitted_residual(self, run: int, fold: int) -> ResidualModel:
+        """The RG of one run and fold."""
+        return ResidualModel.load(self.path(Job("residual", run, fold)))
+
+    def surrogate_figures(self) -> list[dict[str, float]]:
+        """Errors of the surrogate on held-out twin trajectories, one entry per run."""
+        figures: list[dict[str, float]] = []
+        for run in range(self.plan.number_of_runs):
+            path = self.path(Job("surrogate", run))
+            if path.exists():
+                figures.append(read_about(path, "surrogate")["fitted"]["figures"])
+        return figures
+
+    def discrepancies(self) -> dict[str, Any]:
+        """z* of held-out healthy trajectories beside what the RG predicts for the same movements.
+
+        Of the first run: `observed` and `identified` (k, d_z), `predicted` (DRAWS k, d_z), `inside`
+        (k, d_z) whether z* lies in the central 90 % of its own predictions.
+        """
+        import torch
+
+        real = self.real_data()
+        surrogate = self._fitted_surrogate(0)
+        parts: dict[str, list[NDArray]] = {
+            name: [] for name in ("observed", "identified", "predicted", "inside")
+        }
+        for fold, (_, test) in enumerate(self.roles.folds):
+            held_out = real[list(test)].with_label(HEALTHY)
+            if len(held_out) == 0:
+                continue
+            residual = self.fitted_residual(0, fold)
+            context, found = infer_discrepancy(surrogate, held_out, residual.correction)
+            generator = torch.Generator().manual_seed(self.plan.seed_of("fidelity", 0, fold))
+            valid = torch.as_tensor(context.segments.valid)
+            drawn = torch.stack(
+                [residual.sample(context, generator=generator)[valid] for _ in range(DRAWS * 10)]
+            ).numpy()
+            observed = found.z[valid].numpy()
+            low, high = np.quantile(drawn, [0.05, 0.95], axis=0)
+            parts["observed"].append(observed)
+            parts["identified"].append(found.identified[valid].numpy())
+            parts["predicted"].append(drawn[:DRAWS].reshape(-1, drawn.shape[-1]))
+            parts["inside"].append((low <= observed) & (observed <= high))
+        return {name: np.concatenate(each) for name, each in parts.items() if each}

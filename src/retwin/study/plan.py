@@ -1,0 +1,140 @@
+"""What a study compares: sources, presets, roles of data, and the seeds of every stage."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from retwin.errors import InputError
+from retwin.networks import CLASSIFIERS, Network
+from retwin.training import Training
+
+__all__ = ["PRESETS", "SOURCES", "Preset", "Source", "StudyPlan"]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a diagnoser's training data come from (PROTOCOL, sources).
+
+    Attributes
+    ----------
+    title: for people.
+    real_data: "none", "healthy", "unlabelled", "labelled" or "transductive".
+    surrogate, residual: whether it needs the IBG, and the RG.
+    per_fold: whether it depends on the calibration set; a source that does not is trained once.
+    """
+
+    title: str
+    real_data: str
+    surrogate: bool
+    residual: bool
+    per_fold: bool
+
+
+SOURCES: dict[str, Source] = {
+    "dt": Source("Digital twin", "none", surrogate=False, residual=False, per_fold=False),
+    "ibg": Source("IBG alone", "timing of commands", surrogate=True, residual=False, per_fold=True),
+    "ibg_rg": Source("IBG + RG", "healthy", surrogate=True, residual=True, per_fold=True),
+}
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Classifier and training of a preset (PROTOCOL, presets)."""
+
+    classifier: str
+    runs: int
+    training: Training
+
+
+PRESETS: dict[str, Preset] = {
+    "quick": Preset("cnn", 5, Training(epochs=25, batch=64, rate=2e-3, weight_decay=1e-2)),
+    "paper": Preset("lstm", 10, Training(epochs=30, batch=32, rate=1e-3, decay="step")),
+}
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """Everything that decides the result of a study, data apart.
+
+    Parameters
+    ----------
+    sources: names from SOURCES, in the order they are reported.
+    preset: "quick" or "paper": classifier, its training and the number of runs.
+    classifier: "cnn" or "lstm"; None takes the preset's.
+    runs: None takes the preset's.
+    seed: of everything.
+    folds: of the real set, when there is one set only.
+    rate: samples per second the classifier looks at; None takes the case's true sensor rate.
+    per_class: generated trajectories per class.
+    calibrate_on: "healthy" or "all".
+
+    Raises InputError for a name that is not known or a number below one.
+    """
+
+    sources: tuple[str, ...] = ("dt", "ibg", "ibg_rg")
+    preset: str = "quick"
+    classifier: str | None = None
+    runs: int | None = None
+    seed: int = 0
+    folds: int = 3
+    rate: float | None = None
+    per_class: int = 400
+    calibrate_on: str = "healthy"
+
+    def __post_init__(self) -> None:
+        for name, value, known in (
+            ("preset", self.preset, PRESETS),
+            ("classifier", self.classifier or "cnn", CLASSIFIERS),
+            *(("sources", source, SOURCES) for source in self.sources),
+        ):
+            if value not in known:
+                raise InputError(
+                    name,
+                    expected=f"one of {', '.join(known)}",
+                    got=repr(value),
+                    remedy="check the spelling",
+                )
+        for name, number in (("runs", self.number_of_runs), ("per_class", self.per_class)):
+            if number < 1:
+                raise InputError(
+                    name, expected="at least 1", got=repr(number), remedy="give a positive number"
+                )
+        if not self.sources or len(set(self.sources)) != len(self.sources):
+            raise InputError(
+                "sources",
+                expected="at least one source, none twice",
+                got=repr(self.sources),
+                remedy=f"choose from {', '.join(SOURCES)}",
+            )
+
+    @property
+    def number_of_runs(self) -> int:
+        """Runs, the preset's unless given."""
+        return PRESETS[self.preset].runs if self.runs is None else self.runs
+
+    @property
+    def classifier_name(self) -> str:
+        """Classifier, the preset's unless given."""
+        return self.classifier or PRESETS[self.preset].classifier
+
+    @property
+    def network(self) -> Network:
+        """The classifier's config."""
+        return CLASSIFIERS[self.classifier_name]
+
+    @property
+    def training(self) -> Training:
+        """The classifier's training."""
+        return PRESETS[self.preset].training
+
+    def seed_of(self, stage: str, run: int, fold: int = 0) -> int:
+        """The seed of one stage of one run, all from one SeedSequence.
+
+        The stage's name is hashed, so that adding a source changes no other's seed.
+        """
+        key = (run, fold, zlib.crc32(stage.encode()))
+        sequence = np.random.SeedSequence(self.seed, spawn_key=key)
+        return int(sequence.generate_state(1, dtype=np.uint32)[0])

@@ -1,0 +1,260 @@
+"""From the results of all jobs to `results.json` and `arrays.npz` (schema 1)."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.statistics import (
+    METRICS,
+    bootstrap,
+    bootstrap_weights,
+    compare_runs,
+    confusion,
+    holm,
+    score,
+)
+from retwin.storage import write_atomically
+from retwin.study.jobs import Job, Work
+from retwin.study.plan import SOURCES
+from retwin.trajectories import Trajectories
+
+__all__ = ["SCHEMA", "write_results"]
+
+SCHEMA = 1
+DRAWS = 10_000
+HOLM_FAMILY = ("macro_f1", "balanced_accuracy", "auroc")
+COMPARED = (*HOLM_FAMILY, "accuracy", "healthy_recall")
+
+
+def write_results(
+    work: Work, out: Path, *, about: Mapping[str, Any], provenance: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Collect every job's result, score it, write both files; returns what `results.json` holds.
+
+    `about` holds the description of the data, `provenance` how the study was called.
+    """
+    real = work.real_data()
+    tested = sorted(work.roles.tested)
+    test = real[tested]
+    classes = work.case.classes
+    truth = np.array([classes.index(label) for label in test.labels])
+    probabilities = {name: _collect(work, name, tested) for name in work.plan.sources}
+    weights = bootstrap_weights(truth, draws=DRAWS, seed=work.plan.seed_of("bootstrap", 0))
+    draws = {
+        name: {m: bootstrap(m, truth, runs, weights, classes) for m in COMPARED}
+        for name, runs in probabilities.items()
+    }
+    sources = {
+        name: _source(work, name, truth, probabilities[name], draws[name])
+        for name in work.plan.sources
+    }
+    found = work.discrepancies() if any(SOURCES[s].residual for s in work.plan.sources) else {}
+    results = {
+        "schema": SCHEMA,
+        "case": work.case.name,
+        "title": work.case.title,
+        "preset": work.plan.preset,
+        "classifier": work.plan.classifier_name,
+        "runs": work.plan.number_of_runs,
+        "classes": list(classes),
+        "emulated": real.emulated,
+        "data": _data(work, real, test, about),
+        "sources": sources,
+        "published": {} if real.emulated else dict(work.case.published),
+        "comparisons": _comparisons(sources, draws),
+        "surrogate": _surrogate(work),
+        "fidelity": _fidelity(work, found),
+        "learning_curve": None,
+        "timing": _timing(work),
+        "provenance": {**_machine(), **provenance},
+    }
+    arrays = {f"probabilities/{name}": runs for name, runs in probabilities.items()}
+    arrays |= {f"z/{name}": found[name] for name in ("observed", "identified", "predicted") if found}
+    with write_atomically(out / "arrays.npz") as part:
+        np.savez_compressed(part, **arrays)
+    with write_atomically(out / "results.json") as part:
+        part.write_text(json.dumps(_plain(results), indent=1, allow_nan=False), encoding="utf-8")
+    return results
+
+
+def _collect(work: Work, source: str, tested: list[int]) -> NDArray:
+    """Probabilities (runs, n_test, classes) of one source, in the order of `tested`."""
+    place = {index: i for i, index in enumerate(tested)}
+    runs = work.plan.number_of_runs
+    out = np.full((runs, len(tested), len(work.case.classes)), np.nan)
+    folds = range(len(work.roles.folds)) if SOURCES[source].per_fold else (0,)
+    for run in range(runs):
+        for fold in folds:
+            with np.load(work.path(Job("diagnosis", run, fold, source))) as made:
+                out[run, [place[i] for i in made["tested"].tolist()]] = made["probabilities"]
+    return out
+
+
+def _source(
+    work: Work, name: str, truth: NDArray, probabilities: NDArray, draws: Mapping[str, NDArray]
+) -> dict[str, Any]:
+    scores = [score(truth, run, work.case.classes) for run in probabilities]
+    predicted = probabilities.argmax(axis=2)
+    kind = SOURCES[name]
+    return {
+        **{metric: [getattr(each, metric) for each in scores] for metric in METRICS},
+        "intervals": {m: np.nanquantile(d, [0.025, 0.975]).tolist() for m, d in draws.items()},
+        "confusion": sum(
+            confusion(truth, run, len(work.case.classes)) for run in predicted
+        ).tolist(),
+        "predictions": predicted.tolist(),
+        "title": kind.title,
+        "real_data": kind.real_data,
+        "fault_protocol_known": True,
+        "twin_runs": len(work.twin_data()),
+        **_costs(work, name),
+    }
+
+
+def _costs(work: Work, name: str) -> dict[str, float | None]:
+    """Seconds to update the twin, and to generate a training set; None where nothing is done."""
+    kind = SOURCES[name]
+    update = 0.0
+    if kind.surrogate:
+        update += _mean(work, "surrogate", "seconds") or 0.0
+    if kind.residual:
+        update += _mean(work, "residual", "seconds") or 0.0
+    generate = None if name == "dt" else _mean(work, "diagnosis", "generate", name)
+    return {"update_s": update, "generate_s": generate}
+
+
+def _mean(work: Work, kind: str, what: str, source: str = "") -> float | None:
+    """Mean over jobs of one of their timings; None where no job told it."""
+    told = [
+        work.timing(job).get(what)
+        for stage in work.jobs()
+        for job in stage
+        if job.kind == kind and job.source == source
+    ]
+    known = [seconds for seconds in told if seconds is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _timing(work: Work) -> dict[str, Any]:
+    jobs = [job for stage in work.jobs() for job in stage]
+    chosen = work.plan.sources
+    return {
+        "generate_s": {name: _costs(work, name)["generate_s"] for name in chosen},
+        "generated": work.plan.per_class * len(work.case.classes),
+        "surrogate_fit_s": _mean(work, "surrogate", "seconds"),
+        "residual_fit_s": _mean(work, "residual", "seconds"),
+        "diagnosis_s": {name: _mean(work, "diagnosis", "seconds", name) for name in chosen},
+        "total_s": float(sum(work.timing(job).get("seconds", 0.0) for job in jobs)),
+    }
+
+
+def _comparisons(
+    sources: Mapping[str, Mapping[str, Any]], draws: Mapping[str, Mapping[str, NDArray]]
+) -> list[dict[str, Any]]:
+    """Every pair of sources, the later one against the earlier one."""
+    out = []
+    for b, a in combinations(sources, 2):
+        rows = []
+        for metric in COMPARED:
+            gap = draws[a][metric] - draws[b][metric]
+            rows.append(
+                {
+                    "a": a,
+                    "b": b,
+                    "metric": metric,
+                    **compare_runs(sources[a][metric], sources[b][metric]),
+                    "p_holm": None,
+                    "bootstrap_ci95": np.nanquantile(gap, [0.025, 0.975]).tolist(),
+                }
+            )
+        family = [row for row in rows if row["metric"] in HOLM_FAMILY and row["p"] is not None]
+        for row, adjusted in zip(family, holm([row["p"] for row in family]), strict=True):
+            row["p_holm"] = adjusted
+        out += rows
+    return out
+
+
+def _data(
+    work: Work, real: Trajectories, test: Trajectories, about: Mapping[str, Any]
+) -> dict[str, Any]:
+    used = sorted({i for calibration, _ in work.roles.folds for i in calibration})
+    return {
+        "twin": about["twin"],
+        "calibration": {**about["calibration"], "n": len(used), "used": real.ids[used].tolist()},
+        "test": {
+            **about["test"],
+            "n": len(test),
+            "ids": test.ids.tolist(),
+            "labels": test.labels.tolist(),
+        },
+        "protocol": about["protocol"],
+    }
+
+
+def _surrogate(work: Work) -> dict[str, Any]:
+    figures = work.surrogate_figures()
+    outputs = work.case.outputs
+    if not figures:
+        return {}
+    return {
+        "rmse": {n: float(np.mean([f[f"rmse_{n}"] for f in figures])) for n in outputs.names},
+        "nrmse": {n: float(np.mean([f[f"nrmse_{n}"] for f in figures])) for n in outputs.names},
+        "unit": outputs.units[0],
+    }
+
+
+def _fidelity(work: Work, found: Mapping[str, NDArray]) -> dict[str, Any]:
+    """How the RG's draws compare with z* of trajectories it has not seen."""
+    from scipy.stats import ks_2samp
+
+    if not found:
+        return {}
+    latent = work.case.correction.latent(work.case.outputs)
+    tests, coverage = [], {}
+    for k, name in enumerate(latent.names):
+        known = found["identified"][:, k]
+        if not known.any():
+            continue
+        test = ks_2samp(found["observed"][known, k], found["predicted"][:, k])
+        tests.append({"name": name, "statistic": float(test.statistic), "p": float(test.pvalue)})
+        coverage[name] = float(found["inside"][known, k].mean())
+    return {
+        "latent": list(latent.names),
+        "units": list(latent.units),
+        "held_out": len(found["observed"]),
+        "ks": tests,
+        "coverage90": coverage,
+    }
+
+
+def _machine() -> dict[str, str]:
+    return {
+        "retwin": version("retwin"),
+        "python": platform.python_version(),
+        "torch": version("torch"),
+        "numpy": version("numpy"),
+        "machine": platform.platform(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no NaN: undefined figures become null."""
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
