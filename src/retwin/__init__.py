@@ -56,7 +56,7 @@ _HOME = {
     "write_report": "report",
 }
 
-__all__ = ["__version__", "cases", *sorted(_HOME)]  # noqa: PLE0604
+__all__ = ["__version__", "cases", *sorted(_HOME)]
 
 
 def __getattr__(name: str) -> Any:

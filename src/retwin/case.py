@@ -51,6 +51,7 @@ class Case:
     sensor_rate: samples per second that the measuring chain really takes.
     recover: fills in commands that a file does not hold; None when files hold them.
     published: the figures of a paper to show beside ours: source to metric to text.
+
     """
 
     name: str
@@ -85,7 +86,7 @@ class Case:
         return self.twin.rate
 
     def with_random_onset(self) -> Case:
-        """The same case with every fault that has an onset drawing it over the first four fifths."""
+        """The same case with stuck actuators that freeze anywhere in the first four fifths."""
         onset = (0, 4 * self.sampler.steps // 5)
         faults = {
             name: replace(fault, onset=onset) if isinstance(fault, Stuck) else fault

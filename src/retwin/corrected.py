@@ -34,6 +34,7 @@ class CorrectedTwin:
     surrogate: the IBG.
     residual: the RG; it holds the correction g.
     case: name of the case it was fitted for, for the command line.
+
     """
 
     surrogate: Surrogate
@@ -146,6 +147,7 @@ def generate(
     Raises
     ------
     InputError: `per_class` below 1.
+
     """
     if per_class < 1:
         raise InputError(

@@ -62,6 +62,7 @@ def fetch(
     InputError: an unknown name without `url` and `sha256`, or an address that is not http(s).
     OSError: no network, no such file there, or a folder that cannot be written.
     RuntimeError: what came has another SHA-256; nothing of it is kept.
+
     """
     known = _known(name, url, sha256)
     if not known.url.startswith(("http://", "https://")):

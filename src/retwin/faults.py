@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 from retwin.errors import InputError
 from retwin.segments import Segments
 
-__all__ = ["Fault", "SteadyStateError", "Stuck", "draw_faults", "faulty_commands", "frozen_response"]
+__all__ = [
+    "Fault",
+    "SteadyStateError",
+    "Stuck",
+    "draw_faults",
+    "faulty_commands",
+    "frozen_response",
+]
 
 
 @runtime_checkable
@@ -50,6 +57,7 @@ class Stuck:
     onset: 0-based sample from which the response stays as it is; a pair (low, high) is drawn
         uniformly. The published protocol freezes at sample 49.
     label: class name.
+
     """
 
     actuator: int
@@ -90,6 +98,7 @@ class SteadyStateError:
     size: least and greatest size of a drawn bias, in units of the command; its sign is random.
     bias: one per movement; empty leaves it open.
     label: class name.
+
     """
 
     actuator: int
@@ -97,9 +106,7 @@ class SteadyStateError:
     bias: tuple[float, ...] = ()
     label: str = "Steady_state_error"
 
-    def drawn(
-        self, rng: np.random.Generator, *, steps: int, movements: int
-    ) -> SteadyStateError:
+    def drawn(self, rng: np.random.Generator, *, steps: int, movements: int) -> SteadyStateError:
         """The same fault with one bias per movement."""
         if self.bias:
             return self

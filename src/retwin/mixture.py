@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.distributions import Categorical, Distribution, MixtureSameFamily, MultivariateNormal, constraints
+from torch.distributions import (
+    Categorical,
+    Distribution,
+    MixtureSameFamily,
+    MultivariateNormal,
+    constraints,
+)
 
 __all__ = ["Blocks", "GaussianMixture", "MixtureHead"]
 
@@ -24,9 +31,11 @@ class GaussianMixture(MixtureSameFamily):
     logits: (..., K), unnormalised log weights π.
     mean: (..., K, D), μ.
     factor: (..., K, D, D), Cholesky factor of Σ.
+
     """
 
     def __init__(self, logits: Tensor, mean: Tensor, factor: Tensor) -> None:
+        self.means = mean
         self.factor = factor
         super().__init__(
             Categorical(logits=logits, validate_args=False),
@@ -43,9 +52,9 @@ class GaussianMixture(MixtureSameFamily):
         steps = weights.cumsum(dim=-1)
         chosen = (uniform[..., None] >= steps).sum(dim=-1).clamp_max(weights.shape[-1] - 1)
         size = normal.shape[-1]
-        mean = self.component_distribution.loc.gather(
-            -2, chosen[..., None, None].expand(*chosen.shape, 1, size)
-        )[..., 0, :]
+        mean = self.means.gather(-2, chosen[..., None, None].expand(*chosen.shape, 1, size))[
+            ..., 0, :
+        ]
         factor = self.factor.gather(
             -3, chosen[..., None, None, None].expand(*chosen.shape, 1, size, size)
         )[..., 0, :, :]
@@ -54,14 +63,14 @@ class GaussianMixture(MixtureSameFamily):
     def marginal_cdf(self, value: Tensor) -> Tensor:
         """P(z_d <= value_d) of each component of z on its own, (..., D): the PIT of a value."""
         deviation = self.factor.square().sum(dim=-1).sqrt()
-        distance = (value[..., None, :] - self.component_distribution.loc) / deviation
+        distance = (value[..., None, :] - self.means) / deviation
         return (self.mixture_distribution.probs[..., None] * torch.special.ndtr(distance)).sum(-2)
 
 
 class Blocks(Distribution):
     """Independent distributions side by side: the distribution of their joined values (..., D)."""
 
-    arg_constraints: dict[str, constraints.Constraint] = {}
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     support = constraints.real_vector
 
     def __init__(self, blocks: Sequence[GaussianMixture]) -> None:

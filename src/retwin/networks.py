@@ -143,9 +143,7 @@ class _Convolutional(nn.Module):
 
     def forward(self, values: Tensor) -> Tensor:
         state = self.enter(values.transpose(1, 2))
-        for reach, convolution, mix in zip(
-            self.reach, self.convolutions, self.mixers, strict=True
-        ):
+        for reach, convolution, mix in zip(self.reach, self.convolutions, self.mixers, strict=True):
             past = functional.pad(state, (reach, 0), mode="replicate")
             state = state + mix(functional.silu(convolution(past)))
         return self.leave(functional.silu(state)).transpose(1, 2)
@@ -212,7 +210,9 @@ class _Pooled(nn.Module):
         return self.readout(self.dropout(pooled))
 
 
-_CONFIGS = {config.__name__: config for config in (MLP, LSTM, TCN, LSTMClassifier, CNN)}
+_CONFIGS: dict[str, Any] = {
+    config.__name__: config for config in (MLP, LSTM, TCN, LSTMClassifier, CNN)
+}
 
 
 SURROGATES: dict[str, Network] = {"mlp": MLP(), "lstm": LSTM(), "tcn": TCN()}

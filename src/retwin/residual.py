@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -20,7 +19,7 @@ from retwin.models import read_model, write_model
 from retwin.networks import Standardise
 from retwin.segments import Segments
 from retwin.surrogate import Surrogate
-from retwin.training import Fit, Training, isolated, train
+from retwin.training import Fit, Loss, Training, isolated, train
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins.protocol import HEALTHY, Progress
 
@@ -38,6 +37,7 @@ class Mixture:
     dropout: of the encoder.
     smoothness, boundedness: λ_s and λ_b of Eq. 10, on z in standard units.
     training: epochs, rate, patience.
+
     """
 
     components: int = 3
@@ -45,7 +45,7 @@ class Mixture:
     dropout: float = 0.1
     smoothness: float = 0.01
     boundedness: float = 1.0
-    training: Training = Training(
+    training: Training = Training(  # noqa: RUF009 - frozen
         epochs=300, batch=64, rate=3e-3, decay="step", patience=40, weight_decay=1e-2
     )
 
@@ -89,6 +89,7 @@ class ResidualModel(nn.Module):
         self.heads = nn.ModuleList(
             MixtureHead(width, size, mixture.components) for _, size in correction.heads(outputs)
         )
+        self.sizes = [size for _, size in correction.heads(outputs)]
         for name in ("bounds", "shift", "scale"):
             self.register_buffer(name, torch.ones(len(self.latent)))
 
@@ -113,13 +114,14 @@ class ResidualModel(nn.Module):
     def distribution(self, features: Tensor) -> Blocks:
         """q_ψ for described movements (..., F), see `describe`."""
         encoded = self.encoder(self.before(features))
-        sizes = [head.width for head in self.heads]
-        parts = zip(self.heads, self.shift.split(sizes), self.scale.split(sizes), strict=True)
+        parts = zip(
+            self.heads, self.shift.split(self.sizes), self.scale.split(self.sizes), strict=True
+        )
         return Blocks([head(encoded, shift, scale) for head, shift, scale in parts])
 
     @torch.no_grad()
     def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:
-        """Draws of z (n, M, d_z), clipped at the bounds b: regularising z̄ does not bound samples."""
+        """Draws of z (n, M, d_z), clipped at b: regularising z̄ does not bound samples."""
         drawn = self(context).sample(generator=generator)
         return drawn.clamp(-self.bounds, self.bounds)
 
@@ -212,7 +214,7 @@ def fit_residual(
     surrogate: Surrogate,
     calibration: Trajectories,
     correction: Correction = DelayOffset(),  # noqa: B008 - a frozen config
-    mixture: Mixture = Mixture(),  # noqa: B008 - a frozen config
+    mixture: Mixture = Mixture(),
     *,
     seed: int,
     calibrate_on: str = "healthy",
@@ -236,6 +238,7 @@ def fit_residual(
     Raises
     ------
     InputError: no trajectory to calibrate on, no movement in any, an unknown `calibrate_on`.
+
     """
     keep = _chosen(calibration, calibrate_on)
     used = calibration[keep]
@@ -305,8 +308,7 @@ def _chosen(calibration: Trajectories, calibrate_on: str) -> NDArray:
 
 def _known(model: ResidualModel, found: Discrepancy) -> Tensor:
     """(n, M, heads): whether the outputs tell that block of z."""
-    sizes = [head.width for head in model.heads]
-    parts = found.identified.split(sizes, dim=-1)
+    parts = found.identified.split(model.sizes, dim=-1)
     return torch.stack([part.all(dim=-1) for part in parts], dim=-1)
 
 
@@ -322,9 +324,9 @@ def _prepare(
     """Standardise, bound and start the model from the data it is trained on."""
     model.before.fit(features[valid])
     begin = 0
-    for head in model.heads:
-        part = slice(begin, begin + head.width)
-        begin += head.width
+    for head, size in zip(model.heads, model.sizes, strict=True):
+        part = slice(begin, begin + size)
+        begin += size
         known = found.identified[..., part].all(dim=-1) & valid
         values = found.z[..., part][known if known.any() else valid].float()
         # Robust: a few missed movements must not set the unit in which the others are told.
@@ -334,7 +336,7 @@ def _prepare(
         scale = torch.maximum(scale, 0.1 * spread).clamp_min(1e-9)
         model.shift[part], model.scale[part] = shift, scale
         model.bounds[part] = 1.25 * values.abs().amax(dim=0).clamp_min(1e-9)
-        head.initialise(((values - shift) / scale).double().numpy(), seed)
+        cast(MixtureHead, head).initialise(((values - shift) / scale).double().numpy(), seed)
     if bounds is not None:
         model.bounds.copy_(torch.as_tensor(bounds, dtype=torch.float32))
 
@@ -348,7 +350,7 @@ def _validation_split(used: Trajectories, seed: int) -> tuple[Tensor, Tensor | N
     return order[held:], order[:held]
 
 
-def _objective(mixture: Mixture) -> Callable[[nn.Module, tuple[Tensor, ...]], Tensor]:
+def _objective(mixture: Mixture) -> Loss:
     """L_RG of Eq. 10, averaged over movements."""
 
     def loss(model: Any, batch: tuple[Tensor, ...]) -> Tensor:

@@ -27,6 +27,7 @@ class Segments:
     stop: (n, M), end of the steady part: the next onset, or the end of the trajectory.
     valid: (n, M) bool; where False, start = settle = stop = steps and nothing moves.
     steps: samples per trajectory.
+
     """
 
     start: NDArray
@@ -100,7 +101,7 @@ class Segments:
         """
         change = np.abs(np.diff(commands.astype(np.float64), axis=1))
         extent = np.ptp(commands, axis=(0, 1)).astype(np.float64)
-        moving = (change > tolerance * np.where(extent > 0, extent, 1)).any(axis=2)
+        moving = np.any(change > tolerance * np.where(extent > 0, extent, 1), axis=2)
         return cls._from_moving(moving, change.sum(axis=2))
 
     @classmethod

@@ -57,6 +57,7 @@ class Scores:
     ece: expected calibration error of the top label, 10 bins of equal mass; its noise floor is
         about 0.04 at 90 trajectories and 0.06 at 36.
     n: trajectories.
+
     """
 
     accuracy: float

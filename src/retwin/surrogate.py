@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,8 +23,8 @@ from retwin.twins.protocol import Progress, checked_commands, fault_labels
 
 __all__ = ["Surrogate", "fit_surrogate"]
 
-# Larger chunks leave the processor's cache (measured: 16–64 trajectories of 1000 samples).
-CHUNK = 32
+# Larger chunks leave the processor's cache (measured with benchmarks/generation.py).
+CHUNK = 8
 
 
 class Surrogate(nn.Module):
@@ -34,6 +35,7 @@ class Surrogate(nn.Module):
     network: the config its module was built from.
     inputs, outputs: channels of commands and outputs.
     rate: samples per second it was trained at.
+
     """
 
     def __init__(
@@ -55,14 +57,26 @@ class Surrogate(nn.Module):
 
     @torch.no_grad()
     def predict(self, commands: NDArray, *, progress: Progress | None = None) -> NDArray:
-        """Outputs (n, T, d_y), float32, for commands (n, T, d_u); in chunks that fit the cache."""
-        out = np.empty((*commands.shape[:2], len(self.outputs)), dtype=np.float32)
-        for begin in range(0, len(commands), CHUNK):
+        """Outputs (n, T, d_y), float32, for commands (n, T, d_u), without gradient.
+
+        In chunks that fit the cache; a network without memory is asked once for a held command.
+        """
+        values = np.ascontiguousarray(commands, dtype=np.float32)
+        rows = self._distinct if isinstance(self.config, MLP) else self.forward
+        out = np.empty((*values.shape[:2], len(self.outputs)), dtype=np.float32)
+        for begin in range(0, len(values), CHUNK):
             part = slice(begin, begin + CHUNK)
-            out[part] = self(torch.tensor(commands[part], dtype=torch.float32)).numpy()
+            out[part] = rows(torch.tensor(values[part])).numpy()
             if progress is not None:
-                progress(min(1.0, (begin + CHUNK) / len(commands)))
+                progress(min(1.0, (begin + CHUNK) / len(values)))
         return out
+
+    def _distinct(self, commands: Tensor) -> Tensor:
+        """The same as `forward`, computed only where the command differs from the sample before."""
+        fresh = torch.ones(commands.shape[:2], dtype=torch.bool)
+        fresh[:, 1:] = (commands[:, 1:] != commands[:, :-1]).any(dim=-1)
+        place = fresh.flatten().cumsum(0) - 1
+        return self(commands[fresh])[place].view(*commands.shape[:2], -1)
 
     def simulate(
         self,
@@ -75,18 +89,18 @@ class Surrogate(nn.Module):
         """What the surrogate says, see `Twin.simulate`; frozen responses are held commands."""
         commands = checked_commands(commands, self.inputs).astype(np.float32, copy=False)
         nominal = self.predict(commands)
-        observed, labels = nominal, None
+        observed = nominal
+        drawn: Sequence[Fault | None] = [None] * len(commands)
         if faults is not None:
             segments = Segments.from_commands(commands)
             drawn = draw_faults(faults, segments, seed)
             faulty = frozen_response(faulty_commands(commands, drawn, segments), drawn)
             observed = self.predict(faulty, progress=progress)
-            labels = fault_labels(drawn)
         return Trajectories(
             commands=commands,
             nominal=nominal,
             observed=observed,
-            labels=labels,
+            labels=fault_labels(drawn),
             rate=self.rate,
             inputs=self.inputs,
             outputs=self.outputs,
@@ -151,6 +165,7 @@ def fit_surrogate(
     Raises
     ------
     InputError: fewer than ten trajectories, or a set without commands.
+
     """
     if len(twin) < 10 or twin.commands.shape[2] == 0:
         raise InputError(
@@ -164,14 +179,12 @@ def fit_surrogate(
     test, valid, train_part = order[:tenth], order[tenth : 2 * tenth], order[2 * tenth :]
     with isolated(seed):
         surrogate = Surrogate(network, inputs=twin.inputs, outputs=twin.outputs, rate=twin.rate)
-    rows = (
-        _samples if isinstance(network, MLP) else _windows
-    )
+    rows = _samples if isinstance(network, MLP) else _windows
     fitted = rows(twin, train_part, seed)
     surrogate.before.fit(fitted[0])
     surrogate.after.fit(fitted[1])
 
-    def loss(module: nn.Module, batch: tuple[Tensor, ...]) -> Tensor:
+    def loss(module: Any, batch: tuple[Tensor, ...]) -> Tensor:
         commands, nominal = batch
         error = module.network(module.before(commands)) - module.after(nominal)
         return error.square().mean()

@@ -12,11 +12,17 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.utils.data import BatchSampler, DataLoader, RandomSampler, SequentialSampler, TensorDataset
+from torch.utils.data import (
+    BatchSampler,
+    DataLoader,
+    RandomSampler,
+    SequentialSampler,
+    TensorDataset,
+)
 
 __all__ = ["Fit", "Training", "isolated", "train"]
 
-Loss = Callable[[nn.Module, tuple[Tensor, ...]], Tensor]
+Loss = Callable[[Any, tuple[Tensor, ...]], Tensor]
 """Network and batch in, mean loss out."""
 
 
@@ -34,6 +40,7 @@ class Training:
     patience: epochs without a better validation loss before it stops; 0 never stops early.
     weight_decay: of AdamW.
     clip: largest norm of a gradient.
+
     """
 
     epochs: int = 100
@@ -55,6 +62,7 @@ class Fit:
     history: losses per epoch, "train" and "validation".
     best_epoch: the epoch whose weights were kept.
     reason: why training stopped.
+
     """
 
     figures: dict[str, float]
@@ -96,8 +104,10 @@ def train(
     """
     from lightning.pytorch import Trainer
 
-    steps = max(1, math.ceil(len(training_set[0]) / how.batch))
-    module, keeper = _lightning_parts(network, loss, how, steps, progress)
+    from retwin.training_loop import Loop
+
+    steps = math.ceil(len(training_set[0]) / how.batch)
+    loop = Loop(network, loss, how, steps=steps, progress=progress)
     generator = torch.Generator().manual_seed(seed)
     with isolated(seed), _quiet():
         trainer = Trainer(
@@ -110,106 +120,17 @@ def train(
             enable_progress_bar=False,
             num_sanity_val_steps=0,
             gradient_clip_val=how.clip,
-            callbacks=[keeper],
         )
         trainer.fit(
-            module,
+            loop,
             _loader(training_set, how.batch, generator),
             None if validation_set is None else _loader(validation_set, 4 * how.batch, None),
         )
     network.cpu()
-    if keeper.weights is not None:
-        network.load_state_dict(keeper.weights)
+    if loop.weights is not None:
+        network.load_state_dict(loop.weights)
     network.eval()
-    epochs = len(keeper.history["train"])
-    best = keeper.best_epoch if keeper.weights is not None else epochs
-    reason = (
-        f"no better validation loss for {how.patience} epochs"
-        if keeper.stopped
-        else f"all {epochs} epochs done"
-    )
-    return Fit({}, keeper.history, best, reason)
-
-
-def _lightning_parts(
-    network: nn.Module,
-    loss: Loss,
-    how: Training,
-    steps: int,
-    progress: Callable[[float], None] | None,
-) -> tuple:
-    """The lightning module and callback, defined here so that importing retwin stays quick."""
-    from lightning.pytorch import Callback, LightningModule, Trainer
-
-    class Module(LightningModule):
-        def __init__(self) -> None:
-            super().__init__()
-            self.network = network
-            self.train_losses: list[Tensor] = []
-            self.valid_losses: list[tuple[Tensor, int]] = []
-
-        def training_step(self, batch: list[Tensor], _: int) -> Tensor:
-            value = loss(self.network, tuple(batch))
-            if not torch.isfinite(value):
-                raise RuntimeError(
-                    f"training: the loss is {value.item()} in epoch {self.current_epoch + 1}; "
-                    "lower the learning rate or check the data's scale"
-                )
-            self.train_losses.append(value.detach())
-            return value
-
-        def validation_step(self, batch: list[Tensor], _: int) -> None:
-            self.valid_losses.append((loss(self.network, tuple(batch)).detach(), len(batch[0])))
-
-        def configure_optimizers(self) -> dict:
-            optimiser = torch.optim.AdamW(
-                self.network.parameters(), lr=how.rate, weight_decay=how.weight_decay
-            )
-            total = steps * how.epochs
-            if how.decay == "cosine":
-                schedule: torch.optim.lr_scheduler.LRScheduler = (
-                    torch.optim.lr_scheduler.OneCycleLR(
-                        optimiser, how.rate, total, pct_start=0.1, final_div_factor=1000
-                    )
-                )
-            else:
-                schedule = torch.optim.lr_scheduler.MultiStepLR(
-                    optimiser, [math.ceil(total * 2 / 3)], gamma=0.1
-                )
-            return {
-                "optimizer": optimiser,
-                "lr_scheduler": {"scheduler": schedule, "interval": "step"},
-            }
-
-    class Keeper(Callback):
-        """Keeps history and the best weights, stops early, tells progress."""
-
-        def __init__(self) -> None:
-            self.history: dict[str, list[float]] = {"train": [], "validation": []}
-            self.weights: dict[str, Tensor] | None = None
-            self.best = math.inf
-            self.best_epoch = 0
-            self.stopped = False
-
-        def on_validation_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
-            total = sum(value.item() * count for value, count in module.valid_losses)
-            value = total / sum(count for _, count in module.valid_losses)
-            module.valid_losses.clear()
-            self.history["validation"].append(value)
-            epoch = len(self.history["validation"])
-            if value < self.best:
-                self.best, self.best_epoch = value, epoch
-                self.weights = {k: v.detach().cpu().clone() for k, v in network.state_dict().items()}
-            elif how.patience and epoch - self.best_epoch >= how.patience:
-                self.stopped = trainer.should_stop = True
-
-        def on_train_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
-            self.history["train"].append(torch.stack(module.train_losses).mean().item())
-            module.train_losses.clear()
-            if progress is not None:
-                progress(1.0 if self.stopped else (trainer.current_epoch + 1) / how.epochs)
-
-    return Module(), Keeper()
+    return loop.result()
 
 
 def _loader(
@@ -218,11 +139,11 @@ def _loader(
     """Whole batches by one index each: example-wise collation would cost more than the network."""
     dataset = TensorDataset(*tensors)
     order = (
-        SequentialSampler(dataset) if generator is None else RandomSampler(dataset, generator=generator)
+        SequentialSampler(dataset)
+        if generator is None
+        else RandomSampler(dataset, generator=generator)
     )
-    return DataLoader(
-        dataset, sampler=BatchSampler(order, batch, drop_last=False), batch_size=None
-    )
+    return DataLoader(dataset, sampler=BatchSampler(order, batch, drop_last=False), batch_size=None)
 
 
 @contextmanager

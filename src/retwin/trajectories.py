@@ -79,6 +79,7 @@ class Trajectories:
     ------
     InputError: shapes that disagree, NaN or infinite commands or nominal outputs, infinite
         observations, a rate that is not positive, ids that repeat.
+
     """
 
     commands: NDArray

@@ -68,6 +68,7 @@ class ArmSampler:
     period: samples from one onset to the next.
     amplitude: greatest angle of a target from straight, in degrees, per motor.
     speed: greatest speed of a motor, in degrees per sample.
+
     """
 
     movements: int = 5
@@ -113,7 +114,7 @@ class ArmSampler:
 def recover(trajectories: Trajectories, progress: Progress | None = None) -> Trajectories:
     """Commands from the desired path (`nominal`); says how many movements stay ambiguous."""
     found = recover_commands(trajectories.nominal, arm=ARM, progress=progress)
-    unsure = found.ambiguous.any(axis=1)
+    unsure = np.any(found.ambiguous, axis=1)
     if unsure.any():
         warnings.warn(
             f"commands of {unsure.sum()} of {len(unsure)} trajectories are not certain: "

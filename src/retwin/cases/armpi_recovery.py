@@ -15,7 +15,7 @@ seen in the path: it leaves a planar arm with signed radius r and height h.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,6 +59,7 @@ class Recovery:
     rms: (n,) RMS distance in m of the forward kinematics of `commands` from the path.
     ambiguous: (n, M) True where other commands on the grid explain the movement as well, where it
         is cut off by the end of the path, or where nothing found explains it to 0.05 mm.
+
     """
 
     commands: NDArray
@@ -95,6 +96,7 @@ def ramp_commands(
     onsets: (n, M) fractional sample at which a movement starts; NaN for a movement left out.
     closed: one bool or (n,): a ramp of L samples is `linspace(old, new, L)`, both ends counted,
         instead of lasting L intervals.
+
     """
     start, targets = np.asarray(start, float), np.asarray(targets, float)
     spans = np.asarray(ramps, float) - np.reshape(np.asarray(closed, float), (-1, 1, 1))
@@ -125,6 +127,7 @@ def recover_commands(
     Raises
     ------
     ValueError: `path` is not (n, T, 3) with T >= 2 or not finite, `arm` has not three links.
+
     """
     path = np.asarray(path)
     if path.ndim != 3 or path.shape[2] != 3 or path.shape[1] < 2:

@@ -36,7 +36,7 @@ app.command("generate", epilog="Example: `retwin generate model --per-class 400 
 app.add_typer(models.diagnose, name="diagnose")
 app.command(
     "study",
-    epilog="Example: `retwin study armpi --twin-data sim.mat --real real.mat --folds 3 --out study`",
+    epilog="Example: `retwin study armpi --twin-data sim.mat --real real.mat --out study`",
 )(studies.study)
 app.command("report", epilog="Example: `retwin report study`")(studies.report)
 

@@ -49,7 +49,8 @@ def fit(
         )
     rt.CorrectedTwin(ibg, rg, case=case).save(out)
     table = Table("output", "RMSE", "NRMSE", title="Surrogate on held-out twin trajectories")
-    assert ibg.fitted is not None and rg.fitted is not None
+    assert ibg.fitted is not None
+    assert rg.fitted is not None
     for name, unit in zip(ibg.outputs.names, ibg.outputs.units, strict=True):
         figures = ibg.fitted.figures
         table.add_row(
@@ -119,8 +120,7 @@ def diagnose_fit(
     assert diagnoser.fitted is not None
     console = Console()
     console.print(
-        f"Accuracy on the held-out fifth of {file.name}: "
-        f"{diagnoser.fitted.figures['accuracy']:.3f}"
+        f"Accuracy on the held-out fifth of {file.name}: {diagnoser.fitted.figures['accuracy']:.3f}"
     )
     console.print(f"Saved {out}", soft_wrap=True)
 

@@ -92,7 +92,7 @@ def demo(
         if real is None or not (arm / "sim.mat").exists():
             raise InputError(
                 "RETWIN_DATA",
-                expected="a folder with armpi/sim.mat and armpi/real_a.mat (or my_dataset_test.mat)",
+                expected="a folder with armpi/sim.mat and armpi/real_a.mat or my_dataset_test.mat",
                 got=folder,
                 remedy="set it to the folder of the public data, or unset it",
             )

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-__all__ = ["FAILED", "BAD_INPUT", "INTERRUPTED", "bar", "complain", "show_warnings"]
+__all__ = ["BAD_INPUT", "FAILED", "INTERRUPTED", "bar", "complain", "show_warnings"]
 
 FAILED = 1
 BAD_INPUT = 2

@@ -9,7 +9,15 @@ from retwin.corrections.delay_offset import DelayOffset
 from retwin.corrections.protocol import Context, Correction, Discrepancy, Head
 from retwin.errors import InputError
 
-__all__ = ["Context", "Correction", "DelayOffset", "Discrepancy", "Head", "from_config", "to_config"]
+__all__ = [
+    "Context",
+    "Correction",
+    "DelayOffset",
+    "Discrepancy",
+    "Head",
+    "from_config",
+    "to_config",
+]
 
 _OPERATORS: dict[str, type] = {"DelayOffset": DelayOffset}
 

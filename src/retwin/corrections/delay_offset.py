@@ -9,7 +9,6 @@ whatever z is.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -32,11 +31,16 @@ class DelayOffset:
     ----------
     delay_range: least and greatest delay that `infer` looks for, in samples.
     known_delay: standard deviation in samples above which a delay counts as not identified.
+
     """
 
     delay_range: tuple[float, float] = (-5.0, 30.0)
     known_delay: float = 2.0
-    resolution: ClassVar[str] = "segment"
+
+    @property
+    def resolution(self) -> str:
+        """One z per movement."""
+        return "segment"
 
     def latent(self, outputs: Channels) -> Channels:
         """`delay` in samples, then one offset per output in its unit."""
@@ -65,9 +69,7 @@ class DelayOffset:
         that fit badly lose their weight (Tukey), so glitches do not move z.
         """
         parts = [
-            self._infer(
-                context[slice(i, i + CHUNK)], observed[i : i + CHUNK], mask[i : i + CHUNK]
-            )
+            self._infer(context[slice(i, i + CHUNK)], observed[i : i + CHUNK], mask[i : i + CHUNK])
             for i in range(0, len(context), CHUNK)
         ]
         return Discrepancy(
@@ -84,7 +86,9 @@ class DelayOffset:
         if most == 0:
             empty = torch.zeros(n, 0, 1 + width, 1 + width, dtype=torch.float64)
             nothing = torch.zeros(n, 0, 1 + width, dtype=torch.bool)
-            return Discrepancy(z, empty, nothing, (observed - path).norm(dim=-1).median(dim=1).values)
+            return Discrepancy(
+                z, empty, nothing, (observed - path).norm(dim=-1).median(dim=1).values
+            )
         z[..., 1:] = _settled_offset(context.segments, observed - path, seen, self.delay_range[1])
         model = _Model(context.segments, path, observed, seen)
         z[..., 0] = self._best_delay(model, z)
@@ -159,13 +163,16 @@ class _Knots:
 
     @classmethod
     def of(cls, segments: Segments, delay: Tensor) -> _Knots:
-        kind = {"dtype": delay.dtype}
         source = torch.stack(
-            [torch.as_tensor(segments.start, **kind), torch.as_tensor(segments.settle, **kind)], -1
+            [
+                torch.as_tensor(segments.start, dtype=delay.dtype),
+                torch.as_tensor(segments.settle, dtype=delay.dtype),
+            ],
+            -1,
         ).flatten(1)
         # A movement cannot begin before the last one has ended, however the delays differ.
         target = (source + delay.repeat_interleave(2, dim=1)).cummax(dim=1).values
-        time = torch.arange(segments.steps, **kind)
+        time = torch.arange(segments.steps, dtype=delay.dtype)
         right = torch.searchsorted(target, time.expand(len(target), -1).contiguous(), right=True)
         last = target.shape[1] - 1
         begin = target.gather(1, (right - 1).clamp(0, last))
@@ -207,9 +214,7 @@ def _read(path: Tensor, when: Tensor) -> Tensor:
 class _Model:
     """The corrected path as a function of z, its residual and its derivative."""
 
-    def __init__(
-        self, segments: Segments, path: Tensor, observed: Tensor, seen: Tensor
-    ) -> None:
+    def __init__(self, segments: Segments, path: Tensor, observed: Tensor, seen: Tensor) -> None:
         self.segments = segments
         self.path = path
         self.observed = observed
@@ -233,7 +238,7 @@ class _Model:
         return (self.seen * (1 - (1 - size.clamp_max(1).square()) ** 3)).sum(dim=1)
 
     def linearised(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual (n, T, d_y) and the derivative (n, T, d_y, M (1 + d_y)) of the corrected path."""
+        """Residual (n, T, d_y) and the corrected path's derivative (n, T, d_y, M (1 + d_y))."""
         knots = _Knots.of(self.segments, z[..., 0])
         n, most, size = z.shape
         values = knots.spread(z[..., 1:])
@@ -299,9 +304,7 @@ def _correlation_time(residual: Tensor, weight: Tensor) -> Tensor:
     return (1 + alike) / (1 - alike)
 
 
-def _settled_offset(
-    segments: Segments, residual: Tensor, seen: Tensor, margin: float
-) -> Tensor:
+def _settled_offset(segments: Segments, residual: Tensor, seen: Tensor, margin: float) -> Tensor:
     """Median residual (n, M, d_y) of each steady part, late movements left out if any remain."""
     time = torch.arange(residual.shape[1], dtype=torch.float64)
     settle, stop = torch.as_tensor(segments.settle), torch.as_tensor(segments.stop)

@@ -1,8 +1,7 @@
-"""What every correction operator g offers: apply z to a nominal path, infer z from a measured one."""
+"""What every correction operator g offers: apply z to a path, infer z from a measured one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -13,7 +12,20 @@ from torch import Tensor
 from retwin.segments import Segments
 from retwin.trajectories import Channels
 
-__all__ = ["Context", "Correction", "Discrepancy", "Head"]
+__all__ = ["Context", "Correction", "DifferentiableTwin", "Discrepancy", "Head"]
+
+
+class DifferentiableTwin(Protocol):
+    """What a correction needs of a surrogate: a differentiable call, and a fast one without."""
+
+    def __call__(self, commands: Tensor) -> Tensor:
+        """Outputs (n, T, d_y) for commands (n, T, d_u), differentiable."""
+        ...
+
+    def predict(self, commands: NDArray) -> NDArray:
+        """The same without gradient."""
+        ...
+
 
 Head = tuple[str, int]
 """A block of z that gets a mixture of its own in the residual model: name and width."""
@@ -32,9 +44,10 @@ class Context:
     path: (n, T, d_y), the surrogate's output for the faulty commands: what is corrected.
     segments: movements of the clean commands or of the nominal path.
     rate: samples per second.
+
     """
 
-    surrogate: Callable[[Tensor], Tensor]
+    surrogate: DifferentiableTwin
     commands: Tensor
     faulty: Tensor
     nominal: Tensor
@@ -57,30 +70,23 @@ class Context:
         )
 
     @classmethod
-    @torch.no_grad()
     def of(
         cls,
-        surrogate: Callable[[Tensor], Tensor],
-        commands: NDArray | Tensor,
+        surrogate: DifferentiableTwin,
+        commands: NDArray,
         segments: Segments,
         *,
         rate: float,
-        faulty: NDArray | Tensor | None = None,
+        faulty: NDArray | None = None,
     ) -> Context:
         """The context of those commands; the surrogate is asked once, or twice with faults."""
-        clean = _own(commands)
-        nominal = surrogate(clean)
+        clean = torch.tensor(commands, dtype=torch.float32)
+        nominal = torch.as_tensor(surrogate.predict(commands))
         if faulty is None:
             return cls(surrogate, clean, clean, nominal, nominal, segments, rate)
-        told = _own(faulty)
-        return cls(surrogate, clean, told, nominal, surrogate(told), segments, rate)
-
-
-def _own(values: NDArray | Tensor) -> Tensor:
-    """A float32 tensor with memory of its own: arrays of `Trajectories` are read-only."""
-    if isinstance(values, Tensor):
-        return values.float()
-    return torch.tensor(values, dtype=torch.float32)
+        told = torch.tensor(faulty, dtype=torch.float32)
+        path = torch.as_tensor(surrogate.predict(faulty))
+        return cls(surrogate, clean, told, nominal, path, segments, rate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +99,7 @@ class Discrepancy:
     covariance: (n, M, d_z, d_z), of each movement's z, correlated noise accounted for.
     identified: (n, M, d_z) bool, False where the outputs do not tell that component.
     noise: (n,) scale of what z leaves unexplained, in the output's unit.
+
     """
 
     z: Tensor
@@ -105,8 +112,10 @@ class Discrepancy:
 class Correction(Protocol):
     """An operator g with its inverse; holds settings, no data."""
 
-    resolution: str
-    """"segment" or "step": what z has one value for."""
+    @property
+    def resolution(self) -> str:
+        """What z has one value for: "segment" or "step"."""
+        ...
 
     def latent(self, outputs: Channels) -> Channels:
         """Names and units of the components of z for a system with these outputs."""

@@ -1,4 +1,4 @@
-"""`NetworkDiagnoser`: a network on the nominal output and the residual, x = concat(ŷ, r) (Eq. 11)."""
+"""`NetworkDiagnoser`: a network on nominal output and residual, x = concat(ŷ, r) (Eq. 11)."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ class NetworkDiagnoser(nn.Module):
     outputs: channels it was trained on.
     rate: samples per second of the trajectories it takes.
     stride: every how many samples it looks; the sensor's true rate is often lower than the file's.
+
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class NetworkDiagnoser(nn.Module):
         self.fitted: Fit | None = None
 
     def features(self, trajectories: Trajectories) -> Tensor:
-        """concat(ŷ, r) at every `stride`-th sample, (n, T / stride, 2 d_y); r is 0 where missing."""
+        """concat(ŷ, r) at every `stride`-th sample, (n, T', 2 d_y); r is 0 where missing."""
         for name, ours, theirs in (
             ("outputs", self.outputs, trajectories.outputs),
             ("rate", self.rate, trajectories.rate),
@@ -147,6 +148,7 @@ def fit_diagnoser(
     Raises
     ------
     InputError: unlabelled trajectories, fewer than two classes, a label not among `classes`.
+
     """
     named = training.known_labels
     order = tuple(classes) if classes is not None else tuple(sorted(named))
@@ -155,7 +157,9 @@ def fit_diagnoser(
         raise InputError(
             "training",
             expected=f"labelled trajectories of at least two of the classes {', '.join(order)}",
-            got=f"unknown {sorted(unknown)}" if unknown else f"labels {sorted(set(training.labels))}",
+            got=f"unknown {sorted(unknown)}"
+            if unknown
+            else f"labels {sorted(set(training.labels))}",
             remedy="label every trajectory with a known class",
         )
     stride = max(1, round(training.rate / (rate or min(10.0, training.rate))))

@@ -15,7 +15,10 @@ __all__ = ["Diagnoser"]
 class Diagnoser(Protocol):
     """Tells which class a trajectory belongs to."""
 
-    classes: tuple[str, ...]
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Class names, in the order of the probabilities."""
+        ...
 
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
         """Probabilities (n, classes) that sum to one; labels are not looked at.
@@ -23,5 +26,6 @@ class Diagnoser(Protocol):
         Raises
         ------
         InputError: other output channels or another sample rate than it was trained on.
+
         """
         ...

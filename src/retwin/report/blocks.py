@@ -95,11 +95,11 @@ class Table:
 
 @dataclass(frozen=True)
 class Key:
-    """Entry of a legend: the mark (line, dash, dot, bar, diamond), its colour token, its text."""
+    """Entry of a legend: text, colour token, and mark (a line's dash, `disc`, `bar`, `diamond`)."""
 
     text: str
     colour: str
-    mark: str = "line"
+    mark: str = "solid"
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,7 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     Raises
     ------
     InputError: results.json is missing, damaged or of another schema, or arrays.npz is damaged.
+
     """
     results = read_results(folder)
     images = draw_figures(results)

@@ -85,7 +85,7 @@ def scores_plot(results: Results, metrics: Sequence[str]) -> Plot | None:
     y = _axis("", tickvals=ticks, ticktext=names, range=[len(bounded) - 0.5, -0.5], showgrid=False)
     y |= {"ticks": "", "tickfont": {"color": "@ink"}}
     x = _axis("score", rangemode="normal", tickformat=".1f", dtick=0.1)
-    keys = [Key(source_name(name), f"c{slot(name)}", "dot") for name in sources]
+    keys = [Key(source_name(name), f"c{slot(name)}", "disc") for name in sources]
     text = "Dots are means over runs, bars the 95 % bootstrap interval over test trajectories"
     if any(trace["name"].endswith("(paper)") for trace in data):
         keys.append(Key("paper’s mean ± sd over its runs", "muted", "diamond"))
@@ -114,13 +114,17 @@ def _score_traces(
                 "type": "data",
                 "symmetric": False,
                 "array": [max(end[1] - mean, 0) for end, mean in zip(ends, means, strict=True)],
-                "arrayminus": [max(mean - end[0], 0) for end, mean in zip(ends, means, strict=True)],
+                "arrayminus": [
+                    max(mean - end[0], 0) for end, mean in zip(ends, means, strict=True)
+                ],
                 "color": colour,
                 "thickness": 2,
                 "width": 0,
             },
             "marker": {"color": colour, "size": 10},
-            "text": [f"{mean_and_spread(one.scores[m])} [{span(one.intervals.get(m))}]" for m in shown],
+            "text": [
+                f"{mean_and_spread(one.scores[m])} [{span(one.intervals.get(m))}]" for m in shown
+            ],
             "hovertemplate": f"{name}<br>%{{text}}<extra></extra>",
         }
     ]

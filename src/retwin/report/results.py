@@ -208,6 +208,7 @@ def read_results(folder: str | os.PathLike[str]) -> Results:
     ------
     InputError: results.json is missing, damaged, of another schema, or does not agree with
         arrays.npz. A missing arrays.npz is no error: what needs it is left out.
+
     """
     path = Path(folder) / "results.json"
     if not path.is_file():

@@ -117,8 +117,7 @@ def discrepancy_groups(results: Results) -> list[tuple[str, str, list[Latent]]]:
 def discrepancy(results: Results) -> Section | None:
     """Observed against predicted discrepancy (figures 5 and 6), and tests of the agreement."""
     blocks: list[Block] = [
-        latent_plot(results, name, text, shown)
-        for name, text, shown in discrepancy_groups(results)
+        latent_plot(results, name, text, shown) for name, text, shown in discrepancy_groups(results)
     ]
     table = _agreement(results)
     if table is not None:

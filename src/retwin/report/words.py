@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 __all__ = [
     "CHROME",
@@ -162,7 +163,7 @@ def span(interval: Sequence[float] | None, *, sign: bool = False) -> str:
     return f"{show(interval[0])} to {show(interval[1])}"
 
 
-def mean_and_spread(values: Sequence[float]) -> str:
+def mean_and_spread(values: Sequence[float] | NDArray) -> str:
     """Mean ± standard deviation over runs; one run has no spread."""
     finite = np.asarray(values, dtype=float)
     finite = finite[np.isfinite(finite)]

@@ -48,6 +48,7 @@ def load(
     Raises
     ------
     InputError: anything about the data that is not as described, in one line.
+
     """
     path = Path(path)
     if rate is not None and not (isinstance(rate, Real) and np.isfinite(rate) and rate > 0):
@@ -75,6 +76,7 @@ def save(trajectories: Trajectories, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     InputError: another suffix, a place that cannot be written, or Zarr without the extra `scale`.
+
     """
     write = WRITERS[check_target(path)]
     with write_atomically(path) as part:

@@ -109,6 +109,7 @@ def assemble(
     Raises
     ------
     InputError: widths, rates or the presence of commands differ among `raws`; no rate is known.
+
     """
     first = raws[0]
     for raw in raws:
@@ -123,7 +124,10 @@ def assemble(
             _same_width(name, raw, first)
     steps = max(len(raw.nominal) for raw in raws)
     empty = [np.zeros((len(raw.nominal), 0), raw.nominal.dtype) for raw in raws]
-    commands = [none if raw.commands is None else raw.commands for raw, none in zip(raws, empty)]
+    commands = [
+        none if raw.commands is None else raw.commands
+        for raw, none in zip(raws, empty, strict=True)
+    ]
     _check_known(raws, commands)
     lengths = np.array([len(raw.nominal) for raw in raws])
     observed = _held([raw.observed for raw in raws], steps)
@@ -149,6 +153,7 @@ def settle(
     Raises
     ------
     InputError: widths, rate, channels or class names that are not those of the case.
+
     """
     if case is None:
         return trajectories
@@ -193,7 +198,7 @@ def _held(blocks: Sequence[NDArray], steps: int) -> NDArray:
     """(n, steps, k) from blocks (T, k), the last value of each held."""
     kind = np.result_type(*{block.dtype for block in blocks})
     held = np.empty((len(blocks), steps, blocks[0].shape[1]), kind)
-    for row, block in zip(held, blocks):
+    for row, block in zip(held, blocks, strict=True):
         row[: len(block)] = block
         row[len(block) :] = block[-1:]
     return held
@@ -212,7 +217,7 @@ def _same_width(name: str, raw: Raw, first: Raw) -> None:
 
 def _check_known(raws: Sequence[Raw], commands: Sequence[NDArray]) -> None:
     """Name the place where a known input is NaN or infinite, or a measurement infinite."""
-    for raw, told in zip(raws, commands):
+    for raw, told in zip(raws, commands, strict=True):
         for name, block, bad in (
             ("nominal", raw.nominal, ~np.isfinite(raw.nominal)),
             ("commands", told, ~np.isfinite(told)),
@@ -256,4 +261,7 @@ def _common_rate(raws: Sequence[Raw], case: DataCase | None, rate: float | None)
 
 
 def _told(channels: Channels) -> str:
-    return ", ".join(f"{n} [{u}]" for n, u in zip(channels.names, channels.units)) or "none"
+    return (
+        ", ".join(f"{n} [{u}]" for n, u in zip(channels.names, channels.units, strict=True))
+        or "none"
+    )

@@ -39,6 +39,7 @@ def read_class_folders(
     Raises
     ------
     InputError: no such files, files of both kinds, or one that does not hold what is expected.
+
     """
     kinds: list[tuple[str, Reader]] = [("*.csv", _read_csv), ("dataset_*.mat", _read_dataset)]
     found = [(_in_order(path, pattern), read) for pattern, read in kinds]
@@ -80,7 +81,7 @@ def _read_csv(file: Path, where: str, case: DataCase | None) -> Raw:
         with file.open(encoding="utf-8-sig") as lines, warnings.catch_warnings():
             warnings.simplefilter("error")  # numpy only warns when there is no row at all
             block = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
-    except Exception as error:  # noqa: BLE001 - whatever it is, the file is not a table of numbers
+    except Exception as error:
         raise _csv_error(file, where, brief(error)) from None
     commands, nominal, observed = split_columns(block, where, case)
     return Raw(

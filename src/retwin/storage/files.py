@@ -29,6 +29,7 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
     InputError: `path` cannot be written, is of the other kind (file, folder), or is a folder that
         holds anything besides what the new one replaces, which would be lost.
     FileNotFoundError: the block wrote nothing.
+
     """
     # Through a link the file behind it is replaced, not the link.
     target = Path(os.path.realpath(path))

@@ -28,6 +28,7 @@ def read_mat(path: Path, *, case: DataCase | None, rate: float | None) -> Trajec
     Raises
     ------
     InputError: a damaged file, other variables, shapes or types, or no known rate.
+
     """
     variables = mat_variables(path)
     found = [pair for pair in PAIRS if set(pair) <= set(variables)]
@@ -50,7 +51,7 @@ def read_mat(path: Path, *, case: DataCase | None, rate: float | None) -> Trajec
             remedy="give one class name per trajectory ('' when it is unknown)",
         )
     raws = []
-    for i, (cell, label) in enumerate(zip(blocks, labels)):
+    for i, (cell, label) in enumerate(zip(blocks, labels, strict=True)):
         where = f"{path.name}: {x_name}, trajectory {i}"
         commands, nominal, observed = split_columns(matrix(cell, where), where, case)
         raws.append(
@@ -79,7 +80,7 @@ def mat_variables(path: Path, names: list[str] | None = None) -> dict[str, Any]:
             got=f"{path.name}, of version 7.3 (HDF5) or newer",
             remedy="save it in MATLAB with the option '-v7'",
         ) from None
-    except Exception as error:  # noqa: BLE001 - decoders raise almost anything on a damaged file
+    except Exception as error:
         raise InputError(
             "path",
             expected="a readable MAT file",

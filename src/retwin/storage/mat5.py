@@ -68,6 +68,7 @@ def read_mat5(data: bytes, names: Collection[str] | None = None) -> dict[str, An
     ------
     NewerMat: the file is of version 7.3.
     Damaged, or whatever a decoder says: the file does not keep to the format.
+
     """
     order = {b"IM": "<", b"MI": ">"}.get(data[126:HEADER])
     if data[:4] == b"\x89HDF" or (order and struct.unpack(f"{order}H", data[124:126])[0] >= 0x200):

@@ -56,7 +56,7 @@ def read_npz(path: Path) -> Trajectories:
         return restore(header, arrays, path.name)
     except InputError:
         raise
-    except Exception as error:  # noqa: BLE001 - a damaged file makes zipfile raise almost anything
+    except Exception as error:
         raise InputError(
             "path",
             expected="a readable NPZ file without pickled objects",

@@ -58,7 +58,7 @@ def read_zarr(path: Path) -> Trajectories:
         return restore(header, arrays, path.name)
     except InputError:
         raise
-    except Exception as error:  # noqa: BLE001 - a damaged folder makes zarr raise almost anything
+    except Exception as error:
         raise InputError(
             "path",
             expected="a readable Zarr folder of trajectories",

@@ -37,6 +37,7 @@ class StudyData:
     calibration, test: two real sets.
     real: one real set, split into folds; every trajectory is tested once. Without any real set the
         case's emulator makes one, which is labelled "emulated" everywhere.
+
     """
 
     twin: Path | None = None
@@ -64,7 +65,7 @@ def run_study(
     report: Report | None = None,
     command: str = "",
 ) -> dict[str, Any]:
-    """Run or resume a study; writes `results.json` and `arrays.npz` in `out` and returns the former.
+    """Run or resume a study; writes `results.json` and `arrays.npz` in `out`, returns the former.
 
     Parameters
     ----------
@@ -79,9 +80,10 @@ def run_study(
     Raises
     ------
     InputError: bad data; or `out` holds another study.
+
     """
     out = Path(out)
-    tell = report or (lambda text, share: None)
+    tell = report or (lambda _text, _share: None)
     digests = _digests(data)
     _claim(out, case, plan, digests)
     work_folder = out / "work"
@@ -178,9 +180,7 @@ def _twin(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> Traject
     return generate(case.twin, case, per_class=plan.per_class, seed=seed, progress=progress)
 
 
-def _real(
-    case: Case, plan: StudyPlan, data: StudyData, tell: Report
-) -> tuple[Trajectories, Roles]:
+def _real(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> tuple[Trajectories, Roles]:
     def read(path: Path) -> Trajectories:
         found = load(path, case=case, progress=lambda share: tell(path.name, share))
         return _labelled(found, case, path.name)

@@ -1,4 +1,4 @@
-"""The work of a study as jobs that each leave one result on disk; a job whose result is there is done.
+"""The work of a study as jobs; each leaves one result on disk, and is done when that is there.
 
 Killed at any moment and called again, a study goes on with the jobs that are missing. Results are
 moved into place whole, and every job draws from a seed of its own, so the order does not matter.

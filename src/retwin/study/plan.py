@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,7 @@ class Source:
     real_data: "none", "healthy", "unlabelled", "labelled" or "transductive".
     surrogate, residual: whether it needs the IBG, and the RG.
     per_fold: whether it depends on the calibration set; a source that does not is trained once.
+
     """
 
     title: str
@@ -72,6 +74,7 @@ class StudyPlan:
     calibrate_on: "healthy" or "all".
 
     Raises InputError for a name that is not known or a number below one.
+
     """
 
     sources: tuple[str, ...] = ("dt", "ibg", "ibg_rg")
@@ -85,11 +88,12 @@ class StudyPlan:
     calibrate_on: str = "healthy"
 
     def __post_init__(self) -> None:
-        for name, value, known in (
+        choices: list[tuple[str, str, Mapping[str, object]]] = [
             ("preset", self.preset, PRESETS),
             ("classifier", self.classifier or "cnn", CLASSIFIERS),
             *(("sources", source, SOURCES) for source in self.sources),
-        ):
+        ]
+        for name, value, known in choices:
             if value not in known:
                 raise InputError(
                     name,

@@ -1,4 +1,4 @@
-"""Jobs over processes, one torch thread each: more threads than cores cost several times the time."""
+"""Jobs over processes, one torch thread each: threads beyond the cores cost several times."""
 
 from __future__ import annotations
 

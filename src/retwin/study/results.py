@@ -79,9 +79,11 @@ def write_results(
         "provenance": {**_machine(), **provenance},
     }
     arrays = {f"probabilities/{name}": runs for name, runs in probabilities.items()}
-    arrays |= {f"z/{name}": found[name] for name in ("observed", "identified", "predicted") if found}
+    arrays |= {
+        f"z/{name}": found[name] for name in ("observed", "identified", "predicted") if found
+    }
     with write_atomically(out / "arrays.npz") as part:
-        np.savez_compressed(part, **arrays)
+        np.savez_compressed(part, allow_pickle=False, **arrays)
     with write_atomically(out / "results.json") as part:
         part.write_text(json.dumps(_plain(results), indent=1, allow_nan=False), encoding="utf-8")
     return results
@@ -109,8 +111,8 @@ def _source(
     return {
         **{metric: [getattr(each, metric) for each in scores] for metric in METRICS},
         "intervals": {m: np.nanquantile(d, [0.025, 0.975]).tolist() for m, d in draws.items()},
-        "confusion": sum(
-            confusion(truth, run, len(work.case.classes)) for run in predicted
+        "confusion": np.sum(
+            [confusion(truth, run, len(work.case.classes)) for run in predicted], axis=0
         ).tolist(),
         "predictions": predicted.tolist(),
         "title": kind.title,
@@ -257,4 +259,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value
-

@@ -1,0 +1,1 @@
+"""Twins: commands in, outputs out."""

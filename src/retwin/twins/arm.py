@@ -18,6 +18,7 @@ class YawPitchArm:
     ----------
     base: height of the first pitch joint above the ground, in m.
     links: length of the link behind each pitch joint, in m.
+
     """
 
     base: float
@@ -40,9 +41,7 @@ class YawPitchArm:
         links = np.asarray(self.links, dtype=angles.dtype)
         radius = np.sin(pitch) @ links
         height = np.cos(pitch) @ links
-        return np.stack(
-            [np.sin(yaw) * radius, -np.cos(yaw) * radius, self.base + height], axis=-1
-        )
+        return np.stack([np.sin(yaw) * radius, -np.cos(yaw) * radius, self.base + height], axis=-1)
 
     def jacobian(self, angles: NDArray) -> NDArray:
         """Derivative (..., 3, joints) of `position` in m/rad."""

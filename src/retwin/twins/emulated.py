@@ -25,7 +25,8 @@ __all__ = ["EmulatedArm", "JointDiscrepancy"]
 @dataclass(frozen=True, eq=False)
 class JointDiscrepancy:
     """What goes otherwise than commanded: delay (n, M) in samples, offset (n, M, d_u) in command
-    units, missed (n, M, d_u) bool."""
+    units, missed (n, M, d_u) bool.
+    """
 
     delay: NDArray
     offset: NDArray
@@ -46,6 +47,7 @@ class EmulatedArm:
     poll: samples per reading; readings are joined linearly.
     glitch: probability that a trajectory has a glitch of one or two readings.
     glitch_size: size of the largest glitch, in output units.
+
     """
 
     twin: KinematicTwin

@@ -27,6 +27,7 @@ class ServoLag:
     Parameters
     ----------
     proportional, integral: the loop's gains P (no unit) and I (1/s).
+
     """
 
     proportional: float
@@ -62,6 +63,7 @@ class KinematicTwin:
     rate: samples per second.
 
     `nominal` is the forward kinematics of the clean commands without lag.
+
     """
 
     arm: YawPitchArm

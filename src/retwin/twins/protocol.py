@@ -23,9 +23,20 @@ Progress = Callable[[float], None]
 class Twin(Protocol):
     """A simulator: plain, learned or corrected, all look the same."""
 
-    inputs: Channels
-    outputs: Channels
-    rate: float
+    @property
+    def inputs(self) -> Channels:
+        """Command channels."""
+        ...
+
+    @property
+    def outputs(self) -> Channels:
+        """Output channels."""
+        ...
+
+    @property
+    def rate(self) -> float:
+        """Samples per second."""
+        ...
 
     def simulate(
         self,
@@ -43,6 +54,7 @@ class Twin(Protocol):
         Raises
         ------
         InputError: commands of another width, NaN or infinite; not one fault per trajectory.
+
         """
         ...
 
@@ -67,6 +79,6 @@ def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
     return array if array.dtype.kind == "f" else array.astype(np.float64)
 
 
-def fault_labels(faults: Sequence[Fault | None]) -> list[str]:
+def fault_labels(faults: Sequence[Fault | None]) -> NDArray:
     """The class name of each fault, `Healthy` for none."""
-    return [HEALTHY if fault is None else fault.label for fault in faults]
+    return np.array([HEALTHY if fault is None else fault.label for fault in faults])

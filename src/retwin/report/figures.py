@@ -1,0 +1,201 @@
+"""The figures as PNG, by matplotlib, for papers and slides."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+from retwin.report.curves import Latent
+from retwin.report.plots import DASHES, latent_names, missing, published_value
+from retwin.report.results import Results
+from retwin.report.sections import discrepancy_groups, recalls, roc_curves
+from retwin.report.words import (
+    CHROME,
+    METRICS,
+    PALETTE,
+    class_name,
+    mean_and_spread,
+    order,
+    slot,
+    source_name,
+)
+
+__all__ = ["FIGURES", "draw_figures"]
+
+FIGURES = ("scores", "confusion", "roc", "tde", "tpe")
+"""Every figure there can be; its file is `figures/NAME.png`."""
+SCORES = ("macro_f1", "balanced_accuracy", "auroc", "healthy_recall")
+STYLES = dict(zip(DASHES, ("-", "--", ":", "-."), strict=True))
+INK, MUTED, GRID, RULE, WASH, OBSERVED, ALARM = (
+    CHROME[name][0] for name in ("ink", "muted", "grid", "rule", "wash", "observed", "alarm")
+)
+
+
+def draw_figures(results: Results) -> dict[str, bytes]:
+    """PNG by figure name; what lacks its data is left out."""
+    drawn = {"scores": _scores(results), "confusion": _confusion(results), "roc": _roc(results)}
+    for name, _, shown in discrepancy_groups(results):
+        drawn[name] = _latents(shown)
+    return {
+        name: _png(figure, results.emulated) for name, figure in drawn.items() if figure is not None
+    }
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _png(figure: Figure, emulated: bool) -> bytes:
+    if emulated:
+        figure.suptitle("EMULATED robot: no real measurements", color=ALARM, fontsize=10)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=160, metadata={"Software": None})
+    return file.getvalue()
+
+
+def _dress(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x, color=MUTED)
+    axes.set_ylabel(y, color=MUTED)
+    axes.tick_params(colors=MUTED, labelsize=9)
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    for name, spine in axes.spines.items():
+        spine.set_color(RULE)
+        spine.set_visible(name in ("left", "bottom"))
+
+
+def _colour(source: str) -> str:
+    return PALETTE[slot(source)][0]
+
+
+def _scores(results: Results) -> Figure | None:
+    sources = order(list(results.sources))
+    shown = [name for name in SCORES if any(name in results.sources[s].scores for s in sources)]
+    if not shown:
+        return None
+    figure = _figure(7, 0.9 + 0.26 * len(shown) * max(len(sources), 2))
+    axes = figure.add_subplot()
+    for place, source in enumerate(sources):
+        lane = 0.62 * ((place + 0.5) / len(sources) - 0.5)
+        _score_marks(axes, results, source, shown, lane)
+    axes.set_yticks(range(len(shown)), [METRICS[name].name for name in shown])
+    axes.set_ylim(len(shown) - 0.5, -0.5)
+    _dress(axes, "score: mean and 95 % bootstrap interval; open diamonds: paper ± sd", "")
+    axes.tick_params(axis="y", length=0, labelcolor=INK)
+    axes.grid(visible=False, axis="y")
+    axes.legend(frameon=False, fontsize=9, ncols=3, loc="lower left", bbox_to_anchor=(0, 1))
+    return figure
+
+
+def _score_marks(
+    axes: Axes, results: Results, source: str, shown: Sequence[str], lane: float
+) -> None:
+    one, told = results.sources[source], results.published.get(source, {})
+    named = False
+    for place, metric in enumerate(shown):
+        if metric in one.scores:
+            mean = float(np.nanmean(one.scores[metric]))
+            ends = one.intervals.get(metric, (mean, mean))
+            axes.plot(ends, [place + lane] * 2, color=_colour(source), linewidth=1.8)
+            name = None if named else source_name(source)
+            axes.plot(mean, place + lane, "o", color=_colour(source), markersize=6, label=name)
+            named = True
+        value = published_value(told.get(metric, ""))
+        if value is not None:
+            axes.errorbar(
+                value[0],
+                place + lane + 0.12,
+                xerr=value[1] or None,
+                fmt="D",
+                color=_colour(source),
+                markerfacecolor="white",
+                markersize=5,
+                linewidth=0.9,
+                capsize=2,
+            )
+
+
+def _confusion(results: Results) -> Figure | None:
+    sources = [s for s in order(list(results.sources)) if results.sources[s].confusion]
+    if not sources or not results.classes:
+        return None
+    wide = min(len(sources), 3)
+    tall = math.ceil(len(sources) / wide)
+    figure = _figure(1 + 4.2 * wide, 0.6 + 4.1 * tall)
+    names = [class_name(name) for name in results.classes]
+    grid = figure.subplots(tall, wide, squeeze=False)
+    for axes in grid.flat[len(sources) :]:
+        axes.set_visible(False)
+    for place, source in enumerate(sources):
+        axes = grid.flat[place]
+        counts = results.sources[source].confusion or []
+        shares = np.array(recalls(counts))
+        shade = LinearSegmentedColormap.from_list("shade", [WASH, _colour(source)])
+        axes.imshow(shares, cmap=shade, vmin=0, vmax=1)
+        for (row, column), share in np.ndenumerate(shares):
+            if counts[row][column]:
+                tone = "white" if share >= 0.5 else INK
+                text = str(counts[row][column])
+                axes.text(column, row, text, ha="center", va="center", color=tone, fontsize=8)
+        axes.set_title(source_name(source), fontsize=11, color=INK, loc="left")
+        axes.set_xticks(range(len(names)), names, rotation=90)
+        axes.set_yticks(range(len(names)), names if place % wide == 0 else [])
+        _dress(axes, "answer", "true class" if place % wide == 0 else "")
+        axes.grid(visible=False)
+        axes.tick_params(length=0, labelsize=8)
+    return figure
+
+
+def _roc(results: Results) -> Figure | None:
+    curves = roc_curves(results)
+    if not curves:
+        return None
+    figure = _figure(5.6, 5.2)
+    axes = figure.add_subplot()
+    axes.plot([0, 1], [0, 1], color=RULE, linewidth=1)
+    for place, (source, curve) in enumerate(curves.items()):
+        colour = _colour(source)
+        if len(curve.areas) > 1:
+            axes.fill_between(curve.rate, *curve.band, color=colour, alpha=0.18, linewidth=0)
+        style = STYLES[DASHES[place % len(DASHES)]]
+        text = f"{source_name(source)}: {mean_and_spread(curve.areas)}"
+        axes.plot(curve.rate, curve.mean, style, color=colour, linewidth=1.8, label=text)
+    axes.set(xlim=(-0.01, 1.01), ylim=(-0.01, 1.01), aspect="equal")
+    _dress(axes, "false positive rate", "true positive rate (micro-average)")
+    axes.legend(frameon=False, fontsize=9, loc="lower right")
+    return figure
+
+
+def _latents(shown: Sequence[Latent]) -> Figure:
+    figure = _figure(1 + 3.6 * max(len(shown), 1.3), 3.4)
+    for axes, latent in zip(figure.subplots(1, len(shown), squeeze=False).flat, shown, strict=True):
+        title, quantity = latent_names(latent.name)
+        left, width = latent.edges[:-1], np.diff(latent.edges)
+        axes.bar(left, latent.observed, width, align="edge", color=OBSERVED, label="observed")
+        colour = _colour("ibg_rg")
+        axes.stairs(latent.predicted, latent.edges, color=colour, linewidth=1.8, label="predicted")
+        unit = f", {latent.unit}" if latent.unit else ""
+        _dress(axes, f"{quantity}{unit}", "share per bin")
+        axes.set_title(title, fontsize=11, color=INK, loc="left")
+        axes.set_xlim(latent.edges[0], latent.edges[-1])
+        if any(latent.outside):
+            axes.annotate(
+                missing(latent).replace(": ", ":\n"),
+                (0.98, 0.98),
+                xycoords="axes fraction",
+                ha="right",
+                va="top",
+                fontsize=7,
+                color=MUTED,
+            )
+    figure.axes[0].legend(frameon=False, fontsize=9, loc="upper left")
+    return figure

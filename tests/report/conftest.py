@@ -1,0 +1,189 @@
+"""A synthetic study: made-up scores, but counts, scores and probabilities that fit together."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+MOTORS = range(1, 5)
+CLASSES = [
+    "Healthy",
+    *(f"Motor_{motor}_Stuck" for motor in MOTORS),
+    *(f"Motor_{motor}_Steady_state_error" for motor in MOTORS),
+]
+SKILL = {"dt": 1.2, "ibg": 1.5, "ibg_rg": 2.4}
+PUBLISHED = {
+    "dt": {"macro_f1": "0.644 ± 0.036", "healthy_recall": "0.06", "generate": "8.5 h"},
+    "ibg_rg": {"macro_f1": "0.753 ± 0.026", "healthy_recall": "0.62", "generate": "4–5 min"},
+}
+Study = tuple[dict[str, Any], dict[str, NDArray]]
+
+
+def _source(rng: np.random.Generator, truth: NDArray, skill: float, runs: int) -> Study:
+    noise = rng.gumbel(size=(runs, len(truth), len(CLASSES)))
+    logits = noise + skill * 1.6 * np.eye(len(CLASSES))[truth]
+    logits[:, truth == 0, 5:] += 2.2 / skill
+    probabilities = np.exp(1.5 * logits)
+    probabilities /= probabilities.sum(axis=2, keepdims=True)
+    predictions = probabilities.argmax(axis=2)
+    confusion = np.zeros((len(CLASSES), len(CLASSES)), dtype=int)
+    np.add.at(confusion, (np.tile(truth, runs), predictions.ravel()), 1)
+    right = predictions == truth
+    recall = np.array([right[:, truth == c].mean(axis=1) for c in range(len(CLASSES))])
+    scores = {
+        "accuracy": right.mean(axis=1),
+        "macro_f1": recall.mean(axis=0) - 0.01,
+        "balanced_accuracy": recall.mean(axis=0),
+        "healthy_recall": recall[0],
+        "auroc": 0.85 + 0.05 * skill + 0.005 * rng.standard_normal(runs),
+        "auroc_micro": 0.86 + 0.05 * skill + 0.005 * rng.standard_normal(runs),
+        "ece": 0.1 + 0.02 * rng.random(runs),
+    }
+    told: dict[str, Any] = {name: list(map(float, values)) for name, values in scores.items()}
+    told["intervals"] = {
+        name: [float(np.mean(values)) - 0.06, float(np.mean(values)) + 0.05]
+        for name, values in scores.items()
+    }
+    told |= {
+        "confusion": confusion.tolist(),
+        "predictions": predictions.tolist(),
+        "fault_protocol_known": True,
+        "update_s": 60.0 * skill,
+        "generate_s": 3.0,
+    }
+    return told, {"probabilities": probabilities.astype(np.float32)}
+
+
+def _comparison(sources: dict[str, Any], a: str, b: str, metric: str) -> dict[str, Any]:
+    difference = float(np.mean(sources[a][metric]) - np.mean(sources[b][metric]))
+    family = metric in ("macro_f1", "balanced_accuracy", "auroc")
+    return {
+        "a": a,
+        "b": b,
+        "metric": metric,
+        "mean_diff": difference,
+        "t": 7.86,
+        "df": 16.55,
+        "p": 0.0000123,
+        "p_holm": 0.0000369 if family else None,
+        "bootstrap_ci95": [difference - 0.06, difference + 0.05],
+    }
+
+
+def _discrepancy(rng: np.random.Generator) -> dict[str, NDArray]:
+    def draw(count: int) -> NDArray:
+        late = rng.random(count) < 0.3
+        delay = np.where(late, rng.normal(24, 4, count), rng.normal(11, 3, count))
+        offset = rng.multivariate_normal([0.002, -0.001, -0.004], 1e-5 * np.eye(3), count)
+        return np.column_stack([delay, offset])
+
+    observed, identified = draw(240), np.ones((240, 4), dtype=bool)
+    observed[:9, 0], observed[:9, 1:] = 180.0, 0.2  # missed movements
+    identified[200:, 0] = False
+    return {"z/observed": observed, "z/identified": identified, "z/predicted": draw(4000)}
+
+
+def synthetic(*, runs: int = 10, per_class: int = 10) -> Study:
+    """results.json and the arrays of a synthetic study."""
+    rng = np.random.default_rng(7)
+    truth = np.repeat(np.arange(len(CLASSES)), per_class)
+    sources: dict[str, Any] = {}
+    arrays = _discrepancy(rng)
+    seen = {"dt": "none", "ibg": "timing", "ibg_rg": "healthy"}
+    for name, skill in SKILL.items():
+        told, made = _source(rng, truth, skill, runs)
+        sources[name] = {**told, "real_data": seen[name], "twin_runs": 3600}
+        arrays[f"probabilities/{name}"] = made["probabilities"]
+    metrics = ("macro_f1", "balanced_accuracy", "auroc", "healthy_recall")
+    pairs = (("ibg_rg", "dt"), ("ibg_rg", "ibg"), ("ibg", "dt"))
+    results = {
+        "schema": 1,
+        "case": "armpi",
+        "title": "ArmPi FPV robot arm",
+        "preset": "quick",
+        "classifier": "cnn",
+        "runs": runs,
+        "classes": CLASSES,
+        "emulated": False,
+        "data": {
+            "twin": {"name": "sim.mat", "sha256": "a1" * 32, "n": 3600},
+            "calibration": {
+                "name": "real_a.mat",
+                "sha256": "b2" * 32,
+                "n": 90,
+                "used": [f"real_a/{i:03d}" for i in range(10)],
+            },
+            "test": {
+                "name": "real_a.mat",
+                "sha256": "b2" * 32,
+                "n": len(truth),
+                "ids": [f"real_a/{i:03d}" for i in range(len(truth))],
+                "labels": [CLASSES[label] for label in truth],
+            },
+            "protocol": "3 folds: every trajectory is tested once",
+        },
+        "sources": sources,
+        "published": PUBLISHED,
+        "comparisons": [_comparison(sources, a, b, m) for a, b in pairs for m in metrics],
+        "surrogate": {
+            "rmse": {"x": 0.00042, "y": 0.00051, "z": 0.00038},
+            "unit": "m",
+            "nrmse": {"x": 0.004, "y": 0.0042, "z": 0.0051},
+        },
+        "fidelity": {
+            "latent": ["delay", "offset_x", "offset_y", "offset_z"],
+            "units": ["samples", "m", "m", "m"],
+            "held_out": 48,
+            "ks": [
+                {"name": "delay", "statistic": 0.112, "p": 0.41},
+                {"name": "offset_x", "statistic": 0.231, "p": 0.0004},
+            ],
+            "coverage90": {"delay": 0.87, "offset_x": 0.93},
+        },
+        "learning_curve": None,
+        "timing": {
+            "generate_3600_s": {"ibg": 0.31, "ibg_rg": 0.52},
+            "surrogate_fit_s": 48.2,
+            "residual_fit_s": 33.0,
+            "diagnoser_fit_s": 412.5,
+            "total_s": 1511.0,
+        },
+        "provenance": {
+            "command": "retwin study armpi --twin-data sim.mat --real real_a.mat --folds 3 "
+            "--sources dt,ibg,ibg_rg --classifier cnn --runs 10 --seed 0 --preset quick --out runs/a",
+            "retwin": "0.1.0",
+            "python": "3.11.7",
+            "torch": "2.13.0",
+            "numpy": "2.4.6",
+            "seed": 0,
+            "date": "2026-01-01",
+            "machine": "2 cores",
+        },
+    }
+    return results, arrays
+
+
+@pytest.fixture
+def study() -> Study:
+    """A synthetic study with ten runs."""
+    return synthetic()
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[Study], Path]:
+    """Writes a study to a folder as `retwin study` does."""
+
+    def _write(study: Study) -> Path:
+        results, arrays = study
+        (tmp_path / "results.json").write_text(json.dumps(results), encoding="utf-8")
+        if arrays:
+            np.savez(tmp_path / "arrays.npz", allow_pickle=False, **arrays)
+        return tmp_path
+
+    return _write
