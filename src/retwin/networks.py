@@ -179,9 +179,9 @@ class _LastStep(nn.Module):
 
 @dataclass(frozen=True)
 class CNN:
-    """Three convolutions over time, then mean and maximum over time, then a dense layer."""
+    """Convolutions with pooling between, then mean and maximum over time, then a dense layer."""
 
-    channels: tuple[int, ...] = (32, 64, 64)
+    channels: tuple[int, ...] = (32, 64, 128)
     kernel: int = 5
     dropout: float = 0.2
 
@@ -199,8 +199,10 @@ class _Pooled(nn.Module):
                 nn.Conv1d(width, following, config.kernel, padding="same"),
                 nn.BatchNorm1d(following),
                 nn.ReLU(),
+                nn.MaxPool1d(2, ceil_mode=True),
             ]
-        self.features = nn.Sequential(*layers)
+        # No pooling behind the last one: mean and maximum over time follow.
+        self.features = nn.Sequential(*layers[:-1])
         self.dropout = nn.Dropout(config.dropout)
         self.readout = nn.Linear(2 * config.channels[-1], outputs)
 

@@ -422,3 +422,97 @@ class _Chunk:
         chain += turn.min(axis=3).sum(axis=1)[self.owner][..., None]
         self._choose(cost, chain, turn, behind)
         self._set_yaw(index, parts, turn)
+
+    def _choose(self, cost: NDArray, chain: NDArray, turn: NDArray, behind: NDArray) -> None:
+        """Walk the cheapest chain; mark the movements another chain explains as well."""
+        total = np.full((self.count, 2), np.inf)
+        at = self.move == 0
+        np.minimum.at(total, self.owner[at], chain[at].min(axis=2))
+        family = np.argmin(total, axis=1)
+        self.closed = family == 1
+        rest_first = np.searchsorted(self.point, np.arange(self.count) * (self.moves + 1))
+        self.grid = np.zeros((self.count, self.moves + 1, 4))
+        self.grid[:, 0, 1:] = self.posture[rest_first]
+        self.length_index = np.zeros((self.count, self.moves, 4), dtype=int)
+        self.tied = np.zeros((self.count, self.moves), dtype=bool)
+        rows = np.arange(self.count)
+        standing = None
+        for move in range(self.moves):
+            edge = np.flatnonzero(self.move == move)
+            if standing is not None:
+                edge = edge[self.head[edge] == standing[self.owner[edge]]]
+            own = self.owner[edge]
+            value = cost[edge, family[own]].min(axis=1) + behind[self.tail[edge], family[own]]
+            order = np.lexsort((value, own))
+            edge = edge[order[np.searchsorted(own[order], rows)]]
+            standing = self.tail[edge]
+            if move == 0:
+                self.grid[:, 0, 1:] = self.posture[self.head[edge]]
+            self.grid[:, move + 1, 1:] = self.posture[standing]
+            combination = np.argmin(cost[edge, family], axis=1)
+            self.length_index[:, move, 1:] = np.stack(
+                np.unravel_index(combination, (3, 3, 3)), axis=1
+            )
+            noise = cost[edge, family, combination] + turn[rows, move, family].min(axis=1)
+            limit = total[rows, family] + (_TIE - 1) * noise + _FLOOR
+            at = self.move == move
+            as_good = (chain[at] <= limit[self.owner[at], None, None]).sum(axis=(1, 2))
+            self.tied[:, move] = np.bincount(self.owner[at], as_good, self.count) > 1
+
+    def _set_yaw(self, index: NDArray, parts: NDArray, turn: NDArray) -> None:
+        """Ramps of the yaw motor, and its whole units at all rests by weighted least squares."""
+        rows, moves = np.arange(self.count), np.arange(self.moves)
+        turn = turn[rows, :, self.closed.astype(int)]
+        length = np.argmin(turn, axis=2)
+        part = parts[rows[:, None], moves, self.closed.astype(int)[:, None], length]
+        matrix = np.zeros((self.count, self.moves + 1, self.moves + 1))
+        vector = np.zeros((self.count, self.moves + 1))
+        hats = np.stack([1 - part, part])
+        for i, j in np.ndindex(2, 2):
+            matrix[:, moves + i, moves + j] += (self.weight * hats[i] * hats[j]).sum(axis=2)
+        for i in range(2):
+            vector[:, moves + i] += (self.weight * hats[i] * self.angle).sum(axis=2)
+        matrix += 1e-14 * np.eye(self.moves + 1)
+        inverse = np.linalg.inv(matrix)
+        self.grid[..., 0] = np.rint((inverse @ vector[..., None])[..., 0]).clip(
+            -_STRAIGHT, _STRAIGHT
+        )
+        if self.moves == 0:
+            middle = np.median(np.where(self.seen, self.yaw, 0), axis=1)
+            self.grid[:, 0, 0] = np.rint(middle / _STEP)
+            return
+        ordered = np.sort(turn, axis=2)
+        noise = ordered[..., 0] + _FLOOR
+        moved = np.diff(self.grid[..., 0], axis=1) != 0
+        self.length_index[..., 0] = np.where(moved, length, 0)
+        self.tied |= moved & (ordered[..., 1] <= _TIE * noise)
+        spread = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2)) / _STEP
+        unsure = np.maximum(spread[:, 1:], spread[:, :-1]) * np.sqrt(noise) > 0.15
+        self.tied |= unsure
+
+    @property
+    def ramps(self) -> NDArray:
+        return np.array(RAMPS)[self.length_index]
+
+    def _commands(self, onsets: NDArray) -> NDArray:
+        units = _STRAIGHT - self.grid
+        return ramp_commands(
+            units[:, 0], units[:, 1:], self.ramps, onsets, self.length, closed=self.closed
+        )
+
+    def _error(self, onsets: NDArray) -> NDArray:
+        return self.arm.position(unit_angles(self._commands(onsets))) - self.path
+
+    def _refine(self) -> None:
+        """Gauss-Newton on the onsets: movements do not overlap, so each has its own equation."""
+        step = 1e-3
+        for _ in range(3):
+            error = self._error(self.onsets)
+            slope = (self._error(self.onsets + step) - error) / step
+            power = self._per_movement((slope**2).sum(axis=2))
+            shift = self._per_movement((slope * error).sum(axis=2)) / np.maximum(power, 1e-18)
+            self.onsets = self.onsets - np.clip(shift, -2, 2)
+        whole = np.rint(self.onsets)
+        now = self._per_movement((self._error(self.onsets) ** 2).sum(axis=2))
+        then = self._per_movement((self._error(whole) ** 2).sum(axis=2))
+        self.onsets = np.where(then <= _TIE * now + _FLOOR, whole, self.onsets)

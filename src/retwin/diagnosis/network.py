@@ -117,7 +117,7 @@ class NetworkDiagnoser(nn.Module):
 
 
 DEFAULTS = {
-    "CNN": Training(epochs=25, batch=64, rate=2e-3, weight_decay=1e-2),
+    "CNN": Training(epochs=25, batch=64, rate=3e-3, weight_decay=1e-2),
     "LSTMClassifier": Training(epochs=30, batch=32, rate=1e-3, decay="step"),
 }
 

@@ -115,13 +115,16 @@ class Panel:
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure of one or more panels; `name` is also that of its PNG."""
+    """A figure of one or more panels; `name` is also that of its PNG.
+
+    A narrow figure has its caption beside it where the screen is wide enough.
+    """
 
     name: str
     caption: str
     panels: Sequence[Panel]
     keys: Sequence[Key] = ()
-    width: int | None = None
+    narrow: bool = False
     kind: ClassVar[str] = "plot"
 
 

@@ -92,14 +92,12 @@ def latents(results: Results) -> list[Latent]:
     """Every latent for which the arrays hold observed and predicted values."""
     observed = results.arrays.get("z/observed")
     predicted = results.arrays.get("z/predicted")
-    if observed is None or predicted is None or observed.ndim != 2 or predicted.ndim != 2:
+    if observed is None or predicted is None:
         return []
-    identified = results.arrays.get("z/identified", np.ones(observed.shape, dtype=bool))
+    identified = results.arrays.get("z/identified", np.ones(observed.shape)).astype(bool)
     names, units = results.fidelity.latent, results.fidelity.units
     found = []
-    for column, name in enumerate(names):
-        if column >= min(observed.shape[1], predicted.shape[1]):
-            break
+    for column, name in enumerate(names[: observed.shape[1]]):
         factor, unit = quantity(units[column] if column < len(units) else "")
         seen = factor * observed[identified[:, column], column]
         said = factor * predicted[:, column]

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 
 from retwin.report.curves import Latent
 from retwin.report.plots import DASHES, latent_names, missing, published_value
@@ -85,7 +86,7 @@ def _scores(results: Results) -> Figure | None:
     figure = _figure(7, 0.9 + 0.26 * len(shown) * max(len(sources), 2))
     axes = figure.add_subplot()
     for place, source in enumerate(sources):
-        lane = 0.62 * ((place + 0.5) / len(sources) - 0.5)
+        lane = 0.62 * ((place + 0.5) / len(sources) - 0.5) - 0.04
         _score_marks(axes, results, source, shown, lane)
     axes.set_yticks(range(len(shown)), [METRICS[name].name for name in shown])
     axes.set_ylim(len(shown) - 0.5, -0.5)
@@ -103,8 +104,8 @@ def _score_marks(
     named = False
     for place, metric in enumerate(shown):
         if metric in one.scores:
-            mean = float(np.nanmean(one.scores[metric]))
-            ends = one.intervals.get(metric, (mean, mean))
+            mean = one.mean(metric)
+            ends = one.interval(metric) or (mean, mean)
             axes.plot(ends, [place + lane] * 2, color=_colour(source), linewidth=1.8)
             name = None if named else source_name(source)
             axes.plot(mean, place + lane, "o", color=_colour(source), markersize=6, label=name)
@@ -143,7 +144,7 @@ def _confusion(results: Results) -> Figure | None:
         axes.imshow(shares, cmap=shade, vmin=0, vmax=1)
         for (row, column), share in np.ndenumerate(shares):
             if counts[row][column]:
-                tone = "white" if share >= 0.5 else INK
+                tone = "white" if share >= 0.78 else INK
                 text = str(counts[row][column])
                 axes.text(column, row, text, ha="center", va="center", color=tone, fontsize=8)
         axes.set_title(source_name(source), fontsize=11, color=INK, loc="left")
@@ -162,11 +163,11 @@ def _roc(results: Results) -> Figure | None:
     figure = _figure(5.6, 5.2)
     axes = figure.add_subplot()
     axes.plot([0, 1], [0, 1], color=RULE, linewidth=1)
-    for place, (source, curve) in enumerate(curves.items()):
+    for source, curve in curves.items():
         colour = _colour(source)
         if len(curve.areas) > 1:
             axes.fill_between(curve.rate, *curve.band, color=colour, alpha=0.18, linewidth=0)
-        style = STYLES[DASHES[place % len(DASHES)]]
+        style = STYLES[DASHES[slot(source) % len(DASHES)]]
         text = f"{source_name(source)}: {mean_and_spread(curve.areas)}"
         axes.plot(curve.rate, curve.mean, style, color=colour, linewidth=1.8, label=text)
     axes.set(xlim=(-0.01, 1.01), ylim=(-0.01, 1.01), aspect="equal")
@@ -185,17 +186,12 @@ def _latents(shown: Sequence[Latent]) -> Figure:
         axes.stairs(latent.predicted, latent.edges, color=colour, linewidth=1.8, label="predicted")
         unit = f", {latent.unit}" if latent.unit else ""
         _dress(axes, f"{quantity}{unit}", "share per bin")
+        axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
         axes.set_title(title, fontsize=11, color=INK, loc="left")
-        axes.set_xlim(latent.edges[0], latent.edges[-1])
         if any(latent.outside):
-            axes.annotate(
-                missing(latent).replace(": ", ":\n"),
-                (0.98, 0.98),
-                xycoords="axes fraction",
-                ha="right",
-                va="top",
-                fontsize=7,
-                color=MUTED,
-            )
-    figure.axes[0].legend(frameon=False, fontsize=9, loc="upper left")
+            text = missing(latent).replace(": ", ":\n")
+            axes.set_title(text, fontsize=7, color=MUTED, loc="right")
+        axes.set_xlim(latent.edges[0], latent.edges[-1])
+    marks = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*marks, frameon=False, fontsize=9, ncols=2, loc="outside lower left")
     return figure

@@ -24,7 +24,8 @@
     for (const [id, spec] of Object.entries(specs)) {
       const place = document.getElementById(id);
       const layout = paint(spec.layout, style);
-      layout.height = spec.height;
+      layout.height = spec.height * (root.dataset.print ? 0.72 : 1);
+      place.style.height = layout.height + "px";
       layout.width = place.clientWidth;
       Plotly.react(place, paint(spec.data, style), layout, { displayModeBar: false });
     }

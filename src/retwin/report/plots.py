@@ -36,7 +36,11 @@ def caption(results: Results, text: str) -> str:
 
 def _axis(title: str, **more: Any) -> dict[str, Any]:
     return {
-        "title": {"text": html.escape(title, quote=False), "standoff": 8},
+        "title": {
+            "text": html.escape(title, quote=False),
+            "standoff": 8,
+            "font": {"size": 13},
+        },
         "gridcolor": "@grid",
         "linecolor": "@rule",
         "zeroline": False,
@@ -78,21 +82,37 @@ def scores_plot(results: Results, metrics: Sequence[str]) -> Plot | None:
         return None
     data: list[dict[str, Any]] = []
     for place, source in enumerate(sources):
-        lane = 0.62 * ((place + 0.5) / len(sources) - 0.5)
+        lane = 0.6 * (place + 0.5) / len(sources) - 0.25
         data += _score_traces(results, source, bounded, lane)
-    names = [html.escape(METRICS[name].name, quote=False) for name in bounded]
-    ticks = list(range(len(bounded)))
-    y = _axis("", tickvals=ticks, ticktext=names, range=[len(bounded) - 0.5, -0.5], showgrid=False)
-    y |= {"ticks": "", "tickfont": {"color": "@ink"}}
-    x = _axis("score", rangemode="normal", tickformat=".1f", dtick=0.1)
+    y = _axis("", showticklabels=False, range=[len(bounded) - 0.5, -0.55], showgrid=False)
+    y |= {"ticks": "", "showline": False}
+    x = _axis("score", range=[-0.01, 1.02], tickformat=".1f", dtick=0.2)
     keys = [Key(source_name(name), f"c{slot(name)}", "disc") for name in sources]
     text = "Dots are means over runs, bars the 95 % bootstrap interval over test trajectories"
     if any(trace["name"].endswith("(paper)") for trace in data):
         keys.append(Key("paper’s mean ± sd over its runs", "muted", "diamond"))
         text += "; open diamonds are the paper’s numbers, in the colour of their source"
-    panel = Panel(_spec(data, x, y), text, height=90 + 26 * len(bounded) * max(len(sources), 2))
+    spec = _spec(data, x, y)
+    spec["layout"]["annotations"] = [
+        _lane_title(METRICS[name].name, i) for i, name in enumerate(bounded)
+    ]
+    height = 70 + len(bounded) * (30 + 24 * max(len(sources), 2))
+    panel = Panel(spec, "Scores of every source as dots with intervals", height=height)
     see = ". See whether the bars of two sources part, and whether the order is the paper’s."
     return Plot("scores", caption(results, text + see), [panel], keys)
+
+
+def _lane_title(text: str, place: int) -> dict[str, Any]:
+    """A score's name above its lanes, which leaves a narrow screen all of its width."""
+    return {
+        "text": f"<b>{html.escape(text, quote=False)}</b>",
+        "x": 0,
+        "xref": "paper",
+        "xanchor": "left",
+        "y": place - 0.42,
+        "showarrow": False,
+        "font": {"color": "@ink"},
+    }
 
 
 def _score_traces(
@@ -101,8 +121,8 @@ def _score_traces(
     one, colour = results.sources[source], f"@c{slot(source)}"
     name = html.escape(source_name(source), quote=False)
     shown = [metric for metric in metrics if metric in one.scores]
-    means = [float(np.nanmean(one.scores[metric])) for metric in shown]
-    ends = [one.intervals.get(m, (mean, mean)) for m, mean in zip(shown, means, strict=True)]
+    means = [one.mean(metric) for metric in shown]
+    ends = [one.interval(m) or (mean, mean) for m, mean in zip(shown, means, strict=True)]
     traces: list[dict[str, Any]] = [
         {
             "type": "scatter",
@@ -123,34 +143,41 @@ def _score_traces(
             },
             "marker": {"color": colour, "size": 10},
             "text": [
-                f"{mean_and_spread(one.scores[m])} [{span(one.intervals.get(m))}]" for m in shown
+                f"{mean_and_spread(one.scores[m])} [{span(one.interval(m))}]" for m in shown
             ],
             "hovertemplate": f"{name}<br>%{{text}}<extra></extra>",
         }
     ]
     told = results.published.get(source, {})
-    paper = [(m, published_value(told[m])) for m in metrics if m in told]
-    known = [(metric, value) for metric, value in paper if value is not None]
-    if known:
-        traces.append(
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "name": f"{name} (paper)",
-                "x": [value[0] for _, value in known],
-                "y": [metrics.index(metric) + lane + 0.12 for metric, _ in known],
-                "error_x": {
-                    "type": "data",
-                    "array": [value[1] for _, value in known],
-                    "color": colour,
-                    "thickness": 1,
-                    "width": 3,
-                },
-                "marker": {"color": colour, "size": 9, "symbol": "diamond-open"},
-                "hovertemplate": f"{name}, paper<br>%{{x:.3f}}<extra></extra>",
-            }
-        )
+    paper = {m: published_value(told[m]) for m in metrics if m in told}
+    marks = [
+        (*value, metrics.index(m) + lane + 0.09) for m, value in paper.items() if value is not None
+    ]
+    for known in ([mark for mark in marks if mark[1]], [mark for mark in marks if not mark[1]]):
+        traces += _paper_trace(name, colour, known)
     return traces
+
+
+def _paper_trace(
+    name: str, colour: str, marks: Sequence[tuple[float, float, float]]
+) -> list[dict[str, Any]]:
+    """The paper's (mean, spread, height) as open diamonds; marks without a spread have no bar."""
+    if not marks:
+        return []
+    means, spreads, heights = (list(each) for each in zip(*marks, strict=True))
+    bars = {"type": "data", "array": spreads, "color": colour, "thickness": 1, "width": 3}
+    return [
+        {
+            "type": "scatter",
+            "mode": "markers",
+            "name": f"{name} (paper)",
+            "x": means,
+            "y": heights,
+            "error_x": bars if any(spreads) else {"visible": False},
+            "marker": {"color": colour, "size": 9, "symbol": "diamond-open"},
+            "hovertemplate": f"{name}, paper<br>%{{x:.3f}}<extra></extra>",
+        }
+    ]
 
 
 def roc_plot(results: Results, curves: dict[str, Roc]) -> Plot:
@@ -167,8 +194,8 @@ def roc_plot(results: Results, curves: dict[str, Roc]) -> Plot:
         }
     ]
     keys = []
-    for place, (source, curve) in enumerate(curves.items()):
-        dash = DASHES[place % len(DASHES)]
+    for source, curve in curves.items():
+        dash = DASHES[slot(source) % len(DASHES)]
         data += _roc_traces(source, curve, dash)
         area = mean_and_spread(curve.areas)
         keys.append(Key(f"{source_name(source)}: area {area}", f"c{slot(source)}", dash))
@@ -177,13 +204,13 @@ def roc_plot(results: Results, curves: dict[str, Roc]) -> Plot:
     text = (
         f"Micro-averaged ROC, mean over {results.runs} runs; shading: ± one standard deviation. "
         "The further up and to the left, the better a source’s classifier separates the classes "
-        "at any threshold; where bands overlap, the runs do not."
+        "at any threshold; where bands overlap, chance in training can swap the sources."
         if results.runs > 1
         else "Micro-averaged ROC of the one run, so there is no band. The further up and to the "
         "left, the better a source’s classifier separates the classes at any threshold."
     )
     panel = Panel(_spec(data, x, y), "Micro-averaged ROC curves", height=460)
-    return Plot("roc", caption(results, text), [panel], keys, width=640)
+    return Plot("roc", caption(results, text), [panel], keys, narrow=True)
 
 
 def _roc_traces(source: str, curve: Roc, dash: str) -> list[dict[str, Any]]:
@@ -244,8 +271,7 @@ def latent_plot(results: Results, name: str, text: str, shown: Sequence[Latent])
     """Observed as bars, predicted as a stepped line, a panel per latent."""
     keys = [Key("observed", "observed", "bar"), Key("predicted", f"c{slot('ibg_rg')}")]
     panels = [_latent_panel(each) for each in shown]
-    width = 640 if len(panels) == 1 else None
-    return Plot(name, caption(results, text), panels, keys, width=width)
+    return Plot(name, caption(results, text), panels, keys, narrow=len(panels) == 1)
 
 
 def _latent_panel(latent: Latent) -> Panel:

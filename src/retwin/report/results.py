@@ -34,6 +34,9 @@ SCORES = (
 """Every score of a source that the page knows, in the order in which it is shown."""
 
 
+Interval = tuple[float | None, float | None]
+
+
 class Part(BaseModel):
     """A part of results.json: read-only, and unknown keys are left to later versions."""
 
@@ -64,7 +67,7 @@ class Source(Part):
     """Scores (one value per run) and costs of one source of training data."""
 
     scores: dict[str, list[float]]
-    intervals: dict[str, tuple[float, float]] = {}
+    intervals: dict[str, Interval | None] = {}
     confusion: list[list[int]] | None = None
     real_data: str | None = None
     fault_protocol_known: bool | None = None
@@ -85,10 +88,17 @@ class Source(Part):
             else runs
             for name, runs in found.items()
         }
-        intervals = values.get("intervals") or {}
-        if isinstance(intervals, dict):
-            intervals = {k: v for k, v in intervals.items() if v is not None and None not in v}
-        return {**values, "scores": scores, "intervals": intervals}
+        given = {key: value for key, value in values.items() if value is not None}
+        return {**given, "scores": scores}
+
+    def mean(self, metric: str) -> float:
+        """Over the runs that have the score; NaN when none has."""
+        finite = [run for run in self.scores.get(metric, []) if math.isfinite(run)]
+        return sum(finite) / len(finite) if finite else math.nan
+
+    def interval(self, metric: str) -> tuple[float, float] | None:
+        """Bootstrap interval, if there is one."""
+        return _finite(self.intervals.get(metric))
 
 
 class Comparison(Part):
@@ -102,13 +112,18 @@ class Comparison(Part):
     df: float | None = None
     p: float | None = None
     p_holm: float | None = None
-    bootstrap_ci95: tuple[float, float] | None = None
+    bootstrap_ci95: Interval | None = None
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Bootstrap interval of the difference, if there is one."""
+        return _finite(self.bootstrap_ci95)
 
     def seen_from(self, name: str) -> Comparison:
         """The same comparison with `name` first."""
         if self.a == name:
             return self
-        interval = self.bootstrap_ci95
+        interval = self.interval
         turned = {
             "a": self.b,
             "b": self.a,
@@ -186,10 +201,21 @@ class Results(Part):
             wanted = (len(self.data.test.labels), size)
             if shape != (0,) and shape[1:] != wanted:
                 raise ValueError(f"probabilities/{name} has shape {shape}, not (runs, *{wanted})")
+        self._check_latents()
         strange = set(self.data.test.labels) - set(self.classes)
         if strange and self.classes:
             raise ValueError(f"test label {min(strange)!r} is none of the classes")
         return self
+
+    def _check_latents(self) -> None:
+        seen, said = self.arrays.get("z/observed"), self.arrays.get("z/predicted")
+        if seen is None or said is None:
+            return
+        identified = self.arrays.get("z/identified")
+        if seen.ndim != 2 or said.ndim != 2 or seen.shape[1] != said.shape[1]:
+            raise ValueError(f"z/observed {seen.shape} and z/predicted {said.shape} do not match")
+        if identified is not None and identified.shape != seen.shape:
+            raise ValueError(f"z/identified has shape {identified.shape}, not {seen.shape}")
 
     def probabilities(self, source: str) -> NDArray:
         """(runs, n_test, classes), or empty."""
@@ -242,6 +268,12 @@ def _read_arrays(folder: Path) -> dict[str, NDArray]:
             return {name: file[name] for name in file.files}
     except Exception as error:  # whatever zip, numpy or the disk finds wrong with it
         raise _bad("arrays.npz", "arrays of a study", f"{path} ({error})") from error
+
+
+def _finite(interval: Interval | None) -> tuple[float, float] | None:
+    if interval is None or interval[0] is None or interval[1] is None:
+        return None
+    return (interval[0], interval[1]) if math.isfinite(sum(interval)) else None  # type: ignore[arg-type]
 
 
 def _bad(argument: str, expected: str, got: str) -> InputError:

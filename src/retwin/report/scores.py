@@ -12,6 +12,7 @@ from retwin.report.plots import scores_plot
 from retwin.report.results import Comparison, Results
 from retwin.report.words import (
     METRICS,
+    in_sentence,
     mean_and_spread,
     number,
     order,
@@ -31,9 +32,9 @@ MORE = ("accuracy", "auroc_micro", "ece", "coverage50", "coverage90")
 
 def outcome(comparison: Comparison) -> str:
     """`better` or `worse` when the interval leaves zero out, `open` when not, else nothing."""
-    interval = comparison.bootstrap_ci95
+    interval = comparison.interval
     direction = METRICS[comparison.metric].better if comparison.metric in METRICS else 0
-    if interval is None or direction == 0 or not np.isfinite(interval).all():
+    if interval is None or direction == 0:
         return ""
     if interval[0] <= 0 <= interval[1]:
         return "open"
@@ -69,25 +70,25 @@ def _between(found: Sequence[Comparison], a: str, b: str) -> list[Comparison]:
 
 
 def _first(results: Results, found: Comparison) -> str:
-    a, b = source_name(found.a), source_name(found.b)
-    name = METRICS[found.metric].name
+    a, b = (in_sentence(source_name(each)) for each in (found.a, found.b))
     means = [
-        number(float(np.nanmean(results.sources[each].scores[found.metric])))
-        if each in results.sources and found.metric in results.sources[each].scores
-        else "–"
+        number(results.sources[each].mean(found.metric)) if each in results.sources else "–"
         for each in (found.a, found.b)
     ]
-    result = outcome(found)
     count = results.data.test.n or len(results.data.test.labels)
     on = f"{count} test trajectories" if count else "the test trajectories"
-    what = f"{name} {means[0]} against {means[1]}"
-    difference = f"{signed(found.mean_diff)}, 95 % interval {span(found.bootstrap_ci95, sign=True)}"
+    what = f"{in_sentence(METRICS[found.metric].name)} {means[0]} against {means[1]}"
+    difference = (
+        f"difference {signed(found.mean_diff)}, "
+        f"95 % interval {span(found.interval, sign=True)}"
+    )
+    result = outcome(found)
     if result == "open":
         return (
-            f"{a} and {b} cannot be told apart on {on}: {what}, "
+            f"On {on}, training on {a} cannot be told apart from training on {b}: {what}, "
             f"and the interval of the difference includes zero ({difference})."
         )
-    return f"{a} is {result} than {b} on {on}: {what} ({difference})."
+    return f"On {on}, training on {a} is {result} than on {b}: {what} ({difference})."
 
 
 def _second(found: Sequence[Comparison]) -> list[str]:
@@ -95,8 +96,8 @@ def _second(found: Sequence[Comparison]) -> list[str]:
     said = []
     for result, words in (("better", "also better"), ("worse", "worse"), ("open", "undecided")):
         each = [
-            f"{METRICS[one.metric].name.replace('Healthy', 'healthy').replace('Bal', 'bal')} "
-            f"({signed(one.mean_diff)}, {span(one.bootstrap_ci95, sign=True)})"
+            f"{in_sentence(METRICS[one.metric].name)} "
+            f"({signed(one.mean_diff)}, {span(one.interval, sign=True)})"
             for one in found
             if outcome(one) == result
         ]
@@ -113,10 +114,10 @@ def _third(found: Comparison) -> str:
         "worse": "so the residual model itself does harm",
         "open": "so it is not shown that the residual model itself helps",
     }[outcome(found)]
-    name = METRICS[found.metric].name
+    name = in_sentence(METRICS[found.metric].name)
     return (
         f"Against {source_name('ibg')}, with the same commands and faults, the difference in "
-        f"{name} is {signed(found.mean_diff)} ({span(found.bootstrap_ci95, sign=True)}), {meaning}."
+        f"{name} is {signed(found.mean_diff)} ({span(found.interval, sign=True)}), {meaning}."
     )
 
 
@@ -136,17 +137,19 @@ def _score_table(results: Results, metrics: Sequence[str]) -> Table | None:
     shown = [name for name in metrics if _has(results, name)]
     if not shown:
         return None
-    columns = [Column("Training data", numeric=False), Column("Real data used", numeric=False)]
+    columns = [Column("Training data", numeric=False)]
+    paper = any(_in_paper(results, name) for name in shown)
     for name in shown:
-        columns += _score_columns(results, name)
+        columns += _score_columns(results, name, paper)
     best = {name: _best(results, name) for name in shown}
     rows = []
     for source in order(list(results.sources)):
         one = results.sources[source]
-        known = "fault protocol known" if one.fault_protocol_known else ""
-        row = [Cell(source_name(source), slot=slot(source)), Cell(real_data(one.real_data), known)]
+        used = f"real data: {real_data(one.real_data)}"
+        known = ["fault protocol known"] if one.fault_protocol_known else []
+        row = [Cell(source_name(source), "; ".join([used, *known]), slot=slot(source))]
         for name in shown:
-            below = f"[{span(one.intervals[name])}]" if name in one.intervals else ""
+            below = f"[{span(one.interval(name))}]" if one.interval(name) else ""
             text = mean_and_spread(one.scores.get(name, []))
             row.append(Cell(text, below, best=source in best[name]))
             if _in_paper(results, name):
@@ -155,11 +158,13 @@ def _score_table(results: Results, metrics: Sequence[str]) -> Table | None:
     return Table(_score_caption(results, shown), columns, rows)
 
 
-def _score_columns(results: Results, name: str) -> list[Column]:
+def _score_columns(results: Results, name: str, paper: bool) -> list[Column]:
+    """One column, or two under the score's name where the paper has it too."""
     title = METRICS[name].name
-    if not _in_paper(results, name):
+    if not paper:
         return [Column(title)]
-    return [Column("this study", group=title), Column("paper", group=title, paper=True)]
+    ours = Column("this study", group=title)
+    return [ours, Column("paper", group=title, paper=True)] if _in_paper(results, name) else [ours]
 
 
 def _score_caption(results: Results, shown: Sequence[str]) -> str:
@@ -192,9 +197,9 @@ def _in_paper(results: Results, metric: str) -> bool:
 def _best(results: Results, metric: str) -> list[str]:
     """The sources with the best mean; none when there is nothing to choose from."""
     means = {
-        name: float(np.nanmean(each.scores[metric]))
+        name: each.mean(metric)
         for name, each in results.sources.items()
-        if metric in each.scores and np.isfinite(each.scores[metric]).any()
+        if np.isfinite(each.mean(metric))
     }
     better = METRICS[metric].better
     if len(means) < 2 or better == 0:
@@ -209,8 +214,12 @@ def further_scores(results: Results) -> Section | None:
     if table is None:
         return None
     floors = {name: _floor(results, name) for name in order(list(results.sources))}
-    if _has(results, "ece") and any(floor is not None for floor in floors.values()):
-        columns = [*table.columns, Column("ECE floor")]
+    computed = any(floor is not None for floor in floors.values())
+    if _has(results, "ece") and computed:
+        columns = [
+            *table.columns,
+            Column("ECE floor", group="ECE floor" if table.columns[-1].group else ""),
+        ]
         rows = [
             [*row, Cell(number(floor))]
             for row, floor in zip(table.rows, floors.values(), strict=True)
@@ -218,7 +227,7 @@ def further_scores(results: Results) -> Section | None:
         table = Table(table.caption, columns, rows)
     blocks: list = [table]
     if _has(results, "ece"):
-        blocks.append(Prose(_floor_note(results), quiet=True))
+        blocks.append(Prose(_floor_note(results, computed), quiet=True))
     return Section("further", "Further scores", blocks)
 
 
@@ -228,15 +237,18 @@ def _floor(results: Results, source: str) -> float | None:
     return ece_floor(probabilities) if usable else None
 
 
-def _floor_note(results: Results) -> str:
+def _floor_note(results: Results, computed: bool) -> str:
     count = results.data.test.n or len(results.data.test.labels)
-    return (
+    text = (
         "The expected calibration error (ECE, top label, 10 bins of equal mass) cannot reach zero "
-        f"on {count or 'few'} trajectories. The floor is what a perfectly calibrated classifier "
-        "with the same confidences would show on average; the ECE says something only where it "
-        "lies clearly above. As a rule of thumb it is about 0.04 with 90 trajectories and 0.06 "
-        "with 36."
+        f"on {count or 'few'} trajectories. "
     )
+    if computed:
+        return text + (
+            "The floor is what a perfectly calibrated classifier with the same confidences would "
+            "show on average; the ECE says something only where it lies clearly above."
+        )
+    return text + "Its floor is about 0.04 with 90 trajectories and 0.06 with 36."
 
 
 def comparisons(results: Results) -> Section | None:
@@ -246,15 +258,15 @@ def comparisons(results: Results) -> Section | None:
         return None
     columns = [
         Column("Score", numeric=False),
+        Column("Reading", numeric=False),
         Column("Difference"),
         Column("95 % interval"),
         Column("", numeric=False),
-        Column("Reading", numeric=False),
         Column("t (df)", group="Welch’s test over runs"),
         Column("p", group="Welch’s test over runs"),
         Column("p, Holm", group="Welch’s test over runs"),
     ]
-    shown = [each.bootstrap_ci95 for each in found if each.bootstrap_ci95 is not None]
+    shown = [each.interval for each in found if each.interval is not None]
     low, high = min([0.0, *(lo for lo, _ in shown)]), max([0.0, *(hi for _, hi in shown)])
     rows: list[list[Cell]] = []
     last: tuple[str, str] | None = None
@@ -280,20 +292,20 @@ def _by_pair(found: Sequence[Comparison]) -> list[Comparison]:
 
 def _comparison_row(each: Comparison, low: float, high: float) -> list[Cell]:
     forest = None
-    if each.bootstrap_ci95 is not None and high > low:
+    if each.interval is not None and np.isfinite(each.mean_diff) and high > low:
         lower, at, upper, zero = (
             100 * (value - low) / (high - low)
-            for value in (each.bootstrap_ci95[0], each.mean_diff, each.bootstrap_ci95[1], 0.0)
+            for value in (each.interval[0], each.mean_diff, each.interval[1], 0.0)
         )
         forest = Forest(lower, min(max(at, 0), 100), upper, zero)
     result = outcome(each)
     reading = "undecided" if result == "open" else result or "–"
     return [
         Cell(METRICS[each.metric].name),
-        Cell(signed(each.mean_diff)),
-        Cell(span(each.bootstrap_ci95, sign=True)),
-        Cell("", forest=forest, slot=slot(each.a)),
         Cell(reading, tone=result),
+        Cell(signed(each.mean_diff)),
+        Cell(span(each.interval, sign=True)),
+        Cell("", forest=forest, slot=slot(each.a)),
         Cell(f"{number(each.t, 2)} ({number(each.df, 1)})" if each.t is not None else "–"),
         Cell(p_value(each.p)),
         Cell(p_value(each.p_holm)),

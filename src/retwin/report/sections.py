@@ -66,7 +66,7 @@ def confusion(results: Results) -> Section | None:
         text += " M1 is motor 1; bias is a steady-state error."
     names = [class_name(name) for name in results.classes]
     block = Matrices("confusion", caption(results, text), names, shown)
-    return Section("confusion", "Which faults are confused", [block])
+    return Section("confusion", "Confusions", [block])
 
 
 def recalls(counts: Sequence[Sequence[int]]) -> list[list[float]]:
@@ -124,7 +124,7 @@ def discrepancy(results: Results) -> Section | None:
         blocks.append(table)
     if not blocks:
         return None
-    return Section("discrepancy", "Observed and predicted discrepancy", blocks)
+    return Section("discrepancy", "Discrepancy", blocks)
 
 
 def _agreement(results: Results) -> Table | None:
@@ -217,19 +217,23 @@ def _costs(results: Results) -> Table | None:
     parts = results.sources
     shown = {
         "Twin runs": [
-            "–" if parts[each].twin_runs is None else f"{parts[each].twin_runs:,}".replace(",", " ")
-            for each in sources
+            "–" if parts[each].twin_runs is None else str(parts[each].twin_runs) for each in sources
         ],
-        "Updating": [duration(parts[each].update_s) for each in sources],
-        "Generating": [duration(parts[each].generate_s) for each in sources],
+        "Update": [duration(parts[each].update_s) for each in sources],
+        "Generation": [duration(parts[each].generate_s) for each in sources],
         "3600 trajectories": [duration(bulk.get(each)) for each in sources],
     }
     kept = {name: texts for name, texts in shown.items() if set(texts) != {"–"}}
     if not kept:
         return None
     columns = [Column("Training data", numeric=False), Column("Real data used", numeric=False)]
-    columns += [Column(name) for name in kept]
-    columns += [Column("paper, 3600", paper=True)] if paper else []
+    bulky = "3600 trajectories"
+    columns += [
+        Column("this study", group=bulky) if paper and name == bulky else Column(name)
+        for name in kept
+    ]
+    if paper:
+        columns.append(Column("paper", group=bulky, paper=True))
     rows = []
     for place, each in enumerate(sources):
         row = [Cell(source_name(each), slot=slot(each)), Cell(real_data(parts[each].real_data))]
@@ -237,7 +241,10 @@ def _costs(results: Results) -> Table | None:
         if paper:
             row.append(Cell(results.published.get(each, {}).get("generate", "–")))
         rows.append(row)
-    text = "What a source costs: simulations, fitting what it is made with, and making data."
+    text = (
+        "What a source costs: runs of the twin, the update (fitting what makes its data), and the "
+        "generation of the diagnoser’s training data."
+    )
     if paper:
         text += (
             " The paper’s times are from another machine (Apple M1 Pro) and another twin, so "
@@ -259,7 +266,11 @@ def provenance(results: Results) -> Section | None:
         blocks.append(data)
     setup = {"preset": results.preset, "classifier": results.classifier, "runs": results.runs}
     facts = {**setup, **told}
-    pairs = [(label(key), str(value)) for key, value in facts.items() if value not in (None, "")]
+    pairs = [
+        (key.replace("_", " "), str(value))
+        for key, value in facts.items()
+        if value not in (None, "")
+    ]
     blocks.append(Facts(pairs))
     used = results.data.calibration.used
     if used:
@@ -267,7 +278,7 @@ def provenance(results: Results) -> Section | None:
     if results.data.test.ids:
         count = len(results.data.test.ids)
         blocks.append(Fold(f"{count} test trajectories", results.data.test.ids))
-    return Section("provenance", "Where this comes from", blocks)
+    return Section("provenance", "Provenance", blocks)
 
 
 def _data_table(results: Results) -> Table | None:

@@ -17,6 +17,7 @@ __all__ = [
     "Metric",
     "class_name",
     "duration",
+    "in_sentence",
     "label",
     "mean_and_spread",
     "number",
@@ -111,6 +112,13 @@ def source_name(source: str) -> str:
     return SOURCES.get(source, source)
 
 
+def in_sentence(name: str) -> str:
+    """A source's or score's name in the middle of a sentence."""
+    if name == SOURCES["dt"]:
+        return "the digital twin"
+    return name if name[:2].isupper() else f"{name[:1].lower()}{name[1:]}"
+
+
 def slot(source: str) -> int:
     """Place of the source's colour in `PALETTE`, the same in every report."""
     names = list(SOURCES)
@@ -146,13 +154,13 @@ def number(value: float | None, digits: int = 3) -> str:
     """Fixed digits with a true minus; a dash for what is not there."""
     if value is None or not math.isfinite(value):
         return "–"
-    return f"{value:.{digits}f}".replace("-", "−")
+    return f"{round(value, digits) + 0.0:.{digits}f}".replace("-", "−")
 
 
 def signed(value: float, digits: int = 3) -> str:
     """With its sign, also when positive."""
     text = number(value, digits)
-    return f"+{text}" if value > 0 else text
+    return f"+{text}" if round(value, digits) > 0 else text
 
 
 def span(interval: Sequence[float] | None, *, sign: bool = False) -> str:

@@ -52,7 +52,7 @@ class Preset:
 
 
 PRESETS: dict[str, Preset] = {
-    "quick": Preset("cnn", 5, Training(epochs=25, batch=64, rate=2e-3, weight_decay=1e-2)),
+    "quick": Preset("cnn", 5, Training(epochs=25, batch=64, rate=3e-3, weight_decay=1e-2)),
     "paper": Preset("lstm", 10, Training(epochs=30, batch=32, rate=1e-3, decay="step")),
 }
 

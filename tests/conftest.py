@@ -1,0 +1,58 @@
+"""What the tests share: the arm's case, small sets, and models fitted once per worker."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import retwin as rt
+from retwin.training import Training
+
+# A surrogate that is good to a millimetre takes a second; the default one is tried in one test.
+BRISK = Training(epochs=6, batch=256, rate=1e-2)
+
+
+@pytest.fixture(scope="session")
+def case() -> rt.Case:
+    return rt.cases.armpi()
+
+
+@pytest.fixture(scope="session")
+def twin_set(case: rt.Case) -> rt.Trajectories:
+    return rt.generate(case.twin, case, per_class=12, seed=100)
+
+
+@pytest.fixture(scope="session")
+def emulated(case: rt.Case) -> rt.Trajectories:
+    """Ten trajectories per class of the emulated robot."""
+    return rt.generate(case.emulator, case, per_class=10, seed=101)
+
+
+@pytest.fixture(scope="session")
+def ibg(twin_set: rt.Trajectories) -> rt.Surrogate:
+    return rt.fit_surrogate(twin_set, rt.MLP((64, 64)), seed=0, training=BRISK)
+
+
+@pytest.fixture(scope="session")
+def rg(ibg: rt.Surrogate, emulated: rt.Trajectories) -> rt.ResidualModel:
+    return rt.fit_residual(ibg, emulated, seed=0)
+
+
+@pytest.fixture(scope="session")
+def updated(ibg: rt.Surrogate, rg: rt.ResidualModel) -> rt.CorrectedTwin:
+    return rt.CorrectedTwin(ibg, rg, case="armpi")
+
+
+class ExactArm:
+    """The arm's kinematics as a differentiable twin: a surrogate without any error."""
+
+    def __init__(self, twin: rt.KinematicTwin) -> None:
+        self.twin = twin
+
+    def predict(self, commands: np.ndarray) -> np.ndarray:
+        return self.twin.position(np.asarray(commands, dtype=np.float64)).astype(np.float32)
+
+
+@pytest.fixture(scope="session")
+def exact(case: rt.Case) -> ExactArm:
+    return ExactArm(case.twin)
