@@ -30,7 +30,12 @@ def test_early_stopping_says_so() -> None:
     network = nn.Linear(2, 1)
     noise = torch.randn(200, 1, generator=torch.Generator().manual_seed(5))
     fit = train(
-        network, squared, (line()[0], noise), line(seed=1), Training(500, 32, 0.05, patience=3), seed=0
+        network,
+        squared,
+        (line()[0], noise),
+        line(seed=1),
+        Training(500, 32, 0.05, patience=3),
+        seed=0,
     )
     assert fit.reason == "no better validation loss for 3 epochs"
     assert len(fit.history["train"]) == fit.best_epoch + 3

@@ -43,6 +43,17 @@ class GaussianMixture(MixtureSameFamily):
             validate_args=False,
         )
 
+    def expand(
+        self, batch_shape: Sequence[int], _instance: Distribution | None = None
+    ) -> GaussianMixture:
+        """The same mixture, repeated to a larger batch."""
+        shape = torch.Size(batch_shape)
+        return GaussianMixture(
+            self.mixture_distribution.logits.expand(*shape, -1),
+            self.means.expand(*shape, -1, -1),
+            self.factor.expand(*shape, -1, -1, -1),
+        )
+
     def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
         """The draw (..., D) that this noise stands for: uniform (...) in [0, 1), normal (..., D).
 
@@ -109,11 +120,7 @@ class Blocks(Distribution):
         uniform = torch.rand(*shape, len(self.blocks), generator=generator)
         normal = torch.randn(*shape, self.event_shape[0], generator=generator)
         parts = zip(self.blocks, uniform.unbind(-1), normal.split(self.widths, -1), strict=True)
-        draws = []
-        for block, u, e in parts:
-            wide = block.expand(shape) if sample_shape else block
-            draws.append(GaussianMixture.from_noise(wide, u, e))
-        return torch.cat(draws, dim=-1)
+        return torch.cat([block.expand(shape).from_noise(u, e) for block, u, e in parts], dim=-1)
 
     def marginal_cdf(self, value: Tensor) -> Tensor:
         """P(z_d <= value_d) of each component of z on its own, (..., D)."""

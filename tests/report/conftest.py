@@ -187,6 +187,12 @@ def study() -> Study:
 
 
 @pytest.fixture
+def single() -> Study:
+    """A synthetic study with one run."""
+    return synthetic(runs=1)
+
+
+@pytest.fixture
 def write(tmp_path: Path) -> Callable[[Study], Path]:
     """Writes a study to a folder as `retwin study` does."""
 

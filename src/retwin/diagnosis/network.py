@@ -83,7 +83,7 @@ class NetworkDiagnoser(nn.Module):
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
         """Probabilities (n, classes), see `Diagnoser`."""
         parts = [
-            self(part).softmax(dim=1).double() for part in self.features(trajectories).split(CHUNK)
+            self(part).double().softmax(dim=1) for part in self.features(trajectories).split(CHUNK)
         ]
         return torch.cat(parts).numpy()
 

@@ -98,7 +98,10 @@ def scores_plot(results: Results, metrics: Sequence[str]) -> Plot | None:
     ]
     height = 70 + len(bounded) * (30 + 24 * max(len(sources), 2))
     panel = Panel(spec, "Scores of every source as dots with intervals", height=height)
-    see = ". See whether the bars of two sources part, and whether the order is the paper’s."
+    see = (
+        ". Look at the order of the sources and at how far apart they lie; bars that overlap do "
+        "not settle a comparison, the paired differences do."
+    )
     return Plot("scores", caption(results, text + see), [panel], keys)
 
 
@@ -142,9 +145,7 @@ def _score_traces(
                 "width": 0,
             },
             "marker": {"color": colour, "size": 10},
-            "text": [
-                f"{mean_and_spread(one.scores[m])} [{span(one.interval(m))}]" for m in shown
-            ],
+            "text": [f"{mean_and_spread(one.scores[m])} [{span(one.interval(m))}]" for m in shown],
             "hovertemplate": f"{name}<br>%{{text}}<extra></extra>",
         }
     ]

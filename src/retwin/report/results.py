@@ -271,9 +271,10 @@ def _read_arrays(folder: Path) -> dict[str, NDArray]:
 
 
 def _finite(interval: Interval | None) -> tuple[float, float] | None:
-    if interval is None or interval[0] is None or interval[1] is None:
+    low, high = interval or (None, None)
+    if low is None or high is None or not math.isfinite(low) or not math.isfinite(high):
         return None
-    return (interval[0], interval[1]) if math.isfinite(sum(interval)) else None  # type: ignore[arg-type]
+    return low, high
 
 
 def _bad(argument: str, expected: str, got: str) -> InputError:

@@ -79,8 +79,7 @@ def _first(results: Results, found: Comparison) -> str:
     on = f"{count} test trajectories" if count else "the test trajectories"
     what = f"{in_sentence(METRICS[found.metric].name)} {means[0]} against {means[1]}"
     difference = (
-        f"difference {signed(found.mean_diff)}, "
-        f"95 % interval {span(found.interval, sign=True)}"
+        f"difference {signed(found.mean_diff)}, 95 % interval {span(found.interval, sign=True)}"
     )
     result = outcome(found)
     if result == "open":
@@ -313,11 +312,11 @@ def _comparison_row(each: Comparison, low: float, high: float) -> list[Cell]:
 
 
 def _comparison_caption(results: Results) -> str:
+    runs = f"{results.runs} runs" if results.runs > 1 else "one run, so there is no test"
     return (
         "“Better” and “worse” are said only where the 95 % paired bootstrap interval over test "
         "trajectories leaves zero out; the bars draw these intervals on one axis, with a line at "
         "zero. Welch’s test asks whether the mean over runs differs, so it sees the chance in "
-        f"training ({results.runs} runs) but not the choice of test trajectories. Holm’s "
-        "correction covers the paper’s three scores; the intervals are not corrected for their "
-        "number."
+        f"training ({runs}) but not the choice of test trajectories. Holm’s correction covers the "
+        "scores that show its p; the intervals are not corrected for their number."
     )

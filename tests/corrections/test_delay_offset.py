@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import retwin as rt
+from retwin.corrections import from_config, to_config
+
+
+def context_of(exact, commands: np.ndarray) -> rt.Context:
+    return rt.Context.of(exact, commands, rt.Segments.from_commands(commands), rate=100.0)
+
+
+@pytest.fixture(scope="module")
+def context(exact, case: rt.Case) -> rt.Context:
+    return context_of(exact, case.sampler.sample(40, rng=np.random.default_rng(0)))
+
+
+@pytest.fixture(scope="module")
+def z(context: rt.Context) -> torch.Tensor:
+    rng = np.random.default_rng(1)
+    delay = rng.gamma(4, 1.2, (40, 5, 1))
+    offset = rng.normal(0, 0.005, (40, 5, 3))
+    return torch.tensor(np.concatenate([delay, offset], axis=2)).float()
+
+
+def everything(observed: torch.Tensor) -> torch.Tensor:
+    return torch.ones(observed.shape, dtype=torch.bool)
+
+
+def test_no_discrepancy_changes_nothing(context: rt.Context) -> None:
+    same = rt.DelayOffset().apply(context, torch.zeros(40, 5, 4))
+    torch.testing.assert_close(same, context.path, atol=1e-6, rtol=0)
+
+
+def test_movements_come_late_and_end_off(context: rt.Context) -> None:
+    """With one delay and one offset for all, the path is the shifted path plus the offset."""
+    z = torch.zeros(40, 5, 4)
+    z[..., 0] = 7.0
+    z[..., 1:] = torch.tensor([0.01, -0.02, 0.03])
+    corrected = rt.DelayOffset().apply(context, z)
+    shift = torch.tensor([0.01, -0.02, 0.03])
+    torch.testing.assert_close(
+        corrected[:, 300:], context.path[:, 293:-7] + shift, atol=1e-5, rtol=0
+    )
+    torch.testing.assert_close(corrected[:, :7], context.path[:, :1].expand(-1, 7, -1))
+
+
+@pytest.mark.parametrize("delay", [-5.0, 0.3, 12.0, 30.0])
+def test_the_path_stays_continuous(context: rt.Context, delay: float) -> None:
+    rng = np.random.default_rng(2)
+    z = torch.tensor(rng.normal(0, [5, 0.02, 0.02, 0.02], (40, 5, 4))).float()
+    z[..., 0] += delay
+    step = rt.DelayOffset().apply(context, z).diff(dim=1).abs().max()
+    # The nominal path's own steps, sped up at most by how far neighbouring delays squeeze it.
+    assert step < 6 * context.path.diff(dim=1).abs().max()
+
+
+def test_known_z_is_recovered_from_clean_outputs(context: rt.Context, z: torch.Tensor) -> None:
+    operator = rt.DelayOffset()
+    observed = operator.apply(context, z)
+    found = operator.infer(context, observed, everything(observed))
+    error = (found.z - z).abs()
+    assert found.identified.float().mean() > 0.97
+    assert error[..., 0][found.identified[..., 0]].mean() < 0.1
+    assert error[..., 1:].mean() < 1e-5
+
+
+def test_intervals_are_honest_under_noise(context: rt.Context, z: torch.Tensor) -> None:
+    operator = rt.DelayOffset()
+    noise = torch.tensor(np.random.default_rng(3).normal(0, 5e-4, (40, 1000, 3)))
+    observed = operator.apply(context, z) + noise
+    found = operator.infer(context, observed, everything(observed))
+    deviation = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    inside = ((found.z - z).abs() <= 1.96 * deviation).float().mean((0, 1))
+    assert (inside > 0.9).all(), inside
+
+
+def test_glitches_do_not_move_z(context: rt.Context, z: torch.Tensor) -> None:
+    operator = rt.DelayOffset()
+    rng = np.random.default_rng(4)
+    clean = operator.apply(context, z) + torch.tensor(rng.normal(0, 2e-4, (40, 1000, 3)))
+    spiked = clean.clone()
+    for i, at in enumerate(rng.integers(20, 980, 40)):
+        spiked[i, at - 10 : at + 10] += 0.3 * torch.hann_window(20)[:, None]
+    before = operator.infer(context, clean, everything(clean)).z
+    after = operator.infer(context, spiked, everything(spiked)).z
+    assert (after - before)[..., 0].abs().median() < 0.05
+    assert (after - before)[..., 1:].abs().quantile(0.99) < 2e-4
+
+
+def test_missing_samples_do_not_count(context: rt.Context, z: torch.Tensor) -> None:
+    operator = rt.DelayOffset()
+    observed = operator.apply(context, z)
+    mask = everything(observed)
+    mask[:, 400:600] = False
+    broken = torch.where(mask, observed, 99.0)
+    found = operator.infer(context, broken, mask)
+    others = [0, 1, 3, 4]
+    assert (found.z - z)[:, others, 1:].abs().mean() < 1e-5
+    assert not found.identified[:, 2, 0].any(), "nothing of the third movement was seen"
+
+
+def test_a_movement_too_small_to_time_is_told(exact, case: rt.Case) -> None:
+    commands = np.full((1, 400, 4), 500.0, dtype=np.float32)
+    commands[0, :, 1] += np.clip(np.arange(400) - 50, 0, 60)
+    commands[0, :, 1] += 0.02 * np.clip(np.arange(400) - 250, 0, 60)
+    context = context_of(exact, commands)
+    noise = torch.tensor(np.random.default_rng(0).normal(0, 1e-3, (1, 400, 3)))
+    found = rt.DelayOffset().infer(context, context.path + noise, everything(noise))
+    assert found.identified[0, :, 0].tolist() == [True, False]
+
+
+def test_emulated_robot_is_understood(exact, case: rt.Case, emulated: rt.Trajectories) -> None:
+    """Delay MAE <= 1 sample, offset MAE <= 0.5 mm where no joint missed a movement."""
+    healthy = rt.generate(case.emulator, case, per_class=60, seed=11).with_label("Healthy")
+    seed = int(np.random.SeedSequence(11).spawn(2)[1].generate_state(1)[0])
+    # The discrepancy is drawn for all 540 trajectories at once, healthy ones first.
+    every = rt.generate(case.emulator, case, per_class=60, seed=11)
+    segments = rt.Segments.from_commands(every.commands)
+    truth = case.emulator.discrepancy(segments, seed)
+    context = context_of(exact, healthy.commands)
+    found = rt.DelayOffset().infer(
+        context, torch.tensor(healthy.observed), torch.tensor(healthy.mask)
+    )
+    parts = context.segments
+    targets = healthy.commands[np.arange(60)[:, None], np.ceil(parts.settle).astype(int)].astype(
+        float
+    )
+    reached = case.twin.position(targets + truth.offset[:60])
+    offset = reached - case.twin.position(targets)
+    # A lag makes a ramp come late by its time constant, on top of the delay.
+    delay = truth.delay[:60] + 100 * case.twin.lag.seconds
+    missed = truth.missed[:60].any(axis=2)
+    beside = missed.copy()
+    beside[:, 1:] |= missed[:, :-1]
+    good = ~beside & parts.valid
+    assert good.mean() > 0.8
+    z = found.z.numpy()
+    timed = good & found.identified[..., 0].numpy()
+    assert np.abs(z[..., 0] - delay)[timed].mean() <= 1.0
+    assert np.abs(z[..., 1:] - offset)[good].mean() <= 5e-4
+
+
+def test_apply_is_differentiable(context: rt.Context) -> None:
+    z = torch.full((40, 5, 4), 0.5, requires_grad=True)
+    rt.DelayOffset().apply(context, z).square().sum().backward()
+    assert torch.isfinite(z.grad).all()
+    assert (z.grad != 0).any(dim=0).all()
+
+
+def test_names_units_and_config() -> None:
+    operator = rt.DelayOffset()
+    latent = operator.latent(rt.Channels(("x", "y"), ("m", "m")))
+    assert latent.names == ("delay", "offset_x", "offset_y")
+    assert latent.units == ("samples", "m", "m")
+    assert from_config(to_config(operator)) == operator
+    assert isinstance(operator, rt.Correction)
+
+
+def test_no_movement_no_correction(exact) -> None:
+    context = context_of(exact, np.full((2, 50, 4), 400.0))
+    operator = rt.DelayOffset()
+    assert torch.equal(operator.apply(context, torch.zeros(2, 0, 4)), context.path)
+    found = operator.infer(context, context.path, everything(context.path))
+    assert found.z.shape == (2, 0, 4)

@@ -1,0 +1,109 @@
+"""ROC, ECE floor and bins against slow or known answers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+from numpy.typing import NDArray
+from sklearn.metrics import roc_auc_score, roc_curve
+
+from retwin.report.blocks import Plot
+from retwin.report.curves import ece_floor, latents, micro_roc
+from retwin.report.results import Results
+from retwin.report.sections import SECTIONS
+from retwin.report.words import class_name, duration, number, p_value, signed
+
+Study = tuple[dict[str, Any], dict[str, NDArray]]
+
+
+def results_of(study: Study) -> Results:
+    return Results.model_validate({**study[0], "arrays": study[1]})
+
+
+def test_micro_roc_is_scikit_learns(study: Study) -> None:
+    results = results_of(study)
+    probabilities = results.probabilities("dt")
+    positive = np.eye(9)[results.truth].ravel()
+    found = micro_roc(probabilities, results.truth)
+    wanted = [roc_auc_score(positive, run.ravel()) for run in probabilities]
+    np.testing.assert_allclose(found.areas, wanted, atol=1e-9)
+    false, true, _ = roc_curve(positive, probabilities[0].ravel(), drop_intermediate=False)
+    one = micro_roc(probabilities[:1], results.truth)
+    middle = one.rate[1:-1]
+    upper = np.array([true[false == each].max() for each in np.unique(false)])
+    wanted = np.interp(middle, np.unique(false), upper)
+    np.testing.assert_allclose(one.mean[1:-1], wanted, atol=1e-9)
+
+
+def test_micro_roc_of_perfect_and_constant_answers() -> None:
+    truth = np.array([0, 1, 2, 0, 1, 2])
+    perfect = micro_roc(np.eye(3)[truth][None], truth)
+    assert perfect.areas == pytest.approx([1.0])
+    assert np.all(perfect.mean == 1)
+    constant = micro_roc(np.full((2, 6, 3), 1 / 3), truth)
+    assert constant.areas == pytest.approx([0.5, 0.5])
+    np.testing.assert_allclose(constant.mean, constant.rate)
+
+
+def test_ece_floor_falls_with_the_root_of_the_count() -> None:
+    few, many = (np.full((1, count, 2), [0.8, 0.2]) for count in (100, 10_000))
+    # Ten bins of n / 10 answers, each right with chance 0.8: E|mean - 0.8|.
+    wanted = np.sqrt(2 / np.pi * 0.8 * 0.2 / 1000)
+    assert ece_floor(many) == pytest.approx(wanted, rel=0.1)
+    assert ece_floor(few) / ece_floor(many) == pytest.approx(10, rel=0.15)
+    assert ece_floor(np.eye(2)[None]) == 0
+
+
+def test_latents_count_what_lies_outside(study: Study) -> None:
+    delay, x, *_ = latents(results_of(study))
+    assert (delay.counts, delay.outside) == ((200, 4000), (9, 0))
+    assert delay.observed.sum() == pytest.approx(191 / 200)
+    assert x.unit == "mm"
+    assert x.edges[-1] < 50  # the outliers at 200 mm do not stretch it
+    assert x.edges[-1] > 8
+
+
+@pytest.mark.parametrize("values", [[1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0, 5.0]])
+def test_latents_of_few_or_equal_values(study: Study, values: list[float]) -> None:
+    study[1]["z/observed"] = np.repeat(np.array(values)[:, None], 4, axis=1)
+    del study[1]["z/identified"]
+    for latent in latents(results_of(study)):
+        assert np.all(np.diff(latent.edges) > 0)
+        assert latent.outside[0] < latent.counts[0]
+
+
+def test_plots_are_valid_for_plotly(study: Study) -> None:
+    def plain(value: object) -> object:
+        if isinstance(value, dict):
+            return {key: plain(each) for key, each in value.items()}
+        if isinstance(value, list):
+            return [plain(each) for each in value]
+        return "#123456" if isinstance(value, str) and value.startswith("@") else value
+
+    results = results_of(study)
+    sections = [section for make in SECTIONS if (section := make(results)) is not None]
+    assert len(sections) == len(SECTIONS)
+    plots = [b for section in sections for b in section.blocks if isinstance(b, Plot)]
+    assert [plot.name for plot in plots] == ["scores", "roc", "tde", "tpe"]
+    for plot in plots:
+        for panel in plot.panels:
+            assert go.Figure(plain(panel.spec)).data
+
+
+def test_words() -> None:
+    assert class_name("Motor_1_Stuck") == "M1 stuck"
+    assert class_name("Motor_3_Steady_state_error") == "M3 bias"
+    assert class_name("Healthy") == "Healthy"
+    assert (number(-0.5), number(float("nan")), number(-0.0001)) == ("−0.500", "–", "0.000")
+    assert (signed(0.1), signed(0.0001), signed(-0.1)) == ("+0.100", "0.000", "−0.100")
+    assert (p_value(0.0002), p_value(0.04), p_value(None)) == ("< 0.001", "0.040", "–")
+    assert [duration(each) for each in (0.02, 5, 300, 30600, None)] == [
+        "20 ms",
+        "5.0 s",
+        "5.0 min",
+        "8.5 h",
+        "–",
+    ]

@@ -1,0 +1,285 @@
+"""The report on synthetic studies: complete, self-contained, honest, and safe to open."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from retwin.errors import InputError
+from retwin.report import write_report
+from retwin.report.figures import FIGURES
+from retwin.report.page import render
+from retwin.report.results import read_results
+
+Study = tuple[dict[str, Any], dict[str, NDArray]]
+Write = Callable[[Study], Path]
+LOADING = {"src", "href", "srcset", "action", "poster", "data", "xlink:href"}
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+class Reader(HTMLParser):
+    """Visible text, elements and addresses of a page; scripts and styles are no text."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.text, self.ids, self.addresses, self.tags = "", [], [], []
+        self.inside: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.inside.append(tag)
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value)
+            if name in LOADING:
+                self.addresses.append(value or "")
+
+    def handle_endtag(self, tag: str) -> None:
+        while self.inside and self.inside.pop() != tag:
+            pass
+
+    def handle_data(self, data: str) -> None:
+        if not {"script", "style"} & set(self.inside[-1:]):
+            self.text += data
+
+
+def read(folder: Path) -> Reader:
+    reader = Reader(render(read_results(folder), {}))
+    reader.text = re.sub(r"\s+", " ", reader.text)
+    return reader
+
+
+def test_page_is_self_contained(study: Study, write: Write) -> None:
+    page = write_report(write(study))
+    assert page.name == "report.html"
+    assert page.stat().st_size <= 10e6
+    text = page.read_text(encoding="utf-8")
+    reader = Reader(text)
+    assert reader.addresses
+    assert all(each.startswith(("#", "data:")) for each in reader.addresses)
+    assert not {"link", "iframe", "object", "embed", "base"} & set(reader.tags)
+    style = text[text.index("<style>") : text.index("</style>")]
+    assert "url(" not in style
+    assert "@import" not in style
+    assert "default-src 'none'" in text
+
+
+def test_figures(study: Study, write: Write) -> None:
+    folder = write(study)
+    write_report(folder)
+    made = {path.stem: path.read_bytes() for path in (folder / "figures").glob("*.png")}
+    assert set(made) == set(FIGURES)
+    assert all(each.startswith(PNG) for each in made.values())
+
+
+def test_same_results_give_same_bytes(study: Study, write: Write) -> None:
+    folder = write(study)
+    first = write_report(folder).read_bytes()
+    assert write_report(folder).read_bytes() == first
+
+
+def test_numbers(study: Study, write: Write) -> None:
+    results, _ = study
+    text = read(write(study)).text
+    for name in ("dt", "ibg", "ibg_rg"):
+        runs = np.array(results["sources"][name]["macro_f1"])
+        assert f"{runs.mean():.3f} ± {runs.std(ddof=1):.3f}" in text
+    assert "0.753 ± 0.026" in text  # the paper's
+    assert "4–5 min" in text
+    assert "7.86 (16.6)" in text
+    assert "< 0.001" in text
+    assert "0.420" in text  # surrogate RMSE in mm
+    assert "9 of 200 observed" in text  # unidentified delays are no observations
+    assert "9 of 240 observed" in text
+    assert "real data: healthy calibration; fault protocol known" in text
+    assert results["provenance"]["command"] in text
+    assert "a1" * 32 in text
+    for count in np.diag(results["sources"]["ibg_rg"]["confusion"]):
+        assert str(count) in text
+    assert "M4 bias" in text
+
+
+def test_verdict_better(study: Study, write: Write) -> None:
+    text = read(write(study)).text
+    assert (
+        "On 90 test trajectories, training on IBG + RG is better than on the digital twin" in text
+    )
+    assert "so the residual model itself helps" in text
+
+
+def test_verdict_follows_the_interval_and_not_the_sign(study: Study, write: Write) -> None:
+    for each in study[0]["comparisons"]:
+        each["bootstrap_ci95"] = [-0.01, each["mean_diff"] + 0.1]
+    text = read(write(study)).text
+    assert "cannot be told apart" in text
+    assert "it is not shown that the residual model itself helps" in text
+    assert "is better than" not in text
+    assert "undecided" in text
+
+
+def test_verdict_worse_whichever_way_the_pair_is_given(study: Study, write: Write) -> None:
+    for each in study[0]["comparisons"]:
+        # dt minus ibg_rg above zero: ibg_rg is worse
+        each["a"], each["b"] = each["b"], each["a"]
+        each["mean_diff"], each["bootstrap_ci95"] = 0.1, [0.05, 0.15]
+    text = read(write(study)).text
+    assert "training on IBG + RG is worse than on the digital twin" in text
+    assert "−0.150 to −0.050" in text
+
+
+def test_no_verdict_without_intervals(study: Study, write: Write) -> None:
+    for each in study[0]["comparisons"]:
+        each["bootstrap_ci95"] = None
+    text = read(write(study)).text
+    assert "is better than" not in text
+    assert "Comparisons" in text
+
+
+def test_emulated(study: Study, write: Write) -> None:
+    folder = write(study)
+    assert "emulated" not in read(folder).text.lower()
+    study[0]["emulated"] = True
+    text = read(write(study)).text
+    assert "EMULATED robot: no real measurements" in text
+    assert text.count("Emulated robot, no real measurements.") >= len(FIGURES)
+    assert "says nothing about a real one" in text
+
+
+def test_no_paper_columns_without_a_paper(study: Study, write: Write) -> None:
+    study[0]["published"] = {}
+    reader = read(write(study))
+    assert "paper’s" not in reader.text
+    assert "this study" not in reader.text
+    assert "numeric paper" not in render(read_results(write(study)), {})
+
+
+def test_everything_is_escaped(study: Study, write: Write) -> None:
+    results, arrays = study
+    evil = "<script>alert(1)</script><img src=x>&\"'</title>"
+    results["title"] = results["provenance"]["machine"] = results["data"]["twin"]["name"] = evil
+    results["classes"] = [evil, *results["classes"][1:]]
+    test = results["data"]["test"]
+    test["labels"] = [evil if each == "Healthy" else each for each in test["labels"]]
+    test["ids"][0] = results["data"]["calibration"]["used"][0] = evil
+    results["sources"][evil] = results["sources"].pop("ibg")
+    arrays[f"probabilities/{evil}".replace("/", "\\")] = arrays.pop("probabilities/ibg")
+    results["published"]["dt"]["macro_f1"] = evil
+    results["fidelity"]["latent"][0] = results["fidelity"]["ks"][0]["name"] = evil
+    for each in results["comparisons"]:
+        each["a"], each["b"] = (evil if each[k] == "ibg" else each[k] for k in "ab")
+    page = write_report(write(study)).read_text(encoding="utf-8")
+    assert "<script>alert" not in page
+    assert "<img src=x>" not in page
+    assert page.count("<script") == page.count("</script") == 3
+    specs = re.search(r'<script type="application/json" id="specs">(.*?)</script>', page)
+    assert specs is not None
+    assert json.loads(specs[1])
+
+
+@pytest.mark.parametrize(
+    ("drop", "section"),
+    [
+        (["surrogate"], "surrogate"),
+        (["comparisons"], "comparisons"),
+        (["timing"], "time"),
+    ],
+)
+def test_sections_without_data_disappear(
+    study: Study, write: Write, drop: list[str], section: str
+) -> None:
+    for name in ("update_s", "generate_s", "twin_runs"):
+        for source in study[0]["sources"].values():
+            del source[name]
+    assert section in read(write(study)).ids
+    for name in drop:
+        del study[0][name]
+    reader = read(write(study))
+    assert section not in reader.ids
+    assert f"#{section}" not in reader.addresses
+
+
+def test_without_arrays_and_stale_figures(study: Study, write: Write) -> None:
+    folder = write(study)
+    write_report(folder)
+    (folder / "arrays.npz").unlink()
+    write_report(folder)
+    reader = read(folder)
+    assert "roc" not in reader.ids
+    assert "figure-tde" not in reader.ids
+    assert "confusion" in reader.ids
+    assert "about 0.04 with 90 trajectories" in reader.text  # instead of the computed floor
+    assert {path.stem for path in (folder / "figures").iterdir()} == {"scores", "confusion"}
+
+
+def test_least_that_a_study_may_hold(write: Write) -> None:
+    least = {"schema": 1, "case": "tanks", "runs": 2, "classes": []}
+    least["sources"] = {"dt": {"rmse": [0.4, 0.5], "coverage90": [0.8, None]}}
+    reader = read(write((least, {})))
+    assert "0.450 ± 0.071" in reader.text
+    assert "tanks" in reader.text
+    assert not any(each and each.startswith("plot-") for each in reader.ids)
+
+
+def test_one_run_has_no_band_and_no_spread(single: Study, write: Write) -> None:
+    text = read(write(single)).text
+    assert "no band" in text
+    assert "One run, so no spread over runs" in text
+
+
+def test_unknown_source_and_missing_numbers(study: Study, write: Write) -> None:
+    results, _ = study
+    results["sources"]["something_new"] = {"macro_f1": [float("nan")] * 10, "intervals": None}
+    results["comparisons"][0] |= {"t": float("nan"), "p": None, "bootstrap_ci95": [None, None]}
+    text = read(write(study)).text
+    assert "something_new" in text
+    assert not re.search(r"\b(nan|None)\b", text)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "a folder with results.json"),
+        ("{", "JSON"),
+        ("[]", "schema None"),
+        ('{"schema": 2}', "schema 2"),
+        ('{"schema": 1, "case": "armpi", "runs": 1, "sources": {}}', "sources"),
+        ('{"schema": 1, "case": "a", "runs": 1, "sources": {"dt": {"auroc": "x"}}}', "auroc"),
+    ],
+)
+def test_bad_results(tmp_path: Path, content: str | None, said: str) -> None:
+    if content is not None:
+        (tmp_path / "results.json").write_text(content, encoding="utf-8")
+    with pytest.raises(InputError, match=re.escape(said)):
+        write_report(tmp_path)
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_damaged_arrays(study: Study, write: Write) -> None:
+    folder = write(study)
+    (folder / "arrays.npz").write_bytes(b"PK no zip")
+    with pytest.raises(InputError, match=r"arrays\.npz"):
+        write_report(folder)
+
+
+@pytest.mark.parametrize("name", ["probabilities/dt", "z/identified", "z/predicted"])
+def test_arrays_that_do_not_fit(study: Study, write: Write, name: str) -> None:
+    study[1][name] = study[1][name][..., :-1]
+    with pytest.raises(InputError, match=name):
+        write_report(write(study))
+
+
+def test_report_needs_no_torch() -> None:
+    code = "import sys, retwin.report.page; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
