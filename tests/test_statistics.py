@@ -120,6 +120,6 @@ def test_one_run_has_no_welch() -> None:
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=8))
-@settings(deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_holm_is_statsmodels_s(p: list[float]) -> None:
     np.testing.assert_allclose(holm(p), multipletests(p, method="holm")[1], atol=1e-12)

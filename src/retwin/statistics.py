@@ -7,6 +7,7 @@ trajectory.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -136,7 +137,10 @@ def compare_runs(a: Sequence[float], b: Sequence[float]) -> dict[str, float | No
     spread = np.std(a) + np.std(b)
     if min(len(a), len(b)) < 2 or spread == 0:
         return {"mean_diff": difference, "t": None, "df": None, "p": None}
-    test = ttest_ind(a, b, equal_var=False)
+    with warnings.catch_warnings():
+        # Runs that agree to the last digit are possible: few trajectories, few values.
+        warnings.filterwarnings("ignore", message="Precision loss occurred")
+        test = ttest_ind(a, b, equal_var=False)
     return {
         "mean_diff": difference,
         "t": float(test.statistic),

@@ -25,8 +25,12 @@ FLOOR = 1e-18  # ... nor those below this, in m^2: double precision is reached
 
 _TURN = 1500  # steps in a full turn
 _MOST = 24  # postures kept per rest
-_DIRECTIONS = 36  # directions of the last link from which the search starts
+_DIRECTIONS = 72  # directions of the last link from which the search starts
+_GUESSES = 4  # explanations of a path kept
+_VALLEYS = 6  # starts per combination of ramps
 _COMBINATIONS = np.stack([axis.ravel() for axis in np.indices((3, 3, 3))], axis=1)
+# (27, 3): which of the three lengths occur in a combination.
+_SHOWN = (_COMBINATIONS[:, None] == np.arange(3)[:, None]).any(axis=2)
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,7 @@ class Plane:
     tolerance: (n,) how far in m a posture may be from a rest.
     kinks: (n, M, 3) True where the path surely has the kink of a ramp of that length ending.
     noise: (n, M) mean square error in m^2 that movements have apart from this plane.
+
     """
 
     links: tuple[float, ...]
@@ -65,12 +70,17 @@ class Plane:
 class Solution:
     """What explains n paths: postures of the rests (n, M + 1, 3) in steps, indices (n, M, 3) of
     the ramp lengths, mean square errors `cost` (n, M) in m^2, and which movements are `tied`
-    (n, M) with another explanation."""
+    (n, M) with another explanation.
+    """
 
     postures: NDArray
     lengths: NDArray
     cost: NDArray
     tied: NDArray
+
+    def rows(self, rows: NDArray) -> Solution:
+        """Some of the paths."""
+        return Solution(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
 def _forward(angles: NDArray, links: tuple[float, ...]) -> tuple[NDArray, NDArray]:
@@ -232,21 +242,112 @@ def _cheapest(plane: Plane, rest: NDArray, posture: NDArray) -> Solution:
     return solution
 
 
+@dataclass
+class _Guesses:
+    """Explanations still in play: the path (g,) each is of and its `Solution` so far."""
+
+    path: NDArray
+    found: Solution
+
+    def keep(self, rows: NDArray) -> _Guesses:
+        """Some of them."""
+        return _Guesses(self.path[rows], self.found.rows(rows))
+
+
 def free_chain(plane: Plane) -> Solution:
     """Continuous postures, movement by movement and then all of a path together."""
     count, moves = plane.noise.shape
     on_grid, postures = _starts(plane)
-    solution = Solution(
+    found = Solution(
         np.repeat(postures[:, None], moves + 1, axis=1), np.zeros((count, moves, 3), dtype=int),
         np.zeros((count, moves)), np.zeros((count, moves), dtype=bool),
     )  # fmt: skip
+    guesses = _Guesses(np.arange(count), found)
     for move in range(moves):
-        _search(plane, move, np.arange(count), plane.kinks[:, move], solution)
-        # Where the kinks misled, try all combinations.
-        again = np.flatnonzero(solution.cost[:, move] > 4 * plane.tolerance**2)
-        _search(plane, move, again, np.ones((again.size, 3), dtype=bool), solution)
-    _polish(plane, solution, on_grid)
-    return solution
+        # Every kink that is there needs a motor whose ramp ends there, and no motor's ramp ends
+        # where there is none.
+        kinks = plane.kinks[guesses.path, move]
+        fits = (~kinks[:, None] | _SHOWN).all(axis=2) & (kinks[:, None] | ~_SHOWN).all(axis=2)
+        more = _search(plane, move, guesses, fits, 8)
+        best = np.full(count, np.inf)
+        np.minimum.at(best, more.path, more.found.cost[:, move])
+        # Where that explains nothing the kinks misled: try all combinations.
+        again = guesses.keep(best[guesses.path] > 4 * plane.tolerance[guesses.path] ** 2)
+        other = _search(plane, move, again, np.ones((again.path.size, 27), dtype=bool), 40)
+        path = np.concatenate([more.path, other.path])
+        fields = zip(vars(more.found).values(), vars(other.found).values(), strict=True)
+        found = Solution(*(np.concatenate(pair) for pair in fields))
+        guesses = _best(plane, move, _Guesses(path, found))
+    _polish(plane, guesses, on_grid)
+    return _settle(plane, guesses)
+
+
+def _best(plane: Plane, move: int, guesses: _Guesses) -> _Guesses:
+    """The few guesses per path that explain it about equally well up to a movement."""
+    total = guesses.found.cost.sum(axis=1)
+    same = np.concatenate([
+        guesses.path[:, None], guesses.found.lengths[:, move],
+        np.rint(guesses.found.postures[:, move: move + 2].reshape(-1, 6) / 2),
+    ], axis=1)  # fmt: skip
+    order = np.lexsort((total, guesses.path))
+    _, first = np.unique(same[order], axis=0, return_index=True)
+    order = order[np.sort(first)]
+    path = guesses.path[order]
+    begin = np.searchsorted(path, path)
+    close = total[order] <= 2 * total[order][begin] + 4 * plane.tolerance[path] ** 2
+    return guesses.keep(order[close & (np.arange(path.size) - begin < _GUESSES)])
+
+
+def _settle(plane: Plane, guesses: _Guesses) -> Solution:
+    """The best guess of each path; movements that another one explains otherwise are tied."""
+    found, path = guesses.found, guesses.path
+    total = found.cost.sum(axis=1)
+    order = np.lexsort((total, path))
+    chosen = order[np.searchsorted(path[order], np.arange(len(plane.noise)))]
+    best = found.rows(chosen)
+    limit = (TIE - 1) * (best.cost + plane.noise) + FLOOR + total[chosen, None]
+    apart = np.abs(found.postures - best.postures[path]).max(axis=2)[:, 1:] > 0.5
+    stays = np.abs(np.diff(found.postures, axis=1)) < 0.5
+    apart |= ((found.lengths != best.lengths[path]) & ~stays).any(axis=2)
+    np.logical_or.at(best.tied, path, apart & (total[:, None] <= limit[path]))
+    return best
+
+
+def _search(
+    plane: Plane, move: int, guesses: _Guesses, fits: NDArray, starts: int
+) -> _Guesses:
+    """Good ramps out of those that fit (g, 27) and next postures for one movement of guesses."""
+    links = plane.links
+    scan, usable = _curve(plane.rests[guesses.path, move + 1], links)
+    guess, combination = np.nonzero(fits & usable.any(axis=1)[:, None])
+    path = guesses.path[guess]
+    old = guesses.found.postures[guess, move]
+    part = np.take_along_axis(
+        plane.parts[path, move], _COMBINATIONS[combination][..., None], axis=1
+    ).swapaxes(1, 2)
+    data = np.stack([plane.radius[path, move], plane.height[path, move]], axis=-1)
+    pick, at = np.nonzero(usable[guess])
+    coarse = slice(4, None, 6)
+    cost = np.full((guess.size, 2, _DIRECTIONS), np.inf)
+    error = _misfit(old[pick], scan[guess[pick], at], part[pick, coarse], data[pick, coarse], links)
+    cost.reshape(guess.size, -1)[pick, at] = error[1]
+    # Start from the lowest valleys of each combination.
+    valley = (cost <= np.roll(cost, 1, axis=2)) & (cost <= np.roll(cost, -1, axis=2))
+    cost = np.where(valley, cost, np.inf).reshape(guess.size, -1)
+    at = np.argpartition(cost, _VALLEYS, axis=1)[:, :_VALLEYS]
+    which, nth = np.nonzero(np.isfinite(np.take_along_axis(cost, at, axis=1)))
+    new = scan[guess[which], at[which, nth]]
+    for rounds, some, kept in ((4, coarse, starts), (8, slice(None, None, 2), _GUESSES)):
+        new, cost = _newton(old[which], new, part[which, some], data[which, some], links, rounds)
+        order = np.lexsort((cost, guess[which]))
+        owner = guess[which][order]
+        order = order[np.arange(owner.size) - np.searchsorted(owner, owner) < kept]
+        which, new, cost = which[order], new[order], cost[order]
+    more = guesses.keep(guess[which])
+    more.found.postures[:, move + 1] = new
+    more.found.lengths[:, move] = _COMBINATIONS[combination[which]]
+    more.found.cost[:, move] = _misfit(old[which], new, part[which], data[which], links)[1]
+    return more
 
 
 def _starts(plane: Plane) -> tuple[NDArray, NDArray]:
@@ -282,53 +383,6 @@ def _curve(rest: NDArray, links: tuple[float, ...]) -> tuple[NDArray, NDArray]:
     return posture, usable
 
 
-def _search(
-    plane: Plane, move: int, rows: NDArray, allowed: NDArray, solution: Solution
-) -> None:
-    """Best ramps and next posture of one movement of some paths, from the posture before it."""
-    if rows.size == 0:
-        return
-    allowed = allowed | ~allowed.any(axis=1, keepdims=True)
-    fits = allowed[:, _COMBINATIONS].all(axis=2)
-    # Every kink that is there needs a motor whose ramp ends there.
-    shown = (_COMBINATIONS[:, None] == np.arange(3)[:, None]).any(axis=2)
-    fits &= (shown | ~allowed[:, None]).all(axis=2) | allowed.all(axis=1)[:, None]
-    owner, combination = np.nonzero(fits)
-    at = rows[owner]
-    lengths = _COMBINATIONS[combination]
-    part = np.take_along_axis(plane.parts[at, move], lengths[..., None], axis=1)
-    radius, height = plane.radius[at, move], plane.height[at, move]
-    scan, feasible = _curve(plane.rests[rows, move + 1], plane.links)
-    pick, posture = np.nonzero(feasible[owner])
-    old = solution.postures[at, move]
-    coarse = slice(None, None, 5)
-    new = scan[owner[pick], posture]
-    angle = old[pick, None] + (new - old[pick])[:, None] * part[pick, :, coarse].swapaxes(1, 2)
-    r, h = _forward(angle, plane.links)
-    error = ((r - radius[pick, coarse]) ** 2 + (h - height[pick, coarse]) ** 2).mean(axis=1)
-    table = np.full((owner.size, scan.shape[1]), np.inf)
-    table[pick, posture] = error
-    best = np.argmin(table.reshape(owner.size, 2, -1), axis=2) + [0, _DIRECTIONS]
-    new = scan[owner[:, None], best].reshape(-1, 3)
-    twice = np.repeat(np.arange(owner.size), 2)
-    new, cost = _newton(
-        old[twice], new, part[twice], radius[twice], height[twice], plane.links
-    )
-    owner, at, lengths = owner[twice], at[twice], lengths[twice]
-    order = np.lexsort((cost, owner))
-    chosen = order[np.searchsorted(owner[order], np.arange(rows.size))]
-    solution.postures[rows, move + 1] = new[chosen]
-    solution.lengths[rows, move] = lengths[chosen]
-    solution.cost[rows, move] = cost[chosen]
-    limit = cost[chosen] + (TIE - 1) * (cost[chosen] + plane.noise[rows, move]) + FLOOR
-    # The same commands found twice are no tie; a motor that stays has no ramp.
-    stays = np.abs(new - old[twice]) < 0.5
-    apart = (np.abs(new - new[chosen][owner]) > 0.5).any(axis=1)
-    apart |= ((lengths != lengths[chosen][owner]) & ~stays).any(axis=1)
-    tied = np.bincount(owner, apart & (cost <= limit[owner]), rows.size) > 0
-    solution.tied[rows, move] = tied
-
-
 def _slopes(angle: NDArray, links: tuple[float, ...]) -> NDArray:
     """Derivatives (..., 2, 3) of radius and height in m per step of postures (..., 3)."""
     total = np.cumsum(angle, axis=-1) * STEP
@@ -336,20 +390,83 @@ def _slopes(angle: NDArray, links: tuple[float, ...]) -> NDArray:
     return np.cumsum(reach[..., ::-1], axis=-1)[..., ::-1]
 
 
+def _misfit(
+    old: NDArray, new: NDArray, part: NDArray, data: NDArray, links: tuple[float, ...]
+) -> tuple[NDArray, NDArray]:
+    """Errors (p, k, 2) in m, and their mean square, of steps (p, 3) with parts done (p, k, 3)."""
+    error = np.stack(_forward(old[:, None] + (new - old)[:, None] * part, links), axis=-1) - data
+    return error, (error**2).sum(axis=-1).mean(axis=-1)
+
+
 def _newton(
-    old: NDArray, new: NDArray, part: NDArray, radius: NDArray, height: NDArray,
-    links: tuple[float, ...],
+    old: NDArray, new: NDArray, part: NDArray, data: NDArray, links: tuple[float, ...],
+    rounds: int,
 ) -> tuple[NDArray, NDArray]:  # fmt: skip
     """Damped Gauss-Newton on the posture (p, 3) at the end of a movement; mean square errors."""
-    part = part.swapaxes(1, 2)
-    data = np.stack([radius, height], axis=-1)
+    error, cost = _misfit(old, new, part, data, links)
+    damping = np.full(cost.size, 1e-4)
+    for _ in range(rounds):
+        slope = _slopes(old[:, None] + (new - old)[:, None] * part, links) * part[:, :, None]
+        step = _damped(slope.reshape(cost.size, -1, 3), error.reshape(cost.size, -1), damping)
+        trial = np.clip(new - step, -LIMIT, LIMIT)
+        its_error, its_cost = _misfit(old, trial, part, data, links)
+        better = its_cost < cost
+        new = np.where(better[:, None], trial, new)
+        error = np.where(better[:, None, None], its_error, error)
+        cost = np.where(better, its_cost, cost)
+        damping = np.where(better, damping / 10, damping * 10)
+    return new, cost
 
-    def residual(new: NDArray) -> tuple[NDArray, NDArray]:
-        angle = old[:, None] + (new - old)[:, None] * part
-        return angle, np.stack(_forward(angle, links), axis=-1) - data
 
-    angle, error = residual(new)
-    cost = (error**2).sum(axis=-1).mean(axis=-1)
-    damping = np.full(cost.size, 1e-3)
-    live = np.arange(cost.size)
-    return _descend(residual, angle, error, new, cost, damping, live, part, links)
+def _damped(slope: NDArray, error: NDArray, damping: NDArray) -> NDArray:
+    """Levenberg-Marquardt steps (p, 3) for slopes (p, k, 3) and errors (p, k)."""
+    turned = slope.swapaxes(1, 2)
+    matrix = turned @ slope
+    size = np.trace(matrix, axis1=1, axis2=2) + 1e-20
+    matrix = matrix + (size * (damping + 1e-13))[:, None, None] * np.eye(3)
+    return np.linalg.solve(matrix, turned @ error[..., None])[..., 0]
+
+
+def _polish(plane: Plane, guesses: _Guesses, on_grid: NDArray) -> None:
+    """Gauss-Newton on all postures of guesses, ramps fixed; ties of what it cannot tell apart."""
+    found, path = guesses.found, guesses.path
+    count, moves = found.cost.shape
+    part = np.take_along_axis(plane.parts[path], found.lengths[..., None], axis=2).swapaxes(2, 3)
+    data = np.stack([plane.radius[path], plane.height[path]], axis=-1)
+    width = 3 * moves + 3
+    diagonal = np.arange(width)
+    hold = np.zeros((count, width))
+    hold[on_grid[path], :3] = 1e6
+
+    def look(postures: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        angle = postures[:, :-1, None] + np.diff(postures, axis=1)[:, :, None] * part
+        error = np.stack(_forward(angle, plane.links), axis=-1) - data
+        return angle, error, (error**2).sum(axis=-1).mean(axis=-1)
+
+    new = found.postures
+    angle, error, cost = look(new)
+    damping = np.full(count, 1e-6)
+    share = np.stack([1 - part, part], axis=3)[:, :, :, None]
+    for _ in range(4):
+        slope = _slopes(angle, plane.links)[:, :, :, :, None] * share
+        slope = slope.reshape(count, moves, -1, 6)
+        turned = slope.swapaxes(2, 3)
+        block, pull = turned @ slope, turned @ error.reshape(count, moves, -1, 1)
+        matrix, vector = np.zeros((count, width, width)), np.zeros((count, width))
+        for move in range(moves):
+            at = slice(3 * move, 3 * move + 6)
+            matrix[:, at, at] += block[:, move]
+            vector[:, at] += pull[:, move, :, 0]
+        matrix[:, diagonal, diagonal] += hold + 1e-16
+        normal = matrix.copy()
+        normal[:, diagonal, diagonal] *= 1 + damping[:, None]
+        trial = new - np.linalg.solve(normal, vector[..., None]).reshape(new.shape)
+        its_angle, its_error, its_cost = look(trial)
+        better = its_cost.sum(axis=1) < cost.sum(axis=1)
+        new = np.where(better[:, None, None], trial, new)
+        angle[better], error[better] = its_angle[better], its_error[better]
+        cost[better] = its_cost[better]
+        damping = np.where(better, damping / 100, damping * 10)
+    found.postures[:], found.cost[:] = new, cost
+    variance = np.abs(np.einsum("nii->ni", np.linalg.inv(matrix))).reshape(new.shape)
+    found.tied[:] |= (variance[:, 1:] * (cost + FLOOR)[..., None]).max(axis=2) > 0.5**2

@@ -48,7 +48,7 @@ def fit(
             progress=lambda s: tell("residual model", s),
         )
     rt.CorrectedTwin(ibg, rg, case=case).save(out)
-    table = Table("output", "RMSE", "NRMSE", title="Surrogate on held-out twin trajectories")
+    table = Table("output", "RMSE", "NRMSE")
     assert ibg.fitted is not None
     assert rg.fitted is not None
     for name, unit in zip(ibg.outputs.names, ibg.outputs.units, strict=True):
@@ -57,6 +57,7 @@ def fit(
             name, f"{figures[f'rmse_{name}']:.3g} {unit}", f"{figures[f'nrmse_{name}']:.2%}"
         )
     console = Console()
+    console.print("Surrogate on held-out twin trajectories:")
     console.print(table)
     console.print(
         f"Residual model: {rg.fitted.figures['movements']:.0f} movements of "

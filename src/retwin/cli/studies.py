@@ -127,11 +127,16 @@ def _table(results: Mapping[str, Any]) -> Table:
     for title in COLUMNS.values():
         table.add_column(title, justify="right")
     for name, source in results["sources"].items():
-        cells = [f"{np.mean(source[m]):.3f} ± {np.std(source[m]):.3f}" for m in COLUMNS]
-        table.add_row(f"{source['title']} ({name})", *cells)
+        table.add_row(source["title"], *(_over_runs(source[metric]) for metric in COLUMNS))
     for name, figures in results["published"].items():
-        table.add_row(f"paper: {name}", *(figures.get(m, "") for m in COLUMNS), style="dim")
+        title = results["sources"][name]["title"] if name in results["sources"] else name
+        table.add_row(f"  paper: {title}", *(figures.get(m, "") for m in COLUMNS), style="dim")
     return table
+
+
+def _over_runs(values: list[float]) -> str:
+    mean = f"{np.mean(values):.3f}"
+    return mean if len(values) < 2 else f"{mean} ± {np.std(values, ddof=1):.3f}"
 
 
 def _gaps(results: Mapping[str, Any]) -> list[str]:

@@ -90,7 +90,9 @@ def _scores(results: Results) -> Figure | None:
         _score_marks(axes, results, source, shown, lane)
     axes.set_yticks(range(len(shown)), [METRICS[name].name for name in shown])
     axes.set_ylim(len(shown) - 0.5, -0.5)
-    _dress(axes, "score: mean and 95 % bootstrap interval; open diamonds: paper ± sd", "")
+    axes.set_xlim(-0.01, 1.02)
+    paper = "; open diamonds: paper ± sd" if results.published else ""
+    _dress(axes, f"score: mean and 95 % bootstrap interval{paper}", "")
     axes.tick_params(axis="y", length=0, labelcolor=INK)
     axes.grid(visible=False, axis="y")
     axes.legend(frameon=False, fontsize=9, ncols=3, loc="lower left", bbox_to_anchor=(0, 1))

@@ -141,10 +141,11 @@ def _score_table(results: Results, metrics: Sequence[str]) -> Table | None:
     for name in shown:
         columns += _score_columns(results, name, paper)
     best = {name: _best(results, name) for name in shown}
+    word = "emulated" if results.emulated else "real"
     rows = []
     for source in order(list(results.sources)):
         one = results.sources[source]
-        used = f"real data: {real_data(one.real_data)}"
+        used = f"{word} data: {real_data(one.real_data)}"
         known = ["fault protocol known"] if one.fault_protocol_known else []
         row = [Cell(source_name(source), "; ".join([used, *known]), slot=slot(source))]
         for name in shown:
@@ -174,8 +175,8 @@ def _score_caption(results: Results, shown: Sequence[str]) -> str:
     text = f"{text[0].upper()}{text[1:]}. Bold: the best mean of a column, whoever has it."
     if any(_in_paper(results, name) for name in shown):
         text += (
-            " The paper's numbers (its Table 1) are from its own test set and classifier, so "
-            "compare the gap between rows before the level."
+            " The paper’s numbers (its Table 1) are from its own runs, test set and classifier, "
+            "so compare the gap between rows before the level."
         )
     if any(each.fault_protocol_known for each in results.sources.values()):
         text += (

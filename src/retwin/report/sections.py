@@ -205,7 +205,7 @@ def time(results: Results) -> Section | None:
         rows.append([Cell("Whole study"), Cell(duration(numbers["total_s"]))])
     if rows:
         columns = [Column("Stage", numeric=False), Column("Time")]
-        blocks.append(Table("Wall-clock time of this study’s stages.", columns, rows))
+        blocks.append(Table("Wall-clock time of the stages.", columns, rows))
     return Section("time", "Time", blocks) if blocks else None
 
 
@@ -226,7 +226,8 @@ def _costs(results: Results) -> Table | None:
     kept = {name: texts for name, texts in shown.items() if set(texts) != {"–"}}
     if not kept:
         return None
-    columns = [Column("Training data", numeric=False), Column("Real data used", numeric=False)]
+    word = "Emulated" if results.emulated else "Real"
+    columns = [Column("Training data", numeric=False), Column(f"{word} data used", numeric=False)]
     bulky = "3600 trajectories"
     columns += [
         Column("this study", group=bulky) if paper and name == bulky else Column(name)

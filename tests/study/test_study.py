@@ -1,0 +1,178 @@
+"""The study end to end on the emulated robot, small: what it writes, and that it resumes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import retwin as rt
+from retwin.statistics import METRICS
+from retwin.study.jobs import Job, Roles, Work
+
+PLAN = rt.StudyPlan(runs=2, per_class=10, folds=2, seed=3)
+COMMAND = "study armpi --runs 2 --per-class 10 --folds 2 --seed 3 --processes 2 --out".split()  # noqa: SIM905
+
+
+@pytest.fixture(scope="module")
+def finished(case: rt.Case, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, Path]:
+    out = tmp_path_factory.mktemp("study") / "whole"
+    results = rt.run_study(case, PLAN, rt.StudyData(), out, processes=2)
+    return results, out
+
+
+def comparable(out: Path) -> dict[str, Any]:
+    """results.json without what depends on the clock and the machine."""
+    results = json.loads((out / "results.json").read_text("utf-8"))
+    for name in ("timing", "provenance"):
+        del results[name]
+    for source in results["sources"].values():
+        del source["update_s"], source["generate_s"]
+    return results
+
+
+def test_results_follow_the_schema(finished: tuple[dict, Path], case: rt.Case) -> None:
+    _, out = finished
+    results = json.loads((out / "results.json").read_text("utf-8"))
+    assert results["schema"] == 1
+    assert results["emulated"] is True
+    assert results["published"] == {}, "the paper's figures do not stand beside emulated ones"
+    assert results["classes"] == list(case.classes)
+    assert list(results["sources"]) == ["dt", "ibg", "ibg_rg"]
+    assert results["data"]["test"]["n"] == 90
+    for source in results["sources"].values():
+        for metric in METRICS:
+            assert len(source[metric]) == 2
+        assert np.array(source["predictions"]).shape == (2, 90)
+        table = np.array(source["confusion"])
+        assert table.sum() == 180
+        assert (table.sum(axis=1) == 20).all(), "rows are true"
+        assert source["fault_protocol_known"] is True
+    pairs = {(row["a"], row["b"]) for row in results["comparisons"]}
+    assert pairs == {("ibg", "dt"), ("ibg_rg", "dt"), ("ibg_rg", "ibg")}
+    for row in results["comparisons"]:
+        low, high = row["bootstrap_ci95"]
+        assert low <= row["mean_diff"] + 1e-9
+        assert row["mean_diff"] - 1e-9 <= high
+    assert set(results["fidelity"]["coverage90"]) == {"delay", "offset_x", "offset_y", "offset_z"}
+
+
+def test_figures_agree_with_the_predictions(finished: tuple[dict, Path]) -> None:
+    results, out = finished
+    labels = results["data"]["test"]["labels"]
+    truth = np.array([results["classes"].index(label) for label in labels])
+    with np.load(out / "arrays.npz", allow_pickle=False) as arrays:
+        for name, source in results["sources"].items():
+            probabilities = arrays[f"probabilities/{name}"]
+            assert probabilities.shape == (2, 90, 9)
+            predicted = probabilities.argmax(axis=2)
+            np.testing.assert_array_equal(predicted, source["predictions"])
+            assert source["accuracy"] == pytest.approx((predicted == truth).mean(axis=1).tolist())
+        assert arrays["z/observed"].shape[1] == 4
+
+
+def test_calling_again_does_nothing_new(finished: tuple[dict, Path], case: rt.Case) -> None:
+    _, out = finished
+    before = comparable(out)
+    stamps = {p: p.stat().st_mtime_ns for p in (out / "work").rglob("*") if p.is_file()}
+    rt.run_study(case, PLAN, rt.StudyData(), out, processes=2)
+    assert comparable(out) == before
+    assert {p: p.stat().st_mtime_ns for p in (out / "work").rglob("*") if p.is_file()} == stamps
+
+
+@pytest.mark.parametrize("sign_of_life", ["work/run-0/surrogate", "work/run-0/fold-0/dt.npz"])
+def test_killed_and_called_again_it_ends_the_same(
+    finished: tuple[dict, Path], tmp_path: Path, sign_of_life: str
+) -> None:
+    out = tmp_path / "killed"
+    call = [sys.executable, "-m", "retwin", *COMMAND, str(out)]
+    process = subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 240
+    while not (out / sign_of_life).exists() and time.monotonic() < deadline:
+        assert process.poll() is None, "ended before it could be killed"
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    assert not (out / "results.json").exists()
+    subprocess.run(call, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    assert comparable(out) == comparable(finished[1])
+    with np.load(out / "arrays.npz") as ours, np.load(finished[1] / "arrays.npz") as theirs:
+        assert set(ours) == set(theirs)
+        for name in ours:
+            np.testing.assert_array_equal(ours[name], theirs[name])
+    assert not list(out.rglob(".*")), "no temporary file is left"
+
+
+def test_another_study_in_the_same_folder_is_refused(
+    finished: tuple[dict, Path], case: rt.Case, tmp_path: Path
+) -> None:
+    with pytest.raises(rt.InputError, match="another plan or other data"):
+        rt.run_study(case, rt.StudyPlan(runs=3), rt.StudyData(), finished[1])
+    (tmp_path / "mine.txt").write_text("precious")
+    with pytest.raises(rt.InputError, match="holds other files"):
+        rt.run_study(case, PLAN, rt.StudyData(), tmp_path)
+
+
+def test_calibration_and_test_sets_keep_their_roles(
+    emulated: rt.Trajectories, twin_set: rt.Trajectories, case: rt.Case, tmp_path: Path
+) -> None:
+    calibration, test = emulated.split(0.4, seed=0)
+    for name, part in (("c", calibration), ("t", test), ("twin", twin_set)):
+        rt.save(part, tmp_path / f"{name}.npz")
+    plan = rt.StudyPlan(sources=("dt", "ibg_rg"), runs=1, per_class=8)
+    data = rt.StudyData(tmp_path / "twin.npz", tmp_path / "c.npz", tmp_path / "t.npz")
+    results = rt.run_study(case, plan, data, tmp_path / "out", processes=2)
+    assert results["data"]["test"]["ids"] == test.ids.tolist()
+    assert results["data"]["calibration"]["used"] == calibration.ids.tolist()
+    assert results["data"]["twin"]["n"] == 108
+    row = next(r for r in results["comparisons"] if r["metric"] == "macro_f1")
+    assert row["p"] is None, "one run has no Welch test"
+
+
+def test_folds_test_everything_once_and_never_what_they_calibrate_on(
+    emulated: rt.Trajectories,
+) -> None:
+    roles = Roles.of(emulated.folds(3, seed=0))
+    assert sorted(roles.tested) == list(range(90))
+    for calibration, test in roles.folds:
+        assert not set(calibration) & set(test)
+        assert (emulated.labels[list(test)] == "Healthy").sum() in (3, 4)
+
+
+def test_seeds_differ_by_run_fold_and_stage_and_not_by_the_sources_chosen(case: rt.Case) -> None:
+    one, other = PLAN, rt.StudyPlan(sources=("dt",), seed=3)
+    keys = [("generate", r, f) for r in range(3) for f in range(3)] + [("surrogate", 0, 0)]
+    seeds = [one.seed_of(*key) for key in keys]
+    assert len(set(seeds)) == len(seeds)
+    assert seeds == [other.seed_of(*key) for key in keys]
+    work = Work(Path("x"), case, rt.StudyPlan(sources=("dt",)), Roles.of([((0,), (1,))]))
+    assert [len(stage) for stage in work.jobs()] == [0, 0, 5]
+    assert work.path(Job("diagnosis", 0, 0, "dt")).name == "dt.npz"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sources": ("dt", "magic")}, "sources: expected one of dt, ibg, ibg_rg"),
+        ({"sources": ()}, "at least one source"),
+        ({"preset": "slow"}, "preset: expected one of quick, paper"),
+        ({"classifier": "svm"}, "classifier: expected one of cnn, lstm"),
+        ({"runs": 0}, "runs: expected at least 1"),
+    ],
+)
+def test_bad_plans_are_refused(changes: dict, message: str) -> None:
+    with pytest.raises(rt.InputError, match=message):
+        rt.StudyPlan(**changes)
+
+
+def test_contradicting_data_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(rt.InputError, match="either calibration and test, or real alone"):
+        rt.StudyData(calibration=tmp_path)
+    with pytest.raises(rt.InputError, match="either calibration and test, or real alone"):
+        rt.StudyData(calibration=tmp_path, test=tmp_path, real=tmp_path)
