@@ -84,7 +84,7 @@ def fitted(identity: rt.Surrogate) -> dict[int, rt.ResidualModel]:
             identity,
             calibration,
             rt.DelayOffset(),
-            rt.Mixture(components=k, dropout=0.0, smoothness=0.0, training=LEARN),
+            rt.Mixture(components=k, hidden=(32, 32), dropout=0.0, smoothness=0.0, training=LEARN),
             seed=0,
         )
         for k in (1, 3)

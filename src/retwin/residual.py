@@ -41,8 +41,8 @@ class Mixture:
     """
 
     components: int = 3
-    hidden: tuple[int, ...] = (32, 32)
-    dropout: float = 0.1
+    hidden: tuple[int, ...] = (32,)
+    dropout: float = 0.3
     smoothness: float = 0.01
     boundedness: float = 1.0
     training: Training = Training(  # noqa: RUF009 - frozen

@@ -136,8 +136,8 @@ class Surrogate(nn.Module):
 
 DEFAULTS = {
     "MLP": Training(epochs=20, batch=256, rate=5e-3),
-    "LSTM": Training(epochs=30, batch=32, rate=3e-3),
-    "TCN": Training(epochs=30, batch=32, rate=3e-3),
+    "LSTM": Training(epochs=10, batch=32, rate=5e-3),
+    "TCN": Training(epochs=10, batch=32, rate=5e-3),
 }
 
 

@@ -29,7 +29,8 @@ def get(name: str) -> Case:
         except (ImportError, AttributeError) as error:
             got = str(error)
         else:
-            found = found if isinstance(found, Case) else found()
+            if callable(found):
+                found = found()
             if isinstance(found, Case):
                 return found
             got = f"a {type(found).__name__}"

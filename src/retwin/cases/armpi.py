@@ -32,7 +32,7 @@ TWIN = KinematicTwin(
     ARM,
     centre=STRAIGHT,
     scale=-np.deg2rad(DEGREES),
-    lag=ServoLag(proportional=-0.47, integral=45.0),
+    lag=ServoLag(proportional=-0.515, integral=48.7),
     inputs=INPUTS,
     outputs=OUTPUTS,
     rate=RATE,

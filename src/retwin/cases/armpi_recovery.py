@@ -1,40 +1,39 @@
 """Commands of the ArmPi arm, recovered from the desired path of its end-effector.
 
-The public arrays hold paths, not commands. What makes the recovery exact is that every resting
-position is one of finitely many grid points of the motors: for each direction of the last link
-the two links before it are solved in closed form, and only whole command units are kept. Usually
-one point per rest survives. Ramp lengths are then decided by forward kinematics of all their
-combinations, for all trajectories at once, and by the cheapest chain of rests; onsets come from
-Gauss-Newton. Everything that explains the path as well as the answer does is counted, so that
+The public arrays hold paths, not commands. Movements and their onsets are seen in the path, and
+so is the vertical plane of the arm: the yaw motor is solved apart, by weighted least squares, and
+leaves a planar arm with signed radius r and height h. For it there are two ways. Targets of the
+real robot are whole command units, and then enumeration decides exactly (`armpi_plane`). Targets
+of the simulated paths are not on that grid, and Gauss-Newton over all ramp combinations finds
+them (`armpi_search`). Whatever else explains a path as well as the answer is counted, so that
 `Recovery.ambiguous` is a statement and not a guess.
 
-Inside this module a motor's angle is an integer `500 - unit`, positive like `YawPitchArm`'s
-angles, one step being 0.24 deg; the yaw joint is apart because the vertical plane of the arm is
-seen in the path: it leaves a planar arm with signed radius r and height h.
+Inside, a motor's angle is a number of steps `500 - unit` of 0.24 deg, signed as `YawPitchArm`'s.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from retwin.cases.armpi_plane import LIMIT, STEP, TIE, Plane, free_chain, grid_chain
+from retwin.cases.armpi_plane import LIMIT, STEP, TIE, Plane, grid_chain
+from retwin.cases.armpi_ramps import RAMPS, STRAIGHT, ramp_commands, unit_angles
+from retwin.cases.armpi_search import free_chain
 from retwin.twins.arm import YawPitchArm
 
 __all__ = ["RAMPS", "Recovery", "ramp_commands", "recover_commands", "unit_angles"]
 
-RAMPS = (60, 80, 100)
-"""Ramp lengths of a motor, in samples."""
-
-_STRAIGHT = 500  # command unit of angle 0
 _HALF_TURN = 750  # command units in half a turn
 _ROUNDING = 1.5e-6  # m: more than the rounding of the published paths (1e-6 m per axis)
+_NOISIEST = 1e-4  # m: no more than this is taken for noise
 _EXPLAINED = 5e-5  # m: a movement with a larger RMS is not explained
 _PULL = 1e-14  # m^2: far less than what a single sample off the axis says about the yaw
-_CHUNK = 200  # trajectories at a time, to bound memory
+_BATCH = 32  # paths solved at a time: they fit the cache, and there is work for each core
 
 
 @dataclass(frozen=True)
@@ -49,8 +48,8 @@ class Recovery:
     commands: (n, T, 4) in units, 0.24 deg each, 500 being straight.
     onsets: (n, M) fractional sample at which each movement starts.
     ramps: (n, M, 4) ramp lengths in samples.
-    targets: (n, M, 4) whole units reached by each movement.
-    start: (n, 4) whole units before the first movement.
+    targets: (n, M, 4) units reached by each movement.
+    start: (n, 4) units before the first movement.
     closed: (n,) True where a ramp of L samples counts both its ends, so it lasts L - 1 intervals
         (the simulated paths); False where it lasts L intervals (the real ones).
     whole: (n,) True where start and targets are whole units (the real paths); False where whole
@@ -70,46 +69,6 @@ class Recovery:
     whole: NDArray
     rms: NDArray
     ambiguous: NDArray
-
-
-def unit_angles(commands: NDArray) -> NDArray:
-    """Angles in rad of commands in units, any shape: 120 deg - 0.24 deg per unit."""
-    return (_STRAIGHT - commands) * STEP
-
-
-def ramp_commands(
-    start: ArrayLike,
-    targets: ArrayLike,
-    ramps: ArrayLike,
-    onsets: ArrayLike,
-    length: int,
-    *,
-    closed: ArrayLike = False,
-) -> NDArray:
-    """Commands (n, length, motors) that ramp linearly from target to target and hold.
-
-    Parameters
-    ----------
-    start: (n, motors) before the first movement.
-    targets, ramps: (n, M, motors) value reached by each movement and length of its ramp in
-        samples.
-    onsets: (n, M) fractional sample at which a movement starts; NaN for a movement left out.
-    closed: one bool or (n,): a ramp of L samples is `linspace(old, new, L)`, both ends counted,
-        instead of lasting L intervals.
-
-    """
-    start, targets = np.asarray(start, float), np.asarray(targets, float)
-    spans = np.asarray(ramps, float) - np.reshape(np.asarray(closed, float), (-1, 1, 1))
-    onsets = np.asarray(onsets, float)
-    time = np.arange(length)
-    commands = np.repeat(start[:, None], length, axis=1)
-    previous = start
-    for move in range(targets.shape[1]):
-        since = np.nan_to_num(time - onsets[:, move, None], nan=-1.0)
-        part = np.clip(since[..., None] / spans[:, None, move], 0, 1)
-        commands += (targets[:, move] - previous)[:, None] * part
-        previous = targets[:, move]
-    return commands
 
 
 def recover_commands(
@@ -150,34 +109,49 @@ def recover_commands(
     counts = np.array([len(run) for run in runs], dtype=int)
     most = int(counts.max(initial=0))
     result = Recovery(
-        commands=np.full((count, length, 4), float(_STRAIGHT)),
+        commands=np.full((count, length, 4), float(STRAIGHT)),
         onsets=np.full((count, most), np.nan),
         ramps=np.full((count, most, 4), RAMPS[0]),
-        targets=np.full((count, most, 4), float(_STRAIGHT)),
-        start=np.full((count, 4), float(_STRAIGHT)),
+        targets=np.full((count, most, 4), float(STRAIGHT)),
+        start=np.full((count, 4), float(STRAIGHT)),
         closed=np.zeros(count, dtype=bool),
         whole=np.ones(count, dtype=bool),
         rms=np.zeros(count),
         ambiguous=np.zeros((count, most), dtype=bool),
     )
-    done = 0
     # Equal numbers of movements make rectangular batches.
+    batches = []
     for moves in np.unique(counts):
         same = np.flatnonzero(counts == moves)
-        for rows in np.array_split(same, -(-same.size // _CHUNK)):
-            spans = np.array([runs[row] for row in rows]).reshape(rows.size, moves, 2)
-            _Chunk(path[rows].astype(float), spans, arm).write(result, rows)
-            done += rows.size
+        batches += np.array_split(same, -(-same.size // _BATCH))
+
+    def solve(rows: NDArray) -> int:
+        spans = np.array([runs[row] for row in rows], dtype=int).reshape(
+            rows.size, counts[rows[0]], 2
+        )
+        _Chunk(path[rows].astype(float), spans, arm).write(result, rows)
+        return rows.size
+
+    done = 0
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for size in pool.map(solve, batches):
+            done += size
             if progress is not None:
                 progress(done / count)
     return result
 
 
+def _noise(path: NDArray) -> NDArray:
+    """Distance in m (n,) between noisy samples of paths (n, T, 3) at rest, if there is noise."""
+    speed = np.linalg.norm(np.diff(path, axis=1), axis=2)
+    # Rests are at least a quarter of a path; what is not so is no path of this arm.
+    return np.minimum(np.quantile(speed, 0.25, axis=1), _NOISIEST)
+
+
 def _movements(path: NDArray) -> list[tuple[int, int]]:
     """First and last moving step (from sample i to i + 1) of each movement in a path (T, 3)."""
     speed = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    # Rests are at least a quarter of a path, and noise, if any, is seen there.
-    moving = np.flatnonzero(speed > 1e-9 + 6 * np.quantile(speed, 0.25))
+    moving = np.flatnonzero(speed > 1e-9 + 6 * _noise(path[None])[0])
     found: list[tuple[int, int]] = []
     for step in moving.tolist():
         # A slow movement seems to stop when rounding hides its steps: bridge short stops, but
@@ -230,28 +204,47 @@ class _Chunk:
         lasts = np.abs(span[..., None] - spans).min(axis=2, initial=9).sum(axis=1)
         counts = np.abs(span[..., None] - spans + 1).min(axis=2, initial=9).sum(axis=1)
         self.closed = counts < lasts
+        # A ramp that counts both its ends has them on samples.
+        whole = np.rint(self.onsets)
+        near = self.closed & (np.abs(self.onsets - whole) < 0.1).all(axis=1)
+        self.onsets = np.where(near[:, None], whole, self.onsets)
 
     def write(self, result: Recovery, rows: NDArray) -> None:
-        """Solve, twice because onsets and commands need one another, and fill in rows."""
-        for _ in range(2):
-            self._solve()
+        """Solve, more than once where that helps, and fill in rows of the result."""
+        self.steps = np.zeros((self.count, self.moves + 1, 4))
+        self.index = np.zeros((self.count, self.moves, 4), dtype=int)
+        self.whole = np.zeros(self.count, dtype=bool)
+        self.tied = np.zeros((self.count, self.moves), dtype=bool)
+        some = np.arange(self.count)
+        for effort in (1, 1, 2, 4):
+            before = self.onsets
+            self._solve(some, effort)
             self._refine()
+            square = (self._error(self.onsets) ** 2).sum(axis=2)
+            cost = self._per_movement(square)
+            again = (cost > self.tolerance[:, None] ** 2).any(axis=1)
+            # More effort is in vain where not one movement is like one of this arm.
+            again &= (cost < _EXPLAINED**2).any(axis=1)
+            if effort == 1 and some.size == self.count:
+                # Commands and onsets need one another.
+                again |= (np.abs(self.onsets - before) > 1e-9).any(axis=1)
+            some = np.flatnonzero(again)
+            if some.size == 0:
+                break
         moves = self.moves
         commands = self._commands(self.onsets)
-        error = self.path - self.arm.position(unit_angles(commands))
-        square = (error**2).sum(axis=2)
         result.commands[rows] = commands
         result.onsets[rows, :moves] = self.onsets
         result.ramps[rows, :moves] = self.ramps
-        result.targets[rows, :moves] = _STRAIGHT - self.steps[:, 1:]
-        result.targets[rows, moves:] = _STRAIGHT - self.steps[:, -1:]
-        result.start[rows] = _STRAIGHT - self.steps[:, 0]
+        result.targets[rows, :moves] = STRAIGHT - self.steps[:, 1:]
+        result.targets[rows, moves:] = STRAIGHT - self.steps[:, -1:]
+        result.start[rows] = STRAIGHT - self.steps[:, 0]
         result.closed[rows], result.whole[rows] = self.closed, self.whole
         result.rms[rows] = np.sqrt(square.mean(axis=1))
         # Half a turn of yaw away there is a second answer unless the motor could not go there.
         low, high = self.steps[..., 0].min(axis=1), self.steps[..., 0].max(axis=1)
         mirrored = (low - _HALF_TURN >= -LIMIT) | (high + _HALF_TURN <= LIMIT)
-        poor = self._per_movement(square) > _EXPLAINED**2
+        poor = cost > _EXPLAINED**2
         cut = self.last >= self.length - 2
         result.ambiguous[rows, :moves] = self.tied | poor | cut | mirrored[:, None]
 
@@ -272,8 +265,7 @@ class _Chunk:
             total = np.cumsum(np.pad(signal, ((0, 0), (1, 0))), axis=1)
             sums = np.take_along_axis(total, high + 1, 1) - np.take_along_axis(total, low, 1)
             where.append(sums / (high + 1 - low))
-        steps = np.linalg.norm(np.diff(self.path, axis=1), axis=2)
-        return np.stack(where, axis=2), _ROUNDING + np.quantile(steps, 0.25, axis=1)
+        return np.stack(where, axis=2), _ROUNDING + _noise(self.path)
 
     def _kinks(self) -> NDArray:
         """Where the path in the plane (n, M, 3) surely has the kink of a ramp's end."""
@@ -293,8 +285,8 @@ class _Chunk:
         jump -= np.einsum("nmlkd,k->nmld", after, meet[::-1])
         return np.linalg.norm(jump, axis=3) > 10 * self.tolerance[:, None, None]
 
-    def _solve(self) -> None:
-        """Commands for the onsets as they stand."""
+    def _solve(self, rows: NDArray, effort: int) -> None:
+        """Commands of some rows for the onsets as they stand."""
         until = np.pad(self.first[:, 1:], ((0, 0), (0, 1)), constant_values=self.length - 1)
         offsets = np.arange(-4, RAMPS[-1] + 6, 2)
         index = np.floor(self.onsets).astype(int)[..., None] + offsets
@@ -309,22 +301,18 @@ class _Chunk:
             self.arm.links, self.radius[row, index], self.height[row, index], parts,
             rests, self.tolerance, self._kinks(), turn.min(axis=2),
         )  # fmt: skip
-        on_grid, found = grid_chain(plane)
+        plane = plane.rows(rows)
+        whole, found = grid_chain(plane)
         # A rest is near the grid by accident once in a while; a whole path never is.
-        good = (found.cost < _EXPLAINED**2).all(axis=1)
-        self.whole = on_grid.copy()
-        self.whole[on_grid] = good
-        self.steps = np.zeros((self.count, self.moves + 1, 4))
-        self.index = np.zeros((self.count, self.moves, 4), dtype=int)
-        self.tied = np.zeros((self.count, self.moves), dtype=bool)
-        parts_of = [(self.whole, found.rows(good))]
-        if not self.whole.all():
-            parts_of.append((~self.whole, free_chain(plane.rows(~self.whole))))
-        for rows, solution in parts_of:
-            self.steps[rows, :, 1:] = solution.postures
-            self.index[rows, :, 1:] = solution.lengths
-            self.tied[rows] = solution.tied
-        self._set_yaw(parts, turn)
+        good: NDArray = np.all(found.cost < _EXPLAINED**2, axis=1)
+        whole[whole] = good
+        self.whole[rows] = whole
+        free = free_chain(plane.rows(~whole), effort)
+        for some, solution in ((rows[whole], found.rows(good)), (rows[~whole], free)):
+            self.steps[some, :, 1:] = solution.postures.clip(-LIMIT, LIMIT)
+            self.index[some, :, 1:] = solution.lengths
+            self.tied[some] = solution.tied
+        self._set_yaw(rows, parts, turn)
 
     def _yaw_fit(self, index: NDArray, parts: NDArray) -> NDArray:
         """Mean square error (n, M, 3) in m^2 of the best yaw ramp of each length."""
@@ -341,32 +329,35 @@ class _Chunk:
         fit = old[..., None] * a + new[..., None] * b
         return (w * (y - fit) ** 2).mean(axis=-1) * STEP**2
 
-    def _set_yaw(self, parts: NDArray, turn: NDArray) -> None:
+    def _set_yaw(self, rows: NDArray, parts: NDArray, turn: NDArray) -> None:
         """Ramps of the yaw motor, and where it rests, by weighted least squares over a path."""
         moves = np.arange(self.moves)
+        parts, turn, weight, angle = parts[rows], turn[rows], self.weight[rows], self.angle[rows]
         length = np.argmin(turn, axis=2)
         part = np.take_along_axis(parts, length[..., None, None], axis=2)[:, :, 0]
-        matrix = np.zeros((self.count, self.moves + 1, self.moves + 1))
-        vector = np.zeros((self.count, self.moves + 1))
+        matrix = np.zeros((rows.size, self.moves + 1, self.moves + 1))
+        vector = np.zeros((rows.size, self.moves + 1))
         hats = (1 - part, part)
         for i in range(2):
-            vector[:, moves + i] += (self.weight * hats[i] * self.angle).sum(axis=2)
+            vector[:, moves + i] += (weight * hats[i] * angle).sum(axis=2)
             for j in range(2):
-                matrix[:, moves + i, moves + j] += (self.weight * hats[i] * hats[j]).sum(axis=2)
+                matrix[:, moves + i, moves + j] += (weight * hats[i] * hats[j]).sum(axis=2)
         # What nothing shows is pulled to straight.
         inverse = np.linalg.inv(matrix + _PULL * np.eye(self.moves + 1))
         yaw = (inverse @ vector[..., None])[..., 0]
         if self.moves == 0:
-            yaw[:, 0] = np.median(self.yaw, axis=1) / STEP * self.seen.any(axis=1)
-        yaw = np.where(self.whole[:, None], np.rint(yaw), yaw).clip(-LIMIT, LIMIT)
-        self.steps[..., 0] = yaw
+            yaw[:, 0] = np.median(self.yaw[rows], axis=1) / STEP * self.seen[rows].any(axis=1)
+        whole = self.whole[rows, None]
+        yaw = np.where(whole, np.rint(yaw), yaw).clip(-LIMIT, LIMIT)
+        self.steps[rows, :, 0] = yaw
         ordered = np.sort(turn, axis=2)
         noise = ordered[..., 0] + 1e-18
-        moved = np.abs(np.diff(yaw, axis=1)) > np.where(self.whole, 0, 0.5)[:, None]
-        self.index[..., 0] = np.where(moved, length, 0) if self.whole.all() else length
-        self.tied |= moved & (ordered[..., 1] <= TIE * noise)
+        moved = np.abs(np.diff(yaw, axis=1)) > np.where(whole, 0, 0.5)
+        # A motor that stays has no ramp.
+        self.index[rows, :, 0] = np.where(moved | ~whole, length, 0)
         spread = np.sqrt(np.einsum("nii->ni", inverse)) / STEP
-        self.tied |= np.maximum(spread[:, 1:], spread[:, :-1]) * np.sqrt(noise) > 0.2
+        unsure = np.maximum(spread[:, 1:], spread[:, :-1]) * np.sqrt(noise) > 0.2
+        self.tied[rows] |= unsure | (moved & (ordered[..., 1] <= TIE * noise))
 
     @property
     def ramps(self) -> NDArray:
@@ -374,7 +365,7 @@ class _Chunk:
         return np.array(RAMPS)[self.index]
 
     def _commands(self, onsets: NDArray) -> NDArray:
-        units = _STRAIGHT - self.steps
+        units = STRAIGHT - self.steps
         return ramp_commands(
             units[:, 0], units[:, 1:], self.ramps, onsets, self.length, closed=self.closed
         )
@@ -390,7 +381,9 @@ class _Chunk:
             slope = (self._error(self.onsets + nudge) - error) / nudge
             power = self._per_movement((slope**2).sum(axis=2))
             shift = self._per_movement((slope * error).sum(axis=2)) / np.maximum(power, 1e-18)
-            self.onsets = self.onsets - np.clip(shift, -2, 2)
+            # What the commands do not explain says nothing about its onset.
+            good = self._per_movement((error**2).sum(axis=2)) < _EXPLAINED**2
+            self.onsets = self.onsets - np.where(good, np.clip(shift, -2, 2), 0)
         whole = np.rint(self.onsets)
         now = self._per_movement((self._error(self.onsets) ** 2).sum(axis=2))
         then = self._per_movement((self._error(whole) ** 2).sum(axis=2))

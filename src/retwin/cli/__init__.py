@@ -13,7 +13,7 @@ import typer
 
 from retwin import __version__
 from retwin.cli import data, models, studies
-from retwin.cli.terminal import BAD_INPUT, FAILED, INTERRUPTED, complain, show_warnings
+from retwin.cli.terminal import BAD_INPUT, FAILED, complain, show_warnings
 from retwin.errors import InputError
 
 __all__ = ["app", "main"]
@@ -62,6 +62,3 @@ def main() -> None:
         except (OSError, RuntimeError) as error:
             complain(f"{type(error).__name__}: {error}")
             sys.exit(FAILED)
-        except KeyboardInterrupt:
-            complain("interrupted; a study goes on when the same command is given again")
-            sys.exit(INTERRUPTED)

@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from retwin.cli.terminal import bar
+from retwin.cli.terminal import INTERRUPTED, bar, complain
 from retwin.errors import InputError
 
 __all__ = ["demo", "report", "study"]
@@ -106,12 +106,17 @@ def _run(case: Any, plan: Any, data: Any, out: Path, processes: int | None) -> N
     from retwin.study import run_study
 
     command = shlex.join(["retwin", *sys.argv[1:]])
-    with bar("study") as tell:
-        results = run_study(
-            case, plan, data, out, processes=processes, report=tell, command=command
-        )
-        tell("report", 1.0)
-        page = write_report(out)
+    try:
+        with bar("study") as tell:
+            results = run_study(
+                case, plan, data, out, processes=processes, report=tell, command=command
+            )
+            tell("report", 1.0)
+            page = write_report(out)
+    except KeyboardInterrupt:
+        # Typer would end without a word.
+        complain(f"interrupted; give the same command again to go on: {command}")
+        raise typer.Exit(INTERRUPTED) from None
     console = Console()
     console.print(_table(results))
     for line in _gaps(results):

@@ -35,7 +35,7 @@ class DelayOffset:
     """
 
     delay_range: tuple[float, float] = (-5.0, 30.0)
-    known_delay: float = 2.0
+    known_delay: float = 3.0
 
     @property
     def resolution(self) -> str:

@@ -91,7 +91,7 @@ def run_study(
     work = Work(work_folder, case, plan, roles)
     run_jobs(work, processes or os.cpu_count() or 1, tell)
     tell("scores", 1.0)
-    provenance = {"command": command, "seed": plan.seed, "plan": asdict(plan)}
+    provenance = {"command": command, "seed": plan.seed}
     return write_results(work, out, about=about, provenance=provenance)
 
 

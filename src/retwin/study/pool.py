@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import queue
 import signal
 import threading
@@ -27,24 +28,23 @@ def run_jobs(work: Work, processes: int, tell: Callable[[str, float], None]) -> 
         return
     # Spawned, not forked: torch's threads do not survive a fork.
     context = multiprocessing.get_context("spawn")
-    with context.Manager() as manager:
-        news = manager.Queue()
-        stop = threading.Event()
-        listener = threading.Thread(target=_listen, args=(news, shares, tell, stop), daemon=True)
-        listener.start()
-        pool = ProcessPoolExecutor(
-            min(processes, max(map(len, missing))), context, _start_worker, (news,)
-        )
-        try:
-            for stage in missing:
-                _finish({pool.submit(_do, work, job) for job in stage})
-        except BaseException:
-            _abandon(pool)
-            raise
-        finally:
-            stop.set()
-            listener.join()
-            pool.shutdown(cancel_futures=True)
+    news = context.Queue()
+    stop = threading.Event()
+    listener = threading.Thread(target=_listen, args=(news, shares, tell, stop), daemon=True)
+    listener.start()
+    workers = min(processes, max(map(len, missing)))
+    pool = ProcessPoolExecutor(workers, context, _start_worker, (news,))
+    try:
+        for stage in missing:
+            _finish({pool.submit(_do, work, job) for job in stage})
+    except BaseException:
+        _abandon(pool)
+        raise
+    finally:
+        stop.set()
+        # A worker ended in the middle of a message could keep the listener waiting.
+        listener.join(timeout=1.0)
+        pool.shutdown(cancel_futures=True)
 
 
 def _finish(futures: set[Future[None]]) -> None:
@@ -82,9 +82,18 @@ def _start_worker(news: Any) -> None:
     global _progress
     _progress = news
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     # Recurrent nets run into denormal numbers, which are several times slower; must be first.
     torch.set_flush_denormal(True)
+
+
+def _end_with_parent() -> None:
+    """A parent that was killed cannot end its workers: they must see for themselves."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _do(work: Work, job: Job) -> None:

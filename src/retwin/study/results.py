@@ -152,7 +152,6 @@ def _timing(work: Work) -> dict[str, Any]:
     chosen = work.plan.sources
     return {
         "generate_s": {name: _costs(work, name)["generate_s"] for name in chosen},
-        "generated": work.plan.per_class * len(work.case.classes),
         "surrogate_fit_s": _mean(work, "surrogate", "seconds"),
         "residual_fit_s": _mean(work, "residual", "seconds"),
         "diagnosis_s": {name: _mean(work, "diagnosis", "seconds", name) for name in chosen},
