@@ -13,7 +13,7 @@ install: .venv/installed
 
 # The main job: on the real robot if RETWIN_DATA is set, else on an emulated one.
 demo: install
-	$(BIN)/retwin demo --out demo
+	$(BIN)/retwin demo
 
 # A worker per core, one torch thread each: more threads than cores cost several times the time.
 test: install

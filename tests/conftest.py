@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
 import retwin as rt
 from retwin.training import Training
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item):
+    """With RETWIN_DATA set, a test on real data that is skipped has failed."""
+    outcome = yield
+    report = outcome.get_result()
+    if report.skipped and os.environ.get("RETWIN_DATA") and item.get_closest_marker("real_data"):
+        report.outcome = "failed"
+        report.longrepr = "skipped although RETWIN_DATA is set"
+
 
 # A surrogate that is good to a millimetre takes a second; the default one is tried in one test.
 BRISK = Training(epochs=6, batch=256, rate=1e-2)

@@ -214,3 +214,26 @@ def test_saved_and_loaded_is_the_same(
     assert torch.equal(*draws)
     assert back.fitted == rg.fitted
     np.testing.assert_array_equal(back.timing, rg.timing)
+
+
+def test_calibration_data_must_speak_of_the_same_system(
+    ibg: rt.Surrogate, emulated: rt.Trajectories
+) -> None:
+    with pytest.raises(rt.InputError, match=r"calibration.rate: expected .* 100.0, got 50.0"):
+        rt.fit_residual(ibg, emulated.replace(rate=50.0), seed=0)
+    millimetres = rt.Channels(("x", "y", "z"), ("mm",) * 3)
+    with pytest.raises(rt.InputError, match=r"calibration.outputs"):
+        rt.fit_residual(ibg, emulated.replace(outputs=millimetres), seed=0)
+    with pytest.raises(rt.InputError, match="one positive bound for each of delay, offset_x"):
+        rt.fit_residual(ibg, emulated, seed=0, bounds=np.ones(3))
+    with pytest.raises(rt.InputError, match="0 components"):
+        rt.Mixture(components=0)
+
+
+def test_what_was_calibrated_on_emulated_data_says_so(
+    rg: rt.ResidualModel, updated: rt.CorrectedTwin, case: rt.Case, tmp_path: Path
+) -> None:
+    assert rg.emulated
+    updated.save(tmp_path / "twin")
+    back = rt.CorrectedTwin.load(tmp_path / "twin")
+    assert rt.generate(back, case, per_class=1, seed=0).emulated

@@ -57,7 +57,7 @@ def test_saved_and_loaded_is_the_same(
 
 
 def test_bad_input_is_refused(twin_set: rt.Trajectories, tmp_path: Path) -> None:
-    with pytest.raises(rt.InputError, match="at least ten trajectories"):
+    with pytest.raises(rt.InputError, match="at least 10 trajectories"):
         rt.fit_surrogate(twin_set[:5], seed=0)
     bare = twin_set.replace(commands=twin_set.commands[..., :0], inputs=None)
     with pytest.raises(rt.InputError, match="0 command channels"):

@@ -97,3 +97,22 @@ def test_standardise_and_back() -> None:
         standard.std((0, 1), correction=0), torch.tensor([1.0, 1, 0]), atol=1e-5, rtol=0
     )
     torch.testing.assert_close(layer.inverse(standard), values)
+
+
+def test_unknown_settings_are_refused() -> None:
+    from retwin import InputError
+
+    with pytest.raises(InputError, match="decay 'linear'"):
+        Training(decay="linear")
+    with pytest.raises(InputError, match="0 epochs"):
+        Training(epochs=0)
+
+
+def test_a_network_that_could_not_be_loaded_is_not_saved() -> None:
+    from retwin import InputError
+
+    class Mine(nn.Module):
+        pass
+
+    with pytest.raises(InputError, match=r"expected one of MLP, .* got Mine"):
+        to_config(Mine())

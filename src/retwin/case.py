@@ -50,6 +50,8 @@ class Case:
     correction: the shape that the gap may take, by default.
     sensor_rate: samples per second that the measuring chain really takes.
     recover: fills in commands that a file does not hold; None when files hold them.
+    encoder_noise: puts reading noise of so many command units on frozen actuators (trajectories,
+        units, seed); None when the case cannot tell what that does to its outputs.
     published: the figures of a paper to show beside ours: source to metric to text.
 
     """
@@ -63,6 +65,7 @@ class Case:
     correction: Correction
     sensor_rate: float
     recover: Callable[[Trajectories, Progress | None], Trajectories] | None = None
+    encoder_noise: Callable[[Trajectories, float, int], Trajectories] | None = None
     published: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @property
@@ -92,7 +95,8 @@ class Case:
             name: replace(fault, onset=onset) if isinstance(fault, Stuck) else fault
             for name, fault in self.faults.items()
         }
-        return replace(self, faults=faults)
+        # What noise does to a frozen joint is known for the published onset only.
+        return replace(self, faults=faults, encoder_noise=None)
 
     def complete(
         self, trajectories: Trajectories, *, progress: Progress | None = None

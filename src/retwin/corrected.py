@@ -98,6 +98,7 @@ class CorrectedTwin:
             inputs=self.inputs,
             outputs=self.outputs,
             provenance=(Source(f"CorrectedTwin seed={seed}"),),
+            emulated=self.residual.emulated,
         )
 
     @torch.no_grad()

@@ -221,11 +221,11 @@ SURROGATES: dict[str, Network] = {"mlp": MLP(), "lstm": LSTM(), "tcn": TCN()}
 CLASSIFIERS: dict[str, Network] = {"cnn": CNN(), "lstm": LSTMClassifier()}
 
 
-def named(name: str, known: Mapping[str, Network]) -> Network:
+def named(name: str, known: Mapping[str, Network], argument: str) -> Network:
     """The network of that name in SURROGATES or CLASSIFIERS; InputError when there is none."""
     if name not in known:
         raise InputError(
-            "network",
+            argument,
             expected=f"one of {', '.join(known)}",
             got=repr(name),
             remedy="check the spelling",
@@ -234,7 +234,14 @@ def named(name: str, known: Mapping[str, Network]) -> Network:
 
 
 def to_config(network: Any) -> dict[str, Any]:
-    """A network's config as plain JSON values."""
+    """A network's config as plain JSON values; InputError for one that cannot be loaded."""
+    if type(network) not in _CONFIGS.values():
+        raise InputError(
+            "network",
+            expected=f"one of {', '.join(_CONFIGS)}, to be saved",
+            got=type(network).__name__,
+            remedy="use the model without saving it: loading runs no code that a file names",
+        )
     return {"kind": type(network).__name__, **asdict(network)}
 
 

@@ -49,6 +49,15 @@ class Mixture:
         epochs=300, batch=64, rate=3e-3, decay="step", patience=40, weight_decay=1e-2
     )
 
+    def __post_init__(self) -> None:
+        if self.components < 1 or not 0 <= self.dropout < 1:
+            raise InputError(
+                "mixture",
+                expected="at least one component and a dropout from 0 to below 1",
+                got=f"{self.components} components, dropout {self.dropout}",
+                remedy="see the parameters of Mixture",
+            )
+
 
 class ResidualModel(nn.Module):
     """Call it on a `Context`: out comes a torch `Distribution` over z (n, M, d_z).
@@ -76,6 +85,14 @@ class ResidualModel(nn.Module):
         self.outputs = outputs
         self.segmentation = segmentation
         self.latent = correction.latent(outputs)
+        if correction.resolution != "segment":
+            raise InputError(
+                "correction",
+                expected="an operator with one z per movement",
+                got=f"{type(correction).__name__}, one z per {correction.resolution}",
+                remedy="use DelayOffset",
+            )
+        self.emulated = False
         self.timing: NDArray = np.empty((0, 0))
         self.fitted: Fit | None = None
         features = 3 * (len(inputs) + len(outputs)) + 2
@@ -133,6 +150,7 @@ class ResidualModel(nn.Module):
             "inputs": vars(self.inputs),
             "outputs": vars(self.outputs),
             "segmentation": self.segmentation,
+            "emulated": self.emulated,
             "timing": [[None if np.isnan(t) else t for t in row] for row in self.timing],
             "fitted": None if self.fitted is None else asdict(self.fitted),
         }
@@ -154,6 +172,7 @@ class ResidualModel(nn.Module):
             segmentation=about["segmentation"],
         )
         model.load_state_dict(weights)
+        model.emulated = about["emulated"]
         model.timing = np.array(about["timing"], dtype=float)
         model.fitted = Fit.of(about["fitted"])
         return model.eval()
@@ -233,13 +252,15 @@ def fit_residual(
     correction: what z means.
     calibrate_on: "healthy" or "all".
     bounds: b of Eq. 9, (d_z,); by default 1.25 times the largest |z*|.
-    segments: "commands", "path", or the movements themselves, one row per trajectory.
+    segments: "commands", "path", or the movements themselves, one row per trajectory; generated
+        trajectories then get theirs from command events.
 
     Raises
     ------
     InputError: no trajectory to calibrate on, no movement in any, an unknown `calibrate_on`.
 
     """
+    _check_match(surrogate, calibration)
     keep = _chosen(calibration, calibrate_on)
     used = calibration[keep]
     if isinstance(segments, str):
@@ -272,12 +293,26 @@ def fit_residual(
         seed=seed,
         progress=progress,
     )
+    model.emulated = used.emulated
     onsets = Segments.from_commands(calibration.commands)
     model.timing = np.where(onsets.valid, onsets.start, np.nan)
     model.fitted = replace(
         result, figures={"trajectories": float(len(used)), "movements": float(valid.sum())}
     )
     return model.eval()
+
+
+def _check_match(surrogate: Surrogate, calibration: Trajectories) -> None:
+    """Calibration data must speak of the same channels at the same rate as the surrogate."""
+    for name in ("inputs", "outputs", "rate"):
+        ours, theirs = getattr(surrogate, name), getattr(calibration, name)
+        if ours != theirs:
+            raise InputError(
+                f"calibration.{name}",
+                expected=f"what the surrogate was trained on, {ours}",
+                got=f"{theirs}",
+                remedy="load the file with its case, or convert it",
+            )
 
 
 def _chosen(calibration: Trajectories, calibrate_on: str) -> NDArray:
@@ -338,6 +373,13 @@ def _prepare(
         model.bounds[part] = 1.25 * values.abs().amax(dim=0).clamp_min(1e-9)
         cast(MixtureHead, head).initialise(((values - shift) / scale).double().numpy(), seed)
     if bounds is not None:
+        if np.shape(bounds) != (len(model.latent),) or not (np.asarray(bounds) > 0).all():
+            raise InputError(
+                "bounds",
+                expected=f"one positive bound for each of {', '.join(model.latent.names)}",
+                got=repr(bounds),
+                remedy="leave bounds out to take them from the data",
+            )
         model.bounds.copy_(torch.as_tensor(bounds, dtype=torch.float32))
 
 

@@ -1,4 +1,4 @@
-"""Scores of a diagnoser, and whether one is better than another (PROTOCOL: Welch, Holm, bootstrap).
+"""Scores of a diagnoser, and whether one is better than another (Welch, Holm, bootstrap).
 
 Over runs: Welch's t, which measures training noise only. Over test trajectories: a paired
 stratified bootstrap; claims of "better" stand on that one. The unit of resampling is the

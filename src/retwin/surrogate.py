@@ -134,6 +134,9 @@ class Surrogate(nn.Module):
         return surrogate.eval()
 
 
+ENOUGH = 10
+"""Fewest trajectories to fit on: a tenth each is held out for validation and for the error."""
+
 DEFAULTS = {
     "MLP": Training(epochs=20, batch=256, rate=5e-3),
     "LSTM": Training(epochs=10, batch=32, rate=5e-3),
@@ -167,10 +170,10 @@ def fit_surrogate(
     InputError: fewer than ten trajectories, or a set without commands.
 
     """
-    if len(twin) < 10 or twin.commands.shape[2] == 0:
+    if len(twin) < ENOUGH or twin.commands.shape[2] == 0:
         raise InputError(
             "twin",
-            expected="at least ten trajectories with commands",
+            expected=f"at least {ENOUGH} trajectories with commands",
             got=f"{len(twin)} trajectories with {twin.commands.shape[2]} command channels",
             remedy="load the file with its case, which recovers commands, or simulate more",
         )
@@ -194,7 +197,7 @@ def fit_surrogate(
         loss,
         fitted,
         rows(twin, valid, seed + 1),
-        training or DEFAULTS[type(network).__name__],
+        training or DEFAULTS.get(type(network).__name__, Training()),
         seed=seed,
         progress=progress,
     )

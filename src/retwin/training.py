@@ -20,6 +20,8 @@ from torch.utils.data import (
     TensorDataset,
 )
 
+from retwin.errors import InputError
+
 __all__ = ["Fit", "Training", "isolated", "train"]
 
 Loss = Callable[[Any, tuple[Tensor, ...]], Tensor]
@@ -50,6 +52,15 @@ class Training:
     patience: int = 0
     weight_decay: float = 0.0
     clip: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.decay not in ("cosine", "step") or min(self.epochs, self.batch) < 1:
+            raise InputError(
+                "training",
+                expected="decay 'cosine' or 'step', at least one epoch and one example per batch",
+                got=f"decay {self.decay!r}, {self.epochs} epochs, batch {self.batch}",
+                remedy="see the parameters of Training",
+            )
 
 
 @dataclass(frozen=True)

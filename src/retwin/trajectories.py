@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from typing import Any
@@ -12,9 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.errors import InputError
 
-__all__ = ["Channels", "Source", "Trajectories"]
+__all__ = ["Channels", "Progress", "Source", "Trajectories"]
 
 UNLABELLED = ""
+
+Progress = Callable[[float], None]
+"""Called with the share that is done, 0 … 1."""
 
 
 @dataclass(frozen=True)

@@ -112,3 +112,28 @@ def test_a_corrected_twin_is_nearer_to_the_real_robot() -> None:
 
     target = spread(held_out)
     assert abs(np.log(spread(made) / target)) < abs(np.log(spread(plain) / target)) / 2
+
+
+def test_encoder_noise_moves_stuck_joints_only(case: rt.Case) -> None:
+    made = rt.generate(case.twin, case, per_class=3, seed=0)
+    noisy = case.encoder_noise(made, 1.0, seed=0)
+    moved = np.abs(noisy.observed - made.observed).max(axis=2)
+    stuck = np.char.endswith(made.labels, "Stuck")
+    assert (moved[~stuck] == 0).all()
+    assert (moved[stuck, :50] == 0).all()
+    assert (moved[stuck, 50:].max(axis=1) > 1e-4).all()
+    # One unit at the arm's full reach, as the twin itself answers it.
+    assert moved.max() <= 0.26 * np.deg2rad(0.24) * 1.1
+    i = int(np.flatnonzero(made.labels == "Motor_2_Stuck")[0])
+    held = made.commands[i].astype(float)
+    held[49:, 1] = held[49, 1]
+    nudged = held.copy()
+    nudged[:, 1] += 1
+    slope = case.twin.position(nudged) - case.twin.position(held)
+    change = (noisy.observed - made.observed)[i, 200]
+    assert (
+        np.linalg.norm(
+            change - round(float(change @ slope[200] / (slope[200] @ slope[200]))) * slope[200]
+        )
+        < 1e-5
+    )

@@ -194,4 +194,4 @@ def test_demo_with_a_wrong_folder_is_refused(
     monkeypatch.setenv("RETWIN_DATA", str(tmp_path))
     code, _, err = call("demo", "--out", tmp_path / "demo")
     assert code == 2
-    assert "RETWIN_DATA: expected a folder with armpi/sim.mat" in err
+    assert "RETWIN_DATA: expected a folder with armpi/real_a.mat" in err

@@ -20,7 +20,7 @@ def training(case: rt.Case, ibg: rt.Surrogate) -> rt.Trajectories:
 
 @pytest.fixture(scope="module")
 def cnn(training: rt.Trajectories) -> rt.NetworkDiagnoser:
-    return rt.fit_diagnoser(training, SMALL, seed=0, how=SHORT)
+    return rt.fit_diagnoser(training, SMALL, seed=0, training=SHORT)
 
 
 def test_learns_what_can_be_learnt(
@@ -59,7 +59,7 @@ def test_missing_samples_are_zero_residual(
 
 def test_same_seed_same_bytes(training: rt.Trajectories, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        rt.fit_diagnoser(training, SMALL, seed=2, how=Training(epochs=2)).save(tmp_path / name)
+        rt.fit_diagnoser(training, SMALL, seed=2, training=Training(epochs=2)).save(tmp_path / name)
     for file in ("model.json", "weights.safetensors"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
@@ -74,14 +74,16 @@ def test_saved_and_loaded_is_the_same(
 
 
 def test_classes_keep_the_order_given(training: rt.Trajectories, case: rt.Case) -> None:
-    named = rt.fit_diagnoser(training, SMALL, seed=0, classes=case.classes, how=Training(epochs=1))
+    named = rt.fit_diagnoser(
+        training, SMALL, seed=0, classes=case.classes, training=Training(epochs=1)
+    )
     assert named.classes == case.classes
     assert named.predict_proba(training[:2]).shape == (2, 9)
 
 
 def test_the_paper_s_lstm_trains(training: rt.Trajectories) -> None:
     model = rt.fit_diagnoser(
-        training, rt.LSTMClassifier(16), seed=0, how=Training(epochs=2, batch=16)
+        training, rt.LSTMClassifier(16), seed=0, training=Training(epochs=2, batch=16)
     )
     assert np.isfinite(model.predict_proba(training[:3])).all()
 
@@ -93,5 +95,8 @@ def test_bad_input_is_refused(cnn: rt.NetworkDiagnoser, training: rt.Trajectorie
         rt.fit_diagnoser(training.replace(labels=None), SMALL, seed=0)
     with pytest.raises(rt.InputError, match=r"trajectories.rate: expected .* 100.0, got 50.0"):
         cnn.predict_proba(training.replace(rate=50.0))
+    for rate in (0.0, -5.0, 40.0, 200.0):
+        with pytest.raises(rt.InputError, match="rate: expected 100 Hz"):
+            rt.fit_diagnoser(training, SMALL, seed=0, rate=rate)
     with pytest.raises(rt.InputError, match="labels among"):
         rt.evaluate(cnn, training.replace(labels=np.array(["Strange"] * len(training))))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -164,6 +165,9 @@ def test_seeds_differ_by_run_fold_and_stage_and_not_by_the_sources_chosen(case: 
         ({"preset": "slow"}, "preset: expected one of quick, paper"),
         ({"classifier": "svm"}, "classifier: expected one of cnn, lstm"),
         ({"runs": 0}, "runs: expected at least 1"),
+        ({"calibrate_on": "some"}, "calibrate_on: expected one of healthy, all"),
+        ({"encoder_noise": -1.0}, "encoder_noise of at least 0"),
+        ({"rate": 0.0}, "a positive rate"),
     ],
 )
 def test_bad_plans_are_refused(changes: dict, message: str) -> None:
@@ -176,3 +180,41 @@ def test_contradicting_data_are_refused(tmp_path: Path) -> None:
         rt.StudyData(calibration=tmp_path)
     with pytest.raises(rt.InputError, match="either calibration and test, or real alone"):
         rt.StudyData(calibration=tmp_path, test=tmp_path, real=tmp_path)
+
+
+def test_bad_data_leave_nothing_behind(
+    emulated: rt.Trajectories, case: rt.Case, tmp_path: Path
+) -> None:
+    faulty = emulated[emulated.labels != "Healthy"]
+    rt.save(faulty, tmp_path / "faulty.npz")
+    data = rt.StudyData(real=tmp_path / "faulty.npz")
+    with pytest.raises(rt.InputError, match="labelled 'Healthy' in every calibration part"):
+        rt.run_study(case, PLAN, data, tmp_path / "out")
+    strange = emulated.replace(labels=np.array(["Strange"] * 90))
+    rt.save(strange, tmp_path / "strange.npz")
+    with pytest.raises(rt.InputError, match="Strange"):
+        rt.run_study(case, PLAN, rt.StudyData(real=tmp_path / "strange.npz"), tmp_path / "out")
+    with pytest.raises(rt.InputError, match="at least 10 trajectories of the twin"):
+        rt.run_study(case, rt.StudyPlan(per_class=1), rt.StudyData(), tmp_path / "out")
+    noisy = rt.StudyPlan(encoder_noise=1.0)
+    with pytest.raises(rt.InputError, match="cannot tell what a joint's reading"):
+        rt.run_study(case.with_random_onset(), noisy, rt.StudyData(), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.real_data
+@pytest.mark.skipif(
+    "RETWIN_DATA" not in os.environ, reason="RETWIN_DATA names the folder of the real data"
+)
+def test_the_whole_job_runs_on_the_public_files(case: rt.Case, tmp_path: Path) -> None:
+    """The published twin (a tenth of it) and the real robot, commands recovered, two folds."""
+    arm = Path(os.environ["RETWIN_DATA"]) / "armpi"
+    real = next(f for n in ("real_a.mat", "my_dataset_test.mat") if (f := arm / n).exists())
+    rt.save(rt.load(arm / "sim.mat", rate=100.0)[::10], tmp_path / "sim.npz")
+    plan = rt.StudyPlan(sources=("dt", "ibg_rg"), runs=1, folds=2, per_class=40)
+    data = rt.StudyData(twin=tmp_path / "sim.npz", real=real)
+    results = rt.run_study(case, plan, data, tmp_path / "out", processes=1)
+    assert results["emulated"] is False
+    assert results["published"]["ibg_rg"]["healthy_recall"] == "0.62"
+    assert results["sources"]["ibg_rg"]["auroc"][0] > 0.8
+    assert rt.write_report(tmp_path / "out").stat().st_size < 10_000_000

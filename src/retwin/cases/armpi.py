@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from retwin.case import Case
 from retwin.cases.armpi_recovery import RAMPS, ramp_commands, recover_commands
 from retwin.corrections import DelayOffset
-from retwin.faults import Fault, SteadyStateError, Stuck
+from retwin.faults import Fault, SteadyStateError, Stuck, frozen_response
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins.arm import YawPitchArm
 from retwin.twins.emulated import EmulatedArm
@@ -24,6 +24,8 @@ ARM = YawPitchArm(base=0.028505 + 0.0361, links=(0.10048, 0.094714, 0.05071))
 INPUTS = Channels(tuple(f"motor_{i}" for i in range(1, 5)), ("0.24 deg",) * 4)
 OUTPUTS = Channels(("x", "y", "z"), ("m",) * 3)
 RATE = 100.0
+POLL = 10
+"""Samples per reading of the real arm's motors; between them its data are straight lines."""
 STRAIGHT = 500.0
 DEGREES = 0.24
 """One command unit; a motor's angle in degrees is 120 - 0.24 units."""
@@ -126,21 +128,47 @@ def recover(trajectories: Trajectories, progress: Progress | None = None) -> Tra
     )
 
 
+MOTORS = range(4)
+ONSET = 49
+FAULTS: dict[str, Fault | None] = {
+    HEALTHY: None,
+    **{f"Motor_{i + 1}_Stuck": Stuck(i, ONSET) for i in MOTORS},
+    **{f"Motor_{i + 1}_Steady_state_error": SteadyStateError(i) for i in MOTORS},
+}
+"""The nine classes in their fixed order; the published protocol freezes at sample 49 (0-based)."""
+
+
+def encoder_noise(trajectories: Trajectories, units: float, seed: int) -> Trajectories:
+    """Readings of a stuck motor that flicker by -1, 0 or 1 times `units`, seen at the output.
+
+    The outputs move by the arm's Jacobian where the arm is told to be, the motor being held.
+    """
+    rng = np.random.default_rng(seed)
+    observed = trajectories.observed.copy()
+    polls = np.arange(0, trajectories.steps + POLL, POLL)
+    time = np.arange(trajectories.steps)
+    for i, label in enumerate(trajectories.labels):
+        fault = FAULTS.get(str(label))
+        flicker = np.interp(time, polls, units * rng.integers(-1, 2, size=len(polls)))
+        if isinstance(fault, Stuck):
+            held = frozen_response(trajectories.commands[i : i + 1], [fault])[0]
+            effect = ARM.jacobian(TWIN.angles(held))[:, :, fault.actuator] * TWIN.scale
+            observed[i] += np.where(time > ONSET, flicker, 0.0)[:, None] * effect
+    return trajectories.replace(observed=observed)
+
+
 def armpi() -> Case:
-    """The case of the paper: nine classes in their fixed order, the published fault protocol."""
-    motors = range(4)
-    stuck = {f"Motor_{i + 1}_Stuck": Stuck(i) for i in motors}
-    biased = {f"Motor_{i + 1}_Steady_state_error": SteadyStateError(i) for i in motors}
-    faults: dict[str, Fault | None] = {HEALTHY: None, **stuck, **biased}
+    """The case of the paper."""
     return Case(
         name="armpi",
         title="ArmPi FPV robot arm",
-        faults=faults,
+        faults=FAULTS,
         twin=TWIN,
         emulator=EmulatedArm(TWIN),
         sampler=ArmSampler(),
         correction=DelayOffset(),
-        sensor_rate=10.0,
+        sensor_rate=RATE / POLL,
         recover=recover,
+        encoder_noise=encoder_noise,
         published=PUBLISHED,
     )

@@ -32,6 +32,7 @@ _HALF_TURN = 750  # command units in half a turn
 _ROUNDING = 1.5e-6  # m: more than the rounding of the published paths (1e-6 m per axis)
 _NOISIEST = 1e-4  # m: no more than this is taken for noise
 _EXPLAINED = 5e-5  # m: a movement with a larger RMS is not explained
+_NEARLY = 2e-3  # m: a movement with a larger RMS is nothing like one of this arm
 _PULL = 1e-14  # m^2: far less than what a single sample off the axis says about the yaw
 _BATCH = 32  # paths solved at a time: they fit the cache, and there is work for each core
 
@@ -223,8 +224,8 @@ class _Chunk:
             square = (self._error(self.onsets) ** 2).sum(axis=2)
             cost = self._per_movement(square)
             again = (cost > self.tolerance[:, None] ** 2).any(axis=1)
-            # More effort is in vain where not one movement is like one of this arm.
-            again &= (cost < _EXPLAINED**2).any(axis=1)
+            # More effort is in vain where not one movement is nearly like one of this arm.
+            again &= (cost < _NEARLY**2).any(axis=1)
             if effort == 1 and some.size == self.count:
                 # Commands and onsets need one another.
                 again |= (np.abs(self.onsets - before) > 1e-9).any(axis=1)

@@ -24,7 +24,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
-app.command("demo", epilog="Example: `retwin demo --out demo`")(studies.demo)
+app.command("demo", epilog="Example: `retwin demo`")(studies.demo)
 app.add_typer(data.app, name="data")
 app.command(
     "fit",

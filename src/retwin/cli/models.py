@@ -16,7 +16,7 @@ from retwin.storage import check_target, write_atomically
 __all__ = ["diagnose", "fit", "generate"]
 
 CaseName = Annotated[str, typer.Argument(help="Built-in case or package.module:object.")]
-Seed = Annotated[int, typer.Option(help="Same seed, same result.")]
+Seed = Annotated[int, typer.Option(help="Same seed, same result.", min=0)]
 
 
 def fit(
@@ -33,7 +33,7 @@ def fit(
     from retwin.networks import SURROGATES, named
 
     system = rt.cases.get(case)
-    config = named(network, SURROGATES)
+    config = named(network, SURROGATES, "network")
     with bar("read") as tell:
         twin = rt.load(twin_data, case=system, progress=lambda s: tell(twin_data.name, s))
         measured = rt.load(real, case=system, progress=lambda s: tell(real.name, s))
@@ -61,7 +61,8 @@ def fit(
     console.print(table)
     console.print(
         f"Residual model: {rg.fitted.figures['movements']:.0f} movements of "
-        f"{rg.fitted.figures['trajectories']:.0f} trajectories; {rg.fitted.reason}."
+        f"{rg.fitted.figures['trajectories']:.0f} "
+        f"{'EMULATED ' if rg.emulated else ''}trajectories; {rg.fitted.reason}."
     )
     console.print(f"Saved {out}", soft_wrap=True)
 
@@ -80,6 +81,13 @@ def generate(
 
     check_target(out)
     updated = rt.CorrectedTwin.load(model)
+    if not (case or updated.case):
+        raise rt.InputError(
+            "case",
+            expected="the name of a case",
+            got=f"none, and {model} was saved without one",
+            remedy="give --case",
+        )
     system = rt.cases.get(case or updated.case)
     with bar("generate") as tell:
         made = rt.generate(
@@ -106,7 +114,7 @@ def diagnose_fit(
     from retwin.networks import CLASSIFIERS, named
 
     system = None if case is None else rt.cases.get(case)
-    config = named(classifier, CLASSIFIERS)
+    config = named(classifier, CLASSIFIERS, "classifier")
     with bar("diagnose") as tell:
         training = rt.load(file, case=system, progress=lambda s: tell("read", s))
         diagnoser = rt.fit_diagnoser(
@@ -152,6 +160,8 @@ def diagnose_predict(
         )
     console = Console()
     console.print(table)
+    if trajectories.emulated:
+        console.print("These trajectories are EMULATED: no real measurements.")
     if trajectories.known_labels and "" not in trajectories.labels:
         console.print(str(rt.evaluate(diagnoser, trajectories)))
     if out is not None:

@@ -38,12 +38,15 @@ def study(
     sources: Annotated[str, typer.Option(help="Names joined by commas, or all.")] = "all",
     classifier: Annotated[str | None, typer.Option(help="cnn or lstm.")] = None,
     runs: Annotated[int | None, typer.Option(help="Runs; the preset's if not given.")] = None,
-    seed: Annotated[int, typer.Option(help="Same seed, same result.")] = 0,
+    seed: Annotated[int, typer.Option(help="Same seed, same result.", min=0)] = 0,
     preset: Annotated[str, typer.Option(help="quick or paper.")] = "quick",
     rate: Annotated[float | None, typer.Option(help="Hz that the classifier looks at.")] = None,
     per_class: Annotated[int, typer.Option(help="Generated trajectories per class.")] = 400,
     calibrate_on: Annotated[str, typer.Option(help="healthy or all.")] = "healthy",
     random_onset: Annotated[bool, typer.Option(help="Draw the onset of stuck motors.")] = False,
+    encoder_noise: Annotated[
+        float, typer.Option(help="Command units of noise on frozen joints, training and test.")
+    ] = 0.0,
     processes: Annotated[int | None, typer.Option(help="Jobs at a time; one per core.")] = None,
 ) -> None:
     """Compare sources of training data on real trajectories."""
@@ -63,6 +66,7 @@ def study(
         rate=rate,
         per_class=per_class,
         calibrate_on=calibrate_on,
+        encoder_noise=encoder_noise,
     )
     _run(system, plan, StudyData(twin_data, calibration, test, real), out, processes)
 
@@ -75,9 +79,11 @@ def report(folder: Annotated[Path, typer.Argument(help="Folder of a study.")]) -
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("demo"),
-    runs: Annotated[int, typer.Option(help="Runs.")] = 2,
-    seed: Annotated[int, typer.Option(help="Same seed, same result.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for results; demo/real or demo/emulated.")
+    ] = None,
+    runs: Annotated[int, typer.Option(help="Runs.")] = 1,
+    seed: Annotated[int, typer.Option(help="Same seed, same result.", min=0)] = 0,
 ) -> None:
     """The whole job on the robot arm: real data in `RETWIN_DATA` if set, else emulated ones."""
     import retwin as rt
@@ -89,16 +95,18 @@ def demo(
         arm = Path(folder) / "armpi"
         given = [arm / name for name in ("real_a.mat", "my_dataset_test.mat")]
         real = next((file for file in given if file.exists()), None)
-        if real is None or not (arm / "sim.mat").exists():
+        if real is None:
             raise InputError(
                 "RETWIN_DATA",
-                expected="a folder with armpi/sim.mat and armpi/real_a.mat or my_dataset_test.mat",
+                expected="a folder with armpi/real_a.mat or armpi/my_dataset_test.mat",
                 got=folder,
                 remedy="set it to the folder of the public data, or unset it",
             )
-        data = StudyData(twin=arm / "sim.mat", real=real)
+        recorded = arm / "sim.mat"
+        data = StudyData(twin=recorded if recorded.exists() else None, real=real)
+    target = out or Path("demo", "real" if folder else "emulated")
     plan = StudyPlan(runs=runs, seed=seed, folds=folds)
-    _run(rt.cases.get("armpi"), plan, data, out, None)
+    _run(rt.cases.get("armpi"), plan, data, target, None)
 
 
 def _run(case: Any, plan: Any, data: Any, out: Path, processes: int | None) -> None:
@@ -127,11 +135,12 @@ def _run(case: Any, plan: Any, data: Any, out: Path, processes: int | None) -> N
 def _table(results: Mapping[str, Any]) -> Table:
     n, runs = results["data"]["test"]["n"], results["runs"]
     kind = "EMULATED robot (no real measurements)" if results["emulated"] else results["title"]
-    table = Table(title=f"{kind}: {n} test trajectories, {runs} runs, {results['classifier']}")
+    counted = f"{runs} run{'s' if runs > 1 else ''}"
+    table = Table(title=f"{kind}: {n} test trajectories, {counted}, {results['classifier']}")
     table.add_column("training data")
     for title in COLUMNS.values():
         table.add_column(title, justify="right")
-    for name, source in results["sources"].items():
+    for source in results["sources"].values():
         table.add_row(source["title"], *(_over_runs(source[metric]) for metric in COLUMNS))
     for name, figures in results["published"].items():
         title = results["sources"][name]["title"] if name in results["sources"] else name

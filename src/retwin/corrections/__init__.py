@@ -23,7 +23,14 @@ _OPERATORS: dict[str, type] = {"DelayOffset": DelayOffset}
 
 
 def to_config(correction: Any) -> dict[str, Any]:
-    """A correction's settings as plain JSON values."""
+    """A correction's settings as plain JSON values; InputError for one that cannot be loaded."""
+    if type(correction) not in _OPERATORS.values():
+        raise InputError(
+            "correction",
+            expected=f"one of {', '.join(_OPERATORS)}, to be saved",
+            got=type(correction).__name__,
+            remedy="use the model without saving it: loading runs no code that a file names",
+        )
     return {"kind": type(correction).__name__, **asdict(correction)}
 
 

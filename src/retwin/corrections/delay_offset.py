@@ -136,16 +136,17 @@ class DelayOffset:
         weight = weight / _correlation_time(residual, weight)[:, None]
         normal = torch.einsum("ntci,nt,ntcj->nij", jacobian, weight, jacobian)
         # A prior a hundred times wider than anything plausible: what is not seen stays at it.
-        wide = torch.full((size,), 100 * residual.abs().amax().item() + 1e-9)
-        wide[0] = 100.0 * (self.delay_range[1] - self.delay_range[0])
-        prior = torch.diag(wide.double().square().reciprocal().repeat(most))
+        largest = (residual.norm(dim=-1) * model.seen).amax(dim=1)
+        wide = (100 * largest + 1e-9)[:, None].repeat(1, size)
+        wide[:, 0] = 100.0 * (self.delay_range[1] - self.delay_range[0])
+        prior = torch.diag_embed(wide.square().reciprocal().repeat(1, most))
         whole = torch.linalg.inv(normal + prior).reshape(n, most, size, most, size)
         index = torch.arange(most)
         covariance = whole[:, index, :, index].transpose(0, 1)
         deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
         at_edge = (z[..., 0] <= self.delay_range[0]) | (z[..., 0] >= self.delay_range[1])
         late = (deviation[..., 0] <= self.known_delay) & ~at_edge
-        off = (deviation[..., 1:] <= 0.1 * wide[1:]).all(dim=-1, keepdim=True)
+        off = (deviation[..., 1:] <= 0.1 * wide[:, None, 1:]).all(dim=-1, keepdim=True)
         identified = torch.cat([late[..., None], off.expand(-1, -1, size - 1)], dim=-1)
         steady = torch.where(moving, torch.inf, noise).amin(dim=1)
         return Discrepancy(z, covariance, identified & valid[..., None], steady)
@@ -273,7 +274,7 @@ def _scale(residual: Tensor, seen: Tensor, moving: Tensor) -> Tensor:
     A model of movements is always worse than one of rest; one scale would throw motion away.
     """
     length = residual.norm(dim=-1)
-    extent = length.amax(dim=1, keepdim=True).clamp_min(1e-9)
+    extent = (length * (seen > 0)).amax(dim=1, keepdim=True).clamp_min(1e-9)
     scales = []
     for part in (moving, ~moving):
         within = torch.where((seen > 0) & part, length, torch.nan)

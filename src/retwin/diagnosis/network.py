@@ -116,6 +116,19 @@ class NetworkDiagnoser(nn.Module):
         return model.eval()
 
 
+def _stride(given: float, wanted: float) -> int:
+    """Every how many samples at `given` Hz make `wanted` Hz."""
+    stride = given / wanted if wanted > 0 else 0.0
+    if stride < 1 or abs(stride - round(stride)) > 1e-6:
+        raise InputError(
+            "rate",
+            expected=f"{given:g} Hz, the data's rate, or a whole part of it",
+            got=f"{wanted:g} Hz",
+            remedy="choose a rate that takes every sample, every second, every third …",
+        )
+    return round(stride)
+
+
 DEFAULTS = {
     "CNN": Training(epochs=25, batch=64, rate=3e-3, weight_decay=1e-2),
     "LSTMClassifier": Training(epochs=30, batch=32, rate=1e-3, decay="step"),
@@ -123,51 +136,56 @@ DEFAULTS = {
 
 
 def fit_diagnoser(
-    training: Trajectories,
+    trajectories: Trajectories,
     network: Network = CNN(),  # noqa: B008 - a frozen config
     *,
     seed: int,
     classes: Sequence[str] | None = None,
     rate: float | None = None,
-    how: Training | None = None,
+    training: Training | None = None,
     progress: Progress | None = None,
 ) -> NetworkDiagnoser:
     """Train a classifier on labelled trajectories.
 
     Parameters
     ----------
-    training: labelled; a stratified fifth is held out to choose the best epoch.
+    trajectories: labelled; a stratified fifth is held out to choose the best epoch.
     network: `CNN` or `LSTMClassifier`.
     seed: same seed, same weights on the same machine.
     classes: their order; by default sorted by name.
     rate: samples per second the network looks at; by default 10 Hz or the data's, if lower.
-    how: epochs, batch, rate; by default what suits the network.
+    training: epochs, batch, rate; by default what suits the network.
 
     `fitted.figures` hold the `accuracy` on the held-out fifth.
 
     Raises
     ------
-    InputError: unlabelled trajectories, fewer than two classes, a label not among `classes`.
+    InputError: unlabelled trajectories, fewer than two classes, a label not among `classes`, a
+        rate that is no whole part of the data's.
 
     """
-    named = training.known_labels
+    named = trajectories.known_labels
     order = tuple(classes) if classes is not None else tuple(sorted(named))
     unknown = named - set(order)
-    if len(named) < 2 or unknown or "" in training.labels:
+    if len(named) < 2 or unknown or "" in trajectories.labels:
         raise InputError(
-            "training",
+            "trajectories",
             expected=f"labelled trajectories of at least two of the classes {', '.join(order)}",
             got=f"unknown {sorted(unknown)}"
             if unknown
-            else f"labels {sorted(set(training.labels))}",
+            else f"labels {sorted(set(trajectories.labels))}",
             remedy="label every trajectory with a known class",
         )
-    stride = max(1, round(training.rate / (rate or min(10.0, training.rate))))
+    stride = _stride(trajectories.rate, min(10.0, trajectories.rate) if rate is None else rate)
     with isolated(seed):
         model = NetworkDiagnoser(
-            network, classes=order, outputs=training.outputs, rate=training.rate, stride=stride
+            network,
+            classes=order,
+            outputs=trajectories.outputs,
+            rate=trajectories.rate,
+            stride=stride,
         )
-    fitted_on, held_out = training.split(0.8, seed=seed)
+    fitted_on, held_out = trajectories.split(0.8, seed=seed)
     sets = [
         (model.features(part), torch.tensor([order.index(label) for label in part.labels]))
         for part in (fitted_on, held_out)
@@ -182,7 +200,7 @@ def fit_diagnoser(
         loss,
         sets[0],
         sets[1],
-        how or DEFAULTS[type(network).__name__],
+        training or DEFAULTS.get(type(network).__name__, Training()),
         seed=seed,
         progress=progress,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -10,12 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.errors import InputError
-from retwin.trajectories import Channels, Source, Trajectories
+from retwin.trajectories import Channels, Progress, Source, Trajectories
 
 __all__ = ["DataCase", "Progress", "Raw", "assemble", "brief", "settle", "split_columns"]
-
-Progress = Callable[[float], None]
-"""Called with the share that is done, 0 … 1."""
 
 
 class DataCase(Protocol):

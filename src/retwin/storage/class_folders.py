@@ -239,18 +239,14 @@ def _commands_of_case(
 ) -> tuple[list[Raw], Channels | None]:
     """`raws` with commands in the unit of the case, and the names of the command channels.
 
-    Without a case commands in rad stay as they are. A case that neither turns them into its own
-    unit nor takes rad does not get them, and recovers its commands from the nominal path.
+    Without a case commands in rad stay as they are. A case that does not take rad does not get
+    them, and recovers its commands from the nominal path.
     """
     if not radians or any(raw.commands is None for raw in raws):
         return raws, None
     motors = {raw.commands.shape[1] for raw in raws if raw.commands is not None}
     if case is None:
         return raws, Channels.numbered("motor_", max(motors), "rad") if len(motors) == 1 else None
-    convert = getattr(case, "commands_from_radians", None)
-    if convert is not None:
-        raws = [replace(raw, commands=np.asarray(convert(raw.commands))) for raw in raws]
-        return raws, case.inputs
     if set(case.inputs.units) == {"rad"} and motors == {len(case.inputs)}:
         return raws, case.inputs
     return [replace(raw, commands=None) for raw in raws], None

@@ -1,4 +1,4 @@
-"""The study: sources × runs → results.json, resumable (PROTOCOL)."""
+"""The study: sources × runs → results.json, resumable."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from retwin.study.jobs import Roles, Work
 from retwin.study.plan import PRESETS, SOURCES, StudyPlan
 from retwin.study.pool import run_jobs
 from retwin.study.results import write_results
+from retwin.surrogate import ENOUGH
 from retwin.trajectories import Trajectories
+from retwin.twins.protocol import HEALTHY
 
 __all__ = ["PRESETS", "SOURCES", "StudyData", "StudyPlan", "run_study"]
 
@@ -29,7 +31,7 @@ EMULATED_PER_CLASS = 10
 
 @dataclass(frozen=True)
 class StudyData:
-    """Where a study's data are; see PROTOCOL, roles of data.
+    """Where a study's data are; see docs/theory.md, How a study scores.
 
     Parameters
     ----------
@@ -84,15 +86,19 @@ def run_study(
     """
     out = Path(out)
     tell = report or (lambda _text, _share: None)
-    digests = _digests(data)
-    _claim(out, case, plan, digests)
+    ours = _identity(case, plan, _digests(data))
+    _check_free(out, ours)
     work_folder = out / "work"
-    about, roles = _prepare(case, plan, data, digests, work_folder, tell)
+    if not (work_folder / "roles.json").exists():
+        _prepare(case, plan, data, out, ours, tell)
+    roles = Roles.of(json.loads((work_folder / "roles.json").read_text("utf-8")))
     work = Work(work_folder, case, plan, roles)
     run_jobs(work, processes or os.cpu_count() or 1, tell)
     tell("scores", 1.0)
     provenance = {"command": command, "seed": plan.seed}
-    return write_results(work, out, about=about, provenance=provenance)
+    return write_results(
+        work, out, about=_about(case, plan, data, ours["data"]), provenance=provenance
+    )
 
 
 def _digests(data: StudyData) -> dict[str, dict[str, str]]:
@@ -104,61 +110,79 @@ def _digests(data: StudyData) -> dict[str, dict[str, str]]:
     }
 
 
-def _claim(out: Path, case: Case, plan: StudyPlan, digests: Mapping[str, Any]) -> None:
-    """Write down which study `out` holds, or make sure that it is this one."""
+def _identity(case: Case, plan: StudyPlan, digests: Mapping[str, Any]) -> dict[str, Any]:
+    """What decides a study's result, as plain JSON values: two studies are the same if it is."""
     faults = {name: repr(fault) for name, fault in case.faults.items()}
-    ours = json.loads(
-        json.dumps({"case": case.name, "faults": faults, "plan": asdict(plan), "data": digests})
-    )
+    told = {"case": case.name, "faults": faults, "plan": asdict(plan), "data": digests}
+    plain: dict[str, Any] = json.loads(json.dumps(told))
+    return plain
+
+
+def _check_free(out: Path, ours: Mapping[str, Any]) -> None:
+    """Make sure that `out` is new or holds this very study."""
     file = out / "study.json"
     if file.exists():
         try:
             theirs = json.loads(file.read_text("utf-8"))
         except ValueError:
             theirs = None
-        if theirs != ours:
-            raise InputError(
-                "out",
-                expected="a new folder, or the folder of this very study",
-                got=f"{out}, which holds a study with another plan or other data",
-                remedy="give another folder, or remove this one",
-            )
+        if theirs == ours:
+            return
+        got = f"{out}, which holds a study with another plan or other data"
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        got = f"{out}, which holds other files"
+    else:
         return
-    if out.exists() and any(out.iterdir()):
-        raise InputError(
-            "out",
-            expected="a new folder, or the folder of this very study",
-            got=f"{out}, which holds other files",
-            remedy="give another folder",
-        )
-    with write_atomically(file) as part:
-        part.write_text(json.dumps(ours, indent=1), encoding="utf-8")
+    raise InputError(
+        "out",
+        expected="a new folder, or the folder of this very study",
+        got=got,
+        remedy="give another folder, or remove this one",
+    )
 
 
 def _prepare(
-    case: Case,
-    plan: StudyPlan,
-    data: StudyData,
-    digests: Mapping[str, dict[str, str]],
-    folder: Path,
-    tell: Report,
-) -> tuple[dict[str, Any], Roles]:
-    """Put twin and real data, with commands, where the jobs find them; decide the roles."""
-    twin_file, roles_file = folder / "twin.npz", folder / "roles.json"
-    if not roles_file.exists():
-        real, roles = _real(case, plan, data, tell)
-        save(real, folder / "real.npz")
-        with write_atomically(roles_file) as part:
-            part.write_text(json.dumps(roles.folds), encoding="utf-8")
-    roles = Roles.of(json.loads(roles_file.read_text("utf-8")))
-    if not twin_file.exists():
-        save(_twin(case, plan, data, tell), twin_file)
-    twin = load(twin_file)
+    case: Case, plan: StudyPlan, data: StudyData, out: Path, ours: Mapping[str, Any], tell: Report
+) -> None:
+    """Read all data, then put them, with commands, where the jobs find them; decide the roles.
+
+    Nothing is written before everything is read and found good. The roles come last: where they
+    are, all is.
+    """
+    if plan.encoder_noise and case.encoder_noise is None:
+        raise InputError(
+            "encoder_noise",
+            expected="0 for a case that cannot tell what a joint's reading does to its outputs",
+            got=repr(plan.encoder_noise),
+            remedy=f"leave it out for the case {case.name!r}",
+        )
+    real, roles = _real(case, plan, data, tell)
+    _check_healthy(plan, real, roles)
+    twin = _twin(case, plan, data, tell)
+    if len(twin) < ENOUGH:
+        raise InputError(
+            "twin-data",
+            expected=f"at least {ENOUGH} trajectories of the twin",
+            got=f"{len(twin)}",
+            remedy="give more of them, or a larger per_class",
+        )
+    with write_atomically(out / "study.json") as part:
+        part.write_text(json.dumps(ours, indent=1), encoding="utf-8")
+    save(real, out / "work" / "real.npz")
+    save(twin, out / "work" / "twin.npz")
+    with write_atomically(out / "work" / "roles.json") as part:
+        part.write_text(json.dumps(roles.folds), encoding="utf-8")
+
+
+def _about(
+    case: Case, plan: StudyPlan, data: StudyData, digests: Mapping[str, dict[str, str]]
+) -> dict[str, Any]:
+    """The data in words, for the results."""
     simulated = {"name": f"simulated by {type(case.twin).__name__}", "sha256": ""}
     emulated = {"name": f"emulated by {type(case.emulator).__name__}", "sha256": ""}
     one = digests.get("real", emulated)
-    about = {
-        "twin": {**digests.get("twin", simulated), "n": len(twin)},
+    return {
+        "twin": digests.get("twin", simulated),
         "calibration": digests.get("calibration", one),
         "test": digests.get("test", one),
         "protocol": (
@@ -167,7 +191,21 @@ def _prepare(
             else f"{plan.folds} folds: every trajectory is tested once, by models that never saw it"
         ),
     }
-    return about, roles
+
+
+def _check_healthy(plan: StudyPlan, real: Trajectories, roles: Roles) -> None:
+    """Every calibration part must have what the residual model is calibrated on."""
+    needed = any(SOURCES[name].residual for name in plan.sources)
+    if not needed or plan.calibrate_on == "all":
+        return
+    for calibration, _ in roles.folds:
+        if not (real.labels[list(calibration)] == HEALTHY).any():
+            raise InputError(
+                "calibration",
+                expected=f"at least one trajectory labelled {HEALTHY!r} in every calibration part",
+                got="none",
+                remedy="label healthy trajectories, give more of them, or calibrate on 'all'",
+            )
 
 
 def _twin(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> Trajectories:

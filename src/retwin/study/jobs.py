@@ -156,23 +156,34 @@ class Work:
 
     def _diagnosis(self, job: Job, progress: Progress | None) -> dict[str, float]:
         started = time.perf_counter()
-        training = self._training_set(job)
+        made = self._training_set(job)
         generated = time.perf_counter() - started
+        noise = self.plan.seed_of("encoder noise in training", job.run, job.fold)
+        made = self._with_encoder_noise(made, noise)
         diagnoser = fit_diagnoser(
-            training,
+            made,
             self.plan.network,
             seed=self.plan.seed_of("diagnoser", job.run, job.fold),
             classes=self.case.classes,
             rate=self.plan.rate or self.case.sensor_rate,
-            how=self.plan.training,
+            training=self.plan.training,
             progress=progress,
         )
         per_fold = SOURCES[job.source].per_fold
         test = list(self.roles.folds[job.fold][1]) if per_fold else self.roles.tested
-        probabilities = diagnoser.predict_proba(self.real_data()[test])
+        # The test set's noise is the same in every run and for every source.
+        real = self._with_encoder_noise(
+            self.real_data(), self.plan.seed_of("encoder noise in test", 0)
+        )
+        probabilities = diagnoser.predict_proba(real[test])
         with write_atomically(self.path(job)) as part:
             np.savez(part, tested=np.array(test), probabilities=probabilities)
-        return {"generate": generated, "trajectories": float(len(training))}
+        return {"generate": generated, "trajectories": float(len(made))}
+
+    def _with_encoder_noise(self, trajectories: Trajectories, seed: int) -> Trajectories:
+        if self.plan.encoder_noise == 0 or self.case.encoder_noise is None:
+            return trajectories
+        return self.case.encoder_noise(trajectories, self.plan.encoder_noise, seed)
 
     def _training_set(self, job: Job) -> Trajectories:
         """The labelled set that this source trains the diagnoser on."""

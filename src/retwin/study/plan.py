@@ -12,17 +12,17 @@ from retwin.errors import InputError
 from retwin.networks import CLASSIFIERS, Network
 from retwin.training import Training
 
-__all__ = ["PRESETS", "SOURCES", "Preset", "Source", "StudyPlan"]
+__all__ = ["PRESETS", "SOURCES", "Preset", "StudyPlan", "TrainingSource"]
 
 
 @dataclass(frozen=True)
-class Source:
-    """Where a diagnoser's training data come from (PROTOCOL, sources).
+class TrainingSource:
+    """Where a diagnoser's training data come from (docs/theory.md, How a study scores).
 
     Attributes
     ----------
     title: for people.
-    real_data: "none", "healthy", "unlabelled", "labelled" or "transductive".
+    real_data: "none", "timing" (of commands), "healthy", "unlabelled", "labelled", "transductive".
     surrogate, residual: whether it needs the IBG, and the RG.
     per_fold: whether it depends on the calibration set; a source that does not is trained once.
 
@@ -35,16 +35,16 @@ class Source:
     per_fold: bool
 
 
-SOURCES: dict[str, Source] = {
-    "dt": Source("Digital twin", "none", surrogate=False, residual=False, per_fold=False),
-    "ibg": Source("IBG alone", "timing of commands", surrogate=True, residual=False, per_fold=True),
-    "ibg_rg": Source("IBG + RG", "healthy", surrogate=True, residual=True, per_fold=True),
+SOURCES: dict[str, TrainingSource] = {
+    "dt": TrainingSource("Digital twin", "none", surrogate=False, residual=False, per_fold=False),
+    "ibg": TrainingSource("IBG alone", "timing", surrogate=True, residual=False, per_fold=True),
+    "ibg_rg": TrainingSource("IBG + RG", "healthy", surrogate=True, residual=True, per_fold=True),
 }
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Classifier and training of a preset (PROTOCOL, presets)."""
+    """Classifier and training of a preset."""
 
     classifier: str
     runs: int
@@ -72,6 +72,9 @@ class StudyPlan:
     rate: samples per second the classifier looks at; None takes the case's true sensor rate.
     per_class: generated trajectories per class.
     calibrate_on: "healthy" or "all".
+    encoder_noise: command units of reading noise put on frozen joints, in training and test sets
+        alike. Real stuck joints are frozen in software; their exact stillness is an artefact that
+        a diagnoser could live on. 0 leaves the data as they are.
 
     Raises InputError for a name that is not known or a number below one.
 
@@ -86,11 +89,13 @@ class StudyPlan:
     rate: float | None = None
     per_class: int = 400
     calibrate_on: str = "healthy"
+    encoder_noise: float = 0.0
 
     def __post_init__(self) -> None:
         choices: list[tuple[str, str, Mapping[str, object]]] = [
             ("preset", self.preset, PRESETS),
             ("classifier", self.classifier or "cnn", CLASSIFIERS),
+            ("calibrate_on", self.calibrate_on, {"healthy": None, "all": None}),
             *(("sources", source, SOURCES) for source in self.sources),
         ]
         for name, value, known in choices:
@@ -106,6 +111,13 @@ class StudyPlan:
                 raise InputError(
                     name, expected="at least 1", got=repr(number), remedy="give a positive number"
                 )
+        if self.encoder_noise < 0 or (self.rate is not None and self.rate <= 0):
+            raise InputError(
+                "encoder_noise and rate",
+                expected="encoder_noise of at least 0 and a positive rate",
+                got=f"{self.encoder_noise} and {self.rate}",
+                remedy="leave them out for the defaults",
+            )
         if not self.sources or len(set(self.sources)) != len(self.sources):
             raise InputError(
                 "sources",

@@ -27,6 +27,7 @@ from retwin.storage import write_atomically
 from retwin.study.jobs import Job, Work
 from retwin.study.plan import SOURCES
 from retwin.trajectories import Trajectories
+from retwin.twins.protocol import HEALTHY
 
 __all__ = ["SCHEMA", "write_results"]
 
@@ -188,10 +189,13 @@ def _comparisons(
 def _data(
     work: Work, real: Trajectories, test: Trajectories, about: Mapping[str, Any]
 ) -> dict[str, Any]:
-    used = sorted({i for calibration, _ in work.roles.folds for i in calibration})
+    pool = sorted({i for calibration, _ in work.roles.folds for i in calibration})
+    seen = real.ids[pool]
+    if work.plan.calibrate_on == "healthy":
+        seen = seen[real.labels[pool] == HEALTHY]
     return {
-        "twin": about["twin"],
-        "calibration": {**about["calibration"], "n": len(used), "used": real.ids[used].tolist()},
+        "twin": {**about["twin"], "n": len(work.twin_data())},
+        "calibration": {**about["calibration"], "n": len(pool), "used": seen.tolist()},
         "test": {
             **about["test"],
             "n": len(test),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -10,13 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.errors import InputError
 from retwin.faults import Fault
-from retwin.trajectories import Channels, Trajectories
+from retwin.trajectories import Channels, Progress, Trajectories
 
 __all__ = ["HEALTHY", "Progress", "Twin", "checked_commands", "fault_labels"]
 
 HEALTHY = "Healthy"
-Progress = Callable[[float], None]
-"""Called with the share that is done, 0 … 1."""
 
 
 @runtime_checkable
@@ -62,7 +60,12 @@ class Twin(Protocol):
 def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
     """`commands` as a finite float array (n, T, d_u), or an InputError."""
     array = np.asarray(commands)
-    if array.ndim != 3 or array.shape[2] != len(inputs) or array.dtype.kind not in "fiu":
+    if (
+        array.ndim != 3
+        or len(array) == 0
+        or array.shape[2] != len(inputs)
+        or array.dtype.kind not in "fiu"
+    ):
         raise InputError(
             "commands",
             expected=f"numbers of shape (n, T, {len(inputs)})",

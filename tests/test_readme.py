@@ -1,0 +1,136 @@
+"""What the README and the docs show is true: code runs, commands exist, the drawing stands."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from scipy.io import savemat
+from test_architecture import FLOORS
+
+import retwin as rt
+from retwin.cli import app
+
+ROOT = Path(__file__).parents[1]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
+
+
+def blocks(page: Path, *languages: str) -> list[str]:
+    """The fenced blocks of a page in one of the languages."""
+    found = re.findall(r"^```(\w*)[^\n]*\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
+    return [text for language, text in found if language in languages]
+
+
+def shown(page: Path) -> list[tuple[str, bool]]:
+    """Every `retwin …` command of a page, and whether it is whole (a line of a shell block)."""
+    lines = [
+        line.strip()
+        for block in blocks(page, "sh", "bash", "console", "shell")
+        for line in block.replace("\\\n", " ").splitlines()
+    ]
+    whole = [line for line in lines if re.match(r"(\$ )?([A-Z_]+=\S+ )*retwin\s", line)]
+    prose = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.M | re.S)
+    mentioned = re.findall(r"`(retwin\s[^`]+)`", prose)
+    return [(re.sub(r"^.*?retwin\s", "", line), True) for line in whole] + [
+        (line.removeprefix("retwin "), False) for line in mentioned
+    ]
+
+
+def check(line: str, *, whole: bool) -> None:
+    """Hold a command against what the command line knows; `whole`: nothing may be missing."""
+    command: Any = typer.main.get_command(app)
+    words = shlex.split(re.split(r"\s(?:&&|\||>)\s", line)[0], comments=True)
+    while words and hasattr(command, "commands") and not words[0].startswith("-"):
+        assert words[0] in command.commands, f"no command {words[0]!r} in: retwin {line}"
+        command = command.commands[words.pop(0)]
+    if whole:
+        assert not hasattr(command, "commands"), f"an unfinished command: retwin {line}"
+        command.make_context(command.name, words)
+    known = {name for each in command.params for name in each.opts} | {"--help"}
+    unknown = {word.split("=")[0] for word in words if word.startswith("--")} - known
+    assert not unknown, f"no option {unknown} in: retwin {line}"
+
+
+def write_mat(path: Path, made: rt.Trajectories) -> None:
+    """A file in the public layout: desired and realised paths, no commands."""
+    cells, labels = np.empty((1, len(made)), object), np.empty((1, len(made)), object)
+    for i in range(len(made)):
+        cells[0, i] = np.hstack([made.nominal[i], made.observed[i]])
+        labels[0, i] = str(made.labels[i])
+    savemat(path, {"X_array": cells, "y_array": labels})
+
+
+def test_the_code_of_the_readme_runs(
+    case: rt.Case,
+    twin_set: rt.Trajectories,
+    emulated: rt.Trajectories,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_mat(tmp_path / "sim.mat", twin_set[:3])
+    write_mat(tmp_path / "real.mat", emulated[:3])
+    codes = blocks(ROOT / "README.md", "python")
+    assert len(codes) == 3
+    names: dict[str, Any] = {}
+    for code in codes:
+        exec(compile(code, "README.md", "exec"), names)
+    assert "macro_f1" in capsys.readouterr().out
+    assert rt.CorrectedTwin.load("model").case == "armpi"
+    assert names["twin"].inputs == names["real"].inputs == case.inputs
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_every_command_shown_exists(page: Path) -> None:
+    for line, whole in shown(page):
+        check(line, whole=whole)
+
+
+def test_the_readme_shows_every_command() -> None:
+    told = [line for line, _ in shown(ROOT / "README.md")]
+    for name in ("study", "report", "fit", "generate", "diagnose fit", "diagnose predict"):
+        assert any(line.startswith(name) for line in told), name
+    for name in ("info", "convert", "split", "fetch"):
+        assert any(line.startswith(f"data {name}") for line in told), name
+
+
+@pytest.mark.parametrize("line", ["nonsense", "data nonsense", "fit armpi --nonsense 1", "data"])
+def test_a_wrong_command_is_seen(line: str) -> None:
+    with pytest.raises(Exception, match=r"nonsense|unfinished"):
+        check(line, whole=True)
+
+
+def test_the_drawing_lists_the_floors_in_their_order() -> None:
+    (house,) = (
+        block for block in blocks(ROOT / "docs" / "architecture.md", "") if "src/retwin/" in block
+    )
+    drawn = re.findall(r"^  (\w+)(\.py|/) ", house, re.M)
+    assert [name for name, _ in drawn] == FLOORS
+    room = ROOT / "src" / "retwin"
+    for line in house.splitlines()[1:]:
+        depth, name = len(line) - len(line.lstrip()), line.split()[0]
+        if depth == 2:
+            floor = room / name
+        assert (floor if depth == 2 else floor / name).exists(), line
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)", page.read_text("utf-8")):
+        if not target.startswith("http"):
+            assert (page.parent / target).exists(), target
+
+
+def test_versions_agree() -> None:
+    assert f"\nversion: {rt.__version__}\n" in (ROOT / "CITATION.cff").read_text("utf-8")
+    assert f"## [{rt.__version__}]" in (ROOT / "CHANGELOG.md").read_text("utf-8")
