@@ -37,7 +37,7 @@ FLOORS = [
     "cases",
     "cli",
 ]
-ONE_ROOM = {"training_loop": "training", "__main__": "cli"}
+ONE_ROOM = {"__main__": "cli"}
 MODULES = sorted(p for p in ROOT.rglob("*.py") if p != ROOT / "__init__.py")
 
 

@@ -12,17 +12,14 @@ from numpy.typing import NDArray
 
 from retwin.case import Case
 from retwin.errors import InputError
-from retwin.faults import Fault, draw_faults, faulty_commands, frozen_response
+from retwin.faults import Fault
 from retwin.models import read_about, write_model
 from retwin.residual import ResidualModel
-from retwin.segments import Segments
 from retwin.surrogate import Surrogate
-from retwin.trajectories import Channels, Source, Trajectories
-from retwin.twins.protocol import Progress, Twin, checked_commands, fault_labels
+from retwin.trajectories import Channels, Trajectories
+from retwin.twins.protocol import Chunk, Progress, Twin, simulate_in_chunks
 
 __all__ = ["CorrectedTwin", "generate"]
-
-CHUNK = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,42 +70,26 @@ class CorrectedTwin:
 
         z is drawn for the clean commands: the RG is not told of faults.
         """
-        commands = checked_commands(commands, self.inputs).astype(np.float32, copy=False)
-        faults = [None] * len(commands) if faults is None else faults
-        segments = Segments.from_commands(commands)
-        drawn = draw_faults(faults, segments, seed)
         generator = torch.Generator().manual_seed(seed)
-        nominal = np.empty((*commands.shape[:2], len(self.outputs)), dtype=np.float32)
-        observed = np.empty_like(nominal)
-        for begin in range(0, len(commands), CHUNK):
-            part = slice(begin, begin + CHUNK)
-            told = faulty_commands(commands[part], drawn[part], segments[part])
-            held = frozen_response(told, drawn[part])
-            nominal[part], observed[part] = self._corrected(
-                commands[part], held, segments[part], generator
+
+        @torch.no_grad()
+        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+            context = self.residual.context(
+                self.surrogate, chunk.commands, chunk.segments, faulty=chunk.held
             )
-            if progress is not None:
-                progress(min(1.0, (begin + CHUNK) / len(commands)))
-        return Trajectories(
-            commands=commands,
-            nominal=nominal,
-            observed=observed,
-            labels=fault_labels(drawn),
-            rate=self.rate,
-            inputs=self.inputs,
-            outputs=self.outputs,
-            provenance=(Source(f"CorrectedTwin seed={seed}"),),
+            z = self.residual.sample(context, generator=generator)
+            corrected = self.residual.correction.apply(context, z)
+            return context.nominal.numpy(), corrected.numpy()
+
+        return simulate_in_chunks(
+            self,
+            run,
+            np.asarray(commands, np.float32),
+            faults,
+            seed=seed,
+            progress=progress,
             emulated=self.residual.emulated,
         )
-
-    @torch.no_grad()
-    def _corrected(
-        self, commands: NDArray, held: NDArray, segments: Segments, generator: torch.Generator
-    ) -> tuple[NDArray, NDArray]:
-        context = self.residual.context(self.surrogate, commands, segments, faulty=held)
-        z = self.residual.sample(context, generator=generator)
-        corrected = self.residual.correction.apply(context, z)
-        return context.nominal.numpy(), corrected.numpy()
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with `surrogate` and `residual` inside, or nothing."""

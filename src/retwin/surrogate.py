@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retwin.errors import InputError
-from retwin.faults import Fault, draw_faults, faulty_commands, frozen_response
+from retwin.faults import Fault
 from retwin.models import read_model, write_model
 from retwin.networks import MLP, Network, Standardise, from_config, to_config
-from retwin.segments import Segments
 from retwin.training import Fit, Training, isolated, train
-from retwin.trajectories import Channels, Source, Trajectories
-from retwin.twins.protocol import Progress, checked_commands, fault_labels
+from retwin.trajectories import Channels, Trajectories
+from retwin.twins.protocol import Chunk, Progress, simulate_in_chunks
 
 __all__ = ["Surrogate", "fit_surrogate"]
 
@@ -87,24 +86,13 @@ class Surrogate(nn.Module):
         progress: Progress | None = None,
     ) -> Trajectories:
         """What the surrogate says, see `Twin.simulate`; frozen responses are held commands."""
-        commands = checked_commands(commands, self.inputs).astype(np.float32, copy=False)
-        nominal = self.predict(commands)
-        observed = nominal
-        drawn: Sequence[Fault | None] = [None] * len(commands)
-        if faults is not None:
-            segments = Segments.from_commands(commands)
-            drawn = draw_faults(faults, segments, seed)
-            faulty = frozen_response(faulty_commands(commands, drawn, segments), drawn)
-            observed = self.predict(faulty, progress=progress)
-        return Trajectories(
-            commands=commands,
-            nominal=nominal,
-            observed=observed,
-            labels=fault_labels(drawn),
-            rate=self.rate,
-            inputs=self.inputs,
-            outputs=self.outputs,
-            provenance=(Source(f"Surrogate seed={seed}"),),
+
+        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+            nominal = self.predict(chunk.commands)
+            return nominal, self.predict(chunk.held) if any(chunk.faults) else nominal
+
+        return simulate_in_chunks(
+            self, run, np.asarray(commands, np.float32), faults, seed=seed, progress=progress
         )
 
     def save(self, folder: str | Path) -> None:

@@ -66,7 +66,7 @@ def test_the_steps_one_by_one(call, files: Path, tmp_path: Path) -> None:
     )
     assert code == 0, err
     assert "Surrogate on held-out twin trajectories" in out
-    assert "50 movements of 10 trajectories" in out
+    assert "50 movements of 10 EMULATED trajectories" in out
     made = tmp_path / "made.npz"
     code, out, err = call(
         "generate", tmp_path / "model", "--per-class", 20, "--seed", 1, "--out", made

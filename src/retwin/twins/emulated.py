@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.faults import Fault, draw_faults, faulty_commands, frozen_response
+from retwin.faults import Fault, frozen_response
 from retwin.segments import Segments
-from retwin.trajectories import Channels, Source, Trajectories
+from retwin.trajectories import Channels, Trajectories
 from retwin.twins.kinematic import KinematicTwin
-from retwin.twins.protocol import Progress, checked_commands, fault_labels
+from retwin.twins.protocol import Chunk, Progress, simulate_in_chunks
 
 __all__ = ["EmulatedArm", "JointDiscrepancy"]
 
@@ -94,25 +94,26 @@ class EmulatedArm:
         progress: Progress | None = None,
     ) -> Trajectories:
         """See `Twin.simulate`: fault on the command, discrepancy, lag, freeze, map, measurement."""
-        commands = checked_commands(commands, self.inputs)
-        faults = [None] * len(commands) if faults is None else faults
-        segments = Segments.from_commands(commands)
-        drawn = draw_faults(faults, segments, seed)
-        told = faulty_commands(commands, drawn, segments)
-        effective = _effective(told, segments, self.discrepancy(segments, seed))
-        path = self.twin.position(frozen_response(self.twin.respond(effective), drawn))
-        observed = self._measure(path, np.random.default_rng([seed, 2]))
-        if progress is not None:
-            progress(1.0)
-        return Trajectories(
-            commands=commands,
-            nominal=self.twin.position(commands),
-            observed=observed.astype(commands.dtype),
-            labels=fault_labels(drawn),
-            rate=self.rate,
-            inputs=self.inputs,
-            outputs=self.outputs,
-            provenance=(Source(f"EmulatedArm seed={seed}"),),
+        # Everything at once: the discrepancy is drawn for all trajectories together.
+        everything = max(len(commands), 1)
+
+        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+            effective = _effective(
+                chunk.told, chunk.segments, self.discrepancy(chunk.segments, seed)
+            )
+            response = frozen_response(self.twin.respond(effective), chunk.faults)
+            path = self.twin.position(response)
+            observed = self._measure(path, np.random.default_rng([seed, 2]))
+            return self.twin.position(chunk.commands), observed
+
+        return simulate_in_chunks(
+            self,
+            run,
+            commands,
+            faults,
+            seed=seed,
+            progress=progress,
+            size=everything,
             emulated=True,
         )
 

@@ -5,19 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
-from retwin.faults import Fault, draw_faults, faulty_commands, frozen_response
-from retwin.segments import Segments
-from retwin.trajectories import Channels, Source, Trajectories
+from retwin.faults import Fault, frozen_response
+from retwin.trajectories import Channels, Trajectories
 from retwin.twins.arm import YawPitchArm
-from retwin.twins.protocol import Progress, checked_commands, fault_labels
+from retwin.twins.protocol import Chunk, Progress, simulate_in_chunks
 
 __all__ = ["KinematicTwin", "ServoLag"]
-
-CHUNK = 256
 
 
 @dataclass(frozen=True)
@@ -95,26 +91,8 @@ class KinematicTwin:
         progress: Progress | None = None,
     ) -> Trajectories:
         """See `Twin.simulate`; stuck actuators are held in their response, behind the lag."""
-        commands = checked_commands(commands, self.inputs)
-        faults = [None] * len(commands) if faults is None else faults
-        segments = Segments.from_commands(commands)
-        drawn = draw_faults(faults, segments, seed)
-        nominal = np.empty((*commands.shape[:2], len(self.outputs)), dtype=commands.dtype)
-        observed = np.empty_like(nominal)
-        for begin in range(0, len(commands), CHUNK):
-            part = slice(begin, begin + CHUNK)
-            told = faulty_commands(commands[part], drawn[part], segments[part])
-            nominal[part] = self.position(commands[part])
-            observed[part] = self.position(frozen_response(self.respond(told), drawn[part]))
-            if progress is not None:
-                progress(min(1.0, (begin + CHUNK) / len(commands)))
-        return Trajectories(
-            commands=commands,
-            nominal=nominal,
-            observed=observed,
-            labels=fault_labels(drawn),
-            rate=self.rate,
-            inputs=self.inputs,
-            outputs=self.outputs,
-            provenance=(Source(f"KinematicTwin seed={seed}"),),
-        )
+        return simulate_in_chunks(self, self._run, commands, faults, seed=seed, progress=progress)
+
+    def _run(self, chunk: Chunk) -> tuple[NDArray, NDArray]:
+        response = frozen_response(self.respond(chunk.told), chunk.faults)
+        return self.position(chunk.commands), self.position(response)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from retwin.errors import InputError
-from retwin.faults import Fault
-from retwin.trajectories import Channels, Progress, Trajectories
+from retwin.faults import Fault, draw_faults, faulty_commands, frozen_response
+from retwin.segments import Segments
+from retwin.trajectories import Channels, Progress, Source, Trajectories
 
-__all__ = ["HEALTHY", "Progress", "Twin", "checked_commands", "fault_labels"]
+__all__ = ["HEALTHY", "Chunk", "Progress", "Twin", "checked_commands", "simulate_in_chunks"]
 
 HEALTHY = "Healthy"
 
@@ -82,6 +84,71 @@ def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
     return array if array.dtype.kind == "f" else array.astype(np.float64)
 
 
-def fault_labels(faults: Sequence[Fault | None]) -> NDArray:
-    """The class name of each fault, `Healthy` for none."""
-    return np.array([HEALTHY if fault is None else fault.label for fault in faults])
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """A few trajectories that are simulated together.
+
+    Attributes
+    ----------
+    index: which of all they are.
+    commands: (n, T, d_u), clean.
+    told: (n, T, d_u), with the faults' effect on the reference.
+    faults: drawn, one per trajectory.
+    segments: movements of the clean commands.
+
+    """
+
+    index: slice
+    commands: NDArray
+    told: NDArray
+    faults: Sequence[Fault | None]
+    segments: Segments
+
+    @property
+    def held(self) -> NDArray:
+        """`told`, with the faults' effect on the response put on the commands themselves.
+
+        For twins whose actuators are not visible: a frozen response is a held command.
+        """
+        return frozen_response(self.told, self.faults)
+
+
+def simulate_in_chunks(
+    twin: Twin,
+    run: Callable[[Chunk], tuple[NDArray, NDArray]],
+    commands: ArrayLike,
+    faults: Sequence[Fault | None] | None,
+    *,
+    seed: int,
+    progress: Progress | None,
+    size: int = 128,
+    emulated: bool = False,
+) -> Trajectories:
+    """What every twin's `simulate` does around its own simulation `run`.
+
+    Checks commands, draws the severities of faults, tells progress, and collects what `run` says
+    of each chunk of at most `size` trajectories: nominal and observed outputs (n, T, d_y).
+    """
+    commands = checked_commands(commands, twin.inputs)
+    segments = Segments.from_commands(commands)
+    drawn = draw_faults([None] * len(commands) if faults is None else faults, segments, seed)
+    nominal = np.empty((*commands.shape[:2], len(twin.outputs)), dtype=commands.dtype)
+    observed = np.empty_like(nominal)
+    for begin in range(0, len(commands), size):
+        index = slice(begin, begin + size)
+        part, some, these = commands[index], drawn[index], segments[index]
+        told = faulty_commands(part, some, these)
+        nominal[index], observed[index] = run(Chunk(index, part, told, some, these))
+        if progress is not None:
+            progress(min(1.0, (begin + size) / len(commands)))
+    return Trajectories(
+        commands=commands,
+        nominal=nominal,
+        observed=observed,
+        labels=np.array([HEALTHY if fault is None else fault.label for fault in drawn]),
+        rate=twin.rate,
+        inputs=twin.inputs,
+        outputs=twin.outputs,
+        provenance=(Source(f"{type(twin).__name__} seed={seed}"),),
+        emulated=emulated,
+    )

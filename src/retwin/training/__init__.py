@@ -7,8 +7,6 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -20,82 +18,9 @@ from torch.utils.data import (
     TensorDataset,
 )
 
-from retwin.errors import InputError
+from retwin.training.settings import Fit, Loss, Training, isolated
 
-__all__ = ["Fit", "Training", "isolated", "train"]
-
-Loss = Callable[[Any, tuple[Tensor, ...]], Tensor]
-"""Network and batch in, mean loss out."""
-
-
-@dataclass(frozen=True)
-class Training:
-    """How to train.
-
-    Parameters
-    ----------
-    epochs: at most.
-    batch: examples per step.
-    rate: highest learning rate of AdamW.
-    decay: "cosine" rises over a tenth of the steps and falls to nothing (one cycle); "step" starts
-        at the full rate and drops tenfold after two thirds of the steps.
-    patience: epochs without a better validation loss before it stops; 0 never stops early.
-    weight_decay: of AdamW.
-    clip: largest norm of a gradient.
-
-    """
-
-    epochs: int = 100
-    batch: int = 64
-    rate: float = 1e-3
-    decay: str = "cosine"
-    patience: int = 0
-    weight_decay: float = 0.0
-    clip: float = 1.0
-
-    def __post_init__(self) -> None:
-        if self.decay not in ("cosine", "step") or min(self.epochs, self.batch) < 1:
-            raise InputError(
-                "training",
-                expected="decay 'cosine' or 'step', at least one epoch and one example per batch",
-                got=f"decay {self.decay!r}, {self.epochs} epochs, batch {self.batch}",
-                remedy="see the parameters of Training",
-            )
-
-
-@dataclass(frozen=True)
-class Fit:
-    """What a fitted model remembers of its training, saved with it.
-
-    Attributes
-    ----------
-    figures: what it reached, by name.
-    history: losses per epoch, "train" and "validation".
-    best_epoch: the epoch whose weights were kept.
-    reason: why training stopped.
-
-    """
-
-    figures: dict[str, float]
-    history: dict[str, list[float]]
-    best_epoch: int
-    reason: str
-
-    @classmethod
-    def of(cls, values: dict[str, Any] | None) -> Fit | None:
-        """From plain JSON values."""
-        return None if values is None else cls(**values)
-
-
-@contextmanager
-def isolated(seed: int) -> Iterator[None]:
-    """Run with torch's global generator seeded, and leave it as it was.
-
-    Fresh weights and dropout draw from the global generator and take no other.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        yield
+__all__ = ["Fit", "Loss", "Training", "isolated", "train"]
 
 
 def train(
@@ -115,7 +40,7 @@ def train(
     """
     from lightning.pytorch import Trainer
 
-    from retwin.training_loop import Loop
+    from retwin.training.loop import Loop
 
     steps = math.ceil(len(training_set[0]) / how.batch)
     loop = Loop(network, loss, how, steps=steps, progress=progress)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 from lightning.pytorch import LightningModule
@@ -12,8 +11,7 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LRScheduler, MultiStepLR, OneCycleLR
 
-if TYPE_CHECKING:
-    from retwin.training import Fit, Loss, Training
+from retwin.training.settings import Fit, Loss, Training
 
 __all__ = ["Loop"]
 
@@ -101,8 +99,6 @@ class Loop(LightningModule):
 
     def result(self) -> Fit:
         """What the trained model remembers of this."""
-        from retwin.training import Fit
-
         epochs = len(self.history["train"])
         best = self.best_epoch if self.weights is not None else epochs
         patience = f"no better validation loss for {self.how.patience} epochs"
