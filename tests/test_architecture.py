@@ -15,6 +15,7 @@ ROOT = Path(retwin.__file__).parent
 # From the ground up, as docs/architecture.md draws it.
 FLOORS = [
     "errors",
+    "configs",
     "trajectories",
     "storage",
     "download",

@@ -5,7 +5,8 @@ import pytest
 import torch
 from torch import nn
 
-from retwin.networks import CNN, LSTM, MLP, TCN, LSTMClassifier, Standardise, from_config, to_config
+from retwin.configs import from_config, to_config
+from retwin.networks import CNN, LSTM, MLP, NETWORKS, TCN, LSTMClassifier, Standardise
 from retwin.training import Training, isolated, train
 
 
@@ -85,7 +86,7 @@ def test_classifiers_take_any_length(config: CNN | LSTMClassifier, steps: int) -
 def test_configs_survive_json(config: object) -> None:
     import json
 
-    assert from_config(json.loads(json.dumps(to_config(config)))) == config
+    assert from_config(json.loads(json.dumps(to_config(config, NETWORKS))), NETWORKS) == config
 
 
 def test_standardise_and_back() -> None:
@@ -115,4 +116,4 @@ def test_a_network_that_could_not_be_loaded_is_not_saved() -> None:
         pass
 
     with pytest.raises(InputError, match=r"expected one of MLP, .* got Mine"):
-        to_config(Mine())
+        to_config(Mine(), NETWORKS)

@@ -7,9 +7,9 @@ networks map (n, T, inputs) to (n, T, outputs); classifiers map (n, T, inputs) t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -22,14 +22,13 @@ __all__ = [
     "CNN",
     "LSTM",
     "MLP",
+    "NETWORKS",
     "SURROGATES",
     "TCN",
     "LSTMClassifier",
     "Network",
     "Standardise",
-    "from_config",
     "named",
-    "to_config",
 ]
 
 
@@ -212,10 +211,8 @@ class _Pooled(nn.Module):
         return self.readout(self.dropout(pooled))
 
 
-_CONFIGS: dict[str, Any] = {
-    config.__name__: config for config in (MLP, LSTM, TCN, LSTMClassifier, CNN)
-}
-
+NETWORKS: tuple[type, ...] = (MLP, LSTM, TCN, LSTMClassifier, CNN)
+"""Those that a model folder may name."""
 
 SURROGATES: dict[str, Network] = {"mlp": MLP(), "lstm": LSTM(), "tcn": TCN()}
 CLASSIFIERS: dict[str, Network] = {"cnn": CNN(), "lstm": LSTMClassifier()}
@@ -231,29 +228,3 @@ def named(name: str, known: Mapping[str, Network], argument: str) -> Network:
             remedy="check the spelling",
         )
     return known[name]
-
-
-def to_config(network: Any) -> dict[str, Any]:
-    """A network's config as plain JSON values; InputError for one that cannot be loaded."""
-    if type(network) not in _CONFIGS.values():
-        raise InputError(
-            "network",
-            expected=f"one of {', '.join(_CONFIGS)}, to be saved",
-            got=type(network).__name__,
-            remedy="use the model without saving it: loading runs no code that a file names",
-        )
-    return {"kind": type(network).__name__, **asdict(network)}
-
-
-def from_config(values: dict[str, Any]) -> Any:
-    """The config object that `to_config` wrote; InputError for an unknown kind."""
-    kind = values.get("kind")
-    if kind not in _CONFIGS:
-        raise InputError(
-            "network",
-            expected=f"one of {', '.join(_CONFIGS)}",
-            got=repr(kind),
-            remedy="load the model with the version of retwin that wrote it",
-        )
-    parts = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k != "kind"}
-    return _CONFIGS[kind](**parts)

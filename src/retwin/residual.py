@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retwin.corrections import Context, Correction, DelayOffset, Discrepancy, from_config, to_config
+from retwin.configs import from_config, to_config
+from retwin.corrections import OPERATORS, Context, Correction, DelayOffset, Discrepancy
 from retwin.errors import InputError
 from retwin.mixture import Blocks, MixtureHead
 from retwin.models import read_model, write_model
@@ -145,7 +146,7 @@ class ResidualModel(nn.Module):
     def save(self, folder: str | Path) -> None:
         """Write weights and description, see `retwin.models`."""
         about = {
-            "correction": to_config(self.correction),
+            "correction": to_config(self.correction, OPERATORS),
             "mixture": asdict(self.mixture),
             "inputs": vars(self.inputs),
             "outputs": vars(self.outputs),
@@ -165,7 +166,7 @@ class ResidualModel(nn.Module):
         mixture["hidden"] = tuple(mixture["hidden"])
         mixture["training"] = Training(**mixture["training"])
         model = cls(
-            from_config(about["correction"]),
+            from_config(about["correction"], OPERATORS),
             Mixture(**mixture),
             inputs=Channels.of(about["inputs"]),
             outputs=Channels.of(about["outputs"]),

@@ -12,10 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from retwin.configs import from_config, to_config
 from retwin.errors import InputError
 from retwin.faults import Fault
 from retwin.models import read_model, write_model
-from retwin.networks import MLP, Network, Standardise, from_config, to_config
+from retwin.networks import MLP, NETWORKS, Network, Standardise
 from retwin.training import Fit, Training, isolated, train
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins.protocol import Chunk, Progress, simulate_in_chunks
@@ -98,7 +99,7 @@ class Surrogate(nn.Module):
     def save(self, folder: str | Path) -> None:
         """Write weights and description; see `read_model` for the layout."""
         about = {
-            "network": to_config(self.config),
+            "network": to_config(self.config, NETWORKS),
             "inputs": vars(self.inputs),
             "outputs": vars(self.outputs),
             "rate": self.rate,
@@ -112,7 +113,7 @@ class Surrogate(nn.Module):
         """Read what `save` wrote; InputError when it is not a surrogate or damaged."""
         about, weights = read_model(folder, "surrogate")
         surrogate = cls(
-            from_config(about["network"]),
+            from_config(about["network"], NETWORKS),
             inputs=Channels.of(about["inputs"]),
             outputs=Channels.of(about["outputs"]),
             rate=about["rate"],

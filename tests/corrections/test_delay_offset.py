@@ -5,7 +5,8 @@ import pytest
 import torch
 
 import retwin as rt
-from retwin.corrections import from_config, to_config
+from retwin.configs import from_config, to_config
+from retwin.corrections import OPERATORS
 
 
 def context_of(exact, commands: np.ndarray) -> rt.Context:
@@ -92,13 +93,14 @@ def test_glitches_do_not_move_z(context: rt.Context, z: torch.Tensor) -> None:
 
 def test_missing_samples_do_not_count(context: rt.Context, z: torch.Tensor) -> None:
     operator = rt.DelayOffset()
-    observed = operator.apply(context, z)
+    noise = torch.tensor(np.random.default_rng(5).normal(0, 2e-4, (40, 1000, 3)))
+    observed = operator.apply(context, z) + noise
     mask = everything(observed)
     mask[:, 400:600] = False
     broken = torch.where(mask, observed, 99.0)
     found = operator.infer(context, broken, mask)
     others = [0, 1, 3, 4]
-    assert (found.z - z)[:, others, 1:].abs().mean() < 1e-5
+    assert (found.z - z)[:, others, 1:].abs().mean() < 5e-5
     assert not found.identified[:, 2, 0].any(), "nothing of the third movement was seen"
 
 
@@ -155,7 +157,7 @@ def test_names_units_and_config() -> None:
     latent = operator.latent(rt.Channels(("x", "y"), ("m", "m")))
     assert latent.names == ("delay", "offset_x", "offset_y")
     assert latent.units == ("samples", "m", "m")
-    assert from_config(to_config(operator)) == operator
+    assert from_config(to_config(operator, OPERATORS), OPERATORS) == operator
     assert isinstance(operator, rt.Correction)
 
 

@@ -114,6 +114,8 @@ class DelayOffset:
         low, high = self.delay_range
         segments = model.segments
         grid = torch.arange(low, high + 1.0, 1.0, dtype=torch.float64)
+        # Smallest first: where nothing was seen all fit alike, and the first one is taken.
+        grid = grid[grid.abs().argsort(stable=True)]
         start, settle = torch.as_tensor(segments.start), torch.as_tensor(segments.settle)
         time = torch.arange(segments.steps, dtype=torch.float64)
         near = (time >= (start + low)[..., None]) & (time <= (settle + high)[..., None])
@@ -140,7 +142,7 @@ class DelayOffset:
         wide = (100 * largest + 1e-9)[:, None].repeat(1, size)
         wide[:, 0] = 100.0 * (self.delay_range[1] - self.delay_range[0])
         prior = torch.diag_embed(wide.square().reciprocal().repeat(1, most))
-        whole = torch.linalg.inv(normal + prior).reshape(n, most, size, most, size)
+        whole = _inverse(normal + prior).reshape(n, most, size, most, size)
         index = torch.arange(most)
         covariance = whole[:, index, :, index].transpose(0, 1)
         deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
@@ -189,6 +191,15 @@ class _Knots:
         after = values.gather(1, index.clamp(0, last))
         return before + self.share[..., None] * (after - before)
 
+    def slope(self, values: Tensor) -> Tensor:
+        """Change per sample of `between` (n, T, k)."""
+        last = values.shape[1] - 1
+        before, after = (self.right - 1).clamp(0, last), self.right.clamp(0, last)
+        wide = [place[..., None].expand(-1, -1, values.shape[2]) for place in (before, after)]
+        length = self.target.gather(1, after) - self.target.gather(1, before)
+        rise = values.gather(1, wide[1]) - values.gather(1, wide[0])
+        return rise / length.clamp_min(1e-9)[..., None]
+
     def source_time(self) -> Tensor:
         """When in the uncorrected path each sample (n, T) is read."""
         inner = self.between(self.source[..., None])[..., 0]
@@ -220,7 +231,8 @@ class _Model:
         self.path = path
         self.observed = observed
         self.seen = seen
-        self.slope = torch.gradient(path, dim=1)[0]
+        # Exactly the derivative of what `_read` gives between two samples.
+        self.slope = path.diff(dim=1, append=path[:, -1:])
 
     def residual(self, z: Tensor) -> Tensor:
         """Observed minus corrected (n, T, d_y)."""
@@ -248,8 +260,9 @@ class _Model:
         unit = torch.eye(most, dtype=z.dtype).expand(n, -1, -1)
         reach = knots.between(knots.spread(unit))  # (n, T, M): share of each movement's offset
         late = knots.between(unit.repeat_interleave(2, dim=1))  # share of each movement's delay
-        rise = torch.gradient(knots.between(values), dim=1)[0]
-        velocity = _read(self.slope, when) + rise
+        below = when.floor().long().clamp(0, self.path.shape[1] - 1)
+        index = below[..., None].expand(-1, -1, self.path.shape[2])
+        velocity = self.slope.gather(1, index) + knots.slope(values)
         jacobian = torch.zeros(*residual.shape, most, size, dtype=z.dtype)
         jacobian[..., 0] = -velocity[..., None] * late[:, :, None]
         for channel in range(size - 1):
@@ -289,12 +302,21 @@ def _solve(jacobian: Tensor, residual: Tensor, weight: Tensor, damping: Tensor) 
     weighted = jacobian * weight[..., None, None]
     normal = torch.einsum("ntci,ntcj->nij", weighted, jacobian)
     right = torch.einsum("ntci,ntc->ni", weighted, residual)
-    # Delays and offsets differ by orders of magnitude: damp in units of their own curvature.
-    unit = normal.diagonal(dim1=-2, dim2=-1).sqrt()
-    unit = torch.where(unit > 0, unit, torch.ones_like(unit))
-    scaled = normal / unit[:, :, None] / unit[:, None, :]
+    unit, scaled = _in_own_units(normal)
     ridge = torch.diag_embed((damping[:, None] + 1e-9).expand_as(unit))
     return torch.linalg.solve(scaled + ridge, right / unit) / unit
+
+
+def _inverse(normal: Tensor) -> Tensor:
+    unit, scaled = _in_own_units(normal)
+    return torch.linalg.inv(scaled) / unit[:, :, None] / unit[:, None, :]
+
+
+def _in_own_units(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """The matrix scaled to a unit diagonal: delays and offsets differ by orders of magnitude."""
+    unit = normal.diagonal(dim1=-2, dim2=-1).sqrt()
+    unit = torch.where(unit > 0, unit, torch.ones_like(unit))
+    return unit, normal / unit[:, :, None] / unit[:, None, :]
 
 
 def _correlation_time(residual: Tensor, weight: Tensor) -> Tensor:

@@ -11,9 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from retwin.configs import from_config, to_config
 from retwin.errors import InputError
 from retwin.models import read_model, write_model
-from retwin.networks import CNN, Network, Standardise, from_config, to_config
+from retwin.networks import CNN, NETWORKS, Network, Standardise
 from retwin.training import Fit, Training, isolated, train
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins.protocol import Progress
@@ -90,7 +91,7 @@ class NetworkDiagnoser(nn.Module):
     def save(self, folder: str | Path) -> None:
         """Write weights and description, see `retwin.models`."""
         about = {
-            "network": to_config(self.config),
+            "network": to_config(self.config, NETWORKS),
             "classes": self.classes,
             "outputs": vars(self.outputs),
             "rate": self.rate,
@@ -105,7 +106,7 @@ class NetworkDiagnoser(nn.Module):
         """Read what `save` wrote; InputError when it is not a diagnoser or damaged."""
         about, weights = read_model(folder, "diagnoser")
         model = cls(
-            from_config(about["network"]),
+            from_config(about["network"], NETWORKS),
             classes=tuple(about["classes"]),
             outputs=Channels.of(about["outputs"]),
             rate=about["rate"],
