@@ -147,7 +147,8 @@ class DelayOffset:
         covariance = whole[:, index, :, index].transpose(0, 1)
         deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
         at_edge = (z[..., 0] <= self.delay_range[0]) | (z[..., 0] >= self.delay_range[1])
-        late = (deviation[..., 0] <= self.known_delay) & ~at_edge
+        watched = _watched(model.segments, model.seen) >= 0.5
+        late = (deviation[..., 0] <= self.known_delay) & ~at_edge & watched
         off = (deviation[..., 1:] <= 0.1 * wide[:, None, 1:]).all(dim=-1, keepdim=True)
         identified = torch.cat([late[..., None], off.expand(-1, -1, size - 1)], dim=-1)
         steady = torch.where(moving, torch.inf, noise).amin(dim=1)
@@ -279,6 +280,14 @@ def _moving(segments: Segments, delay: Tensor, steps: int) -> Tensor:
     begin = (torch.as_tensor(segments.start) + delay - 5)[..., None]
     end = (torch.as_tensor(segments.settle) + delay + 10)[..., None]
     return ((time >= begin) & (time <= end)).any(dim=1)
+
+
+def _watched(segments: Segments, seen: Tensor) -> Tensor:
+    """(n, M) share of each motion part that was measured."""
+    time = torch.arange(seen.shape[1], dtype=torch.float64)
+    start, settle = torch.as_tensor(segments.start), torch.as_tensor(segments.settle)
+    inside = (time >= start[..., None]) & (time <= settle[..., None])
+    return (inside * seen[:, None]).sum(dim=-1) / inside.sum(dim=-1).clamp_min(1)
 
 
 def _scale(residual: Tensor, seen: Tensor, moving: Tensor) -> Tensor:
