@@ -46,14 +46,6 @@ class Case:
         return trajectories.replace(commands=trajectories.nominal[..., :2], inputs=self.inputs)
 
 
-class RadiansCase(Case):
-    """A case that knows motors of which only the first two count."""
-
-    def commands_from_radians(self, array):
-        """Hundreds of a radian of the first two motors."""
-        return 100 * array[..., :2]
-
-
 def cells(values):
     row = np.empty((1, len(values)), object)
     for i, value in enumerate(values):
@@ -415,13 +407,10 @@ clock = np.arange(20) / 100
 )
 def test_dataset_commands_in_radians(tmp_path, stored):
     write_dataset(tmp_path, "Healthy/dataset_1.mat", motorCmdsRadius=stored)
-    read = load(tmp_path, case=RadiansCase())
-    np.testing.assert_allclose(read.commands[0], 100 * motors[:, :2])
-    assert read.inputs == Case.inputs
     plain = load(tmp_path, rate=100)
     np.testing.assert_array_equal(plain.commands[0], motors)
     assert plain.inputs == Channels.numbered("motor_", 5, "rad")
-    # A case in volts that cannot convert recovers its commands instead.
+    # A case in volts recovers its commands instead.
     recovered = load(tmp_path, case=Case())
     np.testing.assert_array_equal(recovered.commands, recovered.nominal[..., :2])
     in_rad = Case(inputs=Channels.numbered("motor_", 5, "rad"))

@@ -122,7 +122,7 @@ def spoilt(value: float, column: int) -> np.ndarray:
     [
         ([GOOD], ["Healthy"], "X_strange", "X_array"),
         ([np.zeros((1000, 5))], ["Healthy"], "X_test_array", "expected"),
-        ([spoilt(np.nan, 0)], ["Healthy"], "X_test_array", "NaN"),
+        ([spoilt(np.nan, 0)], ["Healthy"], "X_test_array", "got nan in sample 5"),
         ([spoilt(np.inf, 4)], ["Healthy"], "X_test_array", "infinite"),
         ([GOOD], ["Motor_9_Broken"], "X_test_array", "Motor_9_Broken"),
     ],

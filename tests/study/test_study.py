@@ -130,7 +130,9 @@ def test_calibration_and_test_sets_keep_their_roles(
     data = rt.StudyData(tmp_path / "twin.npz", tmp_path / "c.npz", tmp_path / "t.npz")
     results = rt.run_study(case, plan, data, tmp_path / "out", processes=2)
     assert results["data"]["test"]["ids"] == test.ids.tolist()
-    assert results["data"]["calibration"]["used"] == calibration.ids.tolist()
+    healthy = calibration.with_label("Healthy")
+    assert results["data"]["calibration"]["n"] == len(calibration)
+    assert results["data"]["calibration"]["used"] == healthy.ids.tolist()
     assert results["data"]["twin"]["n"] == 108
     row = next(r for r in results["comparisons"] if r["metric"] == "macro_f1")
     assert row["p"] is None, "one run has no Welch test"
