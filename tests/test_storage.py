@@ -441,7 +441,7 @@ def test_dataset_with_timeseries_objects_is_completed(tmp_path):
     stored = loadmat(file)["motorCmdsRadius"]  # the reader does meet what it would in earnest
     assert stored.shape == (1, 5)
     assert "timeseries" in str(stored[0, 0])
-    read = load(tmp_path, case=RadiansCase())
+    read = load(tmp_path, case=Case())
     np.testing.assert_array_equal(read.commands[0], desired[:, :2])
     assert load(tmp_path, rate=100).commands.shape == (1, 20, 0)
 
@@ -456,7 +456,7 @@ def test_dataset_clock_tells_the_rate_and_must_agree(tmp_path):
     refused("one sample rate, 50 Hz as rate says, got 100 Hz", tmp_path, rate=50)
     write_dataset(tmp_path, "Healthy/dataset_2.mat", motorCmdsRadius=structs(50))
     refused("one sample rate.*got 50 Hz in Healthy/dataset_2", tmp_path)
-    refused("one sample rate, 100 Hz as the case says", tmp_path, case=RadiansCase())
+    refused("one sample rate, 100 Hz as the case says", tmp_path, case=Case())
 
 
 def uneven(times):
