@@ -40,6 +40,8 @@ def test_bad_commands_are_refused(twin: rt.Twin) -> None:
         twin.simulate(np.zeros((2, 10, 3)), seed=0)
     with pytest.raises(rt.InputError, match="NaN or an infinite value"):
         twin.simulate(np.full((2, 10, 4), np.nan), seed=0)
+    with pytest.raises(rt.InputError, match="an actuator from 0 to 3"):
+        twin.simulate(np.zeros((1, 10, 4)), faults=[rt.Stuck(7)], seed=0)
     with pytest.raises(rt.InputError, match="one per trajectory"):
         twin.simulate(np.zeros((2, 10, 4)), faults=[None], seed=0)
 

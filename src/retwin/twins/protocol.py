@@ -84,6 +84,19 @@ def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
     return array if array.dtype.kind == "f" else array.astype(np.float64)
 
 
+def _check_actuators(faults: Sequence[Fault | None], inputs: Channels) -> None:
+    """A fault on one actuator must name one that there is."""
+    for fault in faults:
+        actuator = getattr(fault, "actuator", 0)
+        if not 0 <= actuator < len(inputs):
+            raise InputError(
+                "faults",
+                expected=f"an actuator from 0 to {len(inputs) - 1}",
+                got=repr(fault),
+                remedy=f"count the command channels from 0: {', '.join(inputs.names)}",
+            )
+
+
 @dataclass(frozen=True, eq=False)
 class Chunk:
     """A few trajectories that are simulated together.
@@ -130,6 +143,7 @@ def simulate_in_chunks(
     of each chunk of at most `size` trajectories: nominal and observed outputs (n, T, d_y).
     """
     commands = checked_commands(commands, twin.inputs)
+    _check_actuators(faults or (), twin.inputs)
     segments = Segments.from_commands(commands)
     drawn = draw_faults([None] * len(commands) if faults is None else faults, segments, seed)
     nominal = np.empty((*commands.shape[:2], len(twin.outputs)), dtype=commands.dtype)
