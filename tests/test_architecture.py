@@ -16,6 +16,7 @@ ROOT = Path(retwin.__file__).parent
 FLOORS = [
     "errors",
     "configs",
+    "processes",
     "trajectories",
     "storage",
     "download",

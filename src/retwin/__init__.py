@@ -26,6 +26,7 @@ _HOME = {
     "Fault": "faults",
     "InputError": "errors",
     "KinematicTwin": "twins.kinematic",
+    "Limits": "twins.protocol",
     "LSTM": "networks",
     "LSTMClassifier": "networks",
     "MLP": "networks",
@@ -34,6 +35,7 @@ _HOME = {
     "ResidualModel": "residual",
     "Scores": "statistics",
     "Segments": "segments",
+    "SimulationError": "twins.protocol",
     "SteadyStateError": "faults",
     "Stuck": "faults",
     "StudyData": "study",
@@ -91,4 +93,4 @@ if TYPE_CHECKING:
     from retwin.training import Training
     from retwin.trajectories import Channels, Trajectories
     from retwin.twins.kinematic import KinematicTwin
-    from retwin.twins.protocol import Twin
+    from retwin.twins.protocol import Limits, SimulationError, Twin

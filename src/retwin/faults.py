@@ -21,6 +21,7 @@ __all__ = [
     "Stuck",
     "draw_faults",
     "faulty_commands",
+    "frozen_from",
     "frozen_response",
 ]
 
@@ -204,3 +205,29 @@ def frozen_response(response: NDArray, faults: Sequence[Fault | None]) -> NDArra
         if fault is not None:
             out[i] = fault.response(response[i])
     return out
+
+
+def frozen_from(faults: Sequence[Fault | None], steps: int, actuators: int) -> NDArray:
+    """The sample (n, d_u) from which every actuator is held; `steps` where it never is.
+
+    For twins that integrate their dynamics and must hold an actuator while they do. Asked of the
+    faults themselves: what they do to a response that rises by one per sample.
+
+    Raises InputError for a fault that does something else to the response than hold it.
+    """
+    rising = np.tile(np.arange(steps, dtype=float)[:, None], (1, actuators))
+    onsets = np.full((len(faults), actuators), steps)
+    for i, fault in enumerate(faults):
+        if fault is None:
+            continue
+        response = fault.response(rising)
+        onset = response[-1].astype(int)
+        if not np.array_equal(response, np.minimum(rising, onset)):
+            raise InputError(
+                "faults",
+                expected="faults that hold an actuator's response or leave it as it is",
+                got=repr(fault),
+                remedy="use a twin whose actuators' response is visible, such as KinematicTwin",
+            )
+        onsets[i] = np.where(onset < steps - 1, onset, steps)
+    return onsets

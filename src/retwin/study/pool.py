@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import queue
-import signal
 import threading
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any
 
+from retwin.processes import worker_pool
 from retwin.study.jobs import Job, Work
 
 __all__ = ["run_jobs"]
@@ -26,25 +25,20 @@ def run_jobs(work: Work, processes: int, tell: Callable[[str, float], None]) -> 
     missing = [[job for job in stage if not shares[job]] for stage in stages]
     if not any(missing):
         return
-    # Spawned, not forked: torch's threads do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    news = context.Queue()
+    # Spawned, as the workers are.
+    news = multiprocessing.get_context("spawn").Queue()
     stop = threading.Event()
     listener = threading.Thread(target=_listen, args=(news, shares, tell, stop), daemon=True)
     listener.start()
     workers = min(processes, max(map(len, missing)))
-    pool = ProcessPoolExecutor(workers, context, _start_worker, (news,))
     try:
-        for stage in missing:
-            _finish({pool.submit(_do, work, job) for job in stage})
-    except BaseException:
-        _abandon(pool)
-        raise
+        with worker_pool(workers, _start_worker, (news,)) as pool:
+            for stage in missing:
+                _finish({pool.schedule(_do, args=(work, job)) for job in stage})
     finally:
         stop.set()
         # A worker ended in the middle of a message could keep the listener waiting.
         listener.join(timeout=1.0)
-        pool.shutdown(cancel_futures=True)
 
 
 def _finish(futures: set[Future[None]]) -> None:
@@ -53,12 +47,6 @@ def _finish(futures: set[Future[None]]) -> None:
         done, futures = wait(futures, return_when=FIRST_COMPLETED)
         for future in done:
             future.result()
-
-
-def _abandon(pool: ProcessPoolExecutor) -> None:
-    """End the workers now: their results so far are on disk, and whole."""
-    for process in list((pool._processes or {}).values()):
-        process.terminate()
 
 
 def _listen(
@@ -81,19 +69,9 @@ def _start_worker(news: Any) -> None:
 
     global _progress
     _progress = news
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     # Recurrent nets run into denormal numbers, which are several times slower; must be first.
     torch.set_flush_denormal(True)
-
-
-def _end_with_parent() -> None:
-    """A parent that was killed cannot end its workers: they must see for themselves."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _do(work: Work, job: Job) -> None:

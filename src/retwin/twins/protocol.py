@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,9 +14,41 @@ from retwin.faults import Fault, draw_faults, faulty_commands, frozen_response
 from retwin.segments import Segments
 from retwin.trajectories import Channels, Progress, Source, Trajectories
 
-__all__ = ["HEALTHY", "Chunk", "Progress", "Twin", "checked_commands", "simulate_in_chunks"]
+__all__ = [
+    "HEALTHY",
+    "Chunk",
+    "Limits",
+    "Progress",
+    "SimulationError",
+    "Twin",
+    "checked_commands",
+    "simulate_in_chunks",
+]
 
 HEALTHY = "Healthy"
+
+
+class SimulationError(RuntimeError):
+    """Some trajectories could not be simulated; the others are at hand.
+
+    Attributes
+    ----------
+    failed: index of the trajectory to the reason.
+    finished: the trajectories that were simulated; their ids are their indices.
+
+    """
+
+    def __init__(self, failed: Mapping[int, str], finished: Trajectories) -> None:
+        self.failed = dict(failed)
+        self.finished = finished
+        named = "; ".join(f"trajectory {i}: {why}" for i, why in list(self.failed.items())[:5])
+        more = "; …" if len(self.failed) > 5 else ""
+        count = len(self.failed) + len(finished)
+        super().__init__(f"{len(self.failed)} of {count} simulations failed: {named}{more}")
+
+    def __reduce__(self) -> tuple:
+        """Keep the parts when the error crosses a process border."""
+        return SimulationError, (self.failed, self.finished)
 
 
 @runtime_checkable
@@ -51,12 +83,83 @@ class Twin(Protocol):
         `nominal` of the result is the ideal output for the clean commands, `observed` what the
         twin says happens, `labels` the label of each fault. The same seed gives the same bytes.
 
+        A twin may also have `limits`, the `Limits` its commands must keep.
+
         Raises
         ------
-        InputError: commands of another width, NaN or infinite; not one fault per trajectory.
+        InputError: commands of another width, NaN or infinite, or outside the twin's limits; not
+            one fault per trajectory.
+        SimulationError: some trajectories could not be simulated; it names them and holds the
+            others.
 
         """
         ...
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The least and the greatest command of every input channel.
+
+    Parameters
+    ----------
+    low, high: one per channel, in its unit; infinite where there is no limit.
+    outside: what to do with commands beyond: "refuse" them, or "clip" them to the limit.
+
+    Limits are for what an operator commands. A fault that pushes an effective command beyond them
+    is none of the operator's: what then happens is up to the twin.
+
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    outside: Literal["refuse", "clip"] = "refuse"
+
+    def __post_init__(self) -> None:
+        paired = len(self.low) == len(self.high)
+        if not (paired and all(a < b for a, b in zip(self.low, self.high, strict=True))):
+            raise InputError(
+                "limits",
+                expected="one low and one greater high per input channel",
+                got=f"low {self.low}, high {self.high}",
+                remedy="give -inf and inf where a channel has no limit",
+            )
+        if self.outside not in ("refuse", "clip"):
+            raise InputError(
+                "outside",
+                expected="'refuse' or 'clip'",
+                got=repr(self.outside),
+                remedy="say what to do with commands beyond the limits",
+            )
+
+    def keep(self, commands: NDArray, inputs: Channels) -> NDArray:
+        """`commands` (n, T, d_u) within the limits, clipped if that is asked for.
+
+        Raises InputError when a command is outside and `outside` is "refuse", or when there are
+        not as many limits as channels.
+        """
+        if len(self.low) != len(inputs):
+            raise InputError(
+                "limits",
+                expected=f"{len(inputs)}, one per input channel",
+                got=f"{len(self.low)}",
+                remedy="give -inf and inf where a channel has no limit",
+            )
+        low = np.asarray(self.low, commands.dtype)
+        high = np.asarray(self.high, commands.dtype)
+        if self.outside == "clip":
+            return np.clip(commands, low, high)
+        beyond = (commands < low) | (commands > high)
+        if beyond.any():
+            trajectory, sample, channel = np.argwhere(beyond)[0]
+            raise InputError(
+                "commands",
+                expected=f"{inputs.names[channel]} from {low[channel]:g} to {high[channel]:g} "
+                f"{inputs.units[channel]}",
+                got=f"{commands[trajectory, sample, channel]:g} in trajectory {trajectory}, "
+                f"sample {sample}",
+                remedy="keep the limits, or have commands clipped (outside='clip')",
+            )
+        return commands
 
 
 def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
@@ -108,6 +211,8 @@ class Chunk:
     told: (n, T, d_u), with the faults' effect on the reference.
     faults: drawn, one per trajectory.
     segments: movements of the clean commands.
+    failed: for `run` to fill in: which trajectories of this chunk, counted from 0, could not be
+        simulated, and why. Their outputs do not matter.
 
     """
 
@@ -116,6 +221,7 @@ class Chunk:
     told: NDArray
     faults: Sequence[Fault | None]
     segments: Segments
+    failed: dict[int, str] = field(default_factory=dict)
 
     @property
     def held(self) -> NDArray:
@@ -140,29 +246,57 @@ def simulate_in_chunks(
     """What every twin's `simulate` does around its own simulation `run`.
 
     Checks commands, draws the severities of faults, tells progress, and collects what `run` says
-    of each chunk of at most `size` trajectories: nominal and observed outputs (n, T, d_y).
+    of each chunk of at most `size` trajectories: nominal and observed outputs (n, T, d_y). One
+    trajectory that fails, or gives outputs that are not finite, does not end the others.
     """
     commands = checked_commands(commands, twin.inputs)
+    limits: Limits | None = getattr(twin, "limits", None)
+    if limits is not None:
+        commands = limits.keep(commands, twin.inputs)
     _check_actuators(faults or (), twin.inputs)
     segments = Segments.from_commands(commands)
     drawn = draw_faults([None] * len(commands) if faults is None else faults, segments, seed)
     nominal = np.empty((*commands.shape[:2], len(twin.outputs)), dtype=commands.dtype)
     observed = np.empty_like(nominal)
+    failed: dict[int, str] = {}
     for begin in range(0, len(commands), size):
         index = slice(begin, begin + size)
         part, some, these = commands[index], drawn[index], segments[index]
         told = faulty_commands(part, some, these)
-        nominal[index], observed[index] = run(Chunk(index, part, told, some, these))
+        chunk = Chunk(index, part, told, some, these)
+        nominal[index], observed[index] = run(chunk)
+        wrong = _not_finite(twin, nominal[index], observed[index]) | chunk.failed
+        failed |= {begin + i: reason for i, reason in sorted(wrong.items())}
         if progress is not None:
             progress(min(1.0, (begin + size) / len(commands)))
-    return Trajectories(
-        commands=commands,
-        nominal=nominal,
-        observed=observed,
-        labels=np.array([HEALTHY if fault is None else fault.label for fault in drawn]),
+    labels = np.array([HEALTHY if fault is None else fault.label for fault in drawn])
+    good = np.setdiff1d(np.arange(len(commands)), list(failed))
+    made = Trajectories(
+        commands=commands[good],
+        nominal=nominal[good],
+        observed=observed[good],
+        ids=np.array([f"{i:05d}" for i in good], dtype=np.str_),
+        labels=labels[good],
         rate=twin.rate,
         inputs=twin.inputs,
         outputs=twin.outputs,
         provenance=(Source(f"{type(twin).__name__} seed={seed}"),),
         emulated=emulated,
     )
+    if failed:
+        raise SimulationError(failed, made)
+    return made
+
+
+def _not_finite(twin: Twin, nominal: NDArray, observed: NDArray) -> dict[int, str]:
+    """Which trajectories have outputs that are not finite, and where first."""
+    wrong = {}
+    for outputs in (observed, nominal):
+        bad = ~np.isfinite(outputs)
+        for i in np.flatnonzero(bad.any(axis=(1, 2))):
+            sample, channel = np.argwhere(bad[i])[0]
+            wrong[int(i)] = (
+                f"{twin.outputs.names[channel]} is {outputs[i, sample, channel]} from sample "
+                f"{sample} on"
+            )
+    return wrong
