@@ -19,11 +19,15 @@ def peak_memory_gb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
 
 
-def record(name: str, title: str, rows: dict[str, float]) -> None:
-    """Print `rows` and write them, with the machine, to benchmarks/out/`name`.json."""
-    table = Table("what", "value", title=title)
-    for what, value in rows.items():
-        table.add_row(what, f"{value:.3g}")
+def record(name: str, title: str, rows: dict[str, float] | dict[str, dict[str, float]]) -> None:
+    """Print `rows`, of one value or of a value per column, and keep them with the machine.
+
+    Written to benchmarks/out/`name`.json.
+    """
+    several = {what: row if isinstance(row, dict) else {"value": row} for what, row in rows.items()}
+    table = Table("what", *next(iter(several.values())), title=title)
+    for what, row in several.items():
+        table.add_row(what, *(f"{value:.3g}" for value in row.values()))
     Console().print(table)
     OUT.mkdir(exist_ok=True)
     machine = {"platform": platform.platform(), "cores": os.cpu_count()}

@@ -15,8 +15,8 @@ from pathlib import Path
 from record import record
 
 import retwin as rt
-from retwin.cases.armpi import ARM
 from retwin.cases.armpi_recovery import recover_commands
+from retwin.twins.armpi import ARM
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 import retwin as rt
 from retwin.training import Training
+from retwin.twins.armpi import KINEMATIC
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -67,5 +68,5 @@ class ExactArm:
 
 
 @pytest.fixture(scope="session")
-def exact(case: rt.Case) -> ExactArm:
-    return ExactArm(case.twin)
+def exact() -> ExactArm:
+    return ExactArm(KINEMATIC)

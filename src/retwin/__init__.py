@@ -14,6 +14,7 @@ __version__ = "0.1.0"
 
 # Name to module, loaded when first asked for: `import retwin` must not wait for torch.
 _HOME = {
+    "ArmPiTwin": "twins.armpi",
     "CNN": "networks",
     "Case": "case",
     "Channels": "trajectories",
@@ -23,14 +24,17 @@ _HOME = {
     "DelayOffset": "corrections",
     "Diagnoser": "diagnosis",
     "Discrepancy": "corrections",
+    "FMUTwin": "twins.fmu",
     "Fault": "faults",
+    "FunctionTwin": "twins.function",
     "InputError": "errors",
     "KinematicTwin": "twins.kinematic",
-    "Limits": "twins.protocol",
     "LSTM": "networks",
     "LSTMClassifier": "networks",
+    "Limits": "twins.protocol",
     "MLP": "networks",
     "Mixture": "residual",
+    "MuJoCoTwin": "twins.mujoco",
     "NetworkDiagnoser": "diagnosis",
     "ResidualModel": "residual",
     "Scores": "statistics",
@@ -45,6 +49,7 @@ _HOME = {
     "Training": "training",
     "Trajectories": "trajectories",
     "Twin": "twins.protocol",
+    "animate": "animation",
     "evaluate": "statistics",
     "fetch": "download",
     "fit_diagnoser": "diagnosis",
@@ -55,15 +60,19 @@ _HOME = {
     "load": "storage",
     "run_study": "study",
     "save": "storage",
+    "simulate_to": "scale",
     "write_report": "report",
 }
 
-__all__ = ["__version__", "cases", *sorted(_HOME)]
+# Modules of which users take several things.
+_MODULES = ("cases", "testing", "twins")
+
+__all__ = ["__version__", *_MODULES, *sorted(_HOME)]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "cases":
-        return importlib.import_module("retwin.cases")
+    if name in _MODULES:
+        return importlib.import_module(f"retwin.{name}")
     if name in _HOME:
         return getattr(importlib.import_module(f"retwin.{_HOME[name]}"), name)
     raise AttributeError(f"module 'retwin' has no attribute {name!r}")
@@ -74,7 +83,8 @@ def __dir__() -> list[str]:
 
 
 if TYPE_CHECKING:
-    from retwin import cases
+    from retwin import cases, testing, twins
+    from retwin.animation import animate
     from retwin.case import Case
     from retwin.corrected import CorrectedTwin, generate
     from retwin.corrections import Context, Correction, DelayOffset, Discrepancy
@@ -85,6 +95,7 @@ if TYPE_CHECKING:
     from retwin.networks import CNN, LSTM, MLP, TCN, LSTMClassifier
     from retwin.report import write_report
     from retwin.residual import Mixture, ResidualModel, fit_residual, infer_discrepancy
+    from retwin.scale import simulate_to
     from retwin.segments import Segments
     from retwin.statistics import Scores, evaluate
     from retwin.storage import load, save
@@ -92,5 +103,9 @@ if TYPE_CHECKING:
     from retwin.surrogate import Surrogate, fit_surrogate
     from retwin.training import Training
     from retwin.trajectories import Channels, Trajectories
+    from retwin.twins.armpi import ArmPiTwin
+    from retwin.twins.fmu import FMUTwin
+    from retwin.twins.function import FunctionTwin
     from retwin.twins.kinematic import KinematicTwin
+    from retwin.twins.mujoco import MuJoCoTwin
     from retwin.twins.protocol import Limits, SimulationError, Twin

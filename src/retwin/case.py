@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -14,7 +15,7 @@ from retwin.faults import Fault, Stuck
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins.protocol import Progress, Twin
 
-__all__ = ["Case", "CommandSampler"]
+__all__ = ["Body", "Case", "CommandSampler"]
 
 
 class CommandSampler(Protocol):
@@ -36,6 +37,34 @@ class CommandSampler(Protocol):
         ...
 
 
+class Body(Protocol):
+    """What can be drawn of a system: a chain of points in space, moved by joints.
+
+    Only outputs are measured. The pose behind them is inferred, for pictures and for nothing else.
+    """
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints, as in `model`."""
+        ...
+
+    @property
+    def model(self) -> Path | None:
+        """An MJCF file that has these joints, z upwards; None when the chain is all there is."""
+        ...
+
+    def poses(self, trajectories: Trajectories) -> tuple[NDArray, NDArray]:
+        """Joint positions (n, T, joints) in rad or m, nominal and observed.
+
+        The observed ones are the nearest to the nominal ones that explain the outputs.
+        """
+        ...
+
+    def skeleton(self, joints: NDArray) -> NDArray:
+        """Points (..., k, 3) in m along the chain, from its root to its tip."""
+        ...
+
+
 @dataclass(frozen=True)
 class Case:
     """One system.
@@ -53,6 +82,7 @@ class Case:
     encoder_noise: puts reading noise of so many command units on frozen actuators (trajectories,
         units, seed); None when the case cannot tell what that does to its outputs.
     published: the figures of a paper to show beside ours: source to metric to text.
+    body: what can be drawn of the system; None when there is nothing to draw.
 
     """
 
@@ -67,6 +97,7 @@ class Case:
     recover: Callable[[Trajectories, Progress | None], Trajectories] | None = None
     encoder_noise: Callable[[Trajectories, float, int], Trajectories] | None = None
     published: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    body: Body | None = None
 
     @property
     def classes(self) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from retwin.models import read_about, write_model
 from retwin.residual import ResidualModel
 from retwin.surrogate import Surrogate
 from retwin.trajectories import Channels, Trajectories
-from retwin.twins.protocol import Chunk, Progress, Twin, simulate_in_chunks
+from retwin.twins.protocol import Chunk, Progress, Twin, checked_commands, simulate_in_chunks
 
 __all__ = ["CorrectedTwin", "generate"]
 
@@ -84,7 +84,7 @@ class CorrectedTwin:
         return simulate_in_chunks(
             self,
             run,
-            np.asarray(commands, np.float32),
+            checked_commands(commands, self.inputs).astype(np.float32, copy=False),
             faults,
             seed=seed,
             progress=progress,

@@ -69,8 +69,8 @@ class Stuck:
         """The same fault with its onset fixed."""
         if isinstance(self.onset, int):
             return self
-        low, high = self.onset
-        return replace(self, onset=int(rng.integers(low, min(high, steps - 1) + 1)))
+        low, high = (min(onset, steps - 1) for onset in self.onset)
+        return replace(self, onset=int(rng.integers(low, high + 1)))
 
     def command(self, commands: NDArray, segments: Segments) -> NDArray:
         """Commands are not touched: the actuator does not follow them."""

@@ -19,7 +19,7 @@ from retwin.models import read_model, write_model
 from retwin.networks import MLP, NETWORKS, Network, Standardise
 from retwin.training import Fit, Training, isolated, train
 from retwin.trajectories import Channels, Trajectories
-from retwin.twins.protocol import Chunk, Progress, simulate_in_chunks
+from retwin.twins.protocol import Chunk, Progress, checked_commands, simulate_in_chunks
 
 __all__ = ["Surrogate", "fit_surrogate"]
 
@@ -92,9 +92,8 @@ class Surrogate(nn.Module):
             nominal = self.predict(chunk.commands)
             return nominal, self.predict(chunk.held) if any(chunk.faults) else nominal
 
-        return simulate_in_chunks(
-            self, run, np.asarray(commands, np.float32), faults, seed=seed, progress=progress
-        )
+        checked = checked_commands(commands, self.inputs).astype(np.float32, copy=False)
+        return simulate_in_chunks(self, run, checked, faults, seed=seed, progress=progress)
 
     def save(self, folder: str | Path) -> None:
         """Write weights and description; see `read_model` for the layout."""

@@ -9,6 +9,7 @@ import pytest
 
 import retwin as rt
 from retwin.cases.armpi import ArmSampler
+from retwin.twins.armpi import KINEMATIC
 
 DATA = os.environ.get("RETWIN_DATA")
 needs_data = pytest.mark.skipif(not DATA, reason="RETWIN_DATA names the folder of the real data")
@@ -129,7 +130,7 @@ def test_encoder_noise_moves_stuck_joints_only(case: rt.Case) -> None:
     held[49:, 1] = held[49, 1]
     nudged = held.copy()
     nudged[:, 1] += 1
-    slope = case.twin.position(nudged) - case.twin.position(held)
+    slope = KINEMATIC.position(nudged) - KINEMATIC.position(held)
     change = (noisy.observed - made.observed)[i, 200]
     assert (
         np.linalg.norm(

@@ -7,6 +7,7 @@ import torch
 import retwin as rt
 from retwin.configs import from_config, to_config
 from retwin.corrections import OPERATORS
+from retwin.twins.armpi import KINEMATIC
 
 
 def context_of(exact, commands: np.ndarray) -> rt.Context:
@@ -114,27 +115,23 @@ def test_a_movement_too_small_to_time_is_told(exact, case: rt.Case) -> None:
     assert found.identified[0, :, 0].tolist() == [True, False]
 
 
-def test_emulated_robot_is_understood(exact, case: rt.Case, emulated: rt.Trajectories) -> None:
+def test_emulated_robot_is_understood(exact, case: rt.Case) -> None:
     """Delay MAE <= 1 sample, offset MAE <= 0.5 mm where no joint missed a movement."""
-    healthy = rt.generate(case.emulator, case, per_class=60, seed=11).with_label("Healthy")
-    seed = int(np.random.SeedSequence(11).spawn(2)[1].generate_state(1)[0])
-    # The discrepancy is drawn for all 540 trajectories at once, healthy ones first.
-    every = rt.generate(case.emulator, case, per_class=60, seed=11)
-    segments = rt.Segments.from_commands(every.commands)
-    truth = case.emulator.discrepancy(segments, seed)
+    commands = case.sampler.sample(60, rng=np.random.default_rng(11))
+    hidden: dict[str, np.ndarray] = {}
+    healthy = case.emulator.simulate(commands, seed=11, hidden=hidden)
     context = context_of(exact, healthy.commands)
     found = rt.DelayOffset().infer(
         context, torch.tensor(healthy.observed), torch.tensor(healthy.mask)
     )
     parts = context.segments
-    targets = healthy.commands[np.arange(60)[:, None], np.ceil(parts.settle).astype(int)].astype(
-        float
-    )
-    reached = case.twin.position(targets + truth.offset[:60])
-    offset = reached - case.twin.position(targets)
-    # A lag makes a ramp come late by its time constant, on top of the delay.
-    delay = truth.delay[:60] + 100 * case.twin.lag.seconds
-    missed = truth.missed[:60].any(axis=2)
+    each = np.arange(60)[:, None]
+    targets = commands[each, np.ceil(parts.settle).astype(int)].astype(float)
+    reached = hidden["angles"][each, np.ceil(parts.stop).astype(int) - 1]
+    offset = KINEMATIC.position(reached) - KINEMATIC.position(targets)
+    # On top of a movement's delay comes the servo's own, about two samples.
+    delay = hidden["delay"] + 100 * KINEMATIC.lag.seconds
+    missed = hidden["missed"].any(axis=2)
     beside = missed.copy()
     beside[:, 1:] |= missed[:, :-1]
     good = ~beside & parts.valid

@@ -100,6 +100,21 @@ def _discrepancy(rng: np.random.Generator) -> dict[str, NDArray]:
     return {"z/observed": observed, "z/identified": identified, "z/predicted": draw(4000)}
 
 
+def _poses(ids: list[str]) -> dict[str, NDArray]:
+    """A chain of four points that bends for 2 s; the second one's tip is 10 mm off."""
+    angle = np.linspace(0, 1, 21)[:, None] * np.arange(4)
+    chain = 0.1 * np.stack([np.sin(angle), 0 * angle, np.cumsum(np.cos(angle), axis=1)], axis=2)
+    nominal = np.stack([chain, chain])
+    observed = nominal.copy()
+    observed[1, :, -1, 1] += 0.01
+    return {
+        "pose/nominal": nominal.astype(np.float32),
+        "pose/observed": observed.astype(np.float32),
+        "pose/ids": np.array(ids),
+        "pose/rate": np.array(10.0),
+    }
+
+
 def synthetic(*, runs: int = 10, per_class: int = 10) -> Study:
     """results.json and the arrays of a synthetic study."""
     rng = np.random.default_rng(7)
@@ -177,6 +192,9 @@ def synthetic(*, runs: int = 10, per_class: int = 10) -> Study:
             "machine": "2 cores",
         },
     }
+    test = results["data"]["test"]
+    faulty = test["labels"].index("Motor_1_Steady_state_error")
+    arrays |= _poses([test["ids"][0], test["ids"][faulty]])
     return results, arrays
 
 

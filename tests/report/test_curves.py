@@ -87,7 +87,7 @@ def test_plots_are_valid_for_plotly(study: Study) -> None:
     sections = [section for make in SECTIONS if (section := make(results)) is not None]
     assert len(sections) == len(SECTIONS)
     plots = [b for section in sections for b in section.blocks if isinstance(b, Plot)]
-    assert [plot.name for plot in plots] == ["scores", "roc", "tde", "tpe"]
+    assert [plot.name for plot in plots] == ["scores", "roc", "tde", "tpe", "poses"]
     for plot in plots:
         for panel in plot.panels:
             assert go.Figure(plain(panel.spec)).data

@@ -174,6 +174,7 @@ def test_everything_is_escaped(study: Study, write: Write) -> None:
     test["ids"][0] = results["data"]["calibration"]["used"][0] = evil
     results["sources"][evil] = results["sources"].pop("ibg")
     arrays[f"probabilities/{evil}".replace("/", "\\")] = arrays.pop("probabilities/ibg")
+    arrays["pose/ids"] = np.array([evil, evil])
     results["published"]["dt"]["macro_f1"] = evil
     results["fidelity"]["latent"][0] = results["fidelity"]["ks"][0]["name"] = evil
     for each in results["comparisons"]:

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from retwin.cases.armpi import ARM
+from retwin.twins.armpi import ARM
 
 
 def chain(angles: np.ndarray) -> np.ndarray:

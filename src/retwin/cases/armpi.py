@@ -9,36 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.case import Case
+from retwin.cases.armpi_body import ArmBody
 from retwin.cases.armpi_recovery import RAMPS, ramp_commands, recover_commands
 from retwin.corrections import DelayOffset
 from retwin.faults import Fault, SteadyStateError, Stuck, frozen_response
-from retwin.trajectories import Channels, Trajectories
-from retwin.twins.arm import YawPitchArm
-from retwin.twins.emulated import EmulatedArm
-from retwin.twins.kinematic import KinematicTwin, ServoLag
+from retwin.trajectories import Trajectories
+from retwin.twins.armpi import ARM, KINEMATIC, POLL, STRAIGHT, UNIT, ArmPiTwin
+from retwin.twins.emulated import EmulatedArmPi
 from retwin.twins.protocol import HEALTHY, Progress
 
-__all__ = ["ARM", "ArmSampler", "armpi"]
-
-ARM = YawPitchArm(base=0.028505 + 0.0361, links=(0.10048, 0.094714, 0.05071))
-INPUTS = Channels(tuple(f"motor_{i}" for i in range(1, 5)), ("0.24 deg",) * 4)
-OUTPUTS = Channels(("x", "y", "z"), ("m",) * 3)
-RATE = 100.0
-POLL = 10
-"""Samples per reading of the real arm's motors; between them its data are straight lines."""
-STRAIGHT = 500.0
-DEGREES = 0.24
-"""One command unit; a motor's angle in degrees is 120 - 0.24 units."""
-
-TWIN = KinematicTwin(
-    ARM,
-    centre=STRAIGHT,
-    scale=-np.deg2rad(DEGREES),
-    lag=ServoLag(proportional=-0.515, integral=48.7),
-    inputs=INPUTS,
-    outputs=OUTPUTS,
-    rate=RATE,
-)
+__all__ = ["ArmSampler", "armpi"]
 
 # Table 1 and section 5 of the paper: 90 real trajectories, LSTM, 10 runs.
 PUBLISHED = {
@@ -91,8 +71,8 @@ class ArmSampler:
         for movement in range(self.movements):
             reach = self.speed * ramps[:, movement]
             now = now + np.clip(goals[:, movement] - now, -reach, reach)
-            now = DEGREES * np.round(now / DEGREES)
-            targets[:, movement] = STRAIGHT - now / DEGREES
+            now = UNIT * np.round(now / UNIT)
+            targets[:, movement] = STRAIGHT - now / UNIT
         if timing is None or len(timing) == 0:
             onsets = np.tile(self.period * np.arange(self.movements, dtype=float), (count, 1))
         else:
@@ -124,7 +104,9 @@ def recover(trajectories: Trajectories, progress: Progress | None = None) -> Tra
             stacklevel=2,
         )
     return trajectories.replace(
-        commands=found.commands.astype(np.float32), inputs=INPUTS, outputs=OUTPUTS
+        commands=found.commands.astype(np.float32),
+        inputs=KINEMATIC.inputs,
+        outputs=KINEMATIC.outputs,
     )
 
 
@@ -152,7 +134,7 @@ def encoder_noise(trajectories: Trajectories, units: float, seed: int) -> Trajec
         flicker = np.interp(time, polls, units * rng.integers(-1, 2, size=len(polls)))
         if isinstance(fault, Stuck):
             held = frozen_response(trajectories.commands[i : i + 1], [fault])[0]
-            effect = ARM.jacobian(TWIN.angles(held))[:, :, fault.actuator] * TWIN.scale
+            effect = ARM.jacobian(KINEMATIC.angles(held))[:, :, fault.actuator] * KINEMATIC.scale
             observed[i] += np.where(time > ONSET, flicker, 0.0)[:, None] * effect
     return trajectories.replace(observed=observed)
 
@@ -163,12 +145,13 @@ def armpi() -> Case:
         name="armpi",
         title="ArmPi FPV robot arm",
         faults=FAULTS,
-        twin=TWIN,
-        emulator=EmulatedArm(TWIN),
+        twin=ArmPiTwin(),
+        emulator=EmulatedArmPi(),
         sampler=ArmSampler(),
         correction=DelayOffset(),
-        sensor_rate=RATE / POLL,
+        sensor_rate=KINEMATIC.rate / POLL,
         recover=recover,
         encoder_noise=encoder_noise,
         published=PUBLISHED,
+        body=ArmBody(KINEMATIC),
     )

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from retwin import __version__
-from retwin.cli import data, models, studies
+from retwin.cli import data, models, studies, twins
 from retwin.cli.terminal import BAD_INPUT, FAILED, complain, show_warnings
 from retwin.errors import InputError
 
@@ -26,6 +26,7 @@ app = typer.Typer(
 )
 app.command("demo", epilog="Example: `retwin demo`")(studies.demo)
 app.add_typer(data.app, name="data")
+app.add_typer(twins.app, name="twin")
 app.command(
     "fit",
     epilog="Example: `retwin fit armpi --twin-data sim.mat --real real.mat --out model`",

@@ -27,7 +27,9 @@
       layout.height = spec.height * (root.dataset.print ? 0.72 : 1);
       place.style.height = layout.height + "px";
       layout.width = place.clientWidth;
-      Plotly.react(place, paint(spec.data, style), layout, { displayModeBar: false });
+      // The wheel scrolls the page, also over a picture in space.
+      const config = { displayModeBar: false, scrollZoom: false };
+      Plotly.react(place, { data: paint(spec.data, style), layout, config, frames: spec.frames });
     }
   };
 

@@ -16,6 +16,7 @@ from retwin.report.words import METRICS, mean_and_spread, number, order, slot, s
 
 __all__ = [
     "DASHES",
+    "FONT",
     "caption",
     "latent_names",
     "latent_plot",

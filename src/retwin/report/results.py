@@ -202,6 +202,7 @@ class Results(Part):
             if shape != (0,) and shape[1:] != wanted:
                 raise ValueError(f"probabilities/{name} has shape {shape}, not (runs, *{wanted})")
         self._check_latents()
+        self._check_poses()
         strange = set(self.data.test.labels) - set(self.classes)
         if strange and self.classes:
             raise ValueError(f"test label {min(strange)!r} is none of the classes")
@@ -216,6 +217,20 @@ class Results(Part):
             raise ValueError(f"z/observed {seen.shape} and z/predicted {said.shape} do not match")
         if identified is not None and identified.shape != seen.shape:
             raise ValueError(f"z/identified has shape {identified.shape}, not {seen.shape}")
+
+    def _check_poses(self) -> None:
+        nominal, observed = self.arrays.get("pose/nominal"), self.arrays.get("pose/observed")
+        ids, rate = self.arrays.get("pose/ids"), self.arrays.get("pose/rate")
+        if nominal is None or observed is None or ids is None or rate is None:
+            return
+        if nominal.ndim != 4 or nominal.shape[3] != 3 or nominal.shape != observed.shape:
+            raise ValueError(f"pose/nominal {nominal.shape} and pose/observed {observed.shape}")
+        if nominal.shape[1] < 2 or nominal.shape[2] < 1:
+            raise ValueError(f"pose/nominal {nominal.shape} has too few moments or points")
+        if not (np.isfinite(nominal).all() and np.isfinite(observed).all()):
+            raise ValueError("pose/nominal or pose/observed is not finite")
+        if ids.shape != nominal.shape[:1] or rate.shape != () or not rate > 0:
+            raise ValueError(f"pose/ids {ids.shape} or pose/rate {rate} does not fit the poses")
 
     def probabilities(self, source: str) -> NDArray:
         """(runs, n_test, classes), or empty."""

@@ -22,6 +22,7 @@ from retwin.report.blocks import (
 )
 from retwin.report.curves import Latent, Roc, latents, micro_roc
 from retwin.report.plots import caption, latent_names, latent_plot, roc_plot
+from retwin.report.poses import poses
 from retwin.report.results import Dataset, Results
 from retwin.report.scores import comparisons, further_scores, scores
 from retwin.report.words import (
@@ -321,6 +322,7 @@ SECTIONS: tuple[SectionMaker, ...] = (
     confusion,
     roc,
     discrepancy,
+    poses,
     surrogate,
     further_scores,
     time,

@@ -1,19 +1,43 @@
-"""Zarr: chunked folders for sets that are large; needs the extra `scale`."""
+"""Zarr: chunked folders for sets that are large; needs the extra `scale`.
+
+`write_zarr` writes a set that is at hand. A set that no memory holds is written by several
+processes, chunk by chunk: `create_chunked`, then `write_chunk` in any order, then `seal_chunked`.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
 from retwin.errors import InputError
 from retwin.storage.border import brief
-from retwin.storage.header import NAMES, arrays_of, check_header, header_of, restore
+from retwin.storage.header import (
+    CHUNKED,
+    CHUNKED_NAMES,
+    NAMES,
+    arrays_of,
+    check_chunk,
+    check_header,
+    chunk_digest,
+    header_of,
+    restore,
+    restore_chunked,
+)
 from retwin.trajectories import Trajectories
 
-__all__ = ["read_zarr", "write_zarr"]
+__all__ = [
+    "create_chunked",
+    "read_header",
+    "read_zarr",
+    "seal_chunked",
+    "write_chunk",
+    "write_zarr",
+]
 
 CHUNK = 128
 KEY = "retwin"
@@ -40,8 +64,10 @@ def write_zarr(trajectories: Trajectories, path: Path) -> None:
             target[...] = array
 
 
-def read_zarr(path: Path) -> Trajectories:
-    """Trajectories that `write_zarr` wrote.
+def read_zarr(path: Path, rows: slice = slice(None)) -> Trajectories:
+    """Trajectories that `write_zarr` wrote, or that were written chunk by chunk.
+
+    Of a set in chunks, only the chunks that hold `rows` are read; each is checked as a whole.
 
     Raises InputError for a damaged folder, one of another kind, a newer schema, or when the
     package zarr is not installed.
@@ -49,34 +75,110 @@ def read_zarr(path: Path) -> Trajectories:
     zarr = _zarr()
     try:
         group = zarr.open_group(str(path), mode="r")
-        header: Any = dict(group.attrs).get(KEY)
-        check_header(header, path.name)
+        header = _header(group, path.name)
+        if header["schema"] == CHUNKED:
+            return _read_chunks(group, header, path.name, rows)
         arrays = {name: np.array(header[name], dtype=np.str_) for name in TEXTS}
         for name in set(NAMES) - set(TEXTS):
-            _check_size(group[name], header["arrays"][name]["shape"], f"{path.name}: {name}")
+            _check_size(group[name], header["arrays"][name]["shape"], CHUNK, path.name)
             arrays[name] = np.asarray(group[name][...])
-        return restore(header, arrays, path.name)
+        return restore(header, arrays, path.name)[rows]
     except InputError:
         raise
     except Exception as error:
-        raise InputError(
-            "path",
-            expected="a readable Zarr folder of trajectories",
-            got=f"{path.name}, which is damaged or of another kind ({brief(error)})",
-            remedy="get or make the folder again",
-        ) from None
+        raise _damaged(path, error) from None
 
 
-def _check_size(array: Any, shape: list[int], where: str) -> None:
+def read_header(path: Path) -> dict[str, Any]:
+    """The header of a folder without its arrays; raises as `read_zarr` does."""
+    zarr = _zarr()
+    try:
+        return _header(zarr.open_group(str(path), mode="r"), path.name)
+    except InputError:
+        raise
+    except Exception as error:
+        raise _damaged(path, error) from None
+
+
+def create_chunked(path: Path, header: Mapping[str, Any], dtype: DTypeLike) -> None:
+    """Make the arrays of `chunked_header` in the new folder `path`, still without any values.
+
+    Numbers are stored as `dtype`. Raises InputError when the package zarr is not installed.
+    """
+    group = _zarr().open_group(str(path), mode="w", zarr_format=3)
+    kinds = {"mask": np.dtype(bool), "labels": np.dtype(np.int16)}
+    for name in CHUNKED_NAMES:
+        shape = header["arrays"][name]["shape"]
+        chunks = (header["chunk"], *(max(1, size) for size in shape[1:]))
+        kind = kinds.get(name, np.dtype(dtype)).newbyteorder("<")
+        group.create_array(name, shape=shape, dtype=kind, chunks=chunks)
+
+
+def write_chunk(path: Path, begin: int, arrays: Mapping[str, NDArray]) -> str:
+    """Write the chunk whose first trajectory is `begin`, and return its `chunk_digest`.
+
+    A chunk is a file of its own per array: processes that write different ones do not meet.
+    """
+    group = _zarr().open_group(str(path), mode="r+")
+    for name in CHUNKED_NAMES:
+        if arrays[name].size:
+            group[name][begin : begin + len(arrays[name])] = arrays[name]
+    return chunk_digest(arrays)
+
+
+def seal_chunked(path: Path, header: Mapping[str, Any]) -> None:
+    """Put the header on a folder whose chunks are all written; before that, nobody can read it."""
+    for left_over in path.rglob("*.partial"):  # of a process that was killed while it wrote
+        left_over.unlink()
+    _zarr().open_group(str(path), mode="r+").attrs[KEY] = dict(header)
+
+
+def _header(group: Any, where: str) -> dict[str, Any]:
+    header: Any = dict(group.attrs).get(KEY)
+    check_header(header, where, newest=CHUNKED)
+    return dict(header)
+
+
+def _read_chunks(group: Any, header: Mapping[str, Any], where: str, rows: slice) -> Trajectories:
+    """The trajectories at `rows`, with one chunk at a time in memory besides them."""
+    size = int(header["chunk"])
+    for name in CHUNKED_NAMES:
+        _check_size(group[name], header["arrays"][name]["shape"], size, where)
+    index = np.arange(group["labels"].shape[0])[rows]
+    arrays = {
+        name: np.empty((len(index), *group[name].shape[1:]), group[name].dtype)
+        for name in CHUNKED_NAMES
+    }
+    edges = np.flatnonzero(np.diff(index // size)) + 1
+    for here in np.split(np.arange(len(index)), edges) if len(index) else []:
+        number = int(index[here[0]]) // size
+        begin = number * size
+        chunk = {name: np.asarray(group[name][begin : begin + size]) for name in CHUNKED_NAMES}
+        check_chunk(header, chunk, number, where)
+        for name, array in chunk.items():
+            arrays[name][here] = array[index[here] - begin]
+    return restore_chunked(header, arrays, index)
+
+
+def _check_size(array: Any, shape: list[int], chunk: int, where: str) -> None:
     """Refuse a size that was not written, before memory is taken for it."""
-    largest = CHUNK * math.prod(max(1, size) for size in shape[1:])
+    largest = chunk * math.prod(max(1, size) for size in shape[1:])
     if list(array.shape) != shape or math.prod(array.chunks) > largest:
         raise InputError(
-            where,
+            f"{where}: {array.basename}",
             expected=f"shape {tuple(shape)}",
             got=f"shape {array.shape} in chunks of {array.chunks}",
             remedy="the folder is damaged: get or make it again",
         )
+
+
+def _damaged(path: Path, error: Exception) -> InputError:
+    return InputError(
+        "path",
+        expected="a readable Zarr folder of trajectories",
+        got=f"{path.name}, which is damaged or of another kind ({brief(error)})",
+        remedy="get or make the folder again",
+    )
 
 
 def _zarr() -> Any:

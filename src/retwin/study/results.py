@@ -34,6 +34,8 @@ __all__ = ["SCHEMA", "write_results"]
 SCHEMA = 1
 DRAWS = 10_000
 HOLM_FAMILY = ("macro_f1", "balanced_accuracy", "auroc")
+SHOWN = 3
+"""Trajectories whose poses the report draws."""
 COMPARED = (*HOLM_FAMILY, "accuracy", "healthy_recall")
 
 
@@ -83,6 +85,7 @@ def write_results(
     arrays |= {
         f"z/{name}": found[name] for name in ("observed", "identified", "predicted") if found
     }
+    arrays |= _poses(work, test)
     with write_atomically(out / "arrays.npz") as part:
         np.savez_compressed(part, allow_pickle=False, **arrays)
     with write_atomically(out / "results.json") as part:
@@ -239,6 +242,27 @@ def _fidelity(work: Work, found: Mapping[str, NDArray]) -> dict[str, Any]:
         "held_out": len(found["observed"]),
         "ks": tests,
         "coverage90": coverage,
+    }
+
+
+def _poses(work: Work, test: Trajectories) -> dict[str, NDArray]:
+    """Skeletons of the first test trajectory of some classes, healthy first, at the sensor's rate.
+
+    `pose/nominal` and `pose/observed` (k, T, points, 3) in m, `pose/ids` (k,), `pose/rate` in Hz.
+    """
+    body, labels = work.case.body, test.labels.tolist()
+    known = [name for name in work.case.classes if name in labels]
+    if body is None or not known:
+        return {}
+    spread = known[:: -(-len(known) // SHOWN)]
+    shown = test[[labels.index(name) for name in spread]]
+    every = max(1, round(test.rate / work.case.sensor_rate))
+    nominal, observed = (body.skeleton(joints[:, ::every]) for joints in body.poses(shown))
+    return {
+        "pose/nominal": nominal.astype(np.float32),
+        "pose/observed": observed.astype(np.float32),
+        "pose/ids": shown.ids,
+        "pose/rate": np.array(test.rate / every),
     }
 
 

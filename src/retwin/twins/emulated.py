@@ -1,89 +1,87 @@
-"""`EmulatedArm`: stands in for the real arm where no real data are at hand. Its data are emulated.
+"""`EmulatedArmPi`: stands in for the real arm where there are no real data; it is emulated.
 
-A `KinematicTwin` with what the twin is too ideal to have: movements that come late, joints that
-stop a little off, movements that a joint misses, readings polled at a low rate, and glitches. The
-discrepancy is known, so inference from outputs alone can be held against it.
+The MuJoCo arm with what it is too ideal to have. On the way in: movements that come late, joints
+that stop a little off or miss a movement, a dead zone in the servo. On the way out: backlash of the
+gear, readings polled at a low rate, rounded, joined linearly, and glitches. The discrepancy is
+known, so inference from outputs alone can be held against it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.faults import Fault, frozen_response
+from retwin.faults import Fault, frozen_from
 from retwin.segments import Segments
 from retwin.trajectories import Channels, Trajectories
-from retwin.twins.kinematic import KinematicTwin
-from retwin.twins.protocol import Chunk, Progress, simulate_in_chunks
+from retwin.twins.armpi import KINEMATIC, POLL, ArmPiTwin
+from retwin.twins.protocol import Chunk, Limits, Progress, simulate_in_chunks
 
-__all__ = ["EmulatedArm", "JointDiscrepancy"]
-
-
-@dataclass(frozen=True, eq=False)
-class JointDiscrepancy:
-    """What goes otherwise than commanded: delay (n, M) in samples, offset (n, M, d_u) in command
-    units, missed (n, M, d_u) bool.
-    """
-
-    delay: NDArray
-    offset: NDArray
-    missed: NDArray
+__all__ = ["EmulatedArmPi"]
 
 
 @dataclass(frozen=True)
-class EmulatedArm:
-    """A `KinematicTwin` that errs as a real arm does.
+class EmulatedArmPi:
+    """The arm as the real one behaves; its defaults are fitted to set A (docs/results.md).
+
+    A command unit is 0.24 degrees, a sample 10 ms.
 
     Parameters
     ----------
-    twin: the ideal arm.
-    delay: mean and standard deviation of a movement's delay, in samples (a gamma law).
-    offset: scale of the position a joint stops off by, in command units (Student's t, 4 degrees of
-        freedom: heavier tails than a Gaussian).
-    missed: probability that a joint misses a movement and catches up at the next.
-    poll: samples per reading; readings are joined linearly.
-    glitch: probability that a trajectory has a glitch of one or two readings.
-    glitch_size: size of the largest glitch, in output units.
+    delay: mean transport delay of a movement, in samples, beyond the servo's own.
+    jitter: standard deviation of that delay from movement to movement, in samples (a gamma law).
+    offset: scale of the error in the position that a joint stops at, in command units, one per
+        movement (Student's t with 8 degrees of freedom: heavier tails than a Gaussian).
+    bias: standard deviation of a joint's error that stays for a whole trajectory, in command units.
+    missed: probability that a joint misses a movement; it catches up at the next one.
+    dead_zone: greatest error that the servo leaves uncorrected, in command units.
+    backlash: play between gear and joint, in command units.
+    poll: samples per reading of the joints; readings are joined linearly.
+    noise: scale of a reading's error before it is rounded, in command units (Student's t with 3
+        degrees of freedom).
+    resolution: step of a reading, in command units.
+    glitch: probability that a trajectory has a glitch, one or two readings of one joint.
+    glitch_size: greatest error of such a reading, in command units (300 are 0.3 m at most).
+    arm: the ideal arm.
 
     """
 
-    twin: KinematicTwin
-    delay: tuple[float, float] = (3.0, 1.2)
-    offset: float = 2.5
+    delay: float = 2.2
+    jitter: float = 1.1
+    offset: float = 3.4
+    bias: float = 0.8
     missed: float = 0.015
-    poll: int = 10
-    glitch: float = 0.15
-    glitch_size: float = 0.3
+    dead_zone: float = 1.0
+    backlash: float = 0.5
+    poll: int = POLL
+    noise: float = 0.25
+    resolution: float = 1.0
+    glitch: float = 0.06
+    glitch_size: float = 300.0
+    arm: ArmPiTwin = field(default_factory=ArmPiTwin)
 
     @property
     def inputs(self) -> Channels:
         """Command channels."""
-        return self.twin.inputs
+        return self.arm.inputs
 
     @property
     def outputs(self) -> Channels:
         """Output channels."""
-        return self.twin.outputs
+        return self.arm.outputs
 
     @property
     def rate(self) -> float:
         """Samples per second."""
-        return self.twin.rate
+        return self.arm.rate
 
-    def discrepancy(self, segments: Segments, seed: int) -> JointDiscrepancy:
-        """The discrepancy that `simulate` draws with this seed; hidden states, for tests only."""
-        rng = np.random.default_rng([seed, 1])
-        shape = segments.start.shape
-        mean, deviation = self.delay
-        joints = (*shape, len(self.inputs))
-        return JointDiscrepancy(
-            delay=rng.gamma((mean / deviation) ** 2, deviation**2 / mean, size=shape),
-            offset=self.offset * rng.standard_t(4, size=joints),
-            missed=rng.random(joints) < self.missed,
-        )
+    @property
+    def limits(self) -> Limits:
+        """What the servos accept."""
+        return self.arm.limits
 
     def simulate(
         self,
@@ -92,65 +90,98 @@ class EmulatedArm:
         faults: Sequence[Fault | None] | None = None,
         seed: int,
         progress: Progress | None = None,
+        hidden: dict[str, NDArray] | None = None,
     ) -> Trajectories:
-        """See `Twin.simulate`: fault on the command, discrepancy, lag, freeze, map, measurement."""
-        # Everything at once: the discrepancy is drawn for all trajectories together.
-        everything = max(len(commands), 1)
+        """See `Twin.simulate`: fault on the command, discrepancy, servo, freeze, map, measurement.
+
+        `hidden`, for tests, is filled with the discrepancy that acted: "delay" (n, M) in samples,
+        "offset" (n, M, d_u) in command units with the trajectory's bias in it, "missed" (n, M, d_u)
+        bool; and with "angles" (n, T, d_u), where the joints were, in command units.
+        """
+        acted: list[dict[str, NDArray]] = []
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            effective = _effective(
-                chunk.told, chunk.segments, self.discrepancy(chunk.segments, seed)
-            )
-            response = frozen_response(self.twin.respond(effective), chunk.faults)
-            path = self.twin.position(response)
-            observed = self._measure(path, np.random.default_rng([seed, 2]))
-            return self.twin.position(chunk.commands), observed
+            rng = np.random.default_rng([seed, 1, chunk.index.start])
+            z = self._draw(chunk.segments, rng)
+            effective = _play(_effective(chunk.told, chunk.segments, z), self.dead_zone)
+            frozen = frozen_from(chunk.faults, chunk.commands.shape[1], len(self.inputs))
+            driven = self.arm.respond(effective, frozen, chunk.failed)
+            angles = _play(driven, self.backlash / 2)
+            acted.append(z | {"angles": angles})
+            observed = KINEMATIC.position(self._read(angles, frozen, rng))
+            return KINEMATIC.position(chunk.commands), observed
 
-        return simulate_in_chunks(
-            self,
-            run,
-            commands,
-            faults,
-            seed=seed,
-            progress=progress,
-            size=everything,
-            emulated=True,
+        made = simulate_in_chunks(
+            self, run, commands, faults, seed=seed, progress=progress, emulated=True
         )
+        if hidden is not None:
+            hidden |= {name: np.concatenate([each[name] for each in acted]) for name in acted[0]}
+        return made
 
-    def _measure(self, path: NDArray, rng: np.random.Generator) -> NDArray:
-        """The path (n, T, 3) polled, with glitches, joined linearly."""
-        n, steps, width = path.shape
-        time = np.arange(steps, dtype=float)
+    def _draw(self, segments: Segments, rng: np.random.Generator) -> dict[str, NDArray]:
+        """How each movement goes wrong."""
+        shape = segments.start.shape
+        joints = (*shape, len(self.inputs))
+        spread = max(self.jitter, 1e-9)
+        late = rng.gamma((self.delay / spread) ** 2, spread**2 / max(self.delay, 1e-9), size=shape)
+        lasting = self.bias * rng.normal(size=(len(segments), 1, len(self.inputs)))
+        return {
+            "delay": late,
+            "offset": lasting + self.offset * rng.standard_t(8, size=joints),
+            "missed": rng.random(joints) < self.missed,
+        }
+
+    def _read(self, angles: NDArray, frozen: NDArray, rng: np.random.Generator) -> NDArray:
+        """The joints (n, T, d_u) as they are read: polled, rounded, with glitches, joined."""
+        n, steps, width = angles.shape
         polls = np.arange(0, steps, self.poll)
-        readings = path[:, polls].copy()
-        for i in np.flatnonzero(rng.random(n) < self.glitch):
-            at = rng.integers(1, len(polls) - 2)
-            direction = rng.normal(size=width)
-            size = rng.uniform(0.1, 1.0) * self.glitch_size / np.linalg.norm(direction)
-            readings[i, at : at + rng.integers(1, 3)] += size * direction
-        right = np.searchsorted(polls, time, side="right").clip(1, len(polls) - 1)
-        span = polls[right] - polls[right - 1]
-        share = ((time - polls[right - 1]) / span).clip(0, 1)[:, None]
-        return readings[:, right - 1] * (1 - share) + readings[:, right] * share
+        noise = self.noise * rng.standard_t(3, size=(n, len(polls), width))
+        # A frozen joint is held in software: its readings stand still.
+        noise[polls[None, :, None] >= frozen[:, None, :]] = 0.0
+        readings = angles[:, polls] + noise
+        if self.resolution:
+            readings = self.resolution * np.round(readings / self.resolution)
+        hit = np.flatnonzero(rng.random(n) < self.glitch)
+        for i in hit if len(polls) > 3 else ():
+            at, joint = rng.integers(1, len(polls) - 2), rng.integers(width)
+            size = rng.uniform(0.1, 1.0) * self.glitch_size * rng.choice([-1.0, 1.0])
+            readings[i, at : at + rng.integers(1, 3), joint] += size
+        time = np.arange(steps)
+        right = np.searchsorted(polls, time, side="right").clip(1, max(len(polls) - 1, 1))
+        right = np.minimum(right, len(polls) - 1)
+        left = np.maximum(right - 1, 0)
+        span = np.maximum(polls[right] - polls[left], 1)
+        share = ((time - polls[left]) / span).clip(0, 1)[:, None]
+        return readings[:, left] * (1 - share) + readings[:, right] * share
 
 
-def _effective(told: NDArray, segments: Segments, z: JointDiscrepancy) -> NDArray:
+def _play(path: NDArray, half: float) -> NDArray:
+    """`path` (n, T, d) followed with a play of ±`half`: it moves only when pushed by an edge."""
+    if half <= 0:
+        return path
+    out = np.array(path, dtype=float)
+    for t in range(1, path.shape[1]):
+        out[:, t] = np.clip(out[:, t - 1], path[:, t] - half, path[:, t] + half)
+    return out
+
+
+def _effective(told: NDArray, segments: Segments, z: dict[str, NDArray]) -> NDArray:
     """What the joints are effectively told (n, T, d_u): late, off, and sometimes not at all."""
-    out = told.copy()
+    out = np.repeat(told[:, :1].astype(float), told.shape[1], axis=1)
     time = np.arange(told.shape[1], dtype=float)
     for i in range(len(told)):
-        before = told[i, 0].astype(float)
+        before = out[i, 0].copy()
         for m in np.flatnonzero(segments.valid[i]):
             begin, end = segments.start[i, m], segments.settle[i, m]
             first, last = (_at(told[i], when) for when in (begin, end))
-            goal = np.where(z.missed[i, m], before, last + z.offset[i, m])
-            late = np.clip(time - z.delay[i, m], begin, end)
+            goal = np.where(z["missed"][i, m], before, last + z["offset"][i, m])
+            late = np.clip(time - z["delay"][i, m], begin, end)
             moved = _at(told[i], late) - first
             extent = last - first
             # A joint that is told nothing new drifts to its offset while the others move.
             ramp = ((late - begin) / max(end - begin, 1e-9))[:, None]
             share = np.where(extent != 0, moved / np.where(extent != 0, extent, 1), ramp)
-            inside = time >= begin + z.delay[i, m]
+            inside = time >= begin + z["delay"][i, m]
             out[i, inside] = (before + share * (goal - before))[inside]
             before = goal
     return out
@@ -159,6 +190,7 @@ def _effective(told: NDArray, segments: Segments, z: JointDiscrepancy) -> NDArra
 def _at(values: NDArray, when: NDArray | float) -> NDArray:
     """Values (T, d) at fractional samples, linear between."""
     when = np.asarray(when, dtype=float)
-    below = np.clip(np.floor(when).astype(int), 0, len(values) - 2)
+    below = np.clip(np.floor(when).astype(int), 0, max(len(values) - 2, 0))
+    above = np.minimum(below + 1, len(values) - 1)
     share = (when - below)[..., None]
-    return values[below] * (1 - share) + values[below + 1] * share
+    return values[below] * (1 - share) + values[above] * share

@@ -11,7 +11,7 @@ from scipy.signal import cont2discrete, lfilter
 from retwin.faults import Fault, frozen_response
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins.arm import YawPitchArm
-from retwin.twins.protocol import Chunk, Progress, simulate_in_chunks
+from retwin.twins.protocol import Chunk, Limits, Progress, simulate_in_chunks
 
 __all__ = ["KinematicTwin", "ServoLag"]
 
@@ -57,6 +57,7 @@ class KinematicTwin:
     lag: the joints' closed loop; None follows at once.
     inputs, outputs: channels of commands and outputs.
     rate: samples per second.
+    limits: of the commands, if there are any.
 
     `nominal` is the forward kinematics of the clean commands without lag.
 
@@ -69,6 +70,7 @@ class KinematicTwin:
     inputs: Channels
     outputs: Channels
     rate: float
+    limits: Limits | None = None
 
     def angles(self, commands: NDArray) -> NDArray:
         """Joint angles in rad for commands or responses in command units, any leading shape."""

@@ -168,12 +168,13 @@ def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
     if (
         array.ndim != 3
         or len(array) == 0
+        or array.shape[1] < 2
         or array.shape[2] != len(inputs)
         or array.dtype.kind not in "fiu"
     ):
         raise InputError(
             "commands",
-            expected=f"numbers of shape (n, T, {len(inputs)})",
+            expected=f"numbers of shape (n, T, {len(inputs)}), T at least 2",
             got=f"{array.dtype} of shape {array.shape}",
             remedy=f"give one column per input channel, {', '.join(inputs.names)}",
         )

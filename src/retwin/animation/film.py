@@ -1,0 +1,85 @@
+"""Films: pictures to MP4 or GIF."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.errors import InputError
+
+__all__ = ["check_film", "write_film"]
+
+TICKS = 100
+"""GIF counts time in 1/100 s."""
+
+
+def check_film(path: str | os.PathLike[str]) -> str:
+    """The suffix of `path` if a film can be written there, else an InputError."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".mp4", ".gif"):
+        raise InputError(
+            "path",
+            expected="a name that ends in .mp4 or .gif",
+            got=str(path),
+            remedy="choose one of these formats by the name",
+        )
+    if suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise InputError(
+            "path",
+            expected="the package imageio-ffmpeg, which writes MP4",
+            got="an installation without it",
+            remedy='install it: pip install "retwin[render]", or write a *.gif',
+        )
+    return suffix
+
+
+def write_film(
+    pictures: Iterable[NDArray], path: Path, suffix: str, *, fps: float, size: tuple[int, int]
+) -> None:
+    """Write pictures (height, width, 3) of uint8 one after the other."""
+    if suffix == ".gif":
+        _write_gif(pictures, path, fps)
+    else:
+        _write_mp4(pictures, path, fps, size)
+
+
+def _write_gif(pictures: Iterable[NDArray], path: Path, fps: float) -> None:
+    from PIL import Image
+
+    frames = [Image.fromarray(picture) for picture in pictures]
+    # One palette for all: with one each, plain areas flicker.
+    shown = np.hstack([np.asarray(frames[i]) for i in (0, len(frames) // 2, -1)])
+    palette = Image.fromarray(shown).quantize(256, dither=Image.Dither.NONE)
+    drawn = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    # From the moments and not from one length, so that rounding does not change the speed.
+    ends = np.round(np.arange(len(frames) + 1) * TICKS / fps).astype(int)
+    milliseconds = (1000 // TICKS * np.diff(ends)).tolist()
+    next(drawn).save(
+        path, save_all=True, append_images=drawn, duration=milliseconds, loop=0, optimize=False
+    )
+
+
+def _write_mp4(pictures: Iterable[NDArray], path: Path, fps: float, size: tuple[int, int]) -> None:
+    from imageio_ffmpeg import write_frames
+
+    film = write_frames(
+        str(path),
+        size,
+        fps=fps,
+        codec="libx264",
+        quality=None,
+        macro_block_size=2,
+        ffmpeg_log_level="error",
+        output_params=["-crf", "20", "-movflags", "+faststart", "-fflags", "+bitexact"],
+    )
+    film.send(None)
+    try:
+        for picture in pictures:
+            film.send(np.ascontiguousarray(picture))
+    finally:
+        film.close()

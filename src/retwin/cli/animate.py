@@ -1,0 +1,75 @@
+"""`retwin twin animate`: one trajectory as a film."""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from retwin.animation import animate as film
+from retwin.animation.film import check_film
+from retwin.cli.terminal import bar
+from retwin.errors import InputError
+from retwin.storage import load
+
+__all__ = ["animate"]
+
+
+class Renderer(StrEnum):
+    """What draws the pictures."""
+
+    auto = "auto"
+    mujoco = "mujoco"
+    stick = "stick"
+
+
+def animate(
+    file: Annotated[Path, typer.Argument(help="File or folder of trajectories.")],
+    out: Annotated[Path, typer.Option(help="The film, *.mp4 or *.gif.")],
+    case: Annotated[
+        str, typer.Option(help="Case the data belong to: a built-in name or module:object.")
+    ] = "armpi",
+    name: Annotated[str | None, typer.Option("--id", help="Which trajectory, by its id.")] = None,
+    index: Annotated[int, typer.Option(min=0, help="Which trajectory, by its place.")] = 0,
+    fps: Annotated[float, typer.Option(help="Pictures per second.")] = 25.0,
+    size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "640x480",
+    renderer: Annotated[
+        Renderer, typer.Option(help="What draws: MuJoCo, stick figures, or the best there is.")
+    ] = Renderer.auto,
+) -> None:
+    """Film a trajectory: the nominal motion as a ghost, the observed one solid."""
+    from retwin import cases
+
+    check_film(out)
+    shape = _size(size)
+    found = cases.get(case)
+    with bar("animate") as tell:
+        tell(f"read {file.name}", 0.0)
+        trajectories = load(file, case=found)
+        path = film(
+            trajectories,
+            found,
+            out,
+            index=index if name is None else name,
+            fps=fps,
+            size=shape,
+            renderer=renderer.value,
+            progress=lambda share: tell("draw", share),
+        )
+    Console().print(str(path), markup=False, highlight=False, soft_wrap=True)
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if found is None:
+        raise InputError(
+            "--size",
+            expected="WIDTHxHEIGHT in pixels",
+            got=repr(text),
+            remedy="640x480 is usual",
+        )
+    return int(found[1]), int(found[2])

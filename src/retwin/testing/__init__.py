@@ -1,0 +1,31 @@
+"""Contract suites: what every twin, correction and diagnoser must do, to be run on your own too.
+
+A suite is a tuple of checks. A check takes a subject, and raises AssertionError with what is wrong.
+With pytest, which is not needed:
+
+    SUBJECT = TwinSubject(MyTwin(), commands)
+
+    @pytest.mark.parametrize("check", TWIN_CHECKS, ids=lambda check: check.__name__)
+    def test_contract(check):
+        check(SUBJECT)
+
+Without, `check_twin(MyTwin(), commands)` runs them all and lists everything that is broken.
+"""
+
+from __future__ import annotations
+
+from retwin.testing.corrections import CORRECTION_CHECKS, CorrectionSubject, check_correction
+from retwin.testing.diagnosers import DIAGNOSER_CHECKS, DiagnoserSubject, check_diagnoser
+from retwin.testing.twins import TWIN_CHECKS, TwinSubject, check_twin
+
+__all__ = [
+    "CORRECTION_CHECKS",
+    "DIAGNOSER_CHECKS",
+    "TWIN_CHECKS",
+    "CorrectionSubject",
+    "DiagnoserSubject",
+    "TwinSubject",
+    "check_correction",
+    "check_diagnoser",
+    "check_twin",
+]

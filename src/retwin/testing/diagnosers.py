@@ -1,0 +1,175 @@
+"""The contract of `Diagnoser`: what every classifier of trajectories must do, as checks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.errors import InputError
+from retwin.testing.suite import (
+    quiet_randomness,
+    require,
+    require_alike,
+    require_refused,
+    require_same,
+    run_checks,
+)
+from retwin.trajectories import Channels, Source, Trajectories
+
+if TYPE_CHECKING:  # torch takes seconds to load, and twins can be checked without it
+    from retwin.diagnosis import Diagnoser
+
+__all__ = ["DIAGNOSER_CHECKS", "DiagnoserSubject", "check_diagnoser"]
+
+
+@dataclass(frozen=True, eq=False)
+class DiagnoserSubject:
+    """A diagnoser, and what it is to be tried on.
+
+    Parameters
+    ----------
+    diagnoser: fitted.
+    trajectories: at least two of the kind that it was fitted on.
+
+    Raises
+    ------
+    InputError: fewer than two trajectories.
+
+    """
+
+    diagnoser: Diagnoser
+    trajectories: Trajectories
+
+    def __post_init__(self) -> None:
+        if len(self.trajectories) < 2:
+            raise InputError(
+                "trajectories",
+                expected="at least two",
+                got=f"{len(self.trajectories)}",
+                remedy="give a few of the kind that the diagnoser was fitted on",
+            )
+
+    def predict(self, trajectories: Trajectories | None = None) -> NDArray:
+        """Probabilities, by default of the subject's trajectories."""
+        return self.diagnoser.predict_proba(
+            self.trajectories if trajectories is None else trajectories
+        )
+
+
+def check_protocol(subject: DiagnoserSubject) -> None:
+    """It has classes, each named once, and predict_proba."""
+    from retwin.diagnosis import Diagnoser
+
+    require(
+        isinstance(subject.diagnoser, Diagnoser),
+        "a diagnoser must have classes and predict_proba, see retwin.Diagnoser",
+    )
+    classes = subject.diagnoser.classes
+    named = isinstance(classes, tuple) and all(isinstance(name, str) for name in classes)
+    several = len(classes) == len(set(classes)) >= 2
+    require(named and several, f"classes must be a tuple of different names, got {classes!r}")
+
+
+def check_probabilities(subject: DiagnoserSubject) -> None:
+    """One probability per class, none below 0, that sum to 1."""
+    shape = (len(subject.trajectories), len(subject.diagnoser.classes))
+    got = subject.predict()
+    sound = isinstance(got, np.ndarray) and got.shape == shape and got.dtype.kind == "f"
+    require(sound, f"predict_proba must give an array of shape {shape}, got {np.shape(got)}")
+    require((got >= 0).all(), f"probabilities must not be below 0, got {got.min()}")
+    require_alike(got.sum(axis=1), np.ones(shape[0]), "probabilities must sum to 1")
+
+
+def check_blindness(subject: DiagnoserSubject) -> None:
+    """Labels, names and provenance are not looked at."""
+    n = len(subject.trajectories)
+    wanted = subject.predict()
+    wrong = np.resize(subject.diagnoser.classes, n)
+    for what, given in {
+        "the labels": subject.trajectories.replace(labels=wrong),
+        "whether there are labels": subject.trajectories.replace(labels=None),
+        "the ids": subject.trajectories.replace(ids=[f"another {i}" for i in range(n)]),
+        "the provenance": subject.trajectories.replace(provenance=(Source("elsewhere"),)),
+        "whether they are emulated": subject.trajectories.replace(
+            emulated=not subject.trajectories.emulated
+        ),
+    }.items():
+        require_same(subject.predict(given), wanted, f"predict_proba must not depend on {what}")
+
+
+def check_batch(subject: DiagnoserSubject) -> None:
+    """What a trajectory gives does not depend on those beside it, or on their order."""
+    whole = subject.predict()
+    turned = subject.predict(subject.trajectories[::-1])
+    require_alike(turned, whole[::-1], "order must not matter")
+    for i in range(len(whole)):
+        alone = subject.predict(subject.trajectories[i : i + 1])
+        require_alike(alone, whole[i : i + 1], f"trajectory {i} must give the same alone")
+
+
+def check_missing(subject: DiagnoserSubject) -> None:
+    """Missing measurements do not make probabilities NaN, were they all missing."""
+    for share in (2, 1):
+        mask = subject.trajectories.mask.copy()
+        mask[:, : mask.shape[1] // share] = False
+        got = subject.predict(subject.trajectories.replace(mask=mask))
+        message = f"1/{share} of the measurements missing: probabilities must be finite, sum to 1"
+        require(np.isfinite(got).all() and np.allclose(got.sum(axis=1), 1), message)
+
+
+def check_other_data(subject: DiagnoserSubject) -> None:
+    """Other channels or another rate than it was trained on are refused."""
+    given = subject.trajectories
+    units = given.outputs.units
+    other = Channels(tuple(f"not {name}" for name in given.outputs.names), units)
+    more = Channels((*given.outputs.names, "one more"), (*units, "1"))
+    wide = given.replace(
+        nominal=np.concatenate([given.nominal, given.nominal[..., :1]], axis=2),
+        observed=np.concatenate([given.observed, given.observed[..., :1]], axis=2),
+        mask=np.concatenate([given.mask, given.mask[..., :1]], axis=2),
+        outputs=more,
+    )
+    for what, argument, strange in (
+        ("twice the rate", "rate", given.replace(rate=2 * given.rate)),
+        ("outputs of other names", "outputs", given.replace(outputs=other)),
+        ("an output too many", "outputs", wide),
+    ):
+        require_refused(
+            lambda t=strange: subject.predict(t),  # type: ignore[misc]
+            f"trajectories.{argument}",
+            what,
+        )
+
+
+def check_same_again(subject: DiagnoserSubject) -> None:
+    """The same trajectories give the same bytes, and no generator is touched."""
+    with quiet_randomness():
+        first, second = subject.predict(), subject.predict()
+    require_same(second, first, "predict_proba must give the same bytes again")
+
+
+DIAGNOSER_CHECKS: tuple[Callable[[DiagnoserSubject], None], ...] = (
+    check_protocol,
+    check_probabilities,
+    check_blindness,
+    check_batch,
+    check_missing,
+    check_other_data,
+    check_same_again,
+)
+
+
+def check_diagnoser(diagnoser: Diagnoser, trajectories: Trajectories) -> None:
+    """Run all `DIAGNOSER_CHECKS`, see `DiagnoserSubject` for the arguments.
+
+    Raises
+    ------
+    AssertionError: one that lists everything the diagnoser breaks.
+
+    """
+    subject = DiagnoserSubject(diagnoser, trajectories)
+    run_checks(DIAGNOSER_CHECKS, subject, type(diagnoser).__name__)

@@ -1,0 +1,210 @@
+"""What an FMU says of itself: read and checked, without loading its native code."""
+
+from __future__ import annotations
+
+import difflib
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from retwin.errors import InputError
+from retwin.storage.border import brief
+from retwin.trajectories import Channels
+from retwin.twins.protocol import Limits
+
+__all__ = [
+    "channels_of",
+    "extract",
+    "find_variables",
+    "limits_of",
+    "read_description",
+    "start_column",
+]
+
+NUMBERS = ("Real", "Float32", "Float64")
+WHOLE = (
+    "Integer",
+    "Enumeration",
+    *(f"{u}Int{bits}" for u in ("", "U") for bits in (8, 16, 32, 64)),
+)
+SCALARS = (*NUMBERS, *WHOLE, "Boolean")
+UNLIMITED = 1e30
+"""Tools write the largest float where they mean no limit."""
+
+
+def _fmpy() -> Any:
+    try:
+        import fmpy
+    except ImportError:
+        raise InputError(
+            "path",
+            expected="the package fmpy, which runs FMUs",
+            got="an installation without it",
+            remedy='install it: pip install "retwin[fmu]"',
+        ) from None
+    return fmpy
+
+
+def read_description(path: Path) -> Any:
+    """FMPy's model description of an FMU that can run here; loads no native code."""
+    fmpy = _fmpy()
+
+    def refuse(expected: str, got: str, remedy: str) -> InputError:
+        return InputError("path", expected=expected, got=f"{path.name}, {got}", remedy=remedy)
+
+    if not path.is_file() or not zipfile.is_zipfile(path):
+        got = "which is no zip file" if path.is_file() else "which is not there"
+        raise refuse("an FMU, a zip file", got, "give the path of a .fmu file")
+    try:
+        # Not validated against FMI's schema: many FMUs that run break it in some small way.
+        description = fmpy.read_model_description(path, validate=False)
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except Exception as error:  # FMPy raises nothing more special
+        raise refuse(
+            "an FMU with a readable modelDescription.xml",
+            f"which has none ({brief(error)})",
+            "export it again",
+        ) from None
+    if description.coSimulation is None or description.fmiMajorVersion == 1:
+        raise refuse(
+            "an FMU for co-simulation, FMI 2.0 or 3.0",
+            f"FMI {description.fmiVersion} for "
+            + ("model exchange" if description.coSimulation is None else "co-simulation"),
+            "export it for co-simulation, which brings its own solver",
+        )
+    platform = fmpy.platform if description.fmiMajorVersion == 2 else fmpy.platform_tuple
+    library = description.coSimulation.modelIdentifier + fmpy.sharedLibraryExtension
+    if f"binaries/{platform}/{library}" not in names:
+        there = sorted({name.split("/")[1] for name in names if name.startswith("binaries/")})
+        raise refuse(
+            f"native code for this machine, binaries/{platform}/{library}",
+            f"which has {', '.join(filter(None, there)) or 'none'}",
+            "export it for this system",
+        )
+    return description
+
+
+def extract(path: Path, folder: str) -> None:
+    """Unpack an FMU. Members cannot leave the folder: FMPy and zipfile see to that."""
+    try:
+        _fmpy().extract(path, folder)
+    except Exception as error:  # FMPy raises nothing more special
+        raise InputError(
+            "path",
+            expected="an FMU that can be unpacked",
+            got=f"{path.name} ({brief(error)})",
+            remedy="get or make the file again",
+        ) from None
+
+
+def find_variables(description: Any, argument: str, names: Sequence[str]) -> list[Any]:
+    """The variables called `names`, or all that can be a channel."""
+    causality = argument.removesuffix("s")
+    every = {variable.name: variable for variable in description.modelVariables}
+    able = {
+        name: variable
+        for name, variable in every.items()
+        if variable.causality == causality
+        and variable.type in SCALARS
+        and not variable.shape
+        and not variable.clocks
+    }
+    for name in names:
+        if name not in able:
+            raise InputError(
+                argument,
+                expected=f"variables that are an {causality} and a scalar number",
+                got=f"{name!r}, {_what(every.get(name))}",
+                remedy=_close(name, able),
+            )
+    return [able[name] for name in names] if names else list(able.values())
+
+
+def _what(variable: Any) -> str:
+    if variable is None:
+        return "which the FMU does not have"
+    shape = f" of shape {variable.shape}" if variable.shape else ""
+    clocked = " with a clock" if variable.clocks else ""
+    return f"whose causality is {variable.causality}, type {variable.type}{shape}{clocked}"
+
+
+def _close(name: str, names: Sequence[str] | Mapping[str, Any]) -> str:
+    """What may have been meant, and what there is."""
+    near = difflib.get_close_matches(name, names, n=3)
+    meant = f"did you mean {' or '.join(near)}? " if near else ""
+    more = f", … ({len(names)} in all)" if len(names) > 10 else ""
+    return f"{meant}there are: {', '.join(list(names)[:10]) or 'none'}{more}"
+
+
+def _declared(variable: Any, attribute: str) -> Any:
+    """An attribute of a variable, or else of the type it refers to."""
+    value = getattr(variable, attribute)
+    return value if value is not None else getattr(variable.declaredType, attribute, None)
+
+
+def channels_of(variables: Sequence[Any]) -> Channels:
+    """Names and units; "1" where a variable has no unit."""
+    return Channels(
+        tuple(variable.name for variable in variables),
+        tuple(_declared(variable, "unit") or "1" for variable in variables),
+    )
+
+
+def limits_of(variables: Sequence[Any], outside: Literal["refuse", "clip"]) -> Limits | None:
+    """The ranges the FMU declares for its inputs; None where it declares none."""
+
+    def bound(variable: Any, attribute: str, open_end: float) -> float:
+        if variable.type == "Boolean":
+            return float(attribute == "max")
+        declared = _declared(variable, attribute)
+        value = open_end if declared is None else float(declared)
+        return value if abs(value) < UNLIMITED else open_end
+
+    low = tuple(bound(variable, "min", -np.inf) for variable in variables)
+    high = tuple(bound(variable, "max", np.inf) for variable in variables)
+    return None if np.isinf([*low, *high]).all() else Limits(low, high, outside)
+
+
+def start_column(
+    description: Any, name: str, value: Any, count: int, inputs: Sequence[str]
+) -> list[Any]:
+    """One checked start value per trajectory."""
+    from fmpy.simulation import settable_in_initialization_mode, settable_in_instantiated
+
+    able = {
+        variable.name: variable
+        for variable in description.modelVariables
+        if (settable_in_instantiated(variable) or settable_in_initialization_mode(variable))
+        and variable.causality != "structuralParameter"
+        and variable.type in (*SCALARS, "String")
+        and not variable.shape
+        and variable.name not in inputs
+    }
+    if name not in able:
+        raise InputError(
+            "start",
+            expected="scalar variables that can be set before a run, and are no commands",
+            got=repr(name),
+            remedy=_close(name, able),
+        )
+    kind = able[name].type
+    array = np.asarray(value)
+    fits = array.shape in ((), (count,)) and array.dtype.kind in (
+        "U" if kind == "String" else "biuf"
+    )
+    if fits and kind != "String":
+        fits = bool(np.isfinite(array).all())
+        if kind not in NUMBERS:
+            fits = fits and not np.any(array % 1)
+    if not fits:
+        raise InputError(
+            "start",
+            expected=f"for {name} ({kind}) one fitting value, or one per trajectory, {count}",
+            got=f"{array.dtype} of shape {array.shape}" if array.ndim else repr(value),
+            remedy="give finite numbers, whole ones for whole types",
+        )
+    return np.broadcast_to(array, (count,)).tolist()

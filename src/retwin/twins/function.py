@@ -1,0 +1,303 @@
+"""`FunctionTwin`: any Python function from commands to outputs, over processes if asked for."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
+from dataclasses import KW_ONLY, dataclass
+from functools import partial
+from numbers import Real
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pebble import ProcessExpired, ProcessPool
+
+from retwin.errors import InputError
+from retwin.faults import Fault
+from retwin.processes import worker_pool
+from retwin.trajectories import Channels, Trajectories
+from retwin.twins.protocol import Chunk, Limits, Progress, simulate_in_chunks
+
+__all__ = ["FunctionTwin"]
+
+CHUNK = 128
+"""Trajectories that a vectorised function gets at once."""
+
+Function = Callable[..., ArrayLike]
+
+
+@dataclass(frozen=True)
+class FunctionTwin:
+    """A twin that is a Python function.
+
+    Parameters
+    ----------
+    function: commands in, outputs out, both in physical units. Vectorised: (n, T, d_u) to
+        (n, T, d_y), for at most 128 trajectories at a time. Else (T, d_u) to (T, d_y). With a
+        parameter `rng` it is stochastic, and gets a `numpy.random.Generator` by that name.
+    inputs, outputs: channels of commands and outputs.
+    rate: samples per second.
+    vectorised: whether `function` takes many trajectories at once.
+    nominal: the ideal output for clean commands, called as `function` is; by default what
+        `function` itself says. A stochastic function needs one: what is ideal has no noise.
+    limits: what commands must keep.
+    workers: processes that a function of one trajectory is spread over; 1 runs it in this one.
+
+    The actuators are inside the function, out of sight: a frozen response is a held command. The
+    generator is drawn from the seed and the index of the (first) trajectory, so the same seed gives
+    the same bytes whatever `workers`.
+
+    Raises
+    ------
+    InputError: something that cannot be called, a stochastic function without `nominal`, a rate
+        that is not positive, `workers` below 1 or for a vectorised function, or more than one for a
+        function that other processes cannot import.
+
+    """
+
+    function: Function
+    inputs: Channels
+    outputs: Channels
+    rate: float
+    _: KW_ONLY
+    vectorised: bool = True
+    nominal: Function | None = None
+    limits: Limits | None = None
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        for role, given in (("function", self.function), ("nominal", self.nominal)):
+            if not (callable(given) or (role == "nominal" and given is None)):
+                raise InputError(
+                    role,
+                    expected="something that can be called with commands",
+                    got=repr(given),
+                    remedy="give a function of the commands that returns the outputs",
+                )
+        if _takes_rng(self.function) and self.nominal is None:
+            raise InputError(
+                "nominal",
+                expected=f"a function for the ideal output, since {_name(self.function)} is random",
+                got="None",
+                remedy="give nominal=, the same without noise",
+            )
+        if not (isinstance(self.rate, Real) and math.isfinite(self.rate) and self.rate > 0):
+            raise InputError(
+                "rate",
+                expected="a positive number of samples per second",
+                got=repr(self.rate),
+                remedy="give the sample rate in Hz",
+            )
+        if self.workers < 1 or (self.vectorised and self.workers > 1):
+            raise InputError(
+                "workers",
+                expected="1, or more for a function of one trajectory",
+                got=f"{self.workers} with vectorised={self.vectorised}",
+                remedy="leave workers out, or give vectorised=False",
+            )
+        if self.workers > 1:
+            _check_importable(self.function, "function")
+            _check_importable(self.nominal, "nominal")
+
+    def simulate(
+        self,
+        commands: NDArray,
+        *,
+        faults: Sequence[Fault | None] | None = None,
+        seed: int,
+        progress: Progress | None = None,
+    ) -> Trajectories:
+        """See `Twin.simulate`. What the function raises comes through as it is.
+
+        Raises InputError too when the function returns another shape, no numbers, NaN or infinite
+        ones; `SimulationError` names trajectories whose worker process died.
+        """
+
+        def tell(chunk: Chunk, share: float) -> None:
+            if progress is not None:
+                done = chunk.index.start + share * len(chunk.commands)
+                progress(done / len(commands))
+
+        # No process is started before commands and faults are found good.
+        with nullcontext() if self.workers == 1 else worker_pool(self.workers) as pool:
+            run = partial(self._run, seed=seed, pool=pool, tell=tell)
+            return simulate_in_chunks(
+                self, run, commands, faults, seed=seed, progress=progress, size=CHUNK
+            )
+
+    def _run(
+        self, chunk: Chunk, *, seed: int, pool: ProcessPool | None, tell: Callable
+    ) -> tuple[NDArray, NDArray]:
+        held = chunk.held
+        every = np.arange(len(held))
+        # Without a nominal of its own, the function need not say twice what a healthy one does.
+        fresh = every
+        if self.nominal is None:
+            fresh = np.flatnonzero((held != chunk.commands).any(axis=(1, 2)))
+        ideal = "function" if self.nominal is None else "nominal"
+        clean = self._calls(ideal, chunk, chunk.commands, every, seed)
+        calls = [*clean, *self._calls("function", chunk, held, fresh, seed)]
+        answers = []
+        for answer in _answers(calls, pool, chunk):
+            answers.append(answer)
+            tell(chunk, len(answers) / len(calls))
+        nominal = np.concatenate(answers[: len(clean)]).astype(chunk.commands.dtype)
+        observed = nominal.copy()
+        if len(fresh):
+            observed[fresh] = np.concatenate(answers[len(clean) :])
+        return nominal, observed
+
+    def _calls(
+        self, role: str, chunk: Chunk, commands: NDArray, rows: NDArray, seed: int
+    ) -> list[_Call]:
+        """The calls that give the outputs of those rows of the chunk, in order."""
+        function = getattr(self, role)
+        random = role == "function" and _takes_rng(function)
+        if len(rows) == 0:
+            return []
+        parts = [rows] if self.vectorised else np.split(rows, len(rows))
+        return [
+            _Call(
+                function=function,
+                role=role,
+                # A copy: what the function does to its argument stays there.
+                commands=commands[part],
+                outputs=self.outputs,
+                ids=part + chunk.index.start,
+                alone=not self.vectorised,
+                seed=seed if random else None,
+            )
+            for part in parts
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Call:
+    """One call of a user's function: what it gets, and what it must give."""
+
+    function: Function
+    role: str
+    commands: NDArray
+    outputs: Channels
+    ids: NDArray
+    alone: bool
+    seed: int | None
+
+    def answer(self) -> NDArray:
+        """The outputs (n, T, d_y), checked."""
+        given = self.commands[0] if self.alone else self.commands
+        if self.seed is None:
+            returned = self.function(given)
+        else:
+            # A key of its own: the faults' severities are drawn from the bare seed.
+            sequence = np.random.SeedSequence(self.seed, spawn_key=(int(self.ids[0]),))
+            returned = self.function(given, rng=np.random.default_rng(sequence))
+        outputs = self._numbers(returned)
+        outputs = outputs[None] if self.alone else outputs
+        self._check_finite(outputs)
+        return outputs
+
+    def _numbers(self, returned: ArrayLike) -> NDArray:
+        shape = (*self.commands.shape[:2], len(self.outputs))[int(self.alone) :]
+        try:
+            # A copy: the function may use its own array again.
+            values = np.array(returned)
+            got = f"{values.dtype} of shape {values.shape}"
+        except (TypeError, ValueError, RuntimeError) as error:
+            values = np.empty(0)
+            got = " ".join(str(error).split())
+        if values.shape != shape or values.dtype.kind not in "fiub":
+            names = ", ".join(self.outputs.names)
+            other = "vectorised=False if it takes one trajectory, (T, d_u)"
+            if self.alone:
+                other = "vectorised=True if it takes many trajectories, (n, T, d_u)"
+            raise InputError(
+                self.role,
+                expected=f"{_name(self.function)} to return numbers of shape {shape}",
+                got=f"{type(returned).__name__}, {got}",
+                remedy=f"return one column per output channel, {names}; give {other}",
+            )
+        return values
+
+    def _check_finite(self, outputs: NDArray) -> None:
+        bad = ~np.isfinite(outputs)
+        if bad.any():
+            row, sample, channel = np.argwhere(bad)[0]
+            raise InputError(
+                self.role,
+                expected=f"{_name(self.function)} to return finite numbers",
+                got=f"{outputs[row, sample, channel]} for {self.outputs.names[channel]} in "
+                f"trajectory {self.ids[row]}, sample {sample}",
+                remedy="mend the function, or give limits that keep commands where it holds",
+            )
+
+
+def _answers(calls: Sequence[_Call], pool: ProcessPool | None, chunk: Chunk) -> Iterator[NDArray]:
+    """What each call gives, in order; a trajectory whose process died is noted as failed."""
+    if pool is None:
+        yield from (call.answer() for call in calls)
+        return
+    # Packed here, so that a function the worker cannot import ends its call, and not the pool.
+    futures = [pool.schedule(_in_worker, args=(pickle.dumps(call), call.role)) for call in calls]
+    for call, future in zip(calls, futures, strict=True):
+        try:
+            yield future.result()
+        except BrokenProcessPool as error:
+            raise InputError(
+                "workers",
+                expected="worker processes that can start",
+                got=str(error),
+                remedy="call it from a script, under `if __name__ == '__main__':`, or workers=1",
+            ) from error
+        except ProcessExpired as error:
+            chunk.failed[int(call.ids[0]) - chunk.index.start] = (
+                f"the process of {_name(call.function)} died, exit code {error.exitcode}"
+            )
+            yield np.zeros((*call.commands.shape[:2], len(call.outputs)))
+
+
+def _in_worker(packed: bytes, role: str) -> NDArray:
+    try:
+        call = pickle.loads(packed)
+    except (AttributeError, ImportError) as error:
+        raise _not_importable(role, str(error)) from error
+    try:
+        return call.answer()
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            # An exception that cannot cross the border would break the pool.
+            raise RuntimeError(f"{type(error).__name__}: {error}") from error
+        raise
+
+
+def _check_importable(function: Function | None, role: str) -> None:
+    try:
+        pickle.dumps(function)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise _not_importable(role, str(error)) from error
+
+
+def _not_importable(role: str, reason: str) -> InputError:
+    return InputError(
+        role,
+        expected="a function that worker processes can import",
+        got=" ".join(reason.split()),
+        remedy="define it in a module of its own, or give workers=1",
+    )
+
+
+def _takes_rng(function: Function) -> bool:
+    try:
+        return "rng" in inspect.signature(function).parameters
+    except (TypeError, ValueError):  # some compiled functions do not tell
+        return False
+
+
+def _name(function: Function) -> str:
+    return getattr(function, "__qualname__", type(function).__qualname__)

@@ -1,0 +1,352 @@
+"""FMUs: the right numbers at the right times, and no harm from those that hang or crash."""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fmus import c_fmu, changed, described, python_fmu
+
+import retwin as rt
+from retwin.twins.fmu import FMUTwin
+
+TAU = 0.1
+RATE = 100.0
+
+
+@pytest.fixture(scope="module")
+def lag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return c_fmu(tmp_path_factory.mktemp("lag"))
+
+
+@pytest.fixture(scope="module")
+def pylag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return python_fmu(tmp_path_factory.mktemp("pylag"))
+
+
+def lagged(inputs: np.ndarray, seconds: float, gain: float = 1.0) -> np.ndarray:
+    """The exact response (K,) of the lag to inputs (K,) held for `seconds` each."""
+    out = np.zeros(len(inputs))
+    decay = np.exp(-seconds / TAU)
+    for k in range(1, len(inputs)):
+        target = gain * inputs[k - 1]
+        out[k] = target + (out[k - 1] - target) * decay
+    return out
+
+
+@pytest.mark.parametrize("fmu", ["lag", "pylag"])
+def test_step_response_is_exact(fmu: str, request: pytest.FixtureRequest) -> None:
+    twin = FMUTwin.from_file(request.getfixturevalue(fmu), RATE, ["u"], ["x"], workers=1)
+    assert isinstance(twin, rt.Twin)
+    made = twin.simulate(np.full((3, 80, 1), 2.0), seed=0)
+    truth = 2.0 * (1.0 - np.exp(-np.arange(80) / RATE / TAU))
+    for observed in made.observed[:, :, 0]:
+        np.testing.assert_allclose(observed, truth, atol=1e-12)
+    assert made.nominal.tobytes() == made.observed.tobytes()
+
+
+def test_continuous_inputs_are_linear_within_a_sample(lag: Path) -> None:
+    rng = np.random.default_rng(0)
+    commands = rng.uniform(-5, 5, size=(2, 30, 1))
+    twin = FMUTwin.from_file(lag, RATE, ["u"], ["x"], step=1 / (4 * RATE), workers=1)
+    made = twin.simulate(commands, seed=0)
+    fine = np.interp(np.arange(29 * 4 + 1) / 4, np.arange(30), commands[1, :, 0])
+    truth = lagged(fine, 1 / (4 * RATE))[::4]
+    np.testing.assert_allclose(made.observed[1, :, 0], truth, atol=1e-12)
+
+
+def test_an_input_may_have_a_rate_of_its_own(lag: Path) -> None:
+    commands = np.zeros((1, 40, 2))
+    commands[0, :, 0] = np.linspace(0, 8, 40)
+    commands[0, :, 1] = np.linspace(10, 49, 40)
+    rates = {"u": 20.0, "trouble": 100 / 3}
+    twin = FMUTwin.from_file(lag, RATE, ["u", "trouble"], ["x", "seen"], rates=rates, workers=1)
+    made = twin.simulate(commands, seed=0)
+    held = commands[0, np.arange(40) // 5 * 5, 0]
+    np.testing.assert_allclose(made.observed[0, :, 0], lagged(held, 1 / RATE), atol=1e-12)
+    thirds = np.floor(np.arange(39) / 3 + 1e-9) * 3
+    np.testing.assert_array_equal(made.observed[0, 1:, 1], 10 + thirds)
+
+
+def test_whole_numbers_are_rounded_and_held(lag: Path, pylag: Path) -> None:
+    commands = np.array([[10.4, 10.6, 11.0, 40.0], [0.2, 0.9, 0.4, 1.0]]).T[None]
+    twin = FMUTwin.from_file(lag, RATE, ["trouble", "on"], ["seen"], step=0.005, workers=1)
+    assert twin.simulate(commands, seed=0).observed[0, :, 0].tolist() == [0, 10, 11, 11]
+    twin = FMUTwin.from_file(pylag, RATE, ["level", "on", "u"], ["sum", "x"], workers=1)
+    drive = np.concatenate([commands, np.full((1, 4, 1), 3.0)], axis=2)
+    made = twin.simulate(drive, seed=0)
+    assert made.observed[0, :, 0].tolist() == [0, 10, 21, 32]
+    truth = lagged(np.array([0.0, 3.0, 0.0, 3.0]), 1 / RATE)
+    np.testing.assert_allclose(made.observed[0, :, 1], truth, atol=1e-12)
+
+
+def test_names_units_and_limits_come_from_the_fmu(lag: Path) -> None:
+    twin = FMUTwin.from_file(lag)
+    assert twin.inputs == rt.Channels(("u", "trouble", "on"), ("V", "1", "1"))
+    assert twin.outputs == rt.Channels(("x", "seen", "runs"), ("m", "1", "1"))
+    assert twin.limits == rt.Limits((-10.0, -np.inf, 0.0), (10.0, np.inf, 1.0))
+    assert FMUTwin.from_file(lag, inputs=["trouble"]).limits is None
+    loud = np.full((1, 20, 1), 12.0)
+    with pytest.raises(rt.InputError, match="expected u from -10 to 10 V, got 12"):
+        FMUTwin.from_file(lag, inputs=["u"]).simulate(loud, seed=0)
+    clipping = FMUTwin.from_file(lag, RATE, ["u"], ["x"], outside="clip", workers=1)
+    made = clipping.simulate(loud, seed=0)
+    assert made.commands.max() == 10.0
+    np.testing.assert_allclose(
+        made.observed[0, :, 0], lagged(np.full(20, 10.0), 1 / RATE), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("fmu", ["lag", "pylag"])
+def test_start_values_may_differ_between_runs(fmu: str, request: pytest.FixtureRequest) -> None:
+    path = request.getfixturevalue(fmu)
+    twin = FMUTwin.from_file(path, RATE, ["u"], ["x"], start={"gain": 7.0}, workers=1)
+    commands = np.ones((4, 20, 1))
+    unit = lagged(np.ones(20), 1 / RATE)
+    for gains, given in [([7.0] * 4, None), ([3.0] * 4, 3.0), ([1, 2, 4, 8], [1, 2, 4, 8])]:
+        parameters = None if given is None else {"gain": given}
+        made = twin.simulate(commands, seed=0, parameters=parameters)
+        np.testing.assert_allclose(made.observed[:, :, 0], np.outer(gains, unit), atol=1e-12)
+
+
+def test_an_fmu_may_have_no_inputs(lag: Path) -> None:
+    alone = described(lag, "alone", 'causality="input"', 'causality="local"')
+    twin = FMUTwin.from_file(alone, RATE, outputs=["runs"], workers=1)
+    made = twin.simulate(np.zeros((2, 10, 0)), seed=0, parameters={"gain": [1, 2]})
+    assert made.observed[:, -1, 0].tolist() == [1, 2]
+
+
+def test_faults_hold_the_command(lag: Path) -> None:
+    ramp = np.linspace(0, 6, 60)
+    commands = np.tile(ramp[:, None], (3, 1, 1))
+    twin = FMUTwin.from_file(lag, RATE, ["u"], ["x", "runs"], workers=1)
+    made = twin.simulate(commands, faults=[None, rt.Stuck(0, onset=20), None], seed=0)
+    assert made.labels.tolist() == ["Healthy", "Stuck", "Healthy"]
+    stuck = np.minimum(ramp, ramp[20])
+    np.testing.assert_allclose(made.observed[1, :, 0], lagged(stuck, 1 / RATE), atol=1e-12)
+    for nominal in made.nominal[:, :, 0]:
+        np.testing.assert_allclose(nominal, lagged(ramp, 1 / RATE), atol=1e-12)
+    # The FMU counts the runs of an instance: the healthy ones were not run twice.
+    assert made.observed[:, -1, 1].tolist() == [1, 2, 3]
+    assert made.nominal[:, -1, 1].tolist() == [1, 4, 3]
+
+
+def test_nominal_may_be_given(lag: Path) -> None:
+    commands = np.ones((2, 10, 1))
+    twin = FMUTwin.from_file(lag, RATE, ["u"], ["x"], nominal=lambda u: 3 * u, workers=1)
+    faults = [None, rt.Stuck(0, onset=0)]
+    assert (
+        twin.simulate(commands, faults=faults, seed=0).nominal.tolist() == (3 * commands).tolist()
+    )
+    wrong = FMUTwin.from_file(lag, RATE, ["u"], ["x"], nominal=lambda u: u[0], workers=1)
+    with pytest.raises(rt.InputError, match=r"nominal: expected .* \(2, 10, 1\), got \(10, 1\)"):
+        wrong.simulate(commands, seed=0)
+
+
+TROUBLES = {
+    1: "hung for more than 1.5 s",
+    2: "its process died (signal 11)",
+    3: "FMI status error in fmi3DoStep (trouble was asked for)",
+    4: "x is nan from sample 6 on",
+    5: "FMI status fatal in fmi3DoStep",
+    6: "its process ended (exit code 3)",
+    7: "the FMU ended its simulation at 0.06 s",
+}
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_run_that_fails_ends_alone(lag: Path, workers: int) -> None:
+    twin = FMUTwin.from_file(lag, RATE, ["u", "trouble"], ["x"], timeout=1.5, workers=workers)
+    commands = np.zeros((16, 20, 2))
+    commands[:, :, 0] = np.arange(16)[:, None] / 2
+    commands[1::2, 5:, 1] = np.arange(1, 9)[:, None]  # number 8 is no trouble
+    told: list[float] = []
+    with pytest.raises(rt.SimulationError, match=r"7 of 16 .* trajectory 1: hung") as caught:
+        twin.simulate(commands, seed=0, progress=told.append)
+    assert caught.value.failed == {2 * kind - 1: why for kind, why in TROUBLES.items()}
+    finished = caught.value.finished
+    assert finished.ids.tolist() == [f"{i:05d}" for i in (0, 2, 4, 6, 8, 10, 12, 14, 15)]
+    for made, which in zip(finished.observed, finished.ids, strict=True):
+        truth = lagged(np.full(20, int(which) / 2), 1 / RATE)
+        np.testing.assert_allclose(made[:, 0], truth, atol=1e-12)
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
+def test_a_healthy_run_that_fails_is_told_apart(lag: Path) -> None:
+    commands = np.zeros((1, 20, 2))
+    commands[0, :, 0] = 1.0
+    commands[0, 10:, 1] = 3
+    twin = FMUTwin.from_file(lag, RATE, ["u", "trouble"], ["x"], workers=1)
+    with pytest.raises(rt.SimulationError, match="trajectory 0: without its fault: FMI status"):
+        twin.simulate(commands, faults=[rt.Stuck(1, onset=5)], seed=0)
+
+
+@pytest.mark.parametrize(("reset", "reuse"), [(1, True), (2, False)], ids=["refused", "idle"])
+def test_an_fmu_without_a_reset_is_instantiated_anew(
+    tmp_path: Path, reset: int, reuse: bool
+) -> None:
+    """More often than one process may."""
+    path = c_fmu(tmp_path, reset=reset)
+    twin = FMUTwin.from_file(path, RATE, ["u"], ["x", "runs"], reuse=reuse, workers=1)
+    made = twin.simulate(np.ones((600, 4, 1)), seed=0)
+    assert np.ptp(made.observed, axis=0).max() == 0
+    assert made.observed[:, :, 1].max() == 1
+    np.testing.assert_allclose(made.observed[-1, :, 0], lagged(np.ones(4), 1 / RATE), atol=1e-12)
+
+
+def test_same_bytes_whatever_the_workers(lag: Path) -> None:
+    commands = np.random.default_rng(1).uniform(-3, 3, size=(300, 10, 1))
+    faults = [rt.Stuck(0, onset=(2, 8)) if i % 3 else None for i in range(300)]
+    made = []
+    for workers in (1, 2):
+        twin = FMUTwin.from_file(lag, RATE, ["u"], ["x"], workers=workers)
+        made.append(twin.simulate(commands, faults=faults, seed=4))
+    assert made[0].observed.tobytes() == made[1].observed.tobytes()
+    assert made[0].nominal.tobytes() == made[1].nominal.tobytes()
+
+
+def test_progress_is_told_per_trajectory(lag: Path) -> None:
+    twin = FMUTwin.from_file(lag, RATE, ["u"], ["x"], workers=1)
+    told: list[float] = []
+    twin.simulate(np.ones((20, 4, 1)), seed=0, progress=told.append)
+    np.testing.assert_allclose(told, np.arange(1, 21) / 20)
+
+
+def test_native_code_stays_out_of_this_process_and_off_the_disk(
+    lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    commands = np.zeros((2, 10, 2))
+    twin = pickle.loads(pickle.dumps(FMUTwin.from_file(lag, RATE, ["u", "trouble"], ["x"])))
+    seen: list[int] = []
+    with pytest.raises(rt.SimulationError):
+        commands[1, :, 1] = 2
+        twin.simulate(
+            commands, seed=0, progress=lambda _: seen.append(len(list(tmp_path.iterdir())))
+        )
+    assert seen == [1, 1]
+    assert not list(tmp_path.iterdir())
+    assert not multiprocessing.active_children()
+    if sys.platform == "linux":
+        assert "Lag.so" not in Path("/proc/self/maps").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rate": 0.0}, "rate: expected a positive number of Hz, got 0.0"),
+        ({"timeout": -1.0}, "timeout: expected a positive number of s"),
+        ({"step": 0.003}, "step: expected a step that divides the sample period, 0.01 s"),
+        ({"step": 0.02}, "step: expected a step that divides .*give for instance step=0.01"),
+        ({"step": float("nan")}, "step: expected a positive number of s"),
+        ({"rates": {"u": 200.0}}, "rates: expected .* up to 100 Hz, got 'u' with 200 Hz"),
+        ({"rates": {"w": 2.0}}, "rates: .* 'w' .*the inputs are u, trouble, on"),
+        ({"inputs": ["truble"]}, "inputs: .* 'truble', which the FMU does not have; did you mean "),
+        ({"inputs": ["gain"]}, "inputs: .* 'gain', whose causality is parameter, type Float64; "),
+        ({"inputs": ["pair"]}, r"inputs: .* 'pair', .* of shape \(2,\); there are: u, trouble, on"),
+        ({"outputs": ["u"]}, "outputs: .* whose causality is input, .*there are: x, seen, runs"),
+        ({"start": {"gian": 1.0}}, "start: .* 'gian'; did you mean gain"),
+        ({"start": {"u": 1.0}}, "start: expected scalar variables .* no commands, got 'u'"),
+        ({"start": {"x": 1.0}}, "start: .* got 'x'"),
+        ({"start": {"gain": "high"}}, r"start: expected for gain \(Float64\) .* got 'high'"),
+        ({"start": {"gain": float("inf")}}, "start: .* got inf"),
+        ({"inputs": ["u"], "start": {"trouble": 0.5}}, r"start: .* trouble \(Int32\) .*got 0.5"),
+        ({"outside": "ignore"}, "outside: expected 'refuse' or 'clip'"),
+    ],
+)
+def test_bad_options_are_refused(lag: Path, options: dict, message: str) -> None:
+    with pytest.raises(rt.InputError, match=message):
+        FMUTwin.from_file(lag, **options)
+
+
+def test_bad_parameters_are_refused(lag: Path) -> None:
+    twin = FMUTwin.from_file(lag, inputs=["u"])
+    for parameters, message in [
+        ({"gain": [1.0, 2.0]}, r"one per trajectory, 3, got float64 of shape \(2,\)"),
+        ({"gain": [1.0, np.nan, 2.0]}, "give finite numbers"),
+        ({"gains": 1.0}, "did you mean gain"),
+    ]:
+        with pytest.raises(rt.InputError, match=message):
+            twin.simulate(np.zeros((3, 10, 1)), seed=0, parameters=parameters)
+    with pytest.raises(rt.InputError, match="commands: "):
+        twin.simulate(np.zeros((3, 10, 2)), seed=0)
+
+
+def test_files_that_cannot_run_are_refused(lag: Path, tmp_path: Path) -> None:
+    (tmp_path / "text.fmu").write_text("no zip", encoding="utf-8")
+    (tmp_path / "none.fmu").write_bytes(b"PK\x05\x06" + bytes(18))
+    exchange = described(lag, "exchange", "<CoSimulation", "<ModelExchange")
+    elsewhere = changed(lag, "elsewhere", lambda n, c: (n.replace("x86_64", "riscv64"), c))
+    cases = {
+        tmp_path / "missing.fmu": "which is not there",
+        tmp_path / "text.fmu": "which is no zip file",
+        tmp_path / "none.fmu": "no item named 'modelDescription.xml'",
+        described(lag, "broken", "<ModelVariables>", "<Model"): "readable modelDescription.xml",
+        described(lag, "future", 'fmiVersion="3.0"', 'fmiVersion="9.0"'): "Unsupported FMI version",
+        exchange: "for co-simulation, FMI 2.0 or 3.0, got exchange.fmu, FMI 3.0 for model exchange",
+        changed(lag, "bare", lambda n, c: None if "bin" in n else (n, c)): "which has none",
+        elsewhere: "which has riscv64-",
+        described(lag, "mute", 'causality="output"', 'causality="local"'): "at least one variable",
+    }
+    for path, message in cases.items():
+        with pytest.raises(rt.InputError, match=message) as caught:
+            FMUTwin.from_file(path)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("load", "why"), [(1, "Failed to instantiate"), (2, "signal 11")])
+def test_an_fmu_that_does_not_load_is_refused_once(tmp_path: Path, load: int, why: str) -> None:
+    twin = FMUTwin.from_file(c_fmu(tmp_path, load=load), RATE, ["u"], ["x"], workers=1)
+    with pytest.raises(rt.InputError, match=f"an FMU that loads on this machine, got .*{why}"):
+        twin.simulate(np.zeros((3, 10, 1)), seed=0)
+
+
+def test_members_stay_in_the_folder(
+    lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+
+    def simulate(name: str, member: str) -> None:
+        path = changed(lag, name, lambda n, c: (n, c))
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.writestr(member, "evil")
+        twin = FMUTwin.from_file(path, RATE, ["u"], ["x"], workers=1)
+        twin.simulate(np.zeros((1, 10, 1)), seed=0)
+
+    simulate("climbing", "../../evil.txt")
+    with pytest.raises(rt.InputError, match="an FMU that can be unpacked"):
+        simulate("absolute", str(tmp_path / "evil.txt"))
+    assert not list(tmp_path.rglob("evil.txt"))
+
+
+def test_without_fmpy_it_says_how_to_get_it(lag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fmpy", None)
+    with pytest.raises(rt.InputError, match=r'pip install "retwin\[fmu\]"'):
+        FMUTwin.from_file(lag)
+
+
+@pytest.mark.slow
+def test_ten_thousand_runs_do_not_grow_the_worker(lag: Path) -> None:
+    if sys.platform != "linux":
+        pytest.skip("reads /proc")
+    twin = FMUTwin.from_file(lag, RATE, ["u"], ["x", "runs"], workers=1)
+    memory: list[float] = []
+
+    def measure(share: float) -> None:
+        for child in multiprocessing.active_children():
+            pages = int(Path(f"/proc/{child.pid}/statm").read_text("utf-8").split()[1])
+            memory.append(pages * 4096 / 2**20)
+
+    made = twin.simulate(np.ones((10_000, 20, 1)), seed=0, progress=measure)
+    assert made.observed[-1, -1, 1] == 10_000  # one instance, one process
+    assert len(memory) == 10_000
+    assert max(memory[1000:]) - memory[1000] < 3.0

@@ -1,0 +1,219 @@
+"""`MuJoCoTwin` on models with a known answer, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import retwin as rt
+from retwin.twins.mujoco import MuJoCoTwin, Servo
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.001" integrator="implicitfast"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="bob">
+      <joint name="hinge" axis="0 1 0" {joint}/>
+      <geom type="sphere" size="0.01" pos="0 0 -1" mass="2"/>
+      <site name="tip" pos="0 0 -1"/>
+    </body>
+  </worldbody>
+  <actuator>{actuator}</actuator>
+  <sensor><jointpos name="angle" joint="hinge"/><jointvel name="speed" joint="hinge"/></sensor>
+  <keyframe><key name="raised" qpos="0.1"/><key name="hanging" qpos="0"/></keyframe>
+</mujoco>"""
+MOTOR = '<motor name="motor" joint="hinge"/>'
+SERVO = '<position name="servo" joint="hinge" kp="400" kv="40" ctrlrange="-1 1"/>'
+
+
+@pytest.fixture
+def make(tmp_path: Path):
+    def write(actuator: str = MOTOR, joint: str = "", **options: object) -> MuJoCoTwin:
+        path = tmp_path / "model.xml"
+        path.write_text(PENDULUM.format(actuator=actuator, joint=joint), encoding="utf-8")
+        return MuJoCoTwin.from_file(path, **options)
+
+    return write
+
+
+def test_names_units_and_limits_come_from_the_model(make) -> None:
+    twin = make(SERVO, outputs=("angle", "tip", "bob"))
+    assert twin.inputs == rt.Channels(("servo",), ("rad",))
+    assert twin.outputs.names == ("angle", "tip_x", "tip_y", "tip_z", "bob_x", "bob_y", "bob_z")
+    assert twin.outputs.units == ("rad", *("m",) * 6)
+    assert twin.limits == rt.Limits((-1.0,), (1.0,))
+    assert make().limits is None
+    assert make().inputs.units == ("N m",)
+    assert make().outputs == rt.Channels(("angle", "speed"), ("rad", "rad/s"))
+
+
+def test_a_small_swing_has_the_period_of_a_pendulum(make) -> None:
+    made = make(keyframe="raised").simulate(np.zeros((1, 400, 1)), seed=0)
+    time = np.arange(400) / 100
+    # A bob of radius 1 cm at 1 m, amplitude 0.1 rad: period longer than the linear one by 1/1600.
+    omega = np.sqrt(9.81 / (1 + 0.4 * 0.01**2)) / (1 + 0.1**2 / 16)
+    np.testing.assert_allclose(made.observed[0, :, 0], 0.1 * np.cos(omega * time), atol=2e-4)
+
+
+def test_a_constant_torque_turns_a_rotor_as_newton_says(make) -> None:
+    """Samples are at their times: q = t^2 tau / (2 J), to the integrator's first order."""
+    twin = make(joint='damping="0"', keyframe="hanging")
+    made = twin.simulate(np.full((1, 20, 1), 0.5), seed=0, parameters={"opt.gravity[2]": 0.0})
+    time = np.arange(20) / 100
+    expected = 0.5 * 0.5 / (2 * (1 + 0.4 * 0.01**2)) * time**2
+    np.testing.assert_allclose(made.observed[0, :, 0], expected, atol=3e-5)
+    assert made.observed[0, 0, 0] == 0.0
+
+
+def test_parameters_differ_from_simulation_to_simulation(make) -> None:
+    twin = make(keyframe="raised")
+    gravity = np.array([-9.81, -1.62, -3.71])
+    made = twin.simulate(np.zeros((3, 100, 1)), seed=0, parameters={"opt.gravity[2]": gravity})
+    swung = 0.1 - made.observed[:, 20, 0]
+    np.testing.assert_allclose(swung / swung[0], gravity / gravity[0], rtol=0.05)
+    alone = twin.simulate(np.zeros((1, 100, 1)), seed=0, parameters={"opt.gravity[2]": -3.71})
+    assert alone.observed[0].tobytes() == made.observed[2].tobytes()
+    heavy = twin.simulate(
+        np.full((2, 50, 1), 1.0), seed=0, parameters={"joint.hinge.damping": [0.0, 50.0]}
+    )
+    assert abs(heavy.observed[1, -1, 0] - 0.1) < abs(heavy.observed[0, -1, 0] - 0.1) / 2
+
+
+def test_a_servo_starts_at_rest_at_its_first_command(make) -> None:
+    twin = make(SERVO)
+    made = twin.simulate(np.full((2, 50, 1), [[[0.0]], [[0.5]]]), seed=0)
+    assert made.observed[:, 0, 0].tolist() == [0.0, 0.5]
+    # It sags under gravity to where 400 N m/rad hold 2 kg at 1 m.
+    settled = make(SERVO, settle=3.0).simulate(np.full((1, 50, 1), 0.5), seed=0).observed[0, :, 0]
+    assert np.ptp(settled) < 1e-6
+    assert settled[0] == pytest.approx(0.5 - 2 * 9.81 * np.sin(settled[0]) / 400, abs=1e-6)
+
+
+def test_native_delay_shifts_the_response(make) -> None:
+    commands = np.zeros((1, 100, 1))
+    commands[0, 20:] = 0.3
+    delayed = SERVO.replace("/>", ' nsample="60" interp="linear" delay="0.05"/>')
+    now = make(SERVO, interpolate=False).simulate(commands, seed=0).observed[0, :, 0]
+    late = make(delayed, interpolate=False).simulate(commands, seed=0).observed[0, :, 0]
+    np.testing.assert_allclose(late[25:], now[20:-5], atol=2e-3)
+    # What it looks back at before sample 0 is the first command, not zero.
+    held = make(delayed).simulate(np.full((1, 30, 1), 0.5), seed=0).observed[0, :, 0]
+    assert np.abs(held - 0.5).max() < 0.05
+
+
+def test_interpolated_commands_are_ramps_and_held_ones_are_steps(make) -> None:
+    ramp = np.linspace(0, 0.5, 60)[None, :, None]
+    smooth = make(SERVO).simulate(ramp, seed=0).observed[0]
+    steps = make(SERVO, interpolate=False).simulate(ramp, seed=0).observed[0]
+    # Held commands come 4.5 of 10 steps of a sample late on average.
+    lead = (smooth[50:, 0] - steps[50:, 0]).mean() / (0.5 / 59)
+    assert lead == pytest.approx(0.45, abs=0.05)
+
+
+@pytest.mark.parametrize("onset", [0, 1, 37, 98, 99])
+def test_a_stuck_joint_stays_where_it_was_at_the_onset(make, onset: int) -> None:
+    commands = 0.8 * np.sin(np.arange(100) / 15)[None, :, None]
+    twin = make(SERVO)
+    hidden: dict[str, np.ndarray] = {}
+    free = twin.simulate(commands, seed=0).observed[0, :, 0]
+    made = twin.simulate(commands, faults=[rt.Stuck(0, onset)], seed=0, hidden=hidden)
+    stuck = made.observed[0, :, 0]
+    np.testing.assert_array_equal(stuck[: onset + 1], free[: onset + 1])
+    np.testing.assert_allclose(stuck[onset:], free[onset], atol=1e-5)
+    np.testing.assert_allclose(hidden["positions"][0, :, 0], made.observed[0, :, 0], atol=1e-12)
+    assert hidden["velocities"].shape == (1, 100, 1)
+    np.testing.assert_array_equal(made.nominal[0, :, 0], free)
+
+
+def test_onsets_of_a_batch_do_not_disturb_each_other(make) -> None:
+    commands = np.tile(0.8 * np.sin(np.arange(80) / 15)[None, :, None], (4, 1, 1))
+    twin = make(SERVO)
+    faults = [rt.Stuck(0, 50), None, rt.Stuck(0, 10), rt.Stuck(0, 50)]
+    together = twin.simulate(commands, faults=faults, seed=0)
+    for i, fault in enumerate(faults):
+        alone = twin.simulate(commands[:1], faults=[fault], seed=0)
+        assert alone.observed[0].tobytes() == together.observed[i].tobytes()
+
+
+def test_threads_do_not_change_the_result(make) -> None:
+    commands = np.random.default_rng(0).normal(size=(40, 50, 1))
+    one = make(threads=1).simulate(commands, seed=0)
+    two = make(threads=2).simulate(commands, seed=0)
+    assert one.observed.tobytes() == two.observed.tobytes()
+
+
+def test_an_unstable_simulation_ends_alone(
+    make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    commands = np.zeros((6, 50, 1))
+    commands[3, 20:] = 1e13
+    with pytest.raises(rt.SimulationError, match=r"1 of 6 .* trajectory 3: .*CTRL") as caught:
+        make().simulate(commands, seed=0)
+    assert list(caught.value.failed) == [3]
+    assert caught.value.finished.ids.tolist() == ["00000", "00001", "00002", "00004", "00005"]
+    assert [path.name for path in tmp_path.iterdir()] == ["model.xml"], "MuJoCo left its log"
+
+
+def test_urdf_gets_servos(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(
+        """<robot name="r"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 0.5"/>
+        <mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>
+        </inertial><collision><geometry><mesh filename="package://gone/arm.stl"/></geometry></collision>
+        </link><joint name="hip" type="revolute"><parent link="base"/><child link="arm"/>
+        <axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="9" velocity="9"/></joint>
+        <link name="hand"><inertial><mass value="0.1"/><inertia ixx="0.01" iyy="0.01" izz="0.01"
+        ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="wrist" type="revolute">
+        <parent link="arm"/><child link="hand"/><origin xyz="0 0 1"/><axis xyz="0 1 0"/>
+        <limit lower="-2" upper="2" effort="9" velocity="9"/></joint></robot>""",
+        encoding="utf-8",
+    )
+    path = tmp_path / "arm.urdf"
+    servos = (("hip", Servo(500, 40)), ("wrist", Servo(100, 10)))
+    twin = MuJoCoTwin.from_file(path, servos=servos, outputs=["hand"], meshes=False)
+    assert twin.inputs == rt.Channels(("hip", "wrist"), ("rad", "rad"))
+    made = twin.simulate(np.full((1, 200, 2), [0.3, 0.0]), seed=0)
+    np.testing.assert_allclose(made.observed[0, -1], [np.sin(0.3), 0, np.cos(0.3)], atol=0.02)
+    with pytest.raises(rt.InputError, match="meshes=False"):
+        MuJoCoTwin.from_file(path, servos=servos, outputs=["hand"])
+    with pytest.raises(rt.InputError, match="add servos"):
+        MuJoCoTwin.from_file(path, outputs=["hand"], meshes=False)
+    with pytest.raises(rt.InputError, match=r"name places .* hand"):
+        MuJoCoTwin.from_file(path, servos=servos, meshes=False)
+    with pytest.raises(rt.InputError, match=r"servos: .* got 'hips'; did you mean 'hip'\?"):
+        MuJoCoTwin.from_file(path, servos=[("hips", Servo(1, 1))], meshes=False)
+
+
+def test_what_is_refused(make, tmp_path: Path) -> None:
+    with pytest.raises(rt.InputError, match=r"inputs: .* motor, got 'moter'; did you mean 'motor'"):
+        make(inputs=("moter",))
+    with pytest.raises(rt.InputError, match=r"outputs: .* got 'speeed'"):
+        make(outputs=("speeed",))
+    with pytest.raises(rt.InputError, match=r"keyframe: .* raised, hanging"):
+        make(keyframe="standing")
+    with pytest.raises(rt.InputError, match="divides the sample period"):
+        make(rate=333.0)
+    with pytest.raises(rt.InputError, match="where there is none"):
+        MuJoCoTwin.from_file(tmp_path / "gone.xml")
+    (tmp_path / "bad.xml").write_text("<mujoco><worldbody><geom size='a'/></worldbody></mujoco>")
+    with pytest.raises(rt.InputError, match="bad format in attribute 'size'"):
+        MuJoCoTwin.from_file(tmp_path / "bad.xml")
+    beyond = np.full((1, 20, 1), 1.5)
+    with pytest.raises(rt.InputError, match=r"servo from -1 to 1 rad, got 1.5"):
+        make(SERVO).simulate(beyond, seed=0)
+    clipped = make(SERVO, outside="clip").simulate(beyond, seed=0)
+    assert clipped.commands.max() == 1.0
+    twin = make()
+    for bad in ({"opt.gravty": 1}, {"joint.knee.damping": 1}, {"joint.hinge": 1}):
+        with pytest.raises(rt.InputError, match=r'parameters: expected "KIND.NAME.FIELD'):
+            twin.simulate(np.zeros((1, 20, 1)), seed=0, parameters=bad)
+    with pytest.raises(rt.InputError, match="as many values as there are trajectories"):
+        twin.simulate(np.zeros((3, 20, 1)), seed=0, parameters={"joint.hinge.damping": [1, 2]})
+    runge = PENDULUM.replace("implicitfast", "RK4").format(actuator=MOTOR, joint="")
+    (tmp_path / "runge.xml").write_text(runge, encoding="utf-8")
+    with pytest.raises(rt.InputError, match="implicit integrator"):
+        MuJoCoTwin.from_file(tmp_path / "runge.xml").simulate(
+            np.zeros((1, 60, 1)), faults=[rt.Stuck(0)], seed=0
+        )
