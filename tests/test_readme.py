@@ -102,6 +102,8 @@ def test_the_readme_shows_every_command() -> None:
         assert any(line.startswith(name) for line in told), name
     for name in ("info", "convert", "split", "fetch"):
         assert any(line.startswith(f"data {name}") for line in told), name
+    for name in ("list", "info", "simulate", "animate"):
+        assert any(line.startswith(f"twin {name}") for line in told), name
 
 
 @pytest.mark.parametrize("line", ["nonsense", "data nonsense", "fit armpi --nonsense 1", "data"])

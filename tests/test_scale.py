@@ -503,6 +503,7 @@ def test_bad_places_and_calls(tmp_path: Path) -> None:
 
     refused(r"\.npz or \.zarr", "a.csv")
     refused("at least 1", "a.zarr", workers=0)
+    refused("or none said with a scheduler", "a.zarr", workers=2, scheduler="tcp://nowhere:1")
     refused("with workers", "a.npz", workers=2)
     refused("for more than 512 MB", "a.npz", plan=plan(n=10**7))
     refused("one trajectory per command", "a.zarr", plan=plan(twin=Short()))

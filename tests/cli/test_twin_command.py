@@ -270,7 +270,14 @@ def test_simulate_saved_models(
     assert code == 2, "workers are for Zarr"
     code, _, err = call("simulate", tmp_path / "ibg", *words, "--case", "armpi")
     assert code == 0, err
-    refused(call, "not all inputs have limits", "simulate", tmp_path / "ibg", "--out", tmp_path / "b.npz")
+    refused(
+        call,
+        "not all inputs have limits",
+        "simulate",
+        tmp_path / "ibg",
+        "--out",
+        tmp_path / "b.npz",
+    )
     (tmp_path / "ibg" / "model.json").write_text("{")
     refused(call, "a corrected model", "simulate", tmp_path / "ibg", "--out", tmp_path / "b.npz")
 

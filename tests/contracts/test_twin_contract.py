@@ -6,16 +6,20 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from fmus import c_fmu
 
 import retwin as rt
 from retwin.testing import TWIN_CHECKS, TwinSubject, check_twin
 from retwin.twins.armpi import KINEMATIC
+from retwin.twins.fmu import FMUTwin
 from retwin.twins.function import FunctionTwin
+from retwin.twins.mujoco import MuJoCoTwin
 
 Subject = Callable[[pytest.FixtureRequest], TwinSubject]
 
@@ -57,12 +61,36 @@ def of_tank(function: Callable = tank, **settings: Any) -> Subject:
     return lambda request: TwinSubject(twin, ramps())
 
 
+def of_crane(**options: Any) -> Subject:
+    """A pendulum on a cart, driven by a force and observed by its sensors."""
+    path = Path(__file__).with_name("crane.xml")
+    twin = MuJoCoTwin.from_file(path, rate=50.0, **options)
+    pushes = ramps()[:, :, :1] - 0.4
+    faults = (None, rt.SteadyStateError(0, size=(0.5, 1.0)), rt.Stuck(0, onset=30))
+    return lambda request: TwinSubject(twin, pushes, faults)
+
+
+@pytest.fixture(scope="module")
+def lag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return c_fmu(tmp_path_factory.mktemp("lag"))
+
+
+def of_fmu(request: pytest.FixtureRequest) -> TwinSubject:
+    """A first-order lag, compiled from C."""
+    path = request.getfixturevalue("lag")
+    twin = FMUTwin.from_file(path, 20.0, ["u"], ["x"], workers=1)
+    return TwinSubject(twin, ramps()[:, :, :1])
+
+
 TWINS: dict[str, Subject] = {
     "arm": of_arm(lambda request: request.getfixturevalue("case").twin),
     "kinematic arm": of_arm(lambda request: KINEMATIC),
     "emulator": of_arm(lambda request: request.getfixturevalue("case").emulator),
     "surrogate": of_arm(lambda request: request.getfixturevalue("ibg")),
     "corrected": of_arm(lambda request: request.getfixturevalue("updated")),
+    "MuJoCo model": of_crane(inputs=("free",)),
+    "MuJoCo model with limits": of_crane(inputs=("limited",)),
+    "FMU": of_fmu,
     "function": of_tank(),
     "function with limits": of_tank(limits=rt.Limits((0.0, -np.inf), (1.0, 200.0))),
     "function that clips": of_tank(limits=rt.Limits((0.0, 0.0), (1.0, 200.0), outside="clip")),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -217,3 +218,21 @@ def test_what_is_refused(make, tmp_path: Path) -> None:
         MuJoCoTwin.from_file(tmp_path / "runge.xml").simulate(
             np.zeros((1, 60, 1)), faults=[rt.Stuck(0)], seed=0
         )
+
+
+def test_the_how_to_is_true(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tests = Path(__file__).parents[1]
+    page = (tests.parent / "docs" / "mujoco.md").read_text("utf-8")
+    (tmp_path / "crane.xml").write_text((tests / "contracts" / "crane.xml").read_text("utf-8"))
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
+    names: dict[str, object] = {}
+    for code in blocks:
+        exec(compile(code, "mujoco.md", "exec"), names)
+    told = re.findall(r"  # prints (.*)", page)
+    assert told
+    assert capsys.readouterr().out.splitlines() == told
+    swing = np.ptp(names["made"].observed[:, 60:, 0], axis=1)
+    assert len(set(swing.round(4))) == 4, "the loads are told apart"

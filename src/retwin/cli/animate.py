@@ -10,8 +10,6 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from retwin.animation import animate as film
-from retwin.animation.film import check_film
 from retwin.cli.terminal import bar
 from retwin.errors import InputError
 from retwin.storage import load
@@ -43,6 +41,8 @@ def animate(
 ) -> None:
     """Film a trajectory: the nominal motion as a ghost, the observed one solid."""
     from retwin import cases
+    from retwin.animation import animate as film
+    from retwin.animation.film import check_film
 
     check_film(out)
     shape = _size(size)

@@ -40,7 +40,8 @@ Outputs = Annotated[str, typer.Option(help="Names of the outputs, joined by comm
 Rate = Annotated[float | None, typer.Option(help="Samples per second.", min=1e-9)]
 
 app.command(
-    "animate", epilog="Example: `retwin twin animate real.mat --case armpi --id 00036 --out arm.mp4`"
+    "animate",
+    epilog="Example: `retwin twin animate real.mat --case armpi --id 00036 --out arm.mp4`",
 )(animate)
 
 OTHERS = {

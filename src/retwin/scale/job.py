@@ -86,7 +86,7 @@ def simulate_to(
     Raises
     ------
     InputError: a plan that cannot be carried out; a folder that holds another plan's work, or
-        anything else; an NPZ of more than 512 MB or with workers.
+        anything else; an NPZ of more than 512 MB or with workers; workers and a scheduler.
     SimulationError: all trajectories of the first chunk failed.
     RuntimeError: worker processes died again and again.
 
@@ -96,8 +96,13 @@ def simulate_to(
     if check_target(target) == ".npz":
         _check_small(plan, workers, scheduler)
         return _into_npz(target, plan, tell)
-    if workers is not None and workers < 1:
-        raise InputError("workers", expected="at least 1", got=str(workers), remedy="give more")
+    if workers is not None and (workers < 1 or scheduler is not None):
+        raise InputError(
+            "workers",
+            expected="at least 1, or none said with a scheduler, which has its own",
+            got=f"{workers}, scheduler {scheduler}",
+            remedy="leave workers out",
+        )
     about = _about(plan)
     if target.exists():
         return _already(target, plan, about)
