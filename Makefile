@@ -28,6 +28,9 @@ bench: install
 	$(BIN)/python benchmarks/generation.py
 	$(BIN)/python benchmarks/fitting.py
 	$(BIN)/python benchmarks/importing.py
+	$(BIN)/python benchmarks/twins.py
+	$(BIN)/python benchmarks/fmu.py
+	$(BIN)/python benchmarks/scale.py
 
 clean:
 	rm -rf .venv demo

@@ -254,6 +254,7 @@ def test_command_line(short: rt.Trajectories, tmp_path: Path) -> None:
     for wrong in (["--size", "big"], ["--id", "none"], ["--case", "none"]):
         told = CliRunner().invoke(app, [*words, *wrong])
         assert isinstance(told.exception, InputError)
+        assert told.stderr == "", "the error's own line is the only one"
 
 
 def test_skeleton_ends_at_the_end_effector(case: rt.Case, short: rt.Trajectories) -> None:

@@ -38,6 +38,7 @@ FLOORS = [
     "diagnosis",
     "testing",
     "statistics",
+    "fidelity",
     "study",
     "report",
     "cases",

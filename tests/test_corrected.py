@@ -35,15 +35,19 @@ def test_sources_share_commands_and_faults(
     assert 0 < np.median(gap[:, 150:190]) < 0.02
 
 
-def test_healthy_ones_look_like_the_robot(
-    updated: rt.CorrectedTwin, case: rt.Case, emulated: rt.Trajectories
-) -> None:
-    """Median distance from nominal, in steady parts and in motion, within a factor of two."""
+def test_healthy_ones_look_like_the_robot(ibg: rt.Surrogate, case: rt.Case) -> None:
+    """Median distance from nominal, in steady parts and in motion, within a factor of two.
+
+    With 60 trajectories to calibrate on: from ten, a mixture makes too much of missed movements.
+    """
+    commands = case.sampler.sample(60, rng=np.random.default_rng(5))
+    real = case.emulator.simulate(commands, seed=9)
+    updated = rt.CorrectedTwin(ibg, rt.fit_residual(ibg, real, seed=0))
     made = rt.generate(updated, case, per_class=100, seed=6).with_label("Healthy")
-    real = emulated.with_label("Healthy")
-    for part in (slice(150, 195), slice(20, 60)):
+    movements = 200 * np.arange(5)[:, None]
+    for part in (movements + np.arange(150, 195), movements + np.arange(20, 60)):
         ours, theirs = (
-            np.median(np.linalg.norm(t.residual[:, part], axis=2)) for t in (made, real)
+            np.median(np.linalg.norm(t.residual[:, part.ravel()], axis=2)) for t in (made, real)
         )
         assert 0.5 < ours / theirs < 2
 

@@ -176,7 +176,7 @@ def test_calibrates_on_healthy_by_default(ibg: rt.Surrogate, emulated: rt.Trajec
     assert few.fitted.figures["trajectories"] == 10
     every = rt.fit_residual(ibg, emulated, mixture=brief, seed=0, calibrate_on="all")
     assert every.fitted.figures["trajectories"] == 90
-    assert every.bounds[1:].max() > 2 * few.bounds[1:].max(), "the offset absorbs the faults"
+    assert every.scale[1:].max() > 1.5 * few.scale[1:].max(), "the offset absorbs the faults"
 
 
 def test_six_healthy_trajectories_are_enough(ibg: rt.Surrogate, emulated: rt.Trajectories) -> None:

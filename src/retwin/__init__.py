@@ -18,6 +18,7 @@ _HOME = {
     "CNN": "networks",
     "Case": "case",
     "Channels": "trajectories",
+    "CommandSpace": "corrections",
     "Context": "corrections",
     "CorrectedTwin": "corrected",
     "Correction": "corrections",
@@ -40,6 +41,7 @@ _HOME = {
     "Scores": "statistics",
     "Segments": "segments",
     "SimulationError": "twins.protocol",
+    "SimulationPlan": "scale",
     "SteadyStateError": "faults",
     "Stuck": "faults",
     "StudyData": "study",
@@ -87,7 +89,7 @@ if TYPE_CHECKING:
     from retwin.animation import animate
     from retwin.case import Case
     from retwin.corrected import CorrectedTwin, generate
-    from retwin.corrections import Context, Correction, DelayOffset, Discrepancy
+    from retwin.corrections import CommandSpace, Context, Correction, DelayOffset, Discrepancy
     from retwin.diagnosis import Diagnoser, NetworkDiagnoser, fit_diagnoser
     from retwin.download import fetch
     from retwin.errors import InputError
@@ -95,7 +97,7 @@ if TYPE_CHECKING:
     from retwin.networks import CNN, LSTM, MLP, TCN, LSTMClassifier
     from retwin.report import write_report
     from retwin.residual import Mixture, ResidualModel, fit_residual, infer_discrepancy
-    from retwin.scale import simulate_to
+    from retwin.scale import SimulationPlan, simulate_to
     from retwin.segments import Segments
     from retwin.statistics import Scores, evaluate
     from retwin.storage import load, save

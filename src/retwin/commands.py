@@ -1,4 +1,4 @@
-"""`RampSampler`: commands for any twin whose limits are known; ramps and holds at random levels."""
+"""Commands for any twin whose limits are known: ramps and holds at random levels."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 
-__all__ = ["RampSampler"]
+__all__ = ["RampSampler", "draw_onsets"]
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,8 @@ class RampSampler:
         shape = (count, self.movements, len(self.low))
         levels = rng.uniform(self.low, self.high, size=shape)
         ramps = rng.choice(self.ramps, size=shape)
-        onsets = self._onsets(count, rng, timing)
+        period = self.steps / self.movements
+        onsets = draw_onsets(count, self.movements, period, rng=rng, timing=timing)
         time = np.arange(self.steps, dtype=float)
         commands = np.tile(np.array(self.rest), (count, self.steps, 1))
         before = np.broadcast_to(np.array(self.rest), (count, len(self.low)))
@@ -101,16 +102,28 @@ class RampSampler:
         # Sums round; and movements that are timed more closely than their ramps overshoot.
         return np.clip(commands, self.low, self.high).astype(np.float32)
 
-    def _onsets(self, count: int, rng: np.random.Generator, timing: NDArray | None) -> NDArray:
-        """Onsets (count, movements) in samples."""
-        period = self.steps / self.movements
-        if timing is None or len(timing) == 0:
-            return np.tile(period * np.arange(self.movements), (count, 1))
-        drawn = timing[rng.integers(len(timing), size=count), : self.movements]
-        onsets = np.full((count, self.movements), np.nan)
-        onsets[:, : drawn.shape[1]] = drawn
-        for movement in range(self.movements):
-            before = onsets[:, movement - 1] + period if movement else np.zeros(count)
-            gap = np.isnan(onsets[:, movement])
-            onsets[gap, movement] = before[gap]
-        return onsets
+
+def draw_onsets(
+    count: int,
+    movements: int,
+    period: float,
+    *,
+    rng: np.random.Generator,
+    timing: NDArray | None = None,
+) -> NDArray:
+    """Onsets (count, movements) in samples, one every `period` samples from sample 0 on.
+
+    With `timing` (k, M), in samples, every row of onsets is one of its rows, drawn at random; where
+    that has none (NaN, or fewer than `movements`), the movement comes a period after the one
+    before.
+    """
+    if timing is None or len(timing) == 0:
+        return np.tile(period * np.arange(movements, dtype=float), (count, 1))
+    drawn = timing[rng.integers(len(timing), size=count), :movements]
+    onsets = np.full((count, movements), np.nan)
+    onsets[:, : drawn.shape[1]] = drawn
+    for movement in range(movements):
+        before = onsets[:, movement - 1] + period if movement else np.zeros(count)
+        gap = np.isnan(onsets[:, movement])
+        onsets[gap, movement] = before[gap]
+    return onsets

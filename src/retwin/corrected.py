@@ -75,7 +75,7 @@ class CorrectedTwin:
         @torch.no_grad()
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             context = self.residual.context(
-                self.surrogate, chunk.commands, chunk.segments, faulty=chunk.held
+                self.surrogate, chunk.commands, chunk.segments, told=chunk.told, frozen=chunk.frozen
             )
             z = self.residual.sample(context, generator=generator)
             corrected = self.residual.correction.apply(context, z)

@@ -17,7 +17,7 @@ from torch.distributions import (
     constraints,
 )
 
-__all__ = ["Blocks", "GaussianMixture", "MixtureHead"]
+__all__ = ["BernoulliHead", "Bernoullis", "Blocks", "GaussianMixture", "MixtureHead"]
 
 FLOOR = 0.05
 """Least standard deviation of a component, in standard units: no component shrinks onto a point."""
@@ -78,13 +78,59 @@ class GaussianMixture(MixtureSameFamily):
         return (self.mixture_distribution.probs[..., None] * torch.special.ndtr(distance)).sum(-2)
 
 
+class Bernoullis(Distribution):
+    """D independent events, each 0 or 1, beside the mixtures of `Blocks`.
+
+    Parameters
+    ----------
+    logits: (..., D), log odds.
+
+    """
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+    support = constraints.boolean
+
+    def __init__(self, logits: Tensor) -> None:
+        self.logits = logits
+        super().__init__(logits.shape[:-1], logits.shape[-1:], validate_args=False)
+
+    @property
+    def mean(self) -> Tensor:
+        """The probabilities (..., D)."""
+        return self.logits.sigmoid()
+
+    @property
+    def variance(self) -> Tensor:
+        """Of each event, (..., D)."""
+        return self.mean * (1 - self.mean)
+
+    def expand(
+        self, batch_shape: Sequence[int], _instance: Distribution | None = None
+    ) -> Bernoullis:
+        """The same events, repeated to a larger batch."""
+        return Bernoullis(self.logits.expand(*batch_shape, -1))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log probability of all events together; a value between 0 and 1 counts for both."""
+        odds = nn.functional.logsigmoid
+        return (value * odds(self.logits) + (1 - value) * odds(-self.logits)).sum(dim=-1)
+
+    def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
+        """The draw (..., D) that this normal noise (..., D) stands for; `uniform` is not needed."""
+        return (torch.special.ndtr(normal) > 1 - self.mean).to(self.logits.dtype)
+
+    def marginal_cdf(self, value: Tensor) -> Tensor:
+        """P(z_d <= value_d) of each event, (..., D)."""
+        return torch.where(value < 1, 1 - self.mean, torch.ones_like(value))
+
+
 class Blocks(Distribution):
     """Independent distributions side by side: the distribution of their joined values (..., D)."""
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     support = constraints.real_vector
 
-    def __init__(self, blocks: Sequence[GaussianMixture]) -> None:
+    def __init__(self, blocks: Sequence[GaussianMixture | Bernoullis]) -> None:
         self.blocks = list(blocks)
         self.widths = [block.event_shape[0] for block in self.blocks]
         super().__init__(
@@ -119,6 +165,11 @@ class Blocks(Distribution):
         shape = torch.Size(sample_shape) + self.batch_shape
         uniform = torch.rand(*shape, len(self.blocks), generator=generator)
         normal = torch.randn(*shape, self.event_shape[0], generator=generator)
+        return self.from_noise(uniform, normal)
+
+    def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
+        """The draw (..., D) that this noise stands for: uniform (..., blocks), normal (..., D)."""
+        shape = normal.shape[:-1]
         parts = zip(self.blocks, uniform.unbind(-1), normal.split(self.widths, -1), strict=True)
         return torch.cat([block.expand(shape).from_noise(u, e) for block, u, e in parts], dim=-1)
 
@@ -172,4 +223,24 @@ class MixtureHead(nn.Module):
             bias[k, 1 : 1 + self.width] = torch.as_tensor(found.cluster_centers_[k % count])
             bias[k, 1 + self.width :][diagonal] = torch.log(torch.expm1(deviation)).float()
         self.linear.bias.copy_(bias.flatten())
+        self.linear.weight.mul_(0.1)
+
+
+class BernoulliHead(nn.Module):
+    """Encoded context (..., H) in, `Bernoullis` of `width` events out."""
+
+    def __init__(self, features: int, width: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(features, width)
+
+    def forward(self, encoded: Tensor, shift: Tensor, scale: Tensor) -> Bernoullis:
+        """The events; they have no unit to shift or scale."""
+        return Bernoullis(self.linear(encoded))
+
+    @torch.no_grad()
+    def initialise(self, values: NDArray, seed: int) -> None:
+        """Start at how often each event was seen (n, D), in any context; rare ones as if shared."""
+        common = (values.sum() + 0.5) / (values.size + 1)
+        share = (values.sum(axis=0) + 10 * common) / (len(values) + 10)
+        self.linear.bias.copy_(torch.as_tensor(np.log(share / (1 - share))))
         self.linear.weight.mul_(0.1)

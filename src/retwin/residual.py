@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from retwin.configs import from_config, to_config
 from retwin.corrections import OPERATORS, Context, Correction, DelayOffset, Discrepancy
 from retwin.errors import InputError
-from retwin.mixture import Blocks, MixtureHead
+from retwin.mixture import BernoulliHead, Blocks, MixtureHead
 from retwin.models import read_model, write_model
 from retwin.networks import Standardise
 from retwin.segments import Segments
@@ -69,6 +69,7 @@ class ResidualModel(nn.Module):
     bounds: Tensor
     shift: Tensor
     scale: Tensor
+    persistence: Tensor
 
     def __init__(
         self,
@@ -85,7 +86,7 @@ class ResidualModel(nn.Module):
         self.inputs = inputs
         self.outputs = outputs
         self.segmentation = segmentation
-        self.latent = correction.latent(outputs)
+        self.latent = correction.latent(inputs, outputs)
         if correction.resolution != "segment":
             raise InputError(
                 "correction",
@@ -104,12 +105,17 @@ class ResidualModel(nn.Module):
             layers += [nn.Linear(width, following), nn.SiLU(), nn.Dropout(mixture.dropout)]
             width = following
         self.encoder = nn.Sequential(*layers)
+        blocks = correction.heads(inputs, outputs)
         self.heads = nn.ModuleList(
-            MixtureHead(width, size, mixture.components) for _, size in correction.heads(outputs)
+            MixtureHead(width, block.width, mixture.components)
+            if block.kind == "mixture"
+            else BernoulliHead(width, block.width)
+            for block in blocks
         )
-        self.sizes = [size for _, size in correction.heads(outputs)]
+        self.sizes = [block.width for block in blocks]
         for name in ("bounds", "shift", "scale"):
             self.register_buffer(name, torch.ones(len(self.latent)))
+        self.register_buffer("persistence", torch.zeros(len(self.latent)))
 
     def context(
         self,
@@ -117,13 +123,16 @@ class ResidualModel(nn.Module):
         commands: NDArray,
         segments: Segments | None = None,
         *,
-        faulty: NDArray | None = None,
+        told: NDArray | None = None,
+        frozen: NDArray | None = None,
     ) -> Context:
         """What this model is called on, for commands (n, T, d_u), movements found by its rule."""
         if segments is None or self.segmentation == "path":
             nominal = surrogate.predict(commands) if self.segmentation == "path" else commands
             segments = segment(commands, nominal, self.segmentation)
-        return Context.of(surrogate, commands, segments, rate=surrogate.rate, faulty=faulty)
+        return Context.of(
+            surrogate, commands, segments, rate=surrogate.rate, told=told, frozen=frozen
+        )
 
     def forward(self, context: Context) -> Blocks:
         """q_ψ(z | u, ŷ), in physical units."""
@@ -139,9 +148,20 @@ class ResidualModel(nn.Module):
 
     @torch.no_grad()
     def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:
-        """Draws of z (n, M, d_z), clipped at b: regularising z̄ does not bound samples."""
-        drawn = self(context).sample(generator=generator)
-        return drawn.clamp(-self.bounds, self.bounds)
+        """Draws of z (n, M, d_z), clipped at b: regularising z̄ does not bound samples.
+
+        Errors persist within a trajectory: the noise of its movements has a part in common, such
+        that normal scores of z correlate by `persistence`. What each movement's z is distributed
+        like does not change by that.
+        """
+        law = self(context)
+        shape = law.batch_shape
+        uniform = torch.rand(*shape, len(law.blocks), generator=generator)
+        own = torch.randn(*shape, len(self.latent), generator=generator)
+        if self.persistence.any():
+            common = torch.randn(shape[0], 1, len(self.latent), generator=generator)
+            own = self.persistence.sqrt() * common + (1 - self.persistence).sqrt() * own
+        return law.from_noise(uniform, own).clamp(-self.bounds, self.bounds)
 
     def save(self, folder: str | Path) -> None:
         """Write weights and description, see `retwin.models`."""
@@ -282,9 +302,23 @@ def fit_residual(
         )
     features = describe(context)
     valid = torch.as_tensor(parts.valid)
-    _prepare(model, features, found, valid, bounds, seed)
-    data = (features, found.z.float(), _known(model, found), valid)
+    draws = _draws(model, found, valid, seed)
+    repeats = len(draws) // len(used)
+    told = found.identified
+    if found.posterior:
+        told = valid[..., None].expand_as(found.z)
+    _prepare(model, features, draws, told.repeat(repeats, 1, 1), valid, bounds, seed)
     train_rows, valid_rows = _validation_split(used, seed)
+    data = (
+        features.repeat(repeats, 1, 1),
+        draws.float(),
+        _known(model, told).repeat(repeats, 1, 1),
+        valid.repeat(repeats, 1),
+    )
+    # Every draw of a trajectory is a row; those of one trajectory are all on the same side.
+    train_rows = _repeated(train_rows, repeats, len(used))
+    if valid_rows is not None:
+        valid_rows = _repeated(valid_rows, repeats, len(used))
     result = train(
         model,
         _objective(mixture),
@@ -294,6 +328,8 @@ def fit_residual(
         seed=seed,
         progress=progress,
     )
+    if found.posterior:
+        model.persistence.copy_(_persistence(model.eval(), features, draws, valid))
     model.emulated = used.emulated
     onsets = Segments.from_commands(calibration.commands)
     model.timing = np.where(onsets.valid, onsets.start, np.nan)
@@ -342,29 +378,89 @@ def _chosen(calibration: Trajectories, calibrate_on: str) -> NDArray:
     return np.flatnonzero(keep)
 
 
-def _known(model: ResidualModel, found: Discrepancy) -> Tensor:
-    """(n, M, heads): whether the outputs tell that block of z."""
-    parts = found.identified.split(model.sizes, dim=-1)
+def _known(model: ResidualModel, told: Tensor) -> Tensor:
+    """(n, M, heads): whether the outputs tell that block of z, by `told` (n, M, d_z)."""
+    parts = told.split(model.sizes, dim=-1)
     return torch.stack([part.all(dim=-1) for part in parts], dim=-1)
+
+
+DRAWS = 20
+"""Draws of z per trajectory from its posterior: together they tell what the outputs do not."""
+
+
+def _draws(model: ResidualModel, found: Discrepancy, valid: Tensor, seed: int) -> Tensor:
+    """What to learn z from, (R n, M, d_z): z* itself, or draws from its posterior."""
+    if not found.posterior:
+        return found.z
+    generator = torch.Generator().manual_seed(seed)
+    values, vectors = torch.linalg.eigh(found.covariance)
+    root = vectors * values.clamp_min(0).sqrt()[..., None, :]
+    noise = torch.randn(DRAWS, *found.z.shape, generator=generator, dtype=found.z.dtype)
+    drawn = found.z + torch.einsum("nmij,rnmj->rnmi", root, noise)
+    # What is decided, one way or the other, has no width to draw from.
+    begin = 0
+    for head, size in zip(model.heads, model.sizes, strict=True):
+        part = slice(begin, begin + size)
+        begin += size
+        if isinstance(head, BernoulliHead):
+            drawn[..., part] = found.z[..., part]
+    return (drawn * valid[..., None]).flatten(0, 1)
+
+
+def _repeated(rows: Tensor, repeats: int, count: int) -> Tensor:
+    """The rows of all draws of those trajectories."""
+    return (rows + count * torch.arange(repeats)[:, None]).flatten()
+
+
+@torch.no_grad()
+def _persistence(model: ResidualModel, features: Tensor, draws: Tensor, valid: Tensor) -> Tensor:
+    """How alike the movements of a trajectory err: the intraclass correlation of normal scores.
+
+    One-way analysis of variance, averaged over draws; shrunk where trajectories are few.
+    """
+    law = model.distribution(features)
+    scores = []
+    for z in draws.float().split(len(features)):
+        share = law.marginal_cdf(z).clamp(1e-4, 1 - 1e-4)
+        scores.append(torch.where(valid[..., None], torch.special.ndtri(share), torch.nan))
+    score = torch.stack(scores).mean(dim=0)
+    count = valid.sum(dim=1).clamp_min(1)[:, None]
+    own = score.nanmean(dim=1)
+    enough = valid.sum(dim=1) > 1
+    if enough.sum() < 3:
+        return torch.zeros(len(model.latent))
+    within = torch.nansum((score - own[:, None]).square(), dim=1)[enough].sum(0)
+    within = within / (count[enough] - 1).sum().clamp_min(1)
+    between = (count[enough] * (own[enough] - own[enough].mean(dim=0)).square()).sum(0)
+    between = between / (enough.sum() - 1)
+    size = count[enough].double().mean().float()
+    alike = (between - within) / (between + (size - 1) * within).clamp_min(1e-9)
+    return (alike * (len(own) - 1) / (len(own) + 3)).nan_to_num(0.0).clamp(0.0, 0.9)
 
 
 @torch.no_grad()
 def _prepare(
     model: ResidualModel,
     features: Tensor,
-    found: Discrepancy,
+    z: Tensor,
+    told: Tensor,
     valid: Tensor,
     bounds: NDArray | None,
     seed: int,
 ) -> None:
     """Standardise, bound and start the model from the data it is trained on."""
     model.before.fit(features[valid])
+    valid = valid.repeat(len(z) // len(valid), 1)
     begin = 0
     for head, size in zip(model.heads, model.sizes, strict=True):
         part = slice(begin, begin + size)
         begin += size
-        known = found.identified[..., part].all(dim=-1) & valid
-        values = found.z[..., part][known if known.any() else valid].float()
+        if isinstance(head, BernoulliHead):
+            model.shift[part], model.scale[part], model.bounds[part] = 0.0, 1.0, 1.0
+            head.initialise(z[..., part][valid].double().numpy(), seed)
+            continue
+        known = told[..., part].all(dim=-1) & valid
+        values = z[..., part][known if known.any() else valid].float()
         # Robust: a few missed movements must not set the unit in which the others are told.
         shift = values.median(dim=0).values
         scale = 1.4826 * (values - shift).abs().median(dim=0).values

@@ -51,6 +51,11 @@ class Surrogate(nn.Module):
         self.network = network.build(len(inputs), len(outputs))
         self.fitted: Fit | None = None
 
+    @property
+    def memoryless(self) -> bool:
+        """Whether an output depends on the command of its own sample only."""
+        return isinstance(self.config, MLP)
+
     def forward(self, commands: Tensor) -> Tensor:
         """Outputs (n, T, d_y) for commands (n, T, d_u), both in physical units."""
         return self.after.inverse(self.network(self.before(commands)))
@@ -62,7 +67,7 @@ class Surrogate(nn.Module):
         In chunks that fit the cache; a network without memory is asked once for a held command.
         """
         values = np.ascontiguousarray(commands, dtype=np.float32)
-        rows = self._distinct if isinstance(self.config, MLP) else self.forward
+        rows = self._distinct if self.memoryless else self.forward
         out = np.empty((*values.shape[:2], len(self.outputs)), dtype=np.float32)
         for begin in range(0, len(values), CHUNK):
             part = slice(begin, begin + CHUNK)

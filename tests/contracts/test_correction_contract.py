@@ -60,8 +60,8 @@ class Bent:
 GOOD = rt.DelayOffset()
 
 
-def heads_that_overlap(outputs: rt.Channels) -> tuple[Head, ...]:
-    return ("delay", 2), ("offset", len(outputs))
+def heads_that_overlap(inputs: rt.Channels, outputs: rt.Channels) -> tuple[Head, ...]:
+    return Head("delay", 2), Head("offset", len(outputs))
 
 
 def adds_a_constant(context: rt.Context, z: Tensor) -> Tensor:

@@ -286,6 +286,21 @@ def test_all_that_is_broken_is_listed() -> None:
         check_twin(SimpleNamespace(inputs=TANK, simulate=None), ramps())
 
 
+def test_a_twin_need_not_know_stuck_actuators(tmp_path: Path) -> None:
+    """One whose actuators pull at tendons refuses them; its subject brings other faults."""
+    crane = Path(__file__).with_name("crane.xml").read_text("utf-8")
+    tendon = '<tendon><fixed name="cable"><joint joint="rail" coef="1"/></fixed></tendon>'
+    model = crane.replace("<actuator>", tendon + "<actuator>").replace(
+        'name="free" joint="rail"', 'name="free" tendon="cable"'
+    )
+    (tmp_path / "tendon.xml").write_text(model, encoding="utf-8")
+    twin = MuJoCoTwin.from_file(tmp_path / "tendon.xml", rate=50.0, inputs=("free",))
+    pushes = ramps()[:, :, :1] - 0.4
+    with pytest.raises(rt.InputError, match="hinge or slide"):
+        twin.simulate(pushes, faults=[rt.Stuck(0, 5)] * 3, seed=0)
+    check_twin(twin, pushes, [None, *[rt.SteadyStateError(0, size=(0.5, 1.0))] * 2])
+
+
 def test_a_subject_must_tell_something() -> None:
     with pytest.raises(rt.InputError, match="n at least 2 and T at least 8"):
         TwinSubject(GOOD, ramps(1))

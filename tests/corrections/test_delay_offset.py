@@ -151,7 +151,8 @@ def test_apply_is_differentiable(context: rt.Context) -> None:
 
 def test_names_units_and_config() -> None:
     operator = rt.DelayOffset()
-    latent = operator.latent(rt.Channels(("x", "y"), ("m", "m")))
+    plane = rt.Channels(("x", "y"), ("m", "m"))
+    latent = operator.latent(rt.Channels(("u",), ("V",)), plane)
     assert latent.names == ("delay", "offset_x", "offset_y")
     assert latent.units == ("samples", "m", "m")
     assert from_config(to_config(operator, OPERATORS), OPERATORS) == operator

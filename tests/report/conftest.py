@@ -92,12 +92,71 @@ def _discrepancy(rng: np.random.Generator) -> dict[str, NDArray]:
         late = rng.random(count) < 0.3
         delay = np.where(late, rng.normal(24, 4, count), rng.normal(11, 3, count))
         offset = rng.multivariate_normal([0.002, -0.001, -0.004], 1e-5 * np.eye(3), count)
-        return np.column_stack([delay, offset])
+        noise = 0.0003 * rng.gamma(4, 0.25, (count, 3))
+        return np.column_stack([delay, offset, noise])
 
-    observed, identified = draw(240), np.ones((240, 4), dtype=bool)
-    observed[:9, 0], observed[:9, 1:] = 180.0, 0.2  # missed movements
-    identified[200:, 0] = False
-    return {"z/observed": observed, "z/identified": identified, "z/predicted": draw(4000)}
+    observed = draw(240)
+    observed[:9, 0], observed[:9, 1:4] = 180.0, 0.2  # missed movements
+    observed[200:, 0] = np.nan  # not told by the outputs
+    return {"z/ibg_rg/observed": observed, "z/ibg_rg/predicted": draw(4000)}
+
+
+def _bands(rng: np.random.Generator) -> dict[str, NDArray]:
+    """Two trajectories of 20 moments, one of them never measured at the end."""
+    nominal = np.repeat(np.linspace(0, 0.2, 20)[None, :, None], 2, axis=0) * np.ones(3)
+    spread = 0.004 * np.array([-1.64, -0.67, 0, 0.67, 1.64])[:, None, None]
+    seen = np.ones((2, 20), dtype=bool)
+    seen[1, 15:] = False
+    shares = rng.dirichlet(np.full(20, 50))
+    return {
+        "pit/ibg_rg": np.stack([shares, np.full(20, 0.03), np.full(20, 0.07)]),
+        "bands/ibg_rg/nominal": nominal,
+        "bands/ibg_rg/observed": nominal + 0.004 * rng.standard_normal(nominal.shape),
+        "bands/ibg_rg/seen": seen,
+        "bands/ibg_rg/quantiles": nominal[:, None] + spread,
+        "bands/ibg_rg/ids": np.array(["real_a/000", "real_a/001"]),
+        "bands/ibg_rg/rate": np.array(10.0),
+    }
+
+
+def _fidelity() -> dict[str, Any]:
+    def figure(value: float, low: float, high: float, p: float | None = None) -> dict[str, Any]:
+        return {"value": value, "interval": [low, high], "p": p}
+
+    figures = {
+        "energy": figure(0.0112, 0.0091, 0.0144),
+        "energy/mean_only": figure(0.0151, 0.0122, 0.0188),
+        "energy_below/mean_only": figure(0.258, 0.191, 0.334),
+        "coverage50": figure(0.482, 0.411, 0.553),
+        "coverage90": figure(0.874, 0.822, 0.913),
+        "coverage90_widened": figure(0.903, 0.861, 0.937),
+        "pit": figure(0.061, 0.031, 0.112, 0.17),
+        "auroc": figure(0.83, 0.71, 0.94),
+        "ks/delay": figure(0.112, 0.052, 0.231, 0.41),
+        "coverage90/delay": figure(0.873, 0.792, 0.941),
+        "ks/noise_x": {"value": 0.98, "interval": None, "p": 0.05},
+        "crps_below/mean_only": figure(0.237, 0.162, 0.318),
+    }
+    for name, crps in (("x", 0.0041), ("y", 0.0033), ("z", 0.0018)):
+        figures[f"crps/{name}"] = figure(crps, 0.8 * crps, 1.3 * crps)
+        figures[f"crps/{name}/mean_only"] = figure(1.3 * crps, crps, 1.7 * crps)
+        figures[f"crps_below/{name}/mean_only"] = figure(0.231, 0.154, 0.312)
+    return {
+        "trajectories": 10,
+        "draws": 200,
+        "rate": 10.0,
+        "outputs": ["x", "y", "z"],
+        "units": ["m", "m", "m"],
+        "movement": [
+            "delay",
+            *(f"{kind}_{axis}" for kind in ("offset", "noise") for axis in "xyz"),
+        ],
+        "movement_units": ["samples", *["m"] * 6],
+        "movements": 48,
+        "rivals": ["mean_only"],
+        "widening": 1.31,
+        "figures": figures,
+    }
 
 
 def _poses(ids: list[str]) -> dict[str, NDArray]:
@@ -120,7 +179,7 @@ def synthetic(*, runs: int = 10, per_class: int = 10) -> Study:
     rng = np.random.default_rng(7)
     truth = np.repeat(np.arange(len(CLASSES)), per_class)
     sources: dict[str, Any] = {}
-    arrays = _discrepancy(rng)
+    arrays = _discrepancy(rng) | _bands(rng)
     seen = {"dt": "none", "ibg": "timing", "ibg_rg": "healthy"}
     for name, skill in SKILL.items():
         told, made = _source(rng, truth, skill, runs)
@@ -162,16 +221,7 @@ def synthetic(*, runs: int = 10, per_class: int = 10) -> Study:
             "unit": "m",
             "nrmse": {"x": 0.004, "y": 0.0042, "z": 0.0051},
         },
-        "fidelity": {
-            "latent": ["delay", "offset_x", "offset_y", "offset_z"],
-            "units": ["samples", "m", "m", "m"],
-            "held_out": 48,
-            "ks": [
-                {"name": "delay", "statistic": 0.112, "p": 0.41},
-                {"name": "offset_x", "statistic": 0.231, "p": 0.0004},
-            ],
-            "coverage90": {"delay": 0.87, "offset_x": 0.93},
-        },
+        "fidelity": {"ibg_rg": _fidelity()},
         "learning_curve": None,
         "timing": {
             "generate_3600_s": {"ibg": 0.31, "ibg_rg": 0.52},

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score, roc_curve
 
 from retwin.report.blocks import Plot
-from retwin.report.curves import ece_floor, latents, micro_roc
+from retwin.report.curves import bands, ece_floor, latents, micro_roc
 from retwin.report.results import Results
 from retwin.report.sections import SECTIONS
 from retwin.report.words import class_name, duration, number, p_value, signed
@@ -58,7 +58,7 @@ def test_ece_floor_falls_with_the_root_of_the_count() -> None:
 
 
 def test_latents_count_what_lies_outside(study: Study) -> None:
-    delay, x, *_ = latents(results_of(study))
+    delay, x, *_ = latents(results_of(study), "ibg_rg")
     assert (delay.counts, delay.outside) == ((200, 4000), (9, 0))
     assert delay.observed.sum() == pytest.approx(191 / 200)
     assert x.unit == "mm"
@@ -68,11 +68,23 @@ def test_latents_count_what_lies_outside(study: Study) -> None:
 
 @pytest.mark.parametrize("values", [[1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0, 5.0]])
 def test_latents_of_few_or_equal_values(study: Study, values: list[float]) -> None:
-    study[1]["z/observed"] = np.repeat(np.array(values)[:, None], 4, axis=1)
-    del study[1]["z/identified"]
-    for latent in latents(results_of(study)):
+    study[1]["z/ibg_rg/observed"] = np.repeat(np.array(values)[:, None], 7, axis=1)
+    for latent in latents(results_of(study), "ibg_rg"):
         assert np.all(np.diff(latent.edges) > 0)
         assert latent.outside[0] < latent.counts[0]
+
+
+def test_bands_are_what_was_measured_minus_the_nominal_output(study: Study) -> None:
+    found = bands(results_of(study), "ibg_rg")
+    assert [(each.trajectory, each.output) for each in found] == [
+        (trajectory, output) for trajectory in ("real_a/000", "real_a/001") for output in "xyz"
+    ]
+    last = found[-1]
+    assert (last.unit, last.time[-1]) == ("mm", pytest.approx(1.9))
+    assert np.isfinite(last.observed).sum() == 15
+    np.testing.assert_allclose(last.quantiles[:, 0], 4 * np.array([-1.64, -0.67, 0, 0.67, 1.64]))
+    del study[1]["bands/ibg_rg/seen"]
+    assert bands(results_of(study), "ibg_rg") == []
 
 
 def test_plots_are_valid_for_plotly(study: Study) -> None:
@@ -87,7 +99,16 @@ def test_plots_are_valid_for_plotly(study: Study) -> None:
     sections = [section for make in SECTIONS if (section := make(results)) is not None]
     assert len(sections) == len(SECTIONS)
     plots = [b for section in sections for b in section.blocks if isinstance(b, Plot)]
-    assert [plot.name for plot in plots] == ["scores", "roc", "tde", "tpe", "poses"]
+    assert [plot.name for plot in plots] == [
+        "scores",
+        "roc",
+        "tde",
+        "tpe",
+        "noise",
+        "pit",
+        "bands",
+        "poses",
+    ]
     for plot in plots:
         for panel in plot.panels:
             assert go.Figure(plain(panel.spec)).data

@@ -110,6 +110,43 @@ def test_numbers(study: Study, write: Write) -> None:
     assert "M4 bias" in text
 
 
+def test_fidelity(study: Study, write: Write) -> None:
+    reader = read(write(study))
+    for told in (
+        "4.10[3.28 to 5.33]",  # CRPS of x in mm
+        "26[19 to 33]",  # the energy score, in percent below the mean alone
+        "0.87 0.82 to 0.91",  # coverage of the 90 % band
+        "widened × 1.31",
+        "10 held-out healthy trajectories",
+        "x, typical (real_a/000)",
+        "z, worst (real_a/001)",
+    ):
+        assert told in reader.text.replace(" [", "["), told
+    figures = study[0]["fidelity"]["ibg_rg"]["figures"]
+    for name in ("auroc", "coverage90_widened"):
+        del figures[name]
+    text = read(write(study)).text
+    assert "Too few trajectories to train a classifier" in text
+    assert "widened" not in text
+
+
+def test_two_sources_with_a_residual_model_have_figures_of_their_own(
+    study: Study, write: Write
+) -> None:
+    results, arrays = study
+    results["fidelity"]["ibg_rg_command"] = results["fidelity"]["ibg_rg"]
+    arrays |= {
+        name.replace("ibg_rg", "ibg_rg_command"): each
+        for name, each in arrays.items()
+        if "/ibg_rg" in name
+    }
+    reader = read(write(study))
+    names = ("tde", "tpe", "noise", "pit", "bands")
+    assert {f"figure-{name}{more}" for name in names for more in ("", "-2")} <= set(reader.ids)
+    assert len(reader.ids) == len(set(reader.ids))
+    assert "IBG + RG, command space." in reader.text
+
+
 def test_verdict_better(study: Study, write: Write) -> None:
     text = read(write(study)).text
     assert (
@@ -176,7 +213,11 @@ def test_everything_is_escaped(study: Study, write: Write) -> None:
     arrays[f"probabilities/{evil}".replace("/", "\\")] = arrays.pop("probabilities/ibg")
     arrays["pose/ids"] = np.array([evil, evil])
     results["published"]["dt"]["macro_f1"] = evil
-    results["fidelity"]["latent"][0] = results["fidelity"]["ks"][0]["name"] = evil
+    told = results["fidelity"]["ibg_rg"]
+    told["movement"][0] = told["outputs"][0] = told["rivals"][0] = evil
+    told["figures"][f"ks/{evil}"] = told["figures"].pop("ks/delay")
+    results["fidelity"][evil] = {**told, "movement": [evil]}
+    arrays["bands/ibg_rg/ids"] = np.array([evil, evil])
     for each in results["comparisons"]:
         each["a"], each["b"] = (evil if each[k] == "ibg" else each[k] for k in "ab")
     page = write_report(write(study)).read_text(encoding="utf-8")
@@ -214,13 +255,15 @@ def test_without_arrays_and_stale_figures(study: Study, write: Write) -> None:
     folder = write(study)
     write_report(folder)
     (folder / "arrays.npz").unlink()
+    for name in ("tde-2", "mine"):
+        (folder / "figures" / f"{name}.png").write_bytes(PNG)
     write_report(folder)
     reader = read(folder)
     assert "roc" not in reader.ids
     assert "figure-tde" not in reader.ids
     assert "confusion" in reader.ids
     assert "about 0.04 with 90 trajectories" in reader.text  # instead of the computed floor
-    assert {path.stem for path in (folder / "figures").iterdir()} == {"scores", "confusion"}
+    assert {path.stem for path in (folder / "figures").iterdir()} == {"scores", "confusion", "mine"}
 
 
 def test_least_that_a_study_may_hold(write: Write) -> None:
@@ -273,7 +316,15 @@ def test_damaged_arrays(study: Study, write: Write) -> None:
         write_report(folder)
 
 
-@pytest.mark.parametrize("name", ["probabilities/dt", "z/identified", "z/predicted"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "probabilities/dt",
+        "z/ibg_rg/observed",
+        "z/ibg_rg/predicted",
+        "bands/ibg_rg/quantiles",
+    ],
+)
 def test_arrays_that_do_not_fit(study: Study, write: Write, name: str) -> None:
     study[1][name] = study[1][name][..., :-1]
     with pytest.raises(InputError, match=name):

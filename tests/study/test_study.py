@@ -61,7 +61,15 @@ def test_results_follow_the_schema(finished: tuple[dict, Path], case: rt.Case) -
         low, high = row["bootstrap_ci95"]
         assert low <= row["mean_diff"] + 1e-9
         assert row["mean_diff"] - 1e-9 <= high
-    assert set(results["fidelity"]["coverage90"]) == {"delay", "offset_x", "offset_y", "offset_z"}
+    found = results["fidelity"]["ibg_rg"]
+    assert (found["trajectories"], found["movements"]) == (10, 50)
+    assert found["rivals"] == ["mean_only", "single_gaussian"]
+    assert found["widening"] > 0
+    for name in ("energy", "crps/x", "crps_below/mean_only", "coverage90", "pit", "auroc"):
+        low, high = found["figures"][name]["interval"]
+        assert low <= high
+    for name in ("delay", "offset_x", "noise_z"):
+        assert 0 <= found["figures"][f"ks/{name}"]["value"] <= 1
 
 
 def test_figures_agree_with_the_predictions(finished: tuple[dict, Path]) -> None:
@@ -75,7 +83,15 @@ def test_figures_agree_with_the_predictions(finished: tuple[dict, Path]) -> None
             predicted = probabilities.argmax(axis=2)
             np.testing.assert_array_equal(predicted, source["predictions"])
             assert source["accuracy"] == pytest.approx((predicted == truth).mean(axis=1).tolist())
-        assert arrays["z/observed"].shape[1] == 4
+        assert arrays["z/ibg_rg/observed"].shape[1] == 7
+        assert arrays["pit/ibg_rg"].shape == (3, 20)
+        assert arrays["bands/ibg_rg/quantiles"].shape == (2, 5, 100, 3)
+        healthy = {
+            i
+            for i, label in zip(results["data"]["test"]["ids"], labels, strict=True)
+            if label == "Healthy"
+        }
+        assert set(arrays["bands/ibg_rg/ids"].tolist()) <= healthy
 
 
 def test_calling_again_does_nothing_new(finished: tuple[dict, Path], case: rt.Case) -> None:

@@ -145,7 +145,9 @@ def test_nominal_may_be_given(lag: Path) -> None:
         twin.simulate(commands, faults=faults, seed=0).nominal.tolist() == (3 * commands).tolist()
     )
     wrong = FMUTwin.from_file(lag, RATE, ["u"], ["x"], nominal=lambda u: u[0], workers=1)
-    with pytest.raises(rt.InputError, match=r"nominal: expected .* \(2, 10, 1\), got \(10, 1\)"):
+    with pytest.raises(
+        rt.InputError, match=r"nominal: expected .* \(2, 10, 1\), got float64, \(10, 1\)"
+    ):
         wrong.simulate(commands, seed=0)
 
 

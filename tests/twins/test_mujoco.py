@@ -92,6 +92,46 @@ def test_a_servo_starts_at_rest_at_its_first_command(make) -> None:
     assert settled[0] == pytest.approx(0.5 - 2 * 9.81 * np.sin(settled[0]) / 400, abs=1e-6)
 
 
+def test_a_velocity_actuator_starts_where_the_model_does(make) -> None:
+    """What acts is the integral of its control: the command tells no place to start from."""
+    twin = make('<intvelocity name="speed" joint="hinge" kp="400" actrange="-3 3"/>')
+    assert twin.inputs.units == ("1",)
+    made = twin.simulate(np.full((1, 50, 1), 0.5), seed=0)
+    assert made.observed[0, 0, 0] == 0.1
+    still = twin.simulate(np.zeros((1, 50, 1)), seed=0)
+    assert made.observed[0, 10:, 0].mean() > still.observed[0, 10:, 0].mean()
+
+
+def test_what_has_no_name_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "model.xml"
+    unnamed = PENDULUM.replace('jointpos name="angle"', "jointpos")
+    path.write_text(unnamed.format(actuator=f'<motor joint="hinge"/>{MOTOR}', joint=""))
+    twin = MuJoCoTwin.from_file(path)
+    assert (twin.inputs.names, twin.outputs.names) == (("motor",), ("speed",))
+    path.write_text(unnamed.format(actuator='<motor joint="hinge"/>', joint=""))
+    with pytest.raises(rt.InputError, match="actuators that have names"):
+        MuJoCoTwin.from_file(path)
+
+
+def test_a_tendon_of_joints_has_no_length(tmp_path: Path) -> None:
+    path = tmp_path / "model.xml"
+    tendon = '<tendon><fixed name="sum"><joint joint="hinge" coef="2"/></fixed></tendon><keyframe>'
+    model = PENDULUM.replace("<keyframe>", tendon)
+    model = model.replace("<sensor>", '<sensor><tendonpos name="sum" tendon="sum"/>')
+    path.write_text(model.format(actuator=MOTOR, joint=""))
+    twin = MuJoCoTwin.from_file(path, outputs=["sum"])
+    assert twin.outputs.units == ("1",)
+    made = twin.simulate(np.zeros((1, 10, 1)), seed=0)
+    assert made.observed[0, 0, 0] == pytest.approx(0.2)
+
+
+def test_a_step_may_be_rounded_in_the_file(make) -> None:
+    commands = np.zeros((1, 60, 1))
+    rounded = make(keyframe="raised", rate=60.0, step=0.00208333).simulate(commands, seed=0)
+    exact = make(keyframe="raised", rate=60.0, step=1 / 480).simulate(commands, seed=0)
+    np.testing.assert_allclose(rounded.observed, exact.observed, atol=1e-5)
+
+
 def test_native_delay_shifts_the_response(make) -> None:
     commands = np.zeros((1, 100, 1))
     commands[0, 20:] = 0.3
@@ -128,6 +168,13 @@ def test_a_stuck_joint_stays_where_it_was_at_the_onset(make, onset: int) -> None
     np.testing.assert_array_equal(made.nominal[0, :, 0], free)
 
 
+def test_a_heavy_load_does_not_creep(make) -> None:
+    twin = make(joint='armature="1e5"', keyframe="raised")
+    made = twin.simulate(np.full((1, 1000, 1), 1e5), faults=[rt.Stuck(0, 20)], seed=0)
+    assert np.ptp(made.observed[0, 21:, 0]) < 1e-5
+    assert made.nominal[0, -1, 0] > 10
+
+
 def test_onsets_of_a_batch_do_not_disturb_each_other(make) -> None:
     commands = np.tile(0.8 * np.sin(np.arange(80) / 15)[None, :, None], (4, 1, 1))
     twin = make(SERVO)
@@ -155,6 +202,8 @@ def test_an_unstable_simulation_ends_alone(
         make().simulate(commands, seed=0)
     assert list(caught.value.failed) == [3]
     assert caught.value.finished.ids.tolist() == ["00000", "00001", "00002", "00004", "00005"]
+    with pytest.raises(rt.SimulationError, match=r"2 of 2 .* Inertia matrix"):
+        make().simulate(commands[:2], seed=0, parameters={"body.bob.mass": -1.0})
     assert [path.name for path in tmp_path.iterdir()] == ["model.xml"], "MuJoCo left its log"
 
 
@@ -196,6 +245,9 @@ def test_what_is_refused(make, tmp_path: Path) -> None:
         make(keyframe="standing")
     with pytest.raises(rt.InputError, match="divides the sample period"):
         make(rate=333.0)
+    for name, bad in [("rate", 0.0), ("step", -0.001), ("settle", np.nan), ("threads", -1)]:
+        with pytest.raises(rt.InputError, match=f"^{name}: expected .*, got {bad}"):
+            make(**{name: bad})
     with pytest.raises(rt.InputError, match="where there is none"):
         MuJoCoTwin.from_file(tmp_path / "gone.xml")
     (tmp_path / "bad.xml").write_text("<mujoco><worldbody><geom size='a'/></worldbody></mujoco>")
@@ -210,8 +262,17 @@ def test_what_is_refused(make, tmp_path: Path) -> None:
     for bad in ({"opt.gravty": 1}, {"joint.knee.damping": 1}, {"joint.hinge": 1}):
         with pytest.raises(rt.InputError, match=r'parameters: expected "KIND.NAME.FIELD'):
             twin.simulate(np.zeros((1, 20, 1)), seed=0, parameters=bad)
-    with pytest.raises(rt.InputError, match="as many values as there are trajectories"):
-        twin.simulate(np.zeros((3, 20, 1)), seed=0, parameters={"joint.hinge.damping": [1, 2]})
+    with pytest.raises(rt.InputError, match=r"'opt\.timestep', which they share"):
+        twin.simulate(np.zeros((1, 20, 1)), seed=0, parameters={"opt.timestep": 0.002})
+    for bad, got in (([1, 2], r"shape \(2,\)"), (np.ones(200), "shape"), ("high", "'high'")):
+        with pytest.raises(rt.InputError, match=f"got joint.hinge.damping: .*{got}"):
+            twin.simulate(np.zeros((128, 20, 1)), seed=0, parameters={"joint.hinge.damping": bad})
+    for bad, got in (
+        (lambda commands: commands, r"got float64, \(2, 20, 1\)"),
+        (lambda commands: np.full((2, 20, 2), np.nan), "got NaN"),
+    ):
+        with pytest.raises(rt.InputError, match=rf"nominal: .* shape \(2, 20, 2\), {got}"):
+            make(nominal=bad).simulate(np.zeros((2, 20, 1)), seed=0)
     runge = PENDULUM.replace("implicitfast", "RK4").format(actuator=MOTOR, joint="")
     (tmp_path / "runge.xml").write_text(runge, encoding="utf-8")
     with pytest.raises(rt.InputError, match="implicit integrator"):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
@@ -129,6 +130,8 @@ def _brief(error: Exception) -> str:
 
 def _draw_with(backend: str) -> None:
     """Called in the worker before MuJoCo is there: it looks at these when it is imported."""
+    # What cannot draw ends in an error that says why; a library's own lines would only repeat it.
+    warnings.simplefilter("ignore")
     os.environ["MUJOCO_GL"] = backend
     os.environ.pop("PYOPENGL_PLATFORM", None)
 

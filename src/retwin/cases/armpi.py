@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from retwin.case import Case
 from retwin.cases.armpi_body import ArmBody
 from retwin.cases.armpi_recovery import RAMPS, ramp_commands, recover_commands
+from retwin.commands import draw_onsets
 from retwin.corrections import DelayOffset
 from retwin.faults import Fault, SteadyStateError, Stuck, frozen_response
 from retwin.trajectories import Trajectories
@@ -73,24 +74,10 @@ class ArmSampler:
             now = now + np.clip(goals[:, movement] - now, -reach, reach)
             now = UNIT * np.round(now / UNIT)
             targets[:, movement] = STRAIGHT - now / UNIT
-        if timing is None or len(timing) == 0:
-            onsets = np.tile(self.period * np.arange(self.movements, dtype=float), (count, 1))
-        else:
-            onsets = self._onsets(timing[rng.integers(len(timing), size=count)])
+        onsets = draw_onsets(count, self.movements, self.period, rng=rng, timing=timing)
         start = np.full((count, len(self.amplitude)), STRAIGHT)
         made = ramp_commands(start, targets, ramps, onsets, self.steps)
         return made.astype(np.float32)
-
-    def _onsets(self, drawn: NDArray) -> NDArray:
-        """Onsets of as many movements as this sampler makes, continued at its period."""
-        onsets = np.full((len(drawn), self.movements), np.nan)
-        width = min(drawn.shape[1], self.movements)
-        onsets[:, :width] = drawn[:, :width]
-        for movement in range(self.movements):
-            before = onsets[:, movement - 1] + self.period if movement else np.zeros(len(drawn))
-            gap = np.isnan(onsets[:, movement])
-            onsets[gap, movement] = before[gap]
-        return onsets
 
 
 def recover(trajectories: Trajectories, progress: Progress | None = None) -> Trajectories:

@@ -47,9 +47,9 @@ def animate(
     check_film(out)
     shape = _size(size)
     found = cases.get(case)
+    with bar("read") as tell:
+        trajectories = load(file, case=found, progress=lambda share: tell(file.name, share))
     with bar("animate") as tell:
-        tell(f"read {file.name}", 0.0)
-        trajectories = load(file, case=found)
         path = film(
             trajectories,
             found,

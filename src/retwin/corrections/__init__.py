@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from retwin.corrections.command_space import CommandSpace
 from retwin.corrections.delay_offset import DelayOffset
 from retwin.corrections.protocol import Context, Correction, Discrepancy, Head
 
-__all__ = ["OPERATORS", "Context", "Correction", "DelayOffset", "Discrepancy", "Head"]
+__all__ = [
+    "OPERATORS",
+    "CommandSpace",
+    "Context",
+    "Correction",
+    "DelayOffset",
+    "Discrepancy",
+    "Head",
+]
 
-OPERATORS: tuple[type, ...] = (DelayOffset,)
+OPERATORS: tuple[type, ...] = (DelayOffset, CommandSpace)
 """Those that a model folder may name."""

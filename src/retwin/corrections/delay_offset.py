@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from retwin.corrections.protocol import Context, Discrepancy, Head
+from retwin.corrections.warp import Knots, read
 from retwin.segments import Segments
 from retwin.trajectories import Channels
 
@@ -42,23 +43,23 @@ class DelayOffset:
         """One z per movement."""
         return "segment"
 
-    def latent(self, outputs: Channels) -> Channels:
+    def latent(self, inputs: Channels, outputs: Channels) -> Channels:
         """`delay` in samples, then one offset per output in its unit."""
         return Channels(
             ("delay", *(f"offset_{name}" for name in outputs.names)), ("samples", *outputs.units)
         )
 
-    def heads(self, outputs: Channels) -> tuple[Head, ...]:
+    def heads(self, inputs: Channels, outputs: Channels) -> tuple[Head, ...]:
         """A mixture for the delay, another for the offset (section 4.2.3)."""
-        return ("delay", 1), ("offset", len(outputs))
+        return Head("delay", 1), Head("offset", len(outputs))
 
     def apply(self, context: Context, z: Tensor) -> Tensor:
         """The corrected path (n, T, d_y), continuous, for z (n, M, 1 + d_y)."""
         if context.segments.most == 0:
             return context.path
-        knots = _Knots.of(context.segments, z[..., 0].to(context.path))
+        knots = Knots.of(context.segments, z[..., 0].to(context.path))
         offset = knots.between(knots.spread(z[..., 1:].to(context.path)))
-        return _read(context.path, knots.source_time()) + offset
+        return read(context.path, knots.source_time()) + offset
 
     @torch.no_grad()
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
@@ -73,7 +74,10 @@ class DelayOffset:
             for i in range(0, len(context), CHUNK)
         ]
         return Discrepancy(
-            *(torch.cat([getattr(p, name) for p in parts]) for name in Discrepancy.__annotations__)
+            torch.cat([part.z for part in parts]),
+            torch.cat([part.covariance for part in parts]),
+            torch.cat([part.identified for part in parts]),
+            torch.cat([part.noise for part in parts]),
         )
 
     def _infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
@@ -155,75 +159,6 @@ class DelayOffset:
         return Discrepancy(z, covariance, identified & valid[..., None], steady)
 
 
-@dataclass(frozen=True, eq=False)
-class _Knots:
-    """Where the pieces of the warped time join, and for each sample its piece and place in it."""
-
-    source: Tensor  # (n, 2 M), time of each knot in the uncorrected path
-    target: Tensor  # (n, 2 M), time of each knot in the corrected path
-    right: Tensor  # (n, T), index of the knot that follows each sample
-    share: Tensor  # (n, T), place between the knot before (0) and after (1)
-    time: Tensor  # (T,)
-
-    @classmethod
-    def of(cls, segments: Segments, delay: Tensor) -> _Knots:
-        source = torch.stack(
-            [
-                torch.as_tensor(segments.start, dtype=delay.dtype),
-                torch.as_tensor(segments.settle, dtype=delay.dtype),
-            ],
-            -1,
-        ).flatten(1)
-        # A movement cannot begin before the last one has ended, however the delays differ.
-        target = (source + delay.repeat_interleave(2, dim=1)).cummax(dim=1).values
-        time = torch.arange(segments.steps, dtype=delay.dtype)
-        right = torch.searchsorted(target, time.expand(len(target), -1).contiguous(), right=True)
-        last = target.shape[1] - 1
-        begin = target.gather(1, (right - 1).clamp(0, last))
-        end = target.gather(1, right.clamp(0, last))
-        share = (time - begin) / (end - begin).clamp_min(1e-9)
-        return cls(source, target, right, share.clamp(0, 1), time)
-
-    def between(self, values: Tensor) -> Tensor:
-        """Values (n, 2 M, k) of the knots, linear between them and constant outside: (n, T, k)."""
-        last = values.shape[1] - 1
-        index = self.right[..., None].expand(-1, -1, values.shape[2])
-        before = values.gather(1, (index - 1).clamp(0, last))
-        after = values.gather(1, index.clamp(0, last))
-        return before + self.share[..., None] * (after - before)
-
-    def slope(self, values: Tensor) -> Tensor:
-        """Change per sample of `between` (n, T, k)."""
-        last = values.shape[1] - 1
-        before, after = (self.right - 1).clamp(0, last), self.right.clamp(0, last)
-        wide = [place[..., None].expand(-1, -1, values.shape[2]) for place in (before, after)]
-        length = self.target.gather(1, after) - self.target.gather(1, before)
-        rise = values.gather(1, wide[1]) - values.gather(1, wide[0])
-        return rise / length.clamp_min(1e-9)[..., None]
-
-    def source_time(self) -> Tensor:
-        """When in the uncorrected path each sample (n, T) is read."""
-        inner = self.between(self.source[..., None])[..., 0]
-        early = (self.time - self.target[:, :1]).clamp_max(0)
-        late = (self.time - self.target[:, -1:]).clamp_min(0)
-        return inner + early + late
-
-    @staticmethod
-    def spread(offset: Tensor) -> Tensor:
-        """Offsets (n, M, k) on the knots (n, 2 M, k): the last one's at the start, then its own."""
-        before = torch.cat([torch.zeros_like(offset[:, :1]), offset[:, :-1]], dim=1)
-        return torch.stack([before, offset], dim=2).flatten(1, 2)
-
-
-def _read(path: Tensor, when: Tensor) -> Tensor:
-    """The path (n, T, d) at the fractional samples `when` (n, T), held beyond its ends."""
-    when = when.clamp(0, path.shape[1] - 1)
-    below = when.detach().floor().long().clamp_max(max(path.shape[1] - 2, 0))
-    index = below[..., None].expand(-1, -1, path.shape[2])
-    before, after = path.gather(1, index), path.gather(1, index + 1)
-    return before + (when - below)[..., None] * (after - before)
-
-
 class _Model:
     """The corrected path as a function of z, its residual and its derivative."""
 
@@ -237,9 +172,9 @@ class _Model:
 
     def residual(self, z: Tensor) -> Tensor:
         """Observed minus corrected (n, T, d_y)."""
-        knots = _Knots.of(self.segments, z[..., 0])
+        knots = Knots.of(self.segments, z[..., 0])
         offset = knots.between(knots.spread(z[..., 1:]))
-        return self.observed - _read(self.path, knots.source_time()) - offset
+        return self.observed - read(self.path, knots.source_time()) - offset
 
     def weight(self, residual: Tensor, noise: Tensor) -> Tensor:
         """Tukey's biweight (n, T) on the length of the residual, over the noise's variance."""
@@ -253,11 +188,11 @@ class _Model:
 
     def linearised(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Residual (n, T, d_y) and the corrected path's derivative (n, T, d_y, M (1 + d_y))."""
-        knots = _Knots.of(self.segments, z[..., 0])
+        knots = Knots.of(self.segments, z[..., 0])
         n, most, size = z.shape
         values = knots.spread(z[..., 1:])
         when = knots.source_time()
-        residual = self.observed - _read(self.path, when) - knots.between(values)
+        residual = self.observed - read(self.path, when) - knots.between(values)
         unit = torch.eye(most, dtype=z.dtype).expand(n, -1, -1)
         reach = knots.between(knots.spread(unit))  # (n, T, M): share of each movement's offset
         late = knots.between(unit.repeat_interleave(2, dim=1))  # share of each movement's delay

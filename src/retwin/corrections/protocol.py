@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from numpy.typing import NDArray
@@ -27,8 +27,20 @@ class DifferentiableTwin(Protocol):
         ...
 
 
-Head = tuple[str, int]
-"""A block of z that gets a mixture of its own in the residual model: name and width."""
+@dataclass(frozen=True)
+class Head:
+    """A block of z that the residual model draws on its own.
+
+    Attributes
+    ----------
+    name, width: what it is, and how many components of z it has.
+    kind: "mixture", a Gaussian mixture with full covariance; or "bernoulli", 0 or 1 each.
+
+    """
+
+    name: str
+    width: int
+    kind: Literal["mixture", "bernoulli"] = "mixture"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +51,11 @@ class Context:
     ----------
     surrogate: commands (n, T, d_u) to outputs (n, T, d_y), differentiable.
     commands: (n, T, d_u), clean.
-    faulty: (n, T, d_u), with faults; the clean ones when there is none.
+    told: (n, T, d_u), with the faults' effect on the reference.
+    frozen: (n, d_u), the sample from which a fault holds an actuator's response; T for never.
     nominal: (n, T, d_y), the surrogate's output for the clean commands.
-    path: (n, T, d_y), the surrogate's output for the faulty commands: what is corrected.
+    path: (n, T, d_y), the surrogate's output for what the actuators are told, held where they are
+        frozen: what is corrected.
     segments: movements of the clean commands or of the nominal path.
     rate: samples per second.
 
@@ -49,7 +63,8 @@ class Context:
 
     surrogate: DifferentiableTwin
     commands: Tensor
-    faulty: Tensor
+    told: Tensor
+    frozen: Tensor
     nominal: Tensor
     path: Tensor
     segments: Segments
@@ -63,7 +78,8 @@ class Context:
         return replace(
             self,
             commands=self.commands[index],
-            faulty=self.faulty[index],
+            told=self.told[index],
+            frozen=self.frozen[index],
             nominal=self.nominal[index],
             path=self.path[index],
             segments=self.segments[index],
@@ -77,16 +93,22 @@ class Context:
         segments: Segments,
         *,
         rate: float,
-        faulty: NDArray | None = None,
+        told: NDArray | None = None,
+        frozen: NDArray | None = None,
     ) -> Context:
         """The context of those commands; the surrogate is asked once, or twice with faults."""
         clean = torch.tensor(commands, dtype=torch.float32)
         nominal = torch.as_tensor(surrogate.predict(commands))
-        if faulty is None:
-            return cls(surrogate, clean, clean, nominal, nominal, segments, rate)
-        told = torch.tensor(faulty, dtype=torch.float32)
-        path = torch.as_tensor(surrogate.predict(faulty))
-        return cls(surrogate, clean, told, nominal, path, segments, rate)
+        steps = commands.shape[1]
+        never = torch.full((len(commands), commands.shape[2]), steps)
+        if told is None and frozen is None:
+            return cls(surrogate, clean, clean, never, nominal, nominal, segments, rate)
+        reference = clean if told is None else torch.tensor(told, dtype=torch.float32)
+        since = never if frozen is None else torch.as_tensor(frozen)
+        time = torch.minimum(torch.arange(steps)[:, None], since[:, None])
+        held = reference.gather(1, time)
+        path = torch.as_tensor(surrogate.predict(held.numpy()))
+        return cls(surrogate, clean, reference, since, nominal, path, segments, rate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +121,10 @@ class Discrepancy:
     covariance: (n, M, d_z, d_z), of each movement's z, correlated noise accounted for.
     identified: (n, M, d_z) bool, False where the outputs do not tell that component.
     noise: (n,) scale of what z leaves unexplained, in the output's unit.
+    severity: (n, M, d_u), how far a fault left an actuator off its command; None where the operator
+        cannot tell.
+    posterior: whether z and covariance are a whole posterior: what the outputs do not tell is then
+        as wide as what is believed of it beforehand, and draws stand for z everywhere.
 
     """
 
@@ -106,6 +132,8 @@ class Discrepancy:
     covariance: Tensor
     identified: Tensor
     noise: Tensor
+    severity: Tensor | None = None
+    posterior: bool = False
 
 
 @runtime_checkable
@@ -117,16 +145,16 @@ class Correction(Protocol):
         """What z has one value for: "segment" or "step"."""
         ...
 
-    def latent(self, outputs: Channels) -> Channels:
-        """Names and units of the components of z for a system with these outputs."""
+    def latent(self, inputs: Channels, outputs: Channels) -> Channels:
+        """Names and units of the components of z for a system with these channels."""
         ...
 
-    def heads(self, outputs: Channels) -> tuple[Head, ...]:
+    def heads(self, inputs: Channels, outputs: Channels) -> tuple[Head, ...]:
         """Blocks of z, in order, that the residual model draws independently of each other."""
         ...
 
     def apply(self, context: Context, z: Tensor) -> Tensor:
-        """The corrected output (n, T, d_y): `context.path` with z (n, M, d_z) applied."""
+        """The corrected output (n, T, d_y): `context.path` when z (n, M, d_z) is 0."""
         ...
 
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:

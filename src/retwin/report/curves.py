@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from retwin.report.results import Results
 from retwin.report.words import quantity
 
-__all__ = ["Latent", "Roc", "ece_floor", "latents", "micro_roc"]
+__all__ = ["Band", "Latent", "Roc", "bands", "ece_floor", "latents", "micro_roc"]
 
 GRID = np.linspace(0, 1, 201)
 
@@ -88,22 +88,52 @@ class Latent:
     outside: tuple[int, int]
 
 
-def latents(results: Results) -> list[Latent]:
-    """Every latent for which the arrays hold observed and predicted values."""
-    observed = results.arrays.get("z/observed")
-    predicted = results.arrays.get("z/predicted")
+def latents(results: Results, source: str) -> list[Latent]:
+    """All that is told per movement and of which the arrays hold measured and generated values."""
+    observed = results.arrays.get(f"z/{source}/observed")
+    predicted = results.arrays.get(f"z/{source}/predicted")
     if observed is None or predicted is None:
         return []
-    identified = results.arrays.get("z/identified", np.ones(observed.shape)).astype(bool)
-    names, units = results.fidelity.latent, results.fidelity.units
+    told = results.fidelity[source]
+    units = [*told.movement_units, *[""] * len(told.movement)]
     found = []
-    for column, name in enumerate(names[: observed.shape[1]]):
-        factor, unit = quantity(units[column] if column < len(units) else "")
-        seen = factor * observed[identified[:, column], column]
+    for column, name in enumerate(told.movement):
+        factor, unit = quantity(units[column])
+        seen = factor * observed[:, column]
         said = factor * predicted[:, column]
         seen, said = seen[np.isfinite(seen)], said[np.isfinite(said)]
         if len(seen) and len(said):
             found.append(_bin(name, unit, seen, said))
+    return found
+
+
+@dataclass(frozen=True)
+class Band:
+    """One output of one trajectory, minus the nominal one: measured (P,), quantiles (5, P)."""
+
+    trajectory: str
+    output: str
+    unit: str
+    time: NDArray
+    observed: NDArray
+    quantiles: NDArray
+
+
+def bands(results: Results, source: str) -> list[Band]:
+    """Trajectories one after the other, each with all outputs; NaN where nothing was measured."""
+    parts, told = results.bands(source), results.fidelity[source]
+    if not parts:
+        return []
+    units = [*told.units, *[""] * len(told.outputs)]
+    residual = np.where(parts["seen"][..., None], parts["observed"] - parts["nominal"], np.nan)
+    quantiles = parts["quantiles"] - parts["nominal"][:, None]
+    time = np.arange(residual.shape[1]) / float(parts["rate"])
+    found = []
+    for i, trajectory in enumerate(parts["ids"].tolist()):
+        for c, output in enumerate(told.outputs):
+            factor, unit = quantity(units[c])
+            seen, said = factor * residual[i, :, c], factor * quantiles[i, :, :, c]
+            found.append(Band(str(trajectory), output, unit, time, seen, said))
     return found
 
 

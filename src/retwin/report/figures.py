@@ -12,11 +12,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
+from numpy.typing import NDArray
 
-from retwin.report.curves import Latent
+from retwin.report.curves import Band, Latent, bands
+from retwin.report.fidelity import figure_names, groups
 from retwin.report.plots import DASHES, latent_names, missing, published_value
 from retwin.report.results import Results
-from retwin.report.sections import discrepancy_groups, recalls, roc_curves
+from retwin.report.sections import recalls, roc_curves
 from retwin.report.words import (
     CHROME,
     METRICS,
@@ -30,8 +32,8 @@ from retwin.report.words import (
 
 __all__ = ["FIGURES", "draw_figures"]
 
-FIGURES = ("scores", "confusion", "roc", "tde", "tpe")
-"""Every figure there can be; its file is `figures/NAME.png`."""
+FIGURES = ("scores", "confusion", "roc", "tde", "tpe", "noise", "pit", "bands")
+"""The figures of a study; its file is `figures/NAME.png`, of a second source `NAME-2.png`."""
 SCORES = ("macro_f1", "balanced_accuracy", "auroc", "healthy_recall")
 STYLES = dict(zip(DASHES, ("-", "--", ":", "-."), strict=True))
 INK, MUTED, GRID, RULE, WASH, OBSERVED, ALARM = (
@@ -42,8 +44,13 @@ INK, MUTED, GRID, RULE, WASH, OBSERVED, ALARM = (
 def draw_figures(results: Results) -> dict[str, bytes]:
     """PNG by figure name; what lacks its data is left out."""
     drawn = {"scores": _scores(results), "confusion": _confusion(results), "roc": _roc(results)}
-    for name, _, shown in discrepancy_groups(results):
-        drawn[name] = _latents(shown)
+    for group in groups(results):
+        drawn[group.name] = _latents(group.shown, group.source)
+    for source, added in figure_names(results).items():
+        if f"pit/{source}" in results.arrays:
+            drawn[f"pit{added}"] = _pit(results.arrays[f"pit/{source}"], source)
+        if shown := bands(results, source):
+            drawn[f"bands{added}"] = _bands(shown, source)
     return {
         name: _png(figure, results.emulated) for name, figure in drawn.items() if figure is not None
     }
@@ -178,14 +185,14 @@ def _roc(results: Results) -> Figure | None:
     return figure
 
 
-def _latents(shown: Sequence[Latent]) -> Figure:
+def _latents(shown: Sequence[Latent], source: str) -> Figure:
     figure = _figure(1 + 3.6 * max(len(shown), 1.3), 3.4)
     for axes, latent in zip(figure.subplots(1, len(shown), squeeze=False).flat, shown, strict=True):
         title, quantity = latent_names(latent.name)
         left, width = latent.edges[:-1], np.diff(latent.edges)
         axes.bar(left, latent.observed, width, align="edge", color=OBSERVED, label="observed")
-        colour = _colour("ibg_rg")
-        axes.stairs(latent.predicted, latent.edges, color=colour, linewidth=1.8, label="predicted")
+        colour = _colour(source)
+        axes.stairs(latent.predicted, latent.edges, color=colour, linewidth=1.8, label="generated")
         unit = f", {latent.unit}" if latent.unit else ""
         _dress(axes, f"{quantity}{unit}", "share per bin")
         axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
@@ -196,4 +203,47 @@ def _latents(shown: Sequence[Latent]) -> Figure:
         axes.set_xlim(latent.edges[0], latent.edges[-1])
     marks = figure.axes[0].get_legend_handles_labels()
     figure.legend(*marks, frameon=False, fontsize=9, ncols=2, loc="outside lower left")
+    return figure
+
+
+def _pit(pit: NDArray, source: str) -> Figure:
+    figure = _figure(5.6, 3.6)
+    axes = figure.add_subplot()
+    count = pit.shape[1]
+    edges = np.linspace(0, 1, count + 1)
+    low, high = (np.append(row, row[-1]) for row in pit[1:])
+    text, colour = "where 90 % of perfect generators lie", _colour(source)
+    axes.fill_between(
+        edges, low, high, step="post", color=colour, alpha=0.25, linewidth=0, label=text
+    )
+    axes.axhline(1 / count, color=MUTED, linestyle=":", linewidth=1, label="uniform")
+    axes.stairs(pit[0], edges, baseline=None, color=INK, linewidth=1.6, label="measured")
+    axes.set_ylim(0, 1.1 * max(high.max(), pit[0].max()))
+    _dress(axes, "share of draws below the measured value", "share of points")
+    axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+    axes.set_xlim(0, 1)
+    figure.legend(frameon=False, fontsize=9, ncols=3, loc="outside lower left")
+    return figure
+
+
+def _bands(shown: Sequence[Band], source: str) -> Figure:
+    """A row per trajectory, a column per output."""
+    names = list(dict.fromkeys(band.trajectory for band in shown))
+    wide = len(shown) // len(names)
+    figure = _figure(0.6 + 3.6 * max(wide, 1.3), 0.5 + 2.6 * len(names))
+    grid = figure.subplots(len(names), wide, squeeze=False, sharex=True)
+    colour = _colour(source)
+    for axes, band in zip(grid.flat, shown, strict=True):
+        for low, high, alpha, text in ((0, 4, 0.2, "90 % of the draws"), (1, 3, 0.45, "50 %")):
+            edges = band.quantiles[low], band.quantiles[high]
+            axes.fill_between(band.time, *edges, color=colour, alpha=alpha, linewidth=0, label=text)
+        axes.plot(band.time, band.observed, color=INK, linewidth=1, label="measured")
+        unit = f", {band.unit}" if band.unit else ""
+        last = band.trajectory == names[-1]
+        _dress(axes, "time, s" if last else "", f"{band.output} minus nominal{unit}")
+        which = "typical" if band.trajectory == names[0] else "worst"
+        axes.set_title(f"{band.output}, {which}", fontsize=11, color=INK, loc="left")
+        axes.set_xlim(band.time[0], band.time[-1])
+    marks = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*marks, frameon=False, fontsize=9, ncols=3, loc="outside lower left")
     return figure

@@ -47,13 +47,12 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     results = read_results(folder)
     images = draw_figures(results)
     figures = Path(folder) / "figures"
-    for name in FIGURES:
-        target = figures / f"{name}.png"
-        if name in images:
-            with write_atomically(target) as part:
-                part.write_bytes(images[name])
-        else:  # from an earlier report whose results had it
-            target.unlink(missing_ok=True)
+    for name, image in images.items():
+        with write_atomically(figures / f"{name}.png") as part:
+            part.write_bytes(image)
+    for stale in figures.glob("*.png"):  # from an earlier report whose results had it
+        if stale.stem not in images and stale.stem.split("-")[0] in FIGURES:
+            stale.unlink()
     page = Path(folder) / "report.html"
     with write_atomically(page) as part:
         part.write_text(render(results, images), encoding="utf-8", newline="\n")

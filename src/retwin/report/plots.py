@@ -17,6 +17,7 @@ from retwin.report.words import METRICS, mean_and_spread, number, order, slot, s
 __all__ = [
     "DASHES",
     "FONT",
+    "axis",
     "caption",
     "latent_names",
     "latent_plot",
@@ -24,6 +25,8 @@ __all__ = [
     "published_value",
     "roc_plot",
     "scores_plot",
+    "short",
+    "spec",
 ]
 
 DASHES = ("solid", "dash", "dot", "dashdot")
@@ -35,7 +38,8 @@ def caption(results: Results, text: str) -> str:
     return f"Emulated robot, no real measurements. {text}" if results.emulated else text
 
 
-def _axis(title: str, **more: Any) -> dict[str, Any]:
+def axis(title: str, **more: Any) -> dict[str, Any]:
+    """An axis in the page's style; `more` as plotly names it."""
     return {
         "title": {
             "text": html.escape(title, quote=False),
@@ -54,7 +58,8 @@ def _axis(title: str, **more: Any) -> dict[str, Any]:
     }
 
 
-def _spec(data: list[dict[str, Any]], x: dict[str, Any], y: dict[str, Any]) -> dict[str, Any]:
+def spec(data: list[dict[str, Any]], x: dict[str, Any], y: dict[str, Any]) -> dict[str, Any]:
+    """A picture of these traces and axes."""
     layout = {
         "xaxis": x,
         "yaxis": y,
@@ -85,20 +90,20 @@ def scores_plot(results: Results, metrics: Sequence[str]) -> Plot | None:
     for place, source in enumerate(sources):
         lane = 0.6 * (place + 0.5) / len(sources) - 0.25
         data += _score_traces(results, source, bounded, lane)
-    y = _axis("", showticklabels=False, range=[len(bounded) - 0.5, -0.55], showgrid=False)
+    y = axis("", showticklabels=False, range=[len(bounded) - 0.5, -0.55], showgrid=False)
     y |= {"ticks": "", "showline": False}
-    x = _axis("score", range=[-0.01, 1.02], tickformat=".1f", dtick=0.2)
+    x = axis("score", range=[-0.01, 1.02], tickformat=".1f", dtick=0.2)
     keys = [Key(source_name(name), f"c{slot(name)}", "disc") for name in sources]
     text = "Dots are means over runs, bars the 95 % bootstrap interval over test trajectories"
     if any(trace["name"].endswith("(paper)") for trace in data):
         keys.append(Key("paper’s mean ± sd over its runs", "muted", "diamond"))
         text += "; open diamonds are the paper’s numbers, in the colour of their source"
-    spec = _spec(data, x, y)
-    spec["layout"]["annotations"] = [
+    picture = spec(data, x, y)
+    picture["layout"]["annotations"] = [
         _lane_title(METRICS[name].name, i) for i, name in enumerate(bounded)
     ]
     height = 70 + len(bounded) * (30 + 24 * max(len(sources), 2))
-    panel = Panel(spec, "Scores of every source as dots with intervals", height=height)
+    panel = Panel(picture, "Scores of every source as dots with intervals", height=height)
     see = (
         ". Look at the order of the sources and at how far apart they lie; bars that overlap do "
         "not settle a comparison, the paired differences do."
@@ -201,8 +206,8 @@ def roc_plot(results: Results, curves: dict[str, Roc]) -> Plot:
         data += _roc_traces(source, curve, dash)
         area = mean_and_spread(curve.areas)
         keys.append(Key(f"{source_name(source)}: area {area}", f"c{slot(source)}", dash))
-    x = _axis("false positive rate", range=[-0.01, 1.01], dtick=0.2)
-    y = _axis("true positive rate", range=[-0.01, 1.01], dtick=0.2)
+    x = axis("false positive rate", range=[-0.01, 1.01], dtick=0.2)
+    y = axis("true positive rate", range=[-0.01, 1.01], dtick=0.2)
     text = (
         f"Micro-averaged ROC, mean over {results.runs} runs; shading: ± one standard deviation. "
         "The further up and to the left, the better a source’s classifier separates the classes "
@@ -211,14 +216,14 @@ def roc_plot(results: Results, curves: dict[str, Roc]) -> Plot:
         else "Micro-averaged ROC of the one run, so there is no band. The further up and to the "
         "left, the better a source’s classifier separates the classes at any threshold."
     )
-    panel = Panel(_spec(data, x, y), "Micro-averaged ROC curves", height=460)
+    panel = Panel(spec(data, x, y), "Micro-averaged ROC curves", height=460)
     return Plot("roc", caption(results, text), [panel], keys, narrow=True)
 
 
 def _roc_traces(source: str, curve: Roc, dash: str) -> list[dict[str, Any]]:
     colour = f"@c{slot(source)}"
-    low, high = (_short(edge) for edge in curve.band)
-    x = _short(curve.rate)
+    low, high = (short(edge) for edge in curve.band)
+    x = short(curve.rate)
     name = html.escape(source_name(source), quote=False)
     traces: list[dict[str, Any]] = []
     if len(curve.areas) > 1:
@@ -241,7 +246,7 @@ def _roc_traces(source: str, curve: Roc, dash: str) -> list[dict[str, Any]]:
             "mode": "lines",
             "name": name,
             "x": x,
-            "y": _short(curve.mean),
+            "y": short(curve.mean),
             "line": {"color": colour, "width": 2.2, "dash": dash},
             "hovertemplate": f"{name}<br>%{{y:.3f}} at %{{x:.2f}}<extra></extra>",
         }
@@ -253,8 +258,10 @@ def latent_names(name: str) -> tuple[str, str]:
     """Title of a panel and quantity on its axis."""
     if name.startswith("delay"):
         return f"TDe{name[5:].replace('_', ' ')}", "delay"
-    if name.startswith("offset_"):
-        return f"TPE {name[7:].replace('_', ' ')}", f"offset {name[7:].replace('_', ' ')}"
+    for start, title, what in (("offset_", "TPE", "offset"), ("noise_", "Noise", "noise")):
+        if name.startswith(start):
+            rest = name[len(start) :].replace("_", " ")
+            return f"{title} {rest}", f"{what} {rest}"
     return name.replace("_", " "), name.replace("_", " ")
 
 
@@ -262,30 +269,32 @@ def missing(latent: Latent) -> str:
     """How many values the range leaves out."""
     seen, said = latent.outside
     if not seen and not said:
-        return f"All {latent.counts[0]} observed and {latent.counts[1]} predicted values are shown."
+        return f"All {latent.counts[0]} observed and {latent.counts[1]} generated values are shown."
     return (
         f"Outside the range shown: {seen} of {latent.counts[0]} observed, "
-        f"{said} of {latent.counts[1]} predicted."
+        f"{said} of {latent.counts[1]} generated."
     )
 
 
-def latent_plot(results: Results, name: str, text: str, shown: Sequence[Latent]) -> Plot:
-    """Observed as bars, predicted as a stepped line, a panel per latent."""
-    keys = [Key("observed", "observed", "bar"), Key("predicted", f"c{slot('ibg_rg')}")]
-    panels = [_latent_panel(each) for each in shown]
+def latent_plot(
+    results: Results, source: str, name: str, text: str, shown: Sequence[Latent]
+) -> Plot:
+    """Observed as bars, generated as a stepped line, a panel per latent."""
+    keys = [Key("observed", "observed", "bar"), Key("generated", f"c{slot(source)}")]
+    panels = [_latent_panel(each, f"@c{slot(source)}") for each in shown]
     return Plot(name, caption(results, text), panels, keys, narrow=len(panels) == 1)
 
 
-def _latent_panel(latent: Latent) -> Panel:
-    title, axis = latent_names(latent.name)
+def _latent_panel(latent: Latent, colour: str) -> Panel:
+    title, what = latent_names(latent.name)
     unit = f", {latent.unit}" if latent.unit else ""
-    edges = _short(latent.edges, 5)
+    edges = short(latent.edges, 5)
     data: list[dict[str, Any]] = [
         {
             "type": "bar",
             "name": "observed",
-            "x": _short((latent.edges[1:] + latent.edges[:-1]) / 2, 5),
-            "y": _short(latent.observed, 5),
+            "x": short((latent.edges[1:] + latent.edges[:-1]) / 2, 5),
+            "y": short(latent.observed, 5),
             "width": float(np.diff(latent.edges).mean()),
             "marker": {"color": "@observed", "line": {"width": 0}},
             "hovertemplate": "observed<br>%{y:.1%} near %{x:.3g}<extra></extra>",
@@ -293,19 +302,20 @@ def _latent_panel(latent: Latent) -> Panel:
         {
             "type": "scatter",
             "mode": "lines",
-            "name": "predicted",
+            "name": "generated",
             "x": [edges[0], *edges],
-            "y": [0, *_short(latent.predicted, 5), 0],
-            "line": {"shape": "hv", "color": f"@c{slot('ibg_rg')}", "width": 2.2},
-            "hovertemplate": "predicted<br>%{y:.1%} from %{x:.3g}<extra></extra>",
+            "y": [0, *short(latent.predicted, 5), 0],
+            "line": {"shape": "hv", "color": colour, "width": 2.2},
+            "hovertemplate": "generated<br>%{y:.1%} from %{x:.3g}<extra></extra>",
         },
     ]
     # A step to each bin's share at its left edge: the first point only lifts the line from zero.
-    x = _axis(f"{axis}{unit}", range=[edges[0], edges[-1]], nticks=7)
-    y = _axis("share per bin", tickformat=".0%", rangemode="tozero", nticks=6)
-    alt = f"{title}, observed and predicted, {number(edges[0], 1)} to {number(edges[-1], 1)}{unit}"
-    return Panel(_spec(data, x, y), alt, title, missing(latent), height=300)
+    x = axis(f"{what}{unit}", range=[edges[0], edges[-1]], nticks=7)
+    y = axis("share per bin", tickformat=".0%", rangemode="tozero", nticks=6)
+    alt = f"{title}, observed and generated, {number(edges[0], 1)} to {number(edges[-1], 1)}{unit}"
+    return Panel(spec(data, x, y), alt, title, missing(latent), height=300)
 
 
-def _short(values: Any, digits: int = 4) -> list[float]:
+def short(values: Any, digits: int = 4) -> list[float]:
+    """Numbers with as many digits as a picture needs, so that the page stays small."""
     return [float(f"{value:.{digits}g}") for value in np.asarray(values, dtype=float)]

@@ -14,7 +14,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from retwin.errors import InputError
 
-__all__ = ["SCHEMA", "Comparison", "Dataset", "Fidelity", "Results", "Source", "read_results"]
+__all__ = [
+    "SCHEMA",
+    "Comparison",
+    "Dataset",
+    "Fidelity",
+    "Figure",
+    "Results",
+    "Source",
+    "read_results",
+]
 
 SCHEMA = 1
 SCORES = (
@@ -134,22 +143,33 @@ class Comparison(Part):
         return self.model_copy(update=turned)
 
 
-class Agreement(Part):
-    """A Kolmogorov-Smirnov test on one latent."""
+class Figure(Part):
+    """A figure with its bootstrap interval, and the share of perfect generators as bad."""
 
-    name: str
-    statistic: float
+    value: float | None = None
+    interval: Interval | None = None
     p: float | None = None
+
+    @property
+    def ends(self) -> tuple[float, float] | None:
+        """The interval, if there is one."""
+        return _finite(self.interval)
 
 
 class Fidelity(Part):
-    """How well the predicted discrepancy agrees with the observed one."""
+    """How real the draws of one source's twin are."""
 
-    latent: list[str] = []
+    trajectories: int | None = None
+    draws: int | None = None
+    rate: float | None = None
+    outputs: list[str] = []
     units: list[str] = []
-    held_out: int | None = None
-    ks: list[Agreement] = []
-    coverage90: dict[str, float | None] = {}
+    movement: list[str] = []
+    movement_units: list[str] = []
+    movements: int | None = None
+    rivals: list[str] = []
+    widening: float | None = None
+    figures: dict[str, Figure] = {}
 
 
 class Surrogate(Part):
@@ -177,7 +197,7 @@ class Results(Part):
     published: dict[str, dict[str, str]] = {}
     comparisons: list[Comparison] = []
     surrogate: Surrogate = Surrogate()
-    fidelity: Fidelity = Fidelity()
+    fidelity: dict[str, Fidelity] = {}
     timing: dict[str, Any] = {}
     provenance: dict[str, Any] = {}
     arrays: dict[str, NDArray] = {}
@@ -201,22 +221,49 @@ class Results(Part):
             wanted = (len(self.data.test.labels), size)
             if shape != (0,) and shape[1:] != wanted:
                 raise ValueError(f"probabilities/{name} has shape {shape}, not (runs, *{wanted})")
-        self._check_latents()
+        for name in self.fidelity:
+            self._check_latents(name)
+            self._check_bands(name)
         self._check_poses()
         strange = set(self.data.test.labels) - set(self.classes)
         if strange and self.classes:
             raise ValueError(f"test label {min(strange)!r} is none of the classes")
         return self
 
-    def _check_latents(self) -> None:
-        seen, said = self.arrays.get("z/observed"), self.arrays.get("z/predicted")
-        if seen is None or said is None:
+    def _check_latents(self, source: str) -> None:
+        names = [f"z/{source}/{which}" for which in ("observed", "predicted")]
+        width = len(self.fidelity[source].movement)
+        for name in names:
+            found = self.arrays.get(name)
+            if found is not None and (found.ndim != 2 or found.shape[1] != width):
+                raise ValueError(f"{name} has shape {found.shape}, not (movements, {width})")
+
+    def _check_bands(self, source: str) -> None:
+        pit = self.arrays.get(f"pit/{source}")
+        if pit is not None and (pit.ndim != 2 or len(pit) != 3 or pit.shape[1] < 1):
+            raise ValueError(f"pit/{source} has shape {pit.shape}, not (3, bins)")
+        parts = self.bands(source)
+        if not parts:
             return
-        identified = self.arrays.get("z/identified")
-        if seen.ndim != 2 or said.ndim != 2 or seen.shape[1] != said.shape[1]:
-            raise ValueError(f"z/observed {seen.shape} and z/predicted {said.shape} do not match")
-        if identified is not None and identified.shape != seen.shape:
-            raise ValueError(f"z/identified has shape {identified.shape}, not {seen.shape}")
+        count, moments = parts["seen"].shape
+        full = (count, moments, len(self.fidelity[source].outputs))
+        shapes = {
+            "nominal": full,
+            "observed": full,
+            "quantiles": (count, 5, *full[1:]),
+            "ids": (count,),
+            "rate": (),
+        }
+        for name, shape in shapes.items():
+            if parts[name].shape != shape:
+                raise ValueError(f"bands/{source}/{name} has {parts[name].shape}, not {shape}")
+
+    def bands(self, source: str) -> dict[str, NDArray]:
+        """What `bands/SOURCE/…` hold, by the last part of the name; empty if one is missing."""
+        names = ("nominal", "observed", "seen", "quantiles", "ids", "rate")
+        found = {name: self.arrays.get(f"bands/{source}/{name}") for name in names}
+        there = {name: each for name, each in found.items() if each is not None}
+        return there if len(there) == len(names) and there["seen"].ndim == 2 else {}
 
     def _check_poses(self) -> None:
         nominal, observed = self.arrays.get("pose/nominal"), self.arrays.get("pose/observed")

@@ -20,8 +20,9 @@ from retwin.report.blocks import (
     SectionMaker,
     Table,
 )
-from retwin.report.curves import Latent, Roc, latents, micro_roc
-from retwin.report.plots import caption, latent_names, latent_plot, roc_plot
+from retwin.report.curves import Roc, latents, micro_roc
+from retwin.report.fidelity import discrepancy, fidelity
+from retwin.report.plots import caption, roc_plot
 from retwin.report.poses import poses
 from retwin.report.results import Dataset, Results
 from retwin.report.scores import comparisons, further_scores, scores
@@ -31,14 +32,13 @@ from retwin.report.words import (
     label,
     number,
     order,
-    p_value,
     quantity,
     real_data,
     slot,
     source_name,
 )
 
-__all__ = ["SECTIONS", "discrepancy_groups", "recalls", "roc_curves"]
+__all__ = ["SECTIONS", "recalls", "roc_curves"]
 
 
 def confusion(results: Results) -> Section | None:
@@ -95,73 +95,6 @@ def roc(results: Results) -> Section | None:
     return Section("roc", "ROC", [roc_plot(results, curves)])
 
 
-def discrepancy_groups(results: Results) -> list[tuple[str, str, list[Latent]]]:
-    """Name, caption and latents of each figure: delays apart from the rest."""
-    found = latents(results)
-    delays = [each for each in found if each.name.startswith("delay")]
-    others = [each for each in found if not each.name.startswith("delay")]
-    paper = bool(results.published)
-    see = "Where the line follows the bars, the model draws what the {0} did, spread included."
-    see = see.format("emulated robot" if results.emulated else "real system")
-    groups = []
-    if delays:
-        text = f"Timing discrepancy (TDe), observed and predicted. {see}"
-        groups.append(("tde", f"{text}{' The paper’s figure 5.' if paper else ''}", delays))
-    if others:
-        offsets = all(each.name.startswith("offset") for each in others)
-        name = "Position error (TPE) per axis" if offsets else "Discrepancy"
-        text = f"{name}, observed and predicted. {see}"
-        groups.append(("tpe", f"{text}{' The paper’s figure 6.' if paper else ''}", others))
-    return groups
-
-
-def discrepancy(results: Results) -> Section | None:
-    """Observed against predicted discrepancy (figures 5 and 6), and tests of the agreement."""
-    blocks: list[Block] = [
-        latent_plot(results, name, text, shown) for name, text, shown in discrepancy_groups(results)
-    ]
-    table = _agreement(results)
-    if table is not None:
-        blocks.append(table)
-    if not blocks:
-        return None
-    return Section("discrepancy", "Discrepancy", blocks)
-
-
-def _agreement(results: Results) -> Table | None:
-    told = results.fidelity
-    tests = {each.name: each for each in told.ks}
-    names = [name for name in told.latent if name in tests or name in told.coverage90]
-    names += [name for name in {**tests, **told.coverage90} if name not in names]
-    if not names:
-        return None
-    rows = []
-    for name in names:
-        test = tests.get(name)
-        rows.append(
-            [
-                Cell(latent_names(name)[0]),
-                Cell(number(test.statistic) if test else "–"),
-                Cell(p_value(test.p) if test else "–"),
-                Cell(number(told.coverage90.get(name), 2)),
-            ]
-        )
-    columns = [
-        Column("Component", numeric=False),
-        Column("KS distance"),
-        Column("p"),
-        Column("in the 90 % interval"),
-    ]
-    held = f" on {told.held_out} held-out movements" if told.held_out else ""
-    text = (
-        f"Agreement of the predicted with the observed discrepancy{held}. KS distance: the "
-        "greatest gap between the two cumulative distributions, 0 is best; a small p says that "
-        "they differ. The share inside the predicted 90 % interval should be 0.90: below, the "
-        "model is too sure; above, too wide."
-    )
-    return Table(caption(results, text), columns, rows)
-
-
 def surrogate(results: Results) -> Section | None:
     """Error of the surrogate against the twin, per output."""
     told = results.surrogate
@@ -183,7 +116,7 @@ def surrogate(results: Results) -> Section | None:
         f"Error of the surrogate (IBG) on twin trajectories that it was not fitted to{runs}. It "
         "should be small beside the discrepancy above, or the residual model learns the "
         "surrogate’s errors instead of the robot’s."
-        if latents(results)
+        if any(latents(results, source) for source in results.fidelity)
         else f"Error of the surrogate (IBG) on twin trajectories that it was not fitted to{runs}."
     )
     return Section("surrogate", "Surrogate error", [Table(text, columns, rows)])
@@ -322,6 +255,7 @@ SECTIONS: tuple[SectionMaker, ...] = (
     confusion,
     roc,
     discrepancy,
+    fidelity,
     poses,
     surrogate,
     further_scores,

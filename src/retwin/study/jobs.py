@@ -9,9 +9,8 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +18,9 @@ from numpy.typing import NDArray
 from retwin.case import Case
 from retwin.corrected import CorrectedTwin, generate
 from retwin.diagnosis import fit_diagnoser
+from retwin.fidelity import Fidelity, MeanOnly, measure_fidelity, measure_widening
 from retwin.models import read_about
-from retwin.residual import ResidualModel, fit_residual, infer_discrepancy
+from retwin.residual import ResidualModel, fit_residual
 from retwin.segments import Segments
 from retwin.storage import load, write_atomically
 from retwin.study.plan import SOURCES, StudyPlan
@@ -30,8 +30,8 @@ from retwin.twins.protocol import HEALTHY, Progress
 
 __all__ = ["Job", "Roles", "Work"]
 
-DRAWS = 20
-"""Samples of the residual model per held-out movement, for the distributions in the report."""
+ENOUGH = 5
+"""Healthy calibration trajectories from which some can be kept back to widen bands."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def _indices(values: Iterable[int]) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Job:
-    """One piece of work: kind ("surrogate", "residual", "diagnosis"), run, fold and source."""
+    """One piece of work: kind (see `Work.do`), run, fold and source."""
 
     kind: str
     run: int
@@ -95,6 +95,13 @@ class Work:
                 for run in runs
                 for name, source in chosen.items()
                 for fold in (folds if source.per_fold else (0,))
+            ]
+            # Of the first run: the chance in training is seen in the scores, at less cost.
+            + [
+                Job("fidelity", 0, fold, name)
+                for name, source in chosen.items()
+                if source.residual
+                for fold in folds
             ],
         ]
 
@@ -103,7 +110,9 @@ class Work:
         if job.kind == "surrogate":
             return self.folder / f"run-{job.run}" / "surrogate"
         base = self.folder / f"run-{job.run}" / f"fold-{job.fold}"
-        return base / "residual" if job.kind == "residual" else base / f"{job.source}.npz"
+        if job.kind == "residual":
+            return base / "residual"
+        return base / f"{job.source}{'.fidelity' if job.kind == 'fidelity' else ''}.npz"
 
     def do(self, job: Job, progress: Progress | None = None) -> None:
         """Make a job's result, unless it is there."""
@@ -114,6 +123,7 @@ class Work:
             "surrogate": self._surrogate,
             "residual": self._residual,
             "diagnosis": self._diagnosis,
+            "fidelity": self._fidelity,
         }[job.kind](job, progress)
         timing = {"seconds": time.perf_counter() - started, **made}
         with write_atomically(self._timing(job)) as part:
@@ -180,6 +190,60 @@ class Work:
             np.savez(part, tested=np.array(test), probabilities=probabilities)
         return {"generate": generated, "trajectories": float(len(made))}
 
+    def _fidelity(self, job: Job, progress: Progress | None) -> dict[str, float]:
+        """Hold the corrected twin against the fold's healthy test trajectories."""
+        calibration, test = (self.real_data()[list(part)] for part in self.roles.folds[job.fold])
+        held_out = test.with_label(HEALTHY)
+        if len(held_out) == 0:
+            with write_atomically(self.path(job)) as part:
+                np.savez(part)  # done, and nothing found
+            return {}
+        updated = self._updated(job.run, job.fold)
+        gaussian = self._refitted(job, calibration, components=1)
+        found = measure_fidelity(
+            updated,
+            held_out,
+            seed=self.plan.seed_of("fidelity", job.run, job.fold),
+            rate=self.case.sensor_rate,
+            against={"mean_only": MeanOnly(updated), "single_gaussian": gaussian},
+            widening=self._widening(job, calibration),
+            progress=progress,
+        )
+        found.save(self.path(job))
+        return {}
+
+    def _widening(self, job: Job, calibration: Trajectories) -> float | None:
+        """By how much to widen bands, from healthy calibration trajectories kept back from the RG.
+
+        The RG is fitted to the others for this; test trajectories play no part.
+        """
+        healthy = calibration.with_label(HEALTHY)
+        if len(healthy) < ENOUGH:
+            return None
+        fitted, kept = healthy.split(0.6, seed=self.plan.seed_of("widening", job.run, job.fold))
+        return measure_widening(
+            self._refitted(job, fitted),
+            kept,
+            seed=self.plan.seed_of("widening", job.run, job.fold),
+            rate=self.case.sensor_rate,
+        )
+
+    def _refitted(
+        self, job: Job, calibration: Trajectories, *, components: int | None = None
+    ) -> CorrectedTwin:
+        """The corrected twin of a run and fold, its RG fitted to other data or a smaller one."""
+        updated = self._updated(job.run, job.fold)
+        mixture = updated.residual.mixture
+        residual = fit_residual(
+            updated.surrogate,
+            calibration,
+            updated.residual.correction,
+            mixture if components is None else replace(mixture, components=components),
+            seed=self.plan.seed_of("residual", job.run, job.fold),
+            calibrate_on=self.plan.calibrate_on,
+        )
+        return CorrectedTwin(updated.surrogate, residual)
+
     def _with_encoder_noise(self, trajectories: Trajectories, seed: int) -> Trajectories:
         if self.plan.encoder_noise == 0 or self.case.encoder_noise is None:
             return trajectories
@@ -192,7 +256,7 @@ class Work:
         surrogate = self._fitted_surrogate(job.run)
         twin: Surrogate | CorrectedTwin = surrogate
         if SOURCES[job.source].residual:
-            twin = CorrectedTwin(surrogate, self.fitted_residual(job.run, job.fold))
+            twin = self._updated(job.run, job.fold)
         # One seed for all sources of a run: the same commands and the same faults.
         return generate(
             twin,
@@ -211,9 +275,20 @@ class Work:
     def _fitted_surrogate(self, run: int) -> Surrogate:
         return Surrogate.load(self.path(Job("surrogate", run)))
 
-    def fitted_residual(self, run: int, fold: int) -> ResidualModel:
-        """The RG of one run and fold."""
-        return ResidualModel.load(self.path(Job("residual", run, fold)))
+    def _updated(self, run: int, fold: int) -> CorrectedTwin:
+        """The corrected twin of one run and fold."""
+        residual = ResidualModel.load(self.path(Job("residual", run, fold)))
+        return CorrectedTwin(self._fitted_surrogate(run), residual)
+
+    def fidelity(self, source: str) -> Fidelity | None:
+        """How real the source's twin is, over all folds; None when no healthy one was held out."""
+        healthy = self.real_data().labels == HEALTHY
+        parts = [
+            Fidelity.load(self.path(Job("fidelity", 0, fold, source)))
+            for fold, (_, test) in enumerate(self.roles.folds)
+            if healthy[list(test)].any()
+        ]
+        return Fidelity.concatenate(parts) if parts else None
 
     def surrogate_figures(self) -> list[dict[str, float]]:
         """Errors of the surrogate on held-out twin trajectories, one entry per run."""
@@ -223,35 +298,3 @@ class Work:
             if path.exists():
                 figures.append(read_about(path, "surrogate")["fitted"]["figures"])
         return figures
-
-    def discrepancies(self) -> dict[str, Any]:
-        """z* of held-out healthy trajectories beside what the RG predicts for the same movements.
-
-        Of the first run: `observed` and `identified` (k, d_z), `predicted` (DRAWS k, d_z), `inside`
-        (k, d_z) whether z* lies in the central 90 % of its own predictions.
-        """
-        import torch
-
-        real = self.real_data()
-        surrogate = self._fitted_surrogate(0)
-        parts: dict[str, list[NDArray]] = {
-            name: [] for name in ("observed", "identified", "predicted", "inside")
-        }
-        for fold, (_, test) in enumerate(self.roles.folds):
-            held_out = real[list(test)].with_label(HEALTHY)
-            if len(held_out) == 0:
-                continue
-            residual = self.fitted_residual(0, fold)
-            context, found = infer_discrepancy(surrogate, held_out, residual.correction)
-            generator = torch.Generator().manual_seed(self.plan.seed_of("fidelity", 0, fold))
-            valid = torch.as_tensor(context.segments.valid)
-            drawn = torch.stack(
-                [residual.sample(context, generator=generator)[valid] for _ in range(DRAWS * 10)]
-            ).numpy()
-            observed = found.z[valid].numpy()
-            low, high = np.quantile(drawn, [0.05, 0.95], axis=0)
-            parts["observed"].append(observed)
-            parts["identified"].append(found.identified[valid].numpy())
-            parts["predicted"].append(drawn[:DRAWS].reshape(-1, drawn.shape[-1]))
-            parts["inside"].append((low <= observed) & (observed <= high))
-        return {name: np.concatenate(each) for name, each in parts.items() if each}

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.fidelity import Fidelity
 from retwin.statistics import (
     METRICS,
     bootstrap,
@@ -61,7 +62,7 @@ def write_results(
         name: _source(work, name, truth, probabilities[name], draws[name])
         for name in work.plan.sources
     }
-    found = work.discrepancies() if any(SOURCES[s].residual for s in work.plan.sources) else {}
+    fidelity = _fidelity(work)
     results = {
         "schema": SCHEMA,
         "case": work.case.name,
@@ -76,15 +77,14 @@ def write_results(
         "published": {} if real.emulated else dict(work.case.published),
         "comparisons": _comparisons(sources, draws),
         "surrogate": _surrogate(work),
-        "fidelity": _fidelity(work, found),
+        "fidelity": {name: found.as_dict() for name, found in fidelity.items()},
         "learning_curve": None,
         "timing": _timing(work),
         "provenance": {**_machine(), **provenance},
     }
     arrays = {f"probabilities/{name}": runs for name, runs in probabilities.items()}
-    arrays |= {
-        f"z/{name}": found[name] for name in ("observed", "identified", "predicted") if found
-    }
+    for name, found in fidelity.items():
+        arrays |= _fidelity_arrays(name, found)
     arrays |= _poses(work, test)
     with write_atomically(out / "arrays.npz") as part:
         np.savez_compressed(part, allow_pickle=False, **arrays)
@@ -159,6 +159,7 @@ def _timing(work: Work) -> dict[str, Any]:
         "surrogate_fit_s": _mean(work, "surrogate", "seconds"),
         "residual_fit_s": _mean(work, "residual", "seconds"),
         "diagnosis_s": {name: _mean(work, "diagnosis", "seconds", name) for name in chosen},
+        "fidelity_s": {name: _mean(work, "fidelity", "seconds", name) for name in chosen},
         "total_s": float(sum(work.timing(job).get("seconds", 0.0) for job in jobs)),
     }
 
@@ -221,27 +222,33 @@ def _surrogate(work: Work) -> dict[str, Any]:
     }
 
 
-def _fidelity(work: Work, found: Mapping[str, NDArray]) -> dict[str, Any]:
-    """How the RG's draws compare with z* of trajectories it has not seen."""
-    from scipy.stats import ks_2samp
+def _fidelity(work: Work) -> dict[str, Fidelity]:
+    """How real the draws of each source's twin are, where it has a residual model."""
+    found = {name: work.fidelity(name) for name in work.plan.sources if SOURCES[name].residual}
+    return {name: each for name, each in found.items() if each is not None}
 
-    if not found:
-        return {}
-    latent = work.case.correction.latent(work.case.outputs)
-    tests, coverage = [], {}
-    for k, name in enumerate(latent.names):
-        known = found["identified"][:, k]
-        if not known.any():
-            continue
-        test = ks_2samp(found["observed"][known, k], found["predicted"][:, k])
-        tests.append({"name": name, "statistic": float(test.statistic), "p": float(test.pvalue)})
-        coverage[name] = float(found["inside"][known, k].mean())
+
+def _fidelity_arrays(source: str, found: Fidelity) -> dict[str, NDArray]:
+    """What the report draws of it.
+
+    `z/SOURCE/observed` and `/predicted` (k, d), per movement, NaN where outputs do not tell it;
+    `pit/SOURCE` (3, 20), see `Fidelity.pit_shares`; `bands/SOURCE/…`: `nominal` and `observed`
+    (2, P, d), `seen` (2, P), `quantiles` (2, 5, P, d), `ids` (2,), of the trajectory with the
+    median energy score and of the one with the worst; `rate` in Hz.
+    """
+    told = np.isfinite(found.movements).any(axis=-1)
+    order = np.argsort(found.energy, kind="stable").tolist()
+    index = list(dict.fromkeys([order[(len(order) - 1) // 2], order[-1]]))
     return {
-        "latent": list(latent.names),
-        "units": list(latent.units),
-        "held_out": len(found["observed"]),
-        "ks": tests,
-        "coverage90": coverage,
+        f"z/{source}/observed": found.movements[:, 0][told[:, 0]].astype(np.float32),
+        f"z/{source}/predicted": found.movements[:, 1:][told[:, 1:]].astype(np.float32),
+        f"pit/{source}": found.pit_shares(),
+        f"bands/{source}/nominal": found.nominal[index].astype(np.float32),
+        f"bands/{source}/observed": found.observed[index].astype(np.float32),
+        f"bands/{source}/seen": found.seen[index],
+        f"bands/{source}/quantiles": found.bands[index].astype(np.float32),
+        f"bands/{source}/ids": found.ids[index],
+        f"bands/{source}/rate": np.array(found.rate),
     }
 
 

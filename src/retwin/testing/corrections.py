@@ -57,6 +57,11 @@ class CorrectionSubject:
             )
 
     @property
+    def inputs(self) -> Channels:
+        """Channels for the commands; a context does not name them."""
+        return Channels.numbered("u", self.context.commands.shape[2])
+
+    @property
     def outputs(self) -> Channels:
         """Channels for the outputs; a context does not name them."""
         return Channels.numbered("y", self.context.path.shape[2])
@@ -89,14 +94,14 @@ def check_protocol(subject: CorrectionSubject) -> None:
 
 def check_latent(subject: CorrectionSubject) -> None:
     """Every component of z is named and belongs to one head."""
-    latent = subject.correction.latent(subject.outputs)
+    latent = subject.correction.latent(subject.inputs, subject.outputs)
     width = subject.z.shape[2]
     require(len(latent) == width, f"latent must name {width} components, got {latent.names}")
-    heads = subject.correction.heads(subject.outputs)
-    names = [name for name, _ in heads]
+    heads = subject.correction.heads(subject.inputs, subject.outputs)
+    names = [head.name for head in heads]
     require(len(set(names)) == len(names), f"heads must have different names, got {names}")
-    covered = sum(size for _, size in heads)
-    sound = covered == width and all(size > 0 for _, size in heads)
+    covered = sum(head.width for head in heads)
+    sound = covered == width and all(head.width > 0 for head in heads)
     require(sound, f"heads must share out the {width} components of z, got {heads}")
 
 

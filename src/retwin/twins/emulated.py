@@ -9,12 +9,13 @@ known, so inference from outputs alone can be held against it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.faults import Fault, frozen_from
+from retwin.errors import InputError
+from retwin.faults import Fault
 from retwin.segments import Segments
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins.armpi import KINEMATIC, POLL, ArmPiTwin
@@ -47,6 +48,10 @@ class EmulatedArmPi:
     glitch_size: greatest error of such a reading, in command units (300 are 0.3 m at most).
     arm: the ideal arm.
 
+    Raises
+    ------
+    InputError: a size below 0, a probability outside 0 to 1, readings less than a sample apart.
+
     """
 
     delay: float = 2.2
@@ -62,6 +67,22 @@ class EmulatedArmPi:
     glitch: float = 0.06
     glitch_size: float = 300.0
     arm: ArmPiTwin = field(default_factory=ArmPiTwin)
+
+    def __post_init__(self) -> None:
+        for name in (each.name for each in fields(self) if each.name != "arm"):
+            least, greatest = (1, np.inf) if name == "poll" else (0, np.inf)
+            if name in ("missed", "glitch"):
+                greatest = 1
+            value = getattr(self, name)
+            whole = name != "poll" or isinstance(value, int | np.integer)
+            if not (whole and np.isfinite(value) and least <= value <= greatest):
+                raise InputError(
+                    name,
+                    expected=f"a {'whole' if name == 'poll' else 'finite'} number from {least} to "
+                    f"{greatest}",
+                    got=repr(value),
+                    remedy="leave it out to have it as in the real arm",
+                )
 
     @property
     def inputs(self) -> Channels:
@@ -104,7 +125,7 @@ class EmulatedArmPi:
             rng = np.random.default_rng([seed, 1, chunk.index.start])
             z = self._draw(chunk.segments, rng)
             effective = _play(_effective(chunk.told, chunk.segments, z), self.dead_zone)
-            frozen = frozen_from(chunk.faults, chunk.commands.shape[1], len(self.inputs))
+            frozen = chunk.frozen
             driven = self.arm.respond(effective, frozen, chunk.failed)
             angles = _play(driven, self.backlash / 2)
             acted.append(z | {"angles": angles})

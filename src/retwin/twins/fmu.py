@@ -22,6 +22,7 @@ from retwin.faults import Fault
 from retwin.processes import worker_pool
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins import fmu_worker
+from retwin.twins.checks import check_positive, ideal_outputs, substeps
 from retwin.twins.fmu_model import (
     channels_of,
     extract,
@@ -83,10 +84,8 @@ class FMUTwin:
     workers: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("rate", "timeout"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise _not_positive(name, value, "Hz" if name == "rate" else "s")
+        check_positive("rate", self.rate, "Hz")
+        check_positive("timeout", self.timeout, "s")
         for name, rate in self.rates.items():
             if name not in self.inputs.names or not 0 < rate <= self.rate:
                 raise InputError(
@@ -157,19 +156,7 @@ class FMUTwin:
 
         Raises InputError when the step does not divide the sample period.
         """
-        if self.step is None:
-            return 1
-        if not (np.isfinite(self.step) and self.step > 0):
-            raise _not_positive("step", self.step, "s")
-        count = round(1.0 / (self.rate * self.step))
-        if count < 1 or abs(count * self.step * self.rate - 1.0) > 1e-6:
-            raise InputError(
-                "step",
-                expected=f"a step that divides the sample period, {1.0 / self.rate:g} s",
-                got=f"{self.step:g} s",
-                remedy=f"give for instance step={1.0 / (self.rate * max(count, 1)):g}",
-            )
-        return count
+        return 1 if self.step is None else substeps(self.rate, self.step)
 
     def simulate(
         self,
@@ -251,7 +238,7 @@ class FMUTwin:
                 outputs[i] = outcome
             tell(chunk.index.start + len(clean) * done / len(runs))
         if self.nominal is not None:
-            return _shaped(self.nominal(clean), observed), observed
+            return ideal_outputs(self.nominal, clean, len(self.outputs)), observed
         nominal[~bent] = observed[~bent]
         return nominal, observed
 
@@ -298,28 +285,6 @@ class FMUTwin:
             for own, single in zip(values, column, strict=True):
                 own[name] = single
         return values
-
-
-def _shaped(nominal: ArrayLike, observed: NDArray) -> NDArray:
-    """What the user's `nominal` gave, if it has the shape it must have."""
-    array = np.asarray(nominal)
-    if array.shape != observed.shape:
-        raise InputError(
-            "nominal",
-            expected=f"a function that gives outputs of shape {observed.shape}",
-            got=str(array.shape),
-            remedy="give the ideal outputs (n, T, d_y) for commands (n, T, d_u)",
-        )
-    return array
-
-
-def _not_positive(argument: str, value: float, unit: str) -> InputError:
-    return InputError(
-        argument,
-        expected=f"a positive number of {unit}",
-        got=repr(value),
-        remedy=f"give it in {unit}",
-    )
 
 
 def _death(code: int | None) -> str:

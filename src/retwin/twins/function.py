@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import inspect
-import math
 import pickle
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
-from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +18,7 @@ from retwin.errors import InputError
 from retwin.faults import Fault
 from retwin.processes import worker_pool
 from retwin.trajectories import Channels, Trajectories
+from retwin.twins.checks import check_positive
 from retwin.twins.protocol import Chunk, Limits, Progress, simulate_in_chunks
 
 __all__ = ["FunctionTwin"]
@@ -85,13 +84,7 @@ class FunctionTwin:
                 got="None",
                 remedy="give nominal=, the same without noise",
             )
-        if not (isinstance(self.rate, Real) and math.isfinite(self.rate) and self.rate > 0):
-            raise InputError(
-                "rate",
-                expected="a positive number of samples per second",
-                got=repr(self.rate),
-                remedy="give the sample rate in Hz",
-            )
+        check_positive("rate", self.rate, "Hz")
         if self.workers < 1 or (self.vectorised and self.workers > 1):
             raise InputError(
                 "workers",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,9 +16,11 @@ from mujoco import batch as mujoco_batch
 from numpy.typing import ArrayLike, NDArray
 
 from retwin.errors import InputError
-from retwin.faults import Fault, frozen_from
+from retwin.faults import Fault
 from retwin.trajectories import Channels, Trajectories
+from retwin.twins.checks import check_positive, ideal_outputs, substeps
 from retwin.twins.mujoco_model import (
+    FILTERS,
     Servo,
     compiled,
     input_channels,
@@ -28,18 +29,13 @@ from retwin.twins.mujoco_model import (
     output_channels,
     resting,
 )
-from retwin.twins.protocol import Chunk, Limits, Progress, simulate_in_chunks
+from retwin.twins.mujoco_parameters import per_simulation, set_parameter
+from retwin.twins.protocol import Chunk, Limits, Progress, checked_commands, simulate_in_chunks
 
 __all__ = ["MuJoCoTwin", "Servo"]
 
-LOCKED = 1e8
-"""Damping in N m s/rad (N s/m) of a joint that is held: it creeps by microradians at most."""
-FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
-PLACE = re.compile(
-    r"opt\.(?P<option>\w+)(\[(?P<at>\d+)\])?"
-    r"|(?P<kind>actuator|body|geom|joint|site|tendon)\.(?P<name>[^\[\]]+)\.(?P<field>\w+)"
-    r"(\[(?P<index>\d+)\])?"
-)
+LOCKED = 1e12
+"""Damping in N m s/rad (N s/m) of a joint that is held: under tons it creeps by less than 1 um."""
 TOGETHER = 128
 """Trajectories per batch: their records at every step take tens of MB."""
 
@@ -71,6 +67,10 @@ class MuJoCoTwin:
     outside: "refuse" or "clip" commands outside the actuators' control ranges.
     threads: that simulate; 0 takes all cores. The result does not depend on it.
 
+    Raises
+    ------
+    InputError: a rate or step that is not positive; `settle` or `threads` below 0.
+
     """
 
     path: Path
@@ -87,6 +87,20 @@ class MuJoCoTwin:
     nominal: Callable[[NDArray], NDArray] | None = None
     outside: Literal["refuse", "clip"] = "refuse"
     threads: int = 0
+
+    def __post_init__(self) -> None:
+        check_positive("rate", self.rate, "Hz")
+        if self.step is not None:
+            check_positive("step", self.step, "s")
+        for name, unit in (("settle", "s"), ("threads", "threads, or 0 for all cores")):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise InputError(
+                    name,
+                    expected=f"at least 0 {unit}",
+                    got=repr(value),
+                    remedy="leave it out",
+                )
 
     @classmethod
     def from_file(
@@ -148,17 +162,11 @@ class MuJoCoTwin:
 
     @property
     def substeps(self) -> int:
-        """Integration steps per sample."""
-        period = 1.0 / self.rate
-        count = round(period / self.model.opt.timestep)
-        if count < 1 or abs(count * self.model.opt.timestep - period) > 1e-9 * period:
-            raise InputError(
-                "step",
-                expected=f"a step that divides the sample period, {period:g} s",
-                got=f"{self.model.opt.timestep:g} s",
-                remedy=f"give for instance step={period / max(count, 1):g}",
-            )
-        return count
+        """Integration steps per sample.
+
+        Raises InputError when the step does not divide the sample period.
+        """
+        return substeps(self.rate, self.model.opt.timestep)
 
     def simulate(
         self,
@@ -182,25 +190,30 @@ class MuJoCoTwin:
 
         A simulation that becomes unstable ends alone: see `SimulationError`.
 
+        Raises
+        ------
+        InputError: as in `Twin.simulate`; parameters that the model does not have or that are not
+            one for all or one each; a stuck actuator whose joint cannot be locked.
+
         """
-        steps = np.shape(commands)[1] if np.ndim(commands) == 3 else 0
+        commands = checked_commands(commands, self.inputs)
+        values = per_simulation(parameters, len(commands))
         states: list[tuple[NDArray, NDArray]] = []
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            own = _of_chunk(parameters, chunk.index, len(chunk.commands))
-            frozen = frozen_from(chunk.faults, steps, len(self.inputs))
+            own = {name: each[chunk.index] for name, each in values.items()}
             some = np.arange(len(chunk.commands))
             observed, *state = self._integrate(
-                chunk.told, frozen, own, some, chunk.failed, states=hidden is not None
+                chunk.told, chunk.frozen, own, some, chunk.failed, states=hidden is not None
             )
             if hidden is not None:
                 states.append((state[0], state[1]))
             if self.nominal is not None:
-                return self.nominal(chunk.commands), observed
+                return ideal_outputs(self.nominal, chunk.commands, len(self.outputs)), observed
             nominal = observed.copy()
             faulty = np.flatnonzero([fault is not None for fault in chunk.faults])
             if len(faulty):
-                never = np.full((len(faulty), len(self.inputs)), steps)
+                never = np.full((len(faulty), len(self.inputs)), commands.shape[1])
                 nominal[faulty], *_ = self._integrate(
                     chunk.commands[faulty], never, own, faulty, chunk.failed
                 )
@@ -239,14 +252,14 @@ class MuJoCoTwin:
         """
         steps = commands.shape[1]
         batch = mujoco_batch.Batch(self.model, len(commands), self.threads)
-        for name, values in parameters.items():
-            _set(batch, name, values[rows])
-        if parameters:
-            batch.set_const()
-        batch.reset(keyframe=self._start)
-        controls = self._controls(batch, commands)
         wanted = ("sensordata", "qpos", "qvel") if states else ("sensordata",)
         with _quiet():
+            for name, values in parameters.items():
+                set_parameter(batch, name, values[rows])
+            if parameters:
+                batch.set_const()
+            batch.reset(keyframe=self._start)
+            controls = self._controls(batch, commands)
             self._rest(batch, controls[:, :1], commands[:, 0])
             made = self._roll(batch, controls, frozen, steps, wanted)
         for i in np.flatnonzero(batch.warning[:, :, 1].any(axis=1)):
@@ -380,46 +393,3 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         mujoco.set_mju_user_warning(before)
-
-
-def _of_chunk(
-    parameters: Mapping[str, ArrayLike] | None, index: slice, count: int
-) -> dict[str, NDArray]:
-    """The values of each parameter for the simulations of a chunk, (count,)."""
-    own = {}
-    for name, values in (parameters or {}).items():
-        array = np.asarray(values, dtype=float)
-        part = np.broadcast_to(array, count) if array.ndim == 0 else array[index]
-        if part.shape != (count,) or not np.isfinite(part).all():
-            raise InputError(
-                "parameters",
-                expected="finite numbers, one for all simulations or one each",
-                got=f"{name} of shape {array.shape}",
-                remedy="give as many values as there are trajectories",
-            )
-        own[name] = part
-    return own
-
-
-def _set(batch: mujoco_batch.Batch, name: str, values: NDArray) -> None:
-    """Give a model field a value of its own in every simulation, (n,)."""
-    parts = PLACE.fullmatch(name)
-    try:
-        if parts is None:
-            raise KeyError("no such form")
-        index = int(parts["index"] or parts["at"] or 0)
-        if parts["option"]:
-            field = batch.expand(f"opt.{parts['option']}")
-            field.reshape(len(values), -1)[:, index] = values
-            return
-        place = getattr(batch, parts["kind"])(parts["name"])
-        field = np.array(getattr(place, parts["field"]))
-        field.reshape(len(values), -1)[:, index] = values
-        setattr(place, parts["field"], field)
-    except (KeyError, AttributeError, ValueError, IndexError) as error:
-        raise InputError(
-            "parameters",
-            expected='"KIND.NAME.FIELD[INDEX]" as in "joint.hip.damping", or "opt.FIELD[INDEX]"',
-            got=f"{name!r} ({' '.join(str(error).split())})",
-            remedy="name a body, joint, actuator, … of the model and one of its number fields",
-        ) from None

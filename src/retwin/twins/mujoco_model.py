@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 from retwin.errors import InputError
 from retwin.trajectories import Channels
 
-__all__ = ["Servo", "compiled", "input_channels", "limits_of", "output_channels", "resting"]
+__all__ = [
+    "FILTERS",
+    "Servo",
+    "compiled",
+    "input_channels",
+    "joint_of",
+    "limits_of",
+    "output_channels",
+    "resting",
+]
 
 
 @dataclass(frozen=True)
@@ -40,6 +49,10 @@ class Servo:
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 DIRECT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 FIXED, AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
+FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
+"""Actuators that follow their control with a lag."""
+FOLLOWING = (int(mujoco.mjtDyn.mjDYN_NONE), *FILTERS)
+"""Actuators whose gain acts on their control, and not, say, on its integral."""
 
 
 def compiled(
@@ -93,25 +106,25 @@ def compiled(
     except ValueError as error:
         if isinstance(error, InputError):
             raise
-        missing = "without" if meshes else "with"
+        missing = "meshes that are not there can be left out" if meshes else "or load its meshes"
         raise InputError(
             "model",
             expected="an MJCF or URDF file that MuJoCo can compile",
             got=f"{path} ({' '.join(str(error).split())})",
-            remedy=f"repair the file, or load it {missing} its meshes (meshes={not meshes})",
+            remedy=f"repair the file, {missing} (meshes={not meshes})",
         ) from None
 
 
 def input_channels(model: mujoco.MjModel, names: Sequence[str]) -> Channels:
-    """Those actuators, by default all, with the units of their controls where these are plain."""
-    there = [model.actuator(i).name for i in range(model.nactuator)]
+    """Those actuators, by default all with a name; units of controls where these are plain."""
+    there = [name for i in range(model.nactuator) if (name := model.actuator(i).name)]
     chosen = [_name("inputs", name, there) for name in names] or there
     if not chosen:
         raise InputError(
             "inputs",
-            expected="a model with actuators",
+            expected="a model with actuators that have names",
             got="one without, as a URDF file always is",
-            remedy="add servos=((joint, Servo(stiffness, damping)), …)",
+            remedy="name them, or add servos=((joint, Servo(stiffness, damping)), …)",
         )
     for name in chosen:
         if model.actuator_ctrlnum[model.actuator(name).id] != 1:
@@ -127,10 +140,10 @@ def input_channels(model: mujoco.MjModel, names: Sequence[str]) -> Channels:
 def output_channels(
     model: mujoco.MjModel, names: Sequence[str]
 ) -> tuple[tuple[str, ...], Channels]:
-    """Those sensors, by default all, and a channel for each of their components."""
-    there = [model.sensor(i).name for i in range(model.nsensor)]
-    places = [model.site(i).name for i in range(model.nsite)]
-    places += [model.body(i).name for i in range(1, model.nbody)]
+    """Those sensors, by default all that have a name, and a channel for each component."""
+    there = [name for i in range(model.nsensor) if (name := model.sensor(i).name)]
+    places = [name for i in range(model.nsite) if (name := model.site(i).name)]
+    places += [name for i in range(1, model.nbody) if (name := model.body(i).name)]
     # Places that were asked for have become sensors when the model was compiled.
     for name in names:
         _name("outputs", name, list(dict.fromkeys(there + places)))
@@ -139,8 +152,9 @@ def output_channels(
         raise InputError(
             "outputs",
             expected="sensors, sites or bodies of the model",
-            got="none named, and the model has no sensors",
-            remedy=f"name places whose position is the output, such as {', '.join(places[-3:])}",
+            got="none asked for, and no sensors with names in the model",
+            remedy="name places whose position is the output"
+            + (f", such as {', '.join(places[-3:])}" if places else ""),
         )
     channels: list[str] = []
     units: list[str] = []
@@ -172,7 +186,7 @@ def resting(model: mujoco.MjModel, name: str) -> tuple[int, Callable[[NDArray], 
     joint = joint_of(model, name)
     slope = actuator.biasprm[1]
     plain = actuator.gaintype[0] == FIXED and actuator.biastype[0] == AFFINE
-    if joint is None or not plain or slope == 0:
+    if joint is None or not plain or slope == 0 or actuator.dyntype[0] not in FOLLOWING:
         return None
     gear = actuator.gear[0]
     low, high = limits_of(model, [name]) or (np.array([-np.inf]), np.array([np.inf]))
@@ -210,7 +224,7 @@ def _control_unit(model: mujoco.MjModel, name: str) -> str:
     """Unit of a plain position servo or motor of gear 1; "1" where only the model knows."""
     joint = joint_of(model, name)
     actuator = model.actuator(name)
-    if joint is None or actuator.gear[0] != 1:
+    if joint is None or actuator.gear[0] != 1 or actuator.dyntype[0] not in FOLLOWING:
         return "1"
     hinge = model.jnt_type[joint] == HINGE
     if actuator.biastype[0] != AFFINE and actuator.gainprm[0] == 1:
@@ -247,4 +261,12 @@ def _sensor_unit(model: mujoco.MjModel, name: str) -> str:
     if kind in BY_JOINT:
         hinge = model.jnt_type[sensor.objid[0]] == HINGE
         return BY_JOINT[kind][0 if hinge else 1]
+    if kind.startswith("TENDON") and not _is_spatial(model, int(sensor.objid[0])):
+        return "1"
     return next((unit for unit, kinds in UNITS.items() if kind in kinds), "1")
+
+
+def _is_spatial(model: mujoco.MjModel, tendon: int) -> bool:
+    """Whether a tendon has a length in m; a fixed one adds up joints, in units of their own."""
+    first = int(model.tendon_adr[tendon])
+    return bool(model.wrap_type[first] != int(mujoco.mjtWrap.mjWRAP_JOINT))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from retwin.errors import InputError
-from retwin.faults import Fault, draw_faults, faulty_commands, frozen_response
+from retwin.faults import Fault, draw_faults, faulty_commands, frozen_from, frozen_response
 from retwin.segments import Segments
 from retwin.trajectories import Channels, Progress, Source, Trajectories
 
@@ -223,6 +223,11 @@ class Chunk:
     faults: Sequence[Fault | None]
     segments: Segments
     failed: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def frozen(self) -> NDArray:
+        """The sample (n, d_u) from which an actuator is held; T where it never is."""
+        return frozen_from(self.faults, *self.commands.shape[1:])
 
     @property
     def held(self) -> NDArray:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -105,6 +108,15 @@ PERFECT = EmulatedArmPi(
 )  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("poll", 0), ("poll", 2.5), ("missed", 1.1), ("jitter", -1.0), ("noise", float("nan"))],
+)
+def test_effects_that_cannot_be_are_refused(name: str, value: float) -> None:
+    with pytest.raises(rt.InputError, match=f"^{name}: expected .*, got {value};"):
+        EmulatedArmPi(**{name: value})
+
+
 def test_without_any_effect_it_is_the_plain_arm(commands: np.ndarray) -> None:
     made = PERFECT.simulate(commands, seed=0)
     plain = ArmPiTwin().simulate(commands, seed=0)
@@ -166,3 +178,18 @@ def test_a_stuck_joints_readings_stand_still(commands: np.ndarray) -> None:
 def test_emulated_data_say_so(case: rt.Case, emulated: rt.Trajectories) -> None:
     assert emulated.emulated
     assert not rt.generate(case.twin, case, per_class=1, seed=0).emulated
+
+
+@needs_data
+@pytest.mark.real_data
+@pytest.mark.slow
+def test_the_emulated_arm_errs_as_the_real_one() -> None:
+    """All figures of benchmarks/emulation.py lie inside the intervals of the real ones."""
+    benchmarks = Path(__file__).parents[2] / "benchmarks"
+    run = [sys.executable, "-W", "error::RuntimeWarning", str(benchmarks / "emulation.py")]
+    done = subprocess.run(run, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((benchmarks / "out" / "emulation.json").read_text("utf-8"))["rows"]
+    assert len(rows) == 11
+    outside = [name for name, row in rows.items() if not row["inside"]]
+    assert not outside

@@ -1,0 +1,165 @@
+"""What `CommandSpace` is inferred from: measured outputs, and what a surrogate says for any z."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from retwin.corrections.command_effect import effective
+from retwin.corrections.protocol import Context
+
+if TYPE_CHECKING:
+    from retwin.corrections.command_space import CommandSpace
+
+__all__ = ["Problem"]
+
+NUDGE = 0.05
+"""Step of the finite differences through a surrogate with memory, in samples and units."""
+MARGIN = 15
+"""Samples after the command has settled in which an output may still be on its way."""
+CHUNK = 64
+"""Trajectories linearised together."""
+
+
+class Problem:
+    """Residual and derivative for x = (delay, offsets) per movement (n, M, 1 + d_u) and for what
+    was missed (n, M, d_u).
+
+    Attributes
+    ----------
+    told: (n, T, d_u), the reference, faults included.
+    at: (S,) the samples that are looked at.
+    seen: (n, S), 1 where there is a measurement.
+    moving: (n, S), 1 where a movement may be under way: there the surrogate is told less exactly.
+    observed: (n, S, d_y), in `unit`, the standard deviation of the outputs.
+    valid: (n, M) bool, movements that exist.
+    healthy: (n, M, d_u) bool, where z is a discrepancy: no fault bends or holds the actuator.
+    faulty: (n, M, d_u) bool, where a fault bends the reference: how far off the actuator ends is
+        the fault's severity, of which nothing is believed beforehand.
+
+    """
+
+    def __init__(
+        self, operator: CommandSpace, context: Context, observed: Tensor, mask: Tensor
+    ) -> None:
+        self.operator = operator
+        self.surrogate = context.surrogate
+        self.segments = context.segments
+        self.told = context.told.double()
+        start = torch.as_tensor(context.segments.start)[..., None]
+        frozen = context.frozen[:, None].double()
+        bent = (context.told != context.commands).any(dim=1)[:, None]
+        self.valid = torch.as_tensor(context.segments.valid)
+        self.faulty = bent & self.valid[..., None]
+        self.healthy = self.valid[..., None] & ~bent & (start < frozen)
+
+        seen = mask.all(dim=-1)
+        at = seen.any(dim=0).nonzero()[:, 0]
+        self.at = at[:: max(1, -(-len(at) // operator.most))]
+        self.seen = seen[:, self.at].double()
+        self.unit = observed.double().std(dim=(0, 1)).mean().clamp_min(1e-12)
+        self.observed = observed[:, self.at].double() / self.unit
+        begin = start + operator.delay_range[0]
+        end = torch.as_tensor(context.segments.settle)[..., None] + MARGIN
+        self.moving = ((self.at >= begin) & (self.at <= end)).any(dim=1).double()
+        # A surrogate with memory must be told everything that came before.
+        self.memory = not getattr(context.surrogate, "memoryless", False)
+        every = torch.arange(context.told.shape[1])
+        time = every if self.memory else self.at
+        self.kept = self.at if self.memory else torch.arange(len(self.at))
+        # A frozen actuator stays where it is at its onset.
+        self.when = torch.minimum(time[:, None].double(), frozen)
+
+    def __len__(self) -> int:
+        return len(self.told)
+
+    def __getitem__(self, rows: Tensor) -> Problem:
+        """The problem of some of the trajectories."""
+        part = object.__new__(Problem)
+        part.__dict__.update(self.__dict__)
+        part.segments = self.segments[rows.numpy()]
+        for name in ("told", "valid", "healthy", "faulty", "seen", "moving", "observed", "when"):
+            setattr(part, name, getattr(self, name)[rows])
+        return part
+
+    def nothing(self) -> tuple[Tensor, Tensor]:
+        """What x and missed are of trajectories without any discrepancy."""
+        shape = (*self.valid.shape, self.told.shape[2])
+        x = torch.zeros(*shape[:2], 1 + shape[2], dtype=torch.float64)
+        return x, torch.zeros(shape, dtype=torch.float64)
+
+    def commands(self, x: Tensor, missed: Tensor) -> Tensor:
+        """What the actuators are effectively told, single precision."""
+        z = torch.cat([x, missed], dim=-1)
+        return effective(self.told, self.segments, z, self.when).float()
+
+    @torch.no_grad()
+    def residual(self, x: Tensor, missed: Tensor) -> Tensor:
+        """Observed minus said (n, S, d_y)."""
+        return torch.cat([part._residual(*given) for part, given in self._parts(x, missed)])
+
+    @torch.no_grad()
+    def linearised(self, x: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
+        """The residual, and how the outputs turn with x: (n, S, d_y, P)."""
+        parts = [part._linearised(*given) for part, given in self._parts(x, missed)]
+        residual, jacobian = zip(*parts, strict=True)
+        return torch.cat(residual), torch.cat(jacobian)
+
+    def first_delays(self) -> Tensor:
+        """The delay (n, M) in whole samples that fits each movement best, nothing else being off.
+
+        Where all fit alike, the smallest.
+        """
+        low, high = self.operator.delay_range
+        grid = torch.arange(low, high + 1.0, dtype=torch.float64)
+        grid = grid[grid.abs().argsort(stable=True)]
+        start, settle = (
+            torch.as_tensor(times)[..., None]
+            for times in (self.segments.start, self.segments.settle)
+        )
+        near = ((self.at >= start + low) & (self.at <= settle + high)).double()
+        x, missed = self.nothing()
+        costs = []
+        for delay in grid:
+            x[..., 0] = delay
+            error = self.residual(x, missed).norm(dim=-1) * self.seen
+            costs.append((near * error[:, None]).sum(dim=-1))
+        return grid[torch.stack(costs).argmin(dim=0)]
+
+    def _parts(self, *given: Tensor) -> Iterator[tuple[Problem, tuple[Tensor, ...]]]:
+        for rows in torch.arange(len(self)).split(CHUNK):
+            yield self[rows], tuple(each[rows] for each in given)
+
+    def _residual(self, x: Tensor, missed: Tensor) -> Tensor:
+        made = self.surrogate(self.commands(x, missed))[:, self.kept]
+        return self.observed - made.double() / self.unit
+
+    def _linearised(self, x: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
+        residual = self._residual(x, missed)
+        basis = torch.eye(x[0].numel(), dtype=x.dtype).unflatten(1, x.shape[1:])
+        if self.memory:
+            moved = [self._residual(x + NUDGE * each, missed) for each in basis]
+            return residual, torch.stack([(residual - each) / NUDGE for each in moved], dim=-1)
+        told = self.commands(x, missed)
+
+        def turned(direction: Tensor) -> Tensor:
+            def commands(values: Tensor) -> Tensor:
+                return self.commands(values, missed)
+
+            return torch.func.jvp(commands, (x,), (direction.expand_as(x),))[1]
+
+        def followed(direction: Tensor) -> Tensor:
+            return torch.func.jvp(self.surrogate, (told,), (direction.expand_as(told),))[1]
+
+        with warnings.catch_warnings():
+            # When first used, torch.func calls what torch itself has deprecated.
+            warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
+            # Without memory the chain rule is local: few directions go through the surrogate.
+            turns = torch.func.vmap(turned)(basis)
+            slopes = torch.func.vmap(followed)(torch.eye(told.shape[-1]))
+        jacobian = torch.einsum("unsy,pnsu->nsyp", slopes, turns)
+        return residual, jacobian.double() / self.unit

@@ -1,0 +1,75 @@
+"""`CommandSpace`: what the actuators were effectively told, pushed through the surrogate.
+
+An output offset may leave what the system can reach, and cannot say which actuator errs. Here z
+changes the commands, ỹ = G_φ(T_z(u)), so every corrected output is one that the twin can give. A
+movement of an actuator may come late, end off its target, or not take place at all; then the
+actuator stays where it is and catches up with the next command.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from retwin.corrections.command_effect import effective
+from retwin.corrections.command_inference import infer_commands
+from retwin.corrections.protocol import Context, Discrepancy, Head
+from retwin.trajectories import Channels
+
+__all__ = ["CommandSpace"]
+
+
+@dataclass(frozen=True)
+class CommandSpace:
+    """z = delay, offset and missed per movement and actuator, in command space.
+
+    Per movement: the delay in samples, one for all actuators; then for every actuator the offset of
+    the level that is reached, in its command's unit; then for every actuator whether it missed the
+    movement, 0 or 1.
+
+    Parameters
+    ----------
+    delay_range: least and greatest delay that `infer` looks for, in samples.
+    most: samples per trajectory that `infer` looks at, at most; more tell little.
+    known: share of the prior's variance that the outputs must leave at most for a component of z to
+        count as identified.
+
+    """
+
+    delay_range: tuple[float, float] = (-5.0, 30.0)
+    most: int = 200
+    known: float = 0.7
+
+    @property
+    def resolution(self) -> str:
+        """One z per movement."""
+        return "segment"
+
+    def latent(self, inputs: Channels, outputs: Channels) -> Channels:
+        """`delay` in samples, `offset_…` in the commands' units, `missed_…` 0 or 1."""
+        names = ("delay", *(f"{kind}_{name}" for kind in KINDS for name in inputs.names))
+        return Channels(names, ("samples", *inputs.units, *("1" for _ in inputs.names)))
+
+    def heads(self, inputs: Channels, outputs: Channels) -> tuple[Head, ...]:
+        """A mixture for the delay, one for all offsets together, and what is missed."""
+        return (
+            Head("delay", 1),
+            Head("offset", len(inputs)),
+            Head("missed", len(inputs), "bernoulli"),
+        )
+
+    def apply(self, context: Context, z: Tensor) -> Tensor:
+        """ỹ = G_φ(T_z(u)), differentiable in z; a frozen actuator stays where z had brought it."""
+        time = torch.arange(context.told.shape[1], dtype=z.dtype)
+        held = torch.minimum(time[:, None], context.frozen[:, None].to(z.dtype))
+        told = effective(context.told.to(z.dtype), context.segments, z, held)
+        return context.surrogate(told.to(context.told.dtype))
+
+    def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
+        """z* and its covariance from outputs alone; see `retwin.corrections.command_inference`."""
+        return infer_commands(self, context, observed, mask)
+
+
+KINDS = ("offset", "missed")

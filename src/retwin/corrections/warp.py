@@ -1,0 +1,85 @@
+"""Warped time: every movement shifted by its own delay, everything between stretched to fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from retwin.segments import Segments
+
+__all__ = ["Knots", "read"]
+
+
+@dataclass(frozen=True, eq=False)
+class Knots:
+    """Where the pieces of the warped time join, and for each sample its piece and place in it."""
+
+    source: Tensor  # (n, 2 M), time of each knot in the uncorrected path
+    target: Tensor  # (n, 2 M), time of each knot in the corrected path
+    right: Tensor  # (n, T), index of the knot that follows each sample
+    share: Tensor  # (n, T), place between the knot before (0) and after (1)
+    time: Tensor  # (n, T), the samples themselves
+
+    @classmethod
+    def of(cls, segments: Segments, delay: Tensor, when: Tensor | None = None) -> Knots:
+        """The knots for delays (n, M) in samples, seen at every sample or at `when` (n, T)."""
+        source = torch.stack(
+            [
+                torch.as_tensor(segments.start, dtype=delay.dtype),
+                torch.as_tensor(segments.settle, dtype=delay.dtype),
+            ],
+            -1,
+        ).flatten(1)
+        # A movement cannot begin before the last one has ended, however the delays differ.
+        target = (source + delay.repeat_interleave(2, dim=1)).cummax(dim=1).values
+        time = torch.arange(segments.steps, dtype=delay.dtype) if when is None else when
+        time = time.expand(len(target), -1).contiguous()
+        right = torch.searchsorted(target.detach(), time.detach(), right=True)
+        last = target.shape[1] - 1
+        begin = target.gather(1, (right - 1).clamp(0, last))
+        end = target.gather(1, right.clamp(0, last))
+        share = (time - begin) / (end - begin).clamp_min(1e-9)
+        return cls(source, target, right, share.clamp(0, 1), time)
+
+    def between(self, values: Tensor) -> Tensor:
+        """Values (n, 2 M, k) of the knots, linear between them and constant outside: (n, T, k)."""
+        last = values.shape[1] - 1
+        index = self.right[..., None].expand(-1, -1, values.shape[2])
+        before = values.gather(1, (index - 1).clamp(0, last))
+        after = values.gather(1, index.clamp(0, last))
+        return before + self.share[..., None] * (after - before)
+
+    def slope(self, values: Tensor) -> Tensor:
+        """Change per sample of `between` (n, T, k)."""
+        last = values.shape[1] - 1
+        before, after = (self.right - 1).clamp(0, last), self.right.clamp(0, last)
+        wide = [place[..., None].expand(-1, -1, values.shape[2]) for place in (before, after)]
+        length = self.target.gather(1, after) - self.target.gather(1, before)
+        rise = values.gather(1, wide[1]) - values.gather(1, wide[0])
+        return rise / length.clamp_min(1e-9)[..., None]
+
+    def source_time(self) -> Tensor:
+        """When in the uncorrected path each sample (n, T) is read."""
+        if not self.source.shape[1]:
+            return self.time
+        inner = self.between(self.source[..., None])[..., 0]
+        early = (self.time - self.target[:, :1]).clamp_max(0)
+        late = (self.time - self.target[:, -1:]).clamp_min(0)
+        return inner + early + late
+
+    @staticmethod
+    def spread(offset: Tensor) -> Tensor:
+        """Offsets (n, M, k) on the knots (n, 2 M, k): the last one's at the start, then its own."""
+        before = torch.cat([torch.zeros_like(offset[:, :1]), offset[:, :-1]], dim=1)
+        return torch.stack([before, offset], dim=2).flatten(1, 2)
+
+
+def read(path: Tensor, when: Tensor) -> Tensor:
+    """The path (n, T, d) at the fractional samples `when` (n, T), held beyond its ends."""
+    when = when.clamp(0, path.shape[1] - 1)
+    below = when.detach().floor().long().clamp_max(max(path.shape[1] - 2, 0))
+    index = below[..., None].expand(-1, -1, path.shape[2])
+    before, after = path.gather(1, index), path.gather(1, index + 1)
+    return before + (when - below)[..., None] * (after - before)
