@@ -74,3 +74,20 @@ def test_an_open_severity_is_refused(commands: np.ndarray) -> None:
         frozen_response(commands, [Stuck(0, onset=(0, 9))])
     with pytest.raises(InputError, match="one per trajectory"):
         draw_faults([None, None], segments, seed=0)
+
+
+@pytest.mark.parametrize("onset", [(8, 3), -1, (-2, 3), 1.5, (1, 2, 3), None, ()])
+def test_an_onset_that_cannot_be_is_refused(onset: object) -> None:
+    with pytest.raises(InputError, match=r"onset: expected a sample from 0 on, or a pair \(low, "):
+        Stuck(0, onset)  # type: ignore[arg-type]
+
+
+def test_onsets_may_be_numpys_and_listed() -> None:
+    assert Stuck(0, np.int64(3)) == Stuck(0, 3)
+    assert Stuck(0, [np.int64(3), 8]) == Stuck(0, (3, 8))
+
+
+@pytest.mark.parametrize("size", [(50.0, 10.0), (-5.0, 5.0), (0.0, np.inf), (np.nan, 1.0), (1.0,)])
+def test_sizes_that_cannot_be_are_refused(size: tuple) -> None:
+    with pytest.raises(InputError, match="size: expected a pair"):
+        SteadyStateError(0, size=size)

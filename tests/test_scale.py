@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ import pytest
 from numpy.typing import NDArray
 
 import retwin as rt
+from retwin import twins
 from retwin.commands import RampSampler
 from retwin.scale import Simulated, SimulationPlan, simulate_to
 from retwin.scale.identity import identity
@@ -495,6 +497,77 @@ def test_clipping_is_asked_for(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["a.zarr"], "nothing is left half-written"
 
 
+@dataclass(frozen=True)
+class Strict(Toy):
+    """Refuses to be stored beyond a level, and says which trajectory it was."""
+
+    def simulate(self, commands: NDArray, **options: Any) -> rt.Trajectories:
+        beyond = np.flatnonzero(commands[:, -1, 0] > self.fails_above)
+        if len(beyond):
+            raise rt.InputError(
+                "commands", expected="less", got=f"more in trajectory {beyond[0]}", remedy="less"
+            )
+        return super().simulate(commands, **options)
+
+
+def given(count: int) -> NDArray:
+    """Commands that end at the trajectory's number."""
+    return np.repeat(np.arange(count, dtype=float), 60).reshape(count, 30, 2)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_bad_input_is_counted_in_the_whole_set_and_leaves_nothing(
+    tmp_path: Path, workers: int
+) -> None:
+    bad = plan(twin=Strict(fails_above=13.0), commands=given(20), n=None, chunk=4)
+    for name, options in (("a.zarr", {"workers": workers}), ("a.npz", {})):
+        with pytest.raises(rt.InputError, match="more in trajectory 14;"):
+            simulate_to(tmp_path / name, bad, **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_input_keeps_what_an_earlier_call_has_finished(tmp_path: Path) -> None:
+    bad = plan(twin=Strict(fails_above=13.0), commands=given(20), n=None, chunk=4)
+
+    def interrupt(share: float) -> None:
+        if share > 0.3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate_to(tmp_path / "a.zarr", bad, workers=1, progress=interrupt)
+    with pytest.raises(rt.InputError, match=r"trajectory 14; .* stays in .*a\.zarr\.part"):
+        simulate_to(tmp_path / "a.zarr", bad, workers=1)
+    assert len(list((tmp_path / "a.zarr.part/done").iterdir())) == 3
+
+
+class Leak(Exception):
+    """It cannot be rebuilt from its message alone."""
+
+    def __init__(self, valve: int, reason: str) -> None:
+        super().__init__(f"valve {valve} {reason}")
+
+
+@dataclass(frozen=True)
+class Leaking(Toy):
+    """Raises what no other process can build again."""
+
+    def simulate(self, commands: NDArray, **options: Any) -> rt.Trajectories:
+        if commands[-1, -1, 0] > self.fails_above:
+            raise Leak(3, "leaks")
+        return super().simulate(commands, **options)
+
+
+@pytest.mark.parametrize(("workers", "kind"), [(1, Leak), (2, RuntimeError)])
+def test_what_a_twin_raises_tells_where(
+    tmp_path: Path, workers: int, kind: type[Exception]
+) -> None:
+    leaking = plan(twin=Leaking(fails_above=9.0), commands=given(12), n=None, chunk=4)
+    with pytest.raises(kind, match="valve 3 leaks") as caught:
+        simulate_to(tmp_path / "a.zarr", leaking, workers=workers)
+    assert re.fullmatch(r".*test_scale\.py:\d+, in trajectories 8 to 11", caught.value.__notes__[0])
+    assert (tmp_path / "a.zarr.part").exists(), "it may go on when the twin is mended"
+
+
 def test_bad_places_and_calls(tmp_path: Path) -> None:
     def refused(match: str, name: str, **options: Any) -> None:
         with pytest.raises(rt.InputError, match=match) as caught:
@@ -552,16 +625,55 @@ def test_identity_tells_apart_what_differs(tmp_path: Path, network: rt.Surrogate
     assert identity(rt.cases.armpi().twin) == identity(rt.cases.armpi().twin)
 
 
+MODEL = """
+<mujoco>
+  <include file="arm.xml"/>
+  <asset><mesh name="box" file="box.obj"/></asset>
+  <worldbody><geom type="mesh" mesh="box" pos="0 0 -1"/></worldbody>
+  <actuator><motor name="push" joint="hinge"/></actuator>
+</mujoco>
+"""
+ARM = """
+<mujoco>
+  <worldbody>
+    <body name="arm">
+      <joint name="hinge" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+
+
+def test_a_mujoco_twin_is_known_by_all_its_files(tmp_path: Path) -> None:
+    def told(arm: str, height: int) -> str:
+        (tmp_path / "arm.xml").write_text(arm)
+        corners = (f"v {x} {y} {height * z}\n" for x, y, z in CORNERS)
+        (tmp_path / "box.obj").write_text("".join(corners))
+        # MuJoCo keeps meshes by their time of change, in seconds.
+        os.utime(tmp_path / "box.obj", (height, height))
+        return identity(twins.get(str(tmp_path / "model.xml"), outputs=["arm"]))
+
+    (tmp_path / "model.xml").write_text(MODEL)
+    made = [told(ARM, 1), told(ARM.replace('mass="1"', 'mass="2"'), 1), told(ARM, 2)]
+    assert len(set(made)) == 3
+    assert told(ARM, 1) == made[0]
+
+
 def test_identity_is_the_same_in_another_process(tmp_path: Path, network: rt.Surrogate) -> None:
     network.save(tmp_path / "model")
     code = (
         "import sys, retwin as rt; from retwin.scale.identity import identity;"
-        "print(identity(rt.Surrogate.load(sys.argv[1])), identity(rt.cases.armpi().sampler))"
+        "case = rt.cases.armpi();"
+        "print(*map(identity, (rt.Surrogate.load(sys.argv[1]), case.sampler, case.twin.physics)))"
     )
     told = subprocess.run(
         [sys.executable, "-c", code, tmp_path / "model"], check=True, capture_output=True, text=True
     )
-    mine = [identity(rt.Surrogate.load(tmp_path / "model")), identity(rt.cases.armpi().sampler)]
+    case = rt.cases.armpi()
+    parts = (rt.Surrogate.load(tmp_path / "model"), case.sampler, case.twin.physics)
+    mine = [identity(part) for part in parts]
     assert told.stdout.split() == mine
 
 

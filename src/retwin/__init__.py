@@ -27,6 +27,7 @@ _HOME = {
     "Discrepancy": "corrections",
     "FMUTwin": "twins.fmu",
     "Fault": "faults",
+    "Fidelity": "fidelity",
     "FunctionTwin": "twins.function",
     "InputError": "errors",
     "KinematicTwin": "twins.kinematic",
@@ -60,6 +61,8 @@ _HOME = {
     "generate": "corrected",
     "infer_discrepancy": "residual",
     "load": "storage",
+    "measure_fidelity": "fidelity",
+    "measure_widening": "fidelity",
     "run_study": "study",
     "save": "storage",
     "simulate_to": "scale",
@@ -94,6 +97,7 @@ if TYPE_CHECKING:
     from retwin.download import fetch
     from retwin.errors import InputError
     from retwin.faults import Fault, SteadyStateError, Stuck
+    from retwin.fidelity import Fidelity, measure_fidelity, measure_widening
     from retwin.networks import CNN, LSTM, MLP, TCN, LSTMClassifier
     from retwin.report import write_report
     from retwin.residual import Mixture, ResidualModel, fit_residual, infer_discrepancy

@@ -17,7 +17,14 @@ from retwin.models import read_about, write_model
 from retwin.residual import ResidualModel
 from retwin.surrogate import Surrogate
 from retwin.trajectories import Channels, Trajectories
-from retwin.twins.protocol import Chunk, Progress, Twin, checked_commands, simulate_in_chunks
+from retwin.twins.protocol import (
+    Chunk,
+    Progress,
+    Twin,
+    checked_commands,
+    checked_seed,
+    simulate_in_chunks,
+)
 
 __all__ = ["CorrectedTwin", "generate"]
 
@@ -70,7 +77,7 @@ class CorrectedTwin:
 
         z is drawn for the clean commands: the RG is not told of faults.
         """
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(checked_seed(seed))
 
         @torch.no_grad()
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:

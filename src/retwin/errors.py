@@ -1,8 +1,15 @@
-"""The one way to say that an input is bad: what was expected, what came, and what to do."""
+"""The one way to say that an input is bad: what was expected, what came, and what to do.
+
+And where in a user's own code an exception comes from.
+"""
 
 from __future__ import annotations
 
-__all__ = ["InputError"]
+import sysconfig
+import traceback
+from pathlib import Path
+
+__all__ = ["InputError", "place_of"]
 
 
 class InputError(ValueError):
@@ -25,3 +32,17 @@ class InputError(ValueError):
 
 def _rebuild(argument: str, expected: str, got: str, remedy: str) -> InputError:
     return InputError(argument, expected=expected, got=got, remedy=remedy)
+
+
+def place_of(error: BaseException) -> str:
+    """The user's own line that was at work, as "FILE:LINE"; "" where none was.
+
+    The user's is what belongs neither to retwin, nor to Python, nor to an installed package.
+    """
+    others = [sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")]
+    others.append(str(Path(__file__).parent))
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        file = Path(frame.filename)
+        if file.is_file() and not any(file.is_relative_to(other) for other in others):
+            return f"{file}:{frame.lineno}"
+    return ""

@@ -59,11 +59,29 @@ class Stuck:
         uniformly. The published protocol freezes at sample 49.
     label: class name.
 
+    Raises
+    ------
+    InputError: an onset below 0 or no whole number, a pair out of order.
+
     """
 
     actuator: int
     onset: int | tuple[int, int] = 49
     label: str = "Stuck"
+
+    def __post_init__(self) -> None:
+        pair = isinstance(self.onset, Sequence)
+        ends: Sequence = self.onset if isinstance(self.onset, Sequence) else (self.onset,) * 2
+        whole = all(isinstance(end, int | np.integer) for end in ends)
+        if not (whole and len(ends) == 2 and 0 <= ends[0] <= ends[1]):
+            raise InputError(
+                "onset",
+                expected="a sample from 0 on, or a pair (low, high) of them, in order",
+                got=repr(self.onset),
+                remedy="count the samples from 0",
+            )
+        low, high = map(int, ends)
+        object.__setattr__(self, "onset", (low, high) if pair else low)
 
     def drawn(self, rng: np.random.Generator, *, steps: int, movements: int) -> Stuck:
         """The same fault with its onset fixed."""
@@ -100,12 +118,25 @@ class SteadyStateError:
     bias: one per movement; empty leaves it open.
     label: class name.
 
+    Raises
+    ------
+    InputError: sizes that are negative, infinite or out of order.
+
     """
 
     actuator: int
     size: tuple[float, float] = (10.0, 50.0)
     bias: tuple[float, ...] = ()
     label: str = "Steady_state_error"
+
+    def __post_init__(self) -> None:
+        if not (len(self.size) == 2 and 0 <= self.size[0] <= self.size[1] < np.inf):
+            raise InputError(
+                "size",
+                expected="a pair (least, greatest) of sizes, at least 0 and in order",
+                got=repr(self.size),
+                remedy="leave the sign out, it is drawn",
+            )
 
     def drawn(self, rng: np.random.Generator, *, steps: int, movements: int) -> SteadyStateError:
         """The same fault with one bias per movement."""

@@ -54,6 +54,14 @@ def holes(commands):
     return commands * np.nan
 
 
+def raises(commands):
+    return np.linalg.inv(commands[0, :1, :1] * 0)  # the line that is named
+
+
+def shouts(commands):
+    raise KeyError("no [such]\\n  valve")
+
+
 LIMITED = FunctionTwin(double, CHANNELS, CHANNELS, 50.0, limits=rt.Limits((0.0,), (10.0,)))
 
 
@@ -147,6 +155,17 @@ def test_a_mujoco_file(pendulum: Path) -> None:
     assert len(found.outputs) == 3
     assert found.rate == 50.0
     assert getattr(found, "limits", None) == rt.Limits((-1.0,), (1.0,), "clip")
+
+
+def test_a_module_in_the_current_folder(mine: str, tmp_path: Path) -> None:
+    """By the command that is installed, which Python runs without the current folder."""
+    command = [Path(sys.executable).with_name("retwin"), "twin", "simulate", f"{mine}:LIMITED"]
+    more = ["--n", "6", "--chunk", "2", "--workers", "2", "--out", "a.zarr"]
+    done = subprocess.run([*command, *more], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (tmp_path / "numpy.py").write_text("raise SystemExit('not the real one')")
+    done = subprocess.run([*command, *more], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(
@@ -331,7 +350,66 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert rt.load(out / "a.zarr").commands.max() == 1000
 
 
-def test_ctrl_c_says_how_to_go_on(call, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("function", "match"),
+    [
+        ("raises", r"error: LinAlgError: Singular matrix \(.*my_twins\.py:(\d+), in traj"),
+        ("shouts", r"error: KeyError: 'no \[such\].*valve' \(.*:(\d+), in trajectories 0 to 1\)"),
+    ],
+)
+@pytest.mark.parametrize("workers", [0, 1, 2])
+def test_what_a_function_raises_is_one_line(
+    call,
+    mine: str,
+    tmp_path: Path,
+    function: str,
+    match: str,
+    workers: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = twins.get(f"{mine}:LIMITED").simulate(np.ones((4, 9, 1)), seed=0)
+    rt.save(made.replace(inputs=None), tmp_path / "given.npz")
+    out = ("--out", tmp_path / "a.zarr", "--workers", workers)
+    words = (
+        *("simulate", f"{mine}:{function}", "--inputs=u", "--outputs=y", "--rate=50"),
+        *("--commands", tmp_path / "given.npz", "--chunk", 2),
+        *(out if workers else ("--out", tmp_path / "a.npz")),
+    )
+    code, _, err = call(*words)
+    assert code == 1
+    told = [line for line in err.splitlines() if not line.startswith("simulate")]
+    assert len(told) == 1, err
+    found = re.match(match, told[0])
+    assert found, told[0]
+    line = MODULE.replace("\\\\", "\\").splitlines()[int(found[1]) - 1]
+    assert "linalg" in line or "KeyError" in line
+    if workers < 2:
+        monkeypatch.setenv("RETWIN_TRACEBACK", "1")
+        monkeypatch.setattr(sys, "argv", ["retwin", "twin", *map(str, words)])
+        with pytest.raises((KeyError, np.linalg.LinAlgError)):
+            main()
+
+
+@pytest.mark.parametrize(
+    ("match", "words"),
+    [
+        ("Invalid value for '--rate': .*; see `retwin twin simulate --help`", ["--rate", "nan"]),
+        ("No such option: --nonsense", ["--nonsense"]),
+        ("Invalid value for '--chunk'", ["--chunk", "many"]),
+    ],
+)
+def test_words_that_are_no_command_are_one_line(
+    call, match: str, words: list[str], tmp_path: Path
+) -> None:
+    refused(call, match, "simulate", "armpi-kinematic", "--out", tmp_path / "a.npz", *words)
+    refused(call, "Missing argument 'TWIN'", "simulate")
+    code, out, err = call()
+    assert (code, err) == (2, "")
+    assert "Usage" in out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_says_how_to_go_on(call, tmp_path: Path, number: int) -> None:
     words = ["simulate", "armpi-kinematic", "--n", "600", "--chunk", "4", "--workers", "1"]
     process = subprocess.Popen(
         [sys.executable, "-m", "retwin", "twin", *words, "--out", str(tmp_path / "a.zarr")],
@@ -345,7 +423,7 @@ def test_ctrl_c_says_how_to_go_on(call, tmp_path: Path) -> None:
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "Traceback" not in err

@@ -16,11 +16,20 @@ from retwin.corrections import Head
 from retwin.testing import CORRECTION_CHECKS, CorrectionSubject, check_correction
 
 
+def short(exact, case: rt.Case, count: int) -> rt.Context:
+    sampler = replace(case.sampler, movements=2, steps=400, period=200)
+    commands = sampler.sample(count, rng=np.random.default_rng(0))
+    return rt.Context.of(exact, commands, rt.Segments.from_commands(commands), rate=100.0)
+
+
 @pytest.fixture(scope="module")
 def context(exact, case: rt.Case) -> rt.Context:
-    sampler = replace(case.sampler, movements=2, steps=400, period=200)
-    commands = sampler.sample(3, rng=np.random.default_rng(0))
-    return rt.Context.of(exact, commands, rt.Segments.from_commands(commands), rate=100.0)
+    return short(exact, case, 3)
+
+
+@pytest.fixture(scope="module")
+def several(exact, case: rt.Case) -> rt.Context:
+    return short(exact, case, 10)
 
 
 def delays_and_offsets(context: rt.Context) -> Tensor:
@@ -30,14 +39,26 @@ def delays_and_offsets(context: rt.Context) -> Tensor:
     return torch.tensor(np.concatenate([delay, offset], axis=2)).float()
 
 
-CORRECTIONS: dict[str, tuple[rt.Correction, Callable[[rt.Context], Tensor]]] = {
-    "delay and offset": (rt.DelayOffset(), delays_and_offsets),
+def offsets_of_joints(context: rt.Context) -> Tensor:
+    rng = np.random.default_rng(2)
+    shape = context.segments.start.shape
+    late, off = rng.gamma(4, 1.2, (*shape, 1)), rng.normal(0, 4, (*shape, 4))
+    missed = np.zeros((*shape, 4))
+    missed[[0, 3, 5, 8], [0, 0, 0, 1], [0, 1, 2, 3]] = 1.0
+    return torch.tensor(np.concatenate([late, off * (1 - missed), missed], axis=2)).float()
+
+
+CORRECTIONS: dict[str, tuple[rt.Correction, Callable[[rt.Context], Tensor], str]] = {
+    "delay and offset": (rt.DelayOffset(), delays_and_offsets, "context"),
+    # It learns from all trajectories what to believe, so it needs more than a few.
+    "command space": (rt.CommandSpace(), offsets_of_joints, "several"),
 }
 
 
 @pytest.fixture(params=CORRECTIONS)
-def subject(request: pytest.FixtureRequest, context: rt.Context) -> CorrectionSubject:
-    correction, draw = CORRECTIONS[request.param]
+def subject(request: pytest.FixtureRequest) -> CorrectionSubject:
+    correction, draw, name = CORRECTIONS[request.param]
+    context = request.getfixturevalue(name)
     return CorrectionSubject(correction, context, draw(context))
 
 

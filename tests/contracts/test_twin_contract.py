@@ -222,6 +222,10 @@ def repairs_faults(good: Simulate, commands, *, faults, **how: Any) -> rt.Trajec
     return good(commands, faults=given, **how)
 
 
+def repairs_seeds(good: Simulate, commands, *, seed: Any, **how: Any) -> rt.Trajectories:
+    return good(commands, seed=int(abs(seed or 0)), **how)
+
+
 def good_as_it_is(good: Simulate, commands, **how: Any) -> rt.Trajectories:
     return good(commands, **how)
 
@@ -253,6 +257,7 @@ BROKEN: list[tuple[str, Any]] = [
     ("check_progress", Bent(says_it_is_half_done)),
     ("check_bad_commands", Bent(repairs_commands)),
     ("check_bad_faults", Bent(repairs_faults)),
+    ("check_bad_seed", Bent(repairs_seeds)),
     ("check_limits", Bent(good_as_it_is, limits=ONE)),
     ("check_limits", Bent(good_as_it_is, limits=replace(ONE, outside="clip"))),
     ("check_global_randomness", Bent(seeds_everything)),

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
+import platform
+import signal
+import subprocess
 import sys
 import tempfile
+import time
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -328,6 +334,64 @@ def test_members_stay_in_the_folder(
     with pytest.raises(rt.InputError, match="an FMU that can be unpacked"):
         simulate("absolute", str(tmp_path / "evil.txt"))
     assert not list(tmp_path.rglob("evil.txt"))
+
+
+SCRIPT = """
+import numpy as np
+from retwin.scale import SimulationPlan, simulate_to
+from retwin.twins.fmu import FMUTwin
+
+if __name__ == "__main__":
+    twin = FMUTwin.from_file({path!r}, 100.0, ["u", "trouble"], ["x"])
+    commands = np.zeros((4, 10, 2))
+    commands[:, 3:, 1] = 1  # it hangs
+    plan = SimulationPlan(twin, commands, 0, chunk=2)
+    simulate_to({target!r}, plan, workers={workers})
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="ends processes by signals")
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_nothing_is_left_when_the_program_is_killed(
+    lag: Path, tmp_path: Path, workers: int, number: int
+) -> None:
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    script = SCRIPT.format(path=str(lag), target=str(tmp_path / "a.zarr"), workers=workers)
+    (tmp_path / "main.py").write_text(script)
+    process = subprocess.Popen(
+        [sys.executable, tmp_path / "main.py"], env={**os.environ, "TMPDIR": str(scratch)}
+    )
+    until(lambda: len(list(scratch.glob("retwin-*/binaries/*/*"))) == workers)
+    time.sleep(1.0)
+    process.send_signal(number)
+    process.wait()
+    until(lambda: not list(scratch.glob("retwin-*")))
+
+
+def until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="asks for processes by signal 0")
+def test_what_killed_processes_left_is_removed(
+    lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    here = f"retwin-{platform.node()}"
+    names = [f"{here}-{gone.pid}-a", f"{here}-{os.getpid()}-b", f"{here}-1-c"]
+    names += [f"retwin-elsewhere-{gone.pid}-d", f"{here}-mine-e", "retwin-report"]
+    for name in names:
+        (tmp_path / name / "inside").mkdir(parents=True)
+    twin = FMUTwin.from_file(lag, RATE, ["u"], ["x"], workers=1)
+    twin.simulate(np.zeros((1, 5, 1)), seed=0)
+    assert {file.name for file in tmp_path.iterdir()} == set(names[1:])
 
 
 def test_without_fmpy_it_says_how_to_get_it(lag: Path, monkeypatch: pytest.MonkeyPatch) -> None:

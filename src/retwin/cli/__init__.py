@@ -1,11 +1,13 @@
 """The command line: parse, call the public API, print; no logic.
 
 Exit codes: 0 done, 1 failed, 2 bad input with one line that says what was expected, what came, and
-what to do.
+what to do, 130 interrupted. With RETWIN_TRACEBACK=1 in the environment, an exception that nobody
+expected is shown in full.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Annotated
 
@@ -13,7 +15,17 @@ import typer
 
 from retwin import __version__
 from retwin.cli import data, models, studies, twins
-from retwin.cli.terminal import BAD_INPUT, FAILED, complain, show_warnings
+from retwin.cli.terminal import (
+    BAD_INPUT,
+    FAILED,
+    INTERRUPTED,
+    USAGE_ERROR,
+    complain,
+    complain_of_usage,
+    described,
+    interrupted_by_term,
+    show_warnings,
+)
 from retwin.errors import InputError
 
 __all__ = ["app", "main"]
@@ -53,13 +65,31 @@ def options(
 
 
 def main() -> None:
-    """Run the command line and exit with its code."""
-    with show_warnings():
-        try:
-            app()
-        except InputError as error:
-            complain(str(error))
-            sys.exit(BAD_INPUT)
-        except (OSError, RuntimeError) as error:
-            complain(f"{type(error).__name__}: {error}")
-            sys.exit(FAILED)
+    """Run the command line and exit with its code.
+
+    SIGTERM is taken as Ctrl-C, so that nothing is left lying about. Modules in the current folder
+    can be imported, after all that is installed: a file there must not stand in for a package.
+    """
+    if "" not in sys.path:
+        sys.path.append("")
+    with show_warnings(), interrupted_by_term():
+        sys.exit(_run())
+
+
+def _run() -> int:
+    """The exit code; what went wrong is told in one line."""
+    try:
+        return app(standalone_mode=False) or 0
+    except InputError as error:
+        complain(str(error))
+        return BAD_INPUT
+    except USAGE_ERROR as error:
+        complain_of_usage(error)
+        return BAD_INPUT
+    except typer.Abort:
+        return INTERRUPTED
+    except Exception as error:
+        if os.environ.get("RETWIN_TRACEBACK"):
+            raise
+        complain(described(error))
+        return FAILED

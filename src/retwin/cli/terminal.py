@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+import signal
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
+import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-__all__ = ["BAD_INPUT", "FAILED", "INTERRUPTED", "bar", "complain", "show_warnings"]
+from retwin.errors import place_of
+
+__all__ = [
+    "BAD_INPUT",
+    "FAILED",
+    "INTERRUPTED",
+    "USAGE_ERROR",
+    "bar",
+    "complain",
+    "complain_of_usage",
+    "described",
+    "interrupted_by_term",
+    "show_warnings",
+]
+
+USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
+"""Click's UsageError, by a way that leads to it in any Typer: newer ones bring a Click along."""
 
 FAILED = 1
 BAD_INPUT = 2
@@ -56,7 +75,34 @@ def _lines(console: Console, what: str) -> Callable[[str, float], None]:
 
 def complain(text: str) -> None:
     """One line on stderr, never wrapped."""
-    Console(stderr=True, soft_wrap=True).print(f"[red]error:[/] {escape(text)}", highlight=False)
+    line = escape(" ".join(text.split()))
+    Console(stderr=True, soft_wrap=True).print(f"[red]error:[/] {line}", highlight=False)
+
+
+def complain_of_usage(error: Any) -> None:
+    """One line on words that are no command, and where to read on."""
+    told = error.format_message().rstrip(".")
+    if told:  # without any words the help was shown, and that is all
+        where = f"; see `{error.ctx.command_path} --help`" if error.ctx is not None else ""
+        complain(f"{told}{where}")
+
+
+def described(error: Exception) -> str:
+    """Kind and message of an exception, and where in the user's own code it comes from."""
+    at = "; ".join(getattr(error, "__notes__", ())) or place_of(error)
+    if not (at or isinstance(error, OSError | RuntimeError)):
+        at = "RETWIN_TRACEBACK=1 in the environment shows where"
+    return f"{type(error).__name__}: {error}" + (f" ({at})" if at else "")
+
+
+@contextmanager
+def interrupted_by_term() -> Iterator[None]:
+    """SIGTERM does what Ctrl-C does."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

@@ -28,6 +28,11 @@ def effective(told: Tensor, segments: Segments, z: Tensor, when: Tensor) -> Tens
 
     """
     width = told.shape[2]
+    if not z.shape[1]:
+        columns = [
+            read(told[..., j : j + 1], when[..., j].expand(len(told), -1)) for j in range(width)
+        ]
+        return torch.cat(columns, dim=-1)
     delay, offset, missed = z.split([1, width, width], dim=-1)
     start, settle = (torch.as_tensor(t, dtype=z.dtype) for t in (segments.start, segments.settle))
     first, last = read(told, start), read(told, settle)  # (n, M, d_u)
@@ -43,9 +48,6 @@ def effective(told: Tensor, segments: Segments, z: Tensor, when: Tensor) -> Tens
         source = Knots.of(segments, delay[..., 0], at).source_time()
         here = read(told[..., j : j + 1], source)[..., 0]
         index = torch.searchsorted(start, source.detach().contiguous(), right=True)
-        if z.shape[1] == 0:
-            columns.append(here)
-            continue
         which = (index - 1).clamp_min(0)
         a, b = first[..., j].gather(1, which), last[..., j].gather(1, which)
         begin, end = start.gather(1, which), settle.gather(1, which)

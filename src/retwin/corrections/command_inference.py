@@ -265,11 +265,7 @@ def _suspects(
     far = (fit.x[..., 1:].abs() > SUSPECT * prior.offset) & problem.healthy
     residual = problem.residual(fit.x, missed)
     strange = (residual.norm(dim=-1) > 3 * prior.scale(problem)[0]) * problem.seen
-    start, stop = (
-        torch.as_tensor(times)[..., None]
-        for times in (problem.segments.start, problem.segments.stop)
-    )
-    inside = ((problem.at >= start) & (problem.at < stop)).double() * problem.seen[:, None]
+    inside = problem.inside()
     share = (inside * strange[:, None]).sum(dim=-1) / inside.sum(dim=-1).clamp_min(1)
     first = read(problem.told, torch.as_tensor(problem.segments.start))
     last = read(problem.told, torch.as_tensor(problem.segments.settle))
@@ -308,7 +304,8 @@ def _told(
     covariance[..., size:, size:] = torch.diag_embed(chance * (1 - chance))
     known = (left < problem.operator.known) & (told > 0)
     known[..., 1:] &= missed < 0.5
-    identified = torch.cat([known, problem.healthy], dim=-1) & problem.valid[..., None]
+    watched = problem.inside().any(dim=-1)[..., None] & problem.healthy
+    identified = torch.cat([known, watched], dim=-1) & problem.valid[..., None]
     z = torch.cat([fit.x * told, missed], dim=-1) * problem.valid[..., None]
     noise = (prior.noise[0] * problem.unit).expand(n)
     return Discrepancy(z, covariance, identified, noise, severity=severity, posterior=True)

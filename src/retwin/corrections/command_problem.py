@@ -61,8 +61,11 @@ class Problem:
         at = seen.any(dim=0).nonzero()[:, 0]
         self.at = at[:: max(1, -(-len(at) // operator.most))]
         self.seen = seen[:, self.at].double()
-        self.unit = observed.double().std(dim=(0, 1)).mean().clamp_min(1e-12)
-        self.observed = observed[:, self.at].double() / self.unit
+        told = observed.double()[seen]
+        spread = told.std(dim=0, correction=0).mean() if len(told) else told.new_ones(())
+        self.unit = spread.clamp_min(1e-12)
+        values = torch.where(seen[..., None], observed.double(), 0.0)
+        self.observed = values[:, self.at] / self.unit
         begin = start + operator.delay_range[0]
         end = torch.as_tensor(context.segments.settle)[..., None] + MARGIN
         self.moving = ((self.at >= begin) & (self.at <= end)).any(dim=1).double()
@@ -129,6 +132,13 @@ class Problem:
             error = self.residual(x, missed).norm(dim=-1) * self.seen
             costs.append((near * error[:, None]).sum(dim=-1))
         return grid[torch.stack(costs).argmin(dim=0)]
+
+    def inside(self) -> Tensor:
+        """(n, M, S), 1 where a measured sample belongs to a movement."""
+        start, stop = (
+            torch.as_tensor(times)[..., None] for times in (self.segments.start, self.segments.stop)
+        )
+        return ((self.at >= start) & (self.at < stop)).double() * self.seen[:, None]
 
     def _parts(self, *given: Tensor) -> Iterator[tuple[Problem, tuple[Tensor, ...]]]:
         for rows in torch.arange(len(self)).split(CHUNK):

@@ -47,6 +47,11 @@ class CommandSpace:
         """One z per movement."""
         return "segment"
 
+    @property
+    def pools(self) -> bool:
+        """What `infer` finds of one trajectory leans on what it learns from those beside it."""
+        return True
+
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:
         """`delay` in samples, `offset_…` in the commands' units, `missed_…` 0 or 1."""
         names = ("delay", *(f"{kind}_{name}" for kind in KINDS for name in inputs.names))

@@ -157,12 +157,13 @@ def _scores(results: Results, source: str, told: Fidelity) -> Table:
     lines += [("crps", "CRPS, mean over outputs", 1.0, ""), ("energy", "Energy score", *alike)]
     rows = []
     for key, title, factor, unit in lines:
+        kind, *output = key.split("/", 1)
         row = [Cell(f"{title}, {unit}" if unit else title)]
         row.append(_cell(told.figures.get(key, Figure()), 2, factor))
         for rival in told.rivals:
             row.append(_cell(told.figures.get(f"{key}/{rival}", Figure()), 2, factor))
-            place = f"{key.replace('crps', 'crps_below').replace('energy', 'energy_below')}/{rival}"
-            row.append(_cell(told.figures.get(place, Figure()), 0, 100.0))
+            below = "/".join([f"{kind}_below", *output, rival])
+            row.append(_cell(told.figures.get(below, Figure()), 0, 100.0))
         rows.append(row)
     text = (
         f"{_whose(results, source)}How far {told.draws or 'many'} draws per trajectory lie from "

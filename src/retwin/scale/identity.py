@@ -25,7 +25,9 @@ DEEPEST = 12
 def identity(value: object) -> str:
     """The SHA-256 of what `value` is: kind, settings, arrays, weights, contents of its files.
 
-    Not by pickle, which depends on what happens to be the same object, and is silent on files.
+    An object whose files name other files tells in `fingerprint`, a text, what it is with those.
+    A function or class is known by its name. Not by pickle, which depends on what happens to be
+    the same object, and is silent on files.
     """
     text = json.dumps(_told(value, DEEPEST), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -48,7 +50,8 @@ def _told(value: Any, deep: int) -> Any:
         return [_told(each, deep - 1) for each in value]
     if hasattr(value, "__qualname__") and not isinstance(value, MethodType):  # function or class
         return f"{value.__module__}:{value.__qualname__}"
-    return [_kind(value), _told(_contents(value), deep - 1)]
+    fingerprint = _told(getattr(value, "fingerprint", ""), 0)
+    return [_kind(value), _told(_contents(value), deep - 1), fingerprint]
 
 
 def _contents(value: Any) -> Any:

@@ -70,6 +70,7 @@ def simulate_to(
     A Zarr folder is made chunk by chunk, with memory for one chunk per worker. The work lies in
     `path` + ".part" until it is done. After an interruption of any kind the same call goes on there
     and repeats no chunk that was finished; of a folder that is finished already it does nothing.
+    A bad input leaves nothing but what an earlier call has finished.
     The bytes depend on the plan alone. Trajectories that fail do not end the others: they are told
     in the result and in the folder's header, and left out when the folder is loaded.
 
@@ -106,9 +107,19 @@ def simulate_to(
     about = _about(plan)
     if target.exists():
         return _already(target, plan, about)
+    earlier = _part(target).exists()
     job = _Job.begun(target, plan, about)
     try:
         job.finish(workers, scheduler, tell)
+    except InputError as error:
+        # The plan cannot be carried out, whatever is finished of it.
+        if job.done() and earlier:
+            remedy = f"{error.remedy}; what was finished earlier stays in {job.part}"
+            raise InputError(
+                error.argument, expected=error.expected, got=error.got, remedy=remedy
+            ) from error
+        _remove(job.part)
+        raise
     except BaseException:
         if not job.done():
             _remove(job.part)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from retwin.errors import InputError
+from retwin.errors import InputError, place_of
 from retwin.faults import Fault
 from retwin.storage.header import CHUNKED_NAMES, FAILED
 from retwin.trajectories import Channels, Source, Trajectories
@@ -191,9 +192,34 @@ def make_chunk(plan: SimulationPlan, number: int, progress: Progress | None = No
     ------
     InputError: the twin refuses the commands or faults, or returns other shapes.
     SimulationError: every trajectory of the very first chunk failed, so all others would.
+    Exception: whatever else the twin raises, with a note of where and of which trajectories.
 
     """
     rows = plan.rows(number)
+    try:
+        return _made(plan, number, rows, progress)
+    except InputError as error:
+        raise _of_the_whole(error, int(rows[0])) from error
+    except SimulationError:
+        raise
+    except Exception as error:
+        # The line goes into the note, for a traceback does not come out of a worker process.
+        at = ", ".join(filter(None, (place_of(error), f"in trajectories {rows[0]} to {rows[-1]}")))
+        error.add_note(at)
+        raise
+
+
+def _of_the_whole(error: InputError, begin: int) -> InputError:
+    """The error with the number that a trajectory has in the plan: the twin counts in its chunk."""
+
+    def counted(found: re.Match[str]) -> str:
+        return f"trajectory {begin + int(found[1])}"
+
+    got = re.sub(r"\btrajectory (\d+)\b", counted, error.got)
+    return InputError(error.argument, expected=error.expected, got=got, remedy=error.remedy)
+
+
+def _made(plan: SimulationPlan, number: int, rows: NDArray, progress: Progress | None) -> Made:
     for_commands, for_twin = np.random.SeedSequence(plan.seed, spawn_key=(number,)).spawn(2)
     classes = rows % len(plan.faults)
     faults = list(plan.faults.values())

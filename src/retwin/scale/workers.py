@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from pebble import ProcessExpired
 
 from retwin.errors import InputError
-from retwin.processes import worker_pool
+from retwin.processes import sendable_errors, worker_pool
 from retwin.trajectories import Progress
 
 __all__ = ["alone", "each"]
@@ -57,7 +57,9 @@ def each(
             yield from _as_they_come(submit, numbers)
     else:
         with worker_pool(workers) as pool:
-            yield from _as_they_come(lambda n: pool.schedule(task, args=(job, n)), numbers)
+            yield from _as_they_come(
+                lambda number: pool.schedule(_in_worker, args=(task, job, number)), numbers
+            )
 
 
 def alone(twin: Any) -> Any:
@@ -142,6 +144,11 @@ def _on_cluster(
         finally:
             # Not waiting: after an error or Ctrl-C, what is not begun is not wanted.
             executor.shutdown(wait=False)
+
+
+def _in_worker(task: Callable[..., Result], job: object, number: int) -> Result:
+    with sendable_errors():
+        return task(job, number)
 
 
 def _same(job: Job) -> Job:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from retwin.case import Case
 from retwin.corrected import CorrectedTwin, generate
+from retwin.corrections import Correction
 from retwin.diagnosis import fit_diagnoser
 from retwin.fidelity import Fidelity, MeanOnly, measure_fidelity, measure_widening
 from retwin.models import read_about
@@ -86,10 +87,15 @@ class Work:
         chosen = {name: SOURCES[name] for name in self.plan.sources}
         folds = range(len(self.roles.folds))
         surrogates = any(source.surrogate for source in chosen.values())
-        residuals = any(source.residual for source in chosen.values())
+        corrected = [name for name, source in chosen.items() if source.residual]
         return [
             [Job("surrogate", run) for run in runs if surrogates],
-            [Job("residual", run, fold) for run in runs for fold in folds if residuals],
+            [
+                Job("residual", run, fold, name)
+                for run in runs
+                for fold in folds
+                for name in corrected
+            ],
             [
                 Job("diagnosis", run, fold, name)
                 for run in runs
@@ -97,12 +103,7 @@ class Work:
                 for fold in (folds if source.per_fold else (0,))
             ]
             # Of the first run: the chance in training is seen in the scores, at less cost.
-            + [
-                Job("fidelity", 0, fold, name)
-                for name, source in chosen.items()
-                if source.residual
-                for fold in folds
-            ],
+            + [Job("fidelity", 0, fold, name) for name in corrected for fold in folds],
         ]
 
     def path(self, job: Job) -> Path:
@@ -111,7 +112,7 @@ class Work:
             return self.folder / f"run-{job.run}" / "surrogate"
         base = self.folder / f"run-{job.run}" / f"fold-{job.fold}"
         if job.kind == "residual":
-            return base / "residual"
+            return base / f"{job.source}.residual"
         return base / f"{job.source}{'.fidelity' if job.kind == 'fidelity' else ''}.npz"
 
     def do(self, job: Job, progress: Progress | None = None) -> None:
@@ -156,7 +157,7 @@ class Work:
         residual = fit_residual(
             self._fitted_surrogate(job.run),
             self.real_data()[list(self.roles.folds[job.fold][0])],
-            self.case.correction,
+            self._correction(job.source),
             seed=self.plan.seed_of("residual", job.run, job.fold),
             calibrate_on=self.plan.calibrate_on,
             progress=progress,
@@ -198,7 +199,7 @@ class Work:
             with write_atomically(self.path(job)) as part:
                 np.savez(part)  # done, and nothing found
             return {}
-        updated = self._updated(job.run, job.fold)
+        updated = self._updated(job)
         gaussian = self._refitted(job, calibration, components=1)
         found = measure_fidelity(
             updated,
@@ -232,7 +233,7 @@ class Work:
         self, job: Job, calibration: Trajectories, *, components: int | None = None
     ) -> CorrectedTwin:
         """The corrected twin of a run and fold, its RG fitted to other data or a smaller one."""
-        updated = self._updated(job.run, job.fold)
+        updated = self._updated(job)
         mixture = updated.residual.mixture
         residual = fit_residual(
             updated.surrogate,
@@ -256,7 +257,7 @@ class Work:
         surrogate = self._fitted_surrogate(job.run)
         twin: Surrogate | CorrectedTwin = surrogate
         if SOURCES[job.source].residual:
-            twin = self._updated(job.run, job.fold)
+            twin = self._updated(job)
         # One seed for all sources of a run: the same commands and the same faults.
         return generate(
             twin,
@@ -275,10 +276,15 @@ class Work:
     def _fitted_surrogate(self, run: int) -> Surrogate:
         return Surrogate.load(self.path(Job("surrogate", run)))
 
-    def _updated(self, run: int, fold: int) -> CorrectedTwin:
-        """The corrected twin of one run and fold."""
-        residual = ResidualModel.load(self.path(Job("residual", run, fold)))
-        return CorrectedTwin(self._fitted_surrogate(run), residual)
+    def _updated(self, job: Job) -> CorrectedTwin:
+        """The corrected twin of a job's source, run and fold."""
+        residual = ResidualModel.load(self.path(replace(job, kind="residual")))
+        return CorrectedTwin(self._fitted_surrogate(job.run), residual)
+
+    def _correction(self, source: str) -> Correction:
+        make = SOURCES[source].correction
+        assert make is not None
+        return make(self.case)
 
     def fidelity(self, source: str) -> Fidelity | None:
         """How real the source's twin is, over all folds; None when no healthy one was held out."""

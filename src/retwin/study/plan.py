@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from retwin.case import Case
+from retwin.corrections import CommandSpace, Correction
 from retwin.errors import InputError
 from retwin.networks import CLASSIFIERS, Network
 from retwin.training import Training
@@ -23,7 +25,8 @@ class TrainingSource:
     ----------
     title: for people.
     real_data: "none", "timing" (of commands), "healthy", "unlabelled", "labelled", "transductive".
-    surrogate, residual: whether it needs the IBG, and the RG.
+    surrogate: whether it needs the IBG.
+    correction: the operator of its RG, by case; None for a source without one.
     per_fold: whether it depends on the calibration set; a source that does not is trained once.
 
     """
@@ -31,14 +34,24 @@ class TrainingSource:
     title: str
     real_data: str
     surrogate: bool
-    residual: bool
+    correction: Callable[[Case], Correction] | None
     per_fold: bool
+
+    @property
+    def residual(self) -> bool:
+        """Whether it has a residual model."""
+        return self.correction is not None
 
 
 SOURCES: dict[str, TrainingSource] = {
-    "dt": TrainingSource("Digital twin", "none", surrogate=False, residual=False, per_fold=False),
-    "ibg": TrainingSource("IBG alone", "timing", surrogate=True, residual=False, per_fold=True),
-    "ibg_rg": TrainingSource("IBG + RG", "healthy", surrogate=True, residual=True, per_fold=True),
+    "dt": TrainingSource("Digital twin", "none", False, None, per_fold=False),
+    "ibg": TrainingSource("IBG alone", "timing", True, None, per_fold=True),
+    "ibg_rg": TrainingSource(
+        "IBG + RG", "healthy", True, lambda case: case.correction, per_fold=True
+    ),
+    "ibg_rg_command": TrainingSource(
+        "IBG + RG, command space", "healthy", True, lambda case: CommandSpace(), per_fold=True
+    ),
 }
 
 

@@ -134,7 +134,7 @@ def _costs(work: Work, name: str) -> dict[str, float | None]:
     if kind.surrogate:
         update += _mean(work, "surrogate", "seconds") or 0.0
     if kind.residual:
-        update += _mean(work, "residual", "seconds") or 0.0
+        update += _mean(work, "residual", "seconds", name) or 0.0
     generate = None if name == "dt" else _mean(work, "diagnosis", "generate", name)
     return {"update_s": update, "generate_s": generate}
 
@@ -157,7 +157,7 @@ def _timing(work: Work) -> dict[str, Any]:
     return {
         "generate_s": {name: _costs(work, name)["generate_s"] for name in chosen},
         "surrogate_fit_s": _mean(work, "surrogate", "seconds"),
-        "residual_fit_s": _mean(work, "residual", "seconds"),
+        "residual_fit_s": {name: _mean(work, "residual", "seconds", name) for name in chosen},
         "diagnosis_s": {name: _mean(work, "diagnosis", "seconds", name) for name in chosen},
         "fidelity_s": {name: _mean(work, "fidelity", "seconds", name) for name in chosen},
         "total_s": float(sum(work.timing(job).get("seconds", 0.0) for job in jobs)),

@@ -303,6 +303,13 @@ def check_bad_faults(subject: TwinSubject) -> None:
         require_refused(lambda f=faults: subject.simulate(faults=f), "faults", what)  # type: ignore[misc]
 
 
+def check_bad_seed(subject: TwinSubject) -> None:
+    """A seed is a whole number of at least 0."""
+    for seed in (-1, 0.5, None):
+        what = f"seed {seed}"
+        require_refused(lambda s=seed: subject.simulate(seed=s), "seed", what)  # type: ignore[misc]
+
+
 def check_limits(subject: TwinSubject) -> None:
     """Commands beyond the twin's limits are refused, or clipped if it says so."""
     limits: Limits | None = getattr(subject.twin, "limits", None)
@@ -355,6 +362,7 @@ TWIN_CHECKS: tuple[Callable[[TwinSubject], None], ...] = (
     check_progress,
     check_bad_commands,
     check_bad_faults,
+    check_bad_seed,
     check_limits,
     check_global_randomness,
     check_pickle,

@@ -6,7 +6,6 @@ Needs the extra `fmu`. An FMU runs native code with your rights: run only FMUs t
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -19,7 +18,7 @@ from pebble import ProcessExpired, ProcessPool
 
 from retwin.errors import InputError
 from retwin.faults import Fault
-from retwin.processes import worker_pool
+from retwin.processes import scratch_folder, worker_pool
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins import fmu_worker
 from retwin.twins.checks import check_positive, ideal_outputs, substeps
@@ -185,7 +184,7 @@ class FMUTwin:
         commands = checked_commands(commands, self.inputs)
         count = len(commands)
         values = self._start_values(read_description(self.path), parameters or {}, count)
-        with tempfile.TemporaryDirectory(prefix="retwin-", ignore_cleanup_errors=True) as folder:
+        with scratch_folder() as folder:
             extract(self.path, folder)
             job = fmu_worker.Job(
                 folder,
@@ -197,7 +196,8 @@ class FMUTwin:
                 self.reuse,
             )
             workers = min(self.workers or os.cpu_count() or 1, count)
-            with worker_pool(workers, fmu_worker.start, (job,)) as pool:
+            begin, orphaned = fmu_worker.start, fmu_worker.orphaned
+            with worker_pool(workers, begin, (job,), orphaned=orphaned) as pool:
 
                 def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
                     if chunk.index.start == 0:

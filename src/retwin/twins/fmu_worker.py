@@ -6,6 +6,7 @@ An FMU is native code. This module is the only one that loads it, and no parent 
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import time
 from collections.abc import Callable, Mapping
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["AGAIN", "Job", "load", "run", "start"]
+__all__ = ["AGAIN", "Job", "load", "orphaned", "run", "start"]
 
 AGAIN = 75
 """Exit code of a process that was spent before it began a run: the run is to be asked for again."""
@@ -66,6 +67,11 @@ def start(job: Job) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     # What an FMU prints must not mix with what the program prints.
     os.dup2(2, 1)
+
+
+def orphaned(job: Job) -> None:
+    """Remove the extracted FMU, when the process that would have done it is no more."""
+    shutil.rmtree(job.folder, ignore_errors=True)
 
 
 def load() -> str:

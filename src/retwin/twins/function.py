@@ -16,7 +16,7 @@ from pebble import ProcessExpired, ProcessPool
 
 from retwin.errors import InputError
 from retwin.faults import Fault
-from retwin.processes import worker_pool
+from retwin.processes import sendable_errors, worker_pool
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins.checks import check_positive
 from retwin.twins.protocol import Chunk, Limits, Progress, simulate_in_chunks
@@ -258,15 +258,8 @@ def _in_worker(packed: bytes, role: str) -> NDArray:
         call = pickle.loads(packed)
     except (AttributeError, ImportError) as error:
         raise _not_importable(role, str(error)) from error
-    try:
+    with sendable_errors():
         return call.answer()
-    except Exception as error:
-        try:
-            pickle.loads(pickle.dumps(error))
-        except Exception:
-            # An exception that cannot cross the border would break the pool.
-            raise RuntimeError(f"{type(error).__name__}: {error}") from error
-        raise
 
 
 def _check_importable(function: Function | None, role: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -150,6 +151,13 @@ class MuJoCoTwin:
         return compiled(
             self.path, servos=self.servos, places=self.sensors, step=self.step, meshes=self.meshes
         )
+
+    @property
+    def fingerprint(self) -> str:
+        """The SHA-256 of the compiled model: of all that its file includes and names, too."""
+        whole = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
+        mujoco.mj_saveModel(self.model, None, whole)
+        return hashlib.sha256(whole.tobytes()).hexdigest()
 
     @cached_property
     def limits(self) -> Limits | None:

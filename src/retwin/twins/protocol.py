@@ -22,6 +22,7 @@ __all__ = [
     "SimulationError",
     "Twin",
     "checked_commands",
+    "checked_seed",
     "simulate_in_chunks",
 ]
 
@@ -83,12 +84,13 @@ class Twin(Protocol):
         `nominal` of the result is the ideal output for the clean commands, `observed` what the
         twin says happens, `labels` the label of each fault. The same seed gives the same bytes.
 
-        A twin may also have `limits`, the `Limits` its commands must keep.
+        A twin may also have `limits`, the `Limits` its commands must keep, and `fingerprint`, a
+        text that tells it from others where its fields, and the files they name, do not.
 
         Raises
         ------
         InputError: commands of another width, NaN or infinite, or outside the twin's limits; not
-            one fault per trajectory.
+            one fault per trajectory; a seed that is no whole number or below 0.
         SimulationError: some trajectories could not be simulated; it names them and holds the
             others.
 
@@ -188,6 +190,18 @@ def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
     return array if array.dtype.kind == "f" else array.astype(np.float64)
 
 
+def checked_seed(seed: int) -> int:
+    """`seed` as a plain number, or an InputError."""
+    if not (isinstance(seed, int | np.integer) and seed >= 0):
+        raise InputError(
+            "seed",
+            expected="a whole number of at least 0",
+            got=repr(seed),
+            remedy="give one: the same seed gives the same result",
+        )
+    return int(seed)
+
+
 def _check_actuators(faults: Sequence[Fault | None], inputs: Channels) -> None:
     """A fault on one actuator must name one that there is."""
     for fault in faults:
@@ -251,7 +265,7 @@ def simulate_in_chunks(
 ) -> Trajectories:
     """What every twin's `simulate` does around its own simulation `run`.
 
-    Checks commands, draws the severities of faults, tells progress, and collects what `run` says
+    Checks all arguments, draws the severities of faults, tells progress, collects what `run` says
     of each chunk of at most `size` trajectories: nominal and observed outputs (n, T, d_y). One
     trajectory that fails, or gives outputs that are not finite, does not end the others.
     """
@@ -259,6 +273,7 @@ def simulate_in_chunks(
     limits: Limits | None = getattr(twin, "limits", None)
     if limits is not None:
         commands = limits.keep(commands, twin.inputs)
+    seed = checked_seed(seed)
     _check_actuators(faults or (), twin.inputs)
     segments = Segments.from_commands(commands)
     drawn = draw_faults([None] * len(commands) if faults is None else faults, segments, seed)
