@@ -323,8 +323,9 @@ def test_control_c_ends_it_at_once(tmp_path: Path) -> None:
         assert float(process.stdout.readline()) > 0
         begin = time.monotonic()
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=20)
-    assert time.monotonic() - begin < 10
+        # 500 trajectories would take minutes; how fast it ends depends on what else is running.
+        _, told = process.communicate(timeout=60)
+    assert time.monotonic() - begin < 30
     assert "KeyboardInterrupt" in told
 
 

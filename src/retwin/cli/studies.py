@@ -35,7 +35,7 @@ def study(
     test: Annotated[Path | None, typer.Option(help="Real set to test on.")] = None,
     real: Annotated[Path | None, typer.Option(help="One real set, split into folds.")] = None,
     folds: Annotated[int, typer.Option(help="Folds of --real.")] = 3,
-    sources: Annotated[str, typer.Option(help="Names joined by commas, or all.")] = "all",
+    sources: Annotated[str, typer.Option(help="Names joined by commas, or all.")] = "dt,ibg,ibg_rg",
     classifier: Annotated[str | None, typer.Option(help="cnn or lstm.")] = None,
     runs: Annotated[int | None, typer.Option(help="Runs; the preset's if not given.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same result.", min=0)] = 0,

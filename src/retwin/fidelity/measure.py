@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from retwin.corrected import CorrectedTwin
+from retwin.corrections import DelayOffset
 from retwin.errors import InputError
 from retwin.faults import Fault
 from retwin.fidelity.figures import BINS, LEVELS, Fidelity
@@ -21,6 +22,8 @@ from retwin.twins.protocol import HEALTHY, Chunk, Progress, Twin, simulate_in_ch
 
 __all__ = ["MeanOnly", "measure_fidelity", "measure_widening"]
 
+MOVEMENT = DelayOffset()
+"""Tells TDe and TPE of every twin alike, whatever operator its own residual model has."""
 INFERRED = 19
 """Draws per trajectory of which z* is inferred: one more lies within their range 9 times in 10."""
 REFERENCE = 99
@@ -329,17 +332,17 @@ def _movement_channels(twin: Twin) -> Channels:
     noise = tuple(f"noise_{name}" for name in twin.outputs.names)
     if not isinstance(twin, CorrectedTwin):
         return Channels(noise, twin.outputs.units)
-    latent = twin.residual.latent
+    latent = MOVEMENT.latent(twin.inputs, twin.outputs)
     return Channels(latent.names + noise, latent.units + twin.outputs.units)
 
 
 def _movements(twin: Twin, made: Trajectories, segments: Segments, stride: int) -> NDArray:
-    """z* and plateau noise (m, M, k), measured and drawn alike; NaN where outputs tell neither."""
+    """TDe, TPE and plateau noise (m, M, k), measured and drawn alike; NaN where not told."""
     noise = _plateau_noise(made, segments, stride)
     if not isinstance(twin, CorrectedTwin):
         return noise
     every = segments[np.zeros(len(made), dtype=int)]
-    _, found = infer_discrepancy(twin.surrogate, made, twin.residual.correction, segments=every)
+    _, found = infer_discrepancy(twin.surrogate, made, MOVEMENT, segments=every)
     z = torch.where(found.identified, found.z, torch.nan).numpy()
     return np.concatenate([z, noise], axis=2)
 
