@@ -29,6 +29,7 @@ FLOORS = [
     "training",
     "surrogate",
     "mixture",
+    "flows",
     "corrections",
     "residual",
     "case",

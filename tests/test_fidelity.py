@@ -14,7 +14,7 @@ import scoringrules
 from scipy.stats import ks_2samp, norm
 
 import retwin as rt
-from retwin.fidelity import Fidelity, MeanOnly, measure_fidelity, measure_widening
+from retwin.fidelity import Fidelity, measure_fidelity, measure_widening
 from retwin.twins.protocol import simulate_in_chunks
 
 STEPS, DRAWS = 60, 100
@@ -245,7 +245,7 @@ def test_a_corrected_twin_against_its_own_draws(
 def test_mean_only_is_a_twin_without_spread(
     updated: rt.CorrectedTwin, emulated: rt.Trajectories
 ) -> None:
-    twin = MeanOnly(updated)
+    twin = replace(updated, random=False)
     assert isinstance(twin, rt.Twin)
     commands = emulated.commands[:2]
     one, other = (twin.simulate(commands, seed=seed).observed for seed in (0, 1))

@@ -6,12 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scoringrules
 import torch
 from scipy import stats
 
 import retwin as rt
+from retwin.flows import FlowHead
 from retwin.mixture import Blocks, GaussianMixture
-from retwin.training import Training
+from retwin.residual.refining import energy_score
+from retwin.training import Training, isolated
 
 STEPS = 60
 
@@ -125,6 +128,46 @@ def test_it_beats_a_single_gaussian(
     assert scores[3] > scores[1] + 0.3
 
 
+@pytest.fixture(scope="module")
+def flow(identity: rt.Surrogate) -> rt.ResidualModel:
+    calibration, _ = toy(2500, seed=1)
+    density = rt.Flow(hidden=(32, 32), dropout=0.0, smoothness=0.0, training=LEARN)
+    return rt.fit_residual(identity, calibration, rt.DelayOffset(), density, seed=0)
+
+
+def test_a_flow_recovers_the_law_too(
+    flow: rt.ResidualModel, identity: rt.Surrogate, tmp_path: Path
+) -> None:
+    test, offset = toy(1500, seed=2)
+    flow.save(tmp_path / "flow")
+    told = offset_law(rt.ResidualModel.load(tmp_path / "flow"), identity, test)
+    value = torch.tensor(offset)[:, None, None].float()
+    with torch.no_grad():
+        log_density = told.log_prob(value)[:, 0].numpy()
+        scores = told.normal_scores(value)[:, 0, 0].numpy()
+        drawn = told.from_noise(value, torch.tensor(scores)[:, None, None])
+        mean = told.mean[:, 0, 0].numpy()
+    truth = true_log_density(test.commands[:, -1, 0], offset)
+    assert abs(truth.mean() - log_density.mean()) < 0.1
+    assert stats.kstest(scores, "norm").pvalue > 0.001
+    torch.testing.assert_close(drawn, value, atol=1e-3, rtol=0)
+    weights, means, _ = law(test.commands[:, -1, 0])
+    assert np.abs(mean - (weights * means).sum(axis=-1)).mean() < 0.04
+
+
+def test_a_flow_starts_as_a_normal_law_in_any_unit() -> None:
+    with isolated(0):
+        head = FlowHead(4, 3, transforms=2, bins=6)
+    head.initialise(np.zeros((1, 3)), seed=0)
+    shift, scale = torch.tensor([1.0, -2.0, 0.0]), torch.tensor([0.1, 5.0, 1.0])
+    drawn = head(torch.randn(7, 4, generator=torch.Generator().manual_seed(0)), shift, scale)
+    value = shift + scale * torch.tensor([0.3, -1.2, 2.0])
+    expected = stats.norm.logpdf(value.numpy(), shift.numpy(), scale.numpy()).sum()
+    np.testing.assert_allclose(drawn.log_prob(value).detach(), expected, atol=1e-4)
+    torch.testing.assert_close(drawn.mean[0].detach(), shift, atol=0.1, rtol=0)
+    torch.testing.assert_close(drawn.variance[0].detach().sqrt(), scale, atol=0, rtol=0.2)
+
+
 def test_draws_follow_the_law_and_the_bounds(
     fitted: dict[int, rt.ResidualModel], identity: rt.Surrogate
 ) -> None:
@@ -172,9 +215,9 @@ def test_draws_from_noise_have_the_mixture_s_moments() -> None:
 
 def test_calibrates_on_healthy_by_default(ibg: rt.Surrogate, emulated: rt.Trajectories) -> None:
     brief = rt.Mixture(training=Training(epochs=3, batch=64))
-    few = rt.fit_residual(ibg, emulated, mixture=brief, seed=0)
+    few = rt.fit_residual(ibg, emulated, density=brief, seed=0)
     assert few.fitted.figures["trajectories"] == 10
-    every = rt.fit_residual(ibg, emulated, mixture=brief, seed=0, calibrate_on="all")
+    every = rt.fit_residual(ibg, emulated, density=brief, seed=0, calibrate_on="all")
     assert every.fitted.figures["trajectories"] == 90
     assert every.scale[1:].max() > 1.5 * few.scale[1:].max(), "the offset absorbs the faults"
 
@@ -190,14 +233,14 @@ def test_six_healthy_trajectories_are_enough(ibg: rt.Surrogate, emulated: rt.Tra
 def test_too_few_to_validate_is_a_warning(ibg: rt.Surrogate, emulated: rt.Trajectories) -> None:
     brief = rt.Mixture(training=Training(epochs=3))
     with pytest.warns(UserWarning, match="2 trajectories to calibrate on, at least three"):
-        model = rt.fit_residual(ibg, emulated.with_label("Healthy")[:2], mixture=brief, seed=0)
+        model = rt.fit_residual(ibg, emulated.with_label("Healthy")[:2], density=brief, seed=0)
     assert model.fitted.history["validation"] == []
 
 
 def test_nothing_to_calibrate_on_is_refused(ibg: rt.Surrogate, emulated: rt.Trajectories) -> None:
     with pytest.raises(rt.InputError, match="at least one trajectory labelled 'Healthy'"):
         rt.fit_residual(ibg, emulated.with_label("Motor_1_Stuck"), seed=0)
-    with pytest.raises(rt.InputError, match="'healthy' or 'all'"):
+    with pytest.raises(rt.InputError, match="'healthy', 'all', or what fault"):
         rt.fit_residual(ibg, emulated, seed=0, calibrate_on="some")
     still = emulated.replace(commands=np.full_like(emulated.commands, 500))
     with pytest.raises(rt.InputError, match="commands that never change"):
@@ -226,7 +269,7 @@ def test_calibration_data_must_speak_of_the_same_system(
         rt.fit_residual(ibg, emulated.replace(outputs=millimetres), seed=0)
     with pytest.raises(rt.InputError, match="one positive bound for each of delay, offset_x"):
         rt.fit_residual(ibg, emulated, seed=0, bounds=np.ones(3))
-    with pytest.raises(rt.InputError, match="0 components"):
+    with pytest.raises(rt.InputError, match="components: expected at least 1, got 0"):
         rt.Mixture(components=0)
 
 
@@ -237,3 +280,98 @@ def test_what_was_calibrated_on_emulated_data_says_so(
     updated.save(tmp_path / "twin")
     back = rt.CorrectedTwin.load(tmp_path / "twin")
     assert rt.generate(back, case, per_class=1, seed=0).emulated
+
+
+def test_the_energy_score_is_the_one_of_the_literature() -> None:
+    generator = torch.Generator().manual_seed(0)
+    made = torch.randn(4, 30, 20, 2, generator=generator, dtype=torch.float64)
+    observed = torch.randn(4, 20, 2, generator=generator, dtype=torch.float64)
+    mask = torch.ones(4, 20, 2, dtype=torch.bool)
+    mask[:, 15:] = False
+    ours = energy_score(made, observed, mask)
+    kept = (made[:, :, :15].flatten(2), observed[:, :15].flatten(1))
+    theirs = scoringrules.es_ensemble(
+        kept[1].numpy() / np.sqrt(15), kept[0].numpy() / np.sqrt(15), estimator="fair"
+    )
+    np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def poor(identity: rt.Surrogate) -> dict[str, rt.ResidualModel]:
+    """A model that stopped too early, with and without refinement."""
+    calibration, _ = toy(60, seed=4)
+    brief = {"dropout": 0.0, "training": Training(epochs=1)}
+    how = rt.Refinement(training=Training(epochs=25, batch=16, rate=1e-2, patience=10))
+    bounds = np.array([6.0, 0.6])
+    return {
+        name: rt.fit_residual(
+            identity, calibration, rt.DelayOffset(), density, seed=0, bounds=bounds
+        )
+        for name, density in (
+            ("before", rt.Flow(**brief)),
+            ("after", rt.Flow(**brief, refinement=how)),
+        )
+    }
+
+
+def test_refinement_helps_a_poor_model_on_trajectories_it_never_saw(
+    poor: dict[str, rt.ResidualModel], identity: rt.Surrogate
+) -> None:
+    figures = poor["after"].fitted.figures
+    assert figures["refined"] == 1.0
+    assert figures["energy after"] < figures["energy before"]
+    test, _ = toy(300, seed=5)
+    scores = {}
+    for name, model in poor.items():
+        draws = np.stack(
+            [rt.CorrectedTwin(identity, model).simulate(test.commands, seed=s).observed
+             for s in range(20)], axis=1,
+        )  # fmt: skip
+        observed = torch.tensor(test.observed)
+        scores[name] = energy_score(torch.tensor(draws), observed, observed == observed).mean()
+    assert scores["after"] < scores["before"]
+
+
+def test_refinement_that_does_not_help_changes_nothing(identity: rt.Surrogate) -> None:
+    calibration, _ = toy(30, seed=6)
+    wild = rt.Refinement(draws=2, training=Training(epochs=1, batch=30, rate=50.0, decay="step"))
+    models = [
+        rt.fit_residual(
+            identity,
+            calibration,
+            rt.DelayOffset(),
+            rt.Mixture(training=Training(epochs=20), refinement=how),
+            seed=0,
+        )
+        for how in (None, wild)
+    ]
+    assert models[1].fitted.figures["refined"] == 0.0
+    one, other = (model.state_dict() for model in models)
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.slow
+def test_faulty_trajectories_calibrate_without_their_fault_in_the_gap(
+    ibg: rt.Surrogate, emulated: rt.Trajectories, case: rt.Case
+) -> None:
+    """All nine classes, faults named: offsets as small as those of healthy ones alone."""
+    some = emulated[np.flatnonzero(np.arange(len(emulated)) % 10 < 3)]
+    healthy = some.with_label("Healthy")
+    named = [case.faults[label] for label in some.labels]
+    size = {}
+    for name, used, faults in (
+        ("healthy", healthy, None),
+        ("named", some, named),
+        ("all", some, None),
+    ):
+        context, found = rt.infer_discrepancy(ibg, used, case.correction, faults=faults)
+        free = torch.tensor(context.segments.start)[..., None] < context.frozen[:, None]
+        free = free & (context.told == context.commands).all(dim=1)[:, None]
+        size[name] = found.z[..., 1:5][free].square().mean().sqrt()
+    assert size["named"] < 1.3 * size["healthy"]
+    assert size["all"] > 1.3 * size["named"]
+    brief = rt.Mixture(training=Training(epochs=3))
+    fitted = rt.fit_residual(
+        ibg, emulated[::10], case.correction, brief, seed=0, calibrate_on=case.faults
+    )
+    assert fitted.fitted.figures["trajectories"] == 9

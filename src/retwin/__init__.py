@@ -17,6 +17,7 @@ _HOME = {
     "ArmPiTwin": "twins.armpi",
     "CNN": "networks",
     "Case": "case",
+    "Chain": "corrections",
     "Channels": "trajectories",
     "CommandSpace": "corrections",
     "Context": "corrections",
@@ -28,6 +29,7 @@ _HOME = {
     "FMUTwin": "twins.fmu",
     "Fault": "faults",
     "Fidelity": "fidelity",
+    "Flow": "residual",
     "FunctionTwin": "twins.function",
     "InputError": "errors",
     "KinematicTwin": "twins.kinematic",
@@ -38,7 +40,9 @@ _HOME = {
     "Mixture": "residual",
     "MuJoCoTwin": "twins.mujoco",
     "NetworkDiagnoser": "diagnosis",
+    "Refinement": "residual",
     "ResidualModel": "residual",
+    "SampledSensor": "corrections",
     "Scores": "statistics",
     "Segments": "segments",
     "SimulationError": "twins.protocol",
@@ -92,7 +96,15 @@ if TYPE_CHECKING:
     from retwin.animation import animate
     from retwin.case import Case
     from retwin.corrected import CorrectedTwin, generate
-    from retwin.corrections import CommandSpace, Context, Correction, DelayOffset, Discrepancy
+    from retwin.corrections import (
+        Chain,
+        CommandSpace,
+        Context,
+        Correction,
+        DelayOffset,
+        Discrepancy,
+        SampledSensor,
+    )
     from retwin.diagnosis import Diagnoser, NetworkDiagnoser, fit_diagnoser
     from retwin.download import fetch
     from retwin.errors import InputError
@@ -100,7 +112,14 @@ if TYPE_CHECKING:
     from retwin.fidelity import Fidelity, measure_fidelity, measure_widening
     from retwin.networks import CNN, LSTM, MLP, TCN, LSTMClassifier
     from retwin.report import write_report
-    from retwin.residual import Mixture, ResidualModel, fit_residual, infer_discrepancy
+    from retwin.residual import (
+        Flow,
+        Mixture,
+        Refinement,
+        ResidualModel,
+        fit_residual,
+        infer_discrepancy,
+    )
     from retwin.scale import SimulationPlan, simulate_to
     from retwin.segments import Segments
     from retwin.statistics import Scores, evaluate

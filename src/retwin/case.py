@@ -77,6 +77,7 @@ class Case:
     emulator: a stand-in for the real system, for trying things out; its data are "emulated".
     sampler: draws commands.
     correction: the shape that the gap may take, by default.
+    output_correction: the same told at the outputs alone, as in the paper, for comparison.
     sensor_rate: samples per second that the measuring chain really takes.
     recover: fills in commands that a file does not hold; None when files hold them.
     encoder_noise: puts reading noise of so many command units on frozen actuators (trajectories,
@@ -93,6 +94,7 @@ class Case:
     emulator: Twin | None
     sampler: CommandSampler
     correction: Correction
+    output_correction: Correction
     sensor_rate: float
     recover: Callable[[Trajectories, Progress | None], Trajectories] | None = None
     encoder_noise: Callable[[Trajectories, float, int], Trajectories] | None = None

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from retwin.case import Case
+from retwin.corrections import recorded
 from retwin.errors import InputError
 from retwin.faults import Fault
 from retwin.models import read_about, write_model
@@ -38,12 +39,14 @@ class CorrectedTwin:
     surrogate: the IBG.
     residual: the RG; it holds the correction g.
     case: name of the case it was fitted for, for the command line.
+    random: whether z is drawn; else it is the RG's mean z̄ (Eq. 8), the same in every simulation.
 
     """
 
     surrogate: Surrogate
     residual: ResidualModel
     case: str = ""
+    random: bool = True
 
     @property
     def inputs(self) -> Channels:
@@ -73,20 +76,24 @@ class CorrectedTwin:
         seed: int,
         progress: Progress | None = None,
     ) -> Trajectories:
-        """See `Twin.simulate`. Faults act on the commands, then z is drawn and g applied.
+        """See `Twin.simulate`. Faults act on the commands, then z is drawn, g applied, and read.
 
         z is drawn for the clean commands: the RG is not told of faults.
         """
         generator = torch.Generator().manual_seed(checked_seed(seed))
+        correction = self.residual.correction
 
         @torch.no_grad()
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             context = self.residual.context(
                 self.surrogate, chunk.commands, chunk.segments, told=chunk.told, frozen=chunk.frozen
             )
+            if not self.random:
+                z = self.residual.mean(context)
+                return context.nominal.numpy(), correction.apply(context, z).numpy()
             z = self.residual.sample(context, generator=generator)
-            corrected = self.residual.correction.apply(context, z)
-            return context.nominal.numpy(), corrected.numpy()
+            outputs = correction.apply(context, z)
+            return context.nominal.numpy(), recorded(correction, outputs, generator).numpy()
 
         return simulate_in_chunks(
             self,
@@ -100,17 +107,19 @@ class CorrectedTwin:
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with `surrogate` and `residual` inside, or nothing."""
-        with write_model(folder, "corrected", {"case": self.case}, {}) as inside:
+        about = {"case": self.case, "random": self.random}
+        with write_model(folder, "corrected", about, {}) as inside:
             self.surrogate.save(inside / "surrogate")
             self.residual.save(inside / "residual")
 
     @classmethod
     def load(cls, folder: str | Path) -> CorrectedTwin:
         """Read what `save` wrote; InputError when it is not a corrected twin or damaged."""
-        case = read_about(folder, "corrected")["case"]
+        about = read_about(folder, "corrected")
         folder = Path(folder)
         surrogate = Surrogate.load(folder / "surrogate")
-        return cls(surrogate, ResidualModel.load(folder / "residual"), case)
+        residual = ResidualModel.load(folder / "residual")
+        return cls(surrogate, residual, about["case"], about["random"])
 
 
 def generate(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -21,6 +21,8 @@ __all__ = ["BernoulliHead", "Bernoullis", "Blocks", "GaussianMixture", "MixtureH
 
 FLOOR = 0.05
 """Least standard deviation of a component, in standard units: no component shrinks onto a point."""
+SURE = (1e-4, 1 - 1e-4)
+"""Shares beyond which a normal score goes no further."""
 
 
 class GaussianMixture(MixtureSameFamily):
@@ -77,6 +79,10 @@ class GaussianMixture(MixtureSameFamily):
         distance = (value[..., None, :] - self.means) / deviation
         return (self.mixture_distribution.probs[..., None] * torch.special.ndtr(distance)).sum(-2)
 
+    def normal_scores(self, value: Tensor) -> Tensor:
+        """The PIT of `value` (..., D) in standard deviations of a normal law."""
+        return torch.special.ndtri(self.marginal_cdf(value).clamp(*SURE))
+
 
 class Bernoullis(Distribution):
     """D independent events, each 0 or 1, beside the mixtures of `Blocks`.
@@ -119,9 +125,34 @@ class Bernoullis(Distribution):
         """The draw (..., D) that this normal noise (..., D) stands for; `uniform` is not needed."""
         return (torch.special.ndtr(normal) > 1 - self.mean).to(self.logits.dtype)
 
-    def marginal_cdf(self, value: Tensor) -> Tensor:
-        """P(z_d <= value_d) of each event, (..., D)."""
-        return torch.where(value < 1, 1 - self.mean, torch.ones_like(value))
+    def normal_scores(self, value: Tensor) -> Tensor:
+        """P(z_d <= value_d) of each event (..., D), in standard deviations of a normal law."""
+        share = torch.where(value < 1, 1 - self.mean, torch.ones_like(value))
+        return torch.special.ndtri(share.clamp(*SURE))
+
+
+class Law(Protocol):
+    """What `Blocks` needs of each block, beside what torch's `Distribution` has."""
+
+    @property
+    def batch_shape(self) -> torch.Size: ...
+
+    @property
+    def event_shape(self) -> torch.Size: ...
+
+    @property
+    def mean(self) -> Tensor: ...
+
+    @property
+    def variance(self) -> Tensor: ...
+
+    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Law: ...
+
+    def log_prob(self, value: Tensor) -> Tensor: ...
+
+    def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor: ...
+
+    def normal_scores(self, value: Tensor) -> Tensor: ...
 
 
 class Blocks(Distribution):
@@ -130,7 +161,7 @@ class Blocks(Distribution):
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     support = constraints.real_vector
 
-    def __init__(self, blocks: Sequence[GaussianMixture | Bernoullis]) -> None:
+    def __init__(self, blocks: Sequence[Law]) -> None:
         self.blocks = list(blocks)
         self.widths = [block.event_shape[0] for block in self.blocks]
         super().__init__(
@@ -173,11 +204,11 @@ class Blocks(Distribution):
         parts = zip(self.blocks, uniform.unbind(-1), normal.split(self.widths, -1), strict=True)
         return torch.cat([block.expand(shape).from_noise(u, e) for block, u, e in parts], dim=-1)
 
-    def marginal_cdf(self, value: Tensor) -> Tensor:
-        """P(z_d <= value_d) of each component of z on its own, (..., D)."""
+    def normal_scores(self, value: Tensor) -> Tensor:
+        """The normal noise (..., D) that draws `value`, each block on its own."""
         parts = value.split(self.widths, dim=-1)
         return torch.cat(
-            [block.marginal_cdf(part) for block, part in zip(self.blocks, parts, strict=True)], -1
+            [block.normal_scores(part) for block, part in zip(self.blocks, parts, strict=True)], -1
         )
 
 

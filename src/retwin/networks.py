@@ -6,7 +6,6 @@ networks map (n, T, inputs) to (n, T, outputs); classifiers map (n, T, inputs) t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Protocol
@@ -14,8 +13,6 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-
-from retwin.errors import InputError
 
 __all__ = [
     "CLASSIFIERS",
@@ -28,7 +25,6 @@ __all__ = [
     "LSTMClassifier",
     "Network",
     "Standardise",
-    "named",
 ]
 
 
@@ -216,15 +212,3 @@ NETWORKS: tuple[type, ...] = (MLP, LSTM, TCN, LSTMClassifier, CNN)
 
 SURROGATES: dict[str, Network] = {"mlp": MLP(), "lstm": LSTM(), "tcn": TCN()}
 CLASSIFIERS: dict[str, Network] = {"cnn": CNN(), "lstm": LSTMClassifier()}
-
-
-def named(name: str, known: Mapping[str, Network], argument: str) -> Network:
-    """The network of that name in SURROGATES or CLASSIFIERS; InputError when there is none."""
-    if name not in known:
-        raise InputError(
-            argument,
-            expected=f"one of {', '.join(known)}",
-            got=repr(name),
-            remedy="check the spelling",
-        )
-    return known[name]

@@ -52,6 +52,7 @@ CORRECTIONS: dict[str, tuple[rt.Correction, Callable[[rt.Context], Tensor], str]
     "delay and offset": (rt.DelayOffset(), delays_and_offsets, "context"),
     # It learns from all trajectories what to believe, so it needs more than a few.
     "command space": (rt.CommandSpace(), offsets_of_joints, "several"),
+    "chain": (rt.Chain(rt.CommandSpace(), rt.SampledSensor()), offsets_of_joints, "several"),
 }
 
 

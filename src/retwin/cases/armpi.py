@@ -12,7 +12,7 @@ from retwin.case import Case
 from retwin.cases.armpi_body import ArmBody
 from retwin.cases.armpi_recovery import RAMPS, ramp_commands, recover_commands
 from retwin.commands import draw_onsets
-from retwin.corrections import DelayOffset
+from retwin.corrections import Chain, CommandSpace, DelayOffset, SampledSensor
 from retwin.faults import Fault, SteadyStateError, Stuck, frozen_response
 from retwin.trajectories import Trajectories
 from retwin.twins.armpi import ARM, KINEMATIC, POLL, STRAIGHT, UNIT, ArmPiTwin
@@ -135,7 +135,8 @@ def armpi() -> Case:
         twin=ArmPiTwin(),
         emulator=EmulatedArmPi(),
         sampler=ArmSampler(),
-        correction=DelayOffset(),
+        correction=Chain(CommandSpace(), SampledSensor()),
+        output_correction=DelayOffset(),
         sensor_rate=KINEMATIC.rate / POLL,
         recover=recover,
         encoder_noise=encoder_noise,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from retwin.cli.terminal import bar
+from retwin.configs import named
 from retwin.storage import check_target, write_atomically
 
 __all__ = ["diagnose", "fit", "generate"]
@@ -25,15 +27,28 @@ def fit(
     real: Annotated[Path, typer.Option(help="Real trajectories to calibrate on.")],
     out: Annotated[Path, typer.Option(help="Folder for the corrected twin.")],
     network: Annotated[str, typer.Option(help="Surrogate: mlp, lstm or tcn.")] = "mlp",
+    correction: Annotated[
+        str | None, typer.Option(help="delay_offset or command_space; the case's if not given.")
+    ] = None,
+    density: Annotated[str, typer.Option(help="Law of the gap: mixture or flow.")] = "mixture",
+    refine: Annotated[bool, typer.Option(help="Fine-tune on outputs afterwards.")] = False,
     calibrate_on: Annotated[str, typer.Option(help="healthy or all.")] = "healthy",
     seed: Seed = 0,
 ) -> None:
     """Fit surrogate and residual model; save the corrected twin."""
     import retwin as rt
-    from retwin.networks import SURROGATES, named
+    from retwin.corrections import NAMED_OPERATORS
+    from retwin.networks import SURROGATES
+    from retwin.residual import NAMED_DENSITIES
 
     system = rt.cases.get(case)
     config = named(network, SURROGATES, "network")
+    operator = system.correction
+    if correction is not None:
+        operator = named(correction, NAMED_OPERATORS, "correction")
+    law = replace(
+        named(density, NAMED_DENSITIES, "density"), refinement=rt.Refinement() if refine else None
+    )
     with bar("read") as tell:
         twin = rt.load(twin_data, case=system, progress=lambda s: tell(twin_data.name, s))
         measured = rt.load(real, case=system, progress=lambda s: tell(real.name, s))
@@ -42,9 +57,10 @@ def fit(
         rg = rt.fit_residual(
             ibg,
             measured,
-            system.correction,
+            operator,
+            law,
             seed=seed,
-            calibrate_on=calibrate_on,
+            calibrate_on=system.faults if calibrate_on == "all" else calibrate_on,
             progress=lambda s: tell("residual model", s),
         )
     rt.CorrectedTwin(ibg, rg, case=case).save(out)
@@ -111,7 +127,7 @@ def diagnose_fit(
 ) -> None:
     """Train a diagnoser on labelled trajectories."""
     import retwin as rt
-    from retwin.networks import CLASSIFIERS, named
+    from retwin.networks import CLASSIFIERS
 
     system = None if case is None else rt.cases.get(case)
     config = named(classifier, CLASSIFIERS, "classifier")

@@ -31,7 +31,7 @@ TURNS = 3
 """Missed movements per trajectory that one round may find."""
 TAILS = 4.0
 """Degrees of freedom of the noise (Student's t): glitches do not count."""
-LOOKS = (4.0, 3.0)
+LOOKS = (6.0, 1.0)
 """Independent looks that a movement's readings at rest, and in motion, are worth at most."""
 SUSPECT = 2.5
 """Standard deviations of the prior beyond which an offset makes a movement suspect."""

@@ -52,6 +52,11 @@ class CommandSpace:
         """What `infer` finds of one trajectory leans on what it learns from those beside it."""
         return True
 
+    @property
+    def severities(self) -> bool:
+        """`infer` tells how severe a known fault is, apart from z."""
+        return True
+
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:
         """`delay` in samples, `offset_…` in the commands' units, `missed_…` 0 or 1."""
         names = ("delay", *(f"{kind}_{name}" for kind in KINDS for name in inputs.names))

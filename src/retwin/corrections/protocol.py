@@ -73,7 +73,7 @@ class Context:
     def __len__(self) -> int:
         return len(self.commands)
 
-    def __getitem__(self, index: slice) -> Context:
+    def __getitem__(self, index: slice | NDArray) -> Context:
         """The context of some of the trajectories."""
         return replace(
             self,
@@ -138,7 +138,11 @@ class Discrepancy:
 
 @runtime_checkable
 class Correction(Protocol):
-    """An operator g with its inverse; holds settings, no data."""
+    """An operator g with its inverse; holds settings, no data.
+
+    One may also have `pools`, true if what it infers of a trajectory leans on those beside it, and
+    `severities`, true if it tells how severe a known fault is apart from z.
+    """
 
     @property
     def resolution(self) -> str:

@@ -1,6 +1,6 @@
 """How real what a twin generates is, on measured healthy trajectories that it has not seen."""
 
 from retwin.fidelity.figures import Fidelity, Figure
-from retwin.fidelity.measure import MeanOnly, measure_fidelity, measure_widening
+from retwin.fidelity.measure import measure_fidelity, measure_widening
 
-__all__ = ["Fidelity", "Figure", "MeanOnly", "measure_fidelity", "measure_widening"]
+__all__ = ["Fidelity", "Figure", "measure_fidelity", "measure_widening"]

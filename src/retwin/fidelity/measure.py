@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from retwin.corrected import CorrectedTwin
 from retwin.corrections import DelayOffset
 from retwin.errors import InputError
-from retwin.faults import Fault
 from retwin.fidelity.figures import BINS, LEVELS, Fidelity
 from retwin.residual import infer_discrepancy, segment
 from retwin.segments import Segments
 from retwin.trajectories import UNLABELLED, Channels, Trajectories
-from retwin.twins.protocol import HEALTHY, Chunk, Progress, Twin, simulate_in_chunks
+from retwin.twins.protocol import HEALTHY, Progress, Twin
 
-__all__ = ["MeanOnly", "measure_fidelity", "measure_widening"]
+__all__ = ["measure_fidelity", "measure_widening"]
 
 MOVEMENT = DelayOffset()
 """Tells TDe and TPE of every twin alike, whatever operator its own residual model has."""
@@ -29,58 +28,6 @@ INFERRED = 19
 REFERENCE = 99
 """Draws per trajectory that in turn stand for the measured one."""
 WINDOWS = 20
-
-
-@dataclass(frozen=True, eq=False)
-class MeanOnly:
-    """The corrected twin without its spread, ỹ = g(ŷ, z̄) with the mean z̄ (Eq. 8); a `Twin`."""
-
-    updated: CorrectedTwin
-
-    @property
-    def inputs(self) -> Channels:
-        """Command channels."""
-        return self.updated.inputs
-
-    @property
-    def outputs(self) -> Channels:
-        """Output channels."""
-        return self.updated.outputs
-
-    @property
-    def rate(self) -> float:
-        """Samples per second."""
-        return self.updated.rate
-
-    def simulate(
-        self,
-        commands: NDArray,
-        *,
-        faults: Sequence[Fault | None] | None = None,
-        seed: int,
-        progress: Progress | None = None,
-    ) -> Trajectories:
-        """See `Twin.simulate`; the seed draws faults only."""
-        surrogate, residual = self.updated.surrogate, self.updated.residual
-
-        @torch.no_grad()
-        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            context = residual.context(
-                surrogate, chunk.commands, chunk.segments, told=chunk.told, frozen=chunk.frozen
-            )
-            mean = residual(context).mean.clamp(-residual.bounds, residual.bounds)
-            corrected = residual.correction.apply(context, mean)
-            return context.nominal.numpy(), corrected.numpy()
-
-        return simulate_in_chunks(
-            self,
-            run,
-            np.asarray(commands, dtype=np.float32),
-            faults,
-            seed=seed,
-            progress=progress,
-            emulated=residual.emulated,
-        )
 
 
 def measure_fidelity(
@@ -105,7 +52,7 @@ def measure_fidelity(
     rate: samples per second to look at, a whole part of the data's; the sensor's true rate serves
         best. By default the data's.
     against: rivals by name, scored on the same trajectories; by default the mean correction alone
-        (`MeanOnly`, "mean_only") of a `CorrectedTwin`.
+        ("mean_only") of a `CorrectedTwin`.
     widening: factor for bands about their median, see `measure_widening`, as a further figure.
 
     Raises
@@ -116,7 +63,9 @@ def measure_fidelity(
     """
     stride = _checked(twin, trajectories, rate, draws)
     if against is None:
-        against = {"mean_only": MeanOnly(twin)} if isinstance(twin, CorrectedTwin) else {}
+        against = {}
+        if isinstance(twin, CorrectedTwin):
+            against["mean_only"] = replace(twin, random=False)
     segments = _segments(twin, trajectories.commands)
     seeds = np.random.SeedSequence(seed).generate_state(2 * len(trajectories)).reshape(-1, 2)
     rows: list[dict[str, Any]] = []

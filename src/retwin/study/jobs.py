@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,9 +19,10 @@ from retwin.case import Case
 from retwin.corrected import CorrectedTwin, generate
 from retwin.corrections import Correction
 from retwin.diagnosis import fit_diagnoser
-from retwin.fidelity import Fidelity, MeanOnly, measure_fidelity, measure_widening
+from retwin.faults import Fault
+from retwin.fidelity import Fidelity, measure_fidelity, measure_widening
 from retwin.models import read_about
-from retwin.residual import ResidualModel, fit_residual
+from retwin.residual import Mixture, ResidualModel, fit_residual
 from retwin.segments import Segments
 from retwin.storage import load, write_atomically
 from retwin.study.plan import SOURCES, StudyPlan
@@ -159,7 +160,7 @@ class Work:
             self.real_data()[list(self.roles.folds[job.fold][0])],
             self._correction(job.source),
             seed=self.plan.seed_of("residual", job.run, job.fold),
-            calibrate_on=self.plan.calibrate_on,
+            calibrate_on=self._calibrate_on,
             progress=progress,
         )
         residual.save(self.path(job))
@@ -206,7 +207,7 @@ class Work:
             held_out,
             seed=self.plan.seed_of("fidelity", job.run, job.fold),
             rate=self.case.sensor_rate,
-            against={"mean_only": MeanOnly(updated), "single_gaussian": gaussian},
+            against={"mean_only": replace(updated, random=False), "single_gaussian": gaussian},
             widening=self._widening(job, calibration),
             progress=progress,
         )
@@ -233,17 +234,21 @@ class Work:
         self, job: Job, calibration: Trajectories, *, components: int | None = None
     ) -> CorrectedTwin:
         """The corrected twin of a run and fold, its RG fitted to other data or a smaller one."""
-        updated = self._updated(job)
-        mixture = updated.residual.mixture
+        surrogate = self._fitted_surrogate(job.run)
         residual = fit_residual(
-            updated.surrogate,
+            surrogate,
             calibration,
-            updated.residual.correction,
-            mixture if components is None else replace(mixture, components=components),
+            self._correction(job.source),
+            Mixture() if components is None else Mixture(components=components),
             seed=self.plan.seed_of("residual", job.run, job.fold),
-            calibrate_on=self.plan.calibrate_on,
+            calibrate_on=self._calibrate_on,
         )
-        return CorrectedTwin(updated.surrogate, residual)
+        return CorrectedTwin(surrogate, residual)
+
+    @property
+    def _calibrate_on(self) -> str | Mapping[str, Fault | None]:
+        """The healthy ones; or all, and what is broken in each."""
+        return self.case.faults if self.plan.calibrate_on == "all" else "healthy"
 
     def _with_encoder_noise(self, trajectories: Trajectories, seed: int) -> Trajectories:
         if self.plan.encoder_noise == 0 or self.case.encoder_noise is None:

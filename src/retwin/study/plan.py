@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from retwin.case import Case
-from retwin.corrections import CommandSpace, Correction
+from retwin.corrections import Correction
 from retwin.errors import InputError
 from retwin.networks import CLASSIFIERS, Network
 from retwin.training import Training
@@ -47,10 +47,10 @@ SOURCES: dict[str, TrainingSource] = {
     "dt": TrainingSource("Digital twin", "none", False, None, per_fold=False),
     "ibg": TrainingSource("IBG alone", "timing", True, None, per_fold=True),
     "ibg_rg": TrainingSource(
-        "IBG + RG", "healthy", True, lambda case: case.correction, per_fold=True
+        "IBG + RG", "healthy", True, lambda case: case.output_correction, per_fold=True
     ),
     "ibg_rg_command": TrainingSource(
-        "IBG + RG, command space", "healthy", True, lambda case: CommandSpace(), per_fold=True
+        "IBG + RG, command space", "healthy", True, lambda case: case.correction, per_fold=True
     ),
 }
 

@@ -1,0 +1,115 @@
+"""How well are actuators' errors told from outputs alone, and what does it cost?
+
+On the emulated robot, whose discrepancy is known: 100 trajectories for each of three seeds. Targets:
+delays within 1 sample and offsets within 0.3 degrees (mean absolute error), missed movements with an
+F1 of 0.95, 90 % intervals that cover 85 to 95 %. Beside them the same robot, half as late and half
+as uneven, on which nothing was ever tuned. Then the seconds for inference on 54 trajectories, and
+for generating 3600. Writes benchmarks/out/command_space.json.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import torch
+from record import record
+
+import retwin as rt
+from retwin.twins.armpi import KINEMATIC, UNIT
+
+COUNT = 100
+SURE = 1.645
+
+
+class ExactArm:
+    """The arm's kinematics as a surrogate without any error."""
+
+    memoryless = True
+
+    def __call__(self, commands: torch.Tensor) -> torch.Tensor:
+        angles = (commands - KINEMATIC.centre) * KINEMATIC.scale
+        links = torch.tensor(KINEMATIC.arm.links, dtype=commands.dtype)
+        pitch = angles[..., 1:].cumsum(dim=-1)
+        radius, height = pitch.sin() @ links, pitch.cos() @ links
+        yaw = angles[..., 0]
+        return torch.stack(
+            [yaw.sin() * radius, -yaw.cos() * radius, KINEMATIC.arm.base + height], dim=-1
+        )
+
+    def predict(self, commands: np.ndarray) -> np.ndarray:
+        return KINEMATIC.position(np.asarray(commands, dtype=np.float64)).astype(np.float32)
+
+
+def recovered(case: rt.Case, robot: object, seed: int) -> dict[str, float]:
+    """What is found of one set of trajectories, beside what was true."""
+    commands = case.sampler.sample(COUNT, rng=np.random.default_rng(seed))
+    hidden: dict[str, np.ndarray] = {}
+    made = robot.simulate(commands, seed=seed + 1, hidden=hidden)
+    segments = rt.Segments.from_commands(commands)
+    context = rt.Context.of(ExactArm(), commands, segments, rate=made.rate)
+    found = case.correction.infer(
+        context, torch.as_tensor(made.observed.copy()), torch.as_tensor(made.mask.copy())
+    )
+    each = np.arange(COUNT)[:, None]
+    reached = hidden["angles"][each, np.ceil(segments.stop).astype(int) - 1]
+    targets = commands[each, np.ceil(segments.settle).astype(int).clip(max=made.steps - 1)]
+    z = found.z.numpy()
+    deviation = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt().numpy()
+    missed, called = hidden["missed"], z[..., 5:] > 0.5
+    good = ~missed & ~called
+    offset = z[..., 1:5] - (reached - targets)
+    delay = z[..., 0] - (hidden["delay"] + made.rate * KINEMATIC.lag.seconds)
+    moved = ~missed.all(axis=-1)
+    return {
+        "offset MAE (deg)": UNIT * np.abs(offset[good]).mean(),
+        "knowing nothing (deg)": UNIT * np.abs((reached - targets)[good]).mean(),
+        "delay MAE (samples)": np.abs(delay[moved]).mean(),
+        "missed movements, F1": 2 * (missed & called).sum() / (missed.sum() + called.sum()),
+        "90 % intervals of offsets cover": inside(offset, deviation[..., 1:5])[good].mean(),
+        "90 % intervals of delays cover": inside(delay, deviation[..., 0])[moved].mean(),
+    }
+
+
+def inside(error: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """Whether the truth lies in the 90 % interval."""
+    return np.abs(error) < SURE * deviation
+
+
+def main() -> None:
+    case = rt.cases.armpi()
+    robots = {
+        "as set A": case.emulator,
+        "half as bad": replace(case.emulator, delay=1.1, jitter=0.5, offset=1.7, bias=0.4),
+    }
+    columns: dict[str, dict[str, float]] = {}
+    for name, robot in robots.items():
+        for seed in (11, 21, 31):
+            columns[f"{name}, seed {seed}"] = recovered(case, robot, seed)
+    figures = next(iter(columns.values()))
+    rows = {what: {name: each[what] for name, each in columns.items()} for what in figures}
+    record("command_space", f"z* of {COUNT} emulated trajectories, outputs only", rows)
+
+    twin = rt.generate(case.twin, case, per_class=100, seed=0)
+    ibg = rt.fit_surrogate(twin, seed=0)
+    real = rt.generate(case.emulator, case, per_class=6, seed=1)
+    rows = {}
+    for name, operator in (
+        ("delay and offset", case.output_correction),
+        ("command space", case.correction),
+    ):
+        started = time.perf_counter()
+        rt.infer_discrepancy(ibg, real, operator)
+        rows[f"{name}: infer z* of 54 (s)"] = time.perf_counter() - started
+        started = time.perf_counter()
+        rg = rt.fit_residual(ibg, real, operator, seed=0)
+        rows[f"{name}: fit the RG on the 6 healthy ones (s)"] = time.perf_counter() - started
+        started = time.perf_counter()
+        rt.generate(rt.CorrectedTwin(ibg, rg), case, per_class=400, seed=2)
+        rows[f"{name}: generate 3600 (s)"] = time.perf_counter() - started
+    record("command_space_times", "cost of correction", rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,19 @@
+"""Residual Generator (RG), Eq. 6–10: the distribution of the gap z, given what was commanded."""
+
+from __future__ import annotations
+
+from retwin.residual.fitting import fit_residual, infer_discrepancy
+from retwin.residual.model import ResidualModel, segment
+from retwin.residual.settings import NAMED_DENSITIES, Density, Flow, Mixture, Refinement
+
+__all__ = [
+    "NAMED_DENSITIES",
+    "Density",
+    "Flow",
+    "Mixture",
+    "Refinement",
+    "ResidualModel",
+    "fit_residual",
+    "infer_discrepancy",
+    "segment",
+]
