@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -167,3 +170,17 @@ def test_all_that_is_broken_is_listed(context: rt.Context) -> None:
         check_correction(worse, context, z)
     with pytest.raises(rt.InputError, match="z: expected shape"):
         check_correction(Bent(), context, z[:1])
+
+
+def test_the_operator_that_the_docs_show_keeps_it(context: rt.Context) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "corrections.md").read_text("utf-8")
+    (code,) = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
+    # A dataclass looks its module up, so the page gets one.
+    module = ModuleType("shown")
+    sys.modules["shown"] = module
+    try:
+        exec(compile(code, "docs/corrections.md", "exec"), vars(module))
+        z = delays_and_offsets(context)[..., 1:]
+        check_correction(module.SteadyOffset(), context, z)
+    finally:
+        del sys.modules["shown"]
