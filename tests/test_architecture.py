@@ -35,6 +35,7 @@ FLOORS = [
     "case",
     "animation",
     "corrected",
+    "updating",
     "scale",
     "diagnosis",
     "testing",

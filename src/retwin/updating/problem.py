@@ -1,0 +1,80 @@
+"""The posterior as a problem on a box: parameters and scales of the noise, from 0 to 1."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.updating.misfit import Misfit
+from retwin.updating.noise import Noise
+
+__all__ = ["Problem"]
+
+TOGETHER = 64
+"""Values of the parameters that are simulated at once."""
+
+
+class Problem:
+    """Points are (k + q,): parameters and logarithms of scales, in widths of their bounds.
+
+    The prior is uniform on the unit box: uniform in the parameters, log-uniform in the scales.
+
+    Attributes
+    ----------
+    misfit, noise: of the data and of the output error.
+    low, width: (k + q,) of the box in physical units.
+    parameters: k.
+
+    """
+
+    def __init__(self, misfit: Misfit, noise: Noise) -> None:
+        self.misfit = misfit
+        self.noise = noise
+        self.parameters = len(misfit.low)
+        samples = misfit.seen.shape[1]
+        least, greatest = noise.bounds(misfit.spread, misfit.interval, samples)
+        self.low = np.concatenate([misfit.low, least])
+        self.width = np.concatenate([misfit.high, greatest]) - self.low
+
+    @property
+    def size(self) -> int:
+        """Dimension of the box."""
+        return len(self.low)
+
+    def physical(self, points: NDArray) -> tuple[NDArray, NDArray]:
+        """Parameters (m, k) and logarithms of scales (m, q) at points (m, k + q)."""
+        values = self.low + self.width * points
+        return values[:, : self.parameters], values[:, self.parameters :]
+
+    def log_posterior(self, points: NDArray) -> NDArray:
+        """Unnormalised (m,); minus infinity outside the box and where a simulation fails."""
+        inside = np.all((points >= 0) & (points <= 1), axis=1)
+        out = np.full(len(points), -np.inf)
+        if inside.any():
+            theta, logs = self.physical(points[inside])
+            misfit = self.misfit
+            residual = misfit.residuals(theta)
+            each = self.noise.log_likelihood(residual, misfit.seen, logs, misfit.interval)
+            out[inside] = np.where(np.isfinite(each), each, -np.inf)
+        return out
+
+    def paths(self, points: NDArray) -> NDArray:
+        """Noise-free paths (m, n, P, d_y) less that at the twin's present values, as residuals."""
+        theta, _ = self.physical(points)
+        parts = [theta[i : i + TOGETHER] for i in range(0, len(theta), TOGETHER)]
+        outputs = np.concatenate([self.misfit.outputs(part) for part in parts])
+        off = (outputs - self.misfit.present) / self.misfit.unit
+        return np.where(self.misfit.seen, off, 0.0)
+
+    def errors(self, points: NDArray, rng: np.random.Generator) -> NDArray:
+        """Output errors (m, n, P, d_y) drawn at the scales of those points."""
+        _, logs = self.physical(points)
+        count, samples, width = self.misfit.seen.shape
+        repeated = np.repeat(logs, count, axis=0)
+        drawn = self.noise.draw(rng, repeated, samples, width, self.misfit.interval)
+        return drawn.reshape(len(points), count, samples, width) * self.misfit.seen
+
+    @property
+    def measured(self) -> NDArray:
+        """The measured path (1, n, P, d_y) in the same terms."""
+        return self.misfit.residuals_of(self.misfit.present[None])
