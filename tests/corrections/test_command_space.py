@@ -141,7 +141,7 @@ def test_what_the_outputs_do_not_tell_is_said(exact, commands: np.ndarray) -> No
     observed = rt.CommandSpace().apply(context, z).double() + noise
     found = rt.CommandSpace().infer(context, observed, polled(12))
     share = found.identified[..., 1:5].double().mean(dim=(0, 1))
-    assert share[0] == 1.0, "the yaw is seen"
+    assert share[0] > 0.95, "the yaw is seen, but where the record ends with the motion"
     assert share[1:].min() < 1.0, "one of the others is not, somewhere"
     deviation = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     assert deviation[..., 4].mean() > 3 * deviation[..., 1].mean()

@@ -1,0 +1,308 @@
+"""Faults found by physics alone: against closed forms, on a toy, and on the emulated arm."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+from torch import Tensor
+
+import retwin as rt
+from retwin.commands import RampSampler
+from retwin.corrections.command_effect import effective
+from retwin.corrections.command_problem import Problem
+from retwin.diagnosis import Diagnosis, InversionDiagnoser, evidence, fit_inversion
+from retwin.diagnosis.evidence import Belief, Noise
+from retwin.diagnosis.severity import draw_biases
+from retwin.faults import draw_faults, faulty_commands, frozen_from
+from retwin.statistics import score
+from retwin.testing import DIAGNOSER_CHECKS, DiagnoserSubject
+from retwin.training import Training
+
+CHAIN = rt.Chain(rt.CommandSpace(), rt.SampledSensor())
+MAP = np.array([[1.0, 0.5], [-0.3, 0.8], [0.2, -1.0]])
+SAMPLER = RampSampler((-1.0, -1.0), (1.0, 1.0), movements=4, steps=400, ramps=(30, 40))
+
+
+class Linear:
+    """y = A u: what is known of commands and outputs is then Gaussian together."""
+
+    memoryless = True
+
+    def __call__(self, commands: Tensor) -> Tensor:
+        return commands @ torch.tensor(MAP.T, dtype=commands.dtype)
+
+    def predict(self, commands: np.ndarray) -> np.ndarray:
+        return (commands @ MAP.T).astype(np.float32)
+
+
+def at_rest(commands: np.ndarray) -> tuple[Problem, np.ndarray]:
+    """Two readings of each rest, where no delay is seen; their movements."""
+    segments = rt.Segments.from_commands(commands)
+    context = rt.Context.of(Linear(), commands, segments, rate=100.0)
+    when = np.stack([segments.stop[0] - 30, segments.stop[0] - 20], axis=1).astype(int).ravel()
+    mask = torch.zeros(1, commands.shape[1], 3, dtype=torch.bool)
+    mask[:, when] = True
+    noise = np.random.default_rng(3).normal(0, 0.1, (1, commands.shape[1], 3))
+    observed = torch.tensor(context.nominal.numpy() + noise)
+    problem = Problem(rt.CommandSpace(), context, observed, mask)
+    problem.observed, problem.unit = problem.observed * problem.unit, torch.ones(())
+    return problem, np.repeat(np.arange(segments.most), 2)
+
+
+def test_evidence_is_that_of_a_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Laplace's approximation is exact where nothing is curved and the noise has no tails."""
+    monkeypatch.setattr(evidence, "TAILS", 1e9)
+    rng = np.random.default_rng(0)
+    problem, movement = at_rest(SAMPLER.sample(1, rng=rng))
+    movements, size = problem.valid.shape[1], 3 * problem.valid.shape[1]
+    noise = Noise(torch.full((2, 3), 0.07), torch.ones(2, dtype=torch.float64))
+    turn = np.zeros((len(movement) * 3, size))
+    for s, m in enumerate(movement):
+        turn[3 * s : 3 * s + 3, 3 * m + 1 : 3 * m + 3] = MAP
+    residual = problem.residual(*problem.nothing())[0].numpy().ravel()
+    gaps = []
+    for width in (0.02, 0.5):
+        root = rng.normal(0, width, (size, size))
+        covariance = root @ root.T + 0.01 * np.eye(size)
+        belief = Belief.of(
+            torch.zeros(1, size, dtype=torch.float64),
+            torch.tensor(covariance)[None],
+            torch.full((1, movements, 2), -4.0, dtype=torch.float64),
+        )
+        x, missed = problem.nothing()
+        found = evidence.solve(problem, x, missed, belief, noise)
+        law = multivariate_normal(cov=turn @ covariance @ turn.T + 0.07**2 * np.eye(len(turn)))
+        gaps.append(float(found.evidence[0]) - law.logpdf(residual))
+        gain = covariance @ turn.T @ np.linalg.inv(law.cov_object.covariance)
+        np.testing.assert_allclose(found.x.numpy().ravel(), gain @ residual, atol=1e-4)
+        np.testing.assert_allclose(
+            found.covariance[0].numpy(), covariance - gain @ turn @ covariance, atol=1e-5
+        )
+    # What both have in common is the density of the noise at 0.
+    common = len(turn) * np.log(0.07 * np.sqrt(2 * np.pi))
+    np.testing.assert_allclose(gaps, common, atol=1e-3)
+
+
+@pytest.mark.parametrize("mean", [(25.0, -30.0), (3.0, 20.0), (0.0, -9.0)])
+def test_limits_of_a_bias_are_integrated(mean: tuple[float, float]) -> None:
+    """Against a fine grid over the four boxes of two movements."""
+    covariance = np.array([[16.0, 9.0], [9.0, 25.0]])
+    width, low, high = 32.0, 10.0, 50.0
+    drawn = draw_biases(
+        torch.tensor([mean], dtype=torch.float64),
+        torch.tensor(covariance)[None],
+        width=torch.tensor([width], dtype=torch.float64),
+        size=torch.tensor([[low, high]], dtype=torch.float64),
+    )
+    side = np.arange(low, high, 0.1) + 0.05
+    axis = np.concatenate([-side[::-1], side])
+    grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+    believed = np.exp(-0.5 * (grid / width) ** 2).prod(axis=-1) / (2 * np.pi * width**2)
+    mass = multivariate_normal(mean, covariance).pdf(grid) / believed / (2 * (high - low)) ** 2
+    np.testing.assert_allclose(drawn.gain[0], np.log(mass.sum() * 0.01), atol=0.03)
+    average = (grid * mass[..., None]).sum(axis=(0, 1)) / mass.sum()
+    told = drawn.summary(0.9)[0]
+    np.testing.assert_allclose(told[:, 0], average, atol=0.5)
+    assert (told[:, 1] <= told[:, 0]).all()
+    assert (told[:, 0] <= told[:, 2]).all()
+
+
+TOY: dict[str, rt.Fault | None] = {
+    "Healthy": None,
+    "First stuck": rt.Stuck(0, onset=(0, 320)),
+    "Second biased": rt.SteadyStateError(1, size=(0.2, 0.5)),
+}
+
+
+def toy(count: int, label: str, seed: int) -> tuple[rt.Trajectories, list, np.ndarray]:
+    """A linear system of two actuators that come late and end off their targets."""
+    rng = np.random.default_rng(seed)
+    commands = SAMPLER.sample(count, rng=rng)
+    segments = rt.Segments.from_commands(commands)
+    faults = draw_faults([TOY[label]] * count, segments, seed)
+    told = torch.tensor(faulty_commands(commands, faults, segments), dtype=torch.float64)
+    shape = segments.start.shape
+    z = [rng.normal(4, 0.5, (*shape, 1)), rng.normal(0, 0.02, (*shape, 2)), np.zeros((*shape, 2))]
+    frozen = torch.tensor(frozen_from(faults, *commands.shape[1:]))[:, None]
+    when = torch.minimum(torch.arange(400)[:, None], frozen).double()
+    done = effective(told, segments, torch.tensor(np.concatenate(z, axis=2)), when).numpy()
+    outputs = (done @ MAP.T)[:, np.arange(400) // 10 * 10]
+    noise = rng.normal(0, 0.004, (count, 40, 3)).repeat(10, axis=1)
+    mask = np.zeros(outputs.shape, dtype=bool)
+    mask[:, ::10] = True
+    made = rt.Trajectories(
+        commands,
+        (commands @ MAP.T).astype(np.float32),
+        (outputs + noise).astype(np.float32),
+        rate=100.0,
+        mask=mask,
+        labels=np.full(count, label),
+    )
+    return made, faults, done
+
+
+@pytest.fixture(scope="module")
+def toy_diagnoser() -> InversionDiagnoser:
+    plain = toy(60, "Healthy", 1)[0]
+    ibg = rt.fit_surrogate(
+        plain, rt.MLP((32,)), seed=0, training=Training(epochs=30, batch=64, rate=1e-2)
+    )
+    healthy = toy(8, "Healthy", 2)[0]
+    return fit_inversion(
+        ibg, rt.fit_residual(ibg, healthy, rt.CommandSpace(), seed=0), healthy, TOY
+    )
+
+
+def test_any_twin_with_actuators(toy_diagnoser: InversionDiagnoser) -> None:
+    """Two actuators, three outputs, onsets that nobody knows."""
+    for label in TOY:
+        made, faults, done = toy(6, label, 7)
+        found = toy_diagnoser.diagnose(made)
+        own = found.classes.index(label)
+        assert (found.probabilities.argmax(axis=1) == own).sum() >= 5
+        if label == "First stuck":
+            error = found.level.value[:, own] - done[:, -1, 0]
+            assert np.abs(error).max() < 0.1
+            onset = np.array([fault.onset for fault in faults])
+            inside = (found.onset.low[:, own] <= onset) & (onset <= found.onset.high[:, own])
+            assert inside.sum() >= 5
+            assert np.isnan(found.bias.value[:, own]).all()
+        if label == "Second biased":
+            bias = np.array([fault.bias for fault in faults])
+            assert np.abs(found.bias.value[:, own] - bias).mean() < 0.03
+            assert np.isnan(found.level.value[:, own]).all()
+
+
+@pytest.fixture(scope="module")
+def inversion(ibg: rt.Surrogate, emulated: rt.Trajectories, case: rt.Case) -> InversionDiagnoser:
+    """Calibrated on eight healthy trajectories of the emulated arm."""
+    healthy = emulated.with_label("Healthy")[:8]
+    return fit_inversion(ibg, rt.fit_residual(ibg, healthy, CHAIN, seed=0), healthy, case.faults)
+
+
+@pytest.fixture(scope="module")
+def arm(case: rt.Case) -> tuple[rt.Trajectories, list, dict[str, np.ndarray]]:
+    """Four trajectories per class, their faults, and what was hidden."""
+    faults = [fault for fault in case.faults.values() for _ in range(4)]
+    commands = case.sampler.sample(len(faults), rng=np.random.default_rng(8))
+    hidden: dict[str, np.ndarray] = {}
+    made = case.emulator.simulate(commands, faults=faults, seed=8, hidden=hidden)
+    drawn = draw_faults(faults, rt.Segments.from_commands(commands), 8)
+    return made.replace(labels=np.repeat(case.classes, 4)), drawn, hidden
+
+
+@pytest.fixture(scope="module")
+def diagnosis(inversion: InversionDiagnoser, arm: tuple) -> Diagnosis:
+    return inversion.diagnose(arm[0])
+
+
+@pytest.mark.slow
+def test_the_emulated_arm_is_diagnosed(diagnosis: Diagnosis, arm: tuple) -> None:
+    truth = np.array([diagnosis.classes.index(label) for label in arm[0].labels])
+    scores = score(truth, diagnosis.probabilities, diagnosis.classes)
+    assert scores.macro_f1 > 0.9
+    assert scores.healthy_recall >= 0.75
+    assert scores.ece < 0.1
+
+
+@pytest.mark.slow
+def test_intervals_of_severities_cover(diagnosis: Diagnosis, arm: tuple) -> None:
+    truth = np.array([diagnosis.classes.index(label) for label in arm[0].labels])
+    each, (_, drawn, hidden) = np.arange(len(truth)), arm
+    biased, stuck = np.flatnonzero(truth >= 5), np.flatnonzero((truth > 0) & (truth < 5))
+    bias = np.array([drawn[i].bias for i in biased])
+    told = [part[each, truth][biased] for part in vars(diagnosis.bias).values()]
+    assert np.abs(told[0] - bias).mean() < 8.0, "2 degrees; knowing nothing gives 30 units"
+    assert 0.8 <= ((told[1] <= bias) & (bias <= told[2])).mean() <= 1.0
+    level = hidden["angles"][stuck, -1, truth[stuck] - 1]
+    told = [part[each, truth][stuck] for part in vars(diagnosis.level).values()]
+    assert np.abs(told[0] - level).mean() < 4.0
+    assert ((told[1] <= level) & (level <= told[2])).mean() >= 0.7
+    assert (diagnosis.onset.value[stuck, truth[stuck]] == 49).all()
+
+
+def played(inversion: InversionDiagnoser, case: rt.Case, z: Tensor) -> rt.Trajectories:
+    """Healthy trajectories of which z is known."""
+    commands = case.sampler.sample(len(z), rng=np.random.default_rng(21))
+    context = inversion.residual.context(inversion.surrogate, commands)
+    with torch.no_grad():
+        outputs = rt.CommandSpace().apply(context, z).numpy()
+    noise = np.random.default_rng(2).normal(0, 3e-4, outputs[:, ::10].shape)
+    return rt.Trajectories(
+        commands,
+        context.nominal.numpy(),
+        outputs + noise.repeat(10, axis=1),
+        rate=100.0,
+        inputs=case.inputs,
+        outputs=case.outputs,
+    )
+
+
+def test_a_missed_movement_is_no_fault(inversion: InversionDiagnoser, case: rt.Case) -> None:
+    """Stuck and missed differ by persistence: one movement is no more than a discrepancy."""
+    z = torch.zeros(4, 5, 9)
+    z[..., 0] = 4.5
+    z[torch.arange(4), torch.tensor([1, 2, 3, 4]), 5 + torch.arange(4)] = 1.0
+    found = inversion.diagnose(played(inversion, case, z))
+    assert (found.probabilities[:, 0] > 0.5).all()
+
+
+def test_a_glitch_is_no_fault(inversion: InversionDiagnoser, case: rt.Case) -> None:
+    z = torch.zeros(1, 5, 9)
+    z[..., 0] = 4.5
+    made = played(inversion, case, z)
+    observed = made.observed.copy()
+    observed[0, 290:311] += 0.2
+    clean, hit = (
+        inversion.predict_proba(made.replace(observed=each)) for each in (made.observed, observed)
+    )
+    assert clean[0, 0] > 0.9
+    assert hit[0, 0] > 0.9
+
+
+@pytest.fixture(scope="module")
+def few(inversion: InversionDiagnoser) -> InversionDiagnoser:
+    """The same about three classes: contracts are about form."""
+    names = ("Healthy", "Motor_1_Stuck", "Motor_2_Steady_state_error")
+    faults = {name: inversion.faults[name] for name in names}
+    return InversionDiagnoser(
+        inversion.surrogate, inversion.residual, faults, noise=inversion.noise
+    )
+
+
+@pytest.mark.parametrize("check", DIAGNOSER_CHECKS, ids=lambda check: check.__name__)
+def test_contract(few: InversionDiagnoser, arm: tuple, check) -> None:
+    check(DiagnoserSubject(few, arm[0][:3:2]))
+
+
+def test_saved_and_loaded_is_the_same(few: InversionDiagnoser, arm: tuple, tmp_path: Path) -> None:
+    few.save(tmp_path / "a")
+    back = InversionDiagnoser.load(tmp_path / "a")
+    assert back.classes == few.classes
+    assert back.faults == few.faults
+    wanted, got = few.diagnose(arm[0][:2]), back.diagnose(arm[0][:2])
+    np.testing.assert_array_equal(got.evidence, wanted.evidence)
+    np.testing.assert_array_equal(got.bias.value, wanted.bias.value)
+
+
+def test_what_cannot_be_inverted_is_refused(
+    inversion: InversionDiagnoser, rg: rt.ResidualModel, emulated: rt.Trajectories
+) -> None:
+    parts = (inversion.surrogate, inversion.residual)
+    known = {"Healthy": None, "known": rt.SteadyStateError(0, bias=(20.0,) * 5)}
+    with pytest.raises(rt.InputError, match="SteadyStateError with its bias open"):
+        InversionDiagnoser(*parts, known, noise=inversion.noise)
+    with pytest.raises(rt.InputError, match="at least two classes"):
+        InversionDiagnoser(*parts, {"Healthy": None}, noise=inversion.noise)
+    with pytest.raises(rt.InputError, match="what actuators are effectively told"):
+        InversionDiagnoser(parts[0], rg, inversion.faults, noise=inversion.noise)
+    faulty = emulated.with_label("Motor_1_Stuck")
+    with pytest.raises(rt.InputError, match="at least one trajectory labelled 'Healthy'"):
+        fit_inversion(*parts, faulty, inversion.faults)
+    fewer = emulated[:2].replace(inputs=rt.Channels.numbered("u", 4))
+    with pytest.raises(rt.InputError, match=r"trajectories.inputs"):
+        inversion.predict_proba(fewer)
