@@ -8,7 +8,7 @@ install: .venv/installed
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[bayes,flows,fmu,render,scale,dev]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[bayes,flows,fmu,render,rocket,scale,dev]"
 	touch $@
 
 # The main job: on the real robot if RETWIN_DATA is set, else on an emulated one.

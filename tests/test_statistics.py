@@ -57,6 +57,22 @@ def test_calibrated_probabilities_have_little_calibration_error() -> None:
     assert score(truth, sure, CLASSES).ece == pytest.approx(wrong, abs=1e-9)
 
 
+def test_calibration_is_seen_class_by_class() -> None:
+    """Against cases that can be counted: ten bins of one value each, and two classes mixed up."""
+    share = np.repeat(np.linspace(0.05, 0.95, 10), 100)
+    p = np.stack([share, 1 - share], axis=1)
+    truth = np.concatenate([np.repeat([0, 1], [n, 100 - n]) for n in range(5, 100, 10)])
+    assert score(truth, p, ("Healthy", "a")).ece_classwise == pytest.approx(0.0, abs=1e-12)
+    skewed = np.stack([share**2, 1 - share**2], axis=1)
+    gap = np.abs(share**2 - share).mean()
+    assert score(truth, skewed, ("Healthy", "a")).ece_classwise == pytest.approx(gap)
+    truth, p = np.array([0, 1] * 50 + [2] * 50), np.zeros((150, 3))
+    p[:100, :2], p[100:, 2] = (0.7, 0.3), 1.0
+    got = score(truth, p, ("Healthy", "a", "b"))
+    assert got.ece == pytest.approx(2 / 3 * 0.2)
+    assert got.ece_classwise == pytest.approx(2 / 3 * 2 / 3 * 0.2)
+
+
 def test_classes_that_do_not_occur_do_not_count() -> None:
     truth = np.array([1, 1, 2, 2])
     p = np.eye(4)[[1, 1, 2, 1]]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from retwin.corrections import Correction
 from retwin.faults import Fault, Stuck
 from retwin.trajectories import Channels, Trajectories
+from retwin.twins.parametric import ParametricTwin
 from retwin.twins.protocol import Progress, Twin
 
 __all__ = ["Body", "Case", "CommandSampler"]
@@ -80,6 +81,8 @@ class Case:
     output_correction: the same told at the outputs alone, as in the paper, for comparison.
     sensor_rate: samples per second that the measuring chain really takes.
     recover: fills in commands that a file does not hold; None when files hold them.
+    parametric: the twin with what is not known of it as parameters, for updating those instead;
+        None when the case cannot say.
     encoder_noise: puts reading noise of so many command units on frozen actuators (trajectories,
         units, seed); None when the case cannot tell what that does to its outputs.
     published: the figures of a paper to show beside ours: source to metric to text.
@@ -97,6 +100,7 @@ class Case:
     output_correction: Correction
     sensor_rate: float
     recover: Callable[[Trajectories, Progress | None], Trajectories] | None = None
+    parametric: ParametricTwin | None = None
     encoder_noise: Callable[[Trajectories, float, int], Trajectories] | None = None
     published: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     body: Body | None = None

@@ -1,7 +1,8 @@
 """Small networks and standardisation, chosen by frozen config objects; nothing else.
 
 A config object says what to build; `build(inputs, outputs)` makes the torch module. Sequence
-networks map (n, T, inputs) to (n, T, outputs); classifiers map (n, T, inputs) to (n, outputs).
+networks map (n, T, inputs) to (n, T, outputs); classifiers map (n, T, inputs) to (n, outputs), by
+a `readout` of what they `represent` of a sequence.
 """
 
 from __future__ import annotations
@@ -167,9 +168,12 @@ class _LastStep(nn.Module):
         self.dropout = nn.Dropout(config.dropout)
         self.readout = nn.Linear(config.hidden, outputs)
 
-    def forward(self, values: Tensor) -> Tensor:
+    def represent(self, values: Tensor) -> Tensor:
         remembered, _ = self.memory(values)
-        return self.readout(self.dropout(remembered[:, -1]))
+        return remembered[:, -1]
+
+    def forward(self, values: Tensor) -> Tensor:
+        return self.readout(self.dropout(self.represent(values)))
 
 
 @dataclass(frozen=True)
@@ -201,10 +205,12 @@ class _Pooled(nn.Module):
         self.dropout = nn.Dropout(config.dropout)
         self.readout = nn.Linear(2 * config.channels[-1], outputs)
 
-    def forward(self, values: Tensor) -> Tensor:
+    def represent(self, values: Tensor) -> Tensor:
         features = self.features(values.transpose(1, 2))
-        pooled = torch.cat([features.mean(dim=2), features.amax(dim=2)], dim=1)
-        return self.readout(self.dropout(pooled))
+        return torch.cat([features.mean(dim=2), features.amax(dim=2)], dim=1)
+
+    def forward(self, values: Tensor) -> Tensor:
+        return self.readout(self.dropout(self.represent(values)))
 
 
 NETWORKS: tuple[type, ...] = (MLP, LSTM, TCN, LSTMClassifier, CNN)

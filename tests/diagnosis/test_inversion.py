@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,7 +73,7 @@ def test_evidence_is_that_of_a_gaussian(monkeypatch: pytest.MonkeyPatch) -> None
         belief = Belief.of(
             torch.zeros(1, size, dtype=torch.float64),
             torch.tensor(covariance)[None],
-            torch.full((1, movements, 2), -4.0, dtype=torch.float64),
+            torch.full((1, movements, 2), -40.0, dtype=torch.float64),
         )
         x, missed = problem.nothing()
         found = evidence.solve(problem, x, missed, belief, noise)
@@ -306,3 +308,13 @@ def test_what_cannot_be_inverted_is_refused(
     fewer = emulated[:2].replace(inputs=rt.Channels.numbered("u", 4))
     with pytest.raises(rt.InputError, match=r"trajectories.inputs"):
         inversion.predict_proba(fewer)
+
+
+@pytest.mark.slow
+def test_what_the_page_shows_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "inversion.md").read_text("utf-8")
+    (code,) = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
+    names: dict[str, Any] = {}
+    exec(compile(code, "docs/inversion.md", "exec"), names)
+    assert "stands at" in capsys.readouterr().out
+    assert (names["found"].probabilities[:, names["own"]] > 0.5).all()

@@ -17,8 +17,9 @@ from retwin.report.blocks import Plot
 from retwin.report.page import render
 from retwin.report.poses import poses
 from retwin.report.results import read_results
-from retwin.study.jobs import Roles, Work
+from retwin.study.files import Roles
 from retwin.study.results import _poses
+from retwin.study.work import Work
 
 Study = tuple[dict[str, Any], dict[str, NDArray]]
 Write = Callable[[Study], Path]

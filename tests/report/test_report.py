@@ -102,12 +102,32 @@ def test_numbers(study: Study, write: Write) -> None:
     assert "0.420" in text  # surrogate RMSE in mm
     assert "9 of 200 observed" in text  # unidentified delays are no observations
     assert "9 of 240 observed" in text
-    assert "real data: healthy calibration; fault protocol known" in text
+    assert "real data: healthy only; fault protocol known" in text
     assert results["provenance"]["command"] in text
     assert "a1" * 32 in text
     for count in np.diag(results["sources"]["ibg_rg"]["confusion"]):
         assert str(count) in text
     assert "M4 bias" in text
+
+
+def test_many_sources_are_told_shortly(study: Study, write: Write) -> None:
+    """Who beats whom as one table, and pairs with the plain and the updated twin only."""
+    results, arrays = study
+    for name in ("randomised", "pi_ls", "dann", "ibg_rg_command", "inversion"):
+        results["sources"][name] = results["sources"]["ibg_rg"]
+        arrays[f"probabilities/{name}"] = arrays["probabilities/ibg_rg"]
+    told = results["comparisons"][0]
+    interval = {"bootstrap_ci95": [0.1, 0.2], "mean_diff": 0.15, "metric": "macro_f1"}
+    results["comparisons"] += [
+        {**told, **interval, "a": "inversion", "b": "dann"},
+        {**told, **interval, "a": "ibg_rg_command", "b": "dann"},
+        {**told, **interval, "a": "ibg_rg_command", "b": "dt"},
+    ]
+    text = read(write(study)).text
+    assert "IBG + RG, command space minus Domain-adversarial" in text
+    assert "Fault inversion minus Domain-adversarial" not in text
+    assert "Better than" in text
+    assert text.count("On 90 test trajectories, training on IBG + RG, command space") == 1
 
 
 def test_fidelity(study: Study, write: Write) -> None:
@@ -235,12 +255,13 @@ def test_everything_is_escaped(study: Study, write: Write) -> None:
         (["surrogate"], "surrogate"),
         (["comparisons"], "comparisons"),
         (["timing"], "time"),
+        (["learning_curve"], "learning"),
     ],
 )
 def test_sections_without_data_disappear(
     study: Study, write: Write, drop: list[str], section: str
 ) -> None:
-    for name in ("update_s", "generate_s", "twin_runs"):
+    for name in ("update_s", "generate_s", "twin_runs", "train_s", "predict_s"):
         for source in study[0]["sources"].values():
             del source[name]
     assert section in read(write(study)).ids
@@ -263,7 +284,12 @@ def test_without_arrays_and_stale_figures(study: Study, write: Write) -> None:
     assert "figure-tde" not in reader.ids
     assert "confusion" in reader.ids
     assert "about 0.04 with 90 trajectories" in reader.text  # instead of the computed floor
-    assert {path.stem for path in (folder / "figures").iterdir()} == {"scores", "confusion", "mine"}
+    assert {path.stem for path in (folder / "figures").iterdir()} == {
+        "scores",
+        "confusion",
+        "learning",
+        "mine",
+    }
 
 
 def test_least_that_a_study_may_hold(write: Write) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,10 @@ import pytest
 
 import retwin as rt
 from retwin.statistics import METRICS
-from retwin.study.jobs import Job, Roles, Work
+from retwin.study import SOURCES, possible_sources
+from retwin.study.files import Files, Job, Roles
+from retwin.study.trial import SEES, Trial
+from retwin.study.work import Work
 
 PLAN = rt.StudyPlan(runs=2, per_class=10, folds=2, seed=3)
 COMMAND = "study armpi --runs 2 --per-class 10 --folds 2 --seed 3 --processes 2 --out".split()  # noqa: SIM905
@@ -34,7 +39,8 @@ def comparable(out: Path) -> dict[str, Any]:
     for name in ("timing", "provenance"):
         del results[name]
     for source in results["sources"].values():
-        del source["update_s"], source["generate_s"]
+        for cost in ("update_s", "generate_s", "train_s", "predict_s"):
+            del source[cost]
     return results
 
 
@@ -130,7 +136,7 @@ def test_another_study_in_the_same_folder_is_refused(
     finished: tuple[dict, Path], case: rt.Case, tmp_path: Path
 ) -> None:
     with pytest.raises(rt.InputError, match="another plan or other data"):
-        rt.run_study(case, rt.StudyPlan(runs=3), rt.StudyData(), finished[1])
+        rt.run_study(case, rt.StudyPlan(seed=4), rt.StudyData(), finished[1])
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(rt.InputError, match="holds other files"):
         rt.run_study(case, PLAN, rt.StudyData(), tmp_path)
@@ -171,17 +177,129 @@ def test_seeds_differ_by_run_fold_and_stage_and_not_by_the_sources_chosen(case: 
     assert len(set(seeds)) == len(seeds)
     assert seeds == [other.seed_of(*key) for key in keys]
     work = Work(Path("x"), case, rt.StudyPlan(sources=("dt",)), Roles.of([((0,), (1,))]))
-    assert [len(stage) for stage in work.jobs()] == [0, 0, 5]
-    assert work.path(Job("diagnosis", 0, 0, "dt")).name == "dt.npz"
+    assert work.graph() == {Job("diagnosis", run, 0, "dt"): () for run in range(5)}
+    assert work.files.path(Job("diagnosis", 0, 0, "dt")).name == "dt.npz"
+
+
+REAL = {
+    "timing": lambda trial: trial.timing,
+    "healthy": lambda trial: trial.healthy,
+    "unlabelled": lambda trial: trial.unlabelled,
+    "test outputs": lambda trial: trial.test_outputs,
+    "labelled": lambda trial: trial.labelled,
+}
+
+
+@pytest.mark.parametrize("sees", SEES)
+def test_a_source_gets_no_real_data_but_those_it_declares(
+    sees: str, finished: tuple[dict, Path], case: rt.Case
+) -> None:
+    files = Files(finished[1] / "work")
+    real = files.real_data()
+    fold = (tuple(range(0, 90, 2)), tuple(range(1, 90, 2)))
+    trial = Trial(files, case, PLAN, fold, Job("diagnosis", 0, 0, "a source"), sees)
+    for what, ask in REAL.items():
+        if what not in SEES[sees]:
+            if what == "timing":
+                assert ask(trial) is None
+            else:
+                with pytest.raises(PermissionError, match=f"declares '{sees}' and asks for {what}"):
+                    ask(trial)
+    if sees == "labelled":
+        assert trial.labelled.ids.tolist() == real.ids[::2].tolist()
+        assert set(trial.healthy.labels.tolist()) == {"Healthy"}
+    if sees in ("unlabelled", "transductive"):
+        found = trial.unlabelled if sees == "unlabelled" else trial.test_outputs
+        assert found.ids.tolist() == real.ids[int(sees == "transductive") :: 2].tolist()
+        assert set(found.labels.tolist()) == {""}
+    assert set(trial.tested().labels.tolist()) == {""}, "whoever predicts sees no labels"
+
+
+def test_fewer_trajectories_are_a_part_of_the_more(
+    finished: tuple[dict, Path], case: rt.Case
+) -> None:
+    files, fold = Files(finished[1] / "work"), (tuple(range(45)), tuple(range(45, 90)))
+    kept = [
+        set(
+            Trial(
+                files, case, PLAN, fold, Job("residual", 0, 0, "output", count), "healthy"
+            ).healthy.ids
+        )
+        for count in (1, 2, 4)
+    ]
+    assert [len(each) for each in kept] == [1, 2, 4]
+    assert kept[0] < kept[1] < kept[2]
+
+
+def test_a_study_grows(finished: tuple[dict, Path], case: rt.Case, tmp_path: Path) -> None:
+    """More sources and a learning curve are added to what is there; nothing is made again."""
+    out = tmp_path / "grown"
+    shutil.copytree(finished[1], out)
+    kept = {p: p.stat().st_mtime_ns for p in (out / "work").rglob("*") if p.is_file()}
+    sources = ("dt", "dt_noise", "mean_corrected", "ibg_rg")
+    plan = replace(PLAN, runs=1, sources=sources, learning_curve=True)
+    results = rt.run_study(case, plan, rt.StudyData(), out, processes=2)
+    assert {p: p.stat().st_mtime_ns for p in kept} == kept
+    assert list(results["sources"]) == list(sources)
+    first = finished[0]["sources"]["ibg_rg"]
+    assert results["sources"]["ibg_rg"]["predictions"] == first["predictions"][:1]
+    assert results["sources"]["dt"]["generate_s"] is None
+    curve = [(row["source"], row["healthy"]) for row in results["learning_curve"]]
+    assert [count for name, count in curve if name == "ibg_rg"] == [1, 2, 4, 5]
+    assert ("dt", 1) not in curve
+    assert rt.write_report(out).stat().st_size < 10_000_000
+
+
+@pytest.mark.slow
+def test_every_source_is_made(
+    emulated: rt.Trajectories, twin_set: rt.Trajectories, case: rt.Case, tmp_path: Path
+) -> None:
+    """All fourteen, small: each predicts every trajectory and says what it cost."""
+    place = np.array([np.flatnonzero(emulated.labels == name)[:5] for name in case.classes])
+    parts = {
+        "twin": twin_set,
+        "calibration": emulated[place[:, :3].ravel()],
+        "test": emulated[place[:, 3:].ravel()],
+    }
+    for name, part in parts.items():
+        rt.save(part, tmp_path / f"{name}.npz")
+    data = rt.StudyData(**{name: tmp_path / f"{name}.npz" for name in parts})
+    plan = rt.StudyPlan(runs=1, per_class=10, seed=3)
+    plan = replace(plan, sources=possible_sources(case, plan))
+    assert plan.sources == tuple(SOURCES)
+    results = rt.run_study(case, plan, data, tmp_path / "all", processes=2)
+    untouched = ("dt", "randomised", "dann", "dann_transductive")
+    for name, source in results["sources"].items():
+        assert np.array(source["predictions"]).shape == (1, 18)
+        assert source["twin_runs"] > 0, name
+        assert (source["update_s"] > 0) == (name not in untouched)
+    told = results["sources"]["inversion"]
+    assert told["macro_f1"][0] > 0.8, "it needs no training set, however small the study is"
+    assert told["generate_s"] is None
+    assert told["predict_s"] > 0
+    assert rt.write_report(tmp_path / "all").stat().st_size < 10_000_000
+
+
+def test_a_study_that_cannot_be_is_refused_at_once(case: rt.Case, tmp_path: Path) -> None:
+    blind = replace(case, parametric=None)
+    for sources, system, classifier, message in (
+        (("dt", "pi_ls"), blind, None, "says what is free in its twin"),
+        (("dann",), case, "rocket", "a classifier that is a network"),
+    ):
+        plan = rt.StudyPlan(sources=sources, classifier=classifier)
+        with pytest.raises(rt.InputError, match=message):
+            rt.run_study(system, plan, rt.StudyData(), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    assert "pi_ls" not in possible_sources(blind, rt.StudyPlan())
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"sources": ("dt", "magic")}, "sources: expected one of dt, ibg, ibg_rg"),
+        ({"sources": ("dt", "magic")}, "sources: expected one of dt, randomised, ibg"),
         ({"sources": ()}, "at least one source"),
         ({"preset": "slow"}, "preset: expected one of quick, paper"),
-        ({"classifier": "svm"}, "classifier: expected one of cnn, lstm"),
+        ({"classifier": "svm"}, "classifier: expected one of cnn, lstm, rocket"),
         ({"runs": 0}, "runs: expected at least 1"),
         ({"calibrate_on": "some"}, "calibrate_on: expected one of healthy, all"),
         ({"encoder_noise": -1.0}, "encoder_noise of at least 0"),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,15 @@ from toys import FAST, LAG, LINE, commands, measured
 
 import retwin as rt
 from retwin.testing import TWIN_CHECKS, TwinSubject
-from retwin.updating import MCMC, NPE, Noise, Posterior, calibration_ranks, identify_bayes
+from retwin.updating import (
+    MCMC,
+    NPE,
+    Noise,
+    Posterior,
+    PosteriorTwin,
+    calibration_ranks,
+    identify_bayes,
+)
 
 WHITE = Noise(discrepancy=False)
 A, B = 1.0, -0.5
@@ -125,10 +135,11 @@ def test_ranks_of_the_truth_are_uniform() -> None:
 
 
 def drifting() -> rt.Trajectories:
-    """Data of the line that a slow wave is laid over, which no line has."""
-    observed = measured(LINE, 0.05, seed=3, count=2, a=A, b=B)
-    wave = np.sin(np.arange(60) / 6)[:, None]
-    return observed.replace(observed=observed.observed + wave)
+    """Data of the line that an error is laid over which lasts for about a second."""
+    observed = measured(LINE, 0.0, seed=3, count=2, a=A, b=B)
+    logs = np.log([[0.05, 0.7, 1.0]] * 2)
+    error = Noise().draw(np.random.default_rng(3), logs, observed.steps, 1, 1 / observed.rate)
+    return observed.replace(observed=observed.observed + error)
 
 
 def test_data_that_the_twin_cannot_make_are_told_and_a_discrepancy_takes_them_in() -> None:
@@ -140,7 +151,7 @@ def test_data_that_the_twin_cannot_make_are_told_and_a_discrepancy_takes_them_in
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # so few steps may be too few
         aware = identify_bayes(FAST, observed, seed=0, method=method)
-    assert aware.misspecified > 0.02
+    assert aware.misspecified > 0.1
     assert np.median(aware.scales["discrepancy"]) > 5 * np.median(aware.scales["noise"])
     assert aware.scales["noise"].mean() < blind.scales["noise"].mean() / 3
 
@@ -176,7 +187,7 @@ def test_bad_input_is_named(observed: rt.Trajectories, monkeypatch: pytest.Monke
 
 
 @pytest.fixture(scope="module")
-def stochastic() -> dict[str, rt.Twin]:
+def stochastic() -> dict[str, PosteriorTwin]:
     """Updated twins, with and without an output error that lasts."""
     observed = measured(LAG, 0.1, seed=6, count=2, gain=1.7, share=0.8)
     made = {}
@@ -191,10 +202,26 @@ def stochastic() -> dict[str, rt.Twin]:
 @pytest.mark.parametrize("check", TWIN_CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("noise", ["white", "discrepancy"])
 def test_the_updated_twin_keeps_the_contract(
-    stochastic: dict[str, rt.Twin], noise: str, check: Callable
+    stochastic: dict[str, PosteriorTwin], noise: str, check: Callable
 ) -> None:
     faults = (None, rt.Stuck(0, onset=12), rt.Stuck(0, onset=25))
     check(TwinSubject(stochastic[noise], commands(3, 40), faults))
+
+
+def test_a_saved_posterior_draws_the_same(
+    stochastic: dict[str, PosteriorTwin], tmp_path: Path
+) -> None:
+    told = commands(3, 40)
+    for name, twin in stochastic.items():
+        twin.save(tmp_path / name)
+        again = PosteriorTwin.load(tmp_path / name, LAG)
+        assert again.noise == twin.noise
+        first, second = (each.simulate(told, seed=3) for each in (twin, again))
+        assert first.observed.tobytes() == second.observed.tobytes()
+    with pytest.raises(rt.InputError, match="parameters gain, share"):
+        PosteriorTwin.load(tmp_path / "white", FAST)
+    with pytest.raises(rt.InputError, match="posterior model"):
+        PosteriorTwin.load(tmp_path, LAG)
 
 
 def test_every_trajectory_draws_parameters_of_its_own(chains: Posterior) -> None:
@@ -207,3 +234,20 @@ def test_every_trajectory_draws_parameters_of_its_own(chains: Posterior) -> None
     parameters = np.einsum("ti,ij,tj->t", design, np.cov(chains.samples.T), design)
     wanted = np.sqrt(parameters + np.mean(chains.scales["noise"] ** 2))
     assert spread == pytest.approx(wanted, rel=0.15)
+
+
+@pytest.mark.slow
+def test_the_code_of_the_page_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "updating.md").read_text("utf-8")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    for code in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S):
+        exec(compile(code, "docs/updating.md", "exec"), names)
+    updated, posterior = names["updated"], names["posterior"]
+    for name, true in {"gain": 1.7, "time": 0.8}.items():
+        assert abs(updated.values[name] - true) < 4 * updated.errors[name] < 0.1
+        assert abs(posterior.mean[name] - true) < 4 * posterior.deviation[name]
+    assert names["fidelity"].figures["coverage90"].value == pytest.approx(0.9, abs=0.06)
+    assert "gain" in capsys.readouterr().out

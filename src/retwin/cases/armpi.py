@@ -16,6 +16,7 @@ from retwin.corrections import Chain, CommandSpace, DelayOffset, SampledSensor
 from retwin.faults import Fault, SteadyStateError, Stuck, frozen_response
 from retwin.trajectories import Trajectories
 from retwin.twins.armpi import ARM, KINEMATIC, POLL, STRAIGHT, UNIT, ArmPiTwin
+from retwin.twins.armpi_parametric import armpi_parametric
 from retwin.twins.emulated import EmulatedArmPi
 from retwin.twins.protocol import HEALTHY, Progress
 
@@ -141,5 +142,6 @@ def armpi() -> Case:
         recover=recover,
         encoder_noise=encoder_noise,
         published=PUBLISHED,
+        parametric=armpi_parametric(),
         body=ArmBody(KINEMATIC),
     )

@@ -6,6 +6,7 @@ import os
 import shlex
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,7 +37,7 @@ def study(
     real: Annotated[Path | None, typer.Option(help="One real set, split into folds.")] = None,
     folds: Annotated[int, typer.Option(help="Folds of --real.")] = 3,
     sources: Annotated[str, typer.Option(help="Names joined by commas, or all.")] = "dt,ibg,ibg_rg",
-    classifier: Annotated[str | None, typer.Option(help="cnn or lstm.")] = None,
+    classifier: Annotated[str | None, typer.Option(help="cnn, lstm or rocket.")] = None,
     runs: Annotated[int | None, typer.Option(help="Runs; the preset's if not given.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same result.", min=0)] = 0,
     preset: Annotated[str, typer.Option(help="quick or paper.")] = "quick",
@@ -47,17 +48,20 @@ def study(
     encoder_noise: Annotated[
         float, typer.Option(help="Command units of noise on frozen joints, training and test.")
     ] = 0.0,
+    learning_curve: Annotated[
+        bool, typer.Option(help="Also calibrate on 1, 2, 4, 6 … healthy trajectories.")
+    ] = False,
     processes: Annotated[int | None, typer.Option(help="Jobs at a time; one per core.")] = None,
 ) -> None:
-    """Compare sources of training data on real trajectories."""
+    """Compare updated twins and their rivals on real trajectories."""
     import retwin as rt
-    from retwin.study import SOURCES, StudyData, StudyPlan
+    from retwin.study import StudyData, StudyPlan, possible_sources
 
     system = rt.cases.get(case)
     if random_onset:
         system = system.with_random_onset()
     plan = StudyPlan(
-        sources=tuple(SOURCES if sources == "all" else sources.split(",")),
+        sources=("dt",) if sources == "all" else tuple(sources.split(",")),
         preset=preset,
         classifier=classifier,
         runs=runs,
@@ -67,7 +71,10 @@ def study(
         per_class=per_class,
         calibrate_on=calibrate_on,
         encoder_noise=encoder_noise,
+        learning_curve=learning_curve,
     )
+    if sources == "all":
+        plan = replace(plan, sources=possible_sources(system, plan))
     _run(system, plan, StudyData(twin_data, calibration, test, real), out, processes)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -19,6 +18,8 @@ __all__ = ["Problem"]
 
 NUDGE = 0.05
 """Step of the finite differences through a surrogate with memory, in samples and units."""
+TURN = 1e-4
+"""The same through the commands alone, which follow x piece by piece in a straight line."""
 MARGIN = 15
 """Samples after the command has settled in which an output may still be on its way."""
 CHUNK = 64
@@ -145,31 +146,61 @@ class Problem:
             yield self[rows], tuple(each[rows] for each in given)
 
     def _residual(self, x: Tensor, missed: Tensor) -> Tensor:
-        made = self.surrogate(self.commands(x, missed))[:, self.kept]
-        return self.observed - made.double() / self.unit
+        told = self.commands(x, missed)
+        if self.memory:
+            return self.observed - self.surrogate(told)[:, self.kept].double() / self.unit
+        fresh, place = _distinct(told)
+        return self.observed - self.surrogate(told[fresh][None])[0, place].double() / self.unit
 
     def _linearised(self, x: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
-        residual = self._residual(x, missed)
-        basis = torch.eye(x[0].numel(), dtype=x.dtype).unflatten(1, x.shape[1:])
         if self.memory:
+            residual = self._residual(x, missed)
+            basis = torch.eye(x[0].numel(), dtype=x.dtype).unflatten(1, x.shape[1:])
             moved = [self._residual(x + NUDGE * each, missed) for each in basis]
             return residual, torch.stack([(residual - each) / NUDGE for each in moved], dim=-1)
+        # Without memory the chain rule is local: the surrogate's slope, sample by sample.
         told = self.commands(x, missed)
+        fresh, place = _distinct(told)
+        with torch.enable_grad():
+            asked = told[fresh][None].requires_grad_()
+            said = self.surrogate(asked)
+            slopes = torch.cat(
+                [
+                    torch.autograd.grad(each.sum(), asked, retain_graph=True)[0]
+                    for each in said.unbind(dim=-1)
+                ]
+            )
+        residual = self.observed - said.detach()[0, place].double() / self.unit
+        slope = slopes.movedim(0, 1)[place].double() / self.unit  # (n, S, d_y, d_u)
+        late, off = self._turns(x, missed)
+        by_delay = torch.einsum("nsyu,nmsu->nsym", slope, late)[..., None]
+        by_offset = torch.einsum("nsyu,nmsu->nsymu", slope, off)
+        return residual, torch.cat([by_delay, by_offset], dim=-1).flatten(3)
 
-        def turned(direction: Tensor) -> Tensor:
-            def commands(values: Tensor) -> Tensor:
-                return self.commands(values, missed)
+    def _turns(self, x: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
+        """How the commands turn with each movement's delay, and with its offsets, (n, M, S, d_u).
 
-            return torch.func.jvp(commands, (x,), (direction.expand_as(x),))[1]
+        An actuator's command turns with its own offset only, so all are moved at once.
+        """
+        movements, width = x.shape[1:]
+        step = torch.zeros(2, movements, movements, width, dtype=x.dtype)
+        index = torch.arange(movements)
+        step[0, index, index, 0] = TURN
+        step[1, index, index, 1:] = TURN
+        moved = torch.cat([torch.zeros_like(step[0, :1]), step.flatten(0, 1)])
+        count = len(moved)
+        rows = torch.arange(len(x)).repeat_interleave(count)
+        z = torch.cat([(x[:, None] + moved).flatten(0, 1), missed[rows]], dim=-1)
+        told = effective(self.told[rows], self.segments[rows.numpy()], z, self.when[rows])
+        told = told.unflatten(0, (len(x), count))
+        late, off = ((told[:, 1:] - told[:, :1]) / TURN).split(movements, dim=1)
+        return late, off
 
-        def followed(direction: Tensor) -> Tensor:
-            return torch.func.jvp(self.surrogate, (told,), (direction.expand_as(told),))[1]
 
-        with warnings.catch_warnings():
-            # When first used, torch.func calls what torch itself has deprecated.
-            warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
-            # Without memory the chain rule is local: few directions go through the surrogate.
-            turns = torch.func.vmap(turned)(basis)
-            slopes = torch.func.vmap(followed)(torch.eye(told.shape[-1]))
-        jacobian = torch.einsum("unsy,pnsu->nsyp", slopes, turns)
-        return residual, jacobian.double() / self.unit
+def _distinct(told: Tensor) -> tuple[Tensor, Tensor]:
+    """Where commands (n, S, d_u) differ from the sample before (bool), and for each sample the
+    index of those that it shares: what is held says the same all over.
+    """
+    fresh = torch.ones(told.shape[:2], dtype=torch.bool)
+    fresh[:, 1:] = (told[:, 1:] != told[:, :-1]).any(dim=-1)
+    return fresh, (fresh.flatten().cumsum(dim=0) - 1).view(fresh.shape)

@@ -2,7 +2,25 @@
 
 from __future__ import annotations
 
+from retwin.diagnosis.adversarial import fit_dann
+from retwin.diagnosis.fine_tuning import fine_tune
+from retwin.diagnosis.inversion import Diagnosis, Estimate, InversionDiagnoser, fit_inversion
 from retwin.diagnosis.network import NetworkDiagnoser, fit_diagnoser
+from retwin.diagnosis.pooled import PooledDiagnoser
 from retwin.diagnosis.protocol import Diagnoser
+from retwin.diagnosis.rocket import RocketDiagnoser, fit_rocket
 
-__all__ = ["Diagnoser", "NetworkDiagnoser", "fit_diagnoser"]
+__all__ = [
+    "Diagnoser",
+    "Diagnosis",
+    "Estimate",
+    "InversionDiagnoser",
+    "NetworkDiagnoser",
+    "PooledDiagnoser",
+    "RocketDiagnoser",
+    "fine_tune",
+    "fit_dann",
+    "fit_diagnoser",
+    "fit_inversion",
+    "fit_rocket",
+]

@@ -6,20 +6,19 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retwin.configs import from_config, to_config
-from retwin.errors import InputError
+from retwin.diagnosis.features import Features, class_index, class_order
 from retwin.models import read_model, write_model
 from retwin.networks import CNN, NETWORKS, Network, Standardise
 from retwin.training import Fit, Training, isolated, train
-from retwin.trajectories import Channels, Trajectories
+from retwin.trajectories import Trajectories
 from retwin.twins.protocol import Progress
 
-__all__ = ["NetworkDiagnoser", "fit_diagnoser"]
+__all__ = ["NetworkDiagnoser", "fit_diagnoser", "training_for"]
 
 CHUNK = 256
 
@@ -30,51 +29,19 @@ class NetworkDiagnoser(nn.Module):
     Parameters
     ----------
     network: the config its module was built from.
+    features: what it looks at.
     classes: in the order of the probabilities.
-    outputs: channels it was trained on.
-    rate: samples per second of the trajectories it takes.
-    stride: every how many samples it looks; the sensor's true rate is often lower than the file's.
 
     """
 
-    def __init__(
-        self,
-        network: Network,
-        *,
-        classes: tuple[str, ...],
-        outputs: Channels,
-        rate: float,
-        stride: int,
-    ) -> None:
+    def __init__(self, network: Network, features: Features, *, classes: tuple[str, ...]) -> None:
         super().__init__()
         self.config = network
+        self.features = features
         self.classes = classes
-        self.outputs = outputs
-        self.rate = rate
-        self.stride = stride
-        self.before = Standardise(2 * len(outputs))
-        self.network = network.build(2 * len(outputs), len(classes))
+        self.before = Standardise(features.width)
+        self.network = network.build(features.width, len(classes))
         self.fitted: Fit | None = None
-
-    def features(self, trajectories: Trajectories) -> Tensor:
-        """concat(ŷ, r) at every `stride`-th sample, (n, T', 2 d_y); r is 0 where missing."""
-        for name, ours, theirs in (
-            ("outputs", self.outputs, trajectories.outputs),
-            ("rate", self.rate, trajectories.rate),
-        ):
-            if ours != theirs:
-                raise InputError(
-                    f"trajectories.{name}",
-                    expected=f"what the diagnoser was trained on, {ours}",
-                    got=f"{theirs}",
-                    remedy="resample or rename, or train on data like these",
-                )
-        thin = slice(None, None, self.stride)
-        nominal = trajectories.nominal[:, thin]
-        residual = np.where(
-            trajectories.mask[:, thin], trajectories.observed[:, thin] - nominal, 0.0
-        )
-        return torch.as_tensor(np.concatenate([nominal, residual], axis=2), dtype=torch.float32)
 
     def forward(self, features: Tensor) -> Tensor:
         """Logits (n, classes)."""
@@ -93,9 +60,7 @@ class NetworkDiagnoser(nn.Module):
         about = {
             "network": to_config(self.config, NETWORKS),
             "classes": self.classes,
-            "outputs": vars(self.outputs),
-            "rate": self.rate,
-            "stride": self.stride,
+            **self.features.about(),
             "fitted": None if self.fitted is None else asdict(self.fitted),
         }
         with write_model(folder, "diagnoser", about, self.state_dict()):
@@ -107,33 +72,23 @@ class NetworkDiagnoser(nn.Module):
         about, weights = read_model(folder, "diagnoser")
         model = cls(
             from_config(about["network"], NETWORKS),
+            Features.of(about),
             classes=tuple(about["classes"]),
-            outputs=Channels.of(about["outputs"]),
-            rate=about["rate"],
-            stride=about["stride"],
         )
         model.load_state_dict(weights)
         model.fitted = Fit.of(about["fitted"])
         return model.eval()
 
 
-def _stride(given: float, wanted: float) -> int:
-    """Every how many samples at `given` Hz make `wanted` Hz."""
-    stride = given / wanted if wanted > 0 else 0.0
-    if stride < 1 or abs(stride - round(stride)) > 1e-6:
-        raise InputError(
-            "rate",
-            expected=f"{given:g} Hz, the data's rate, or a whole part of it",
-            got=f"{wanted:g} Hz",
-            remedy="choose a rate that takes every sample, every second, every third …",
-        )
-    return round(stride)
-
-
 DEFAULTS = {
     "CNN": Training(epochs=25, batch=64, rate=3e-3, weight_decay=1e-2),
     "LSTMClassifier": Training(epochs=30, batch=32, rate=1e-3, decay="step"),
 }
+
+
+def training_for(network: Network) -> Training:
+    """What suits the network."""
+    return DEFAULTS.get(type(network).__name__, Training())
 
 
 def fit_diagnoser(
@@ -165,32 +120,12 @@ def fit_diagnoser(
         rate that is no whole part of the data's.
 
     """
-    named = trajectories.known_labels
-    order = tuple(classes) if classes is not None else tuple(sorted(named))
-    unknown = named - set(order)
-    if len(named) < 2 or unknown or "" in trajectories.labels:
-        raise InputError(
-            "trajectories",
-            expected=f"labelled trajectories of at least two of the classes {', '.join(order)}",
-            got=f"unknown {sorted(unknown)}"
-            if unknown
-            else f"labels {sorted(set(trajectories.labels))}",
-            remedy="label every trajectory with a known class",
-        )
-    stride = _stride(trajectories.rate, min(10.0, trajectories.rate) if rate is None else rate)
+    order = class_order(trajectories, classes)
+    features = Features.at(trajectories, rate)
     with isolated(seed):
-        model = NetworkDiagnoser(
-            network,
-            classes=order,
-            outputs=trajectories.outputs,
-            rate=trajectories.rate,
-            stride=stride,
-        )
+        model = NetworkDiagnoser(network, features, classes=order)
     fitted_on, held_out = trajectories.split(0.8, seed=seed)
-    sets = [
-        (model.features(part), torch.tensor([order.index(label) for label in part.labels]))
-        for part in (fitted_on, held_out)
-    ]
+    sets = [(features(part), class_index(part, order)) for part in (fitted_on, held_out)]
     model.before.fit(sets[0][0])
 
     def loss(module: nn.Module, batch: tuple[Tensor, ...]) -> Tensor:
@@ -201,7 +136,7 @@ def fit_diagnoser(
         loss,
         sets[0],
         sets[1],
-        training or DEFAULTS.get(type(network).__name__, Training()),
+        training or training_for(network),
         seed=seed,
         progress=progress,
     )

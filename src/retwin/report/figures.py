@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from retwin.report.curves import Band, Latent, bands
 from retwin.report.fidelity import figure_names, groups
+from retwin.report.learning import learning_curves
 from retwin.report.plots import DASHES, latent_names, missing, published_value
 from retwin.report.results import Results
 from retwin.report.sections import recalls, roc_curves
@@ -32,7 +33,7 @@ from retwin.report.words import (
 
 __all__ = ["FIGURES", "draw_figures"]
 
-FIGURES = ("scores", "confusion", "roc", "tde", "tpe", "noise", "pit", "bands")
+FIGURES = ("scores", "confusion", "roc", "tde", "tpe", "noise", "pit", "bands", "learning")
 """The figures of a study; its file is `figures/NAME.png`, of a second source `NAME-2.png`."""
 SCORES = ("macro_f1", "balanced_accuracy", "auroc", "healthy_recall")
 STYLES = dict(zip(DASHES, ("-", "--", ":", "-."), strict=True))
@@ -44,6 +45,7 @@ INK, MUTED, GRID, RULE, WASH, OBSERVED, ALARM = (
 def draw_figures(results: Results) -> dict[str, bytes]:
     """PNG by figure name; what lacks its data is left out."""
     drawn = {"scores": _scores(results), "confusion": _confusion(results), "roc": _roc(results)}
+    drawn["learning"] = _learning(results)
     for group in groups(results):
         drawn[group.name] = _latents(group.shown, group.source)
     for source, added in figure_names(results).items():
@@ -103,6 +105,29 @@ def _scores(results: Results) -> Figure | None:
     axes.tick_params(axis="y", length=0, labelcolor=INK)
     axes.grid(visible=False, axis="y")
     axes.legend(frameon=False, fontsize=9, ncols=3, loc="lower left", bbox_to_anchor=(0, 1))
+    return figure
+
+
+def _learning(results: Results) -> Figure | None:
+    curves = learning_curves(results)
+    if not curves:
+        return None
+    figure = _figure(4 * len(curves), 3.4)
+    for axes, (title, lines) in zip(
+        figure.subplots(1, len(curves), squeeze=False)[0], curves.items(), strict=True
+    ):
+        for source, points in lines.items():
+            count, value, low, high = (np.array(each) for each in zip(*points, strict=True))
+            style = STYLES[DASHES[slot(source) % len(DASHES)]]
+            axes.plot(count, value, style, color=_colour(source), label=source_name(source))
+            axes.fill_between(count, low, high, color=_colour(source), alpha=0.12, linewidth=0)
+        axes.set_xscale("log")
+        ticks = sorted({point[0] for points in lines.values() for point in points})
+        axes.set_xticks(ticks, [str(tick) for tick in ticks], minor=False)
+        axes.minorticks_off()
+        axes.set_ylim(-0.02, 1.02)
+        _dress(axes, "healthy trajectories", title)
+    axes.legend(frameon=False, fontsize=8)
     return figure
 
 

@@ -137,7 +137,8 @@ def _layout(box: tuple[NDArray, NDArray], seconds: NDArray, begin: int) -> dict[
         "scene": scene,
         "font": {"family": FONT, "size": 13, "color": "@muted"},
         "paper_bgcolor": "rgba(0,0,0,0)",
-        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        # Room for the tick labels of the leftmost axis.
+        "margin": {"l": 24, "r": 8, "t": 0, "b": 0},
         "showlegend": False,
         "uirevision": "kept",
         "hoverlabel": {"font": {"family": FONT, "size": 13}},

@@ -17,6 +17,7 @@ from retwin.errors import InputError
 __all__ = [
     "SCHEMA",
     "Comparison",
+    "CurvePoint",
     "Dataset",
     "Fidelity",
     "Figure",
@@ -34,6 +35,7 @@ SCORES = (
     "accuracy",
     "auroc_micro",
     "ece",
+    "ece_classwise",
     "rmse",
     "nrmse",
     "crps",
@@ -83,6 +85,10 @@ class Source(Part):
     twin_runs: int | None = None
     update_s: float | None = None
     generate_s: float | None = None
+    generated: int | None = None
+    train_s: float | None = None
+    predict_s: float | None = None
+    notes: list[str] = []
 
     @model_validator(mode="before")
     @classmethod
@@ -172,6 +178,19 @@ class Fidelity(Part):
     figures: dict[str, Figure] = {}
 
 
+class CurvePoint(Part):
+    """Scores of a source calibrated on so many healthy trajectories."""
+
+    source: str
+    healthy: int
+    macro_f1: list[float]
+    macro_f1_interval: Interval | None = None
+    healthy_recall: list[float] = []
+    healthy_recall_interval: Interval | None = None
+    coverage90: float | None = None
+    coverage90_interval: Interval | None = None
+
+
 class Surrogate(Part):
     """Error of the surrogate against the twin."""
 
@@ -198,6 +217,7 @@ class Results(Part):
     comparisons: list[Comparison] = []
     surrogate: Surrogate = Surrogate()
     fidelity: dict[str, Fidelity] = {}
+    learning_curve: list[CurvePoint] = []
     timing: dict[str, Any] = {}
     provenance: dict[str, Any] = {}
     arrays: dict[str, NDArray] = {}

@@ -22,11 +22,13 @@ from retwin.report.blocks import (
 )
 from retwin.report.curves import Roc, latents, micro_roc
 from retwin.report.fidelity import discrepancy, fidelity
+from retwin.report.learning import learning_curve
 from retwin.report.plots import caption, roc_plot
 from retwin.report.poses import poses
-from retwin.report.results import Dataset, Results
+from retwin.report.results import Dataset, Results, Source
 from retwin.report.scores import comparisons, further_scores, scores
 from retwin.report.words import (
+    MANY,
     class_name,
     duration,
     label,
@@ -39,6 +41,9 @@ from retwin.report.words import (
 )
 
 __all__ = ["SECTIONS", "recalls", "roc_curves"]
+
+BULK = 3600
+"""Trajectories for which the time of generation is told."""
 
 
 def confusion(results: Results) -> Section | None:
@@ -78,13 +83,25 @@ def recalls(counts: Sequence[Sequence[int]]) -> list[list[float]]:
 
 
 def roc_curves(results: Results) -> dict[str, Roc]:
-    """Micro-averaged ROC of every source that has probabilities."""
+    """Micro-averaged ROC of every source that has probabilities; of many, the twin and the best."""
     found = {}
-    for source in order(list(results.sources)):
+    for source in order(_telling(results)):
         probabilities = results.probabilities(source)
         if probabilities.size and results.classes and np.isfinite(probabilities).all():
             found[source] = micro_roc(probabilities, results.truth)
     return found
+
+
+def _telling(results: Results) -> list[str]:
+    """All sources; of many, the first one and those with the best micro-averaged AUROC."""
+    sources = order(list(results.sources))
+    ranked = sorted(sources[1:], key=lambda name: -_or_zero(results.sources[name]))
+    return [*sources[:1], *ranked[:MANY]]
+
+
+def _or_zero(source: Source) -> float:
+    mean = source.mean("auroc_micro")
+    return mean if math.isfinite(mean) else 0.0
 
 
 def roc(results: Results) -> Section | None:
@@ -128,57 +145,68 @@ def time(results: Results) -> Section | None:
     costs = _costs(results)
     if costs is not None:
         blocks.append(costs)
+    parts = results.timing.get("seconds")
+    told = {**(parts if isinstance(parts, dict) else {}), "total_s": results.timing.get("total_s")}
     numbers = {
         key: float(value)
-        for key, value in results.timing.items()
+        for key, value in told.items()
         if isinstance(value, int | float) and math.isfinite(value)
     }
     stages = {key: value for key, value in numbers.items() if key != "total_s"}
     rows = [[Cell(label(key)), Cell(duration(value))] for key, value in stages.items()]
     if "total_s" in numbers:
-        rows.append([Cell("Whole study"), Cell(duration(numbers["total_s"]))])
+        rows.append([Cell("All jobs"), Cell(duration(numbers["total_s"]))])
     if rows:
         columns = [Column("Stage", numeric=False), Column("Time")]
-        blocks.append(Table("Wall-clock time of the stages.", columns, rows))
+        blocks.append(
+            Table(
+                "Mean time of a job of each kind, on one core; and of all jobs together.",
+                columns,
+                rows,
+            )
+        )
     return Section("time", "Time", blocks) if blocks else None
 
 
 def _costs(results: Results) -> Table | None:
-    told = results.timing.get("generate_3600_s")
-    bulk = told if isinstance(told, dict) else {}
     sources = order(list(results.sources))
-    paper = any("generate" in results.published.get(source, {}) for source in sources)
     parts = results.sources
+    bulky = f"{BULK} trajectories"
     shown = {
         "Twin runs": [
             "–" if parts[each].twin_runs is None else str(parts[each].twin_runs) for each in sources
         ],
         "Update": [duration(parts[each].update_s) for each in sources],
-        "Generation": [duration(parts[each].generate_s) for each in sources],
-        "3600 trajectories": [duration(bulk.get(each)) for each in sources],
+        bulky: [duration(_bulk_seconds(parts[each])) for each in sources],
+        "Training": [duration(parts[each].train_s) for each in sources],
+        "One diagnosis": [duration(parts[each].predict_s) for each in sources],
     }
     kept = {name: texts for name, texts in shown.items() if set(texts) != {"–"}}
     if not kept:
         return None
+    told = any("generate" in results.published.get(source, {}) for source in sources)
+    paper = told and bulky in kept
     word = "Emulated" if results.emulated else "Real"
     columns = [Column("Training data", numeric=False), Column(f"{word} data used", numeric=False)]
-    bulky = "3600 trajectories"
     columns += [
         Column("this study", group=bulky) if paper and name == bulky else Column(name)
         for name in kept
     ]
     if paper:
-        columns.append(Column("paper", group=bulky, paper=True))
+        place = 1 + next(i for i, each in enumerate(columns) if each.group == bulky)
+        columns.insert(place, Column("paper", group=bulky, paper=True))
     rows = []
     for place, each in enumerate(sources):
         row = [Cell(source_name(each), slot=slot(each)), Cell(real_data(parts[each].real_data))]
-        row += [Cell(texts[place]) for texts in kept.values()]
-        if paper:
-            row.append(Cell(results.published.get(each, {}).get("generate", "–")))
+        for name, texts in kept.items():
+            row.append(Cell(texts[place]))
+            if paper and name == bulky:
+                row.append(Cell(results.published.get(each, {}).get("generate", "–")))
         rows.append(row)
     text = (
-        "What a source costs: runs of the twin, the update (fitting what makes its data), and the "
-        "generation of the diagnoser’s training data."
+        "What a source costs in one run, with all that must be made before it: runs of the twin, "
+        "the update (fitting what makes its data), the generation of training data, the training "
+        "of the diagnoser, and the diagnosis of one trajectory. Each job on one core."
     )
     if paper:
         text += (
@@ -186,6 +214,12 @@ def _costs(results: Results) -> Table | None:
             "only the order of magnitude compares."
         )
     return Table(text, columns, rows)
+
+
+def _bulk_seconds(source: Source) -> float | None:
+    if source.generate_s is None or not source.generated:
+        return None
+    return source.generate_s * BULK / source.generated
 
 
 def provenance(results: Results) -> Section | None:
@@ -256,6 +290,7 @@ SECTIONS: tuple[SectionMaker, ...] = (
     roc,
     discrepancy,
     fidelity,
+    learning_curve,
     poses,
     surrogate,
     further_scores,

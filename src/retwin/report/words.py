@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "CHROME",
+    "MANY",
     "METRICS",
     "PALETTE",
     "Metric",
@@ -40,15 +41,28 @@ SOURCES = {
     "dt_noise": "IBG + output noise",
     "randomised": "Randomised twin",
     "mean_corrected": "IBG + RG mean",
-    "pi_ls": "Least squares",
-    "pi_bayes": "Bayesian identification",
+    "pi_ls": "Least squares (Eq. 2)",
+    "pi_bayes": "Bayesian updating (Eq. 3)",
     "dann": "Domain-adversarial",
     "dann_transductive": "Domain-adversarial, transductive",
     "fine_tuned": "Fine-tuned",
     "inversion": "Fault inversion",
     "inversion_cnn": "Inversion with classifier",
 }
-ORDER = ("dt", "ibg", "dt_noise", "randomised", "mean_corrected", "ibg_rg", *SOURCES)
+ORDER = (
+    "dt",
+    "randomised",
+    "ibg",
+    "dt_noise",
+    "pi_ls",
+    "pi_bayes",
+    "dann",
+    "dann_transductive",
+    "mean_corrected",
+    *SOURCES,
+)
+MANY = 5
+"""Sources beyond which pictures and tables show the most telling ones only."""
 
 # Okabe and Ito's colours, (light, dark), readable on the page's two backgrounds.
 PALETTE = (
@@ -75,11 +89,11 @@ CHROME = {
 }
 REAL_DATA = {
     "none": "none",
-    "healthy": "healthy calibration",
-    "unlabelled": "unlabelled calibration",
-    "labelled": "labelled calibration",
-    "transductive": "test outputs, no labels",
     "timing": "timing of commands",
+    "healthy": "healthy only",
+    "unlabelled": "unlabelled, not of the test set",
+    "transductive": "TEST OUTPUTS without labels (transductive)",
+    "labelled": "labelled, some of each class",
 }
 
 
@@ -99,6 +113,7 @@ METRICS = {
     "accuracy": Metric("Accuracy"),
     "auroc_micro": Metric("Micro AUROC"),
     "ece": Metric("ECE", -1),
+    "ece_classwise": Metric("Class-wise ECE", -1),
     "rmse": Metric("RMSE", -1),
     "nrmse": Metric("NRMSE", -1),
     "crps": Metric("CRPS", -1),

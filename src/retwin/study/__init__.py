@@ -13,15 +13,17 @@ from retwin.case import Case
 from retwin.corrected import generate
 from retwin.errors import InputError
 from retwin.storage import load, save, sha256, write_atomically
-from retwin.study.jobs import Roles, Work
-from retwin.study.plan import PRESETS, SOURCES, StudyPlan
+from retwin.study.files import Files, Roles
+from retwin.study.plan import PRESETS, StudyPlan
 from retwin.study.pool import run_jobs
 from retwin.study.results import write_results
+from retwin.study.sources import SOURCES, lacking
+from retwin.study.work import Work
 from retwin.surrogate import ENOUGH
 from retwin.trajectories import Trajectories
 from retwin.twins.protocol import HEALTHY
 
-__all__ = ["PRESETS", "SOURCES", "StudyData", "StudyPlan", "run_study"]
+__all__ = ["PRESETS", "SOURCES", "StudyData", "StudyPlan", "possible_sources", "run_study"]
 
 Report = Callable[[str, float], None]
 """Called with what is going on and the share that is done."""
@@ -74,7 +76,8 @@ def run_study(
     case: the system.
     plan: what is compared, and the seed.
     data: where the data are.
-    out: folder; a second call with the same plan and data goes on where the first one stopped.
+    out: folder; a second call with the same plan and data goes on where the first one stopped. It
+        may ask for other sources, more runs, or a learning curve: what is there is kept.
     processes: jobs at a time, one thread each; by default one per core.
     report: told what is going on.
     command: how the study was called, for the record.
@@ -88,10 +91,12 @@ def run_study(
     tell = report or (lambda _text, _share: None)
     ours = _identity(case, plan, _digests(data))
     _check_free(out, ours)
+    _check_possible(case, plan)
     work_folder = out / "work"
     if not (work_folder / "roles.json").exists():
         _prepare(case, plan, data, out, ours, tell)
     roles = Roles.of(json.loads((work_folder / "roles.json").read_text("utf-8")))
+    _check_healthy(plan, Files(work_folder).real_data(), roles)
     work = Work(work_folder, case, plan, roles)
     run_jobs(work, processes or os.cpu_count() or 1, tell)
     tell("scores", 1.0)
@@ -111,9 +116,15 @@ def _digests(data: StudyData) -> dict[str, dict[str, str]]:
 
 
 def _identity(case: Case, plan: StudyPlan, digests: Mapping[str, Any]) -> dict[str, Any]:
-    """What decides a study's result, as plain JSON values: two studies are the same if it is."""
+    """What decides the result of every job, as plain JSON values.
+
+    Two studies are the same if it is. Which sources and how many runs there are decides none of
+    them, so a study may grow.
+    """
     faults = {name: repr(fault) for name, fault in case.faults.items()}
-    told = {"case": case.name, "faults": faults, "plan": asdict(plan), "data": digests}
+    grows = ("sources", "runs", "learning_curve")
+    fixed = {key: value for key, value in asdict(plan).items() if key not in grows}
+    told = {"case": case.name, "faults": faults, "plan": fixed, "data": digests}
     plain: dict[str, Any] = json.loads(json.dumps(told))
     return plain
 
@@ -141,6 +152,31 @@ def _check_free(out: Path, ours: Mapping[str, Any]) -> None:
     )
 
 
+def _check_possible(case: Case, plan: StudyPlan) -> None:
+    """Find out before hours of work what cannot be done."""
+    if plan.encoder_noise and case.encoder_noise is None:
+        raise InputError(
+            "encoder_noise",
+            expected="0 for a case that cannot tell what a joint's reading does to its outputs",
+            got=repr(plan.encoder_noise),
+            remedy=f"leave it out for the case {case.name!r}",
+        )
+    for name in plan.sources:
+        missing = lacking(SOURCES[name], case, plan)
+        if missing:
+            raise InputError(
+                "sources",
+                expected=f"for {name!r} {missing}",
+                got=f"{name!r}",
+                remedy="leave it out, or say 'all' for those that are possible",
+            )
+
+
+def possible_sources(case: Case, plan: StudyPlan) -> tuple[str, ...]:
+    """Every source that a study of this case and with this classifier can have, in order."""
+    return tuple(name for name, source in SOURCES.items() if not lacking(source, case, plan))
+
+
 def _prepare(
     case: Case, plan: StudyPlan, data: StudyData, out: Path, ours: Mapping[str, Any], tell: Report
 ) -> None:
@@ -149,13 +185,6 @@ def _prepare(
     Nothing is written before everything is read and found good. The roles come last: where they
     are, all is.
     """
-    if plan.encoder_noise and case.encoder_noise is None:
-        raise InputError(
-            "encoder_noise",
-            expected="0 for a case that cannot tell what a joint's reading does to its outputs",
-            got=repr(plan.encoder_noise),
-            remedy=f"leave it out for the case {case.name!r}",
-        )
     real, roles = _real(case, plan, data, tell)
     _check_healthy(plan, real, roles)
     twin = _twin(case, plan, data, tell)
@@ -195,7 +224,7 @@ def _about(
 
 def _check_healthy(plan: StudyPlan, real: Trajectories, roles: Roles) -> None:
     """Every calibration part must have what the residual model is calibrated on."""
-    needed = any(SOURCES[name].residual for name in plan.sources)
+    needed = any(SOURCES[name].real_data in ("healthy", "labelled") for name in plan.sources)
     if not needed or plan.calibrate_on == "all":
         return
     for calibration, _ in roles.folds:

@@ -1,58 +1,19 @@
-"""What a study compares: sources, presets, roles of data, and the seeds of every stage."""
+"""What a study compares, and the seeds of every stage."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from retwin.case import Case
-from retwin.corrections import Correction
 from retwin.errors import InputError
 from retwin.networks import CLASSIFIERS, Network
+from retwin.study.sources import ROCKET, SOURCES
 from retwin.training import Training
 
-__all__ = ["PRESETS", "SOURCES", "Preset", "StudyPlan", "TrainingSource"]
-
-
-@dataclass(frozen=True)
-class TrainingSource:
-    """Where a diagnoser's training data come from (docs/theory.md, How a study scores).
-
-    Attributes
-    ----------
-    title: for people.
-    real_data: "none", "timing" (of commands), "healthy", "unlabelled", "labelled", "transductive".
-    surrogate: whether it needs the IBG.
-    correction: the operator of its RG, by case; None for a source without one.
-    per_fold: whether it depends on the calibration set; a source that does not is trained once.
-
-    """
-
-    title: str
-    real_data: str
-    surrogate: bool
-    correction: Callable[[Case], Correction] | None
-    per_fold: bool
-
-    @property
-    def residual(self) -> bool:
-        """Whether it has a residual model."""
-        return self.correction is not None
-
-
-SOURCES: dict[str, TrainingSource] = {
-    "dt": TrainingSource("Digital twin", "none", False, None, per_fold=False),
-    "ibg": TrainingSource("IBG alone", "timing", True, None, per_fold=True),
-    "ibg_rg": TrainingSource(
-        "IBG + RG", "healthy", True, lambda case: case.output_correction, per_fold=True
-    ),
-    "ibg_rg_command": TrainingSource(
-        "IBG + RG, command space", "healthy", True, lambda case: case.correction, per_fold=True
-    ),
-}
+__all__ = ["PRESETS", "Preset", "StudyPlan"]
 
 
 @dataclass(frozen=True)
@@ -78,7 +39,7 @@ class StudyPlan:
     ----------
     sources: names from SOURCES, in the order they are reported.
     preset: "quick" or "paper": classifier, its training and the number of runs.
-    classifier: "cnn" or "lstm"; None takes the preset's.
+    classifier: "cnn", "lstm" or "rocket"; None takes the preset's.
     runs: None takes the preset's.
     seed: of everything.
     folds: of the real set, when there is one set only.
@@ -88,6 +49,8 @@ class StudyPlan:
     encoder_noise: command units of reading noise put on frozen joints, in training and test sets
         alike. Real stuck joints are frozen in software; their exact stillness is an artefact that
         a diagnoser could live on. 0 leaves the data as they are.
+    learning_curve: whether sources that are calibrated on healthy trajectories are tried with
+        fewer of them too.
 
     Raises InputError for a name that is not known or a number below one.
 
@@ -103,11 +66,12 @@ class StudyPlan:
     per_class: int = 400
     calibrate_on: str = "healthy"
     encoder_noise: float = 0.0
+    learning_curve: bool = False
 
     def __post_init__(self) -> None:
         choices: list[tuple[str, str, Mapping[str, object]]] = [
             ("preset", self.preset, PRESETS),
-            ("classifier", self.classifier or "cnn", CLASSIFIERS),
+            ("classifier", self.classifier or "cnn", {**CLASSIFIERS, ROCKET: None}),
             ("calibrate_on", self.calibrate_on, {"healthy": None, "all": None}),
             *(("sources", source, SOURCES) for source in self.sources),
         ]
@@ -150,9 +114,9 @@ class StudyPlan:
         return self.classifier or PRESETS[self.preset].classifier
 
     @property
-    def network(self) -> Network:
-        """The classifier's config."""
-        return CLASSIFIERS[self.classifier_name]
+    def network(self) -> Network | None:
+        """The classifier's config; None for one that is no network."""
+        return CLASSIFIERS.get(self.classifier_name)
 
     @property
     def training(self) -> Training:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import multiprocessing
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from graphlib import TopologicalSorter
 from typing import Any
 
 from retwin.processes import worker_pool
-from retwin.study.jobs import Job, Work
+from retwin.study.files import Job
+from retwin.study.work import Work
 
 __all__ = ["run_jobs"]
 
@@ -19,34 +21,44 @@ _progress: Any = None
 
 def run_jobs(work: Work, processes: int, tell: Callable[[str, float], None]) -> None:
     """Do all jobs of `work` that are not done; an exception or Ctrl-C leaves what is finished."""
-    stages = work.jobs()
-    every = [job for stage in stages for job in stage]
-    shares = {job: float(work.path(job).exists()) for job in every}
-    missing = [[job for job in stage if not shares[job]] for stage in stages]
-    if not any(missing):
+    graph = work.graph()
+    shares = {job: float(work.files.path(job).exists()) for job in graph}
+    missing = [job for job, share in shares.items() if not share]
+    if not missing:
         return
     # Spawned, as the workers are.
     news = multiprocessing.get_context("spawn").Queue()
     stop = threading.Event()
     listener = threading.Thread(target=_listen, args=(news, shares, tell, stop), daemon=True)
     listener.start()
-    workers = min(processes, max(map(len, missing)))
     try:
-        with worker_pool(workers, _start_worker, (news,)) as pool:
-            for stage in missing:
-                _finish({pool.schedule(_do, args=(work, job)) for job in stage})
+        with worker_pool(min(processes, len(missing)), _start_worker, (news,)) as pool:
+            _finish(graph, set(missing), lambda job: pool.schedule(_do, args=(work, job)))
     finally:
         stop.set()
         # A worker ended in the middle of a message could keep the listener waiting.
         listener.join(timeout=1.0)
 
 
-def _finish(futures: set[Future[None]]) -> None:
-    """Wait for all; the first failure is raised at once."""
-    while futures:
-        done, futures = wait(futures, return_when=FIRST_COMPLETED)
-        for future in done:
-            future.result()
+def _finish(
+    graph: Mapping[Job, Sequence[Job]],
+    missing: set[Job],
+    start: Callable[[Job], Future[None]],
+) -> None:
+    """Start each job when those before it are done; the first failure is raised at once."""
+    order = TopologicalSorter(graph)
+    order.prepare()
+    running: dict[Future[None], Job] = {}
+    while order.is_active():
+        for job in order.get_ready():
+            if job in missing:
+                running[start(job)] = job
+            else:
+                order.done(job)
+        if running:
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                future.result()
+                order.done(running.pop(future))
 
 
 def _listen(
@@ -61,7 +73,7 @@ def _listen(
         except queue.Empty:
             continue
         shares[job] = max(shares[job], share)
-        tell(job.name, sum(shares.values()) / len(shares))
+        tell(str(job), sum(shares.values()) / len(shares))
 
 
 def _start_worker(news: Any) -> None:

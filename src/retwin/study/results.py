@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from itertools import combinations
@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.diagnosis.pooled import pool_opinions
 from retwin.fidelity import Fidelity
+from retwin.models import read_about
 from retwin.statistics import (
     METRICS,
     bootstrap,
@@ -25,8 +27,9 @@ from retwin.statistics import (
     score,
 )
 from retwin.storage import write_atomically
-from retwin.study.jobs import Job, Work
-from retwin.study.plan import SOURCES
+from retwin.study.files import Job
+from retwin.study.sources import SOURCES
+from retwin.study.work import Work
 from retwin.trajectories import Trajectories
 from retwin.twins.protocol import HEALTHY
 
@@ -38,6 +41,7 @@ HOLM_FAMILY = ("macro_f1", "balanced_accuracy", "auroc")
 SHOWN = 3
 """Trajectories whose poses the report draws."""
 COMPARED = (*HOLM_FAMILY, "accuracy", "healthy_recall")
+CURVED = ("macro_f1", "healthy_recall")
 
 
 def write_results(
@@ -47,12 +51,12 @@ def write_results(
 
     `about` holds the description of the data, `provenance` how the study was called.
     """
-    real = work.real_data()
+    real = work.files.real_data()
     tested = sorted(work.roles.tested)
     test = real[tested]
     classes = work.case.classes
     truth = np.array([classes.index(label) for label in test.labels])
-    probabilities = {name: _collect(work, name, tested) for name in work.plan.sources}
+    probabilities = {name: _probabilities(work, name, tested) for name in work.plan.sources}
     weights = bootstrap_weights(truth, draws=DRAWS, seed=work.plan.seed_of("bootstrap", 0))
     draws = {
         name: {m: bootstrap(m, truth, runs, weights, classes) for m in COMPARED}
@@ -62,7 +66,8 @@ def write_results(
         name: _source(work, name, truth, probabilities[name], draws[name])
         for name in work.plan.sources
     }
-    fidelity = _fidelity(work)
+    judged = {name: _judged(work, name) for name in work.plan.sources}
+    fidelity = {name: found for name, found in judged.items() if found is not None}
     results = {
         "schema": SCHEMA,
         "case": work.case.name,
@@ -78,7 +83,7 @@ def write_results(
         "comparisons": _comparisons(sources, draws),
         "surrogate": _surrogate(work),
         "fidelity": {name: found.as_dict() for name, found in fidelity.items()},
-        "learning_curve": None,
+        "learning_curve": _learning_curve(work, truth, tested, weights) or None,
         "timing": _timing(work),
         "provenance": {**_machine(), **provenance},
     }
@@ -93,16 +98,16 @@ def write_results(
     return results
 
 
-def _collect(work: Work, source: str, tested: list[int]) -> NDArray:
-    """Probabilities (runs, n_test, classes) of one source, in the order of `tested`."""
+def _probabilities(work: Work, source: str, tested: list[int], healthy: int = 0) -> NDArray:
+    """Of one source (runs, n_test, classes), in the order of `tested`; see `Job.healthy`."""
+    members = SOURCES[source].pool
+    if members:
+        return pool_opinions([_probabilities(work, member, tested, healthy) for member in members])
     place = {index: i for i, index in enumerate(tested)}
-    runs = work.plan.number_of_runs
-    out = np.full((runs, len(tested), len(work.case.classes)), np.nan)
-    folds = range(len(work.roles.folds)) if SOURCES[source].per_fold else (0,)
-    for run in range(runs):
-        for fold in folds:
-            with np.load(work.path(Job("diagnosis", run, fold, source))) as made:
-                out[run, [place[i] for i in made["tested"].tolist()]] = made["probabilities"]
+    out = np.full((work.plan.number_of_runs, len(tested), len(work.case.classes)), np.nan)
+    for job in work.diagnoses(source, healthy):
+        with np.load(work.files.path(job)) as made:
+            out[job.run, [place[i] for i in made["tested"].tolist()]] = made["probabilities"]
     return out
 
 
@@ -111,7 +116,6 @@ def _source(
 ) -> dict[str, Any]:
     scores = [score(truth, run, work.case.classes) for run in probabilities]
     predicted = probabilities.argmax(axis=2)
-    kind = SOURCES[name]
     return {
         **{metric: [getattr(each, metric) for each in scores] for metric in METRICS},
         "intervals": {m: np.nanquantile(d, [0.025, 0.975]).tolist() for m, d in draws.items()},
@@ -119,49 +123,91 @@ def _source(
             [confusion(truth, run, len(work.case.classes)) for run in predicted], axis=0
         ).tolist(),
         "predictions": predicted.tolist(),
-        "title": kind.title,
-        "real_data": kind.real_data,
+        "title": SOURCES[name].title,
+        "real_data": work.sees(name),
         "fault_protocol_known": True,
-        "twin_runs": len(work.twin_data()),
         **_costs(work, name),
     }
 
 
-def _costs(work: Work, name: str) -> dict[str, float | None]:
-    """Seconds to update the twin, and to generate a training set; None where nothing is done."""
-    kind = SOURCES[name]
-    update = 0.0
-    if kind.surrogate:
-        update += _mean(work, "surrogate", "seconds") or 0.0
-    if kind.residual:
-        update += _mean(work, "residual", "seconds", name) or 0.0
-    generate = None if name == "dt" else _mean(work, "diagnosis", "generate", name)
-    return {"update_s": update, "generate_s": generate}
+def _costs(work: Work, source: str) -> dict[str, Any]:
+    """What a source takes in one run and fold, with all that must be made before it.
+
+    `update_s`: to update the twin. `generate_s`: for its training set, whose size is `generated`.
+    `train_s`: for the diagnoser. `predict_s`: per trajectory. `twin_runs`: of the twin itself.
+    None where nothing is done. `notes`: what went not quite well.
+    """
+    costs: dict[str, list[dict[str, Any]]] = {}
+    for job in _with_all_before(work, work.diagnoses(source)):
+        own = job.name in (source, *SOURCES[source].pool)
+        part = ("own" if own else "other") if job.kind == "diagnosis" else f"{job.kind} {job.name}"
+        costs.setdefault(part, []).append(work.files.costs(job))
+
+    notes = [job["notes"] for part in costs.values() for job in part if "notes" in job]
+
+    def total(what: str, *parts: str) -> float | None:
+        each = [_mean([job.get(what) for job in costs.get(part, [])]) for part in parts]
+        known = [value for value in each if value is not None]
+        return sum(known) if known else None
+
+    made_before = [part for part in costs if part not in ("own", "other")]
+    runs = total("twin_runs", *costs)
+    size = total("trajectories", "own")
+    return {
+        "update_s": total("seconds", *made_before) or 0.0,
+        "generate_s": total("generate", "own", "other"),
+        "generated": None if size is None else round(size),
+        "train_s": total("train", "own", "other"),
+        "predict_s": total("predict", "own"),
+        "twin_runs": 0 if runs is None else round(runs),
+        "notes": sorted(set(notes)),
+    }
 
 
-def _mean(work: Work, kind: str, what: str, source: str = "") -> float | None:
-    """Mean over jobs of one of their timings; None where no job told it."""
-    told = [
-        work.timing(job).get(what)
-        for stage in work.jobs()
-        for job in stage
-        if job.kind == kind and job.source == source
-    ]
-    known = [seconds for seconds in told if seconds is not None]
+def _with_all_before(work: Work, jobs: Sequence[Job]) -> set[Job]:
+    before = {each for job in jobs for each in work.needed(job)}
+    return {*jobs, *_with_all_before(work, sorted(before, key=str))} if before else set(jobs)
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Over those that are known; None where none is."""
+    known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
 
 
 def _timing(work: Work) -> dict[str, Any]:
-    jobs = [job for stage in work.jobs() for job in stage]
-    chosen = work.plan.sources
+    """Mean seconds of each kind of job, and the sum of all."""
+    kinds: dict[str, list[float | None]] = {}
+    for job in work.graph():
+        name = " ".join(part for part in (job.kind, job.name) if part)
+        kinds.setdefault(name, []).append(work.files.costs(job).get("seconds"))
     return {
-        "generate_s": {name: _costs(work, name)["generate_s"] for name in chosen},
-        "surrogate_fit_s": _mean(work, "surrogate", "seconds"),
-        "residual_fit_s": {name: _mean(work, "residual", "seconds", name) for name in chosen},
-        "diagnosis_s": {name: _mean(work, "diagnosis", "seconds", name) for name in chosen},
-        "fidelity_s": {name: _mean(work, "fidelity", "seconds", name) for name in chosen},
-        "total_s": float(sum(work.timing(job).get("seconds", 0.0) for job in jobs)),
+        "seconds": {name: _mean(each) for name, each in sorted(kinds.items())},
+        "total_s": float(sum(value or 0.0 for each in kinds.values() for value in each)),
     }
+
+
+def _learning_curve(
+    work: Work, truth: NDArray, tested: list[int], weights: NDArray
+) -> list[dict[str, Any]]:
+    """Scores and coverage of each source against the healthy trajectories it was calibrated on."""
+    rows = []
+    for source in work.plan.sources:
+        counts = work.counts(source)
+        for healthy in (*counts, 0) if counts else ():
+            runs = _probabilities(work, source, tested, healthy)
+            row: dict[str, Any] = {"source": source, "healthy": healthy or work.healthy}
+            for metric in CURVED:
+                values = [getattr(score(truth, run, work.case.classes), metric) for run in runs]
+                drawn = bootstrap(metric, truth, runs, weights, work.case.classes)
+                row[metric] = values
+                row[f"{metric}_interval"] = np.nanquantile(drawn, [0.025, 0.975]).tolist()
+            found = _judged(work, source, healthy)
+            if found is not None:
+                covered = found.figures["coverage90"]
+                row |= {"coverage90": covered.value, "coverage90_interval": covered.interval}
+            rows.append(row)
+    return rows
 
 
 def _comparisons(
@@ -198,7 +244,7 @@ def _data(
     if work.plan.calibrate_on == "healthy":
         seen = seen[real.labels[pool] == HEALTHY]
     return {
-        "twin": {**about["twin"], "n": len(work.twin_data())},
+        "twin": {**about["twin"], "n": len(work.files.twin_data())},
         "calibration": {**about["calibration"], "n": len(pool), "used": seen.tolist()},
         "test": {
             **about["test"],
@@ -211,7 +257,12 @@ def _data(
 
 
 def _surrogate(work: Work) -> dict[str, Any]:
-    figures = work.surrogate_figures()
+    made = [Job("surrogate", run) for run in range(work.plan.number_of_runs)]
+    figures = [
+        read_about(path, "surrogate")["fitted"]["figures"]
+        for path in map(work.files.path, made)
+        if path.exists()
+    ]
     outputs = work.case.outputs
     if not figures:
         return {}
@@ -222,10 +273,15 @@ def _surrogate(work: Work) -> dict[str, Any]:
     }
 
 
-def _fidelity(work: Work) -> dict[str, Fidelity]:
-    """How real the draws of each source's twin are, where it has a residual model."""
-    found = {name: work.fidelity(name) for name in work.plan.sources if SOURCES[name].residual}
-    return {name: each for name, each in found.items() if each is not None}
+def _judged(work: Work, source: str, healthy: int = 0) -> Fidelity | None:
+    """How real a source's trajectories are, over all folds; None where none was held out."""
+    labels = work.files.real_data().labels
+    parts = [
+        Fidelity.load(work.files.path(job))
+        for job in work.judgements(source, healthy)
+        if (labels[list(work.roles.folds[job.fold][1])] == HEALTHY).any()
+    ]
+    return Fidelity.concatenate(parts) if parts else None
 
 
 def _fidelity_arrays(source: str, found: Fidelity) -> dict[str, NDArray]:

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.faults import Fault
 from retwin.segments import Segments
 from retwin.trajectories import Channels, Trajectories
+from retwin.twins.around import Around, ask_inside
 from retwin.twins.checks import ideal_outputs
-from retwin.twins.parametric import TOGETHER, Parameter, ask_inside, values_per_simulation
+from retwin.twins.parametric import TOGETHER, Parameter, values_per_simulation
 from retwin.twins.protocol import (
     Chunk,
-    Limits,
     Progress,
     Twin,
     checked_commands,
@@ -30,7 +30,7 @@ OFFSET = "offset"
 
 
 @dataclass(frozen=True)
-class CommandSide:
+class CommandSide(Around):
     """Any twin whose commands arrive late and shifted: parameters `delay` and `offset.CHANNEL`.
 
     A transport delay in samples (fractions allowed, all actuators alike) and for every actuator an
@@ -48,26 +48,6 @@ class CommandSide:
 
     twin: Twin
     nominal: Callable[[NDArray], NDArray] | None = None
-
-    @property
-    def inputs(self) -> Channels:
-        """Command channels."""
-        return self.twin.inputs
-
-    @property
-    def outputs(self) -> Channels:
-        """Output channels."""
-        return self.twin.outputs
-
-    @property
-    def rate(self) -> float:
-        """Samples per second."""
-        return self.twin.rate
-
-    @property
-    def limits(self) -> Limits | None:
-        """What commands must keep."""
-        return getattr(self.twin, "limits", None)
 
     def simulate(
         self,

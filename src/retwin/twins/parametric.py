@@ -18,12 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.errors import InputError
 from retwin.faults import Fault
-from retwin.trajectories import Channels, Trajectories
+from retwin.trajectories import Trajectories
+from retwin.twins.around import Around, ask_inside
 from retwin.twins.protocol import (
     Chunk,
-    Limits,
     Progress,
-    SimulationError,
     Twin,
     checked_commands,
     simulate_in_chunks,
@@ -34,7 +33,6 @@ __all__ = [
     "ParametricTwin",
     "RebuiltTwin",
     "TakesParameters",
-    "ask_inside",
     "values_per_simulation",
 ]
 
@@ -105,7 +103,7 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class ParametricTwin:
+class ParametricTwin(Around):
     """A twin at certain values of its free parameters; satisfies `Twin` as it is.
 
     Parameters
@@ -155,26 +153,6 @@ class ParametricTwin:
         """Of a function from values by name to a twin; see `RebuiltTwin`."""
         starts = {each.name: float(each.start or 0.0) for each in parameters}
         return cls(RebuiltTwin(build, starts), tuple(parameters))
-
-    @property
-    def inputs(self) -> Channels:
-        """Command channels."""
-        return self.twin.inputs
-
-    @property
-    def outputs(self) -> Channels:
-        """Output channels."""
-        return self.twin.outputs
-
-    @property
-    def rate(self) -> float:
-        """Samples per second."""
-        return self.twin.rate
-
-    @property
-    def limits(self) -> Limits | None:
-        """What commands must keep."""
-        return getattr(self.twin, "limits", None)
 
     @property
     def nominal(self) -> Callable[[NDArray], NDArray] | None:
@@ -258,7 +236,7 @@ class ParametricTwin:
 
 
 @dataclass(frozen=True)
-class RebuiltTwin:
+class RebuiltTwin(Around):
     """Takes parameters by being built anew for every value; those that share one go together.
 
     Parameters
@@ -273,7 +251,7 @@ class RebuiltTwin:
     defaults: Mapping[str, float]
 
     @cached_property
-    def example(self) -> Twin:
+    def twin(self) -> Twin:
         """The twin at the defaults. Raises InputError when `build` makes no twin."""
         made = self.build(dict(self.defaults))
         if not isinstance(made, Twin):
@@ -284,26 +262,6 @@ class RebuiltTwin:
                 remedy="return a FunctionTwin, or any object that satisfies Twin",
             )
         return made
-
-    @property
-    def inputs(self) -> Channels:
-        """Command channels."""
-        return self.example.inputs
-
-    @property
-    def outputs(self) -> Channels:
-        """Output channels."""
-        return self.example.outputs
-
-    @property
-    def rate(self) -> float:
-        """Samples per second."""
-        return self.example.rate
-
-    @property
-    def limits(self) -> Limits | None:
-        """What commands must keep."""
-        return getattr(self.example, "limits", None)
 
     def simulate(
         self,
@@ -357,36 +315,3 @@ def values_per_simulation(
             )
         own[name] = np.broadcast_to(array.astype(float), count)
     return own
-
-
-def ask_inside(
-    twin: Twin,
-    chunk: Chunk,
-    rows: NDArray,
-    commands: NDArray | None = None,
-    faults: Sequence[Fault | None] | None = None,
-    *,
-    seed: int,
-    parameters: Mapping[str, ArrayLike] | None = None,
-) -> tuple[NDArray, NDArray]:
-    """Nominal and observed outputs of those rows of a chunk, by a twin inside another one.
-
-    `commands` and `faults`, one per row, are by default the chunk's. What could not be simulated is
-    noted in the chunk, and its outputs are 0.
-    """
-    commands = chunk.commands[rows] if commands is None else commands
-    faults = [chunk.faults[i] for i in rows] if faults is None else faults
-    key = (1, chunk.index.start + int(rows[0]))
-    own = int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1)[0])
-    options: dict[str, Any] = {"parameters": parameters} if parameters else {}
-    try:
-        made = twin.simulate(commands, faults=faults, seed=own, **options)
-    except SimulationError as error:
-        for i, why in error.failed.items():
-            chunk.failed[int(rows[i])] = why
-        nominal = np.zeros((*commands.shape[:2], len(twin.outputs)))
-        observed = np.zeros_like(nominal)
-        good = np.setdiff1d(np.arange(len(rows)), list(error.failed))
-        nominal[good], observed[good] = error.finished.nominal, error.finished.observed
-        return nominal, observed
-    return made.nominal, made.observed

@@ -22,8 +22,6 @@ __all__ = ["calibration_ranks", "identify_bayes"]
 
 KEPT = 4000
 """Draws of the posterior that are kept at most."""
-PREDICTED = 200
-"""Draws from the prior that the measured data are held against."""
 OUTSIDE = 0.02
 """Share of prior predictive data below which the measured ones count as outside."""
 
@@ -61,8 +59,9 @@ def identify_bayes(
     """
     began = time.perf_counter()
     with misfit_of(twin, observed, seed=seed, rate=rate, processes=1) as misfit:
-        problem = Problem(misfit, noise)
-        for_method, for_check, for_kept = np.random.SeedSequence(seed).generate_state(3).tolist()
+        seeds = np.random.SeedSequence(seed).generate_state(4).tolist()
+        for_method, for_check, for_kept, for_prior = seeds
+        problem = Problem(misfit, noise, for_prior)
         points, figures, doubt = method.sample(problem, seed=for_method, progress=progress)
         outside = _outside(problem, np.random.default_rng(for_check))
         order = np.random.default_rng(for_kept).permutation(len(points))[:KEPT]
@@ -96,13 +95,10 @@ def identify_bayes(
 
 def _outside(problem: Problem, rng: np.random.Generator) -> float:
     """Share of prior predictive data that lie as far out as the measured ones."""
-    points = rng.random((PREDICTED, problem.size))
-    paths = problem.paths(points)
-    good = np.isfinite(paths).all(axis=(1, 2, 3))
-    points, paths = points[good], paths[good]
+    points, paths = problem.prior
     seen = problem.misfit.seen
     summaries = Summaries.of(paths)
-    simulated = summaries(paths + problem.errors(points, rng), seen)
+    simulated = summaries(problem.seen_noisily(points, paths, problem.box, rng)[1], seen)
     return outlyingness(summaries(problem.measured, seen)[0], simulated)
 
 
@@ -125,7 +121,7 @@ def calibration_ranks(
     """
     blank = twin.simulate(commands, seed=0)
     with misfit_of(twin, blank, seed=0, rate=rate, processes=1) as misfit:
-        problem = Problem(misfit, noise)
+        problem = Problem(misfit, noise, 0)
     ranks = np.empty((count, len(twin.names)))
     for i, sequence in enumerate(np.random.SeedSequence(seed).spawn(count)):
         rng = np.random.default_rng(sequence)
@@ -148,6 +144,6 @@ def _posterior(
 ) -> NDArray:
     """Draws (s, k) of the parameters."""
     with misfit_of(twin, data, seed=0, rate=rate, processes=1) as misfit:
-        own = Problem(misfit, problem.noise)
+        own = Problem(misfit, problem.noise, seed)
         points, _, _ = method.sample(own, seed=seed, progress=None)
     return own.physical(points)[0]

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Identifiability", "correlation_time", "identifiability"]
+__all__ = ["PLAUSIBLE", "Identifiability", "identifiability", "noise_of"]
 
 FLAT = 1e-5
 """Singular values below this share of the greatest count as none: so exact are differences."""
+PLAUSIBLE = 3.84
+"""95 % of chi-square with one degree of freedom."""
 UNIFORM = 12**-0.5
 """Standard deviation of what is only known to lie within its bounds, in widths of the bounds."""
 
@@ -69,6 +71,7 @@ def identifiability(
     jacobian: NDArray,
     residual: NDArray,
     *,
+    measured: int,
     width: NDArray,
     at_bound: NDArray,
     rivals: NDArray,
@@ -80,16 +83,14 @@ def identifiability(
     names: of the parameters.
     jacobian: (n, P, d_y, k) by parameters in widths of their bounds.
     residual: (n, P, d_y), 0 where nothing was measured.
+    measured: how many were.
     width: (k,) of the bounds.
     at_bound: (k,) bool.
     rivals: (r, k), optima from other starts that fit as well, less the best one, in widths.
 
     """
-    seen = int((jacobian != 0).any(axis=-1).sum())
     flat = jacobian.reshape(-1, jacobian.shape[-1])
-    together = correlation_time(residual)
-    freedom = max(seen - len(names), 1)
-    noise = np.sqrt(np.sum(residual**2) / freedom * together)
+    noise = np.sqrt(noise_of(residual, measured, len(names)))
     _, singular, directions = np.linalg.svd(flat, full_matrices=False)
     known = singular > FLAT * singular.max(initial=0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -109,8 +110,13 @@ def identifiability(
         directions=directions,
         at_bound=at_bound,
         identified=(errors < UNIFORM) & agree,
-        independent=seen / together,
+        independent=measured / correlation_time(residual),
     )
+
+
+def noise_of(residual: NDArray, measured: int, free: int) -> float:
+    """Variance per independent residual that a fit of `free` parameters leaves."""
+    return float(np.sum(residual**2)) / max(measured - free, 1) * correlation_time(residual)
 
 
 def correlation_time(residual: NDArray) -> float:

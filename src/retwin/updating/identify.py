@@ -11,9 +11,14 @@ from numpy.typing import NDArray
 
 from retwin.trajectories import Progress, Trajectories
 from retwin.twins.parametric import ParametricTwin
-from retwin.updating.identifiability import Identifiability, identifiability
+from retwin.updating.identifiability import (
+    PLAUSIBLE,
+    Identifiability,
+    identifiability,
+    noise_of,
+)
 from retwin.updating.misfit import misfit_of
-from retwin.updating.search import EDGE, Evolution, LeastSquares, Optimum, Search
+from retwin.updating.search import EDGE, Evolution, LeastSquares, Loss, Optimum, Search
 
 __all__ = ["Updated", "identify"]
 
@@ -35,6 +40,7 @@ class Updated:
     figures: `rms_before` and `rms_after` in output units (relative to each output's standard
         deviation where units differ), `measurements`, `independent`, `starts_agreeing`.
     reason: why the search ended, and what is in doubt.
+    loss, scale: under which it was searched, and the residual beyond which a robust one forgives.
 
     """
 
@@ -48,6 +54,8 @@ class Updated:
     seconds: float
     figures: dict[str, float]
     reason: str
+    loss: Loss
+    scale: float
 
 
 def identify(
@@ -67,7 +75,8 @@ def identify(
     twin: says which parameters are free, within which bounds, and where the search starts.
     observed: healthy calibration trajectories with commands; what is masked does not count.
     seed: of the starts; the same seed gives the same result.
-    method: `LeastSquares` from several starts, or `Evolution`, a global search.
+    method: `LeastSquares` from several starts, or `Evolution`, a global search; with loss="linear"
+        the plain norm of Eq. 2, by default a robust one.
     rate: samples per second to look at, a whole part of the data's; by default all. The sensor's
         true rate serves best: samples in between say nothing new.
     processes: that values of the parameters are spread over. 1 for twins that use all cores.
@@ -108,6 +117,8 @@ def identify(
             "starts_agreeing": float(agreeing),
         },
         reason="; ".join(filter(None, [best.reason, picture.doubts])),
+        loss=search.loss,
+        scale=search.scale,
     )
 
 
@@ -117,18 +128,16 @@ def _picture(
     """What is identified, and how many starts fit as well as the best one."""
     misfit = search.misfit
     # An outlier tells as little of the errors as it told of the optimum.
-    root = np.sqrt(search.weights(residual))
-    jacobian = search.jacobian(best).reshape(*residual.shape, -1) * root[..., None]
-    residual = root * residual
+    _, residual, rise = search.judged(residual)
     # As well as the best one: within what noise alone does to the objective (95 % of chi-square).
-    lowest = optima[0][0].objective ** 2
-    noise = np.sum(residual**2) / max(int(misfit.seen.sum()) - len(best), 1)
-    margin = 3.84 * noise + 1e-6 * lowest
+    measured, lowest = int(misfit.seen.sum()), optima[0][0].objective ** 2
+    margin = PLAUSIBLE * rise * noise_of(residual, measured, len(best)) + 1e-6 * lowest
     rivals = [point for each, point in optima if each.objective**2 <= lowest + margin]
     picture = identifiability(
         misfit.twin.names,
-        jacobian,
+        search.jacobian(best).reshape(*residual.shape, -1),
         residual,
+        measured=measured,
         width=misfit.high - misfit.low,
         at_bound=(best <= EDGE) | (best >= 1 - EDGE),
         rivals=np.array(rivals) - best,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 from retwin.trajectories import Progress
+from retwin.updating.misfit import check_counts
 from retwin.updating.problem import Problem
 from retwin.updating.search import LeastSquares, Search
 
@@ -41,15 +42,9 @@ class MCMC:
     starts: int = 3
 
     def __post_init__(self) -> None:
-        for name in ("walkers", "steps", "warm_up", "starts"):
-            value = getattr(self, name)
-            if not (isinstance(value, int | np.integer) and value >= 1):
-                raise InputError(
-                    name,
-                    expected="a whole number of at least 1",
-                    got=repr(value),
-                    remedy="leave it out",
-                )
+        check_counts(
+            walkers=self.walkers, steps=self.steps, warm_up=self.warm_up, starts=self.starts
+        )
 
     def sample(
         self, problem: Problem, *, seed: int, progress: Progress | None

@@ -15,7 +15,7 @@ from retwin.trajectories import UNLABELLED, Trajectories
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.protocol import HEALTHY, SimulationError, checked_seed
 
-__all__ = ["Misfit", "misfit_of"]
+__all__ = ["Misfit", "check_counts", "misfit_of"]
 
 
 class Misfit:
@@ -118,7 +118,8 @@ def misfit_of(
     Raises InputError for what cannot be compared.
     """
     checked_seed(seed)
-    stride = _checked(twin, observed, rate, processes)
+    check_counts(processes=processes)
+    stride = _checked(twin, observed, rate)
     if processes == 1:
         yield Misfit(twin, observed, stride=stride, seed=seed)
         return
@@ -149,9 +150,7 @@ def _in_worker(
         return _outputs(twin, commands, stride, seed, theta)
 
 
-def _checked(
-    twin: ParametricTwin, observed: Trajectories, rate: float | None, processes: int
-) -> int:
+def _checked(twin: ParametricTwin, observed: Trajectories, rate: float | None) -> int:
     """Every how many samples to look; InputError for what cannot be compared."""
     if not isinstance(twin, ParametricTwin):
         raise InputError(
@@ -193,11 +192,16 @@ def _checked(
             got=f"{count}",
             remedy="give more trajectories, a higher rate, or free fewer parameters",
         )
-    if not (isinstance(processes, int | np.integer) and processes >= 1):
-        raise InputError(
-            "processes",
-            expected="a whole number of at least 1",
-            got=repr(processes),
-            remedy="1 serves twins that use all cores themselves, as MuJoCoTwin does",
-        )
     return stride
+
+
+def check_counts(least: int = 1, **counts: int) -> None:
+    """InputError, by its name, for anything but a whole number of at least `least`."""
+    for name, value in counts.items():
+        if not (isinstance(value, int | np.integer) and value >= least):
+            raise InputError(
+                name,
+                expected=f"a whole number of at least {least}",
+                got=repr(value),
+                remedy="leave it out: the default serves well",
+            )

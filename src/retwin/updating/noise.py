@@ -33,8 +33,8 @@ class Noise:
     ----------
     discrepancy: whether there is an error that lasts, next to white noise. Without it, whatever a
         twin cannot do makes the posterior too sure of itself.
-    degrees: of freedom of Student's t for the white noise; infinite is Gaussian, and the
-        discrepancy needs that.
+    degrees: of freedom of Student's t for the white noise; None is Gaussian, and the discrepancy
+        needs that.
 
     Raises
     ------
@@ -43,13 +43,13 @@ class Noise:
     """
 
     discrepancy: bool = True
-    degrees: float = np.inf
+    degrees: float | None = None
 
     def __post_init__(self) -> None:
-        if not self.degrees > 2 or (self.discrepancy and np.isfinite(self.degrees)):
+        if self.degrees is not None and (self.discrepancy or not self.degrees > 2):
             raise InputError(
                 "degrees",
-                expected="more than 2 degrees of freedom, infinitely many with a discrepancy",
+                expected="more than 2 degrees of freedom, or None; None with a discrepancy",
                 got=f"{self.degrees} with discrepancy={self.discrepancy}",
                 remedy="4 forgives outliers; give discrepancy=False with it",
             )
@@ -77,7 +77,7 @@ class Noise:
             amplitude, duration = scales[:, 1:].T
             return _filtered(residual, seen, noise, amplitude, duration, interval)
         size = residual / noise[..., None]
-        if np.isfinite(self.degrees):
+        if self.degrees is not None:
             each = student.logpdf(size, self.degrees)
         else:
             each = -0.5 * (size**2 + np.log(2 * np.pi))
@@ -91,7 +91,7 @@ class Noise:
         scales = np.exp(logs)
         shape = (len(logs), samples, width)
         white = rng.normal(size=shape)
-        if np.isfinite(self.degrees):
+        if self.degrees is not None:
             white = rng.standard_t(self.degrees, size=shape)
         error = scales[:, 0, None, None] * white
         if not self.discrepancy:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 from retwin.trajectories import Progress
+from retwin.updating.misfit import check_counts
 from retwin.updating.problem import Problem
 from retwin.updating.summaries import Summaries
 
@@ -24,11 +25,9 @@ TAIL = 1e-3
 """Share of the posterior's draws beyond which its box ends, on either side."""
 SPARE, LEAST = 4, 0.1
 """Draws per sample wanted, and the share of these below which they are set on the edge instead."""
-NOISES = 4
-"""Draws of the noise, with scales of their own, through which each simulated path is seen."""
 HIDDEN, COMPONENTS = 32, 2
 """Of the mixture density network: in the last box a posterior is nearly Gaussian."""
-BATCH, RATE, PATIENCE = 200, 1e-3, 20
+BATCH, RATE, PATIENCE = 500, 2e-3, 20
 
 
 @dataclass(frozen=True)
@@ -42,41 +41,36 @@ class NPE:
 
     Parameters
     ----------
-    simulations: values of the parameters per round, each simulated for all calibration commands.
+    simulations: values of the parameters per round, each simulated for all calibration commands;
+        in the first round 200 at least, which also tell whether the twin is misspecified.
     rounds: 1 uses the whole prior only.
     samples: drawn from the posterior.
     epochs: at most, per round.
 
     """
 
-    simulations: int = 1000
-    rounds: int = 3
+    simulations: int = 500
+    rounds: int = 2
     samples: int = 4000
     epochs: int = 500
 
     def __post_init__(self) -> None:
-        for name, least in (("simulations", 50), ("rounds", 1), ("samples", 100), ("epochs", 1)):
-            value = getattr(self, name)
-            if not (isinstance(value, int | np.integer) and value >= least):
-                raise InputError(
-                    name,
-                    expected=f"a whole number of at least {least}",
-                    got=repr(value),
-                    remedy="leave it out",
-                )
+        check_counts(rounds=self.rounds, epochs=self.epochs)
+        check_counts(50, simulations=self.simulations)
+        check_counts(100, samples=self.samples)
 
     def sample(
         self, problem: Problem, *, seed: int, progress: Progress | None
     ) -> tuple[NDArray, dict[str, float], str]:
         """Points (s, k + q), figures, and in words how it went."""
         rng = np.random.default_rng(seed)
-        box = np.array([np.zeros(problem.size), np.ones(problem.size)])
-        points = np.empty((0, problem.size))
-        paths = np.empty((0, *problem.misfit.seen.shape))
+        box = problem.box
+        points, paths = problem.prior
         seen = problem.misfit.seen
         epochs = 0
         for done in range(self.rounds):
-            fresh = box[0] + (box[1] - box[0]) * rng.random((self.simulations, problem.size))
+            count = self.simulations if done else max(self.simulations - len(points), 0)
+            fresh = box[0] + (box[1] - box[0]) * rng.random((count, problem.size))
             made = problem.paths(fresh)
             good = np.isfinite(made).all(axis=(1, 2, 3))
             points = np.concatenate([points, fresh[good]])
@@ -84,8 +78,8 @@ class NPE:
             inside = np.all((points >= box[0]) & (points <= box[1]), axis=1)
             points, paths = points[inside], paths[inside]
             summaries = Summaries.of(paths)
-            told = _renoised(points, problem.parameters, box, rng)
-            known = summaries(np.repeat(paths, NOISES, 0) + problem.errors(told, rng), seen)
+            told, noisy = problem.seen_noisily(points, paths, box, rng)
+            known = summaries(noisy, seen)
             measured = summaries(problem.measured, seen)
             share = (told - box[0]) / (box[1] - box[0])
             found, taken = self._learn(share, known, measured, int(rng.integers(2**31)))
@@ -143,14 +137,6 @@ class NPE:
         if len(inside) < LEAST * self.samples:
             inside = drawn[: self.samples].clip(0.0, 1.0)
         return inside, int(learner.epoch)
-
-
-def _renoised(points: NDArray, parameters: int, box: NDArray, rng: np.random.Generator) -> NDArray:
-    """Each point several times, with other scales of the noise: that costs no simulation."""
-    told = np.repeat(points, NOISES, axis=0)
-    fresh = box[0] + (box[1] - box[0]) * rng.random(told.shape)
-    told[:, parameters:] = fresh[:, parameters:]
-    return told
 
 
 class _Silent:

@@ -4,22 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from retwin.configs import from_config, to_config
+from retwin.errors import InputError
 from retwin.faults import Fault
-from retwin.trajectories import Channels, Trajectories
-from retwin.twins.checks import ideal_outputs
-from retwin.twins.parametric import ParametricTwin, ask_inside
-from retwin.twins.protocol import Chunk, Limits, Progress, checked_seed, simulate_in_chunks
+from retwin.models import read_model, write_model
+from retwin.trajectories import Trajectories
+from retwin.twins.around import Around, generator_of
+from retwin.twins.noisy import between_readings, readings
+from retwin.twins.parametric import ParametricTwin
+from retwin.twins.protocol import Chunk, Progress, simulate_in_chunks
+from retwin.twins.randomised import ask_with
 from retwin.updating.noise import Noise
 
 __all__ = ["Posterior", "PosteriorTwin"]
 
+KIND = "posterior"
+
 
 @dataclass(frozen=True, eq=False)
-class PosteriorTwin:
+class PosteriorTwin(Around):
     """A twin with parameters, noise and discrepancy drawn from the posterior per trajectory.
 
     Parameters
@@ -43,26 +52,6 @@ class PosteriorTwin:
     stride: int = 1
     emulated: bool = False
 
-    @property
-    def inputs(self) -> Channels:
-        """Command channels."""
-        return self.twin.inputs
-
-    @property
-    def outputs(self) -> Channels:
-        """Output channels."""
-        return self.twin.outputs
-
-    @property
-    def rate(self) -> float:
-        """Samples per second."""
-        return self.twin.rate
-
-    @property
-    def limits(self) -> Limits | None:
-        """What commands must keep."""
-        return self.twin.limits
-
     def simulate(
         self,
         commands: NDArray,
@@ -74,19 +63,10 @@ class PosteriorTwin:
         """See `Twin.simulate`; the output error comes last, on faulty trajectories too."""
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            key = (2, chunk.index.start)
-            rng = np.random.default_rng(np.random.SeedSequence(checked_seed(seed), spawn_key=key))
-            rows = np.arange(len(chunk.commands))
-            drawn = rng.integers(len(self.samples), size=len(rows))
-            values = dict(zip(self.twin.names, self.samples[drawn].T, strict=True))
-            _, observed = ask_inside(self.twin, chunk, rows, seed=seed, parameters=values)
-            observed = observed + self._error(rng, self.logs[drawn], observed.shape[1])
-            if self.twin.nominal is not None:
-                ideal = ideal_outputs(self.twin.nominal, chunk.commands, len(self.outputs))
-            else:
-                healthy: list[Fault | None] = [None] * len(rows)
-                ideal, _ = ask_inside(self.twin, chunk, rows, None, healthy, seed=seed)
-            return ideal, observed
+            rng = generator_of(seed, chunk, 2)
+            drawn = rng.integers(len(self.samples), size=len(chunk.commands))
+            ideal, observed = ask_with(self.twin, chunk, self.samples[drawn], seed=seed)
+            return ideal, observed + self._error(rng, self.logs[drawn], observed.shape[1])
 
         return simulate_in_chunks(
             self, run, commands, faults, seed=seed, progress=progress, emulated=self.emulated
@@ -94,11 +74,44 @@ class PosteriorTwin:
 
     def _error(self, rng: np.random.Generator, logs: NDArray, steps: int) -> NDArray:
         """Errors (n, steps, d_y) in output units, drawn at the sensor's rate."""
-        time = np.arange(steps)
-        before, share = time // self.stride, (time % self.stride / self.stride)[:, None]
-        count, width = int(before[-1]) + 2, len(self.outputs)
-        read = self.noise.draw(rng, logs, count, width, self.stride / self.rate)
-        return self.unit * ((1 - share) * read[:, before] + share * read[:, before + 1])
+        count = readings(steps, self.stride)
+        read = self.noise.draw(rng, logs, count, len(self.outputs), self.stride / self.rate)
+        return self.unit * between_readings(read, self.stride, steps)
+
+    def save(self, folder: str | Path) -> None:
+        """Write the draws and what they are of; the twin itself is not written."""
+        about = {
+            "names": self.twin.names,
+            "values": self.twin.values,
+            "noise": to_config(self.noise, (Noise,)),
+            "stride": int(self.stride),
+            "emulated": self.emulated,
+        }
+        drawn = {"samples": self.samples, "logs": self.logs, "unit": self.unit}
+        with write_model(folder, KIND, about, {k: torch.tensor(v) for k, v in drawn.items()}):
+            pass
+
+    @classmethod
+    def load(cls, folder: str | Path, twin: ParametricTwin) -> PosteriorTwin:
+        """Read what `save` wrote, for the same twin at whatever values.
+
+        Raises InputError when it is no posterior, damaged, or one of other parameters.
+        """
+        about, drawn = read_model(folder, KIND)
+        if tuple(about["names"]) != twin.names:
+            raise InputError(
+                "twin",
+                expected=f"one with the parameters {', '.join(about['names'])}",
+                got=", ".join(twin.names),
+                remedy="give the twin whose posterior it is",
+            )
+        return cls(
+            twin.with_values(about["values"]),
+            from_config(about["noise"], (Noise,)),
+            **{name: drawn[name].numpy() for name in ("samples", "logs", "unit")},
+            stride=about["stride"],
+            emulated=about["emulated"],
+        )
 
 
 @dataclass(frozen=True, eq=False)

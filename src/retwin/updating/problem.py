@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,10 @@ from retwin.updating.noise import Noise
 
 __all__ = ["Problem"]
 
+PREDICTED = 200
+"""Draws from the prior that the measured data are held against."""
+NOISES = 8
+"""Draws of the noise, with scales of their own, through which each simulated path is seen."""
 TOGETHER = 64
 """Values of the parameters that are simulated at once."""
 
@@ -22,14 +28,16 @@ class Problem:
     Attributes
     ----------
     misfit, noise: of the data and of the output error.
+    seed: of the draws from the prior.
     low, width: (k + q,) of the box in physical units.
     parameters: k.
 
     """
 
-    def __init__(self, misfit: Misfit, noise: Noise) -> None:
+    def __init__(self, misfit: Misfit, noise: Noise, seed: int) -> None:
         self.misfit = misfit
         self.noise = noise
+        self.seed = seed
         self.parameters = len(misfit.low)
         samples = misfit.seen.shape[1]
         least, greatest = noise.bounds(misfit.spread, misfit.interval, samples)
@@ -66,13 +74,35 @@ class Problem:
         off = (outputs - self.misfit.present) / self.misfit.unit
         return np.where(self.misfit.seen, off, 0.0)
 
-    def errors(self, points: NDArray, rng: np.random.Generator) -> NDArray:
-        """Output errors (m, n, P, d_y) drawn at the scales of those points."""
-        _, logs = self.physical(points)
+    @cached_property
+    def prior(self) -> tuple[NDArray, NDArray]:
+        """Points from the prior that could be simulated, and their `paths`; simulated once."""
+        points = np.random.default_rng(self.seed).random((PREDICTED, self.size))
+        paths = self.paths(points)
+        good = np.isfinite(paths).all(axis=(1, 2, 3))
+        return points[good], paths[good]
+
+    @property
+    def box(self) -> NDArray:
+        """Least and greatest points, (2, k + q)."""
+        return np.array([np.zeros(self.size), np.ones(self.size)])
+
+    def seen_noisily(
+        self, points: NDArray, paths: NDArray, box: NDArray, rng: np.random.Generator
+    ) -> tuple[NDArray, NDArray]:
+        """Each point and its path several times, with other noise, its scales drawn within a box.
+
+        That costs no simulation.
+        """
+        told = np.repeat(points, NOISES, axis=0)
+        low, high = box[:, self.parameters :]
+        told[:, self.parameters :] = rng.uniform(low, high, size=(len(told), len(low)))
+        _, logs = self.physical(told)
         count, samples, width = self.misfit.seen.shape
         repeated = np.repeat(logs, count, axis=0)
         drawn = self.noise.draw(rng, repeated, samples, width, self.misfit.interval)
-        return drawn.reshape(len(points), count, samples, width) * self.misfit.seen
+        errors = drawn.reshape(len(told), count, samples, width) * self.misfit.seen
+        return told, np.repeat(paths, NOISES, axis=0) + errors
 
     @property
     def measured(self) -> NDArray:

@@ -9,14 +9,12 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 from retwin.trajectories import Trajectories
+from retwin.updating.identifiability import PLAUSIBLE, noise_of
 from retwin.updating.identify import Updated
 from retwin.updating.misfit import misfit_of
 from retwin.updating.search import LeastSquares, Search
 
 __all__ = ["Profile", "profile"]
-
-PLAUSIBLE = 3.84
-"""95 % of chi-square with one degree of freedom."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +25,7 @@ class Profile:
     ----------
     name: of the parameter.
     values: (g,) where it was held.
-    objective: (g,) ‖y_obs − f‖ there, all others fitted anew.
+    objective: (g,) of Eq. 2 there (or what a robust loss makes of it), all others fitted anew.
     rise: (g,) of twice the negative log-likelihood over the best; neighbouring residuals are alike,
         and the noise is what the best fit leaves. Below 3.84 the value is plausible at 95 %.
     interval: least and greatest plausible value; at a bound, it may go on beyond.
@@ -63,7 +61,7 @@ def profile(
     rate: float | None = None,
     processes: int = 1,
 ) -> Profile:
-    """The profile likelihood of one parameter about its optimum, by the plain norm of Eq. 2.
+    """The profile likelihood of one parameter about its optimum, under the loss that found it.
 
     Parameters
     ----------
@@ -88,21 +86,19 @@ def profile(
     which = names.index(name)
     with misfit_of(updated.twin, observed, seed=0, rate=rate, processes=processes) as misfit:
         search = Search(misfit, LeastSquares(starts=1), None)
+        search.loss, search.scale = updated.loss, updated.scale
         best = (np.array(updated.twin.values) - misfit.low) / search.width
         reach = 4 * updated.errors[name] / search.width[which]
         low, high = max(best[which] - reach, 0.0), min(best[which] + reach, 1.0)
         grid = np.unique(np.append(np.linspace(low, high, points), best[which]))
         sums = _held(search, which, grid, best)
-        residual = search.residuals(best[None])[0]
-    picture = updated.identifiability
-    freedom = max(updated.figures["measurements"] - len(names), 1.0)
-    together = updated.figures["measurements"] / picture.independent
-    noise = max(float(np.sum(residual**2)) / freedom * together, 1e-300)
+        _, residual, rise = search.judged(misfit.residuals(search.theta(best[None]))[0])
+        noise = rise * noise_of(residual, int(misfit.seen.sum()), len(names))
     return Profile(
         name,
         misfit.low[which] + search.width[which] * grid,
         np.sqrt(sums),
-        (sums - sums.min()) / noise,
+        (sums - sums.min()) / max(noise, 1e-300),
     )
 
 
@@ -117,9 +113,8 @@ def _held(search: Search, which: int, grid: NDArray, best: NDArray) -> NDArray:
         for i in order:
             search.held = np.where(others, 0.0, grid[i])
             if others.any():
-                found = search.descend(point)
-                sums[i], point = 2 * found.cost, found.x
-            else:
-                sums[i] = float(np.sum(search.residuals(np.empty((1, 0))) ** 2))
+                point = search.descend(point).x
+            residual = search.residuals(point[None]).reshape(search.misfit.seen.shape)
+            sums[i] = search.judged(residual)[0]
     search.free, search.held = np.ones(len(best), dtype=bool), np.zeros(len(best))
     return sums

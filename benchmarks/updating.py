@@ -1,0 +1,133 @@
+"""What does it cost to update the MuJoCo arm, and how good is it then? All costs counted, one run.
+
+The healthy trajectories of set A (needs RETWIN_DATA): every third of them is held out in turn, the
+others calibrate. The rivals: the residual generator, without its surrogate, which serves for ever,
+and with it, its twin data and its training; least squares on the twin's own parameters (Eq. 2), and
+their posterior by a network (Eq. 3), with default settings. Accuracy on what was held out, at the
+sensor's rate: CRPS (for a twin without randomness the mean absolute error), energy score, and how
+much 90 % bands hold.
+Expected was: RG at least 10 times faster than least squares, and 100 times than Bayes.
+
+Seconds are of the processor, so other work on the machine does not count; one thread. Writes
+benchmarks/out/updating.json and updating_speed.json.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from record import record
+
+import retwin as rt
+from retwin.twins.armpi_parametric import armpi_parametric
+from retwin.updating import NPE, identify, identify_bayes
+
+FOLDS = 3
+PER_CLASS = 100
+DRAWS = 50
+ARM = rt.ArmPiTwin(threads=1)
+
+Found = tuple[rt.Twin, int]
+"""A twin that was updated, and how often the MuJoCo arm was run for it."""
+Score = tuple[float, int, rt.Fidelity]
+"""Seconds, runs, and what the twin says of what was held out."""
+
+
+def rivals(case: rt.Case, ibg: rt.Surrogate) -> dict[str, Callable[[rt.Trajectories], Found]]:
+    """Name to what updates the twin, given calibration trajectories."""
+    twin, rate = armpi_parametric(ARM), case.sensor_rate
+
+    def corrected(correction: rt.Correction) -> Callable[[rt.Trajectories], Found]:
+        return lambda data: (
+            rt.CorrectedTwin(ibg, rt.fit_residual(ibg, data, correction, seed=0)),
+            0,
+        )
+
+    def least_squares(data: rt.Trajectories) -> Found:
+        found = identify(twin, data, seed=0, rate=rate)
+        return found.twin, found.twin_runs
+
+    def network(data: rt.Trajectories) -> Found:
+        found = identify_bayes(twin, data, seed=0, method=NPE(), rate=rate)
+        return found.twin, found.twin_runs
+
+    return {
+        "twin as it was": lambda data: (twin, 0),
+        "RG, delay and offset": corrected(case.output_correction),
+        "RG, command space": corrected(case.correction),
+        "pi_ls": least_squares,
+        "pi_bayes": network,
+    }
+
+
+def accuracy(fidelity: rt.Fidelity) -> dict[str, float]:
+    figures = fidelity.figures
+    crps = [each.value for name, each in figures.items() if name.startswith("crps/")]
+    return {
+        "CRPS (mm)": 1e3 * float(np.mean(crps)),
+        "energy score (mm)": 1e3 * figures["energy"].value,
+        "90 % bands hold": figures["coverage90"].value,
+    }
+
+
+def main() -> None:
+    folder = os.environ.get("RETWIN_DATA")
+    if not folder:
+        print("updating: set RETWIN_DATA to the folder of the public data")
+        return
+    import lightning  # noqa: F401 - importing is no part of updating
+    import sbi.inference  # noqa: F401
+
+    case = rt.cases.armpi()
+    real = rt.load(Path(folder) / "armpi" / "real_a.mat", case=case).with_label("Healthy")
+    started = time.process_time()
+    told = rt.generate(ARM, case, per_class=PER_CLASS, seed=0)
+    simulated = time.process_time() - started
+    ibg = rt.fit_surrogate(told, seed=0)
+    once = time.process_time() - started
+    scored: dict[str, list[Score]] = {}
+    for calibration, held_out in real.folds(FOLDS, seed=0):
+        for name, update in rivals(case, ibg).items():
+            began = time.process_time()
+            twin, runs = update(real[calibration])
+            took = time.process_time() - began
+            fidelity = rt.measure_fidelity(
+                twin, real[held_out], draws=DRAWS, seed=0, rate=case.sensor_rate, against={}
+            )
+            scored.setdefault(name, []).append((took, runs, fidelity))
+        # Fold by fold, so that a run that is stopped has told something.
+        tell(scored, once, simulated, len(told))
+
+
+def tell(scored: dict[str, list[Score]], once: float, simulated: float, simulations: int) -> None:
+    """The tables for the folds so far; `once` and `simulations` are the surrogate's costs."""
+    rows, seconds = {}, {}
+    for name, folds in scored.items():
+        seconds[name] = float(np.mean([took for took, _, _ in folds]))
+        surrogate = name.startswith("RG")
+        rows[name] = {
+            "seconds": seconds[name],
+            "with the surrogate": seconds[name] + once * surrogate,
+            "twin runs": float(np.mean([runs for _, runs, _ in folds])) + simulations * surrogate,
+            **accuracy(rt.Fidelity.concatenate([fidelity for _, _, fidelity in folds])),
+        }
+    held_out = sum(len(fidelity) for _, _, fidelity in next(iter(scored.values())))
+    record("updating", f"updating the MuJoCo arm, {held_out} held out of {FOLDS} folds", rows)
+    speed = {"surrogate, once (s)": once, "of this, twin runs (s)": simulated}
+    for rg in ("RG, delay and offset", "RG, command space"):
+        for name in ("pi_ls", "pi_bayes"):
+            speed[f"{rg}: times faster than {name}"] = seconds[name] / seconds[rg]
+            whole = seconds[name] / (once + seconds[rg])
+            speed[f"{rg}, with its surrogate: times faster than {name}"] = whole
+    record("updating_speed", "how many times faster", speed)
+
+
+if __name__ == "__main__":
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # doubts on parameters: docs/updating.md
+        main()

@@ -1,0 +1,112 @@
+"""A study's folder: which job leaves its result where, and what roles the real data play."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from retwin.storage import load, write_atomically
+from retwin.trajectories import Trajectories
+
+__all__ = ["Files", "Job", "Roles"]
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Which real trajectories calibrate and which test, by index into the study's real set."""
+
+    folds: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
+
+    @classmethod
+    def of(cls, folds: Iterable[tuple[Iterable[int], Iterable[int]]]) -> Roles:
+        """From any pairs (calibration, test) of indices."""
+        return cls(tuple((_indices(calibration), _indices(test)) for calibration, test in folds))
+
+    @property
+    def tested(self) -> list[int]:
+        """Every tested trajectory, in the order of the folds."""
+        return [i for _, test in self.folds for i in test]
+
+
+def _indices(values: Iterable[int]) -> tuple[int, ...]:
+    return tuple(int(value) for value in values)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One piece of work.
+
+    Attributes
+    ----------
+    kind: "surrogate", "residual", "update", "diagnosis" or "fidelity".
+    run, fold: from 0.
+    name: of the correction of a residual model, or of the source.
+    healthy: calibration trajectories of each class that are used, 0 for all there are.
+
+    """
+
+    kind: str
+    run: int
+    fold: int = 0
+    name: str = ""
+    healthy: int = 0
+
+    def __str__(self) -> str:
+        few = f"from {self.healthy}" if self.healthy else ""
+        parts = [f"run {self.run + 1}", self.kind, self.name, few]
+        return " ".join(part for part in parts if part)
+
+    def before(self, kind: str, name: str) -> Job:
+        """The job that leaves the result of that kind and name for this one."""
+        if kind == "surrogate":
+            return Job(kind, self.run)
+        return replace(self, kind=kind, name=name)
+
+
+@dataclass(frozen=True)
+class Files:
+    """Where everything of a study lies."""
+
+    folder: Path
+
+    def path(self, job: Job) -> Path:
+        """A job's result: a model's folder, or an NPZ file of a diagnosis or of fidelity."""
+        suffix = {"diagnosis": ".npz", "fidelity": ".fidelity.npz"}
+        return self._of(job, suffix.get(job.kind, f".{job.kind}"))
+
+    def diagnoser(self, job: Job) -> Path:
+        """The diagnoser's folder."""
+        return self._of(job, ".diagnoser")
+
+    def _of(self, job: Job, suffix: str) -> Path:
+        run = self.folder / f"run-{job.run}"
+        if job.kind == "surrogate":
+            return run / job.kind
+        fold = run / f"fold-{job.fold}"
+        return (fold / f"healthy-{job.healthy}" if job.healthy else fold) / f"{job.name}{suffix}"
+
+    def costs(self, job: Job) -> dict[str, float]:
+        """Seconds a job took, whole and in parts; empty if it was cut off before it could say."""
+        file = self._costs(job)
+        found: dict[str, float] = json.loads(file.read_text("utf-8")) if file.exists() else {}
+        return found
+
+    def keep_costs(self, job: Job, costs: Mapping[str, Any]) -> None:
+        """Write them beside the result."""
+        with write_atomically(self._costs(job)) as part:
+            part.write_text(json.dumps(costs), encoding="utf-8")
+
+    def _costs(self, job: Job) -> Path:
+        path = self.path(job)
+        return path.with_name(f"{path.name}.costs.json")
+
+    def twin_data(self) -> Trajectories:
+        """What the twin says, with commands."""
+        return load(self.folder / "twin.npz")
+
+    def real_data(self) -> Trajectories:
+        """All real trajectories, with commands."""
+        return load(self.folder / "real.npz")

@@ -1,0 +1,232 @@
+"""`Trial`: what one source holds in its hands in one run and fold, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.case import Case
+from retwin.corrected import generate
+from retwin.corrections import Correction
+from retwin.diagnosis import NetworkDiagnoser, RocketDiagnoser, fit_diagnoser, fit_rocket
+from retwin.models import read_about
+from retwin.networks import Network
+from retwin.residual import ResidualModel
+from retwin.segments import Segments
+from retwin.study.files import Files, Job
+from retwin.study.plan import StudyPlan
+from retwin.surrogate import Surrogate
+from retwin.trajectories import UNLABELLED, Trajectories
+from retwin.twins.parametric import ParametricTwin
+from retwin.twins.protocol import HEALTHY, Progress, Twin
+from retwin.updating import PosteriorTwin
+
+__all__ = ["Trial"]
+
+SEES = {
+    "none": (),
+    "timing": ("timing",),
+    "healthy": ("timing", "healthy"),
+    "unlabelled": ("timing", "unlabelled"),
+    "transductive": ("timing", "test outputs"),
+    "labelled": ("timing", "healthy", "labelled"),
+}
+"""What a source's `real_data` lets it see."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One run and fold of a study, as the source of a job may see it.
+
+    Real data that `sees` does not name cannot be reached from here, so a source cannot use more
+    than it declares.
+
+    Attributes
+    ----------
+    files: where results lie.
+    case, plan: the system, and what is compared.
+    fold: indices of calibration and test trajectories.
+    job: run, fold, and how many healthy calibration trajectories are used.
+    sees: a key of `SEES`.
+    progress: told the share that is done.
+
+    """
+
+    files: Files
+    case: Case
+    plan: StudyPlan
+    fold: tuple[tuple[int, ...], tuple[int, ...]]
+    job: Job
+    sees: str
+    progress: Progress | None = None
+
+    def seed(self, stage: str) -> int:
+        """The seed of one stage of this run and fold."""
+        return self.plan.seed_of(stage, self.job.run, self.job.fold)
+
+    # What was made before.
+
+    @cached_property
+    def surrogate(self) -> Surrogate:
+        """The IBG."""
+        return Surrogate.load(self._made("surrogate", ""))
+
+    def residual(self, name: str) -> ResidualModel:
+        """The RG with the correction of that name, see `correction`."""
+        return ResidualModel.load(self._made("residual", name))
+
+    def diagnoser(self, source: str) -> NetworkDiagnoser:
+        """The network that another source trained."""
+        return NetworkDiagnoser.load(self.files.diagnoser(self.job.before("diagnosis", source)))
+
+    def updated(self, method: str) -> Twin:
+        """The twin whose own parameters were updated: to one value each, or to a posterior."""
+        folder = self._made("update", method)
+        if method == "pi_bayes":
+            return PosteriorTwin.load(folder, self.parametric)
+        return self.parametric.with_values(read_about(folder, "parameters")["values"])
+
+    def _made(self, kind: str, name: str) -> Path:
+        return self.files.path(self.job.before(kind, name))
+
+    # What the case knows.
+
+    @property
+    def parametric(self) -> ParametricTwin:
+        """The twin with what is not known of it as parameters."""
+        assert self.case.parametric is not None, "checked before the study begins"
+        return self.case.parametric
+
+    def correction(self, name: str) -> Correction:
+        """The paper's, at the outputs ("output"), or the case's own ("command")."""
+        return {"output": self.case.output_correction, "command": self.case.correction}[name]
+
+    @property
+    def stride(self) -> int:
+        """Samples of the data per reading of the sensor."""
+        return max(1, round(self.case.rate / self.case.sensor_rate))
+
+    # What may be seen of real data.
+
+    @property
+    def twin_data(self) -> Trajectories:
+        """What the twin says, labelled: no real data."""
+        seed = self.seed("encoder noise in training")
+        return self._noisy(self.files.twin_data(), seed)
+
+    @property
+    def timing(self) -> NDArray | None:
+        """Onsets of movements (k, M) in the calibration set, NaN where there is none."""
+        if "timing" not in SEES[self.sees]:
+            return None
+        commands = self.files.real_data()[list(self.fold[0])].commands
+        segments = Segments.from_commands(commands)
+        return np.where(segments.valid, segments.start, np.nan)
+
+    @property
+    def healthy(self) -> Trajectories:
+        """The healthy calibration trajectories."""
+        return self._calibration("healthy").with_label(HEALTHY)
+
+    @property
+    def unlabelled(self) -> Trajectories:
+        """The calibration set without labels."""
+        found = self._calibration("unlabelled")
+        return found.replace(labels=np.full(len(found), UNLABELLED))
+
+    @property
+    def labelled(self) -> Trajectories:
+        """The calibration set with labels."""
+        return self._calibration("labelled")
+
+    @property
+    def test_outputs(self) -> Trajectories:
+        """The test set without labels; whoever trains on it is flagged."""
+        self._allow("test outputs")
+        found = self._real()[list(self.fold[1])]
+        return found.replace(labels=np.full(len(found), UNLABELLED))
+
+    def _calibration(self, what: str) -> Trajectories:
+        self._allow(what)
+        found = self._real()[list(self.fold[0])]
+        if self.job.healthy == 0:
+            return found
+        # Nested: what few trajectories hold is in more of them as well.
+        order = np.random.default_rng(self.seed("learning curve")).permutation(len(found))
+        kept = [
+            index
+            for label in self.case.classes
+            for index in order[found.labels[order] == label][: self.job.healthy]
+        ]
+        return found[np.sort(kept)]
+
+    def _allow(self, what: str) -> None:
+        if what not in SEES[self.sees]:
+            raise PermissionError(f"{self.job} declares {self.sees!r} and asks for {what}")
+
+    def _real(self) -> Trajectories:
+        # The same noise in every run and for every source.
+        return self._noisy(self.files.real_data(), self.plan.seed_of("encoder noise in test", 0))
+
+    def _noisy(self, trajectories: Trajectories, seed: int) -> Trajectories:
+        if self.plan.encoder_noise == 0 or self.case.encoder_noise is None:
+            return trajectories
+        return self.case.encoder_noise(trajectories, self.plan.encoder_noise, seed)
+
+    # What sources do with it.
+
+    def generate(self, twin: Twin) -> Trajectories:
+        """A labelled training set: the same commands and faults for all sources of a run."""
+        made = generate(
+            twin,
+            self.case,
+            per_class=self.plan.per_class,
+            seed=self.seed("generate"),
+            timing=self.timing,
+        )
+        return self._noisy(made, self.seed("encoder noise in training"))
+
+    @property
+    def network(self) -> Network:
+        """The study's classifier, where it is one."""
+        assert self.plan.network is not None, "checked before the study begins"
+        return self.plan.network
+
+    @property
+    def fitting(self) -> dict[str, Any]:
+        """How every network is trained."""
+        return {**self._fitting, "training": self.plan.training}
+
+    @property
+    def _fitting(self) -> dict[str, Any]:
+        return {
+            "seed": self.seed("diagnoser"),
+            "classes": self.case.classes,
+            "rate": self.plan.rate or self.case.sensor_rate,
+            "progress": self.progress,
+        }
+
+    @property
+    def updating(self) -> dict[str, Any]:
+        """How the twin's own parameters are updated."""
+        return {
+            "seed": self.seed("update"),
+            "rate": self.case.sensor_rate,
+            "progress": self.progress,
+        }
+
+    def train(self, made: Trajectories) -> NetworkDiagnoser | RocketDiagnoser:
+        """The study's classifier, trained on labelled trajectories."""
+        if self.plan.network is None:
+            return fit_rocket(made, **self._fitting)
+        return fit_diagnoser(made, self.network, **self.fitting)
+
+    def tested(self) -> Trajectories:
+        """The test set, to predict and for nothing else."""
+        found = self._real()[list(self.fold[1])]
+        return found.replace(labels=np.full(len(found), UNLABELLED))

@@ -1,0 +1,70 @@
+"""`RandomisedTwin`: domain randomisation, parameters anew for every trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.faults import Fault
+from retwin.trajectories import Trajectories
+from retwin.twins.around import Around, ask_inside, generator_of
+from retwin.twins.checks import ideal_outputs
+from retwin.twins.parametric import ParametricTwin
+from retwin.twins.protocol import Chunk, Progress, simulate_in_chunks
+
+__all__ = ["RandomisedTwin", "ask_with"]
+
+
+@dataclass(frozen=True)
+class RandomisedTwin(Around):
+    """A twin whose every parameter is drawn uniformly within its bounds, per trajectory.
+
+    Domain randomisation (Tobin et al. 2017): the rival that asks for no real data. It is as good as
+    its bounds, which somebody who has not seen the data has to set by hand.
+
+    Parameters
+    ----------
+    twin: says which parameters there are, and their bounds. Its values give the nominal output
+        where the twin has none that is free of parameters.
+
+    """
+
+    twin: ParametricTwin
+
+    def simulate(
+        self,
+        commands: NDArray,
+        *,
+        faults: Sequence[Fault | None] | None = None,
+        seed: int,
+        progress: Progress | None = None,
+    ) -> Trajectories:
+        """See `Twin.simulate`."""
+        low, high = self.twin.bounds
+
+        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+            rng = generator_of(seed, chunk, 3)
+            drawn = rng.uniform(low, high, size=(len(chunk.commands), len(low)))
+            return ask_with(self.twin, chunk, drawn, seed=seed)
+
+        return simulate_in_chunks(self, run, commands, faults, seed=seed, progress=progress)
+
+
+def ask_with(
+    twin: ParametricTwin, chunk: Chunk, values: NDArray, *, seed: int
+) -> tuple[NDArray, NDArray]:
+    """Nominal and observed outputs of a chunk, every trajectory with parameters (n, k) of its own.
+
+    The nominal output does not depend on them: it is the twin's own, or else what the twin says at
+    its present values.
+    """
+    rows = np.arange(len(chunk.commands))
+    named = dict(zip(twin.names, values.T, strict=True))
+    _, observed = ask_inside(twin, chunk, rows, seed=seed, parameters=named)
+    if twin.nominal is not None:
+        return ideal_outputs(twin.nominal, chunk.commands, len(twin.outputs)), observed
+    ideal, _ = ask_inside(twin, chunk, rows, faults=[None] * len(rows), seed=seed)
+    return ideal, observed

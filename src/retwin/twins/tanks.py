@@ -1,0 +1,165 @@
+"""Two cascaded tanks: a pump fills the upper one, which drains into the lower one; one is measured.
+
+Torricelli's law, after Schoukens and Noël, "Three benchmarks addressing open challenges in
+nonlinear system identification" (2017), with levels in volts of the lower tank's sensor:
+
+    upper level: x' = pump u - upper sqrt(x)
+    lower level: y' = upper sqrt(x) - lower sqrt(y)
+
+The upper tank's level is hidden. Its unit is such that it loses what the lower one gains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.integrate import RK45
+
+from retwin.faults import Fault
+from retwin.trajectories import Channels, Trajectories
+from retwin.twins.parametric import Parameter, ParametricTwin, values_per_simulation
+from retwin.twins.protocol import Chunk, Limits, Progress, simulate_in_chunks
+
+__all__ = ["TanksTwin", "tanks_parametric"]
+
+INPUTS = Channels(("pump",), ("V",))
+OUTPUTS = Channels(("level",), ("V",))
+RATE = 0.25
+"""Samples per second: one every 4 s."""
+FULL = 10.0
+"""The lower tank's level, in V, at which it overflows."""
+WEIR = 0.5
+"""What runs over the edge, per V above it and s: so fast that levels stay close to the edge."""
+PHYSICS = ("pump", "upper", "lower", "start_upper", "start_lower", "edge", "spill")
+
+
+@dataclass(frozen=True)
+class TanksTwin:
+    """The tanks in simulation, at one sample every 4 s; the pump's voltage is held in between.
+
+    Parameters
+    ----------
+    pump: what a volt on the pump adds to the upper level, in V/(V s).
+    upper, lower: outflow of each tank at a level of 1 V, in V/s.
+    start_upper, start_lower: levels at the first sample, in V.
+    overflow: whether tanks run over; without, levels know no edge.
+    edge: of the upper tank, in V; the lower one's is at 10 V, where its reading ends.
+    spill: share of what runs over the upper edge that falls into the lower tank.
+
+    `simulate` takes the numbers as `parameters`, by name, one for all trajectories or one each.
+    The defaults fit the benchmark's estimation record (see `retwin.cases.tanks`).
+
+    """
+
+    pump: float = 0.05
+    upper: float = 0.05
+    lower: float = 0.05
+    start_upper: float = 5.0
+    start_lower: float = 5.0
+    overflow: bool = False
+    edge: float = 10.0
+    spill: float = 0.5
+
+    @property
+    def inputs(self) -> Channels:
+        """The pump's voltage."""
+        return INPUTS
+
+    @property
+    def outputs(self) -> Channels:
+        """The lower tank's level."""
+        return OUTPUTS
+
+    @property
+    def rate(self) -> float:
+        """Samples per second."""
+        return RATE
+
+    @property
+    def limits(self) -> Limits:
+        """A pump does not suck."""
+        return Limits((0.0,), (10.0,))
+
+    def simulate(
+        self,
+        commands: NDArray,
+        *,
+        faults: Sequence[Fault | None] | None = None,
+        seed: int,
+        progress: Progress | None = None,
+        parameters: Mapping[str, ArrayLike] | None = None,
+    ) -> Trajectories:
+        """See `TakesParameters.simulate`; a stuck pump holds its voltage."""
+        count = len(commands)
+        own = values_per_simulation(parameters, PHYSICS, count)
+        numbers = {name: own.get(name, np.full(count, getattr(self, name))) for name in PHYSICS}
+
+        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+            some = {name: values[chunk.index] for name, values in numbers.items()}
+            nominal = self._levels(chunk.commands, some)
+            return nominal, self._levels(chunk.held, some) if any(chunk.faults) else nominal
+
+        return simulate_in_chunks(
+            self, run, commands, faults, seed=seed, progress=progress, size=512
+        )
+
+    def _levels(self, commands: NDArray, numbers: Mapping[str, NDArray]) -> NDArray:
+        """The lower level (n, T, 1); the upper one is not told."""
+        voltage = commands[..., 0].T.astype(np.float64)
+        levels = np.concatenate([numbers["start_upper"], numbers["start_lower"]])
+        told = np.empty(voltage.shape)
+        for sample, held in enumerate(voltage):
+            told[sample] = levels[len(held) :]
+            levels = self._after(levels, held, numbers)
+        if self.overflow:
+            np.minimum(told, FULL, out=told)
+        return told.T[..., None].astype(commands.dtype)
+
+    def _after(self, levels: NDArray, voltage: NDArray, numbers: Mapping[str, NDArray]) -> NDArray:
+        """Both levels (2 n,) one sample later: one step of Dormand and Prince's method.
+
+        The step is never refused, whatever its error: trajectories are integrated together, and
+        one must not depend on those beside it. A sample is short against the tanks' time.
+        """
+        solver = RK45(
+            lambda _, now: self._rates(now, voltage, numbers),
+            0.0,
+            levels,
+            1 / RATE,
+            first_step=1 / RATE,
+            rtol=np.inf,
+        )
+        solver.step()
+        return np.maximum(solver.y, 0.0)
+
+    def _rates(self, levels: NDArray, voltage: NDArray, numbers: Mapping[str, NDArray]) -> NDArray:
+        x, y = np.split(np.maximum(levels, 0.0), 2)
+        between = numbers["upper"] * np.sqrt(x)
+        upper = numbers["pump"] * voltage - between
+        lower = between - numbers["lower"] * np.sqrt(y)
+        if self.overflow:
+            over = WEIR * np.maximum(x - numbers["edge"], 0.0)
+            upper -= over
+            lower += numbers["spill"] * over - WEIR * np.maximum(y - FULL, 0.0)
+        return np.concatenate([upper, lower])
+
+
+def tanks_parametric(overflow: bool = False) -> ParametricTwin:
+    """The tanks with their numbers as free parameters, for `retwin.updating` (Eq. 2 and 3).
+
+    Five of them; with `overflow` also the upper tank's edge, and the share that spills into the
+    lower tank. The start levels are the system's own, the same in every record.
+    """
+    free = [
+        Parameter("pump", "V/(V s)", 0.005, 0.3),
+        Parameter("upper", "V/s", 0.005, 0.3),
+        Parameter("lower", "V/s", 0.005, 0.3),
+        Parameter("start_upper", "V", 0.1, 15.0),
+        Parameter("start_lower", "V", 0.1, 10.0),
+    ]
+    if overflow:
+        free += [Parameter("edge", "V", 2.0, 20.0), Parameter("spill", "1", 0.0, 1.0)]
+    return ParametricTwin(TanksTwin(overflow=overflow), tuple(free))

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import retwin as rt
+from retwin.diagnosis import fine_tune
+from retwin.testing import check_diagnoser
+from retwin.training import Training
+
+SMALL = rt.CNN(channels=(8, 16), dropout=0.0)
+SHORT = Training(epochs=8, batch=16, rate=1e-2)
+
+
+def toy(count: int, *, seed: int, gain: float = 1.0, leak: float = 0.0) -> rt.Trajectories:
+    """Two classes that differ after a movement: r is about 0.5 or -0.5, times `gain`.
+
+    With a `leak`, where it begins tells the class as well, in nominal and observed path.
+    """
+    rng = np.random.default_rng(seed)
+    side = np.resize([1.0, -1.0], count)[:, None, None]
+    time = np.arange(300)[None, :, None]
+    start = leak * side
+    commands = start + (1 - start) * np.clip((time - 20) / 60, 0, 1)
+    moved = time >= 80
+    residual = 0.5 * gain * side * moved + 0.1 * rng.normal(size=(count, 300, 1))
+    labels = np.where(side[:, 0, 0] > 0, "high", "low")
+    return rt.Trajectories(commands, commands, commands + residual, rate=100.0, labels=labels)
+
+
+@pytest.fixture(scope="module")
+def generated() -> rt.Trajectories:
+    return toy(160, seed=0)
+
+
+@pytest.fixture(scope="module")
+def base(generated: rt.Trajectories) -> rt.NetworkDiagnoser:
+    return rt.fit_diagnoser(generated, SMALL, seed=0, training=SHORT)
+
+
+def test_learns_what_the_generated_ones_do_not_hold(
+    base: rt.NetworkDiagnoser, generated: rt.Trajectories
+) -> None:
+    def real(count: int, seed: int) -> rt.Trajectories:
+        """The sensor is the wrong way round, and its noise is another: two things at once."""
+        turned = toy(count, seed=seed, gain=-3.0)
+        return turned.replace(observed=turned.observed + 2.0)
+
+    test = real(40, seed=2)
+    assert rt.evaluate(base, test).accuracy < 0.8
+    before = base.predict_proba(test)
+    tuned = fine_tune(base, generated, real(8, seed=1), seed=0, training=SHORT)
+    assert rt.evaluate(tuned, test).accuracy > 0.95
+    assert rt.evaluate(tuned, toy(40, seed=3)).accuracy > 0.95
+    np.testing.assert_array_equal(base.predict_proba(test), before)
+
+
+def test_where_a_recording_began_tells_it_nothing(
+    base: rt.NetworkDiagnoser, generated: rt.Trajectories
+) -> None:
+    told = toy(8, seed=1, gain=0.0, leak=0.8)
+    tuned = fine_tune(base, generated, told, seed=0, training=SHORT)
+    test = toy(40, seed=2, gain=0.0, leak=0.8)
+    other = toy(40, seed=2, gain=0.0, leak=-0.8)
+    np.testing.assert_array_equal(other.observed[:, 80:], test.observed[:, 80:])
+    np.testing.assert_array_equal(tuned.predict_proba(other), tuned.predict_proba(test))
+    # Nothing else tells these classes apart: at 40 trajectories, chance stays below 0.75 ...
+    assert rt.evaluate(tuned, test).accuracy < 0.75
+    # ... but whoever sees the start needs nothing else.
+    seeing = rt.fit_diagnoser(toy(160, seed=3, gain=0.0, leak=0.8), SMALL, seed=0, training=SHORT)
+    assert rt.evaluate(seeing, test).accuracy > 0.95
+
+
+def test_is_saved_with_what_it_does_not_look_at(
+    base: rt.NetworkDiagnoser, generated: rt.Trajectories, tmp_path: Path
+) -> None:
+    real = toy(4, seed=1, leak=0.3)
+    for name in ("a", "b"):
+        tuned = fine_tune(base, generated, real, seed=3, training=Training(epochs=1))
+        tuned.save(tmp_path / name)
+    for file in ("model.json", "weights.safetensors"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    back = rt.NetworkDiagnoser.load(tmp_path / "a")
+    assert back.features.hide_start
+    assert not base.features.hide_start
+    np.testing.assert_array_equal(back.predict_proba(real), tuned.predict_proba(real))
+    check_diagnoser(back, toy(5, seed=4))
+
+
+def test_bad_input_is_refused(base: rt.NetworkDiagnoser, generated: rt.Trajectories) -> None:
+    real = toy(4, seed=1)
+    with pytest.raises(rt.InputError, match="label every trajectory"):
+        fine_tune(base, generated, real.replace(labels=None), seed=0)
+    with pytest.raises(rt.InputError, match=r"unknown \['strange'\]"):
+        strange = real.replace(labels=np.array(["high", "low", "low", "strange"]))
+        fine_tune(base, generated, strange, seed=0)
+    with pytest.raises(rt.InputError, match=r"trajectories\.rate"):
+        fine_tune(base, generated, real.replace(rate=50.0), seed=0)
