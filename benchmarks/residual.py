@@ -1,12 +1,13 @@
 """Which shape of the residual model generates the most real trajectories?
 
 The healthy trajectories of one real set (set A, in `RETWIN_DATA`), over three folds: the RG is
-fitted to the folds' healthy calibration trajectories, and its draws are held against those it never
-saw. Shapes: mixtures of one, two and three Gaussians, a normalising flow, and the mixture refined
-on outputs by the energy score. `healthy`: fitted to healthy trajectories alone; `all`: to those of
-all classes, the severity of each fault inferred apart. Scores are averaged over trajectories; `below` is by which share the
-CRPS lies below that of one Gaussian, with its 95 % bootstrap interval over trajectories, and
-`below mean` the same against the mean correction alone. Writes benchmarks/out/residual.json.
+fitted to the folds' calibration trajectories, and its draws are held against healthy ones that it
+never saw. `healthy`: fitted to healthy trajectories alone; `all`: to those of all classes, the
+severity of each fault inferred apart. Shapes: mixtures of one, two and three Gaussians, a
+normalising flow, and the mixture refined on outputs by the energy score. Scores are averaged over
+trajectories; `below single` is by which share the CRPS lies below that of one Gaussian, with its
+95 % bootstrap interval over trajectories, and `below mean` the same against the mean correction
+alone. Writes benchmarks/out/residual.json.
 """
 
 from __future__ import annotations

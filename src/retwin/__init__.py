@@ -32,6 +32,7 @@ _HOME = {
     "Flow": "residual",
     "FunctionTwin": "twins.function",
     "InputError": "errors",
+    "InversionDiagnoser": "diagnosis",
     "KinematicTwin": "twins.kinematic",
     "LSTM": "networks",
     "LSTMClassifier": "networks",
@@ -40,6 +41,11 @@ _HOME = {
     "Mixture": "residual",
     "MuJoCoTwin": "twins.mujoco",
     "NetworkDiagnoser": "diagnosis",
+    "NoisyTwin": "twins.noisy",
+    "Parameter": "twins.parametric",
+    "ParametricTwin": "twins.parametric",
+    "PooledDiagnoser": "diagnosis",
+    "RandomisedTwin": "twins.randomised",
     "Refinement": "residual",
     "ResidualModel": "residual",
     "SampledSensor": "corrections",
@@ -59,12 +65,19 @@ _HOME = {
     "animate": "animation",
     "evaluate": "statistics",
     "fetch": "download",
+    "fine_tune": "diagnosis",
+    "fit_dann": "diagnosis",
     "fit_diagnoser": "diagnosis",
+    "fit_inversion": "diagnosis",
     "fit_residual": "residual",
+    "fit_rocket": "diagnosis",
     "fit_surrogate": "surrogate",
     "generate": "corrected",
+    "identify": "updating",
+    "identify_bayes": "updating",
     "infer_discrepancy": "residual",
     "load": "storage",
+    "load_diagnoser": "diagnosis",
     "measure_fidelity": "fidelity",
     "measure_widening": "fidelity",
     "run_study": "study",
@@ -105,7 +118,18 @@ if TYPE_CHECKING:
         Discrepancy,
         SampledSensor,
     )
-    from retwin.diagnosis import Diagnoser, NetworkDiagnoser, fit_diagnoser
+    from retwin.diagnosis import (
+        Diagnoser,
+        InversionDiagnoser,
+        NetworkDiagnoser,
+        PooledDiagnoser,
+        fine_tune,
+        fit_dann,
+        fit_diagnoser,
+        fit_inversion,
+        fit_rocket,
+        load_diagnoser,
+    )
     from retwin.download import fetch
     from retwin.errors import InputError
     from retwin.faults import Fault, SteadyStateError, Stuck
@@ -133,4 +157,8 @@ if TYPE_CHECKING:
     from retwin.twins.function import FunctionTwin
     from retwin.twins.kinematic import KinematicTwin
     from retwin.twins.mujoco import MuJoCoTwin
+    from retwin.twins.noisy import NoisyTwin
+    from retwin.twins.parametric import Parameter, ParametricTwin
     from retwin.twins.protocol import Limits, SimulationError, Twin
+    from retwin.twins.randomised import RandomisedTwin
+    from retwin.updating import identify, identify_bayes

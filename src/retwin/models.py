@@ -13,7 +13,7 @@ from torch import Tensor
 from retwin.errors import InputError
 from retwin.storage import write_atomically
 
-__all__ = ["read_model", "write_model"]
+__all__ = ["kind_of", "read_about", "read_model", "write_model"]
 
 SCHEMA = 1
 
@@ -73,3 +73,12 @@ def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str,
 def read_about(folder: str | Path, kind: str) -> dict[str, Any]:
     """The description of a model folder without its weights; raises as `read_model` does."""
     return read_model(folder, kind)[0]
+
+
+def kind_of(folder: str | Path) -> str:
+    """What kind of model a folder says it holds; empty where it says nothing."""
+    try:
+        about = json.loads((Path(folder) / "model.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return ""
+    return str(about.get("kind", "")) if isinstance(about, dict) else ""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -120,7 +122,7 @@ diagnose = typer.Typer(help="Train a diagnoser, and use it.", no_args_is_help=Tr
 def diagnose_fit(
     file: Annotated[Path, typer.Argument(help="Labelled trajectories.")],
     out: Annotated[Path, typer.Option(help="Folder for the diagnoser.")],
-    classifier: Annotated[str, typer.Option(help="cnn or lstm.")] = "cnn",
+    classifier: Annotated[str, typer.Option(help="cnn, lstm or rocket.")] = "cnn",
     case: Annotated[str | None, typer.Option(help="Case the file belongs to.")] = None,
     rate: Annotated[float | None, typer.Option(help="Hz that the classifier looks at.")] = None,
     seed: Seed = 0,
@@ -130,12 +132,14 @@ def diagnose_fit(
     from retwin.networks import CLASSIFIERS
 
     system = None if case is None else rt.cases.get(case)
-    config = named(classifier, CLASSIFIERS, "classifier")
+    fit: dict[str, Callable[..., Any]] = {
+        name: partial(rt.fit_diagnoser, network=network) for name, network in CLASSIFIERS.items()
+    }
+    chosen = named(classifier, {**fit, "rocket": rt.fit_rocket}, "classifier")
     with bar("diagnose") as tell:
         training = rt.load(file, case=system, progress=lambda s: tell("read", s))
-        diagnoser = rt.fit_diagnoser(
+        diagnoser = chosen(
             training,
-            config,
             seed=seed,
             classes=None if system is None else system.classes,
             rate=rate,
@@ -150,6 +154,31 @@ def diagnose_fit(
     console.print(f"Saved {out}", soft_wrap=True)
 
 
+@diagnose.command("invert", epilog="Example: `retwin diagnose invert model real.mat --out physics`")
+def diagnose_invert(
+    model: Annotated[Path, typer.Argument(help="Folder of a corrected twin, in command space.")],
+    real: Annotated[Path, typer.Argument(help="The trajectories it was calibrated on.")],
+    out: Annotated[Path, typer.Option(help="Folder for the diagnoser.")],
+    random_onset: Annotated[
+        bool, typer.Option(help="Leave the onset of stuck motors open.")
+    ] = False,
+) -> None:
+    """Make a diagnoser by physics: no training, only healthy trajectories are used."""
+    import retwin as rt
+
+    updated = rt.CorrectedTwin.load(model)
+    system = rt.cases.get(updated.case)
+    if random_onset:
+        system = system.with_random_onset()
+    with bar("invert") as tell:
+        calibration = rt.load(real, case=system, progress=lambda s: tell("read", s))
+        diagnoser = rt.fit_inversion(
+            updated.surrogate, updated.residual, calibration, system.faults
+        )
+    diagnoser.save(out)
+    Console().print(f"Saved {out}", soft_wrap=True)
+
+
 @diagnose.command("predict", epilog="Example: `retwin diagnose predict cnn real.mat --case armpi`")
 def diagnose_predict(
     model: Annotated[Path, typer.Argument(help="Folder of a diagnoser.")],
@@ -160,7 +189,7 @@ def diagnose_predict(
     """Say which class each trajectory belongs to, and score it where labels are known."""
     import retwin as rt
 
-    diagnoser = rt.NetworkDiagnoser.load(model)
+    diagnoser = rt.load_diagnoser(model)
     system = None if case is None else rt.cases.get(case)
     with bar("read") as tell:
         trajectories = rt.load(file, case=system, progress=lambda s: tell(file.name, s))

@@ -9,6 +9,7 @@ from retwin.diagnosis.network import NetworkDiagnoser, fit_diagnoser
 from retwin.diagnosis.pooled import PooledDiagnoser
 from retwin.diagnosis.protocol import Diagnoser
 from retwin.diagnosis.rocket import RocketDiagnoser, fit_rocket
+from retwin.diagnosis.saved import load_diagnoser
 
 __all__ = [
     "Diagnoser",
@@ -23,4 +24,5 @@ __all__ = [
     "fit_diagnoser",
     "fit_inversion",
     "fit_rocket",
+    "load_diagnoser",
 ]

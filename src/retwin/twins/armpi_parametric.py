@@ -21,7 +21,7 @@ def armpi_parametric(arm: ArmPiTwin | None = None) -> ParametricTwin:
     | parameter | unit | range |
     |---|---|---|
     | `stiffness`, of all servos | N m/rad | 150 to 900 |
-    | `damping`, of all servos | N m s/rad | 1 to 20 |
+    | `damping`, of all servos | N m s/rad | 1 to 40 |
     | `delay`, beyond the servos' own | samples of 10 ms | 0 to 20 |
     | `offset.motor_1` … `offset.motor_4` | command units of 0.24 degrees | -25 to 25 |
 
@@ -50,7 +50,7 @@ def armpi_parametric(arm: ArmPiTwin | None = None) -> ParametricTwin:
         "damping",
         "N m s/rad",
         1.0,
-        20.0,
+        40.0,
         DAMPING / PER_RAD,
         {f"{servo}.biasprm[2]": -PER_RAD for servo in SERVOS},
     )
