@@ -92,6 +92,15 @@ def test_the_steps_one_by_one(call, files: Path, tmp_path: Path) -> None:
     assert len(rows) == 91
     assert "macro_f1" not in out, "no labels, no scores"
     assert "macro_f1" in call("diagnose", "predict", tmp_path / "cnn", files / "real.npz")[1]
+    code, out, err = call(
+        "diagnose", "invert", tmp_path / "model", files / "real.npz", "--out", tmp_path / "physics"
+    )
+    assert code == 0, err
+    rt.save(rt.load(files / "real.npz")[[0, 10]], tmp_path / "two.npz")
+    code, out, err = call("diagnose", "predict", tmp_path / "physics", tmp_path / "two.npz")
+    assert code == 0, err
+    assert out.count("Healthy") >= 2
+    assert "macro_f1" in out
 
 
 def test_same_seed_same_file(call, files: Path, tmp_path: Path) -> None:
