@@ -25,6 +25,7 @@ FLOORS = [
     "commands",
     "faults",
     "twins",
+    "state_space",
     "networks",
     "training",
     "surrogate",

@@ -14,6 +14,7 @@ __version__ = "0.1.0"
 
 # Name to module, loaded when first asked for: `import retwin` must not wait for torch.
 _HOME = {
+    "Additive": "corrections",
     "ArmPiTwin": "twins.armpi",
     "CNN": "networks",
     "Case": "case",
@@ -51,8 +52,11 @@ _HOME = {
     "SampledSensor": "corrections",
     "Scores": "statistics",
     "Segments": "segments",
+    "SequenceMixture": "residual",
+    "SequenceResidual": "residual",
     "SimulationError": "twins.protocol",
     "SimulationPlan": "scale",
+    "StateSpace": "networks",
     "SteadyStateError": "faults",
     "Stuck": "faults",
     "StudyData": "study",
@@ -110,6 +114,7 @@ if TYPE_CHECKING:
     from retwin.case import Case
     from retwin.corrected import CorrectedTwin, generate
     from retwin.corrections import (
+        Additive,
         Chain,
         CommandSpace,
         Context,
@@ -134,13 +139,15 @@ if TYPE_CHECKING:
     from retwin.errors import InputError
     from retwin.faults import Fault, SteadyStateError, Stuck
     from retwin.fidelity import Fidelity, measure_fidelity, measure_widening
-    from retwin.networks import CNN, LSTM, MLP, TCN, LSTMClassifier
+    from retwin.networks import CNN, LSTM, MLP, TCN, LSTMClassifier, StateSpace
     from retwin.report import write_report
     from retwin.residual import (
         Flow,
         Mixture,
         Refinement,
         ResidualModel,
+        SequenceMixture,
+        SequenceResidual,
         fit_residual,
         infer_discrepancy,
     )

@@ -15,7 +15,7 @@ from retwin.corrections import recorded
 from retwin.errors import InputError
 from retwin.faults import Fault
 from retwin.models import read_about, write_model
-from retwin.residual import ResidualModel
+from retwin.residual import Residual, load_residual
 from retwin.surrogate import Surrogate
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins.protocol import (
@@ -44,7 +44,7 @@ class CorrectedTwin:
     """
 
     surrogate: Surrogate
-    residual: ResidualModel
+    residual: Residual
     case: str = ""
     random: bool = True
 
@@ -118,7 +118,7 @@ class CorrectedTwin:
         about = read_about(folder, "corrected")
         folder = Path(folder)
         surrogate = Surrogate.load(folder / "surrogate")
-        residual = ResidualModel.load(folder / "residual")
+        residual = load_residual(folder / "residual")
         return cls(surrogate, residual, about["case"], about["random"])
 
 

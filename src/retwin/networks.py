@@ -15,6 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from retwin.state_space import StateSpace
+
 __all__ = [
     "CLASSIFIERS",
     "CNN",
@@ -26,6 +28,7 @@ __all__ = [
     "LSTMClassifier",
     "Network",
     "Standardise",
+    "StateSpace",
 ]
 
 
@@ -213,8 +216,13 @@ class _Pooled(nn.Module):
         return self.readout(self.dropout(self.represent(values)))
 
 
-NETWORKS: tuple[type, ...] = (MLP, LSTM, TCN, LSTMClassifier, CNN)
+NETWORKS: tuple[type, ...] = (MLP, LSTM, TCN, StateSpace, LSTMClassifier, CNN)
 """Those that a model folder may name."""
 
-SURROGATES: dict[str, Network] = {"mlp": MLP(), "lstm": LSTM(), "tcn": TCN()}
+SURROGATES: dict[str, Network] = {
+    "mlp": MLP(),
+    "lstm": LSTM(),
+    "tcn": TCN(),
+    "state_space": StateSpace(),
+}
 CLASSIFIERS: dict[str, Network] = {"cnn": CNN(), "lstm": LSTMClassifier()}

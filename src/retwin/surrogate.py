@@ -134,6 +134,7 @@ DEFAULTS = {
     "MLP": Training(epochs=20, batch=256, rate=5e-3),
     "LSTM": Training(epochs=10, batch=32, rate=5e-3),
     "TCN": Training(epochs=10, batch=32, rate=5e-3),
+    "StateSpace": Training(epochs=40, batch=16, rate=1e-2),
 }
 
 
@@ -151,7 +152,7 @@ def fit_surrogate(
     ----------
     twin: commands and nominal outputs; faults in `observed` do not matter. A tenth of the
         trajectories is held out for validation and another tenth for the reported error.
-    network: `MLP` (no memory, the default), `LSTM` or `TCN`.
+    network: `MLP` (no memory, the default), `LSTM`, `TCN` or `StateSpace`.
     seed: same seed, same weights on the same machine.
     training: epochs, batch, rate; by default what suits the network.
 

@@ -107,6 +107,7 @@ def test_plots_are_valid_for_plotly(study: Study) -> None:
         "noise",
         "pit",
         "bands",
+        "learning",
         "poses",
     ]
     for plot in plots:

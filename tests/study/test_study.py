@@ -21,6 +21,9 @@ from retwin.study import SOURCES, possible_sources
 from retwin.study.files import Files, Job, Roles
 from retwin.study.trial import SEES, Trial
 from retwin.study.work import Work
+from retwin.twins.armpi import KINEMATIC
+from retwin.twins.command_side import CommandSide, command_side_parameters
+from retwin.twins.parametric import ParametricTwin
 
 PLAN = rt.StudyPlan(runs=2, per_class=10, folds=2, seed=3)
 COMMAND = "study armpi --runs 2 --per-class 10 --folds 2 --seed 3 --processes 2 --out".split()  # noqa: SIM905
@@ -236,17 +239,16 @@ def test_a_study_grows(finished: tuple[dict, Path], case: rt.Case, tmp_path: Pat
     out = tmp_path / "grown"
     shutil.copytree(finished[1], out)
     kept = {p: p.stat().st_mtime_ns for p in (out / "work").rglob("*") if p.is_file()}
-    sources = ("dt", "dt_noise", "mean_corrected", "ibg_rg")
+    sources = ("dt", "dt_noise")
     plan = replace(PLAN, runs=1, sources=sources, learning_curve=True)
     results = rt.run_study(case, plan, rt.StudyData(), out, processes=2)
     assert {p: p.stat().st_mtime_ns for p in kept} == kept
     assert list(results["sources"]) == list(sources)
-    first = finished[0]["sources"]["ibg_rg"]
-    assert results["sources"]["ibg_rg"]["predictions"] == first["predictions"][:1]
+    first = finished[0]["sources"]["dt"]
+    assert results["sources"]["dt"]["predictions"] == first["predictions"][:1]
     assert results["sources"]["dt"]["generate_s"] is None
     curve = [(row["source"], row["healthy"]) for row in results["learning_curve"]]
-    assert [count for name, count in curve if name == "ibg_rg"] == [1, 2, 4, 5]
-    assert ("dt", 1) not in curve
+    assert curve == [("dt_noise", count) for count in (1, 2, 4, 5)]
     assert rt.write_report(out).stat().st_size < 10_000_000
 
 
@@ -255,6 +257,9 @@ def test_every_source_is_made(
     emulated: rt.Trajectories, twin_set: rt.Trajectories, case: rt.Case, tmp_path: Path
 ) -> None:
     """All fourteen, small: each predicts every trajectory and says what it cost."""
+    free = command_side_parameters(KINEMATIC.inputs)
+    quick = ParametricTwin(CommandSide(KINEMATIC, nominal=KINEMATIC.position), free)
+    case = replace(case, parametric=quick)
     place = np.array([np.flatnonzero(emulated.labels == name)[:5] for name in case.classes])
     parts = {
         "twin": twin_set,

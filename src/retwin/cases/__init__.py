@@ -7,11 +7,12 @@ from collections.abc import Callable
 
 from retwin.case import Case
 from retwin.cases.armpi import armpi
+from retwin.cases.tanks import tanks
 from retwin.errors import InputError
 
-__all__ = ["armpi", "get"]
+__all__ = ["armpi", "get", "tanks"]
 
-_BUILT_IN: dict[str, Callable[[], Case]] = {"armpi": armpi}
+_BUILT_IN: dict[str, Callable[[], Case]] = {"armpi": armpi, "tanks": tanks}
 
 
 def get(name: str) -> Case:

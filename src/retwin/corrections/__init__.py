@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from retwin.corrections.additive import Additive
 from retwin.corrections.chain import Chain, calibrated, readings, recorded
 from retwin.corrections.command_space import CommandSpace
 from retwin.corrections.delay_offset import DelayOffset
@@ -11,6 +12,7 @@ from retwin.corrections.sampled_sensor import SampledSensor
 __all__ = [
     "NAMED_OPERATORS",
     "OPERATORS",
+    "Additive",
     "Chain",
     "CommandSpace",
     "Context",
@@ -24,9 +26,10 @@ __all__ = [
     "recorded",
 ]
 
-OPERATORS: tuple[type, ...] = (DelayOffset, CommandSpace, SampledSensor, Chain)
+OPERATORS: tuple[type, ...] = (Additive, DelayOffset, CommandSpace, SampledSensor, Chain)
 """Those that a model folder may name."""
 NAMED_OPERATORS: dict[str, Correction] = {
+    "additive": Additive(),
     "delay_offset": DelayOffset(),
     "command_space": Chain(CommandSpace(), SampledSensor()),
 }

@@ -34,7 +34,7 @@ from retwin.diagnosis.hypotheses import (
 from retwin.errors import InputError
 from retwin.faults import Fault, SteadyStateError, Stuck
 from retwin.models import read_model, write_model
-from retwin.residual import ResidualModel
+from retwin.residual import Residual, ResidualModel
 from retwin.surrogate import Surrogate
 from retwin.trajectories import Trajectories
 from retwin.twins.protocol import HEALTHY, Progress
@@ -184,7 +184,7 @@ FAULTS: tuple[type, ...] = (Stuck, SteadyStateError)
 @torch.no_grad()
 def fit_inversion(
     surrogate: Surrogate,
-    residual: ResidualModel,
+    residual: Residual,
     calibration: Trajectories,
     faults: Mapping[str, Fault | None],
 ) -> InversionDiagnoser:
@@ -201,6 +201,13 @@ def fit_inversion(
     InputError: no healthy trajectory, and whatever `InversionDiagnoser` refuses.
 
     """
+    if not isinstance(residual, ResidualModel):
+        raise InputError(
+            "residual",
+            expected="a residual model with one z per movement",
+            got=type(residual).__name__,
+            remedy="fit it with CommandSpace",
+        )
     healthy = calibration.with_label(HEALTHY)
     if not len(healthy):
         raise InputError(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from retwin.residual.fitting import fit_residual, infer_discrepancy
 from retwin.residual.model import ResidualModel, segment
+from retwin.residual.protocol import Residual, load_residual
+from retwin.residual.sequence import SequenceMixture, SequenceResidual
 from retwin.residual.settings import NAMED_DENSITIES, Density, Flow, Mixture, Refinement
 
 __all__ = [
@@ -12,8 +14,12 @@ __all__ = [
     "Flow",
     "Mixture",
     "Refinement",
+    "Residual",
     "ResidualModel",
+    "SequenceMixture",
+    "SequenceResidual",
     "fit_residual",
     "infer_discrepancy",
+    "load_residual",
     "segment",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -24,7 +24,10 @@ from retwin.errors import InputError
 from retwin.faults import Fault, draw_faults, faulty_commands, frozen_from
 from retwin.mixture import BernoulliHead
 from retwin.residual.model import ResidualModel, segment
+from retwin.residual.penalties import penalties
 from retwin.residual.refining import refine
+from retwin.residual.sequence import SequenceMixture, SequenceResidual
+from retwin.residual.sequence_fitting import fit_sequence
 from retwin.residual.settings import Density, Mixture
 from retwin.residual.targets import Targets
 from retwin.segments import Segments
@@ -53,18 +56,48 @@ def infer_discrepancy(
     return context, correction.infer(context, *_measured(trajectories))
 
 
+@overload
+def fit_residual(
+    surrogate: Surrogate,
+    calibration: Trajectories,
+    correction: Correction = ...,
+    density: Density = ...,
+    *,
+    seed: int,
+    calibrate_on: str | Mapping[str, Fault | None] = ...,
+    bounds: NDArray | None = ...,
+    segments: Segments | str = ...,
+    progress: Progress | None = ...,
+) -> ResidualModel: ...
+
+
+@overload
+def fit_residual(
+    surrogate: Surrogate,
+    calibration: Trajectories,
+    correction: Correction,
+    density: SequenceMixture,
+    *,
+    seed: int,
+    calibrate_on: str | Mapping[str, Fault | None] = ...,
+    bounds: NDArray | None = ...,
+    segments: Segments | str = ...,
+    progress: Progress | None = ...,
+) -> SequenceResidual: ...
+
+
 def fit_residual(
     surrogate: Surrogate,
     calibration: Trajectories,
     correction: Correction = DelayOffset(),  # noqa: B008 - a frozen config
-    density: Density = Mixture(),  # noqa: B008 - a frozen config
+    density: Density | SequenceMixture = Mixture(),  # noqa: B008 - a frozen config
     *,
     seed: int,
     calibrate_on: str | Mapping[str, Fault | None] = "healthy",
     bounds: NDArray | None = None,
     segments: Segments | str = "commands",
     progress: Progress | None = None,
-) -> ResidualModel:
+) -> ResidualModel | SequenceResidual:
     """Fit the RG to measured trajectories, outputs only (Eq. 7–10).
 
     Parameters
@@ -73,7 +106,8 @@ def fit_residual(
     calibration: real trajectories with commands. As few as six do; fewer than three leave none to
         validate on (a warning).
     correction: what z means; a sensor in it is fitted too.
-    density: what the law of z may look like.
+    density: what the law of z may look like; a `SequenceMixture` for an operator with one z per
+        sample, which learns from one record too.
     calibrate_on: "healthy" by default: the offset would absorb the faults of others. "all", as if
         there were no faults. Or what fault each label stands for, `case.faults`: then all
         trajectories serve, and an operator that can (`severities`) tells fault and gap apart.
@@ -87,13 +121,16 @@ def fit_residual(
 
     """
     _check_match(surrogate, calibration)
-    keep, faults = _chosen(calibration, calibrate_on, getattr(correction, "severities", False))
+    stepwise = correction.resolution == "step" or isinstance(density, SequenceMixture)
+    keep, faults = _chosen(
+        calibration, calibrate_on, getattr(correction, "severities", False), 1 if stepwise else 3
+    )
     used = calibration[keep]
     if isinstance(segments, str):
         rule, parts = segments, segment(used.commands, used.nominal, segments)
     else:
         rule, parts = "commands", segments[keep]
-    if not parts.valid.any():
+    if not (stepwise or parts.valid.any()):
         raise InputError(
             "calibration",
             expected="trajectories with movements",
@@ -102,6 +139,10 @@ def fit_residual(
         )
     context = _context(surrogate, used, parts, faults)
     correction, found = calibrated(correction, context, *_measured(used))
+    if isinstance(density, SequenceMixture):
+        return fit_sequence(
+            used, correction, density, context, found, seed=seed, bounds=bounds, progress=progress
+        )
     with isolated(seed):
         model = ResidualModel(
             correction, density, inputs=used.inputs, outputs=used.outputs, segmentation=rule
@@ -179,6 +220,7 @@ def _chosen(
     calibration: Trajectories,
     calibrate_on: str | Mapping[str, Fault | None],
     severities: bool,
+    enough: int,
 ) -> tuple[NDArray, list[Fault | None] | None]:
     """Which trajectories serve, and the faults in them, where they are known and can be told."""
     labels = calibration.labels
@@ -203,7 +245,7 @@ def _chosen(
             got=f"labels {sorted(calibration.known_labels) or 'none'}",
             remedy="label healthy trajectories, or calibrate on 'all'",
         )
-    if keep.sum() < 3:
+    if keep.sum() < enough:
         warnings.warn(
             f"calibration: {keep.sum()} trajectories to calibrate on, at least three are needed to "
             "hold one out; training runs to its last epoch without validation",
@@ -261,12 +303,8 @@ def _objective(density: Density) -> Loss:
         # Unknown blocks are left out of the likelihood; a placeholder keeps them finite.
         told = law.block_log_prob(z)
         nll = -torch.where(known, told, 0.0).sum() / known.sum().clamp_min(1) * known.shape[-1]
-        mean = law.mean
-        step = (mean[:, 1:] - mean[:, :-1]) / model.scale
-        both = valid[:, 1:] & valid[:, :-1]
-        rough = (step.square().sum(-1) * both).sum() / both.sum().clamp_min(1)
-        beyond = torch.relu(mean.abs() - model.bounds) / model.scale
-        outside = (beyond.square().sum(-1) * valid).sum() / valid.sum().clamp_min(1)
-        return nll + density.smoothness * rough + density.boundedness * outside
+        return nll + penalties(
+            law.mean, model.bounds, model.scale, valid, density.smoothness, density.boundedness
+        )
 
     return loss

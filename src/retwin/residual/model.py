@@ -58,7 +58,8 @@ class ResidualModel(nn.Module):
                 "correction",
                 expected="an operator with one z per movement",
                 got=repr(correction),
-                remedy="use DelayOffset, CommandSpace, or a Chain of one with a SampledSensor",
+                remedy="use DelayOffset, CommandSpace, or a Chain of one with a SampledSensor; or, "
+                "for one z per sample, a SequenceMixture as the density",
             )
         self.latent = correction.latent(inputs, outputs)
         self.emulated = False

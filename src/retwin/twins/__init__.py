@@ -28,6 +28,7 @@ BUILT_IN: dict[str, tuple[str, str, str]] = {
         "EmulatedArmPi",
         "stands in for the real arm: delays, backlash, missed movements, polling",
     ),
+    "tanks": ("retwin.twins.tanks", "TanksTwin", "two cascaded tanks, the upper level hidden"),
 }
 """Name to the module, the twin in it or what makes one, and what it is."""
 
