@@ -139,9 +139,10 @@ def _costs(work: Work, source: str) -> dict[str, Any]:
     """
     costs: dict[str, list[dict[str, Any]]] = {}
     for job in _with_all_before(work, work.diagnoses(source)):
-        own = job.name in (source, *SOURCES[source].pool)
-        part = ("own" if own else "other") if job.kind == "diagnosis" else f"{job.kind} {job.name}"
-        costs.setdefault(part, []).append(work.files.costs(job))
+        costs.setdefault(f"{job.kind} {job.name}", []).append(work.files.costs(job))
+    diagnoses = [part for part in costs if part.startswith("diagnosis ")]
+    before = [part for part in costs if part not in diagnoses]
+    own = [f"diagnosis {name}" for name in (source, *SOURCES[source].pool)]
 
     notes = [job["notes"] for part in costs.values() for job in part if "notes" in job]
 
@@ -150,15 +151,14 @@ def _costs(work: Work, source: str) -> dict[str, Any]:
         known = [value for value in each if value is not None]
         return sum(known) if known else None
 
-    made_before = [part for part in costs if part not in ("own", "other")]
     runs = total("twin_runs", *costs)
-    size = total("trajectories", "own")
+    size = total("trajectories", *own)
     return {
-        "update_s": total("seconds", *made_before) or 0.0,
-        "generate_s": total("generate", "own", "other"),
+        "update_s": total("seconds", *before) or 0.0,
+        "generate_s": total("generate", *diagnoses),
         "generated": None if size is None else round(size),
-        "train_s": total("train", "own", "other"),
-        "predict_s": total("predict", "own"),
+        "train_s": total("train", *diagnoses),
+        "predict_s": total("predict", *own),
         "twin_runs": 0 if runs is None else round(runs),
         "notes": sorted(set(notes)),
     }
