@@ -28,6 +28,9 @@ bench: install
 	$(BIN)/python benchmarks/generation.py
 	$(BIN)/python benchmarks/fitting.py
 	$(BIN)/python benchmarks/command_space.py
+	$(BIN)/python benchmarks/inversion.py
+	$(BIN)/python benchmarks/updating.py
+	$(BIN)/python benchmarks/residual.py
 	$(BIN)/python benchmarks/importing.py
 	$(BIN)/python benchmarks/twins.py
 	$(BIN)/python benchmarks/fmu.py

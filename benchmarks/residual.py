@@ -36,9 +36,13 @@ SHAPES = {
 
 
 def main() -> None:
+    folder = os.environ.get("RETWIN_DATA")
+    if not folder:
+        print("residual: set RETWIN_DATA to the folder of the public data")
+        return
     torch.set_num_threads(1)
     case = rt.cases.armpi()
-    real = rt.load(Path(os.environ["RETWIN_DATA"]) / "armpi" / "real_a.mat", case=case)
+    real = rt.load(Path(folder) / "armpi" / "real_a.mat", case=case)
     surrogate = rt.fit_surrogate(rt.generate(case.twin, case, per_class=40, seed=0), seed=0)
     rows: dict[str, dict[str, float]] = {}
     for kind, correction, on in (

@@ -6,7 +6,7 @@ row leaves unseen costs nothing. The integral over x is Laplace's (Tierney and K
 Assoc. 81, 82, 1986); Student's t, which lets glitches pass, is met by reweighted least squares
 (Lange, Little and Taylor, J. Am. Stat. Assoc. 84, 881, 1989).
 
-The constants here are numerical: none was chosen on a score. Those of the noise are those of
+The constants here are numerical: they trade time for accuracy. Those of the noise are those of
 `retwin.corrections.command_inference`.
 """
 

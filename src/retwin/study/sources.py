@@ -96,7 +96,9 @@ def _randomised(trial: Trial) -> Twin:
 
 
 def _noisy(trial: Trial) -> Twin:
-    return NoisyTwin(trial.surrogate, residual_scale(trial.healthy), stride=trial.stride)
+    healthy = trial.healthy
+    scale = residual_scale(healthy)
+    return NoisyTwin(trial.surrogate, scale, stride=trial.stride, emulated=healthy.emulated)
 
 
 def _mean_corrected(trial: Trial) -> Twin:
