@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from retwin.corrections import Correction
 from retwin.faults import Fault, Stuck
+from retwin.networks import MLP, Network
+from retwin.residual import Density, Mixture, SequenceMixture
+from retwin.training import Training
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.protocol import Progress, Twin
@@ -87,6 +90,10 @@ class Case:
         units, seed); None when the case cannot tell what that does to its outputs.
     published: the figures of a paper to show beside ours: source to metric to text.
     body: what can be drawn of the system; None when there is nothing to draw.
+    network, training: of the surrogate; None trains it as suits the network.
+    density: the law of the gap, of one value per sample where the correction has that resolution.
+    records: splits a file into what calibrates and what tests, where a benchmark says so; None
+        when files hold one set.
 
     """
 
@@ -104,11 +111,20 @@ class Case:
     encoder_noise: Callable[[Trajectories, float, int], Trajectories] | None = None
     published: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     body: Body | None = None
+    network: Network = MLP()  # noqa: RUF009 - frozen
+    training: Training | None = None
+    density: Density | SequenceMixture = Mixture()  # noqa: RUF009 - frozen
+    records: Callable[[Path], tuple[Trajectories, Trajectories]] | None = None
 
     @property
     def classes(self) -> tuple[str, ...]:
         """Class names in their fixed order."""
         return tuple(self.faults)
+
+    @property
+    def diagnosed(self) -> bool:
+        """Whether there is more than one class to tell apart."""
+        return len(self.faults) > 1
 
     @property
     def inputs(self) -> Channels:

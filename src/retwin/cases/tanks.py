@@ -18,7 +18,10 @@ from numpy.typing import NDArray
 from retwin.case import Case
 from retwin.corrections import Additive
 from retwin.errors import InputError
+from retwin.networks import LSTM
+from retwin.residual import SequenceMixture
 from retwin.storage import sha256
+from retwin.training import Training
 from retwin.trajectories import Source, Trajectories
 from retwin.twins.protocol import HEALTHY
 from retwin.twins.tanks import INPUTS, OUTPUTS, RATE, TanksTwin, tanks_parametric
@@ -36,14 +39,16 @@ class TankSampler:
 
     Parameters
     ----------
-    steps: samples per trajectory; one period of the slowest sine.
+    steps: samples per trajectory.
+    period: samples of one period of the slowest sine.
     mean, deviation: of the voltage, in V.
     slow, fast: number of sines at full strength, and of all; frequencies are evenly spaced.
     weak: amplitude of the faster ones against the slow ones'.
 
     """
 
-    steps: int = 1024
+    steps: int = 320
+    period: int = 1024
     mean: float = 2.8
     deviation: float = 1.0
     slow: int = 19
@@ -57,7 +62,7 @@ class TankSampler:
         amplitude = np.where(np.arange(1, self.fast + 1) <= self.slow, 1.0, self.weak)
         amplitude *= self.deviation * np.sqrt(2 / np.sum(amplitude**2))
         phase = rng.uniform(0, 2 * np.pi, size=(count, self.fast, 1))
-        turns = np.arange(1, self.fast + 1)[:, None] * np.arange(self.steps) / self.steps
+        turns = np.arange(1, self.fast + 1)[:, None] * np.arange(self.steps) / self.period
         waves = amplitude[:, None] * np.cos(2 * np.pi * turns + phase)
         voltage = self.mean + waves.sum(axis=1)
         return voltage.clip(0.0, 10.0)[..., None].astype(np.float32)
@@ -118,5 +123,9 @@ def tanks() -> Case:
         correction=Additive(),
         output_correction=Additive(),
         sensor_rate=RATE,
-        parametric=tanks_parametric(),
+        parametric=tanks_parametric(overflow=True),
+        network=LSTM(48),
+        training=Training(epochs=80, batch=8, rate=5e-3),
+        density=SequenceMixture(),
+        records=load_benchmark,
     )
