@@ -9,6 +9,7 @@ from statsmodels.stats.multitest import multipletests
 
 from retwin.statistics import (
     bootstrap,
+    bootstrap_means,
     bootstrap_weights,
     compare_runs,
     confusion,
@@ -139,3 +140,31 @@ def test_one_run_has_no_welch() -> None:
 @settings(max_examples=25, deadline=None)
 def test_holm_is_statsmodels_s(p: list[float]) -> None:
     np.testing.assert_allclose(holm(p), multipletests(p, method="holm")[1], atol=1e-12)
+
+
+def test_few_records_are_drawn_again_in_blocks() -> None:
+    white = np.random.default_rng(0).normal(size=(1, 4096, 1))
+    alike = np.cumsum(white, axis=1) - 0.99 * np.cumsum(np.roll(white, 1, axis=1), axis=1)
+    spread = bootstrap_means(white, draws=2000, seed=1).std()
+    assert spread == pytest.approx(1 / np.sqrt(4096), rel=0.25)
+    one_by_one = alike.std() / np.sqrt(4096)
+    assert bootstrap_means(alike, draws=2000, seed=1).std() > 2 * one_by_one
+
+
+def test_many_records_are_drawn_again_whole() -> None:
+    level = np.random.default_rng(0).normal(size=(200, 1, 1))
+    drawn = bootstrap_means(np.repeat(level, 50, axis=1), draws=2000, seed=1)
+    assert drawn.std() == pytest.approx(1 / np.sqrt(200), rel=0.15)
+
+
+@pytest.mark.parametrize("records", [1, 3, 8])
+def test_missing_samples_do_not_count_and_draws_are_paired(records: int) -> None:
+    rng = np.random.default_rng(2)
+    values = rng.normal(size=(records, 160, 2))
+    gaps = np.where(rng.random(values.shape) < 0.2, np.nan, values)
+    drawn = bootstrap_means(gaps, draws=500, seed=3)
+    assert drawn.mean(axis=0) == pytest.approx(np.nanmean(gaps, axis=(0, 1)), abs=0.03)
+    shifted = bootstrap_means(gaps + 1.0, draws=500, seed=3)
+    np.testing.assert_allclose(shifted - drawn, 1.0, atol=1e-9)
+    nothing = np.full_like(values, np.nan)
+    assert np.isnan(bootstrap_means(nothing, draws=5, seed=0)).all()

@@ -23,6 +23,7 @@ __all__ = [
     "METRICS",
     "Scores",
     "bootstrap",
+    "bootstrap_means",
     "bootstrap_weights",
     "compare_runs",
     "confusion",
@@ -42,6 +43,10 @@ METRICS = (
     "ece_classwise",
 )
 BINS = 10
+ENOUGH_RECORDS = 5
+"""Records from which whole ones are drawn again."""
+BLOCKS = 16
+"""Blocks of a record where it is the samples that are drawn again."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +146,41 @@ def bootstrap(
     return np.mean(
         [_weighted(metric, truth, run, weights, classes) for run in probabilities], axis=0
     )
+
+
+def bootstrap_means(values: NDArray, *, draws: int, seed: int) -> NDArray:
+    """Means over records and their samples of values (n, T, k), NaN where missing: (draws, k).
+
+    Every record counts alike. Records are drawn again with replacement. Where there are fewer than
+    `ENOUGH_RECORDS`, each record is instead made anew of `BLOCKS` circular blocks of its samples,
+    since neighbouring samples are alike (circular block bootstrap, Politis and Romano 1992). The
+    same seed draws the same records or blocks, so that two sources are paired.
+    """
+    rng = np.random.default_rng(seed)
+    n, steps, _ = values.shape
+    seen = np.isfinite(values)
+    sums = np.where(seen, values, 0.0)
+    if n >= ENOUGH_RECORDS:
+        with np.errstate(invalid="ignore"):
+            each = sums.sum(axis=1) / seen.sum(axis=1)
+        return rng.multinomial(n, np.full(n, 1 / n), size=draws) @ each / n
+    length = -(-steps // BLOCKS)
+    drawn = np.zeros((draws, values.shape[2]))
+    for record in range(n):
+        begins = rng.integers(steps, size=(draws, BLOCKS))
+        total, count = (
+            _moving_sums(each[record], length)[begins].sum(axis=1) for each in (sums, seen)
+        )
+        with np.errstate(invalid="ignore"):
+            drawn += total / count / n
+    return drawn
+
+
+def _moving_sums(values: NDArray, length: int) -> NDArray:
+    """Sums of `length` samples from each one on, (T, k); the end goes on with the beginning."""
+    around = np.concatenate([values, values[:length]]).astype(float)
+    whole = np.cumsum(np.concatenate([np.zeros_like(around[:1]), around]), axis=0)
+    return whole[length : length + len(values)] - whole[: len(values)]
 
 
 def compare_runs(a: Sequence[float], b: Sequence[float]) -> dict[str, float | None]:

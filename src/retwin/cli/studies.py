@@ -25,6 +25,10 @@ COLUMNS = {
     "balanced_accuracy": "balanced acc.",
     "auroc": "AUROC",
     "healthy_recall": "healthy recall",
+    "rmse": "RMSE",
+    "nrmse": "NRMSE",
+    "crps": "CRPS",
+    "coverage90": "in 90 % band",
 }
 
 
@@ -36,7 +40,13 @@ def study(
     test: Annotated[Path | None, typer.Option(help="Real set to test on.")] = None,
     real: Annotated[Path | None, typer.Option(help="One real set, split into folds.")] = None,
     folds: Annotated[int, typer.Option(help="Folds of --real.")] = 3,
-    sources: Annotated[str, typer.Option(help="Names joined by commas, or all.")] = "dt,ibg,ibg_rg",
+    data: Annotated[
+        Path | None, typer.Option(help="One file that the case splits itself, as tanks.")
+    ] = None,
+    sources: Annotated[
+        str | None,
+        typer.Option(help="Names joined by commas, or all; by default twin, IBG, IBG + RG."),
+    ] = None,
     classifier: Annotated[str | None, typer.Option(help="cnn, lstm or rocket.")] = None,
     runs: Annotated[int | None, typer.Option(help="Runs; the preset's if not given.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same result.", min=0)] = 0,
@@ -60,8 +70,10 @@ def study(
     system = rt.cases.get(case)
     if random_onset:
         system = system.with_random_onset()
+    plain = "dt" if system.diagnosed else "twin"
+    usual = (plain, "ibg", "ibg_rg")
     plan = StudyPlan(
-        sources=("dt",) if sources == "all" else tuple(sources.split(",")),
+        sources=usual if sources in (None, "all") else tuple(sources.split(",")),
         preset=preset,
         classifier=classifier,
         runs=runs,
@@ -75,7 +87,7 @@ def study(
     )
     if sources == "all":
         plan = replace(plan, sources=possible_sources(system, plan))
-    _run(system, plan, StudyData(twin_data, calibration, test, real), out, processes)
+    _run(system, plan, StudyData(twin_data, calibration, test, real, data), out, processes)
 
 
 def report(folder: Annotated[Path, typer.Argument(help="Folder of a study.")]) -> None:
@@ -143,19 +155,27 @@ def _table(results: Mapping[str, Any]) -> Table:
     n, runs = results["data"]["test"]["n"], results["runs"]
     kind = "EMULATED robot (no real measurements)" if results["emulated"] else results["title"]
     counted = f"{runs} run{'s' if runs > 1 else ''}"
-    table = Table(title=f"{kind}: {n} test trajectories, {counted}, {results['classifier']}")
-    table.add_column("training data")
-    for title in COLUMNS.values():
+    what = f"{n} test trajector{'ies' if n > 1 else 'y'}"
+    told = [kind + f": {what}", counted, results["classifier"]]
+    table = Table(title=", ".join(filter(None, told)))
+    sources = results["sources"]
+    shown = {
+        name: title for name, title in COLUMNS.items() if any(name in s for s in sources.values())
+    }
+    table.add_column("training data" if results["classes"] else "source")
+    for title in shown.values():
         table.add_column(title, justify="right")
-    for source in results["sources"].values():
-        table.add_row(source["title"], *(_over_runs(source[metric]) for metric in COLUMNS))
+    for source in sources.values():
+        table.add_row(source["title"], *(_over_runs(source[metric]) for metric in shown))
     for name, figures in results["published"].items():
-        title = results["sources"][name]["title"] if name in results["sources"] else name
-        table.add_row(f"  paper: {title}", *(figures.get(m, "") for m in COLUMNS), style="dim")
+        title = sources[name]["title"] if name in sources else name
+        table.add_row(f"  paper: {title}", *(figures.get(m, "") for m in shown), style="dim")
     return table
 
 
 def _over_runs(values: list[float]) -> str:
+    if not np.isfinite(values).all():
+        return "–"
     mean = f"{np.mean(values):.3f}"
     return mean if len(values) < 2 else f"{mean} ± {np.std(values, ddof=1):.3f}"
 
@@ -163,11 +183,12 @@ def _over_runs(values: list[float]) -> str:
 def _gaps(results: Mapping[str, Any]) -> list[str]:
     """What each source gains over the plain twin, with the interval over test trajectories."""
     told = []
+    first, metric = next(iter(results["sources"])), "macro_f1" if results["classes"] else "nrmse"
     for row in results["comparisons"]:
-        if row["b"] == "dt" and row["metric"] == "macro_f1":
+        if row["b"] == first and row["metric"] == metric:
             low, high = row["bootstrap_ci95"]
             told.append(
-                f"{row['a']} - dt, macro-F1: {row['mean_diff']:+.3f} "
+                f"{row['a']} - {first}, {COLUMNS[metric]}: {row['mean_diff']:+.3f} "
                 f"(95 % bootstrap interval {low:+.3f} to {high:+.3f})"
             )
     return told

@@ -2,5 +2,13 @@
 
 from retwin.fidelity.figures import Fidelity, Figure
 from retwin.fidelity.measure import measure_fidelity, measure_widening
+from retwin.fidelity.simulation import Simulation, simulate_records
 
-__all__ = ["Fidelity", "Figure", "measure_fidelity", "measure_widening"]
+__all__ = [
+    "Fidelity",
+    "Figure",
+    "Simulation",
+    "measure_fidelity",
+    "measure_widening",
+    "simulate_records",
+]

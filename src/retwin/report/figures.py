@@ -20,6 +20,7 @@ from retwin.report.learning import learning_curves
 from retwin.report.plots import DASHES, latent_names, missing, published_value
 from retwin.report.results import Results
 from retwin.report.sections import recalls, roc_curves
+from retwin.report.simulation import records
 from retwin.report.words import (
     CHROME,
     METRICS,
@@ -33,7 +34,18 @@ from retwin.report.words import (
 
 __all__ = ["FIGURES", "draw_figures"]
 
-FIGURES = ("scores", "confusion", "roc", "tde", "tpe", "noise", "pit", "bands", "learning")
+FIGURES = (
+    "scores",
+    "confusion",
+    "roc",
+    "simulation",
+    "tde",
+    "tpe",
+    "noise",
+    "pit",
+    "bands",
+    "learning",
+)
 """The figures of a study; its file is `figures/NAME.png`, of a second source `NAME-2.png`."""
 SCORES = ("macro_f1", "balanced_accuracy", "auroc", "healthy_recall")
 STYLES = dict(zip(DASHES, ("-", "--", ":", "-."), strict=True))
@@ -45,7 +57,7 @@ INK, MUTED, GRID, RULE, WASH, OBSERVED, ALARM = (
 def draw_figures(results: Results) -> dict[str, bytes]:
     """PNG by figure name; what lacks its data is left out."""
     drawn = {"scores": _scores(results), "confusion": _confusion(results), "roc": _roc(results)}
-    drawn["learning"] = _learning(results)
+    drawn |= {"learning": _learning(results), "simulation": _simulation(results)}
     for group in groups(results):
         drawn[group.name] = _latents(group.shown, group.source)
     for source, added in figure_names(results).items():
@@ -125,9 +137,44 @@ def _learning(results: Results) -> Figure | None:
         ticks = sorted({point[0] for points in lines.values() for point in points})
         axes.set_xticks(ticks, [str(tick) for tick in ticks], minor=False)
         axes.minorticks_off()
-        axes.set_ylim(-0.02, 1.02)
+        axes.set_ylim(*((0, None) if title == "RMSE" else (-0.02, 1.02)))
         _dress(axes, "healthy trajectories", title)
     axes.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _simulation(results: Results) -> Figure | None:
+    found = records(results)
+    if not found:
+        return None
+    figure = _figure(8, 0.5 + 3.4 * len(found))
+    grid = figure.subplots(2 * len(found), 1, squeeze=False, height_ratios=[2, 1] * len(found))
+    for each, (above, below) in zip(found, grid.reshape(-1, 2), strict=True):
+        for low, high, alpha, share in ((0, 4, 0.2, "90 %"), (1, 3, 0.35, "50 %")):
+            if each.bands is not None:
+                above.fill_between(
+                    each.time,
+                    each.bands[low],
+                    each.bands[high],
+                    color=_colour(each.banded),
+                    alpha=alpha,
+                    linewidth=0,
+                    label=f"{share} of the draws",
+                )
+        for name, mean in each.means.items():
+            style = {"color": _colour(name), "linestyle": STYLES[DASHES[slot(name) % len(DASHES)]]}
+            above.plot(each.time, mean, linewidth=1.3, label=source_name(name), **style)
+            below.plot(each.time, mean - each.observed, linewidth=1.1, **style)
+        above.plot(each.time, each.observed, color=INK, linewidth=1, label="measured")
+        below.axhline(0, color=RULE, linewidth=1)
+        unit = f", {each.unit}" if each.unit else ""
+        _dress(above, "", f"{each.output}{unit}")
+        _dress(below, "time, s", f"error{unit}")
+        above.set_title(f"{each.output} ({each.name})", fontsize=11, color=INK, loc="left")
+        for axes in (above, below):
+            axes.set_xlim(each.time[0], each.time[-1])
+    marks = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*marks, frameon=False, fontsize=9, ncols=3, loc="outside lower left")
     return figure
 
 

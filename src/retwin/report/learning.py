@@ -23,6 +23,7 @@ def learning_curves(results: Results) -> dict[str, dict[str, list[Point]]]:
     scores: dict[str, Callable[[CurvePoint], tuple[float | None, Interval | None]]] = {
         "macro-F1": lambda each: (_mean(each.macro_f1), each.macro_f1_interval),
         "healthy recall": lambda each: (_mean(each.healthy_recall), each.healthy_recall_interval),
+        "RMSE": lambda each: (_mean(each.rmse), each.rmse_interval),
         "coverage of the 90 % band": lambda each: (each.coverage90, each.coverage90_interval),
     }
     found: dict[str, dict[str, list[Point]]] = {}
@@ -69,7 +70,8 @@ def _panel(title: str, lines: dict[str, list[Point]]) -> Panel:
     counts = sorted({point[0] for points in lines.values() for point in points})
     ticks = {"tickvals": counts, "ticktext": [str(count) for count in counts]}
     x = axis("healthy trajectories", type="log", **ticks)
-    y = axis(title, range=[-0.02, 1.02], dtick=0.2, tickformat=".1f")
+    share = {"range": [-0.02, 1.02], "dtick": 0.2, "tickformat": ".1f"}
+    y = axis(title, **({"rangemode": "tozero"} if title == "RMSE" else share))
     data = [_trace(source, points) for source, points in lines.items()]
     return Panel(spec(data, x, y), f"{title} against calibration trajectories", title, height=320)
 

@@ -20,7 +20,7 @@ from retwin.report.figures import FIGURES, draw_figures
 from retwin.report.results import Results, read_results
 from retwin.report.scores import verdict
 from retwin.report.sections import SECTIONS
-from retwin.report.words import CHROME, PALETTE
+from retwin.report.words import CHROME, PALETTE, counted
 from retwin.storage import write_atomically
 
 __all__ = ["render", "write_report"]
@@ -127,17 +127,20 @@ def _subtitle(results: Results) -> list[str]:
     word = "emulated" if results.emulated else "real"
     if twin.n:
         source = f" ({twin.name})" if twin.name else ""
-        lines.append(f"A twin known by {twin.n} trajectories{source}")
+        lines.append(f"A twin known by {counted(twin.n, 'trajectory')}{source}")
         if calibration.n:
             used = calibration.n if calibration.used is None else len(calibration.used)
             source = f" ({calibration.name})" if calibration.name else ""
-            part = f"{used}" if used == calibration.n else f"{used} of {calibration.n}"
-            lines[-1] += f", updated with {part} {word} trajectories{source}"
+            of = "" if used == calibration.n else f"{used} of "
+            lines[-1] += (
+                f", updated with {of}{counted(calibration.n, f'{word} trajectory')}{source}"
+            )
         lines[-1] += "."
     if test.n or test.labels:
         source = f" ({test.name})" if test.name else ""
-        how = [f"Scored on {test.n or len(test.labels)} {word} trajectories{source}"]
-        how.append(f"{results.runs} run{'s' if results.runs != 1 else ''}")
+        size = test.n or len(test.labels)
+        how = [f"Scored on {counted(size, f'{word} trajectory')}{source}"]
+        how.append(counted(results.runs, "run"))
         if results.classifier:
             how.append(f"classifier {results.classifier.upper()}")
         if results.preset:

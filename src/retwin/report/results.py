@@ -178,12 +178,21 @@ class Fidelity(Part):
     figures: dict[str, Figure] = {}
 
 
+class Outputs(Part):
+    """What is measured."""
+
+    names: list[str] = []
+    units: list[str] = []
+
+
 class CurvePoint(Part):
     """Scores of a source calibrated on so many healthy trajectories."""
 
     source: str
     healthy: int
-    macro_f1: list[float]
+    macro_f1: list[float] = []
+    rmse: list[float] = []
+    rmse_interval: Interval | None = None
     macro_f1_interval: Interval | None = None
     healthy_recall: list[float] = []
     healthy_recall_interval: Interval | None = None
@@ -210,6 +219,7 @@ class Results(Part):
     classifier: str = ""
     runs: int
     classes: list[str] = []
+    outputs: Outputs = Outputs()
     emulated: bool = False
     data: Data = Data()
     sources: dict[str, Source] = Field(min_length=1)
@@ -245,6 +255,7 @@ class Results(Part):
             self._check_latents(name)
             self._check_bands(name)
         self._check_poses()
+        self._check_simulations()
         strange = set(self.data.test.labels) - set(self.classes)
         if strange and self.classes:
             raise ValueError(f"test label {min(strange)!r} is none of the classes")
@@ -284,6 +295,19 @@ class Results(Part):
         found = {name: self.arrays.get(f"bands/{source}/{name}") for name in names}
         there = {name: each for name, each in found.items() if each is not None}
         return there if len(there) == len(names) and there["seen"].ndim == 2 else {}
+
+    def _check_simulations(self) -> None:
+        full = self.arrays.get("simulation/observed", np.empty(0)).shape
+        if full == (0,):
+            return
+        shapes = {"ids": full[:1], "rate": ()}
+        for name in self.sources:
+            shapes |= {f"{name}/mean": full, f"{name}/bands": (*full[:1], 5, *full[1:])}
+        for name, shape in shapes.items():
+            found = self.arrays.get(f"simulation/{name}")
+            if (found is None and "/" not in name) or (found is not None and found.shape != shape):
+                got = "missing" if found is None else f"of shape {found.shape}"
+                raise ValueError(f"simulation/{name} is {got}, not of shape {shape}")
 
     def _check_poses(self) -> None:
         nominal, observed = self.arrays.get("pose/nominal"), self.arrays.get("pose/observed")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from retwin.report.results import Comparison, Results
 from retwin.report.words import (
     MANY,
     METRICS,
+    counted,
     in_sentence,
     mean_and_spread,
     number,
@@ -66,11 +68,11 @@ def verdict(results: Results) -> list[str]:
 
 def _leading(results: Results, metric: str, pair: tuple[str, str]) -> str | None:
     """Which other source has the best mean, if any is ahead of the headline's."""
-    best = max(results.sources, key=lambda name: _at_least(results, name, metric))
-    if best in pair or _at_least(results, best, metric) <= _at_least(results, pair[0], metric):
+    best = max(results.sources, key=lambda name: _rank(results, name, metric))
+    if best in pair or _rank(results, best, metric) <= _rank(results, pair[0], metric):
         return None
     found = [e for e in _between(results.comparisons, best, pair[0]) if e.metric == metric]
-    if not found or METRICS[metric].better < 1:
+    if not found:
         return None
     gap = f"{signed(found[0].mean_diff)}, 95 % interval {span(found[0].interval, sign=True)}"
     sure = "is ahead" if outcome(found[0]) == "better" else "has the best mean, undecided"
@@ -80,16 +82,17 @@ def _leading(results: Results, metric: str, pair: tuple[str, str]) -> str | None
     )
 
 
-def _at_least(results: Results, source: str, metric: str) -> float:
-    mean = results.sources[source].mean(metric)
-    return mean if np.isfinite(mean) else -np.inf
+def _rank(results: Results, source: str, metric: str) -> float:
+    """The more, the better; a target to meet ranks nobody."""
+    value = METRICS[metric].better * results.sources[source].mean(metric)
+    return value if np.isfinite(value) else -np.inf
 
 
 def _headline(found: Sequence[Comparison]) -> tuple[str, str] | None:
     """The updated twin against the plain one, else the first pair in the file."""
-    for updated in ("ibg_rg_command", "ibg_rg"):
-        if _between(found, updated, "dt"):
-            return updated, "dt"
+    for updated, plain in product(("ibg_rg_command", "ibg_rg"), ("dt", "twin")):
+        if _between(found, updated, plain):
+            return updated, plain
     return (found[0].a, found[0].b) if found else None
 
 
@@ -104,18 +107,19 @@ def _first(results: Results, found: Comparison) -> str:
         for each in (found.a, found.b)
     ]
     count = results.data.test.n or len(results.data.test.labels)
-    on = f"{count} test trajectories" if count else "the test trajectories"
+    on = counted(count, "test trajectory") if count else "the test trajectories"
     what = f"{in_sentence(METRICS[found.metric].name)} {means[0]} against {means[1]}"
     difference = (
         f"difference {signed(found.mean_diff)}, 95 % interval {span(found.interval, sign=True)}"
     )
     result = outcome(found)
+    doing, by = ("training", "on") if results.classes else ("simulation", "by")
     if result == "open":
         return (
-            f"On {on}, training on {a} cannot be told apart from training on {b}: {what}, "
+            f"On {on}, {doing} {by} {a} cannot be told apart from {doing} {by} {b}: {what}, "
             f"and the interval of the difference includes zero ({difference})."
         )
-    return f"On {on}, training on {a} is {result} than on {b}: {what} ({difference})."
+    return f"On {on}, {doing} {by} {a} is {result} than {by} {b}: {what} ({difference})."
 
 
 def _second(found: Sequence[Comparison]) -> list[str]:
@@ -144,7 +148,7 @@ def _third(found: Comparison) -> str:
     name = in_sentence(METRICS[found.metric].name)
     gap = f"{signed(found.mean_diff)} ({span(found.interval, sign=True)})"
     return (
-        f"Against {in_sentence(source_name('ibg'))}, with the same commands and faults, the "
+        f"Against {in_sentence(source_name('ibg'))}, given the same commands, the "
         f"difference in {name} is {gap}, {meaning}."
     )
 
@@ -166,7 +170,7 @@ def _score_table(results: Results, metrics: Sequence[str]) -> Table | None:
     shown = [name for name in metrics if _has(results, name)]
     if not shown:
         return None
-    columns = [Column("Training data", numeric=False)]
+    columns = [Column("Training data" if results.classes else "Source", numeric=False)]
     paper = any(_in_paper(results, name) for name in shown)
     for name in shown:
         columns += _score_columns(results, name, paper)
@@ -191,6 +195,8 @@ def _score_table(results: Results, metrics: Sequence[str]) -> Table | None:
 def _score_columns(results: Results, name: str, paper: bool) -> list[Column]:
     """One column, or two under the score's name where the paper has it too."""
     title = METRICS[name].name
+    if name in ("rmse", "crps") and results.outputs.units:
+        title += f", {results.outputs.units[0]}"
     if not paper:
         return [Column(title)]
     ours = Column("this study", group=title)
@@ -202,6 +208,8 @@ def _score_caption(results: Results, shown: Sequence[str]) -> str:
     text = runs if results.runs > 1 else "one run, so no spread over runs"
     if any(each.intervals for each in results.sources.values()):
         text += "; in brackets the 95 % bootstrap interval over test trajectories"
+        if not results.classes:
+            text += ", over blocks of their samples where there are fewer than five"
     text = f"{text[0].upper()}{text[1:]}. Bold: the best mean of a column, whoever has it."
     if any(_in_paper(results, name) for name in shown):
         text += (

@@ -27,6 +27,7 @@ from retwin.report.plots import caption, roc_plot
 from retwin.report.poses import poses
 from retwin.report.results import Dataset, Results, Source
 from retwin.report.scores import comparisons, further_scores, scores
+from retwin.report.simulation import simulation
 from retwin.report.words import (
     MANY,
     class_name,
@@ -187,7 +188,8 @@ def _costs(results: Results) -> Table | None:
     told = any("generate" in results.published.get(source, {}) for source in sources)
     paper = told and bulky in kept
     word = "Emulated" if results.emulated else "Real"
-    columns = [Column("Training data", numeric=False), Column(f"{word} data used", numeric=False)]
+    head = "Training data" if results.classes else "Source"
+    columns = [Column(head, numeric=False), Column(f"{word} data used", numeric=False)]
     columns += [
         Column("this study", group=bulky) if paper and name == bulky else Column(name)
         for name in kept
@@ -205,9 +207,11 @@ def _costs(results: Results) -> Table | None:
         rows.append(row)
     text = (
         "What a source costs in one run, with all that must be made before it: runs of the twin, "
-        "the update (fitting what makes its data), the generation of training data, the training "
-        "of the diagnoser, and the diagnosis of one trajectory. Each job on one core."
+        "the update (fitting what makes its data), the generation of trajectories"
     )
+    if results.classes:
+        text += ", the training of the diagnoser, and the diagnosis of one trajectory"
+    text += ". Each job on one core."
     if paper:
         text += (
             " The paper’s times are from another machine (Apple M1 Pro) and another twin, so "
@@ -288,6 +292,7 @@ SECTIONS: tuple[SectionMaker, ...] = (
     comparisons,
     confusion,
     roc,
+    simulation,
     discrepancy,
     fidelity,
     learning_curve,

@@ -17,6 +17,7 @@ __all__ = [
     "PALETTE",
     "Metric",
     "class_name",
+    "counted",
     "duration",
     "in_sentence",
     "label",
@@ -48,9 +49,12 @@ SOURCES = {
     "fine_tuned": "Fine-tuned",
     "inversion": "Fault inversion",
     "inversion_cnn": "Inversion with classifier",
+    "twin": "Digital twin",
+    "pi_ls_rg": "Least squares, then IBG + RG",
 }
 ORDER = (
     "dt",
+    "twin",
     "randomised",
     "ibg",
     "dt_noise",
@@ -158,6 +162,12 @@ def label(key: str) -> str:
     """`surrogate_fit_s` as `Surrogate fit`."""
     words = re.sub(r"_s$", "", key).replace("_", " ").strip()
     return words[:1].upper() + words[1:]
+
+
+def counted(count: int, what: str) -> str:
+    """`1 trajectory`, `5 trajectories`, `3 runs`."""
+    several = f"{what[:-1]}ies" if what.endswith("y") else f"{what}s"
+    return f"{count} {what if count == 1 else several}"
 
 
 def real_data(text: str | None) -> str:

@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from retwin.case import Case
 from retwin.corrected import generate
 from retwin.errors import InputError
@@ -41,6 +43,7 @@ class StudyData:
     calibration, test: two real sets.
     real: one real set, split into folds; every trajectory is tested once. Without any real set the
         case's emulator makes one, which is labelled "emulated" everywhere.
+    records: one file that the case itself splits into what calibrates and what tests.
 
     """
 
@@ -48,14 +51,17 @@ class StudyData:
     calibration: Path | None = None
     test: Path | None = None
     real: Path | None = None
+    records: Path | None = None
 
     def __post_init__(self) -> None:
-        if (self.calibration is None) != (self.test is None) or (self.real and self.test):
+        given = {name for name, file in vars(self).items() if file is not None} - {"twin"}
+        if given not in ({"calibration", "test"}, {"real"}, {"records"}, set()):
             raise InputError(
                 "real data",
-                expected="either calibration and test, or real alone",
-                got=", ".join(k for k, v in vars(self).items() if v and k != "twin"),
-                remedy="give --calibration FILE --test FILE, or --real FILE --folds K",
+                expected="either calibration and test, or real alone, or records alone",
+                got=", ".join(sorted(given)),
+                remedy="give --calibration FILE --test FILE, or --real FILE --folds K, "
+                "or --data FILE",
             )
 
 
@@ -209,14 +215,14 @@ def _about(
     """The data in words, for the results."""
     simulated = {"name": f"simulated by {type(case.twin).__name__}", "sha256": ""}
     emulated = {"name": f"emulated by {type(case.emulator).__name__}", "sha256": ""}
-    one = digests.get("real", emulated)
+    one = digests.get("records", digests.get("real", emulated))
     return {
         "twin": digests.get("twin", simulated),
         "calibration": digests.get("calibration", one),
         "test": digests.get("test", one),
         "protocol": (
             "one calibration set, one test set"
-            if data.test
+            if data.test or data.records
             else f"{plan.folds} folds: every trajectory is tested once, by models that never saw it"
         ),
     }
@@ -252,10 +258,12 @@ def _real(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> tuple[T
         found = load(path, case=case, progress=lambda share: tell(path.name, share))
         return _labelled(found, case, path.name)
 
+    if data.records is not None:
+        calibration, test = _records(case, data.records)
+        name = data.records.name
+        return _in_two(_labelled(calibration, case, name), _labelled(test, case, name))
     if data.calibration is not None and data.test is not None:
-        calibration, test = read(data.calibration), read(data.test)
-        both = Trajectories.concatenate([calibration, test])
-        return both, Roles.of([(range(len(calibration)), range(len(calibration), len(both)))])
+        return _in_two(read(data.calibration), read(data.test))
     if data.real is not None:
         real = read(data.real)
     elif case.emulator is not None:
@@ -271,7 +279,26 @@ def _real(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> tuple[T
     return real, Roles.of(real.folds(plan.folds, seed=plan.seed_of("folds", 0)))
 
 
+def _records(case: Case, path: Path) -> tuple[Trajectories, Trajectories]:
+    if case.records is None:
+        raise InputError(
+            "records",
+            expected="a case that says how its file is split",
+            got=f"the case {case.name!r}, which does not",
+            remedy="give --calibration FILE --test FILE, or --real FILE --folds K",
+        )
+    return case.records(path)
+
+
+def _in_two(calibration: Trajectories, test: Trajectories) -> tuple[Trajectories, Roles]:
+    """Both as one set, with their roles."""
+    both = Trajectories.concatenate([calibration, test])
+    return both, Roles.of([(range(len(calibration)), range(len(calibration), len(both)))])
+
+
 def _labelled(trajectories: Trajectories, case: Case, name: str) -> Trajectories:
+    if not case.diagnosed:
+        return trajectories.replace(labels=np.full(len(trajectories), case.classes[0]))
     unknown = set(trajectories.labels.tolist()) - set(case.classes)
     if unknown:
         raise InputError(

@@ -41,9 +41,10 @@ class Job:
 
     Attributes
     ----------
-    kind: "surrogate", "residual", "update", "diagnosis" or "fidelity".
+    kind: "surrogate", "residual", "update", "diagnosis", "simulation" or "fidelity".
     run, fold: from 0.
-    name: of the correction of a residual model, or of the source.
+    name: of the correction of a residual model, of the update that a surrogate stands for (none
+        for the twin as it is), or of the source.
     healthy: calibration trajectories of each class that are used, 0 for all there are.
 
     """
@@ -61,7 +62,7 @@ class Job:
 
     def before(self, kind: str, name: str) -> Job:
         """The job that leaves the result of that kind and name for this one."""
-        if kind == "surrogate":
+        if kind == "surrogate" and not name:
             return Job(kind, self.run)
         return replace(self, kind=kind, name=name)
 
@@ -73,8 +74,8 @@ class Files:
     folder: Path
 
     def path(self, job: Job) -> Path:
-        """A job's result: a model's folder, or an NPZ file of a diagnosis or of fidelity."""
-        suffix = {"diagnosis": ".npz", "fidelity": ".fidelity.npz"}
+        """A job's result: a model's folder, or an NPZ file of answers or of fidelity."""
+        suffix = {"diagnosis": ".npz", "simulation": ".npz", "fidelity": ".fidelity.npz"}
         return self._of(job, suffix.get(job.kind, f".{job.kind}"))
 
     def diagnoser(self, job: Job) -> Path:
@@ -83,7 +84,7 @@ class Files:
 
     def _of(self, job: Job, suffix: str) -> Path:
         run = self.folder / f"run-{job.run}"
-        if job.kind == "surrogate":
+        if job.kind == "surrogate" and not job.name:
             return run / job.kind
         fold = run / f"fold-{job.fold}"
         return (fold / f"healthy-{job.healthy}" if job.healthy else fold) / f"{job.name}{suffix}"

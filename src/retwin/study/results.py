@@ -14,19 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.diagnosis.pooled import pool_opinions
 from retwin.fidelity import Fidelity
 from retwin.models import read_about
-from retwin.statistics import (
-    METRICS,
-    bootstrap,
-    bootstrap_weights,
-    compare_runs,
-    confusion,
-    holm,
-    score,
-)
+from retwin.statistics import compare_runs, holm
 from retwin.storage import write_atomically
+from retwin.study.answers import Answers, answers
 from retwin.study.files import Job
 from retwin.study.sources import SOURCES
 from retwin.study.work import Work
@@ -36,12 +28,8 @@ from retwin.twins.protocol import HEALTHY
 __all__ = ["SCHEMA", "write_results"]
 
 SCHEMA = 1
-DRAWS = 10_000
-HOLM_FAMILY = ("macro_f1", "balanced_accuracy", "auroc")
 SHOWN = 3
 """Trajectories whose poses the report draws."""
-COMPARED = (*HOLM_FAMILY, "accuracy", "healthy_recall")
-CURVED = ("macro_f1", "healthy_recall")
 
 
 def write_results(
@@ -52,44 +40,36 @@ def write_results(
     `about` holds the description of the data, `provenance` how the study was called.
     """
     real = work.files.real_data()
-    tested = sorted(work.roles.tested)
-    test = real[tested]
-    classes = work.case.classes
-    truth = np.array([classes.index(label) for label in test.labels])
-    probabilities = {name: _probabilities(work, name, tested) for name in work.plan.sources}
-    weights = bootstrap_weights(truth, draws=DRAWS, seed=work.plan.seed_of("bootstrap", 0))
-    draws = {
-        name: {m: bootstrap(m, truth, runs, weights, classes) for m in COMPARED}
-        for name, runs in probabilities.items()
-    }
-    sources = {
-        name: _source(work, name, truth, probabilities[name], draws[name])
-        for name in work.plan.sources
-    }
+    test = real[sorted(work.roles.tested)]
+    found = answers(work)
+    drawn = {name: found.drawn(name) for name in work.plan.sources}
+    sources = {name: _source(work, found, name, drawn[name]) for name in work.plan.sources}
     judged = {name: _judged(work, name) for name in work.plan.sources}
-    fidelity = {name: found for name, found in judged.items() if found is not None}
+    fidelity = {name: each for name, each in judged.items() if each is not None}
+    diagnosed = work.case.diagnosed
     results = {
         "schema": SCHEMA,
         "case": work.case.name,
         "title": work.case.title,
         "preset": work.plan.preset,
-        "classifier": work.plan.classifier_name,
+        "classifier": work.plan.classifier_name if diagnosed else "",
         "runs": work.plan.number_of_runs,
-        "classes": list(classes),
+        "classes": list(work.case.classes) if diagnosed else [],
+        "outputs": vars(work.case.outputs),
         "emulated": real.emulated,
         "data": _data(work, real, test, about),
         "sources": sources,
         "published": {} if real.emulated else dict(work.case.published),
-        "comparisons": _comparisons(sources, draws),
+        "comparisons": _comparisons(found, sources, drawn),
         "surrogate": _surrogate(work),
-        "fidelity": {name: found.as_dict() for name, found in fidelity.items()},
-        "learning_curve": _learning_curve(work, truth, tested, weights) or None,
+        "fidelity": {name: each.as_dict() for name, each in fidelity.items()},
+        "learning_curve": _learning_curve(work, found) or None,
         "timing": _timing(work),
         "provenance": {**_machine(), **provenance},
     }
-    arrays = {f"probabilities/{name}": runs for name, runs in probabilities.items()}
-    for name, found in fidelity.items():
-        arrays |= _fidelity_arrays(name, found)
+    arrays = found.arrays()
+    for name, each in fidelity.items():
+        arrays |= _fidelity_arrays(name, each)
     arrays |= _poses(work, test)
     with write_atomically(out / "arrays.npz") as part:
         np.savez_compressed(part, allow_pickle=False, **arrays)
@@ -98,36 +78,21 @@ def write_results(
     return results
 
 
-def _probabilities(work: Work, source: str, tested: list[int], healthy: int = 0) -> NDArray:
-    """Of one source (runs, n_test, classes), in the order of `tested`; see `Job.healthy`."""
-    members = SOURCES[source].pool
-    if members:
-        return pool_opinions([_probabilities(work, member, tested, healthy) for member in members])
-    place = {index: i for i, index in enumerate(tested)}
-    out = np.full((work.plan.number_of_runs, len(tested), len(work.case.classes)), np.nan)
-    for job in work.diagnoses(source, healthy):
-        with np.load(work.files.path(job)) as made:
-            out[job.run, [place[i] for i in made["tested"].tolist()]] = made["probabilities"]
-    return out
-
-
-def _source(
-    work: Work, name: str, truth: NDArray, probabilities: NDArray, draws: Mapping[str, NDArray]
-) -> dict[str, Any]:
-    scores = [score(truth, run, work.case.classes) for run in probabilities]
-    predicted = probabilities.argmax(axis=2)
+def _source(work: Work, found: Answers, name: str, drawn: Mapping[str, NDArray]) -> dict[str, Any]:
     return {
-        **{metric: [getattr(each, metric) for each in scores] for metric in METRICS},
-        "intervals": {m: np.nanquantile(d, [0.025, 0.975]).tolist() for m, d in draws.items()},
-        "confusion": np.sum(
-            [confusion(truth, run, len(work.case.classes)) for run in predicted], axis=0
-        ).tolist(),
-        "predictions": predicted.tolist(),
+        **found.scores(name),
+        "intervals": {metric: _interval(each) for metric, each in drawn.items()},
+        **found.told(name),
         "title": SOURCES[name].title,
         "real_data": work.sees(name),
-        "fault_protocol_known": True,
         **_costs(work, name),
     }
+
+
+def _interval(drawn: NDArray) -> list[float] | None:
+    """The middle 95 % of draws; None where there is none."""
+    known = drawn[np.isfinite(drawn)]
+    return np.quantile(known, [0.025, 0.975]).tolist() if len(known) else None
 
 
 def _costs(work: Work, source: str) -> dict[str, Any]:
@@ -138,11 +103,12 @@ def _costs(work: Work, source: str) -> dict[str, Any]:
     None where nothing is done. `notes`: what went not quite well.
     """
     costs: dict[str, list[dict[str, Any]]] = {}
-    for job in _with_all_before(work, work.diagnoses(source)):
+    for job in _with_all_before(work, work.answers(source)):
         costs.setdefault(f"{job.kind} {job.name}", []).append(work.files.costs(job))
-    diagnoses = [part for part in costs if part.startswith("diagnosis ")]
-    before = [part for part in costs if part not in diagnoses]
-    own = [f"diagnosis {name}" for name in (source, *SOURCES[source].pool)]
+    kind = work.answers(source)[0].kind
+    answered = [part for part in costs if part.startswith(f"{kind} ")]
+    before = [part for part in costs if part not in answered]
+    own = [f"{kind} {name}" for name in (source, *SOURCES[source].pool)]
 
     notes = [job["notes"] for part in costs.values() for job in part if "notes" in job]
 
@@ -155,9 +121,9 @@ def _costs(work: Work, source: str) -> dict[str, Any]:
     size = total("trajectories", *own)
     return {
         "update_s": total("seconds", *before) or 0.0,
-        "generate_s": total("generate", *diagnoses),
+        "generate_s": total("generate", *answered),
         "generated": None if size is None else round(size),
-        "train_s": total("train", *diagnoses),
+        "train_s": total("train", *answered),
         "predict_s": total("predict", *own),
         "twin_runs": 0 if runs is None else round(runs),
         "notes": sorted(set(notes)),
@@ -187,49 +153,46 @@ def _timing(work: Work) -> dict[str, Any]:
     }
 
 
-def _learning_curve(
-    work: Work, truth: NDArray, tested: list[int], weights: NDArray
-) -> list[dict[str, Any]]:
+def _learning_curve(work: Work, found: Answers) -> list[dict[str, Any]]:
     """Scores and coverage of each source against the healthy trajectories it was calibrated on."""
     rows = []
     for source in work.plan.sources:
         counts = work.counts(source)
         for healthy in (*counts, 0) if counts else ():
-            runs = _probabilities(work, source, tested, healthy)
             row: dict[str, Any] = {"source": source, "healthy": healthy or work.healthy}
-            for metric in CURVED:
-                values = [getattr(score(truth, run, work.case.classes), metric) for run in runs]
-                drawn = bootstrap(metric, truth, runs, weights, work.case.classes)
-                row[metric] = values
-                row[f"{metric}_interval"] = np.nanquantile(drawn, [0.025, 0.975]).tolist()
-            found = _judged(work, source, healthy)
-            if found is not None:
-                covered = found.figures["coverage90"]
+            scores, drawn = found.scores(source, healthy), found.drawn(source, healthy)
+            for metric in found.curved:
+                row[metric] = scores[metric]
+                row[f"{metric}_interval"] = _interval(drawn[metric])
+            judged = _judged(work, source, healthy)
+            if judged is not None:
+                covered = judged.figures["coverage90"]
                 row |= {"coverage90": covered.value, "coverage90_interval": covered.interval}
             rows.append(row)
     return rows
 
 
 def _comparisons(
-    sources: Mapping[str, Mapping[str, Any]], draws: Mapping[str, Mapping[str, NDArray]]
+    found: Answers,
+    sources: Mapping[str, Mapping[str, Any]],
+    drawn: Mapping[str, Mapping[str, NDArray]],
 ) -> list[dict[str, Any]]:
     """Every pair of sources, the later one against the earlier one."""
     out = []
     for b, a in combinations(sources, 2):
-        rows = []
-        for metric in COMPARED:
-            gap = draws[a][metric] - draws[b][metric]
-            rows.append(
-                {
-                    "a": a,
-                    "b": b,
-                    "metric": metric,
-                    **compare_runs(sources[a][metric], sources[b][metric]),
-                    "p_holm": None,
-                    "bootstrap_ci95": np.nanquantile(gap, [0.025, 0.975]).tolist(),
-                }
-            )
-        family = [row for row in rows if row["metric"] in HOLM_FAMILY and row["p"] is not None]
+        rows: list[dict[str, Any]] = [
+            {
+                "a": a,
+                "b": b,
+                "metric": metric,
+                **compare_runs(sources[a][metric], sources[b][metric]),
+                "p_holm": None,
+                "bootstrap_ci95": _interval(drawn[a][metric] - drawn[b][metric]),
+            }
+            for metric in found.compared
+            if np.isfinite(drawn[a][metric] - drawn[b][metric]).any()
+        ]
+        family = [row for row in rows if row["metric"] in found.family and row["p"] is not None]
         for row, adjusted in zip(family, holm([row["p"] for row in family]), strict=True):
             row["p_holm"] = adjusted
         out += rows

@@ -1,7 +1,8 @@
-"""Where a diagnosis comes from: the sources that a study compares, updated twins and rivals.
+"""What a study compares: updated twins and their rivals, each a source of answers.
 
 A source is a row of PROTOCOL's table (docs/theory.md, How a study scores). It says which real data
-it may see, and how its diagnoser is made from what a `Trial` holds out to it.
+it may see, and how its twin or its diagnoser is made from what a `Trial` holds out to it. Where
+there are classes its answers are diagnoses, else simulations of the test records.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Protocol
 from retwin.case import Case
 from retwin.corrected import CorrectedTwin
 from retwin.diagnosis import Diagnoser, fine_tune, fit_dann, fit_inversion
+from retwin.residual import ResidualModel, SequenceMixture
 from retwin.twins.noisy import NoisyTwin, residual_scale
 from retwin.twins.protocol import Twin
 from retwin.twins.randomised import RandomisedTwin
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
     from retwin.study.plan import StudyPlan
     from retwin.study.trial import Trial
 
-__all__ = ["ROCKET", "SOURCES", "Need", "Source", "Trained", "lacking"]
+__all__ = ["NEEDS", "ROCKET", "SOURCES", "Need", "Source", "Trained", "lacking"]
 
 ROCKET = "rocket"
 """The classifier that is no network."""
@@ -34,6 +36,17 @@ Need = tuple[str, str]
 SURROGATE: Need = ("surrogate", "")
 OUTPUT: Need = ("residual", "output")
 COMMAND: Need = ("residual", "command")
+LEAST_SQUARES: Need = ("update", "pi_ls")
+IDENTIFIED: Need = ("surrogate", "pi_ls")
+IDENTIFIED_OUTPUT: Need = ("residual", "pi_ls")
+
+NEEDS: Mapping[Need, tuple[Need, ...]] = {
+    OUTPUT: (SURROGATE,),
+    COMMAND: (SURROGATE,),
+    IDENTIFIED: (LEAST_SQUARES,),
+    IDENTIFIED_OUTPUT: (IDENTIFIED,),
+}
+"""What must be there before the parts that sources need."""
 
 
 class Trained(Diagnoser, Protocol):
@@ -46,7 +59,7 @@ class Trained(Diagnoser, Protocol):
 
 @dataclass(frozen=True)
 class Source:
-    """Where a diagnosis comes from: one of `twin`, `diagnoser` and `pool` says how it is made.
+    """Where answers come from: one of `twin`, `diagnoser` and `pool` says how they are made.
 
     Attributes
     ----------
@@ -54,11 +67,12 @@ class Source:
     real_data: what it may see: "none", "timing" (of commands), "healthy", "unlabelled",
         "transductive" (outputs of the test set), "labelled".
     needs: what must be made first.
-    twin: the twin whose trajectories the study's classifier is trained on.
+    twin: the twin that simulates, or whose trajectories the study's classifier is trained on.
     diagnoser: makes the diagnoser itself.
     pool: sources whose probabilities are pooled.
     network: whether the study's classifier must be a network for it.
     package: that must be installed.
+    simulates: whether it only simulates, and has no place in a study of diagnoses.
 
     """
 
@@ -70,6 +84,7 @@ class Source:
     pool: tuple[str, ...] = ()
     network: bool = False
     package: str = ""
+    simulates: bool = False
 
     @property
     def per_fold(self) -> bool:
@@ -79,7 +94,8 @@ class Source:
     @property
     def parametric(self) -> bool:
         """Whether the case must say what is not known of its twin."""
-        return any(kind == "update" for kind, _ in self.needs) or self.twin is _randomised
+        updated = {LEAST_SQUARES, ("update", "pi_bayes"), IDENTIFIED}
+        return bool(updated & set(self.needs)) or self.twin is _randomised
 
     @property
     def judged(self) -> bool:
@@ -98,11 +114,11 @@ def _randomised(trial: Trial) -> Twin:
 def _noisy(trial: Trial) -> Twin:
     healthy = trial.healthy
     scale = residual_scale(healthy)
-    return NoisyTwin(trial.surrogate, scale, stride=trial.stride, emulated=healthy.emulated)
+    return NoisyTwin(trial.surrogate(), scale, stride=trial.stride, emulated=healthy.emulated)
 
 
 def _mean_corrected(trial: Trial) -> Twin:
-    return CorrectedTwin(trial.surrogate, trial.residual("output"), random=False)
+    return CorrectedTwin(trial.surrogate(), trial.residual("output"), random=False)
 
 
 def _adversarial(trial: Trial) -> Trained:
@@ -121,26 +137,32 @@ def _fine_tuned(trial: Trial) -> Trained:
 
 def _inversion(trial: Trial) -> Trained:
     residual = trial.residual("command")
-    return fit_inversion(trial.surrogate, residual, trial.healthy, trial.case.faults)
+    assert isinstance(residual, ResidualModel), "checked before the study begins"
+    return fit_inversion(trial.surrogate(), residual, trial.healthy, trial.case.faults)
 
 
 def _output(trial: Trial) -> Twin:
-    return CorrectedTwin(trial.surrogate, trial.residual("output"))
+    return CorrectedTwin(trial.surrogate(), trial.residual("output"))
 
 
 def _command(trial: Trial) -> Twin:
-    return CorrectedTwin(trial.surrogate, trial.residual("command"))
+    return CorrectedTwin(trial.surrogate(), trial.residual("command"))
+
+
+def _identified(trial: Trial) -> Twin:
+    return CorrectedTwin(trial.surrogate("pi_ls"), trial.residual("pi_ls"))
 
 
 SOURCES: Mapping[str, Source] = {
     "dt": Source("Digital twin", "none", diagnoser=_on_twin_data),
+    "twin": Source("Digital twin", "none", twin=lambda trial: trial.case.twin, simulates=True),
     "randomised": Source("Randomised twin", "none", twin=_randomised),
-    "ibg": Source("IBG alone", "timing", (SURROGATE,), twin=lambda trial: trial.surrogate),
+    "ibg": Source("IBG alone", "timing", (SURROGATE,), twin=lambda trial: trial.surrogate()),
     "dt_noise": Source("IBG + output noise", "healthy", (SURROGATE,), twin=_noisy),
     "pi_ls": Source(
         "Least squares (Eq. 2)",
         "healthy",
-        (("update", "pi_ls"),),
+        (LEAST_SQUARES,),
         twin=lambda trial: trial.updated("pi_ls"),
     ),
     "pi_bayes": Source(
@@ -159,6 +181,13 @@ SOURCES: Mapping[str, Source] = {
     ),
     "mean_corrected": Source("IBG + RG mean", "healthy", (SURROGATE, OUTPUT), twin=_mean_corrected),
     "ibg_rg": Source("IBG + RG", "healthy", (SURROGATE, OUTPUT), twin=_output),
+    "pi_ls_rg": Source(
+        "Least squares, then IBG + RG",
+        "healthy",
+        (IDENTIFIED, IDENTIFIED_OUTPUT),
+        twin=_identified,
+        simulates=True,
+    ),
     "ibg_rg_command": Source(
         "IBG + RG, command space", "healthy", (SURROGATE, COMMAND), twin=_command
     ),
@@ -179,6 +208,14 @@ SOURCES: Mapping[str, Source] = {
 
 def lacking(source: Source, case: Case, plan: StudyPlan) -> str:
     """What keeps a study from having that source; empty where nothing does."""
+    if case.diagnosed and source.simulates:
+        return "a case without classes, where twins simulate"
+    if not case.diagnosed and source.twin is None:
+        return f"a case with classes to tell apart; {case.name!r} has none"
+    if COMMAND in source.needs and case.correction == case.output_correction:
+        return f"a case with a correction besides the one at its outputs; {case.name!r} has none"
+    if source.diagnoser is _inversion and isinstance(case.density, SequenceMixture):
+        return "a correction per movement"
     if source.parametric and case.parametric is None:
         return f"a case that says what is free in its twin; {case.name!r} does not"
     if source.network and plan.classifier_name == ROCKET:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from retwin.corrections import Correction
 from retwin.diagnosis import NetworkDiagnoser, RocketDiagnoser, fit_diagnoser, fit_rocket
 from retwin.models import read_about
 from retwin.networks import Network
-from retwin.residual import ResidualModel
+from retwin.residual import Residual, load_residual
 from retwin.segments import Segments
 from retwin.study.files import Files, Job
 from retwin.study.plan import StudyPlan
@@ -71,14 +70,13 @@ class Trial:
 
     # What was made before.
 
-    @cached_property
-    def surrogate(self) -> Surrogate:
-        """The IBG."""
-        return Surrogate.load(self._made("surrogate", ""))
+    def surrogate(self, name: str = "") -> Surrogate:
+        """The IBG, of the twin as it is or after the update of that name."""
+        return Surrogate.load(self._made("surrogate", name))
 
-    def residual(self, name: str) -> ResidualModel:
+    def residual(self, name: str) -> Residual:
         """The RG with the correction of that name, see `correction`."""
-        return ResidualModel.load(self._made("residual", name))
+        return load_residual(self._made("residual", name))
 
     def diagnoser(self, source: str) -> NetworkDiagnoser:
         """The network that another source trained."""
@@ -103,8 +101,8 @@ class Trial:
         return self.case.parametric
 
     def correction(self, name: str) -> Correction:
-        """The paper's, at the outputs ("output"), or the case's own ("command")."""
-        return {"output": self.case.output_correction, "command": self.case.correction}[name]
+        """The case's own ("command"), else the paper's, at the outputs."""
+        return self.case.correction if name == "command" else self.case.output_correction
 
     @property
     def stride(self) -> int:

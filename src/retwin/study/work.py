@@ -10,23 +10,25 @@ import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from retwin.case import Case
-from retwin.corrected import CorrectedTwin
+from retwin.corrected import CorrectedTwin, generate
 from retwin.faults import Fault
-from retwin.fidelity import measure_fidelity, measure_widening
+from retwin.fidelity import measure_fidelity, measure_widening, simulate_records
 from retwin.models import write_model
-from retwin.residual import Density, Mixture, ResidualModel, fit_residual
+from retwin.residual import Density, Mixture, Residual, SequenceMixture, fit_residual
 from retwin.storage import write_atomically
 from retwin.study.files import Files, Job, Roles
 from retwin.study.plan import StudyPlan
-from retwin.study.sources import SOURCES, Trained
+from retwin.study.sources import NEEDS, SOURCES, Trained
 from retwin.study.trial import Trial
-from retwin.surrogate import fit_surrogate
+from retwin.surrogate import Surrogate, fit_surrogate
 from retwin.trajectories import Trajectories
 from retwin.twins.protocol import HEALTHY, Progress, Twin
 from retwin.updating import NPE, Posterior, Updated, identify, identify_bayes
@@ -37,6 +39,9 @@ ENOUGH = 5
 """Healthy calibration trajectories from which some can be kept back to widen bands."""
 CURVE = (1, 2, 4, 6, 8, 12, 16, 24, 32)
 """Healthy calibration trajectories of a learning curve, as far as there are more."""
+
+DRAWS = 500
+"""Simulations of a test record."""
 
 Costs = dict[str, Any]
 
@@ -62,7 +67,7 @@ class Work:
         found: dict[Job, tuple[Job, ...]] = {}
         waiting = [
             job for source in self.plan.sources for count in (0, *self.counts(source))
-            for job in (*self.diagnoses(source, count), *self.judgements(source, count))
+            for job in (*self.answers(source, count), *self.judgements(source, count))
         ]  # fmt: skip
         while waiting:
             job = waiting.pop()
@@ -71,33 +76,36 @@ class Work:
                 waiting += found[job]
         return found
 
-    def diagnoses(self, source: str, healthy: int = 0) -> list[Job]:
-        """The jobs whose predictions are a source's; a pooled source has those of its members."""
-        kind = SOURCES[source]
-        if kind.pool:
-            return [job for member in kind.pool for job in self.diagnoses(member, healthy)]
-        folds = range(len(self.roles.folds)) if kind.per_fold else (0,)
+    def answers(self, source: str, healthy: int = 0) -> list[Job]:
+        """The jobs whose answers are a source's; a pooled source has those of its members.
+
+        Diagnoses of test trajectories; where there are no classes, simulations of them.
+        """
+        made = SOURCES[source]
+        if made.pool:
+            return [job for member in made.pool for job in self.answers(member, healthy)]
+        folds = range(len(self.roles.folds)) if made.per_fold else (0,)
+        kind = "diagnosis" if self.case.diagnosed else "simulation"
         return [
-            Job("diagnosis", run, fold, source, healthy)
+            Job(kind, run, fold, source, healthy)
             for run in range(self.plan.number_of_runs)
             for fold in folds
         ]
 
     def judgements(self, source: str, healthy: int = 0) -> list[Job]:
-        """The jobs that tell how real a source's trajectories are.
+        """The jobs that tell how real a source's trajectories are, if there are some to compare.
 
         Of the first run: the chance in training is seen in the scores, at less cost.
         """
-        if not SOURCES[source].judged:
+        if not SOURCES[source].judged or (self._labels[self.roles.tested] == HEALTHY).sum() < 2:
             return []
         folds = range(len(self.roles.folds))
         return [Job("fidelity", 0, fold, source, healthy) for fold in folds]
 
     def needed(self, job: Job) -> tuple[Job, ...]:
         """What must be done before a job."""
-        needs = SOURCES[job.name].needs if job.kind in ("diagnosis", "fidelity") else ()
-        if job.kind == "residual":
-            needs = (("surrogate", ""),)
+        own = job.kind in ("diagnosis", "simulation", "fidelity")
+        needs = SOURCES[job.name].needs if own else NEEDS.get((job.kind, job.name), ())
         return tuple(job.before(*need) for need in needs)
 
     def counts(self, source: str) -> tuple[int, ...]:
@@ -109,8 +117,12 @@ class Work:
     @property
     def healthy(self) -> int:
         """Healthy calibration trajectories in the fold that has the fewest."""
-        labels = self.files.real_data().labels
-        return min(int((labels[list(part)] == HEALTHY).sum()) for part, _ in self.roles.folds)
+        return min(int((self._labels[list(part)] == HEALTHY).sum()) for part, _ in self.roles.folds)
+
+    @cached_property
+    def _labels(self) -> NDArray:
+        """Of all real trajectories."""
+        return self.files.real_data().labels
 
     # How each is done.
 
@@ -124,6 +136,7 @@ class Work:
             "residual": self._residual,
             "update": self._update,
             "diagnosis": self._diagnosis,
+            "simulation": self._simulation,
             "fidelity": self._fidelity,
         }[job.kind]
         started = time.perf_counter()
@@ -143,19 +156,32 @@ class Work:
         fold = self.roles.folds[job.fold]
         if job.kind in ("residual", "update"):
             sees = "labelled" if self._labels_serve else "healthy"
+        elif job.kind == "surrogate":
+            sees = "none"
         else:
-            sees = self.sees(job.name) if job.name else "none"
+            sees = self.sees(job.name)
         if sees == "none":
             fold = ((), tuple(self.roles.tested))
         return Trial(self.files, self.case, self.plan, fold, job, sees, progress)
 
     def _surrogate(self, trial: Trial, path: Path) -> Costs:
+        """The IBG of the twin as it is, or of the one whose parameters were updated."""
         data = self.files.twin_data()
-        fit_surrogate(data, seed=trial.seed("surrogate"), progress=trial.progress).save(path)
+        if trial.job.name:
+            twin, seed = trial.updated(trial.job.name), trial.seed("updated twin")
+            data = generate(twin, self.case, per_class=self.plan.per_class, seed=seed)
+        fit_surrogate(
+            data,
+            self.case.network,
+            seed=trial.seed("surrogate"),
+            training=self.case.training,
+            progress=trial.progress,
+        ).save(path)
         return {"twin_runs": len(data)}
 
     def _residual(self, trial: Trial, path: Path) -> Costs:
-        self._fitted(trial, self._calibration(trial), trial.job.name).save(path)
+        density = self.case.density
+        self._fitted(trial, self._calibration(trial), trial.job.name, density).save(path)
         return {}
 
     def _update(self, trial: Trial, path: Path) -> Costs:
@@ -189,6 +215,17 @@ class Work:
             np.savez(part, tested=np.array(trial.fold[1]), probabilities=probabilities)
         return {"train": trained - started - costs.get("generate", 0.0), **costs}
 
+    def _simulation(self, trial: Trial, path: Path) -> Costs:
+        """Simulate the test records from their commands alone, and score that sample by sample."""
+        make = SOURCES[trial.job.name].twin
+        assert make is not None, "checked before the study begins"
+        twin, records = make(trial), self.files.real_data()[list(trial.fold[1])]
+        started = time.perf_counter()
+        seed = trial.seed("simulate")
+        simulate_records(twin, records, draws=DRAWS, seed=seed, progress=trial.progress).save(path)
+        seconds = time.perf_counter() - started
+        return {"generate": seconds, "trajectories": DRAWS * len(records)}
+
     def _fidelity(self, trial: Trial, path: Path) -> Costs:
         """Hold a source's twin against the fold's healthy test trajectories."""
         held_out = self.files.real_data()[list(trial.fold[1])].with_label(HEALTHY)
@@ -217,7 +254,10 @@ class Work:
 
     def _rivals(self, trial: Trial, twin: CorrectedTwin) -> dict[str, Twin]:
         """What the residual model's shape is worth: its mean alone, and a single Gaussian."""
-        single = self._refitted(trial, self._calibration(trial), Mixture(components=1))
+        one: Density | SequenceMixture = Mixture(components=1)
+        if isinstance(self.case.density, SequenceMixture):
+            one = replace(self.case.density, components=1)
+        single = self._refitted(trial, self._calibration(trial), one)
         return {"mean_only": replace(twin, random=False), "single_gaussian": single}
 
     def _widening(self, trial: Trial) -> float | None:
@@ -230,24 +270,35 @@ class Work:
             return None
         seed = trial.seed("widening")
         fitted, kept = healthy.split(0.6, seed=seed)
-        twin = self._refitted(trial, fitted, Mixture())
+        twin = self._refitted(trial, fitted, self.case.density)
         return measure_widening(twin, kept, seed=seed, rate=self.case.sensor_rate)
 
-    def _refitted(self, trial: Trial, calibration: Trajectories, density: Density) -> CorrectedTwin:
+    def _refitted(
+        self, trial: Trial, calibration: Trajectories, density: Density | SequenceMixture
+    ) -> CorrectedTwin:
         """The corrected twin of a source, its RG fitted to other data or another shape."""
         (name,) = (name for kind, name in SOURCES[trial.job.name].needs if kind == "residual")
         residual = self._fitted(trial, calibration, name, density)
-        return CorrectedTwin(trial.surrogate, residual)
+        return CorrectedTwin(self._base(trial, name), residual)
+
+    def _base(self, trial: Trial, residual: str) -> Surrogate:
+        """The surrogate that the residual model of that name corrects."""
+        ((_, name),) = NEEDS["residual", residual]
+        return trial.surrogate(name)
 
     def _fitted(
-        self, trial: Trial, calibration: Trajectories, name: str, density: Density | None = None
-    ) -> ResidualModel:
+        self,
+        trial: Trial,
+        calibration: Trajectories,
+        name: str,
+        density: Density | SequenceMixture,
+    ) -> Residual:
         faults: Mapping[str, Fault | None] = self.case.faults
         return fit_residual(
-            trial.surrogate,
+            self._base(trial, name),
             calibration,
             trial.correction(name),
-            density or Mixture(),
+            density,
             seed=trial.seed("residual"),
             calibrate_on=faults if self._labels_serve else "healthy",
             progress=trial.progress,
