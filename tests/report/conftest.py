@@ -162,18 +162,38 @@ def _fidelity() -> dict[str, Any]:
     }
 
 
-def _poses(ids: list[str]) -> dict[str, NDArray]:
-    """A chain of four points that bends for 2 s; the second one's tip is 10 mm off."""
+def _portrait(rng: np.random.Generator, n: int) -> dict[str, NDArray]:
+    """n trajectories of 21 moments in 2 s with two movements; the last one was hardly measured."""
+    nominal = np.linspace(0, 0.2, 21)[:, None] * np.array([1.0, -1.0, 0.5])
+    observed = nominal + 0.004 * rng.standard_normal((n, 21, 3))
+    observed[-1, 5:] = np.nan
+    spread = 0.004 * np.array([-1.64, -0.67, 0, 0.67, 1.64])[:, None, None]
+    times = np.array([[0.1, 0.7, 1.0], [1.0, 1.6, 2.0]])
+    z = rng.normal(size=(n, 2, 2))
+    z[0, 1, 0] = np.nan
+    found = {
+        "commands": np.linspace(400, 600, 21)[:, None] * np.ones((n, 1, 4)),
+        "nominal": np.tile(nominal, (n, 1, 1)),
+        "observed": observed,
+        "bands": np.tile(nominal + spread, (n, 1, 1, 1)),
+        "times": np.tile(times, (n, 1, 1)),
+        "z": z,
+        "deviation": np.where(np.isnan(z), np.nan, 0.25),
+        "rate": np.array(10.0),
+    }
+    return {f"portrait/{name}": each.astype(np.float32) for name, each in found.items()}
+
+
+def _poses(n: int) -> dict[str, NDArray]:
+    """A chain of four points that bends for 2 s; every second one's tip is 10 mm off."""
     angle = np.linspace(0, 1, 21)[:, None] * np.arange(4)
     chain = 0.1 * np.stack([np.sin(angle), 0 * angle, np.cumsum(np.cos(angle), axis=1)], axis=2)
-    nominal = np.stack([chain, chain])
+    nominal = np.tile(chain, (n, 1, 1, 1))
     observed = nominal.copy()
-    observed[1, :, -1, 1] += 0.01
+    observed[1::2, :, -1, 1] += 0.01
     return {
         "pose/nominal": nominal.astype(np.float32),
         "pose/observed": observed.astype(np.float32),
-        "pose/ids": np.array(ids),
-        "pose/rate": np.array(10.0),
     }
 
 
@@ -225,6 +245,13 @@ def synthetic(*, runs: int = 10, per_class: int = 10) -> Study:
             "nrmse": {"x": 0.004, "y": 0.0042, "z": 0.0051},
         },
         "fidelity": {"ibg_rg": _fidelity()},
+        "inputs": {"names": [f"motor_{i}" for i in MOTORS], "units": ["0.24 deg"] * 4},
+        "outputs": {"names": ["x", "y", "z"], "units": ["m"] * 3},
+        "portrait": {
+            "source": "ibg_rg",
+            "movement": ["delay", "offset_motor_1"],
+            "movement_units": ["samples", "0.24 deg"],
+        },
         "learning_curve": [
             {
                 "source": "ibg_rg",
@@ -254,9 +281,7 @@ def synthetic(*, runs: int = 10, per_class: int = 10) -> Study:
             "machine": "2 cores",
         },
     }
-    test = results["data"]["test"]
-    faulty = test["labels"].index("Motor_1_Steady_state_error")
-    arrays |= _poses([test["ids"][0], test["ids"][faulty]])
+    arrays |= _portrait(rng, len(truth)) | _poses(len(truth))
     return results, arrays
 
 

@@ -108,7 +108,6 @@ def test_plots_are_valid_for_plotly(study: Study) -> None:
         "pit",
         "bands",
         "learning",
-        "poses",
     ]
     for plot in plots:
         for panel in plot.panels:

@@ -231,11 +231,11 @@ def test_everything_is_escaped(study: Study, write: Write) -> None:
     test["ids"][0] = results["data"]["calibration"]["used"][0] = evil
     results["sources"][evil] = results["sources"].pop("ibg")
     arrays[f"probabilities/{evil}".replace("/", "\\")] = arrays.pop("probabilities/ibg")
-    arrays["pose/ids"] = np.array([evil, evil])
     results["published"]["dt"]["macro_f1"] = evil
     told = results["fidelity"]["ibg_rg"]
     told["movement"][0] = told["outputs"][0] = told["rivals"][0] = evil
     told["figures"][f"ks/{evil}"] = told["figures"].pop("ks/delay")
+    results["portrait"]["movement"][0] = results["outputs"]["names"][0] = evil
     results["fidelity"][evil] = {**told, "movement": [evil]}
     arrays["bands/ibg_rg/ids"] = np.array([evil, evil])
     for each in results["comparisons"]:
@@ -243,7 +243,7 @@ def test_everything_is_escaped(study: Study, write: Write) -> None:
     page = write_report(write(study)).read_text(encoding="utf-8")
     assert "<script>alert" not in page
     assert "<img src=x>" not in page
-    assert page.count("<script") == page.count("</script") == 3
+    assert page.count("<script") == page.count("</script") == 5
     specs = re.search(r'<script type="application/json" id="specs">(.*?)</script>', page)
     assert specs is not None
     assert json.loads(specs[1])

@@ -2,13 +2,16 @@
 
 from retwin.fidelity.figures import Fidelity, Figure
 from retwin.fidelity.measure import measure_fidelity, measure_widening
+from retwin.fidelity.portrait import Portrait, portray
 from retwin.fidelity.simulation import Simulation, simulate_records
 
 __all__ = [
     "Fidelity",
     "Figure",
+    "Portrait",
     "Simulation",
     "measure_fidelity",
     "measure_widening",
+    "portray",
     "simulate_records",
 ]

@@ -16,6 +16,7 @@ __all__ = [
     "Block",
     "Cell",
     "Column",
+    "Explorer",
     "Facts",
     "Fold",
     "Forest",
@@ -160,6 +161,16 @@ class Facts:
 
 
 @dataclass(frozen=True)
+class Explorer:
+    """What a reader picks from; `content` is drawn by the page's script."""
+
+    caption: str
+    content: dict[str, Any]
+    keys: Sequence[Key] = ()
+    kind: ClassVar[str] = "explorer"
+
+
+@dataclass(frozen=True)
 class Fold:
     """A list that opens on demand."""
 
@@ -168,7 +179,7 @@ class Fold:
     kind: ClassVar[str] = "fold"
 
 
-Block = Prose | Table | Plot | Matrices | Facts | Fold
+Block = Prose | Table | Plot | Matrices | Facts | Fold | Explorer
 
 
 @dataclass(frozen=True)

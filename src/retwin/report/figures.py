@@ -13,6 +13,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
+from PIL import Image
 
 from retwin.report.curves import Band, Latent, bands
 from retwin.report.fidelity import figure_names, groups
@@ -79,8 +80,13 @@ def _figure(width: float, height: float) -> Figure:
 def _png(figure: Figure, emulated: bool) -> bytes:
     if emulated:
         figure.suptitle("EMULATED robot: no real measurements", color=ALARM, fontsize=10)
+    figure.set_dpi(160)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    # The page holds every figure as well; 256 colours are enough for them and a third of the bytes.
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB").quantize(256)
     file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=160, metadata={"Software": None})
+    image.save(file, format="png", optimize=True, dpi=(160, 160))
     return file.getvalue()
 
 

@@ -1,5 +1,5 @@
 // Draws the plots in the page's colours, and again when these or the width change.
-(() => {
+const page = (() => {
   "use strict";
   const specs = JSON.parse(document.getElementById("specs").textContent);
   const root = document.documentElement;
@@ -19,19 +19,21 @@
     return value;
   };
 
-  const draw = () => {
+  // The wheel scrolls the page, also over a picture in space.
+  const config = { displayModeBar: false, scrollZoom: false };
+  const plot = (place, data, layout, frames) => {
     const style = getComputedStyle(root);
-    for (const [id, spec] of Object.entries(specs)) {
-      const place = document.getElementById(id);
-      const layout = paint(spec.layout, style);
-      layout.height = spec.height * (root.dataset.print ? 0.72 : 1);
-      place.style.height = layout.height + "px";
-      layout.width = place.clientWidth;
-      // The wheel scrolls the page, also over a picture in space.
-      const config = { displayModeBar: false, scrollZoom: false };
-      Plotly.react(place, { data: paint(spec.data, style), layout, config, frames: spec.frames });
-    }
+    const height = layout.height * (root.dataset.print ? 0.72 : 1);
+    place.style.height = height + "px";
+    const painted = { ...paint(layout, style), height, width: place.clientWidth };
+    Plotly.react(place, { data: paint(data, style), layout: painted, config, frames });
   };
+  const drawn = [() => {
+    for (const [id, spec] of Object.entries(specs)) {
+      plot(document.getElementById(id), spec.data, { ...spec.layout, height: spec.height }, spec.frames);
+    }
+  }];
+  const draw = () => drawn.forEach((each) => each());
 
   draw();
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
@@ -52,4 +54,18 @@
     delete root.dataset.print;
     draw();
   });
+
+  // As `axis` and `spec` in plots.py.
+  const family = getComputedStyle(document.body).fontFamily;
+  const escaped = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
+  const axis = (text) => ({
+    title: { text: escaped(text), standoff: 8, font: { size: 13 } }, gridcolor: "@grid", linecolor: "@rule",
+    zeroline: false, fixedrange: true, automargin: true, ticks: "outside", tickcolor: "@rule", ticklen: 4,
+  });
+  const layout = {
+    font: { family, size: 13, color: "@muted" }, paper_bgcolor: "rgba(0,0,0,0)",
+    plot_bgcolor: "rgba(0,0,0,0)", margin: { l: 8, r: 12, t: 8, b: 8 }, showlegend: false,
+    dragmode: false, hoverlabel: { font: { family, size: 13 } },
+  };
+  return { axis, drawn, escaped, layout, plot };
 })();

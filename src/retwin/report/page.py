@@ -15,7 +15,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from retwin.report.blocks import Plot, Section
+from retwin.report.blocks import Explorer, Plot, Section
 from retwin.report.figures import FIGURES, draw_figures
 from retwin.report.results import Results, read_results
 from retwin.report.scores import verdict
@@ -63,6 +63,8 @@ def render(results: Results, images: dict[str, bytes]) -> str:
     """The page as text; `images` stand in for the plots where scripts do not run."""
     made = [section for make in SECTIONS if (section := make(results)) is not None]
     specs = _specs(made)
+    blocks = [block for section in made for block in section.blocks]
+    explored = [block.content for block in blocks if isinstance(block, Explorer)]
     environment = Environment(
         loader=FunctionLoader(_asset),
         autoescape=True,
@@ -82,8 +84,10 @@ def render(results: Results, images: dict[str, bytes]) -> str:
         },
         style=Markup(_asset("page.css")),
         script=Markup(_asset("page.js")),
+        explorer_script=Markup(_asset("explorer.js")),
         specs=Markup(_script_json(specs)),
-        plotly=Markup(get_plotlyjs()) if specs else "",
+        explored=Markup(_script_json(explored[0])) if explored else "",
+        plotly=Markup(get_plotlyjs()) if specs or explored else "",
         images={name: base64.b64encode(data).decode() for name, data in images.items()},
     )
 

@@ -178,8 +178,8 @@ class Fidelity(Part):
     figures: dict[str, Figure] = {}
 
 
-class Outputs(Part):
-    """What is measured."""
+class Channels(Part):
+    """What is commanded or measured."""
 
     names: list[str] = []
     units: list[str] = []
@@ -198,6 +198,14 @@ class CurvePoint(Part):
     healthy_recall_interval: Interval | None = None
     coverage90: float | None = None
     coverage90_interval: Interval | None = None
+
+
+class Portrait(Part):
+    """Beside whose twin the test trajectories stand, and what is inferred of their movements."""
+
+    source: str
+    movement: list[str] = []
+    movement_units: list[str] = []
 
 
 class Surrogate(Part):
@@ -219,7 +227,8 @@ class Results(Part):
     classifier: str = ""
     runs: int
     classes: list[str] = []
-    outputs: Outputs = Outputs()
+    inputs: Channels = Channels()
+    outputs: Channels = Channels()
     emulated: bool = False
     data: Data = Data()
     sources: dict[str, Source] = Field(min_length=1)
@@ -227,6 +236,7 @@ class Results(Part):
     comparisons: list[Comparison] = []
     surrogate: Surrogate = Surrogate()
     fidelity: dict[str, Fidelity] = {}
+    portrait: Portrait | None = None
     learning_curve: list[CurvePoint] = []
     timing: dict[str, Any] = {}
     provenance: dict[str, Any] = {}
@@ -254,7 +264,7 @@ class Results(Part):
         for name in self.fidelity:
             self._check_latents(name)
             self._check_bands(name)
-        self._check_poses()
+        self._check_portrait()
         self._check_simulations()
         strange = set(self.data.test.labels) - set(self.classes)
         if strange and self.classes:
@@ -309,19 +319,35 @@ class Results(Part):
                 got = "missing" if found is None else f"of shape {found.shape}"
                 raise ValueError(f"simulation/{name} is {got}, not of shape {shape}")
 
-    def _check_poses(self) -> None:
-        nominal, observed = self.arrays.get("pose/nominal"), self.arrays.get("pose/observed")
-        ids, rate = self.arrays.get("pose/ids"), self.arrays.get("pose/rate")
-        if nominal is None or observed is None or ids is None or rate is None:
+    def _check_portrait(self) -> None:
+        """Arrays of the explorer must fit each other, or be told apart from those that are not."""
+        if self.portrait is None or "portrait/bands" not in self.arrays:
             return
-        if nominal.ndim != 4 or nominal.shape[3] != 3 or nominal.shape != observed.shape:
-            raise ValueError(f"pose/nominal {nominal.shape} and pose/observed {observed.shape}")
-        if nominal.shape[1] < 2 or nominal.shape[2] < 1:
-            raise ValueError(f"pose/nominal {nominal.shape} has too few moments or points")
-        if not (np.isfinite(nominal).all() and np.isfinite(observed).all()):
-            raise ValueError("pose/nominal or pose/observed is not finite")
-        if ids.shape != nominal.shape[:1] or rate.shape != () or not rate > 0:
-            raise ValueError(f"pose/ids {ids.shape} or pose/rate {rate} does not fit the poses")
+        bands = self.arrays["portrait/bands"]
+        if bands.ndim != 4 or bands.shape[1] != 5 or not np.isfinite(bands).all():
+            raise ValueError(
+                f"portrait/bands has shape {bands.shape}, not (n, 5, moments, outputs)"
+            )
+        n, _, moments, outputs = bands.shape
+        k = len(self.portrait.movement)
+        wanted: dict[str, tuple[int | None, ...]] = {
+            "portrait/commands": (n, moments, len(self.inputs.names)),
+            "portrait/nominal": (n, moments, outputs),
+            "portrait/observed": (n, moments, outputs),
+            "portrait/z": (n, None, k),
+            "portrait/deviation": (n, None, k),
+            "portrait/times": (n, None, 3),
+            "portrait/rate": (),
+        }
+        if "pose/nominal" in self.arrays:
+            wanted |= dict.fromkeys(("pose/nominal", "pose/observed"), (n, moments, None, 3))
+        for name, shape in wanted.items():
+            found = self.arrays.get(name, np.empty(0)).shape
+            same = [w in (None, f) for w, f in zip(shape, found, strict=False)]
+            if len(found) != len(shape) or not all(same):
+                raise ValueError(f"{name} has shape {found}, which does not fit portrait/bands")
+        if (n, outputs) != (len(self.data.test.ids), len(self.outputs.names)):
+            raise ValueError(f"portrait/bands has shape {bands.shape}, not of the test's outputs")
 
     def probabilities(self, source: str) -> NDArray:
         """(runs, n_test, classes), or empty."""

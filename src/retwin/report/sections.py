@@ -21,10 +21,10 @@ from retwin.report.blocks import (
     Table,
 )
 from retwin.report.curves import Roc, latents, micro_roc
+from retwin.report.explorer import explorer
 from retwin.report.fidelity import discrepancy, fidelity
 from retwin.report.learning import learning_curve
 from retwin.report.plots import caption, roc_plot
-from retwin.report.poses import poses
 from retwin.report.results import Dataset, Results, Source
 from retwin.report.scores import comparisons, further_scores, scores
 from retwin.report.simulation import simulation
@@ -296,7 +296,7 @@ SECTIONS: tuple[SectionMaker, ...] = (
     discrepancy,
     fidelity,
     learning_curve,
-    poses,
+    explorer,
     surrogate,
     further_scores,
     time,

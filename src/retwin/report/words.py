@@ -224,5 +224,11 @@ def duration(seconds: float | None) -> str:
 
 
 def quantity(unit: str) -> tuple[float, str]:
-    """Factor and unit to show lengths in millimetres; other units stay."""
-    return (1000.0, "mm") if unit == "m" else (1.0, unit)
+    """Factor and unit to show lengths in millimetres, and counts of a unit in it; others stay.
+
+    `m` is `(1000, "mm")`, and `0.24 deg`, a command's unit, is `(0.24, "deg")`.
+    """
+    if unit == "m":
+        return 1000.0, "mm"
+    counts = re.fullmatch(r"(\d*\.?\d+) (.+)", unit)
+    return (float(counts[1]), counts[2]) if counts else (1.0, unit)

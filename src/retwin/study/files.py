@@ -41,7 +41,8 @@ class Job:
 
     Attributes
     ----------
-    kind: "surrogate", "residual", "update", "diagnosis", "simulation" or "fidelity".
+    kind: "surrogate", "residual", "update", "diagnosis", "simulation", "fidelity" or
+        "portrait".
     run, fold: from 0.
     name: of the correction of a residual model, of the update that a surrogate stands for (none
         for the twin as it is), or of the source.
@@ -74,9 +75,11 @@ class Files:
     folder: Path
 
     def path(self, job: Job) -> Path:
-        """A job's result: a model's folder, or an NPZ file of answers or of fidelity."""
-        suffix = {"diagnosis": ".npz", "simulation": ".npz", "fidelity": ".fidelity.npz"}
-        return self._of(job, suffix.get(job.kind, f".{job.kind}"))
+        """A job's result: a model's folder, or an NPZ file of answers, fidelity or portraits."""
+        if job.kind in ("diagnosis", "simulation"):
+            return self._of(job, ".npz")
+        arrays = ".npz" if job.kind in ("fidelity", "portrait") else ""
+        return self._of(job, f".{job.kind}{arrays}")
 
     def diagnoser(self, job: Job) -> Path:
         """The diagnoser's folder."""

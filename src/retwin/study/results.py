@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.fidelity import Fidelity
+from retwin.fidelity import Fidelity, Portrait
 from retwin.models import read_about
 from retwin.statistics import compare_runs, holm
 from retwin.storage import write_atomically
@@ -28,8 +28,6 @@ from retwin.twins.protocol import HEALTHY
 __all__ = ["SCHEMA", "write_results"]
 
 SCHEMA = 1
-SHOWN = 3
-"""Trajectories whose poses the report draws."""
 
 
 def write_results(
@@ -55,6 +53,7 @@ def write_results(
         "classifier": work.plan.classifier_name if diagnosed else "",
         "runs": work.plan.number_of_runs,
         "classes": list(work.case.classes) if diagnosed else [],
+        "inputs": vars(work.case.inputs),
         "outputs": vars(work.case.outputs),
         "emulated": real.emulated,
         "data": _data(work, real, test, about),
@@ -70,7 +69,14 @@ def write_results(
     arrays = found.arrays()
     for name, each in fidelity.items():
         arrays |= _fidelity_arrays(name, each)
-    arrays |= _poses(work, test)
+    portrait = _portrait(work)
+    if portrait is not None:
+        arrays |= _portrait_arrays(work, test, portrait) | _poses(work, test)
+        results["portrait"] = {
+            "source": work.portraits()[0].name,
+            "movement": portrait.latent.names,
+            "movement_units": portrait.latent.units,
+        }
     with write_atomically(out / "arrays.npz") as part:
         np.savez_compressed(part, allow_pickle=False, **arrays)
     with write_atomically(out / "results.json") as part:
@@ -271,24 +277,44 @@ def _fidelity_arrays(source: str, found: Fidelity) -> dict[str, NDArray]:
     }
 
 
-def _poses(work: Work, test: Trajectories) -> dict[str, NDArray]:
-    """Skeletons of the first test trajectory of some classes, healthy first, at the sensor's rate.
+def _portrait(work: Work) -> Portrait | None:
+    """Of all test trajectories; None where no twin was corrected."""
+    made = [Portrait.load(work.files.path(job)) for job in work.portraits()]
+    return Portrait.concatenate(made) if made else None
 
-    `pose/nominal` and `pose/observed` (k, T, points, 3) in m, `pose/ids` (k,), `pose/rate` in Hz.
+
+def _portrait_arrays(work: Work, test: Trajectories, portrait: Portrait) -> dict[str, NDArray]:
+    """Every test trajectory at the sensor's rate, in the order of `data.test.ids`.
+
+    `portrait/commands` (n, P, d_u), `/nominal`, `/observed` (n, P, d), the latter NaN where not
+    measured, and `/rate` in Hz; the rest as in `Portrait`.
     """
-    body, labels = work.case.body, test.labels.tolist()
-    known = [name for name in work.case.classes if name in labels]
-    if body is None or not known:
-        return {}
-    spread = known[:: -(-len(known) // SHOWN)]
-    shown = test[[labels.index(name) for name in spread]]
     every = max(1, round(test.rate / work.case.sensor_rate))
-    nominal, observed = (body.skeleton(joints[:, ::every]) for joints in body.poses(shown))
+    names = portrait.ids.tolist()
+    order = [names.index(name) for name in test.ids.tolist()]
+    found = {
+        "commands": test.commands[:, ::every],
+        "nominal": test.nominal[:, ::every],
+        "observed": np.where(test.mask, test.observed, np.nan)[:, ::every],
+        **{name: getattr(portrait, name)[order] for name in ("bands", "z", "deviation", "times")},
+        "rate": np.array(test.rate / every),
+    }
+    return {f"portrait/{name}": each.astype(np.float32) for name, each in found.items()}
+
+
+def _poses(work: Work, test: Trajectories) -> dict[str, NDArray]:
+    """Skeletons of all test trajectories at the sensor's rate.
+
+    `pose/nominal` and `pose/observed` (n, P, points, 3) in m.
+    """
+    body = work.case.body
+    if body is None:
+        return {}
+    every = max(1, round(test.rate / work.case.sensor_rate))
+    nominal, observed = (body.skeleton(joints[:, ::every]) for joints in body.poses(test))
     return {
         "pose/nominal": nominal.astype(np.float32),
         "pose/observed": observed.astype(np.float32),
-        "pose/ids": shown.ids,
-        "pose/rate": np.array(test.rate / every),
     }
 
 

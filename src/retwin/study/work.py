@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from retwin.case import Case
 from retwin.corrected import CorrectedTwin, generate
 from retwin.faults import Fault
-from retwin.fidelity import measure_fidelity, measure_widening, simulate_records
+from retwin.fidelity import measure_fidelity, measure_widening, portray, simulate_records
 from retwin.models import write_model
 from retwin.residual import Density, Mixture, Residual, SequenceMixture, fit_residual
 from retwin.storage import write_atomically
@@ -40,6 +40,8 @@ ENOUGH = 5
 CURVE = (1, 2, 4, 6, 8, 12, 16, 24, 32)
 """Healthy calibration trajectories of a learning curve, as far as there are more."""
 
+PORTRAYED = ("ibg_rg_command", "ibg_rg")
+"""Sources whose twin stands beside every test trajectory; the first that is there."""
 DRAWS = 500
 """Simulations of a test record."""
 
@@ -69,6 +71,7 @@ class Work:
             job for source in self.plan.sources for count in (0, *self.counts(source))
             for job in (*self.answers(source, count), *self.judgements(source, count))
         ]  # fmt: skip
+        waiting += self.portraits()
         while waiting:
             job = waiting.pop()
             if job not in found:
@@ -102,9 +105,16 @@ class Work:
         folds = range(len(self.roles.folds))
         return [Job("fidelity", 0, fold, source, healthy) for fold in folds]
 
+    def portraits(self) -> list[Job]:
+        """The jobs that portray all test trajectories, beside the twin that was corrected most."""
+        corrected = [name for name in PORTRAYED if name in self.plan.sources]
+        if not corrected or not self.case.diagnosed:
+            return []
+        return [Job("portrait", 0, fold, corrected[0]) for fold in range(len(self.roles.folds))]
+
     def needed(self, job: Job) -> tuple[Job, ...]:
         """What must be done before a job."""
-        own = job.kind in ("diagnosis", "simulation", "fidelity")
+        own = job.kind in ("diagnosis", "simulation", "fidelity", "portrait")
         needs = SOURCES[job.name].needs if own else NEEDS.get((job.kind, job.name), ())
         return tuple(job.before(*need) for need in needs)
 
@@ -138,6 +148,7 @@ class Work:
             "diagnosis": self._diagnosis,
             "simulation": self._simulation,
             "fidelity": self._fidelity,
+            "portrait": self._portrait,
         }[job.kind]
         started = time.perf_counter()
         costs = make(self._trial(job, progress), path)
@@ -250,6 +261,16 @@ class Work:
             progress=trial.progress,
         )
         found.save(path)
+        return {}
+
+    def _portrait(self, trial: Trial, path: Path) -> Costs:
+        """For the eye, and for no score: the fold's test trajectories beside a healthy twin."""
+        make = SOURCES[trial.job.name].twin
+        assert make is not None
+        twin, test = make(trial), self.files.real_data()[list(trial.fold[1])]
+        assert isinstance(twin, CorrectedTwin), "as all in PORTRAYED"
+        seed, rate = trial.seed("portrait"), self.case.sensor_rate
+        portray(twin, test, seed=seed, rate=rate, progress=trial.progress).save(path)
         return {}
 
     def _rivals(self, trial: Trial, twin: CorrectedTwin) -> dict[str, Twin]:

@@ -1,0 +1,122 @@
+"""The explorer: all test trajectories in the page, and refused where they do not fit."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import retwin as rt
+from retwin.errors import InputError
+from retwin.report.explorer import explorer, packed
+from retwin.report.page import render
+from retwin.report.results import read_results
+from retwin.study.files import Roles
+from retwin.study.results import _poses
+from retwin.study.work import Work
+
+Study = tuple[dict[str, Any], dict[str, NDArray]]
+Write = Callable[[Study], Path]
+
+
+def unpacked(told: dict[str, Any]) -> NDArray:
+    """What the page's script does."""
+    codes = np.frombuffer(base64.b64decode(told["codes"]), "<i2").reshape(told["shape"])
+    values = told["low"] + told["step"] * (codes.astype(float) + 32767)
+    return np.where(codes == -32768, np.nan, values)
+
+
+def content_of(page: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="explorer-content">(.*?)</script>', page)
+    assert found is not None
+    told: dict[str, Any] = json.loads(found[1])
+    return told
+
+
+def test_all_trajectories_are_in_the_page(study: Study, write: Write) -> None:
+    results, arrays = study
+    told = content_of(render(read_results(write(study)), {}))
+    assert told["ids"] == results["data"]["test"]["ids"]
+    assert [told["classes"][k] for k in told["truth"][::10]][:2] == ["Healthy", "M1 stuck"]
+    observed = unpacked(told["observed"])
+    expected = 1000 * arrays["portrait/observed"]
+    np.testing.assert_allclose(observed, expected, atol=told["observed"]["step"])
+    np.testing.assert_allclose(
+        unpacked(told["probabilities"]),
+        np.array(
+            [arrays[f"probabilities/{name}"].mean(axis=0) for name in ("dt", "ibg", "ibg_rg")]
+        ),
+        atol=1e-4,
+    )
+    assert told["inputs"]["units"] == ["deg"] * 4
+    np.testing.assert_allclose(unpacked(told["commands"])[0, 0], 0.24 * 400, atol=0.01)
+    latent = told["latent"]
+    assert (latent["names"], latent["units"]) == (["delay", "offset motor 1"], ["samples", "deg"])
+    assert latent["z"][0][1][0] is None
+    pose = unpacked(told["pose"]["observed"]) - unpacked(told["pose"]["nominal"])
+    np.testing.assert_allclose(pose[1, :, -1, 1], 0.01, atol=1e-4)
+
+
+def test_packed_numbers_come_back() -> None:
+    values = np.array([[-3.0, np.nan], [0.25, 1e4]])
+    np.testing.assert_allclose(unpacked(packed(values)), values, atol=packed(values)["step"])
+    np.testing.assert_array_equal(unpacked(packed(np.full(3, 2.5))), 2.5)
+    assert np.isnan(unpacked(packed(np.full(3, np.nan)))).all()
+
+
+def test_what_is_not_there_is_left_out(study: Study, write: Write) -> None:
+    for name in ("pose/nominal", "pose/observed"):
+        del study[1][name]
+    page = render(read_results(write(study)), {})
+    assert content_of(page)["pose"] is None
+    assert "explore-pose" not in page.split("<script")[0]
+    assert "an inference and not a measurement" not in page
+    del study[0]["portrait"]
+    page = render(read_results(write(study)), {})
+    assert '<section id="explorer">' not in page
+    assert "explorer-content" not in page
+
+
+def test_emulated_trajectories_say_so(study: Study, write: Write) -> None:
+    study[0]["emulated"] = True
+    section = explorer(read_results(write(study)))
+    assert section is not None
+    assert section.blocks[0].caption.startswith("Emulated robot, no real measurements.")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("portrait/bands", np.zeros((90, 4, 21, 3))),
+        ("portrait/bands", np.full((90, 5, 21, 3), np.nan)),
+        ("portrait/bands", np.zeros((89, 5, 21, 3))),
+        ("portrait/commands", np.zeros((90, 21, 3))),
+        ("portrait/observed", np.zeros((90, 20, 3))),
+        ("portrait/z", np.zeros((90, 2, 3))),
+        ("portrait/times", np.zeros((90, 2))),
+        ("portrait/rate", np.zeros(2)),
+        ("pose/observed", np.zeros((90, 21, 4, 2))),
+    ],
+)
+def test_arrays_that_do_not_fit(study: Study, write: Write, name: str, value: NDArray) -> None:
+    study[1][name] = value
+    with pytest.raises(InputError, match=r"portrait/bands|test's outputs"):
+        read_results(write(study))
+
+
+def test_what_a_study_keeps_of_poses(
+    case: rt.Case, twin_set: rt.Trajectories, tmp_path: Path
+) -> None:
+    some = twin_set[::12]
+    kept = _poses(Work(tmp_path, case, rt.StudyPlan(), Roles(())), some)
+    every = round(twin_set.rate / case.sensor_rate)
+    for name, path in (("pose/nominal", some.nominal), ("pose/observed", some.observed)):
+        assert kept[name].shape[:2] == (len(some), -(-some.steps // every))
+        np.testing.assert_allclose(kept[name][:, :, -1], path[:, ::every], atol=2e-3)
