@@ -16,6 +16,7 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from retwin.report.blocks import Explorer, Plot, Section
+from retwin.report.claims import claims
 from retwin.report.figures import FIGURES, draw_figures
 from retwin.report.results import Results, read_results
 from retwin.report.scores import verdict
@@ -77,6 +78,7 @@ def render(results: Results, images: dict[str, bytes]) -> str:
         subtitle=_subtitle(results),
         emulated=EMULATED if results.emulated else "",
         verdict=verdict(results),
+        claims=claims(results),
         sections=made,
         colours={
             **{f"c{place}": pair for place, pair in enumerate(PALETTE)},

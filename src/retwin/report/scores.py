@@ -27,7 +27,7 @@ from retwin.report.words import (
     span,
 )
 
-__all__ = ["comparisons", "further_scores", "outcome", "scores", "verdict"]
+__all__ = ["comparisons", "further_scores", "headline", "outcome", "scores", "verdict"]
 
 MAIN = ("macro_f1", "balanced_accuracy", "auroc", "healthy_recall", "rmse", "nrmse", "crps")
 AGAINST = ("dt", "ibg_rg_command")
@@ -48,7 +48,7 @@ def outcome(comparison: Comparison) -> str:
 
 def verdict(results: Results) -> list[str]:
     """Up to three plain sentences; "better" only where the bootstrap interval leaves zero out."""
-    pair = _headline(results.comparisons)
+    pair = headline(results.comparisons)
     if pair is None:
         return []
     found = {each.metric: each for each in _between(results.comparisons, *pair)}
@@ -88,7 +88,7 @@ def _rank(results: Results, source: str, metric: str) -> float:
     return value if np.isfinite(value) else -np.inf
 
 
-def _headline(found: Sequence[Comparison]) -> tuple[str, str] | None:
+def headline(found: Sequence[Comparison]) -> tuple[str, str] | None:
     """The updated twin against the plain one, else the first pair in the file."""
     for updated, plain in product(("ibg_rg_command", "ibg_rg"), ("dt", "twin")):
         if _between(found, updated, plain):

@@ -21,6 +21,7 @@ from retwin.report.blocks import (
     Table,
 )
 from retwin.report.curves import Roc, latents, micro_roc
+from retwin.report.decisions import decisions
 from retwin.report.explorer import explorer
 from retwin.report.fidelity import discrepancy, fidelity
 from retwin.report.learning import learning_curve
@@ -292,6 +293,7 @@ SECTIONS: tuple[SectionMaker, ...] = (
     comparisons,
     confusion,
     roc,
+    decisions,
     simulation,
     discrepancy,
     fidelity,

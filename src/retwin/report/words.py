@@ -88,6 +88,9 @@ CHROME = {
     "paper": ("#ffffff", "#14181d"),
     "wash": ("#f5f6f8", "#1c2127"),
     "observed": ("#9aa3ae", "#727c89"),
+    "go": ("#007a4d", "#3ecf8e"),
+    "wait": ("#9a6700", "#e3b341"),
+    "stop": ("#b3261e", "#ff8a80"),
     "alarm": ("#8f2d00", "#ffb37a"),
     "alarm_wash": ("#fff1e6", "#3a2312"),
 }
