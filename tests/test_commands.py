@@ -1,4 +1,4 @@
-"""Random ramps: within their limits, as many and as timed as asked for."""
+"""Samplers of commands: within their limits, with the law that they promise."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.commands import RampSampler
+from retwin.cases.tanks import TankSampler
+from retwin.commands import HoldSampler, MultisineSampler, RampSampler, RecordedSampler
 
 SAMPLER = RampSampler(low=(0.0, -2.0), high=(10.0, -1.0), movements=4, steps=400, ramps=(10, 30))
 
@@ -77,4 +78,97 @@ def test_settings_that_cannot_be_are_refused(match: str, changes: dict) -> None:
     settings = {"low": (0.0, -2.0), "high": (10.0, -1.0), "movements": 4, "steps": 400}
     with pytest.raises(rt.InputError, match=match) as caught:
         RampSampler(**{**settings, "ramps": (10, 30), **changes})
+    assert "\n" not in str(caught.value)
+
+
+LOW, HIGH = (0.0, -2.0), (10.0, -1.0)
+HOLDS = HoldSampler(LOW, HIGH, steps=400, hold=(10, 30))
+SINES = MultisineSampler(LOW, HIGH, steps=500, period=500, slow=5, fast=20, weak=0.2)
+RECORD = np.arange(2 * 50 * 3, dtype=float).reshape(2, 50, 3)
+
+
+@pytest.mark.parametrize(
+    "sampler", [HOLDS, SINES, RecordedSampler(RECORD, 20)], ids=lambda each: type(each).__name__
+)
+def test_every_sampler_draws_what_it_is_asked_for(sampler) -> None:
+    made = sampler.sample(7, rng=np.random.default_rng(3))
+    width = 3 if isinstance(sampler, RecordedSampler) else 2
+    assert made.shape == (7, sampler.steps, width)
+    assert made.dtype == np.float32
+    again = sampler.sample(7, rng=np.random.default_rng(3), timing=np.array([[1.0]]))
+    assert made.tobytes() == again.tobytes()
+    assert made.tobytes() != sampler.sample(7, rng=np.random.default_rng(4)).tobytes()
+
+
+def test_levels_are_held_for_as_long_as_asked() -> None:
+    made = HOLDS.sample(300, rng=np.random.default_rng(0))
+    assert (made >= LOW).all()
+    assert (made <= HIGH).all()
+    lengths, levels = [], []
+    for row in made[..., 0]:
+        changes = np.flatnonzero(np.diff(row)) + 1
+        lengths += np.diff([0, *changes]).tolist()
+        levels += row[[0, *changes]].tolist()
+    assert {*lengths} == set(range(10, 31))
+    # Uniform, up to the hold that the end cuts off and that was therefore not counted.
+    assert np.mean(lengths) == pytest.approx(20, abs=0.3)
+    assert np.mean(levels) == pytest.approx(5, abs=4 * 10 / np.sqrt(12 * len(levels)))
+    apart = (np.diff(made, axis=1) != 0).any(axis=0)
+    assert not (apart[:, 0] & apart[:, 1]).all(), "channels change for themselves"
+
+
+def test_a_multisine_has_the_spectrum_asked_for() -> None:
+    """Over a whole period sines are orthogonal: mean, deviation and lines are exact."""
+    made = SINES.sample(40, rng=np.random.default_rng(0)).astype(float)
+    power = np.abs(np.fft.rfft(made, axis=1) / 500) ** 2
+    free = ((made > LOW) & (made < HIGH)).all(axis=1)  # where nothing was cut off
+    assert free.mean() > 0.8
+    for channel, (mean, deviation) in enumerate([(5.0, 10 / 6), (-1.5, 1 / 6)]):
+        lines = power[free[:, channel], :, channel]
+        np.testing.assert_allclose(made[free[:, channel], :, channel].mean(axis=1), mean, rtol=1e-5)
+        np.testing.assert_allclose(made[free[:, channel], :, channel].std(axis=1), deviation, 1e-4)
+        np.testing.assert_allclose(lines[:, 2:6] / lines[:, 1:2], 1, rtol=1e-3)
+        np.testing.assert_allclose(lines[:, 6:21] / lines[:, 1:2], 0.04, rtol=1e-2)
+        assert lines[:, 21:].max() < 1e-6 * lines[:, 1:].sum(axis=1).max()
+
+
+def test_a_multisine_is_what_the_tanks_are_told() -> None:
+    ours = MultisineSampler((0.0,), (10.0,), 320, 1024, (2.8,), (1.0,), slow=19, fast=59)
+    theirs = TankSampler().sample(50, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(ours.sample(50, rng=np.random.default_rng(0)), theirs, rtol=1e-6)
+
+
+def test_pieces_of_records_come_from_everywhere() -> None:
+    made = RecordedSampler(RECORD, 20).sample(2000, rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(np.diff(made, axis=1), 3)
+    begins, counts = np.unique(made[:, 0, 0] // 3, return_counts=True)
+    assert set(begins) == {*range(31), *range(50, 81)}, "every piece that fits into a record"
+    assert counts.min() > 10
+    whole = RecordedSampler(RECORD).sample(10, rng=np.random.default_rng(0))
+    assert {row.tobytes() for row in whole} == {row.tobytes() for row in RECORD.astype(np.float32)}
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: HoldSampler((0.0,), (0.0,)), "limits"),
+        (lambda: HoldSampler((0.0,), (1.0,), steps=1), "steps"),
+        (lambda: HoldSampler((0.0,), (1.0,), hold=(0, 5)), "hold"),
+        (lambda: HoldSampler((0.0,), (1.0,), hold=(6, 5)), "hold"),
+        (lambda: MultisineSampler((0.0,), (np.inf,)), "limits"),
+        (lambda: MultisineSampler((0.0,), (1.0,), steps=0), "steps"),
+        (lambda: MultisineSampler((0.0,), (1.0,), mean=(2.0,)), "mean"),
+        (lambda: MultisineSampler((0.0,), (1.0,), deviation=(-1.0,)), "mean"),
+        (lambda: MultisineSampler((0.0,), (1.0,), mean=(0.5, 0.5)), "mean"),
+        (lambda: MultisineSampler((0.0,), (1.0,), slow=9, fast=5), "slow"),
+        (lambda: MultisineSampler((0.0,), (1.0,), period=0), "period"),
+        (lambda: RecordedSampler(RECORD[0]), r"shape \(50, 3\)"),
+        (lambda: RecordedSampler(RECORD[:0]), "shape"),
+        (lambda: RecordedSampler(RECORD * np.nan), "NaN"),
+        (lambda: RecordedSampler(RECORD, 51), "length: expected from 1 to 50"),
+    ],
+)
+def test_samplers_that_cannot_be_are_refused(make, match: str) -> None:
+    with pytest.raises(rt.InputError, match=match) as caught:
+        make()
     assert "\n" not in str(caught.value)

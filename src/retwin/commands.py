@@ -1,4 +1,4 @@
-"""Commands for any twin whose limits are known: ramps and holds at random levels."""
+"""Commands for any twin: ramps, random holds, multisines within limits; or what was recorded."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 
-__all__ = ["RampSampler", "draw_onsets"]
+__all__ = ["HoldSampler", "MultisineSampler", "RampSampler", "RecordedSampler", "draw_onsets"]
 
 
 @dataclass(frozen=True)
@@ -39,15 +39,7 @@ class RampSampler:
     start: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        low, high = np.array(self.low, float), np.array(self.high, float)
-        finite = low.ndim == 1 and low.shape == high.shape and np.isfinite([low, high]).all()
-        if not (finite and len(low) and (low < high).all()):
-            raise InputError(
-                "limits",
-                expected="a finite low and a greater finite high per input channel",
-                got=f"low {self.low}, high {self.high}",
-                remedy="say between which levels commands may be drawn",
-            )
+        low, high = _checked_limits(self.low, self.high)
         rest = np.array(self.rest)
         if rest.shape != low.shape or not ((low <= rest) & (rest <= high)).all():
             raise InputError(
@@ -103,6 +95,178 @@ class RampSampler:
         return np.clip(commands, self.low, self.high).astype(np.float32)
 
 
+@dataclass(frozen=True)
+class HoldSampler:
+    """Random levels, each held for a random time, every channel for itself; a command sampler.
+
+    The field's name is amplitude-modulated pseudo-random binary signal (APRBS): steps of all sizes
+    and of many lengths, which excite what is slow and what is nonlinear.
+
+    Parameters
+    ----------
+    low, high: the levels' limits, one per input channel, in its unit.
+    steps: samples per trajectory.
+    hold: least and greatest number of samples that a level is held for.
+
+    Raises
+    ------
+    InputError: limits that are not finite or not in order, fewer than two samples, holds below one
+        sample or out of order.
+
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    steps: int = 1000
+    hold: tuple[int, int] = (20, 200)
+
+    def __post_init__(self) -> None:
+        _checked_limits(self.low, self.high)
+        _check_steps(self.steps)
+        if not (len(self.hold) == 2 and 1 <= self.hold[0] <= self.hold[1]):
+            raise InputError(
+                "hold",
+                expected="a pair (least, greatest) of samples, at least 1 and in order",
+                got=str(self.hold),
+                remedy="hold for longer than the slowest state takes, at times",
+            )
+
+    def sample(
+        self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
+    ) -> NDArray:
+        """Commands (count, steps, d_u), float32; there are no movements, `timing` is not used."""
+        least, greatest = self.hold
+        shape = (count, len(self.low), 1 + self.steps // least)
+        ends = rng.integers(least, greatest, size=shape, endpoint=True).cumsum(axis=2)
+        levels = rng.uniform(self.low, self.high, size=(count, shape[2], len(self.low)))
+        changes = np.zeros((count, self.steps, len(self.low)), dtype=int)
+        row, channel, hold = np.nonzero(ends < self.steps)
+        changes[row, ends[row, channel, hold], channel] = 1
+        return np.take_along_axis(levels, changes.cumsum(axis=1), axis=1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class MultisineSampler:
+    """Sines of random phases about a mean, every channel for itself; a command sampler.
+
+    Parameters
+    ----------
+    low, high: limits of each input channel, in its unit; what goes beyond is cut off.
+    steps: samples per trajectory.
+    period: samples of one period of the slowest sine.
+    mean, deviation: of each channel; by default the middle of its limits and a sixth of the way
+        between them.
+    slow, fast: number of sines at full strength, and of all; frequencies are evenly spaced.
+    weak: amplitude of the faster ones against the slow ones'.
+
+    Raises
+    ------
+    InputError: limits that are not finite or not in order, fewer than two samples, a mean outside
+        the limits, a negative deviation, numbers of sines out of order.
+
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    steps: int = 1000
+    period: int = 1000
+    mean: tuple[float, ...] = ()
+    deviation: tuple[float, ...] = ()
+    slow: int = 20
+    fast: int = 60
+    weak: float = 0.1
+
+    def __post_init__(self) -> None:
+        low, high = _checked_limits(self.low, self.high)
+        _check_steps(self.steps)
+        mean, deviation = self.mean or (low + high) / 2, self.deviation or (high - low) / 6
+        fits = np.shape(mean) == np.shape(deviation) == low.shape
+        if not (fits and ((low <= mean) & (mean <= high) & (np.array(deviation) >= 0)).all()):
+            raise InputError(
+                "mean",
+                expected=f"{len(low)} means within the limits, and as many deviations from 0",
+                got=f"mean {self.mean}, deviation {self.deviation}",
+                remedy="leave them out for the middle of the limits and a sixth of their distance",
+            )
+        if not (self.period >= 2 and 1 <= self.slow <= self.fast and self.weak >= 0):
+            raise InputError(
+                "slow",
+                expected="slow from 1, fast from slow on, weak from 0, a period from 2 samples on",
+                got=f"slow {self.slow}, fast {self.fast}, weak {self.weak}, period {self.period}",
+                remedy="leave them out for the default",
+            )
+        object.__setattr__(self, "mean", tuple(map(float, mean)))
+        object.__setattr__(self, "deviation", tuple(map(float, deviation)))
+
+    def sample(
+        self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
+    ) -> NDArray:
+        """Commands (count, steps, d_u), float32; there are no movements, `timing` is not used."""
+        number = np.arange(1, self.fast + 1)
+        share = np.where(number <= self.slow, 1.0, self.weak)
+        share = share * np.sqrt(2 / np.sum(share**2))
+        phases = rng.uniform(0, 2 * np.pi, size=(count, self.fast, len(self.low)))
+        turns = 2 * np.pi * number[:, None] * np.arange(self.steps) / self.period
+        commands = np.empty((count, self.steps, len(self.low)), np.float32)
+        for made, phase in zip(commands, phases, strict=True):  # one by one: waves take memory
+            for channel, (mean, deviation) in enumerate(
+                zip(self.mean, self.deviation, strict=True)
+            ):
+                waves = np.cos(turns + phase[:, channel, None])
+                made[:, channel] = mean + deviation * (share @ waves)
+        return commands.clip(*np.array([self.low, self.high], np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSampler:
+    """Recorded commands, or pieces of them, drawn with replacement; a command sampler.
+
+    Parameters
+    ----------
+    commands: (k, T, d_u), recorded.
+    length: samples of a piece, which begins anywhere; 0 takes whole records.
+
+    Raises
+    ------
+    InputError: commands of another shape, none, or not finite; a length beyond the records'.
+
+    """
+
+    commands: NDArray
+    length: int = 0
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.commands)
+        if len(shape) != 3 or 0 in shape or not np.isfinite(self.commands).all():
+            raise InputError(
+                "commands",
+                expected="finite numbers of shape (records, samples, channels), none of them 0",
+                got=f"shape {shape}" if len(shape) != 3 or 0 in shape else "NaN or infinite ones",
+                remedy="give Trajectories.commands of a set that has some",
+            )
+        if not 0 <= self.length <= shape[1]:
+            raise InputError(
+                "length",
+                expected=f"from 1 to {shape[1]} samples, as the records have, or 0 for all",
+                got=repr(self.length),
+                remedy="give shorter pieces",
+            )
+
+    @property
+    def steps(self) -> int:
+        """Samples per trajectory."""
+        return self.length or self.commands.shape[1]
+
+    def sample(
+        self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
+    ) -> NDArray:
+        """Commands (count, steps, d_u), float32; their timing is the records' own."""
+        records, samples, _ = self.commands.shape
+        row = rng.integers(records, size=(count, 1))
+        begin = rng.integers(samples - self.steps, size=(count, 1), endpoint=True)
+        return self.commands[row, begin + np.arange(self.steps)].astype(np.float32)
+
+
 def draw_onsets(
     count: int,
     movements: int,
@@ -127,3 +291,26 @@ def draw_onsets(
         gap = np.isnan(onsets[:, movement])
         onsets[gap, movement] = before[gap]
     return onsets
+
+
+def _checked_limits(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[NDArray, NDArray]:
+    """Both as arrays (d_u,), finite and in order."""
+    least, greatest = np.array(low, float), np.array(high, float)
+    alike = least.ndim == 1 and least.shape == greatest.shape
+    if not (
+        alike and len(least) and np.isfinite([least, greatest]).all() and (least < greatest).all()
+    ):
+        raise InputError(
+            "limits",
+            expected="a finite low and a greater finite high per input channel",
+            got=f"low {low}, high {high}",
+            remedy="say between which levels commands may be drawn",
+        )
+    return least, greatest
+
+
+def _check_steps(steps: int) -> None:
+    if steps < 2:
+        raise InputError(
+            "steps", expected="at least two samples", got=repr(steps), remedy="give more"
+        )

@@ -62,7 +62,9 @@ def test_cases_are_found_by_name() -> None:
     assert rt.cases.get("armpi").name == "armpi"
     assert rt.cases.get("retwin.cases.armpi:armpi").name == "armpi"
     for name in ("nothing", "retwin.cases.armpi:nothing", "no.such.module:case", "os:path"):
-        with pytest.raises(rt.InputError, match="expected armpi, tanks, or package"):
+        with pytest.raises(
+            rt.InputError, match=r"expected armpi, tanks, a file \*.toml, or package"
+        ):
             rt.cases.get(name)
 
 

@@ -204,3 +204,166 @@ def test_demo_with_a_wrong_folder_is_refused(
     code, _, err = call("demo", "--out", tmp_path / "demo")
     assert code == 2
     assert "RETWIN_DATA: expected a folder with armpi/real_a.mat" in err
+
+
+MODULE = """
+import numpy as np
+
+
+def reach(commands):
+    # How far an arm of two joints reaches, and how high, in m.
+    turned = commands.cumsum(axis=-1)
+    return np.stack([np.sin(turned).sum(axis=-1), np.cos(turned).sum(axis=-1)], axis=-1)
+
+
+def filled(commands, gain=0.1, leak=0.05):
+    level = np.zeros((*commands.shape[:2], 1))
+    for t in range(1, commands.shape[1]):
+        level[:, t] = level[:, t - 1] + gain * commands[:, t - 1] - leak * level[:, t - 1]
+    return level
+"""
+
+ARM = """
+name = "reach"
+twin = "own_module:reach"
+rate = 10
+inputs = { first = { unit = "rad", low = -1, high = 1 }, second = { low = -1, high = 1 } }
+outputs = { far = { unit = "m" }, high = { unit = "m" } }
+commands = { steps = 90, movements = 3, ramps = [8, 10] }
+network = { kind = "MLP", hidden = [32] }
+training = { epochs = 20, batch = 64, rate = 1e-2 }
+density = { kind = "Mixture", training = { epochs = 10, decay = "step" } }
+[faults]
+stuck = { kind = "Stuck", actuator = "second", onset = 12 }
+"""
+
+TANK = """
+name = "tank"
+twin = "own_module:filled"
+rate = 1
+inputs = { valve = { unit = "1", low = 0, high = 1 } }
+outputs = { level = { unit = "m" } }
+commands = { kind = "HoldSampler", steps = 100, hold = [5, 30] }
+correction = "additive"
+network = { kind = "StateSpace", states = 2, hidden = 8 }
+training = { epochs = 10, batch = 4, rate = 1e-2 }
+[density]
+kind = "SequenceMixture"
+members = 2
+network = { kind = "LSTM", hidden = 4 }
+training = { epochs = 3 }
+[parameters]
+gain = { unit = "m", low = 0.05, high = 0.2, start = 0.1 }
+leak = { unit = "1/s", low = 0.01, high = 0.1, start = 0.05 }
+[records]
+calibration = { valve = "u1", level = "y1" }
+test = { valve = "u2", level = "y2" }
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Cases of a user's own in the current folder, and what was measured."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.chdir(tmp_path)
+    Path("own_module.py").write_text(MODULE)
+    Path("reach.toml").write_text(ARM)
+    Path("tank.toml").write_text(TANK)
+    reach, tank = (rt.cases.get(f"{name}.toml") for name in ("reach", "tank"))
+    made = rt.generate(reach.twin, reach, per_class=12, seed=5)
+    late = np.concatenate([made.observed[:, :1].repeat(2, axis=1), made.observed[:, :-2]], axis=1)
+    rt.save(made.replace(observed=late + 0.02, emulated=True), "real.npz")
+    told = tank.sampler.sample(2, rng=np.random.default_rng(6)).astype(float)
+    level = tank.parametric.with_values({"leak": 0.07}).simulate(told, seed=0).observed
+    columns = np.concatenate([*told, *level], axis=1)
+    np.savetxt("record.csv", columns, delimiter=",", header="u1,u2,y1,y2", comments="")
+    yield tmp_path
+    sys.modules.pop("own_module", None)
+
+
+def test_a_case_of_ones_own_with_classes(call, own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code, out, err = call("twin", "info", "reach.toml")
+    assert (code, "first" in out, "reach" in out) == (0, True, True), err
+    words = ("twin", "simulate", "reach.toml", "--n", 6, "--fault", "all", "--out", "sim.npz")
+    assert call(*words)[0] == 0
+    assert rt.load("sim.npz").known_labels == {"Healthy", "stuck"}
+    words = ("fit", "reach.toml", "--real", "real.npz", "--simulations", 40, "--out", "model")
+    code, out, err = call(*words)
+    assert code == 0, err
+    assert "36 movements of 12 EMULATED trajectories" in out
+    (own / "elsewhere").mkdir()
+    monkeypatch.chdir(own / "elsewhere")
+    code, out, err = call("generate", "../model", "--per-class", 10, "--out", "made.npz")
+    assert code == 0, err
+    assert rt.load("made.npz").known_labels == {"Healthy", "stuck"}
+    code, out, err = call(
+        "diagnose", "fit", "made.npz", "--case", "../reach.toml", "--out", "cnn"
+    )  # fmt: skip
+    assert code == 0, err
+    code, out, err = call("diagnose", "predict", "cnn", "../real.npz", "--case", "../reach.toml")
+    assert code == 0, err
+    assert "macro_f1" in out
+
+
+def test_a_case_of_ones_own_without_classes(call, own: Path) -> None:
+    words = ("fit", "tank.toml", "--data", "record.csv", "--simulations", 12, "--out", "model")
+    code, out, err = call(*words)
+    assert code == 0, err
+    assert "Residual model: 100 samples" in out
+    assert "residual_level" in out
+    assert "90 % band holds" in " ".join(out.split())
+    assert call("generate", "model", "--per-class", 3, "--out", "made.npz")[0] == 0
+    made = rt.load("made.npz")
+    assert (made.steps, made.outputs.names, len(made)) == (100, ("level",), 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("reach.toml", "--real", "real.npz", "--folds", "2", "--sources", "dt,ibg_rg"), "IBG"),
+        (("tank.toml", "--data", "record.csv", "--sources", "twin,pi_ls,ibg_rg"), "IBG"),
+    ],
+)
+def test_a_study_of_a_case_of_ones_own(call, own: Path, words: tuple, told: str) -> None:
+    words = ("study", *words, "--runs", 1, "--per-class", 12, "--processes", 1, "--out", "study")
+    code, out, err = call(*words)
+    assert code == 0, err
+    assert told in out
+    page = own / "study" / "report.html"
+    assert page.stat().st_size > 1000
+    page.unlink()
+    assert call("report", "study")[0] == 0
+    assert page.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "either --real or --data, got none"),
+        (("--real", "a", "--data", "b"), "either --real or --data, got both"),
+        (("--data", "gone.csv"), "gone.csv: expected a CSV file with a header"),
+        (("--data", "record.csv", "--refine"), "--refine: expected a density of one z"),
+        (("--data", "record.csv", "--density", "flow"), "density: expected SequenceMixture, for"),
+        (("--data", "record.csv", "--network", "gru"), "network: expected one of mlp, lstm"),
+        (("--data", "record.csv", "--simulations", "3"), "at least 10 trajectories"),
+    ],
+)
+def test_what_a_fit_cannot_be_is_one_line(call, own: Path, words: tuple, message: str) -> None:
+    code, _, err = call("fit", "tank.toml", *words, "--out", "model")
+    assert code == 2
+    assert message in err
+    assert sum(line.startswith("error:") for line in err.splitlines()) == 1
+    assert not (own / "model").exists()
+
+
+def test_data_need_a_case_that_splits_them(call, own: Path) -> None:
+    code, _, err = call("fit", "reach.toml", "--data", "record.csv", "--out", "model")
+    assert code == 2
+    assert "--data: expected a case that says how its file is split, got 'reach'" in err
+
+
+def test_a_built_in_twin_has_its_own_case(call, tmp_path: Path) -> None:
+    code, _, err = call("twin", "simulate", "tanks", "--n", 2, "--out", tmp_path / "made.npz")
+    assert code == 0, err
+    assert rt.load(tmp_path / "made.npz").steps == rt.cases.tanks().sampler.steps

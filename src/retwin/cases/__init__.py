@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
+from pathlib import Path
 
 from retwin.case import Case
 from retwin.cases.armpi import armpi
+from retwin.cases.columns import ColumnRecords
+from retwin.cases.file import read_case
 from retwin.cases.tanks import tanks
 from retwin.errors import InputError
 
-__all__ = ["armpi", "get", "tanks"]
+__all__ = ["ColumnRecords", "armpi", "get", "read_case", "tanks"]
 
 _BUILT_IN: dict[str, Callable[[], Case]] = {"armpi": armpi, "tanks": tanks}
 
 
 def get(name: str) -> Case:
-    """The case of that name: a built-in one, or a user's `package.module:object`.
+    """The case of that name: a built-in one, a file *.toml, or a user's `package.module:object`.
 
-    Raises InputError when there is none.
+    Raises InputError when there is none, and for a file that is not as `read_case` wants it.
     """
     if name in _BUILT_IN:
         return _BUILT_IN[name]()
+    if Path(name).suffix.lower() == ".toml":
+        return read_case(name)
     module, _, attribute = name.partition(":")
     got = "no such case"
     if attribute:
@@ -37,7 +42,7 @@ def get(name: str) -> Case:
             got = f"a {type(found).__name__}"
     raise InputError(
         f"case {name!r}",
-        expected=f"{', '.join(_BUILT_IN)}, or package.module:object naming a Case",
+        expected=f"{', '.join(_BUILT_IN)}, a file *.toml, or package.module:object naming a Case",
         got=got,
-        remedy="check the spelling, or that the module can be imported",
+        remedy="check the spelling, or that the file or module is there",
     )

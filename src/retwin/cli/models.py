@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -16,73 +16,179 @@ from rich.table import Table
 from retwin.cli.terminal import bar
 from retwin.configs import named
 from retwin.storage import check_target, write_atomically
+from retwin.trajectories import Trajectories
+from retwin.twins.protocol import HEALTHY
+
+if TYPE_CHECKING:
+    from retwin.case import Case
+    from retwin.residual import ResidualModel, SequenceResidual
+    from retwin.surrogate import Surrogate
 
 __all__ = ["diagnose", "fit", "generate"]
 
-CaseName = Annotated[str, typer.Argument(help="Built-in case or package.module:object.")]
+CaseName = Annotated[str, typer.Argument(help="Built-in case, case.toml, or module:object.")]
 Seed = Annotated[int, typer.Option(help="Same seed, same result.", min=0)]
 
 
 def fit(
     case: CaseName,
-    twin_data: Annotated[Path, typer.Option(help="Trajectories of the twin.")],
-    real: Annotated[Path, typer.Option(help="Real trajectories to calibrate on.")],
     out: Annotated[Path, typer.Option(help="Folder for the corrected twin.")],
-    network: Annotated[str, typer.Option(help="Surrogate: mlp, lstm or tcn.")] = "mlp",
-    correction: Annotated[
-        str | None, typer.Option(help="delay_offset or command_space; the case's if not given.")
+    real: Annotated[
+        Path | None, typer.Option(help="Real trajectories to calibrate on.", show_default=False)
     ] = None,
-    density: Annotated[str, typer.Option(help="Law of the gap: mixture or flow.")] = "mixture",
+    data: Annotated[
+        Path | None, typer.Option(help="Or one file that the case splits; its first part serves.")
+    ] = None,
+    twin_data: Annotated[
+        Path | None, typer.Option(help="Trajectories of the twin; simulated if not given.")
+    ] = None,
+    simulations: Annotated[int, typer.Option(help="How many, without --twin-data.")] = 400,
+    network: Annotated[
+        str | None, typer.Option(help="Surrogate: mlp, lstm, tcn or state_space.")
+    ] = None,
+    correction: Annotated[
+        str | None, typer.Option(help="additive, delay_offset or command_space.")
+    ] = None,
+    density: Annotated[
+        str | None, typer.Option(help="Law of the gap: mixture, flow or sequence_mixture.")
+    ] = None,
     refine: Annotated[bool, typer.Option(help="Fine-tune on outputs afterwards.")] = False,
     calibrate_on: Annotated[str, typer.Option(help="healthy or all.")] = "healthy",
     seed: Seed = 0,
 ) -> None:
-    """Fit surrogate and residual model; save the corrected twin."""
-    import retwin as rt
-    from retwin.corrections import NAMED_OPERATORS
-    from retwin.networks import SURROGATES
-    from retwin.residual import NAMED_DENSITIES
+    """Fit surrogate and residual model; save the corrected twin.
 
-    system = rt.cases.get(case)
-    config = named(network, SURROGATES, "network")
-    operator = system.correction
-    if correction is not None:
-        operator = named(correction, NAMED_OPERATORS, "correction")
-    law = replace(
-        named(density, NAMED_DENSITIES, "density"), refinement=rt.Refinement() if refine else None
-    )
-    with bar("read") as tell:
-        twin = rt.load(twin_data, case=system, progress=lambda s: tell(twin_data.name, s))
-        measured = rt.load(real, case=system, progress=lambda s: tell(real.name, s))
+    Network, correction and density are the case's, if not given.
+    """
+    import retwin as rt
+
+    system = _system(case, network, correction, density, refine)
+    measured = _measured(system, real, data)
+    twin = _of_twin(system, twin_data, simulations, seed)
     with bar("fit") as tell:
-        ibg = rt.fit_surrogate(twin, config, seed=seed, progress=lambda s: tell("surrogate", s))
+        ibg = rt.fit_surrogate(
+            twin,
+            system.network,
+            seed=seed,
+            training=system.training,
+            progress=lambda s: tell("surrogate", s),
+        )
         rg = rt.fit_residual(
             ibg,
             measured,
-            operator,
-            law,
+            system.correction,
+            system.density,
             seed=seed,
             calibrate_on=system.faults if calibrate_on == "all" else calibrate_on,
             progress=lambda s: tell("residual model", s),
         )
-    rt.CorrectedTwin(ibg, rg, case=case).save(out)
-    table = Table("output", "RMSE", "NRMSE")
+    # A model is used from other folders, too.
+    name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
+    rt.CorrectedTwin(ibg, rg, case=name).save(out)
+    console = Console()
+    console.print("Surrogate on held-out twin trajectories:")
+    console.print(_of_surrogate(ibg))
+    console.print(_of_residual(rg))
+    console.print(f"Saved {out}", soft_wrap=True)
+
+
+def _system(
+    case: str, network: str | None, correction: str | None, density: str | None, refine: bool
+) -> Case:
+    """The case, with what the command line says otherwise."""
+    import retwin as rt
+    from retwin.cases.file import check_density
+    from retwin.corrections import NAMED_OPERATORS
+    from retwin.networks import SURROGATES
+    from retwin.residual import NAMED_DENSITIES, Density
+
+    system = rt.cases.get(case)
+    if network is not None:
+        system = replace(system, network=named(network, SURROGATES, "network"), training=None)
+    if correction is not None:
+        system = replace(system, correction=named(correction, NAMED_OPERATORS, "correction"))
+    if density is not None:
+        system = replace(system, density=named(density, NAMED_DENSITIES, "density"))
+    check_density(system.correction, system.density)
+    if not refine:
+        return system
+    if not isinstance(system.density, Density):
+        raise rt.InputError(
+            "--refine",
+            expected="a density of one z per movement, mixture or flow",
+            got=type(system.density).__name__,
+            remedy="leave it out",
+        )
+    return replace(system, density=replace(system.density, refinement=rt.Refinement()))
+
+
+def _measured(system: Case, real: Path | None, data: Path | None) -> Trajectories:
+    """The real trajectories to calibrate on."""
+    import retwin as rt
+
+    if (real is None) == (data is None):
+        raise rt.InputError(
+            "real data",
+            expected="either --real or --data",
+            got="none" if real is None else "both",
+            remedy="give --real FILE; or --data FILE, for a case that says how it is split",
+        )
+    if real is not None:
+        with bar("read") as tell:
+            return rt.load(real, case=system, progress=lambda s: tell(real.name, s))
+    assert data is not None
+    if system.records is None:
+        raise rt.InputError(
+            "--data",
+            expected="a case that says how its file is split",
+            got=f"{system.name!r}, which does not",
+            remedy="give --real FILE",
+        )
+    return system.records(data)[0]
+
+
+def _of_twin(system: Case, file: Path | None, simulations: int, seed: int) -> Trajectories:
+    """What the twin says: from a file, or healthy simulations of the case's own."""
+    import retwin as rt
+
+    if file is not None:
+        with bar("read") as tell:
+            return rt.load(file, case=system, progress=lambda s: tell(file.name, s))
+    healthy = replace(system, faults={HEALTHY: None})
+    with bar("simulate") as tell:
+        return rt.generate(
+            system.twin, healthy, per_class=simulations, seed=seed, progress=lambda s: tell("", s)
+        )
+
+
+def _of_surrogate(ibg: Surrogate) -> Table:
     assert ibg.fitted is not None
-    assert rg.fitted is not None
+    table = Table("output", "RMSE", "NRMSE")
+    figures = ibg.fitted.figures
     for name, unit in zip(ibg.outputs.names, ibg.outputs.units, strict=True):
-        figures = ibg.fitted.figures
         table.add_row(
             name, f"{figures[f'rmse_{name}']:.3g} {unit}", f"{figures[f'nrmse_{name}']:.2%}"
         )
-    console = Console()
-    console.print("Surrogate on held-out twin trajectories:")
-    console.print(table)
-    console.print(
-        f"Residual model: {rg.fitted.figures['movements']:.0f} movements of "
-        f"{rg.fitted.figures['trajectories']:.0f} "
-        f"{'EMULATED ' if rg.emulated else ''}trajectories; {rg.fitted.reason}."
+    return table
+
+
+def _of_residual(rg: ResidualModel | SequenceResidual) -> str:
+    """What a residual model learned from, and how it fared on what it did not."""
+    from retwin.residual import ResidualModel
+
+    assert rg.fitted is not None
+    figures, reason = rg.fitted.figures, rg.fitted.reason
+    emulated = "EMULATED " if rg.emulated else ""
+    if isinstance(rg, ResidualModel):
+        counted = f"{figures['movements']:.0f} movements of {figures['trajectories']:.0f} "
+        return f"Residual model: {counted}{emulated}trajectories; {reason}."
+    latent = zip(rg.latent.names, rg.latent.units, strict=True)
+    errors = ", ".join(f"{name} {figures[f'rmse_{name}']:.3g} {unit}" for name, unit in latent)
+    return (
+        f"Residual model: {figures['samples']:.0f} {emulated}samples; {reason}. "
+        f"On parts held out its mean errs by {errors} (RMSE), and its 90 % band holds "
+        f"{figures['coverage90']:.0%}."
     )
-    console.print(f"Saved {out}", soft_wrap=True)
 
 
 def generate(

@@ -33,7 +33,7 @@ COLUMNS = {
 
 
 def study(
-    case: Annotated[str, typer.Argument(help="Built-in case or package.module:object.")],
+    case: Annotated[str, typer.Argument(help="Built-in case, case.toml, or module:object.")],
     out: Annotated[Path, typer.Option(help="Folder; called again, the study goes on there.")],
     twin_data: Annotated[Path | None, typer.Option(help="Trajectories of the twin.")] = None,
     calibration: Annotated[Path | None, typer.Option(help="Real set to calibrate on.")] = None,

@@ -47,6 +47,7 @@ app.command(
 OTHERS = {
     "FILE.fmu": "an FMU for co-simulation (FMI 2 or 3)",
     "FILE.xml, FILE.urdf": "a MuJoCo model",
+    "case.toml": "the twin of a case of your own",
     "package.module:object": "a twin, or a function from commands to outputs",
     "FOLDER": "a corrected twin or a surrogate that was saved",
 }
@@ -154,7 +155,15 @@ def _twin(name: str, inputs: str, outputs: str, rate: float | None) -> Twin:
     """The twin of that name, or the model that was saved in that folder."""
     if (Path(name) / "model.json").is_file() and not (inputs or outputs or rate):
         return _model(Path(name))
+    if _is_case(name) and not (inputs or outputs or rate):
+        from retwin import cases
+
+        return cases.get(name).twin
     return twins.get(name, inputs=_names(inputs), outputs=_names(outputs), rate=rate)
+
+
+def _is_case(name: str) -> bool:
+    return Path(name).suffix.lower() == ".toml"
 
 
 def _model(folder: Path) -> Twin:
@@ -178,15 +187,23 @@ def _names(given: str) -> tuple[str, ...]:
 def _title(name: str, found: Twin) -> str:
     if name in twins.BUILT_IN:
         return f"{name}: {twins.BUILT_IN[name][2]}"
+    if _is_case(name):
+        from retwin import cases
+
+        return f"{name}: {cases.get(name).title}"
     told = (type(found).__doc__ or "").strip().partition("\n")[0]
     return f"{Path(name).name} ({type(found).__name__}): {told}"
 
 
 def _case(given: str | None, name: str, found: Twin) -> Case | None:
-    """The case that is named, that of a built-in twin, or that a corrected twin was fitted for."""
+    """The case that is named, that of the twin's name, or that a corrected twin was fitted for."""
     from retwin import cases
 
-    own = "armpi" if name in twins.BUILT_IN else getattr(found, "case", "")
+    own = getattr(found, "case", "")
+    if _is_case(name):
+        own = name
+    elif name in twins.BUILT_IN:
+        own = name.partition("-")[0]
     if not (given or own):
         return None
     system = cases.get(given or own)

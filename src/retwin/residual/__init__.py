@@ -6,7 +6,7 @@ from retwin.residual.fitting import fit_residual, infer_discrepancy
 from retwin.residual.model import ResidualModel, segment
 from retwin.residual.protocol import Residual, load_residual
 from retwin.residual.sequence import SequenceMixture, SequenceResidual
-from retwin.residual.settings import NAMED_DENSITIES, Density, Flow, Mixture, Refinement
+from retwin.residual.settings import Density, Flow, Mixture, Refinement
 
 __all__ = [
     "NAMED_DENSITIES",
@@ -23,3 +23,10 @@ __all__ = [
     "load_residual",
     "segment",
 ]
+
+NAMED_DENSITIES: dict[str, Density | SequenceMixture] = {
+    "mixture": Mixture(),
+    "flow": Flow(),
+    "sequence_mixture": SequenceMixture(),
+}
+"""Those that the command line knows by name."""

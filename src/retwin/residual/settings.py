@@ -12,7 +12,7 @@ from retwin.flows import FlowHead
 from retwin.mixture import MixtureHead
 from retwin.training import Training
 
-__all__ = ["DENSITIES", "NAMED_DENSITIES", "Density", "Flow", "Mixture", "Refinement"]
+__all__ = ["DENSITIES", "Density", "Flow", "Mixture", "Refinement"]
 
 
 @dataclass(frozen=True)
@@ -127,5 +127,3 @@ class Flow(Density):
 
 DENSITIES: tuple[type, ...] = (Mixture, Flow, Refinement, Training)
 """Those that a model folder may name, and their parts."""
-NAMED_DENSITIES: dict[str, Density] = {"mixture": Mixture(), "flow": Flow()}
-"""Those that the command line knows by name."""

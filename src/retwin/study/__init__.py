@@ -14,6 +14,7 @@ import numpy as np
 from retwin.case import Case
 from retwin.corrected import generate
 from retwin.errors import InputError
+from retwin.scale.identity import identity
 from retwin.storage import load, save, sha256, write_atomically
 from retwin.study.files import Files, Roles
 from retwin.study.plan import PRESETS, StudyPlan
@@ -124,13 +125,14 @@ def _digests(data: StudyData) -> dict[str, dict[str, str]]:
 def _identity(case: Case, plan: StudyPlan, digests: Mapping[str, Any]) -> dict[str, Any]:
     """What decides the result of every job, as plain JSON values.
 
-    Two studies are the same if it is. Which sources and how many runs there are decides none of
+    Two studies are the same if it is. The case counts with all it holds, functions by their names.
+    Which sources and how many runs there are decides none of
     them, so a study may grow.
     """
-    faults = {name: repr(fault) for name, fault in case.faults.items()}
     grows = ("sources", "runs", "learning_curve")
     fixed = {key: value for key, value in asdict(plan).items() if key not in grows}
-    told = {"case": case.name, "faults": faults, "plan": fixed, "data": digests}
+    known = {"name": case.name, "sha256": identity(case)}
+    told = {"case": known, "plan": fixed, "data": digests}
     plain: dict[str, Any] = json.loads(json.dumps(told))
     return plain
 

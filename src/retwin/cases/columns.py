@@ -1,0 +1,108 @@
+"""Records in one table of text: a column for each channel, one set to calibrate, one to test."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.errors import InputError
+from retwin.storage import sha256
+from retwin.trajectories import Channels, Source, Trajectories
+from retwin.twins.protocol import HEALTHY, Twin
+
+__all__ = ["ColumnRecords"]
+
+
+@dataclass(frozen=True)
+class ColumnRecords:
+    """Call it on a CSV file with a header: out come the record to calibrate on, and that to test.
+
+    One trajectory each, healthy. It ends where its commands end; an output that is missing before
+    is masked. `nominal` is what the twin says.
+
+    Parameters
+    ----------
+    twin: tells channels and rate.
+    calibration, test: the name of each channel's column.
+
+    Raises
+    ------
+    InputError: not one column for each input and output; when called, a file that cannot be read
+        or lacks a column, a command that is no number.
+
+    """
+
+    twin: Twin
+    calibration: Mapping[str, str]
+    test: Mapping[str, str]
+
+    def __post_init__(self) -> None:
+        wanted = (*self.twin.inputs.names, *self.twin.outputs.names)
+        for name in ("calibration", "test"):
+            given = getattr(self, name)
+            if set(given) != set(wanted):
+                raise InputError(
+                    name,
+                    expected=f"a column for each of {', '.join(wanted)}",
+                    got=f"{', '.join(given) or 'none'}",
+                    remedy='write for each channel NAME = "COLUMN"',
+                )
+
+    def __call__(self, path: str | Path) -> tuple[Trajectories, Trajectories]:
+        """The record to calibrate on, and the one to test."""
+        path = Path(path)
+        table = _read(path, [*self.calibration.values(), *self.test.values()])
+        source = Source(path.name, sha256(path))
+        return (
+            self._record(table, "calibration", source),
+            self._record(table, "test", source),
+        )
+
+    def _record(self, table: Mapping[str, NDArray], name: str, source: Source) -> Trajectories:
+        columns = getattr(self, name)
+
+        def values(channels: Channels) -> NDArray:
+            return np.stack([table[columns[each]] for each in channels.names], axis=-1)[None]
+
+        commands = values(self.twin.inputs)
+        told = np.isfinite(commands[0]).all(axis=1)
+        steps = int(np.flatnonzero(told).max(initial=-1)) + 1
+        if steps < 2 or not told[:steps].all():
+            raise InputError(
+                source.name,
+                expected="a number for every command until the record ends, two rows at least",
+                got=f"{int(told.sum())} of {steps} rows of the {name} record",
+                remedy="fill the gaps: what was commanded is known",
+            )
+        commands = commands[:, :steps]
+        return Trajectories(
+            commands=commands,
+            nominal=self.twin.simulate(commands, seed=0).nominal,
+            observed=values(self.twin.outputs)[:, :steps],
+            rate=self.twin.rate,
+            labels=np.array([HEALTHY]),
+            ids=np.array([name]),
+            inputs=self.twin.inputs,
+            outputs=self.twin.outputs,
+            provenance=(source,),
+        )
+
+
+def _read(path: Path, names: list[str]) -> dict[str, NDArray]:
+    """Those columns; NaN where a cell is empty."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as lines:
+            rows = list(csv.DictReader(lines, strict=True))
+        return {name: np.array([float(row[name] or "nan") for row in rows]) for name in names}
+    except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
+        raise InputError(
+            str(path),
+            expected=f"a CSV file with a header and numbers in columns {', '.join(names)}",
+            got=f"{type(error).__name__}: {error}",
+            remedy="name the columns as the file does",
+        ) from None

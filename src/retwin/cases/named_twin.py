@@ -1,0 +1,234 @@
+"""What a case.toml names: Python objects beside it, and the twin, whichever kind it is."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from retwin import twins
+from retwin.configs import at, checked, from_settings, key, named, table
+from retwin.errors import InputError
+from retwin.trajectories import Channels
+from retwin.twins.fmu import FMUTwin
+from retwin.twins.function import FunctionTwin
+from retwin.twins.mujoco import MuJoCoTwin, Servo
+from retwin.twins.parametric import Parameter, ParametricTwin
+from retwin.twins.protocol import Limits, Twin
+
+__all__ = ["imported", "parametric_twin", "read_twin"]
+
+FILES: dict[str, Any] = {".fmu": FMUTwin, ".xml": MuJoCoTwin, ".urdf": MuJoCoTwin}
+APART = ("path", "function", "inputs", "outputs", "sensors", "rate", "limits")
+"""Parameters of twins that a case.toml tells elsewhere."""
+
+Named = Mapping[str, Any] | Sequence[str]
+"""Channels: a table of each, or names alone."""
+
+
+@dataclass(frozen=True)
+class _Channel:
+    """What a table tells of a channel of a function."""
+
+    unit: str = "1"
+    low: float = float("-inf")
+    high: float = float("inf")
+
+
+def imported(name: Any, folder: Path, place: str) -> Any:
+    """What `module:object` names.
+
+    Modules in `folder` can be imported from then on, here and in worker processes, after all that
+    is installed. Raises InputError where there is none, and where `folder` has a module of that
+    name but another one was found.
+    """
+    module, _, attribute = str(name).partition(":")
+    expected = "module:object, the module installed or beside the case"
+    if not re.fullmatch(r"\w+(\.\w+)*:\w+", str(name)):
+        raise InputError(place, expected=expected, got=repr(name), remedy="check the spelling")
+    if str(folder.resolve()) not in sys.path:
+        sys.path.append(str(folder.resolve()))
+    try:
+        home = importlib.import_module(module)
+        found = getattr(home, attribute)
+    except (ImportError, AttributeError) as error:
+        raise InputError(
+            place,
+            expected=expected,
+            got=f"{name!r}: {' '.join(str(error).split())}",
+            remedy="check the spelling",
+        ) from None
+    beside = folder / f"{module}.py"
+    if beside.is_file() and not beside.samefile(home.__file__ or ""):
+        raise InputError(
+            place,
+            expected=f"the module {beside}",
+            got=f"another one of that name, {home.__file__}",
+            remedy="give your module a name of its own",
+        )
+    return found
+
+
+def read_twin(
+    told: Any, inputs: Named, outputs: Named, rate: float | None, folder: Path, place: str
+) -> Twin:
+    """The twin that a text names, or a table that holds its name and its settings.
+
+    | name | takes |
+    |---|---|
+    | `module:function` | inputs and outputs as tables, with units and limits; rate |
+    | `module:object`, or a built-in one | nothing, for it has its own |
+    | `*.fmu`, `*.xml`, `*.urdf` | names of inputs and outputs, by default all; rate |
+    """
+    own = key(place, "twin")
+    options = dict(told) if isinstance(told, Mapping) else {"name": told}
+    name = options.pop("name", None)
+    if not isinstance(name, str):
+        raise InputError(
+            own,
+            expected=f"the name of a twin: {twins.FORMS}",
+            got=repr(told),
+            remedy='write twin = "NAME", or a table with a name in it',
+        )
+    if "nominal" in options:
+        options["nominal"] = imported(options["nominal"], folder, key(own, "nominal"))
+    if Path(name).suffix.lower() in FILES:
+        return _of_file(folder / name, inputs, outputs, rate, options, place)
+    found = imported(name, folder, own) if ":" in name else None
+    if callable(found) and (inputs or outputs):
+        return _of_function(found, inputs, outputs, rate, options, place)
+    if options:
+        raise InputError(
+            own,
+            expected="a name alone, for such a twin has its own settings",
+            got=", ".join(options),
+            remedy="make the object with these settings",
+        )
+    with at(place):
+        return twins.get(name, inputs=tuple(inputs), outputs=tuple(outputs), rate=rate)
+
+
+def _of_function(
+    function: Any,
+    inputs: Named,
+    outputs: Named,
+    rate: float | None,
+    options: dict[str, Any],
+    place: str,
+) -> FunctionTwin:
+    told = _channels(inputs, key(place, "inputs"))
+    made = _channels(outputs, key(place, "outputs"))
+    own = key(place, "twin")
+    outside = _outside(options, own)
+    settings = checked(FunctionTwin, options, place=own, besides=APART)
+    with at(key(place, "inputs")):
+        limits = Limits(
+            tuple(each.low for each in told.values()),
+            tuple(each.high for each in told.values()),
+            outside,
+        )
+    with at(place):
+        return FunctionTwin(
+            function,
+            Channels(tuple(told), tuple(each.unit for each in told.values())),
+            Channels(tuple(made), tuple(each.unit for each in made.values())),
+            rate,  # type: ignore[arg-type]  # it says so itself where there is none
+            limits=limits,
+            **settings,
+        )
+
+
+def _of_file(
+    file: Path,
+    inputs: Named,
+    outputs: Named,
+    rate: float | None,
+    options: dict[str, Any],
+    place: str,
+) -> Twin:
+    own, kind = key(place, "twin"), FILES[file.suffix.lower()]
+    if not file.is_file():
+        raise InputError(
+            own, expected="a file", got=f"{file}, where there is none", remedy="check the name"
+        )
+    for name, given in (("inputs", inputs), ("outputs", outputs)):
+        if isinstance(given, Mapping) and any(given.values()):
+            raise InputError(
+                key(place, name),
+                expected=f"names alone, since units and limits are those of {file.name}",
+                got=repr(given),
+                remedy=f"write {name} = [{', '.join(repr(each) for each in given)}]",
+            )
+    servos, outside = options.pop("servos", {}), _outside(options, own)
+    settings = checked(kind, options, place=own, besides=(*APART, "servos", "outside"))
+    if servos:
+        inside = key(own, "servos")
+        settings["servos"] = [
+            (joint, from_settings(Servo, value, place=key(inside, joint)))
+            for joint, value in table(servos, inside).items()
+        ]
+    if rate is not None:
+        settings["rate"] = rate
+    with at(own):
+        made: Twin = kind.from_file(
+            file, inputs=tuple(inputs), outputs=tuple(outputs), outside=outside, **settings
+        )
+        return made
+
+
+def _outside(options: dict[str, Any], place: str) -> Any:
+    """What to do with commands beyond the limits."""
+    known = {name: name for name in ("refuse", "clip")}
+    return named(options.pop("outside", "refuse"), known, key(place, "outside"))
+
+
+def _channels(given: Named, place: str) -> dict[str, _Channel]:
+    """A table of each channel, which its name alone stands for too."""
+    tables = given if isinstance(given, Mapping) else {name: {} for name in given}
+    return {
+        name: from_settings(_Channel, value, place=key(place, name))
+        for name, value in tables.items()
+    }
+
+
+def parametric_twin(twin: Twin, free: Sequence[Parameter], place: str) -> ParametricTwin:
+    """`twin` at the parameters' starts; those of a function are keyword arguments of it.
+
+    Raises InputError for parameters that the twin does not take.
+    """
+    if not isinstance(twin, FunctionTwin):
+        if "parameters" not in inspect.signature(twin.simulate).parameters:
+            raise _takes_none(place, type(twin).__name__, free)
+        with at(place):
+            return ParametricTwin(twin, tuple(free))  # type: ignore[arg-type]
+    taken = inspect.signature(twin.function).parameters
+    unknown = [each for each in free if each.name not in taken]
+    if unknown:
+        raise _takes_none(place, getattr(twin.function, "__qualname__", "the function"), unknown)
+    return ParametricTwin.built(partial(_with_values, twin), free)
+
+
+def _with_values(twin: FunctionTwin, values: Mapping[str, float]) -> FunctionTwin:
+    """The twin whose functions get `values`, each those that it takes by name."""
+
+    def bound(function: Any) -> Any:
+        taken = inspect.signature(function).parameters
+        return partial(function, **{name: v for name, v in values.items() if name in taken})
+
+    nominal = None if twin.nominal is None else bound(twin.nominal)
+    return replace(twin, function=bound(twin.function), nominal=nominal)
+
+
+def _takes_none(place: str, what: str, parameters: Sequence[Parameter]) -> InputError:
+    return InputError(
+        place,
+        expected=f"parameters that {what} takes by name",
+        got=", ".join(each.name for each in parameters),
+        remedy="give the function keyword arguments of these names, or leave them out",
+    )
