@@ -13,8 +13,10 @@ from scipy.signal import lfilter
 import retwin as rt
 from retwin.corrected import CorrectedTwin
 from retwin.corrections import Additive
+from retwin.mixture import GaussianMixture
 from retwin.networks import LSTM, TCN
 from retwin.residual import SequenceMixture, SequenceResidual, fit_residual, load_residual
+from retwin.residual.sequence import trusted
 from retwin.residual.sequence_fitting import held_parts
 from retwin.training import Training
 
@@ -77,6 +79,7 @@ def test_one_record_teaches_the_gap(twin: rt.Surrogate, rg: SequenceResidual) ->
     z = rg.mean(rg.context(twin, commands)).numpy()
     error = np.sqrt(np.square(z - gap(commands)).mean())
     assert error < 0.25 * gap(commands).std()
+    assert float(rg.trust) > 0.9
 
 
 def test_draws_have_the_law_and_the_memory_of_the_noise(
@@ -103,6 +106,29 @@ def test_bands_hold_records_it_has_not_seen(twin: rt.Surrogate, rg: SequenceResi
         inside.append((low <= z) & (z <= high))
     assert 0.82 < np.mean(inside) < 0.98
     assert 0.82 < rg.fitted.figures["coverage90"] < 0.98
+
+
+def test_a_gap_that_the_past_does_not_tell_is_not_believed(twin: rt.Surrogate) -> None:
+    """One slow wave beside the input: members learn it by heart, and it holds nowhere else."""
+    made = twin.simulate(commands_of(1, 20), seed=0)
+    wave = np.sin(np.arange(STEPS) / 60)[None, :, None].astype(np.float32)
+    quick = replace(SMALL, members=4, block=100, gap=50)
+    rg = fit_residual(twin, made.replace(observed=made.nominal + wave), Additive(), quick, seed=0)
+    figures = rg.fitted.figures
+    assert float(rg.trust) == figures["trust_residual_y"] < 0.6
+    assert figures["rmse_residual_y"] <= figures["rmse_residual_y/constant"] + 1e-6
+    z = rg.mean(rg.context(twin, commands_of(5, 99)))
+    assert z.std() < 0.4 * wave.std()
+
+
+def test_trust_is_a_share_of_the_way_and_leaves_the_shape() -> None:
+    law = GaussianMixture(
+        torch.tensor([0.0, 0.0]), torch.tensor([[1.0], [5.0]]), torch.ones(2, 1, 1)
+    )
+    (half,) = trusted([law], [torch.tensor([1.0])], [torch.tensor([0.5])])
+    torch.testing.assert_close(half.mean, torch.tensor([2.0]))
+    torch.testing.assert_close(half.means, law.means - 1.0)
+    torch.testing.assert_close(half.variance, law.variance)
 
 
 def test_without_persistence_draws_are_white(twin: rt.Surrogate, record: rt.Trajectories) -> None:
@@ -152,10 +178,11 @@ def test_what_is_not_measured_does_not_count(twin: rt.Surrogate, record: rt.Traj
 
 
 def test_parts_are_held_out_once_and_by_whole_records_where_there_are_enough() -> None:
-    one = held_parts(1, 1000, SequenceMixture())
+    one = held_parts(torch.ones(1, 1000, dtype=torch.bool), SequenceMixture())
     assert (one.sum(dim=0) == 1).all()
     assert one.flatten(1).any(dim=1).all()
-    several = held_parts(12, 100, SequenceMixture(members=4))
+    every = torch.ones(12, 100, dtype=torch.bool)
+    several = held_parts(every, SequenceMixture(members=4))
     assert (several.all(dim=2) == several.any(dim=2)).all()
     assert (several.any(dim=2).sum(dim=1) == 3).all()
 
@@ -198,6 +225,7 @@ def test_operator_and_density_must_belong_together(
         fit_residual(twin, record, rt.DelayOffset(), SMALL, seed=0, segments="path")
     with pytest.raises(rt.InputError, match="burn_in below window"):
         SequenceMixture(window=10, burn_in=10)
-    hidden = record.replace(mask=np.zeros(record.mask.shape, dtype=bool))
+    late = np.broadcast_to(np.arange(STEPS)[None, :, None] > STEPS - 20, record.mask.shape)
+    hidden = record.replace(mask=late)
     with pytest.raises(rt.InputError, match="some parts with none"):
         fit_residual(twin, hidden, Additive(), SMALL, seed=0)

@@ -229,7 +229,6 @@ def test_concatenate_joins_and_renumbers_only_when_ids_repeat():
     ("name", "other"),
     [
         ("rate", {"rate": 50.0}),
-        ("steps", {"steps": 4}),
         ("inputs", {"d_u": 1}),
         ("outputs", {"d_y": 2}),
     ],
@@ -238,6 +237,24 @@ def test_concatenate_refuses_sets_that_differ(name, other):
     with pytest.raises(InputError) as caught:
         Trajectories.concatenate([make(), make(**other)])
     assert caught.value.argument == name
+
+
+def test_concatenate_pads_shorter_sets():
+    both = Trajectories.concatenate([make(), make(steps=4)])
+    assert both.steps == make().steps
+    assert both.lengths.tolist() == [make().steps] * len(make()) + [4] * len(make(steps=4))
+    short = both[slice(len(make()), None)]
+    assert not short.mask[:, 4:].any()
+    np.testing.assert_array_equal(
+        short.nominal[:, 4:], short.nominal[:, 3:4].repeat(short.steps - 4, 1)
+    )
+
+
+def test_only_channels_of_one_real_unit_compare():
+    assert Channels(("x", "y"), ("m", "m")).comparable
+    assert not Channels(("x", "a"), ("m", "rad")).comparable
+    assert not Channels.numbered("y", 2).comparable, "what has no unit may be anything"
+    assert Channels.numbered("y", 1).comparable
 
 
 def test_concatenate_needs_a_set():

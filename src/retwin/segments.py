@@ -6,7 +6,7 @@ by the user. Onsets jitter and may fall between samples: nothing here assumes a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -61,6 +61,12 @@ class Segments:
     def most(self) -> int:
         """The largest number of movements in one trajectory, M."""
         return self.start.shape[1]
+
+    def until(self, ends: ArrayLike) -> Segments:
+        """The same in trajectories that end after `ends` (n,) samples; what follows is padding."""
+        ends = np.asarray(ends, dtype=float)[:, None]
+        stop = np.minimum(self.stop, np.maximum(self.settle, ends))
+        return replace(self, stop=stop)
 
     @classmethod
     def given(cls, start: ArrayLike, settle: ArrayLike, *, steps: int) -> Segments:

@@ -56,6 +56,15 @@ class Surrogate(nn.Module):
         """Whether an output depends on the command of its own sample only."""
         return isinstance(self.config, MLP)
 
+    @property
+    def unit(self) -> Tensor:
+        """(d_y,) what outputs are divided by to be compared with each other: their spread.
+
+        One for all where they have the same unit.
+        """
+        spread = self.after.scale
+        return spread.mean().expand_as(spread) if self.outputs.comparable else spread
+
     def forward(self, commands: Tensor) -> Tensor:
         """Outputs (n, T, d_y) for commands (n, T, d_u), both in physical units."""
         return self.after.inverse(self.network(self.before(commands)))
@@ -178,13 +187,14 @@ def fit_surrogate(
         surrogate = Surrogate(network, inputs=twin.inputs, outputs=twin.outputs, rate=twin.rate)
     rows = _samples if isinstance(network, MLP) else _windows
     fitted = rows(twin, train_part, seed)
-    surrogate.before.fit(fitted[0])
-    surrogate.after.fit(fitted[1])
+    commands, nominal, there = fitted
+    surrogate.before.fit(commands[there])
+    surrogate.after.fit(nominal[there])
 
     def loss(module: Any, batch: tuple[Tensor, ...]) -> Tensor:
-        commands, nominal = batch
+        commands, nominal, there = batch
         error = module.network(module.before(commands)) - module.after(nominal)
-        return error.square().mean()
+        return error[there].square().mean()
 
     result = train(
         surrogate,
@@ -195,9 +205,10 @@ def fit_surrogate(
         seed=seed,
         progress=progress,
     )
-    error = surrogate.predict(twin.commands[test]) - twin.nominal[test]
-    rmse = np.sqrt(np.square(error, dtype=np.float64).mean(axis=(0, 1)))
-    spread = twin.nominal[test].std(axis=(0, 1), dtype=np.float64)
+    whole = _there(twin, test)
+    error = (surrogate.predict(twin.commands[test]) - twin.nominal[test])[whole]
+    rmse = np.sqrt(np.square(error, dtype=np.float64).mean(axis=0))
+    spread = twin.nominal[test][whole].std(axis=0, dtype=np.float64)
     figures = {"held_out": float(tenth)}
     for name, error_of, spread_of in zip(twin.outputs.names, rmse, spread, strict=True):
         figures[f"rmse_{name}"] = float(error_of)
@@ -209,7 +220,12 @@ def fit_surrogate(
 SAMPLES = 200_000
 
 
-def _samples(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, Tensor]:
+def _there(twin: Trajectories, part: NDArray) -> NDArray:
+    """(len(part), T) bool, what is no padding: there a nominal output is held, not the twin's."""
+    return np.arange(twin.steps) < twin.lengths[part][:, None]
+
+
+def _samples(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, ...]:
     """Distinct samples of those trajectories, at most SAMPLES: a hold says the same all over."""
     commands = twin.commands[part].reshape(-1, twin.commands.shape[2])
     nominal = twin.nominal[part].reshape(-1, twin.nominal.shape[2])
@@ -221,12 +237,14 @@ def _samples(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, Tens
     return (
         torch.as_tensor(commands[index], dtype=torch.float32),
         torch.as_tensor(nominal[index], dtype=torch.float32),
+        torch.ones(len(index), dtype=torch.bool),
     )
 
 
-def _windows(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, Tensor]:
-    """Whole trajectories."""
+def _windows(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, ...]:
+    """Whole trajectories, and what of them is no padding."""
     return (
         torch.tensor(twin.commands[part], dtype=torch.float32),
         torch.tensor(twin.nominal[part], dtype=torch.float32),
+        torch.as_tensor(_there(twin, part)),
     )

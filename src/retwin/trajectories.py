@@ -15,6 +15,7 @@ from retwin.errors import InputError
 __all__ = ["Channels", "Progress", "Source", "Trajectories"]
 
 UNLABELLED = ""
+PER_TRAJECTORY = ("commands", "nominal", "observed", "mask", "labels", "ids")
 
 Progress = Callable[[float], None]
 """Called with the share that is done, 0 … 1."""
@@ -38,6 +39,14 @@ class Channels:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def comparable(self) -> bool:
+        """Whether numbers of different channels compare: all have one unit, which "1" is not.
+
+        A single channel compares with itself.
+        """
+        return len(self) == 1 or (len(set(self.units)) == 1 and self.units[0] != "1")
 
     @classmethod
     def of(cls, values: Mapping[str, Sequence[str]]) -> Channels:
@@ -75,7 +84,7 @@ class Trajectories:
     provenance: the files or makers the data came from.
     emulated: True when `observed` stands for a real system's measurements but a model made it.
 
-    Arrays are read-only. Shorter trajectories are padded: mask False, commands held.
+    Arrays are read-only. Shorter trajectories are padded (`padded`): mask False, commands held.
     NaN in `observed` means missing and goes to the mask.
 
     Raises
@@ -155,15 +164,8 @@ class Trajectories:
                     got=f"{len(channels)}: {list(channels.names)}",
                     remedy="name every column",
                 )
-        checked = {
-            "commands": commands,
-            "nominal": nominal,
-            "observed": observed,
-            "mask": mask,
-            "labels": labels,
-            "ids": ids,
-        }
-        for name, array in checked.items():
+        checked = (commands, nominal, observed, mask, labels, ids)
+        for name, array in zip(PER_TRAJECTORY, checked, strict=True):
             array = array.view()
             array.flags.writeable = False
             object.__setattr__(self, name, array)
@@ -188,6 +190,17 @@ class Trajectories:
         return self.commands.shape[1]
 
     @property
+    def lengths(self) -> NDArray:
+        """(n,) samples of each, after which nothing is measured nor commanded anew: padding.
+
+        All T where nothing was measured at all, as with a twin that was asked for `nominal` only.
+        """
+        eventful: NDArray = np.any(self.mask, axis=2)
+        nothing: NDArray = ~np.any(eventful, axis=1)
+        eventful[:, 1:] |= (self.commands[:, 1:] != self.commands[:, :-1]).any(axis=2)
+        return self.steps - (eventful | nothing[:, None])[:, ::-1].argmax(axis=1)
+
+    @property
     def residual(self) -> NDArray:
         """(n, T, d_y) observed minus nominal (Eq. 11), 0 where nothing was measured."""
         return np.where(self.mask, self.observed - self.nominal, 0).astype(self.nominal.dtype)
@@ -203,18 +216,32 @@ class Trajectories:
             index = np.atleast_1d(index)
             if index.size == 0:
                 index = index.astype(int)  # an empty list is float to numpy, which indexes nothing
-        return self.replace(
-            commands=self.commands[index],
-            nominal=self.nominal[index],
-            observed=self.observed[index],
-            mask=self.mask[index],
-            labels=self.labels[index],
-            ids=self.ids[index],
-        )
+        return self.replace(**{name: getattr(self, name)[index] for name in PER_TRAJECTORY})
 
     def replace(self, **changes: Any) -> Trajectories:
         """A copy with some attributes changed, checked again."""
         return replace(self, **changes)
+
+    def padded(self, steps: int) -> Trajectories:
+        """The same with `steps` samples each: the last values held, and nothing measured there.
+
+        Raises InputError for fewer samples than there are.
+        """
+        more = steps - self.steps
+        if more < 0:
+            raise InputError(
+                "steps",
+                expected=f"at least {self.steps}, the samples that there are",
+                got=repr(steps),
+                remedy="padding only makes trajectories longer",
+            )
+        longer = ((0, 0), (0, more), (0, 0))
+        return self.replace(
+            commands=np.pad(self.commands, longer, mode="edge"),
+            nominal=np.pad(self.nominal, longer, mode="edge"),
+            observed=np.pad(self.observed, longer),
+            mask=np.pad(self.mask, longer),
+        )
 
     def with_label(self, label: str) -> Trajectories:
         """Those of class `label`."""
@@ -268,9 +295,9 @@ class Trajectories:
 
     @staticmethod
     def concatenate(sets: Sequence[Trajectories]) -> Trajectories:
-        """All trajectories of several sets, renumbered when ids repeat.
+        """All trajectories of several sets, padded to the longest, renumbered when ids repeat.
 
-        Raises InputError when rates, lengths or channels differ, or there is no set.
+        Raises InputError when rates or channels differ, or there is no set.
         """
         if not sets:
             raise InputError(
@@ -281,7 +308,7 @@ class Trajectories:
             )
         first = sets[0]
         for other in sets[1:]:
-            for name in ("rate", "steps", "inputs", "outputs"):
+            for name in ("rate", "inputs", "outputs"):
                 if getattr(other, name) != getattr(first, name):
                     raise InputError(
                         name,
@@ -290,17 +317,15 @@ class Trajectories:
                         remedy="resample or rename before joining",
                     )
 
-        def joined(name: str) -> NDArray:
-            return np.concatenate([getattr(each, name) for each in sets])
-
-        ids = joined("ids")
+        longest = max(each.steps for each in sets)
+        sets = [each.padded(longest) for each in sets]
+        joined: dict[str, Any] = {
+            name: np.concatenate([getattr(each, name) for each in sets]) for name in PER_TRAJECTORY
+        }
+        if len(set(joined["ids"].tolist())) < len(joined["ids"]):
+            joined["ids"] = None
         return first.replace(
-            commands=joined("commands"),
-            nominal=joined("nominal"),
-            observed=joined("observed"),
-            mask=joined("mask"),
-            labels=joined("labels"),
-            ids=ids if len(set(ids.tolist())) == len(ids) else None,
+            **joined,
             provenance=tuple(dict.fromkeys(s for each in sets for s in each.provenance)),
             emulated=any(each.emulated for each in sets),
         )

@@ -90,6 +90,35 @@ def test_a_stuck_actuator_stays_where_z_had_brought_it(exact, commands: np.ndarr
     assert (path[:, 200:] - free[:, 200:]).norm(dim=-1).max() > 0.02
 
 
+def lateness(angles: np.ndarray, commands: np.ndarray, segments: rt.Segments) -> np.ndarray:
+    """How late the joints were, (n, M) in samples, seen on themselves; NaN where none moved.
+
+    A joint's delay is the area between the shares of its way that it was told to have gone and that
+    it has gone; joints count by the square of their way, as in least squares.
+    """
+    late = np.full(segments.start.shape, np.nan)
+    for i, m in np.argwhere(segments.valid):
+        begin, stop = int(segments.start[i, m]), int(np.ceil(segments.stop[i, m]))
+        path, told = angles[i, begin:stop], commands[i, begin:stop].astype(float)
+        way, meant = path[-1] - path[0], told[-1] - told[0]
+        moved = np.minimum(np.abs(way), np.abs(meant)) > 20
+        if moved.any():
+            behind = ((told - told[0])[:, moved] / meant[moved]).sum(axis=0)
+            behind -= ((path - path[0])[:, moved] / way[moved]).sum(axis=0)
+            late[i, m] = np.average(behind, weights=way[moved] ** 2)
+    return late
+
+
+def test_the_ruler_of_delays_is_straight(case: rt.Case, commands: np.ndarray) -> None:
+    """Where servos have neither dead zone nor play, joints are as late as was drawn."""
+    hidden: dict[str, np.ndarray] = {}
+    tight = replace(case.emulator, dead_zone=0.0, backlash=0.0, missed=0.0)
+    tight.simulate(commands, seed=3, hidden=hidden)
+    late = lateness(hidden["angles"], commands, rt.Segments.from_commands(commands))
+    drawn_delay = hidden["delay"] + 100 * KINEMATIC.lag.seconds
+    np.testing.assert_allclose(late, drawn_delay, atol=0.05)
+
+
 @pytest.fixture(scope="module")
 def understood(exact, case: rt.Case) -> dict[str, np.ndarray]:
     """z* of 100 emulated trajectories beside the truth."""
@@ -111,7 +140,8 @@ def understood(exact, case: rt.Case) -> dict[str, np.ndarray]:
         "offset error": (z[..., 1:5] - (reached - targets))[good],
         "offset": (reached - targets)[good],
         "offset deviation": deviation[..., 1:5][good],
-        "delay error": z[..., 0] - (hidden["delay"] + 100 * KINEMATIC.lag.seconds),
+        "delay error": z[..., 0] - lateness(hidden["angles"], commands, segments),
+        "delay": hidden["delay"],
         "delay deviation": deviation[..., 0],
     }
 
@@ -131,6 +161,14 @@ def test_intervals_of_offsets_cover(understood: dict) -> None:
     """Nine in ten true offsets lie in their 90 % intervals."""
     inside = np.abs(understood["offset error"]) < 1.645 * understood["offset deviation"]
     assert 0.85 <= inside.mean() <= 0.95
+
+
+@pytest.mark.slow
+def test_intervals_of_delays_cover(understood: dict) -> None:
+    """Nine in ten delays lie in their 90 % intervals, and these say more than the prior."""
+    inside = np.abs(understood["delay error"]) < 1.645 * understood["delay deviation"]
+    assert 0.85 <= inside.mean() <= 0.95
+    assert understood["delay deviation"].mean() < 0.5 * understood["delay"].std()
 
 
 def test_what_the_outputs_do_not_tell_is_said(exact, commands: np.ndarray) -> None:
@@ -180,6 +218,8 @@ def test_a_surrogate_with_memory_gives_the_same(exact, commands: np.ndarray) -> 
     other = rt.CommandSpace().infer(replace(plain, surrogate=Remembering()), observed, polled(4))
     assert (one.z - other.z)[..., 1:5].abs().mean() < 0.2
     assert (one.z - other.z)[..., 0].abs().mean() < 0.1
+    spread = [found.covariance[..., 0, 0].sqrt() for found in (one, other)]
+    torch.testing.assert_close(spread[0], spread[1], rtol=0.1, atol=0.02)
 
 
 def test_names_units_and_config() -> None:

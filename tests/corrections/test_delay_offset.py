@@ -159,6 +159,33 @@ def test_names_units_and_config() -> None:
     assert isinstance(operator, rt.Correction)
 
 
+def test_what_is_drawn_for_movements_that_do_not_exist_is_not_applied(exact) -> None:
+    """Trajectories have different numbers of movements; z has room for the most."""
+    ramp = np.clip(np.arange(200) - 20, 0, 60)
+    second = np.clip(np.arange(200) - 120, 0, 40)
+    commands = np.full((3, 200, 4), 500.0)
+    commands[..., 1] += np.stack([ramp + second, ramp, 0 * ramp])
+    context = context_of(exact, commands)
+    z = torch.zeros(3, 2, 4)
+    z[:2, 0] = torch.tensor([4.0, 0.01, 0.0, -0.01])
+    wild = z.clone()
+    wild[1, 1], wild[2] = -9.0, 9.0
+    operator = rt.DelayOffset()
+    torch.testing.assert_close(operator.apply(context, wild), operator.apply(context, z))
+    torch.testing.assert_close(operator.apply(context, wild)[2], context.path[2])
+
+
+def test_single_channels_may_be_missing(context: rt.Context, z: torch.Tensor) -> None:
+    """Half of all channels at random: few samples are whole, yet z is found as before."""
+    operator = rt.DelayOffset()
+    noise = torch.tensor(np.random.default_rng(5).normal(0, 2e-4, (40, 1000, 3)))
+    observed = operator.apply(context, z) + noise
+    mask = torch.tensor(np.random.default_rng(6).random((40, 1000, 3)) < 0.5)
+    found = operator.infer(context, torch.where(mask, observed, 99.0), mask)
+    assert (found.z - z)[..., 1:].abs().mean() < 5e-5
+    assert (found.z - z)[..., 0].abs().median() < 0.2
+
+
 def test_no_movement_no_correction(exact) -> None:
     context = context_of(exact, np.full((2, 50, 4), 400.0))
     operator = rt.DelayOffset()

@@ -35,6 +35,7 @@ def effective(told: Tensor, segments: Segments, z: Tensor, when: Tensor) -> Tens
         return torch.cat(columns, dim=-1)
     delay, offset, missed = z.split([1, width, width], dim=-1)
     start, settle = (torch.as_tensor(t, dtype=z.dtype) for t in (segments.start, segments.settle))
+    count = torch.as_tensor(segments.valid).sum(dim=1, keepdim=True)
     first, last = read(told, start), read(told, settle)  # (n, M, d_u)
     # How far off the reference every movement leaves an actuator.
     error = [torch.zeros_like(told[:, 0])]
@@ -47,7 +48,7 @@ def effective(told: Tensor, segments: Segments, z: Tensor, when: Tensor) -> Tens
         at = when[..., j].expand(len(told), -1)
         source = Knots.of(segments, delay[..., 0], at).source_time()
         here = read(told[..., j : j + 1], source)[..., 0]
-        index = torch.searchsorted(start, source.detach().contiguous(), right=True)
+        index = torch.searchsorted(start, source.detach().contiguous(), right=True).minimum(count)
         which = (index - 1).clamp_min(0)
         a, b = first[..., j].gather(1, which), last[..., j].gather(1, which)
         begin, end = start.gather(1, which), settle.gather(1, which)

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from retwin.corrections.command_problem import Problem
+from retwin.corrections.command_delays import delay_variance
+from retwin.corrections.command_problem import TAILS, Problem
 from retwin.corrections.protocol import Context, Discrepancy
 from retwin.corrections.warp import read
 
@@ -29,8 +30,6 @@ STEPS = 12
 """Of Gauss-Newton at most in each round."""
 TURNS = 3
 """Missed movements per trajectory that one round may find."""
-TAILS = 4.0
-"""Degrees of freedom of the noise (Student's t): glitches do not count."""
 LOOKS = (6.0, 1.0)
 """Independent looks that a movement's readings at rest, and in motion, are worth at most."""
 SUSPECT = 2.5
@@ -105,8 +104,12 @@ class _Prior:
         late = x[..., 0][problem.valid]
         spread = 1.4826 * (late - late.median()).abs().median() + 1.0
         residual = problem.residual(x, torch.zeros_like(x[..., 1:]))
-        noise = residual.norm(dim=-1)[problem.seen > 0].median().clamp_min(1e-6).repeat(2)
-        width = 0.05 * problem.told.std(dim=(0, 1)).clamp_min(1e-9)
+        seen = problem.seen > 0
+        # Of nothing at all, the median and the spread are NaN.
+        noise = residual.norm(dim=-1)[seen].median().nan_to_num(1.0).clamp_min(1e-6).repeat(2)
+        told = problem.told[:, problem.at][seen]
+        extent = (told - told.mean(dim=0)).square().mean(dim=0).sqrt()
+        width = 0.05 * extent.nan_to_num(1.0).clamp_min(1e-9)
         one = torch.ones((), dtype=torch.float64)
         return cls(late.median(), spread, width, -4.0 * one, noise, one.repeat(2))
 
@@ -281,6 +284,21 @@ def _with(values: Tensor, row: int, value: Tensor) -> Tensor:
     return changed
 
 
+def _delay_variance(problem: Problem, fit: _Fit, missed: Tensor, prior: _Prior) -> Tensor:
+    """(n, M), actuators that are unevenly late accounted for."""
+    noise, thinning = prior.scale(problem)
+    weights = prior.weights(problem, problem.residual(fit.x, missed)) * problem.seen
+    precision = prior.precision(problem)
+    return delay_variance(
+        problem,
+        fit.x,
+        missed,
+        precision=precision,
+        pull=(fit.x - prior.centre(problem)) * precision,
+        rest=weights * (1 - problem.moving) / noise.square() / thinning,
+    )
+
+
 def _told(
     problem: Problem, fit: _Fit, missed: Tensor, chance: Tensor, prior: _Prior
 ) -> Discrepancy:
@@ -296,8 +314,10 @@ def _told(
     told = torch.cat([problem.valid[..., None], problem.healthy], dim=-1).double()
     own = torch.cat([wide[..., :1], prior.offset.square().expand_as(severity)], dim=-1)
     inner = inner * told[..., None] * told[..., None, :] + torch.diag_embed(own * (1 - told))
-    # A delay is not known better than the commands are sampled.
-    inner[..., 0, 0] += 1 / 12
+    # Offsets stay as they are, and as much correlated with the delay.
+    stretch = torch.ones_like(wide)
+    stretch[..., 0] = (_delay_variance(problem, fit, missed, prior) / inner[..., 0, 0]).sqrt()
+    inner = inner * stretch[..., None] * stretch[..., None, :]
     width = size + missed.shape[-1]
     covariance = torch.zeros(n, most, width, width, dtype=torch.float64)
     covariance[..., :size, :size] = inner
@@ -307,5 +327,5 @@ def _told(
     watched = problem.inside().any(dim=-1)[..., None] & problem.healthy
     identified = torch.cat([known, watched], dim=-1) & problem.valid[..., None]
     z = torch.cat([fit.x * told, missed], dim=-1) * problem.valid[..., None]
-    noise = (prior.noise[0] * problem.unit).expand(n)
+    noise = (prior.noise[0] * problem.unit.mean()).expand(n)
     return Discrepancy(z, covariance, identified, noise, severity=severity, posterior=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ from retwin.corrections.protocol import Context
 if TYPE_CHECKING:
     from retwin.corrections.command_space import CommandSpace
 
-__all__ = ["Problem"]
+__all__ = ["TAILS", "Problem"]
 
 NUDGE = 0.05
 """Step of the finite differences through a surrogate with memory, in samples and units."""
@@ -22,6 +23,8 @@ TURN = 1e-4
 """The same through the commands alone, which follow x piece by piece in a straight line."""
 MARGIN = 15
 """Samples after the command has settled in which an output may still be on its way."""
+TAILS = 4.0
+"""Degrees of freedom of the noise (Student's t): glitches do not count."""
 CHUNK = 64
 """Trajectories linearised together."""
 
@@ -36,7 +39,7 @@ class Problem:
     at: (S,) the samples that are looked at.
     seen: (n, S), 1 where there is a measurement.
     moving: (n, S), 1 where a movement may be under way: there the surrogate is told less exactly.
-    observed: (n, S, d_y), in `unit`, the standard deviation of the outputs.
+    observed: (n, S, d_y), in `unit` (d_y,), the standard deviation of the outputs.
     valid: (n, M) bool, movements that exist.
     healthy: (n, M, d_u) bool, where z is a discrepancy: no fault bends or holds the actuator.
     faulty: (n, M, d_u) bool, where a fault bends the reference: how far off the actuator ends is
@@ -63,13 +66,15 @@ class Problem:
         self.at = at[:: max(1, -(-len(at) // operator.most))]
         self.seen = seen[:, self.at].double()
         told = observed.double()[seen]
-        spread = told.std(dim=0, correction=0).mean() if len(told) else told.new_ones(())
-        self.unit = spread.clamp_min(1e-12)
+        unit = context.unit.double()
+        spread = told.std(dim=0, correction=0) / unit if len(told) else torch.ones_like(unit)
+        self.unit = unit * spread.mean().clamp_min(1e-12)
         values = torch.where(seen[..., None], observed.double(), 0.0)
         self.observed = values[:, self.at] / self.unit
         begin = start + operator.delay_range[0]
         end = torch.as_tensor(context.segments.settle)[..., None] + MARGIN
-        self.moving = ((self.at >= begin) & (self.at <= end)).any(dim=1).double()
+        near = (self.at >= begin) & (self.at <= end) & self.valid[..., None]
+        self.moving = near.any(dim=1).double()
         # A surrogate with memory must be told everything that came before.
         self.memory = not getattr(context.surrogate, "memoryless", False)
         every = torch.arange(context.told.shape[1])
@@ -112,6 +117,11 @@ class Problem:
         parts = [part._linearised(*given) for part, given in self._parts(x, missed)]
         residual, jacobian = zip(*parts, strict=True)
         return torch.cat(residual), torch.cat(jacobian)
+
+    @torch.no_grad()
+    def apart(self, x: Tensor, missed: Tensor) -> Tensor:
+        """How the outputs turn with a delay of each actuator's own: (n, S, d_y, M d_u)."""
+        return torch.cat([part._apart(*given) for part, given in self._parts(x, missed)])
 
     def first_delays(self) -> Tensor:
         """The delay (n, M) in whole samples that fits each movement best, nothing else being off.
@@ -159,6 +169,14 @@ class Problem:
             moved = [self._residual(x + NUDGE * each, missed) for each in basis]
             return residual, torch.stack([(residual - each) / NUDGE for each in moved], dim=-1)
         # Without memory the chain rule is local: the surrogate's slope, sample by sample.
+        residual, slope = self._slope(x, missed)
+        late, off = self._turns(x, missed)
+        by_delay = torch.einsum("nsyu,nmsu->nsym", slope, late)[..., None]
+        by_offset = torch.einsum("nsyu,nmsu->nsymu", slope, off)
+        return residual, torch.cat([by_delay, by_offset], dim=-1).flatten(3)
+
+    def _slope(self, x: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
+        """The residual (n, S, d_y), and how outputs turn with commands (n, S, d_y, d_u)."""
         told = self.commands(x, missed)
         fresh, place = _distinct(told)
         with torch.enable_grad():
@@ -171,11 +189,20 @@ class Problem:
                 ]
             )
         residual = self.observed - said.detach()[0, place].double() / self.unit
-        slope = slopes.movedim(0, 1)[place].double() / self.unit  # (n, S, d_y, d_u)
-        late, off = self._turns(x, missed)
-        by_delay = torch.einsum("nsyu,nmsu->nsym", slope, late)[..., None]
-        by_offset = torch.einsum("nsyu,nmsu->nsymu", slope, off)
-        return residual, torch.cat([by_delay, by_offset], dim=-1).flatten(3)
+        return residual, slopes.movedim(0, 1)[place].double() / self.unit[..., None]
+
+    def _apart(self, x: Tensor, missed: Tensor) -> Tensor:
+        late = self._turns(x, missed)[0]
+        if not self.memory:
+            return torch.einsum("nsyu,nmsu->nsymu", self._slope(x, missed)[1], late).flatten(3)
+        told = self.commands(x, missed)
+        said = self.surrogate(told)[:, self.kept]
+        columns = []
+        for movement, actuator in itertools.product(*map(range, missed.shape[1:])):
+            moved = told.clone()
+            moved[..., actuator] += (NUDGE * late[:, movement, :, actuator]).to(told)
+            columns.append((self.surrogate(moved)[:, self.kept] - said).double() / NUDGE)
+        return torch.stack(columns, dim=-1) / self.unit[..., None]
 
     def _turns(self, x: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
         """How the commands turn with each movement's delay, and with its offsets, (n, M, S, d_u).

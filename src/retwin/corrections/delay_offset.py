@@ -8,7 +8,7 @@ whatever z is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -67,7 +67,8 @@ class DelayOffset:
 
         Offsets start from the median of the settled part, delays from a grid; both are then refined
         together, because a late movement and a wrong position trade off where they meet. Samples
-        that fit badly lose their weight (Tukey), so glitches do not move z.
+        that fit badly lose their weight (Tukey), so glitches do not move z. Outputs are compared in
+        `Context.unit`, and of a sample those count that were measured.
         """
         parts = [
             self._infer(context[slice(i, i + CHUNK)], observed[i : i + CHUNK], mask[i : i + CHUNK])
@@ -81,27 +82,24 @@ class DelayOffset:
         )
 
     def _infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
-        path = context.path.double()
-        observed = observed.double()
-        seen = mask.all(dim=-1).double()
-        n, most, width = len(context), context.segments.most, path.shape[-1]
+        unit = context.unit.double()
+        model = _Model(context.segments, context.path / unit, observed / unit, mask)
+        n, most, width = len(context), context.segments.most, len(unit)
         valid = torch.as_tensor(context.segments.valid)
         z = torch.zeros(n, most, 1 + width, dtype=torch.float64)
         if most == 0:
             empty = torch.zeros(n, 0, 1 + width, 1 + width, dtype=torch.float64)
             nothing = torch.zeros(n, 0, 1 + width, dtype=torch.bool)
-            return Discrepancy(
-                z, empty, nothing, (observed - path).norm(dim=-1).median(dim=1).values
-            )
-        z[..., 1:] = _settled_offset(context.segments, observed - path, seen, self.delay_range[1])
-        model = _Model(context.segments, path, observed, seen)
+            noise = model.scale(model.off(model.path), torch.zeros_like(model.seen))
+            return Discrepancy(z, empty, nothing, noise[:, 0] * unit.mean())
+        z[..., 1:] = model.settled_offset(self.delay_range[1])
         z[..., 0] = self._best_delay(model, z)
-        moving = _moving(context.segments, z[..., 0], path.shape[1])
+        moving = _moving(context.segments, z[..., 0])
         low, high = self.delay_range
         damping = torch.full((n,), 1e-3, dtype=torch.float64)
         for _ in range(ITERATIONS):
             residual, jacobian = model.linearised(z)
-            noise = _scale(residual, seen, moving)
+            noise = model.scale(residual, moving)
             step = _solve(jacobian, residual, model.weight(residual, noise), damping)
             step = step.reshape(z.shape)
             # A few samples per step at most: the path is only piecewise smooth in the delay.
@@ -111,7 +109,14 @@ class DelayOffset:
             better = model.cost(trial, noise) <= model.cost(z, noise)
             z = torch.where(better[:, None, None], trial, z)
             damping = torch.where(better, damping / 3, damping * 5).clamp(1e-9, 1e6)
-        return self._certainty(model, z, moving)
+        found = self._certainty(model, z, moving)
+        size = torch.cat([unit.new_ones(1), unit])
+        return replace(
+            found,
+            z=found.z * size,
+            covariance=found.covariance * size[:, None] * size,
+            noise=found.noise * unit.mean(),
+        )
 
     def _best_delay(self, model: _Model, z: Tensor) -> Tensor:
         """The delay (n, M) on a grid of one sample that fits the motion best, by absolute error."""
@@ -127,7 +132,7 @@ class DelayOffset:
         for delay in grid:
             trial = z.clone()
             trial[..., 0] = delay
-            error = model.residual(trial).norm(dim=-1) * model.seen
+            error = model.length(model.residual(trial))
             costs.append((near * error[:, None]).sum(dim=-1))
         best = torch.stack(costs).argmin(dim=0)
         return grid[best] * torch.as_tensor(segments.valid)
@@ -136,13 +141,13 @@ class DelayOffset:
         n, most, size = z.shape
         valid = torch.as_tensor(model.segments.valid)
         residual, jacobian = model.linearised(z)
-        noise = _scale(residual, model.seen, moving)
+        noise = model.scale(residual, moving)
         weight = model.weight(residual, noise)
         # Neighbouring errors are alike (polling, drift): each sample tells only a part.
-        weight = weight / _correlation_time(residual, weight)[:, None]
-        normal = torch.einsum("ntci,nt,ntcj->nij", jacobian, weight, jacobian)
+        weight = weight / _correlation_time(residual, weight)[:, None, None]
+        normal = torch.einsum("ntci,ntc,ntcj->nij", jacobian, weight, jacobian)
         # A prior a hundred times wider than anything plausible: what is not seen stays at it.
-        largest = (residual.norm(dim=-1) * model.seen).amax(dim=1)
+        largest = model.length(residual).amax(dim=1)
         wide = (100 * largest + 1e-9)[:, None].repeat(1, size)
         wide[:, 0] = 100.0 * (self.delay_range[1] - self.delay_range[0])
         prior = torch.diag_embed(wide.square().reciprocal().repeat(1, most))
@@ -153,38 +158,75 @@ class DelayOffset:
         at_edge = (z[..., 0] <= self.delay_range[0]) | (z[..., 0] >= self.delay_range[1])
         watched = _watched(model.segments, model.seen) >= 0.5
         late = (deviation[..., 0] <= self.known_delay) & ~at_edge & watched
-        off = (deviation[..., 1:] <= 0.1 * wide[:, None, 1:]).all(dim=-1, keepdim=True)
-        identified = torch.cat([late[..., None], off.expand(-1, -1, size - 1)], dim=-1)
-        steady = torch.where(moving, torch.inf, noise).amin(dim=1)
+        off = deviation[..., 1:] <= 0.1 * wide[:, None, 1:]
+        identified = torch.cat([late[..., None], off], dim=-1)
+        steady = torch.where(model.seen, noise, torch.inf).amin(dim=1)
         return Discrepancy(z, covariance, identified & valid[..., None], steady)
 
 
 class _Model:
     """The corrected path as a function of z, its residual and its derivative."""
 
-    def __init__(self, segments: Segments, path: Tensor, observed: Tensor, seen: Tensor) -> None:
+    def __init__(self, segments: Segments, path: Tensor, observed: Tensor, told: Tensor) -> None:
         self.segments = segments
         self.path = path
         self.observed = observed
-        self.seen = seen
+        self.told = told  # (n, T, d_y), what was measured
+        self.seen = told.any(dim=-1)
+        # Where some outputs are missing the others stand for them.
+        self.standing = (told.shape[-1] / told.sum(dim=-1).clamp_min(1)).sqrt()
         # Exactly the derivative of what `_read` gives between two samples.
         self.slope = path.diff(dim=1, append=path[:, -1:])
+
+    def off(self, said: Tensor) -> Tensor:
+        """Observed minus said (n, T, d_y), 0 where nothing was measured."""
+        return torch.where(self.told, self.observed - said, 0.0)
 
     def residual(self, z: Tensor) -> Tensor:
         """Observed minus corrected (n, T, d_y)."""
         knots = Knots.of(self.segments, z[..., 0])
         offset = knots.between(knots.spread(z[..., 1:]))
-        return self.observed - read(self.path, knots.source_time()) - offset
+        return self.off(read(self.path, knots.source_time()) + offset)
+
+    def length(self, residual: Tensor) -> Tensor:
+        """How far off each sample is, (n, T)."""
+        return residual.norm(dim=-1) * self.standing
+
+    def scale(self, residual: Tensor, moving: Tensor) -> Tensor:
+        """A robust scale (n, T) of the residual's length: its median in motion, and at rest.
+
+        A model of movements is always worse than one of rest; one scale would throw motion away.
+        """
+        length = self.length(residual)
+        extent = length.amax(dim=1, keepdim=True).clamp_min(1e-9)
+        scales = []
+        for part in (moving, ~moving):
+            within = torch.where(self.seen & part, length, torch.nan)
+            middle = 1.4826 * torch.nanmedian(within, dim=1, keepdim=True).values
+            scales.append(torch.nan_to_num(middle).maximum(1e-4 * extent))
+        steady = scales[1].maximum(0.01 * scales[0])
+        return torch.where(moving, scales[0].maximum(steady), steady)
 
     def weight(self, residual: Tensor, noise: Tensor) -> Tensor:
-        """Tukey's biweight (n, T) on the length of the residual, over the noise's variance."""
-        size = residual.norm(dim=-1) / noise / TUKEY
-        return self.seen * (1 - size.clamp_max(1).square()).square() / noise.square()
+        """Tukey's biweight (n, T, d_y) on the residual's length, over the noise's variance."""
+        size = self.length(residual) / noise / TUKEY
+        kept = (1 - size.clamp_max(1).square()).square() / noise.square()
+        return self.told * kept[..., None]
 
     def cost(self, z: Tensor, noise: Tensor) -> Tensor:
         """Tukey's loss (n,) at a given noise scale (n, T)."""
-        size = self.residual(z).norm(dim=-1) / noise / TUKEY
-        return (self.seen * (1 - (1 - size.clamp_max(1).square()) ** 3)).sum(dim=1)
+        size = self.length(self.residual(z)) / noise / TUKEY
+        return (1 - (1 - size.clamp_max(1).square()) ** 3).sum(dim=1)
+
+    def settled_offset(self, margin: float) -> Tensor:
+        """Median residual (n, M, d_y) of each steady part, without late movements if any remain."""
+        settle, stop = torch.as_tensor(self.segments.settle), torch.as_tensor(self.segments.stop)
+        begin = settle + torch.minimum(torch.full_like(settle, margin), (stop - settle) / 2)
+        time = torch.arange(self.segments.steps, dtype=torch.float64)
+        inside = (time >= begin[..., None]) & (time < stop[..., None])
+        there = inside[..., None] & self.told[:, None]
+        values = torch.where(there, self.off(self.path)[:, None], torch.nan)
+        return torch.nan_to_num(torch.nanmedian(values, dim=2).values)
 
     def linearised(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Residual (n, T, d_y) and the corrected path's derivative (n, T, d_y, M (1 + d_y))."""
@@ -192,7 +234,7 @@ class _Model:
         n, most, size = z.shape
         values = knots.spread(z[..., 1:])
         when = knots.source_time()
-        residual = self.observed - read(self.path, when) - knots.between(values)
+        residual = self.off(read(self.path, when) + knots.between(values))
         unit = torch.eye(most, dtype=z.dtype).expand(n, -1, -1)
         reach = knots.between(knots.spread(unit))  # (n, T, M): share of each movement's offset
         late = knots.between(unit.repeat_interleave(2, dim=1))  # share of each movement's delay
@@ -209,12 +251,13 @@ class _Model:
 TUKEY = 4.685  # 95 % efficiency under Gaussian noise
 
 
-def _moving(segments: Segments, delay: Tensor, steps: int) -> Tensor:
+def _moving(segments: Segments, delay: Tensor) -> Tensor:
     """(n, T) True where a movement is under way, with some samples around it."""
-    time = torch.arange(steps, dtype=torch.float64)
+    time = torch.arange(segments.steps, dtype=torch.float64)
     begin = (torch.as_tensor(segments.start) + delay - 5)[..., None]
     end = (torch.as_tensor(segments.settle) + delay + 10)[..., None]
-    return ((time >= begin) & (time <= end)).any(dim=1)
+    valid = torch.as_tensor(segments.valid)[..., None]
+    return ((time >= begin) & (time <= end) & valid).any(dim=1)
 
 
 def _watched(segments: Segments, seen: Tensor) -> Tensor:
@@ -225,25 +268,9 @@ def _watched(segments: Segments, seen: Tensor) -> Tensor:
     return (inside * seen[:, None]).sum(dim=-1) / inside.sum(dim=-1).clamp_min(1)
 
 
-def _scale(residual: Tensor, seen: Tensor, moving: Tensor) -> Tensor:
-    """A robust scale (n, T) of the residual's length: its median in motion, and at rest.
-
-    A model of movements is always worse than one of rest; one scale would throw motion away.
-    """
-    length = residual.norm(dim=-1)
-    extent = (length * (seen > 0)).amax(dim=1, keepdim=True).clamp_min(1e-9)
-    scales = []
-    for part in (moving, ~moving):
-        within = torch.where((seen > 0) & part, length, torch.nan)
-        middle = 1.4826 * torch.nanmedian(within, dim=1, keepdim=True).values
-        scales.append(torch.nan_to_num(middle).maximum(1e-4 * extent))
-    steady = scales[1].maximum(0.01 * scales[0])
-    return torch.where(moving, scales[0].maximum(steady), steady)
-
-
 def _solve(jacobian: Tensor, residual: Tensor, weight: Tensor, damping: Tensor) -> Tensor:
     """A damped weighted least-squares step (n, parameters)."""
-    weighted = jacobian * weight[..., None, None]
+    weighted = jacobian * weight[..., None]
     normal = torch.einsum("ntci,ntcj->nij", weighted, jacobian)
     right = torch.einsum("ntci,ntc->ni", weighted, residual)
     unit, scaled = _in_own_units(normal)
@@ -265,17 +292,7 @@ def _in_own_units(normal: Tensor) -> tuple[Tensor, Tensor]:
 
 def _correlation_time(residual: Tensor, weight: Tensor) -> Tensor:
     """Samples (n,) per independent one, from the lag-one correlation of the residual."""
-    kept = residual * weight.sqrt()[..., None]
+    kept = residual * weight.sqrt()
     power = kept.square().sum(dim=(1, 2)).clamp_min(1e-30)
     alike = ((kept[:, 1:] * kept[:, :-1]).sum(dim=(1, 2)) / power).clamp(0, 0.999)
     return (1 + alike) / (1 - alike)
-
-
-def _settled_offset(segments: Segments, residual: Tensor, seen: Tensor, margin: float) -> Tensor:
-    """Median residual (n, M, d_y) of each steady part, late movements left out if any remain."""
-    time = torch.arange(residual.shape[1], dtype=torch.float64)
-    settle, stop = torch.as_tensor(segments.settle), torch.as_tensor(segments.stop)
-    begin = settle + torch.minimum(torch.full_like(settle, margin), (stop - settle) / 2)
-    inside = (time >= begin[..., None]) & (time < stop[..., None]) & (seen[:, None] > 0)
-    values = torch.where(inside[..., None], residual[:, None], torch.nan)
-    return torch.nan_to_num(torch.nanmedian(values, dim=2).values)

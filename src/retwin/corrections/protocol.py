@@ -16,7 +16,11 @@ __all__ = ["Context", "Correction", "DifferentiableTwin", "Discrepancy", "Head"]
 
 
 class DifferentiableTwin(Protocol):
-    """What a correction needs of a surrogate: a differentiable call, and a fast one without."""
+    """What a correction needs of a surrogate: a differentiable call, and a fast one without.
+
+    One may also have `memoryless`, whether an output depends on the command of its own sample only,
+    and `unit`, what outputs are divided by to be compared with each other.
+    """
 
     def __call__(self, commands: Tensor) -> Tensor:
         """Outputs (n, T, d_y) for commands (n, T, d_u), differentiable."""
@@ -72,6 +76,11 @@ class Context:
 
     def __len__(self) -> int:
         return len(self.commands)
+
+    @property
+    def unit(self) -> Tensor:
+        """(d_y,) what outputs are divided by to be compared with each other; 1 if not known."""
+        return getattr(self.surrogate, "unit", self.nominal.new_ones(self.nominal.shape[2]))
 
     def __getitem__(self, index: slice | NDArray) -> Context:
         """The context of some of the trajectories."""

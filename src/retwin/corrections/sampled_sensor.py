@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from retwin.errors import InputError
 from retwin.segments import Segments
@@ -188,7 +188,8 @@ class SampledSensor:
 
 def _timing(observed: Tensor, mask: Tensor) -> tuple[int, tuple[int, ...]]:
     """Samples between readings, and the first one's: the longest period with plain kinks."""
-    for every in range(min(SLOWEST, observed.shape[1] // FEW), 1, -1):
+    measured = int(mask.any(dim=-1).any(dim=0).sum())
+    for every in range(min(SLOWEST, measured // FEW), 1, -1):
         kinks = _kinks(observed, mask, every)
         plain = _plain(kinks)
         if 2 * plain.sum() > (kinks.amax(dim=1) > 0).sum():
@@ -210,8 +211,8 @@ def _kinks(observed: Tensor, mask: Tensor, every: int) -> Tensor:
     told = torch.zeros_like(seen)
     told[:, 1:-1] = seen[:, 2:] & seen[:, 1:-1] & seen[:, :-2]
     size = torch.where(told, (bend / unit).norm(dim=-1), torch.nan)
-    whole = size[:, : size.shape[1] // every * every].unflatten(1, (-1, every))
-    return whole.nanmean(dim=1).nan_to_num(0.0)
+    whole = nn.functional.pad(size, (0, -size.shape[1] % every), value=torch.nan)
+    return whole.unflatten(1, (-1, every)).nanmean(dim=1).nan_to_num(0.0)
 
 
 def _plain(kinks: Tensor) -> Tensor:

@@ -18,7 +18,8 @@ class Knots:
 
     source: Tensor  # (n, 2 M), time of each knot in the uncorrected path
     target: Tensor  # (n, 2 M), time of each knot in the corrected path
-    right: Tensor  # (n, T), index of the knot that follows each sample
+    last: Tensor  # (n, 1), index of the last knot: those behind it are of no movement
+    right: Tensor  # (n, T), index of the knot that follows each sample, one more than the last's
     share: Tensor  # (n, T), place between the knot before (0) and after (1)
     time: Tensor  # (n, T), the samples themselves
 
@@ -32,41 +33,45 @@ class Knots:
             ],
             -1,
         ).flatten(1)
+        valid = torch.as_tensor(segments.valid)
+        late = (delay * valid).repeat_interleave(2, dim=1)
         # A movement cannot begin before the last one has ended, however the delays differ.
-        target = (source + delay.repeat_interleave(2, dim=1)).cummax(dim=1).values
+        target = (source + late).cummax(dim=1).values
+        last = (2 * valid.sum(dim=1, keepdim=True) - 1).clamp_min(0)
         time = torch.arange(segments.steps, dtype=delay.dtype) if when is None else when
         time = time.expand(len(target), -1).contiguous()
-        right = torch.searchsorted(target.detach(), time.detach(), right=True)
-        last = target.shape[1] - 1
-        begin = target.gather(1, (right - 1).clamp(0, last))
-        end = target.gather(1, right.clamp(0, last))
+        right = torch.searchsorted(target.detach(), time.detach(), right=True).minimum(last + 1)
+        begin = target.gather(1, (right - 1).clamp_min(0))
+        end = target.gather(1, right.minimum(last))
         share = (time - begin) / (end - begin).clamp_min(1e-9)
-        return cls(source, target, right, share.clamp(0, 1), time)
+        return cls(source, target, last, right, share.clamp(0, 1), time)
 
     def between(self, values: Tensor) -> Tensor:
         """Values (n, 2 M, k) of the knots, linear between them and constant outside: (n, T, k)."""
-        last = values.shape[1] - 1
-        index = self.right[..., None].expand(-1, -1, values.shape[2])
-        before = values.gather(1, (index - 1).clamp(0, last))
-        after = values.gather(1, index.clamp(0, last))
+        before, after = (self._of(values, place) for place in self._around)
         return before + self.share[..., None] * (after - before)
 
     def slope(self, values: Tensor) -> Tensor:
         """Change per sample of `between` (n, T, k)."""
-        last = values.shape[1] - 1
-        before, after = (self.right - 1).clamp(0, last), self.right.clamp(0, last)
-        wide = [place[..., None].expand(-1, -1, values.shape[2]) for place in (before, after)]
+        before, after = self._around
         length = self.target.gather(1, after) - self.target.gather(1, before)
-        rise = values.gather(1, wide[1]) - values.gather(1, wide[0])
+        rise = self._of(values, after) - self._of(values, before)
         return rise / length.clamp_min(1e-9)[..., None]
+
+    @property
+    def _around(self) -> tuple[Tensor, Tensor]:
+        """Index (n, T) of the knot before each sample, and after it; the same one outside."""
+        return (self.right - 1).clamp_min(0), self.right.minimum(self.last)
+
+    @staticmethod
+    def _of(values: Tensor, place: Tensor) -> Tensor:
+        return values.gather(1, place[..., None].expand(-1, -1, values.shape[2]))
 
     def source_time(self) -> Tensor:
         """When in the uncorrected path each sample (n, T) is read."""
-        if not self.source.shape[1]:
-            return self.time
         inner = self.between(self.source[..., None])[..., 0]
         early = (self.time - self.target[:, :1]).clamp_max(0)
-        late = (self.time - self.target[:, -1:]).clamp_min(0)
+        late = (self.time - self.target.gather(1, self.last)).clamp_min(0)
         return inner + early + late
 
     @staticmethod

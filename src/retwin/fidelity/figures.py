@@ -251,10 +251,16 @@ class Fidelity:
         return found
 
     def _below(self, ours: NDArray, theirs: NDArray) -> Figure:
-        """By which share our mean is below theirs, averaged over outputs if there are several."""
-        return self._figure(
-            lambda w: (1 - (w @ ours) / (w @ theirs)).reshape(len(w), -1).mean(axis=1)
-        )
+        """By which share our mean is below theirs, averaged over outputs if there are several.
+
+        None of nothing, where neither errs at all.
+        """
+
+        def share(w: NDArray) -> NDArray:
+            a, b = w @ ours, w @ theirs
+            return ((b - a) / np.where(b == 0, 1, b)).reshape(len(w), -1).mean(axis=1)
+
+        return self._figure(share)
 
     def _pit(self) -> Figure:
         """The greatest gap between the cumulative PIT and a uniform one."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -66,7 +67,7 @@ def measure_fidelity(
         against = {}
         if isinstance(twin, CorrectedTwin):
             against["mean_only"] = replace(twin, random=False)
-    segments = _segments(twin, trajectories.commands)
+    segments = _segments(twin, trajectories)
     seeds = np.random.SeedSequence(seed).generate_state(2 * len(trajectories)).reshape(-1, 2)
     rows: list[dict[str, Any]] = []
     for i, (for_twin, for_ties) in enumerate(seeds.tolist()):
@@ -200,6 +201,7 @@ def _score(
     """What `Fidelity` tells of one trajectory, its movements apart."""
     seen = made.mask[0, ::stride].all(axis=1)
     values = made.observed[:, ::stride]
+    residual = made.residual[: INFERRED + 1, : one.lengths[0] : stride]
     crps, energy = _accuracy(one, made, stride)
     return {
         "nominal": one.nominal[0, ::stride],
@@ -209,7 +211,7 @@ def _score(
         "crps": crps,
         "energy": energy,
         "pit": _pit(values[:, seen].astype(np.float64), rng),
-        "features": _features(made.residual[: INFERRED + 1, ::stride]),
+        "features": _features(residual),
     }
 
 
@@ -230,8 +232,8 @@ def _accuracy(one: Trajectories, made: Trajectories, stride: int) -> tuple[NDArr
     values = made.observed[:, ::stride][:, seen].astype(np.float64)
     crps = scoringrules.crps_ensemble(values[0], values[1:], m_axis=0, estimator="pwm")
     # Outputs of different units must be made comparable before they are put into one vector.
-    alike = len(set(one.outputs.units)) == 1
-    unit = 1.0 if alike else one.nominal.std(axis=(0, 1)).clip(1e-12)
+    spread = one.nominal[0, ::stride][seen].std(axis=0, dtype=np.float64)
+    unit = 1.0 if one.outputs.comparable else np.where(spread > 0, spread, 1.0)
     flat = (values / unit).reshape(len(values), -1) / np.sqrt(len(values[0]))
     # scipy's distances, as scoringrules' energy score holds draws² × samples numbers at once.
     error = np.linalg.norm(flat[1:] - flat[0], axis=1).mean()
@@ -257,7 +259,9 @@ def _pit(values: NDArray, rng: np.random.Generator) -> NDArray:
 def _features(residual: NDArray) -> NDArray:
     """Mean, spread and step of each output's residual (m, P, d) in 20 windows of time, (m, F)."""
     steps = np.abs(np.diff(residual, axis=1, append=residual[:, -1:]))
-    parts = np.array_split(np.arange(residual.shape[1]), min(WINDOWS, residual.shape[1]))
+    edges = np.arange(WINDOWS + 1) * residual.shape[1] // WINDOWS
+    # Every window has a sample, however short a trajectory is.
+    parts = [slice(a, max(a + 1, b)) for a, b in pairwise(edges)]
     told = [
         value
         for part in parts
@@ -270,11 +274,14 @@ def _features(residual: NDArray) -> NDArray:
     return np.concatenate(told, axis=1).astype(np.float32)
 
 
-def _segments(twin: Twin, commands: NDArray) -> Segments:
+def _segments(twin: Twin, trajectories: Trajectories) -> Segments:
     """Movements, by the rule that the twin itself goes by."""
+    commands = trajectories.commands
     if isinstance(twin, CorrectedTwin) and twin.residual.segmentation == "path":
-        return segment(commands, twin.surrogate.predict(commands), "path")
-    return Segments.from_commands(commands)
+        found = segment(commands, twin.surrogate.predict(commands), "path")
+    else:
+        found = Segments.from_commands(commands)
+    return found.until(trajectories.lengths)
 
 
 def _movement_channels(twin: Twin) -> Channels:

@@ -38,6 +38,9 @@ from retwin.twins.protocol import HEALTHY, Progress
 
 __all__ = ["fit_residual", "infer_discrepancy"]
 
+LEAST = 1e-12
+"""The largest |z| of a gap that is none: what is a millionth of it has squares in float32 still."""
+
 
 def infer_discrepancy(
     surrogate: Surrogate,
@@ -117,7 +120,8 @@ def fit_residual(
 
     Raises
     ------
-    InputError: no trajectory to calibrate on, no movement in any, an unknown `calibrate_on`.
+    InputError: no trajectory to calibrate on, no movement in any, nothing measured that tells of
+        the gap, an unknown `calibrate_on`.
 
     """
     _check_match(surrogate, calibration)
@@ -139,6 +143,13 @@ def fit_residual(
         )
     context = _context(surrogate, used, parts, faults)
     correction, found = calibrated(correction, context, *_measured(used))
+    if not found.identified.any():
+        raise InputError(
+            "calibration",
+            expected="measurements that tell something of the gap",
+            got=f"{int(used.mask.all(axis=2).sum())} samples with all outputs measured",
+            remedy="check the mask; leave an output out that is never measured",
+        )
     if isinstance(density, SequenceMixture):
         return fit_sequence(
             used, correction, density, context, found, seed=seed, bounds=bounds, progress=progress
@@ -185,6 +196,8 @@ def _context(
     """What is corrected; of a known fault any severity, since that is inferred."""
     commands = trajectories.commands
     parts = Segments.from_commands(commands) if segments is None else segments
+    # What follows the last sample is padding, and no rest that was measured.
+    parts = parts.until(trajectories.lengths)
     if faults is None:
         return Context.of(surrogate, commands, parts, rate=trajectories.rate)
     drawn = draw_faults(faults, parts, seed=0)
@@ -270,9 +283,10 @@ def _prepare(model: ResidualModel, targets: Targets, bounds: NDArray | None, see
         shift = values.median(dim=0).values
         scale = 1.4826 * (values - shift).abs().median(dim=0).values
         spread = values.std(dim=0, correction=0)
-        scale = torch.maximum(scale, 0.1 * spread).clamp_min(1e-9)
+        largest = values.abs().amax(dim=0).clamp_min(LEAST)
+        scale = torch.maximum(scale, 0.1 * spread).maximum(1e-6 * largest)
         model.shift[part], model.scale[part] = shift, scale
-        model.bounds[part] = 1.25 * values.abs().amax(dim=0).clamp_min(1e-9)
+        model.bounds[part] = 1.25 * largest
         head.initialise(((values - shift) / scale).double().numpy(), seed)
     if bounds is not None:
         if np.shape(bounds) != (len(model.latent),) or not (np.asarray(bounds) > 0).all():

@@ -117,4 +117,4 @@ def _norm(vectors: Tensor) -> Tensor:
 def _unit(observed: Tensor, mask: Tensor, outputs: Channels) -> Tensor:
     """What outputs are divided by, (d,): their spread, or one for all where units are the same."""
     spread = observed[mask.all(dim=-1)].std(dim=0).clamp_min(1e-12)
-    return spread if len(set(outputs.units)) > 1 else spread.mean().expand_as(spread)
+    return spread.mean().expand_as(spread) if outputs.comparable else spread

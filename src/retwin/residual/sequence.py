@@ -30,7 +30,7 @@ from retwin.surrogate import Surrogate
 from retwin.training import Fit, Training
 from retwin.trajectories import Channels
 
-__all__ = ["Member", "SequenceMixture", "SequenceResidual", "past", "widened"]
+__all__ = ["Member", "SequenceMixture", "SequenceResidual", "past", "trusted", "widened"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ class SequenceMixture:
     components: K of Eq. 6, for each member.
     dropout: of those numbers.
     smoothness, boundedness: λ_s and λ_b of Eq. 10, on z̄ in standard units (Eq. 9 over t).
-    members: networks; each holds out another part of the data to stop early on.
+    members: networks; each is judged on another part of the data, which it does not learn from.
     block, gap: samples of a part of a record that is held out, and of those beside it that are not
         learned from either, as they say nearly the same. With as many records as members, whole
         records are held out.
@@ -52,10 +52,10 @@ class SequenceMixture:
         network up, the record's own begin apart.
     moderation: β of β-NLL (Seitzer et al. 2022): at 0 it is the likelihood, which learns least
         where it errs most; at 1 the mean learns as by least squares.
-    refit: whether members learn anew from all data once it is known for how many epochs; else each
-        is kept as it was best, without what it held out.
+    refit: whether members learn anew from all data once they are judged; else each is kept without
+        what it held out.
     persistent: whether z_t is drawn given z_{t-1}; else draws are independent in time.
-    training: epochs, rate, patience; a batch is so many windows.
+    training: epochs, rate; a batch is so many windows. None stops early.
 
     """
 
@@ -130,6 +130,7 @@ class SequenceResidual(nn.Module):
     bounds: Tensor
     shift: Tensor
     scale: Tensor
+    trust: Tensor
     spread: Tensor
     persistence: Tensor
 
@@ -163,7 +164,7 @@ class SequenceResidual(nn.Module):
         self.fitted: Fit | None = None
         self.before = Standardise(len(inputs) + len(outputs))
         self.members = self.fresh()
-        for name in ("bounds", "shift", "scale"):
+        for name in ("bounds", "shift", "scale", "trust"):
             self.register_buffer(name, torch.ones(len(self.latent)))
         self.register_buffer("spread", torch.ones(()))
         self.register_buffer("persistence", torch.zeros(len(self.latent)))
@@ -194,13 +195,19 @@ class SequenceResidual(nn.Module):
         return Blocks([_together([law[block] for law in laws]) for block in range(len(self.sizes))])
 
     def laws(self, features: Tensor) -> Iterator[list[GaussianMixture]]:
-        """What each member says of the past (n, T, F): a law for each block of z."""
-        return (self.law(member, features) for member in self.members)
+        """What each member says of the past (n, T, F): a law for each block of z.
 
-    def law(self, member: nn.Module, features: Tensor) -> list[GaussianMixture]:
-        """What one member says, as wide as it proved to be."""
+        Believed as far as members proved right where they had not looked.
+        """
+        parts = self.shift.split(self.sizes), self.trust.split(self.sizes)
+        told = (self.told(member, features) for member in self.members)
+        return (widened(trusted(laws, *parts), self.spread) for laws in told)
+
+    def told(self, member: nn.Module, features: Tensor) -> list[GaussianMixture]:
+        """What one member says, believed as it is."""
         units = self.shift.split(self.sizes), self.scale.split(self.sizes)
-        return widened(member(self.before(features), *units), self.spread)
+        laws: list[GaussianMixture] = member(self.before(features), *units)
+        return laws
 
     @torch.no_grad()
     def mean(self, context: Context) -> Tensor:
@@ -260,6 +267,18 @@ class SequenceResidual(nn.Module):
 def past(context: Context) -> Tensor:
     """What the RG may know of each sample: clean commands and nominal output, (n, T, d_u + d_y)."""
     return torch.cat([context.commands.to(context.nominal), context.nominal], dim=-1)
+
+
+def trusted(
+    laws: Sequence[GaussianMixture], shift: Sequence[Tensor], trust: Sequence[Tensor]
+) -> list[GaussianMixture]:
+    """The same laws, their means at `shift` plus that share `trust` (d,) of their way from it."""
+    moved = []
+    for law, middle, share in zip(laws, shift, trust, strict=True):
+        back = (1 - share) * (law.mean - middle)
+        means = law.means - back.unsqueeze(-2)
+        moved.append(GaussianMixture(law.mixture_distribution.logits, means, law.factor))
+    return moved
 
 
 def widened(laws: Sequence[GaussianMixture], spread: Tensor | float) -> list[GaussianMixture]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from retwin.corrections import Context, Correction, Discrepancy
 from retwin.errors import InputError
 from retwin.mixture import Blocks
 from retwin.residual.penalties import penalties
-from retwin.residual.sequence import SequenceMixture, SequenceResidual, past, widened
+from retwin.residual.sequence import SequenceMixture, SequenceResidual, past, trusted, widened
 from retwin.training import Fit, Loss, isolated, train
 from retwin.trajectories import Trajectories
 from retwin.twins.protocol import Progress
@@ -43,14 +45,16 @@ def fit_sequence(
     """The RG of measured records `used`, one at least, whose z* was `found`.
 
     Its `fitted.figures` tell of parts held out, each judged by the member that did not see it:
-    `rmse_NAME` in the output's unit, `nll`, `coverage90`, and the `spread` that was needed. Members
-    stopped early on those parts, which flatters them a little.
+    `rmse_NAME` in the output's unit, beside `rmse_NAME/constant` of a z that is always the mean,
+    `trust_NAME`, `nll`, `coverage90`, and the `spread` that was needed. Trust and spread are chosen
+    on those parts, which flatters them a little.
     """
     with isolated(seed):
         model = SequenceResidual(correction, density, inputs=used.inputs, outputs=used.outputs)
-    data = _Records(past(context), found.z.float(), found.identified.all(dim=-1))
-    n, steps = data.known.shape
-    held = held_parts(n, steps, density)
+    known = found.identified.all(dim=-1)
+    data = _Records(past(context), found.z.float(), known, torch.as_tensor(used.lengths))
+    there = torch.arange(used.steps) < data.lengths[:, None]
+    held = held_parts(there, density)
     if not (held & data.known).flatten(1).any(dim=1).all():
         raise InputError(
             "calibration",
@@ -59,100 +63,91 @@ def fit_sequence(
             remedy="give longer records, fewer members, or shorter blocks",
         )
     _prepare(model, data, bounds, seed)
-    fits = []
-    for k, member in enumerate(model.members):
-        near = _dilated(held[k], density.gap)
-        fits.append(
-            train(
-                member,
-                _objective(model),
-                data.windows(density, data.known & ~near),
-                (data.features, data.z, data.known & held[k]),
-                density.training,
-                seed=seed + k,
-            )
-        )
-        if progress is not None:
-            progress((k + 1) / (len(model.members) * (1 + density.refit)))
+    seen = [data.known & ~_dilated(part, density.gap) for part in held]
+    tell = _told(progress, (1 + density.refit) * len(seen))
+    fits = _trained(model, data, seen, seed, tell)
     figures = _calibrate(model, data, held)
-    epochs = _best_epoch(fits)
     if density.refit:
-        _refit(model, data, epochs, seed, progress)
+        with isolated(seed + 1):
+            model.members = model.fresh()
+        _start(model, data, seed)
+        fits = _trained(model, data, [data.known] * len(seen), seed + len(seen), tell)
     model.emulated = used.emulated
-    model.fitted = _summary(fits, figures, epochs)
+    model.fitted = _summary(fits, figures)
     return model.eval()
 
 
-def _best_epoch(fits: list[Fit]) -> int:
-    """The epoch after which members together erred least on what they held out, in proportion.
+def _told(progress: Progress | None, steps: int) -> Callable[[], None]:
+    """Call it after each of so many steps."""
+    done = count(1)
+    return lambda: progress(next(done) / steps) if progress is not None else None
 
-    Geometric means: a part that is like no other errs by far the most and must not decide alone.
+
+def _trained(
+    model: SequenceResidual,
+    data: _Records,
+    seen: Sequence[Tensor],
+    seed: int,
+    tell: Callable[[], None],
+) -> list[Fit]:
+    """Each member trained to the end on what it has `seen` (n, T).
+
+    None stops early on what it holds out: how much of its mean is to be believed is judged there.
     """
-    curves = [fit.history["validation"] for fit in fits]
-    shortest = min(len(curve) for curve in curves)
-    return 1 + int(np.argmin(np.mean([np.log(curve[:shortest]) for curve in curves], axis=0)))
-
-
-def _refit(
-    model: SequenceResidual, data: _Records, epochs: int, seed: int, progress: Progress | None
-) -> None:
-    """All members anew on all data, for as long as proved best."""
-    how = replace(model.density.training, epochs=epochs)
-    with isolated(seed + 1):
-        model.members = model.fresh()
-    _start(model, data, seed)
-    for k, member in enumerate(model.members):
-        train(
-            member,
-            _objective(model),
-            data.windows(model.density, data.known),
-            None,
-            how,
-            seed=seed + len(model.members) + k,
-        )
-        if progress is not None:
-            progress(0.5 + (k + 1) / (2 * len(model.members)))
+    fits = []
+    for k, (member, part) in enumerate(zip(model.members, seen, strict=True)):
+        windows = data.windows(model.density, part)
+        how = model.density.training
+        fits.append(train(member, _objective(model), windows, None, how, seed=seed + k))
+        tell()
+    return fits
 
 
 @dataclass(frozen=True, eq=False)
 class _Records:
-    """What is known of each sample (n, T, F), its z (n, T, d_z), and whether that is known."""
+    """What is known of each sample (n, T, F), its z (n, T, d_z), and whether that is known.
+
+    Records have `lengths` (n,); what follows is padding.
+    """
 
     features: Tensor
     z: Tensor
     known: Tensor
+    lengths: Tensor
 
     def windows(self, density: SequenceMixture, usable: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Features, z and flags of windows (m, W); what only warms the network up is not flagged.
 
         The network starts at rest in each window as it does at a record's begin.
         """
-        steps = usable.shape[1]
-        width = min(density.window, steps)
+        longest = int(self.lengths.max())
+        width = min(density.window, longest)
         stride = max(1, (width - density.burn_in) // 2)
-        starts = sorted({*range(0, steps - width, stride), steps - width})
+        # The last window of a record ends with it.
+        last = (self.lengths - width).clamp_min(0)
+        begins = torch.arange(0, longest - width + stride, stride)[:, None]
+        turn, record = (begins < last + stride).nonzero().unbind(dim=1)
+        starts = torch.minimum(begins, last)[turn, record][:, None]
         time = torch.arange(width)
-        parts: list[tuple[Tensor, Tensor, Tensor]] = []
-        for start in starts:
-            inside = slice(start, start + width)
-            warm = (time >= density.burn_in) | (start == 0)
-            parts.append((self.features[:, inside], self.z[:, inside], usable[:, inside] & warm))
-        features, z, flags = (torch.cat(each) for each in zip(*parts, strict=True))
+        inside = record[:, None], starts + time
+        flags = usable[inside] & ((time >= density.burn_in) | (starts == 0))
         some = flags.any(dim=1)
-        return features[some], z[some], flags[some]
+        return self.features[inside][some], self.z[inside][some], flags[some]
 
 
-def held_parts(n: int, steps: int, density: SequenceMixture) -> Tensor:
+def held_parts(there: Tensor, density: SequenceMixture) -> Tensor:
     """(members, n, T) bool: what each member holds out; all of them together hold out everything.
 
-    Whole records where there are enough of them, else blocks of samples dealt out in turn.
+    Whole records where there are enough of them, else blocks of samples dealt out in turn, of those
+    that are `there` (n, T) and no padding.
     """
-    if n >= density.members:
-        turn = (torch.arange(n) % density.members)[:, None].expand(n, steps)
+    if len(there) >= density.members:
+        turn = (torch.arange(len(there)) % density.members)[:, None].expand_as(there)
     else:
         # Not fewer blocks than members, however short a record is.
-        block = min(density.block, max(1, n * steps // density.members))
-        turn = (torch.arange(n * steps) // block % density.members).view(n, steps)
+        block = min(density.block, max(1, int(there.sum()) // density.members))
+        place = (there.flatten().cumsum(dim=0) - 1).view_as(there)
+        turn = place // block % density.members
     return turn == torch.arange(density.members)[:, None, None]
 
 
@@ -168,8 +163,9 @@ def _prepare(model: SequenceResidual, data: _Records, bounds: NDArray | None, se
     values = data.z[data.known]
     model.before.fit(data.features[data.known])
     model.shift.copy_(values.mean(dim=0))
-    model.scale.copy_(values.std(dim=0, correction=0).clamp_min(1e-9))
-    model.bounds.copy_(1.25 * values.abs().amax(dim=0).clamp_min(1e-9))
+    largest = values.abs().amax(dim=0).clamp_min(1e-12)
+    model.scale.copy_(values.std(dim=0, correction=0).maximum(1e-6 * largest))
+    model.bounds.copy_(1.25 * largest)
     if bounds is not None:
         if np.shape(bounds) != (len(model.latent),) or not (np.asarray(bounds) > 0).all():
             raise InputError(
@@ -193,15 +189,12 @@ def _start(model: SequenceResidual, data: _Records, seed: int) -> None:
 
 
 def _objective(model: SequenceResidual) -> Loss:
-    """L_RG of Eq. 10 over t; in validation the mean's error, as widths are calibrated after."""
+    """L_RG of Eq. 10 over t."""
     density = model.density
 
     def loss(member: Any, batch: tuple[Tensor, ...]) -> Tensor:
         features, z, known = batch
-        law = Blocks(model.law(member, features))
-        if not member.training:
-            error = ((law.mean - z) / model.scale).square().mean(dim=-1)
-            return (error * known).sum() / known.sum().clamp_min(1)
+        law = Blocks(model.told(member, features))
         width = (law.variance.sqrt() / model.scale).detach().mean(dim=-1)
         nll = -law.log_prob(z) * width ** (2 * density.moderation)
         nll = torch.where(known, nll, 0.0).sum() / known.sum().clamp_min(1)
@@ -214,10 +207,20 @@ def _objective(model: SequenceResidual) -> Loss:
 
 @torch.no_grad()
 def _calibrate(model: SequenceResidual, data: _Records, held: Tensor) -> dict[str, float]:
-    """How wide and how persistent errors are where a member has not looked; the figures there."""
+    """What to believe of members, seen where they have not looked; the figures there.
+
+    How much of their means, how wide errors are, and how long they last.
+    """
     model.eval()
     held = held & data.known
-    plain = list(model.laws(data.features))
+    plain = [model.told(member, data.features) for member in model.members]
+    means = torch.stack([Blocks(law).mean for law in plain])
+    z = data.z.expand_as(means)[held]
+    trust = _trust(means[held] - model.shift, z - model.shift)
+    model.trust.copy_(trust)
+    plain = [
+        trusted(law, *(each.split(model.sizes) for each in (model.shift, trust))) for law in plain
+    ]
 
     def likelihood(spread: float) -> float:
         made = zip(plain, held, strict=True)
@@ -230,15 +233,33 @@ def _calibrate(model: SequenceResidual, data: _Records, held: Tensor) -> dict[st
     scores = torch.stack([law.normal_scores(data.z) for law in laws])
     if model.density.persistent:
         model.persistence.copy_(_persistence(scores, held))
-    error = torch.stack([law.mean - data.z for law in laws])[held]
-    rmse = error.square().mean(dim=0).sqrt().tolist()
     figures = {
         "samples": float(held.sum()),
         "nll": -likelihood(spread) / int(held.sum()),
         "spread": spread,
         "coverage90": float((scores[held].abs() < MIDDLE).float().mean()),
     }
-    return figures | {f"rmse_{name}": e for name, e in zip(model.latent.names, rmse, strict=True)}
+    error = torch.stack([law.mean for law in laws])[held] - z
+    by_name = {
+        "rmse_{}": error.square().mean(dim=0).sqrt(),
+        "rmse_{}/constant": (z - model.shift).square().mean(dim=0).sqrt(),
+        "trust_{}": trust,
+    }
+    for label, values in by_name.items():
+        figures |= {
+            label.format(name): value
+            for name, value in zip(model.latent.names, values.tolist(), strict=True)
+        }
+    return figures
+
+
+def _trust(told: Tensor, z: Tensor) -> Tensor:
+    """The share of what members told (k, d_z) that comes nearest to z, from 0 to 1, (d_z,).
+
+    A network that learned from one record sees more in it than holds elsewhere; a mean that holds
+    nowhere else is worth nothing.
+    """
+    return ((told * z).sum(dim=0) / told.square().sum(dim=0).clamp_min(1e-12)).clamp(0.0, 1.0)
 
 
 def _persistence(scores: Tensor, held: Tensor) -> Tensor:
@@ -249,13 +270,7 @@ def _persistence(scores: Tensor, held: Tensor) -> Tensor:
     return ((ahead * now).sum(dim=0) / power.clamp_min(1e-9)).clamp(0.0, LONGEST)
 
 
-def _summary(fits: list[Fit], figures: dict[str, float], epochs: int) -> Fit:
+def _summary(fits: list[Fit], figures: dict[str, float]) -> Fit:
     """What the members' trainings were like, as one."""
-    history = {
-        f"{name} {k + 1}": values
-        for k, fit in enumerate(fits)
-        for name, values in fit.history.items()
-    }
-    best = sorted(fit.best_epoch for fit in fits)
-    reason = f"{len(fits)} members, each best after {best[0]} to {best[-1]} epochs, all {epochs}"
-    return Fit(figures, history, epochs, reason)
+    history = {f"train {k + 1}": fit.history["train"] for k, fit in enumerate(fits)}
+    return Fit(figures, history, fits[0].best_epoch, f"{len(fits)} members, {fits[0].reason}")

@@ -180,7 +180,7 @@ class Simulations:
         """
         observed = np.where(self._records.mask, self._records.observed, np.nan)
         spread = np.nanstd(observed.astype(float), axis=(0, 1))
-        alike = 1.0 if len(set(self._records.outputs.units)) == 1 else np.nan
+        alike = 1.0 if self._records.outputs.comparable else np.nan
         square, crps, half, most = np.moveaxis(means, -1, 0)
         return {
             "rmse": alike * np.sqrt(square.mean(axis=-1)),

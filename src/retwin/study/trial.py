@@ -122,8 +122,8 @@ class Trial:
         """Onsets of movements (k, M) in the calibration set, NaN where there is none."""
         if "timing" not in SEES[self.sees]:
             return None
-        commands = self.files.real_data()[list(self.fold[0])].commands
-        segments = Segments.from_commands(commands)
+        seen = self.files.real_data()[list(self.fold[0])]
+        segments = Segments.from_commands(seen.commands).until(seen.lengths)
         return np.where(segments.valid, segments.start, np.nan)
 
     @property
