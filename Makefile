@@ -1,14 +1,14 @@
-# make install | demo | test | lint | bench
+# make install | demo | test | lint | docs | bench
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install demo test lint bench clean
+.PHONY: install demo test lint docs bench clean
 
 install: .venv/installed
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[bayes,flows,fmu,render,rocket,scale,dev]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[bayes,docs,flows,fmu,onnx,render,rocket,scale,dev]"
 	touch $@
 
 # The main job: on the real robot if RETWIN_DATA is set, else on an emulated one.
@@ -24,6 +24,10 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# The documentation site, in site/; warnings are errors.
+docs: install
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 bench: install
 	$(BIN)/python benchmarks/generation.py
 	$(BIN)/python benchmarks/fitting.py
@@ -35,6 +39,7 @@ bench: install
 	$(BIN)/python benchmarks/twins.py
 	$(BIN)/python benchmarks/fmu.py
 	$(BIN)/python benchmarks/scale.py
+	$(BIN)/python benchmarks/bundle.py
 
 clean:
 	rm -rf .venv demo

@@ -42,6 +42,7 @@ FLOORS = [
     "testing",
     "statistics",
     "fidelity",
+    "bundle",
     "study",
     "report",
     "cases",

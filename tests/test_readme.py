@@ -22,6 +22,8 @@ PAGES = [
     *sorted((ROOT / "docs").glob("*.md")),
 ]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
+MADE = re.compile(r"(cli|api(/\w+)?)\.md")
+"""Pages that are made from the code when the site is built; the build checks links to them."""
 
 
 def blocks(page: Path, *languages: str) -> list[str]:
@@ -52,7 +54,7 @@ def check(line: str, *, whole: bool) -> None:
     while words and hasattr(command, "commands") and not words[0].startswith("-"):
         assert words[0] in command.commands, f"no command {words[0]!r} in: retwin {line}"
         command = command.commands[words.pop(0)]
-    if whole:
+    if whole and words != ["--version"]:
         assert not hasattr(command, "commands"), f"an unfinished command: retwin {line}"
         command.make_context(command.name, words)
     known = {name for each in command.params for name in each.opts} | {"--help"}
@@ -123,13 +125,14 @@ def test_the_drawing_lists_the_floors_in_their_order() -> None:
         depth, name = len(line) - len(line.lstrip()), line.split()[0]
         if depth == 2:
             floor = room / name
-        assert (floor if depth == 2 else floor / name).exists(), line
+        if depth <= 4 or name.endswith((".py", "/")):  # else a line that goes on
+            assert (floor if depth == 2 else floor / name).exists(), line
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)", page.read_text("utf-8")):
-        if not target.startswith("http"):
+        if not target.startswith("http") and not MADE.fullmatch(target):
             assert (page.parent / target).exists(), target
 
 

@@ -91,6 +91,7 @@ class Case:
     published: the figures of a paper to show beside ours: source to metric to text.
     body: what can be drawn of the system; None when there is nothing to draw.
     network, training: of the surrogate; None trains it as suits the network.
+    per_class: trajectories of each class that a surrogate or a diagnoser learns from, by default.
     density: the law of the gap, of one value per sample where the correction has that resolution.
     records: splits a file into what calibrates and what tests, where a benchmark says so; None
         when files hold one set.
@@ -113,6 +114,7 @@ class Case:
     body: Body | None = None
     network: Network = MLP()  # noqa: RUF009 - frozen
     training: Training | None = None
+    per_class: int = 400
     density: Density | SequenceMixture = Mixture()  # noqa: RUF009 - frozen
     records: Callable[[Path], tuple[Trajectories, Trajectories]] | None = None
 

@@ -63,7 +63,8 @@ def test_cases_are_found_by_name() -> None:
     assert rt.cases.get("retwin.cases.armpi:armpi").name == "armpi"
     for name in ("nothing", "retwin.cases.armpi:nothing", "no.such.module:case", "os:path"):
         with pytest.raises(
-            rt.InputError, match=r"expected armpi, tanks, a file \*.toml, or package"
+            rt.InputError,
+            match=r"armpi, tanks, tanks_overflow, a file \*.toml, or package",
         ):
             rt.cases.get(name)
 

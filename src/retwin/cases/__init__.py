@@ -10,12 +10,16 @@ from retwin.case import Case
 from retwin.cases.armpi import armpi
 from retwin.cases.columns import ColumnRecords
 from retwin.cases.file import read_case
-from retwin.cases.tanks import tanks
+from retwin.cases.tanks import tanks, tanks_overflow
 from retwin.errors import InputError
 
-__all__ = ["ColumnRecords", "armpi", "get", "read_case", "tanks"]
+__all__ = ["ColumnRecords", "armpi", "get", "read_case", "tanks", "tanks_overflow"]
 
-_BUILT_IN: dict[str, Callable[[], Case]] = {"armpi": armpi, "tanks": tanks}
+_BUILT_IN: dict[str, Callable[[], Case]] = {
+    "armpi": armpi,
+    "tanks": tanks,
+    "tanks_overflow": tanks_overflow,
+}
 
 
 def get(name: str) -> Case:

@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 
 from retwin import __version__
-from retwin.cli import data, models, studies, twins
+from retwin.cli import bundle, data, models, studies, twins
 from retwin.cli.terminal import (
     BAD_INPUT,
     FAILED,
@@ -47,6 +47,7 @@ app.command("generate", epilog="Example: `retwin generate model --per-class 400 
     models.generate
 )
 app.add_typer(models.diagnose, name="diagnose")
+app.add_typer(bundle.app, name="bundle")
 app.command(
     "study",
     epilog="Example: `retwin study armpi --twin-data sim.mat --real real.mat --out study`",

@@ -42,7 +42,9 @@ def fit(
     twin_data: Annotated[
         Path | None, typer.Option(help="Trajectories of the twin; simulated if not given.")
     ] = None,
-    simulations: Annotated[int, typer.Option(help="How many, without --twin-data.")] = 400,
+    simulations: Annotated[
+        int | None, typer.Option(help="How many, without --twin-data; the case's if not given.")
+    ] = None,
     network: Annotated[
         str | None, typer.Option(help="Surrogate: mlp, lstm, tcn or state_space.")
     ] = None,
@@ -64,7 +66,8 @@ def fit(
 
     system = _system(case, network, correction, density, refine)
     measured = _measured(system, real, data)
-    twin = _of_twin(system, twin_data, simulations, seed)
+    size = system.per_class if simulations is None else simulations
+    twin = _of_twin(system, twin_data, size, seed)
     with bar("fit") as tell:
         ibg = rt.fit_surrogate(
             twin,

@@ -52,7 +52,9 @@ def study(
     seed: Annotated[int, typer.Option(help="Same seed, same result.", min=0)] = 0,
     preset: Annotated[str, typer.Option(help="quick or paper.")] = "quick",
     rate: Annotated[float | None, typer.Option(help="Hz that the classifier looks at.")] = None,
-    per_class: Annotated[int, typer.Option(help="Generated trajectories per class.")] = 400,
+    per_class: Annotated[
+        int | None, typer.Option(help="Generated trajectories per class; the case's if not given.")
+    ] = None,
     calibrate_on: Annotated[str, typer.Option(help="healthy or all.")] = "healthy",
     random_onset: Annotated[bool, typer.Option(help="Draw the onset of stuck motors.")] = False,
     encoder_noise: Annotated[

@@ -252,7 +252,7 @@ def _twin(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> Traject
     if data.twin is not None:
         return _labelled(load(data.twin, case=case, progress=progress), case, "twin-data")
     seed = plan.seed_of("twin", 0)
-    return generate(case.twin, case, per_class=plan.per_class, seed=seed, progress=progress)
+    return generate(case.twin, case, per_class=plan.generated(case), seed=seed, progress=progress)
 
 
 def _real(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> tuple[Trajectories, Roles]:

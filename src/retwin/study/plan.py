@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from retwin.case import Case
 from retwin.errors import InputError
 from retwin.networks import CLASSIFIERS, Network
 from retwin.study.sources import ROCKET, SOURCES
@@ -44,7 +45,7 @@ class StudyPlan:
     seed: of everything.
     folds: of the real set, when there is one set only.
     rate: samples per second the classifier looks at; None takes the case's true sensor rate.
-    per_class: generated trajectories per class.
+    per_class: generated trajectories per class; None takes the case's.
     calibrate_on: "healthy" or "all".
     encoder_noise: command units of reading noise put on frozen joints, in training and test sets
         alike. Real stuck joints are frozen in software; their exact stillness is an artefact that
@@ -63,7 +64,7 @@ class StudyPlan:
     seed: int = 0
     folds: int = 3
     rate: float | None = None
-    per_class: int = 400
+    per_class: int | None = None
     calibrate_on: str = "healthy"
     encoder_noise: float = 0.0
     learning_curve: bool = False
@@ -84,7 +85,7 @@ class StudyPlan:
                     remedy="check the spelling",
                 )
         for name, number in (("runs", self.number_of_runs), ("per_class", self.per_class)):
-            if number < 1:
+            if number is not None and number < 1:
                 raise InputError(
                     name, expected="at least 1", got=repr(number), remedy="give a positive number"
                 )
@@ -102,6 +103,10 @@ class StudyPlan:
                 got=repr(self.sources),
                 remedy=f"choose from {', '.join(SOURCES)}",
             )
+
+    def generated(self, case: Case) -> int:
+        """Trajectories per class, the case's unless given."""
+        return case.per_class if self.per_class is None else self.per_class
 
     @property
     def number_of_runs(self) -> int:

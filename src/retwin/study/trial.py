@@ -183,7 +183,7 @@ class Trial:
         made = generate(
             twin,
             self.case,
-            per_class=self.plan.per_class,
+            per_class=self.plan.generated(self.case),
             seed=self.seed("generate"),
             timing=self.timing,
         )

@@ -180,7 +180,8 @@ class Work:
         data = self.files.twin_data()
         if trial.job.name:
             twin, seed = trial.updated(trial.job.name), trial.seed("updated twin")
-            data = generate(twin, self.case, per_class=self.plan.per_class, seed=seed)
+            size = self.plan.generated(self.case)
+            data = generate(twin, self.case, per_class=size, seed=seed)
         fit_surrogate(
             data,
             self.case.network,

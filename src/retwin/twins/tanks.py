@@ -3,10 +3,12 @@
 Torricelli's law, after Schoukens and Noël, "Three benchmarks addressing open challenges in
 nonlinear system identification" (2017), with levels in volts of the lower tank's sensor:
 
-    upper level: x' = pump u - upper sqrt(x)
-    lower level: y' = upper sqrt(x) - lower sqrt(y)
+    upper level: x' = pump u - upper x^p
+    lower level: y' = upper x^p - lower y^q
 
-The upper tank's level is hidden. Its unit is such that it loses what the lower one gains.
+with p = q = 1/2. A real outlet may be between that and laminar flow, where the power is 1, and a
+level need not be counted from the outlet. The upper tank's level is hidden. Its unit is such that
+it loses what the lower one gains.
 """
 
 from __future__ import annotations
@@ -33,7 +35,10 @@ FULL = 10.0
 """The lower tank's level, in V, at which it overflows."""
 WEIR = 0.5
 """What runs over the edge, per V above it and s: so fast that levels stay close to the edge."""
-PHYSICS = ("pump", "upper", "lower", "start_upper", "start_lower", "edge", "spill")
+PHYSICS = (
+    *("pump", "upper", "lower", "start_upper", "start_lower"),
+    *("edge", "spill", "upper_power", "lower_power"),
+)
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,7 @@ class TanksTwin:
     overflow: whether tanks run over; without, levels know no edge.
     edge: of the upper tank, in V; the lower one's is at 10 V, where its reading ends.
     spill: share of what runs over the upper edge that falls into the lower tank.
+    upper_power, lower_power: p and q, of the level in the outflow of each tank.
 
     `simulate` takes the numbers as `parameters`, by name, one for all trajectories or one each.
     The defaults are the least-squares fit to the benchmark's estimation record, see
@@ -63,6 +69,8 @@ class TanksTwin:
     overflow: bool = False
     edge: float = 10.0
     spill: float = 0.5
+    upper_power: float = 0.5
+    lower_power: float = 0.5
 
     @property
     def inputs(self) -> Channels:
@@ -138,9 +146,9 @@ class TanksTwin:
 
     def _rates(self, levels: NDArray, voltage: NDArray, numbers: Mapping[str, NDArray]) -> NDArray:
         x, y = np.split(np.maximum(levels, 0.0), 2)
-        between = numbers["upper"] * np.sqrt(x)
+        between = numbers["upper"] * x ** numbers["upper_power"]
         upper = numbers["pump"] * voltage - between
-        lower = between - numbers["lower"] * np.sqrt(y)
+        lower = between - numbers["lower"] * y ** numbers["lower_power"]
         if self.overflow:
             over = WEIR * np.maximum(x - numbers["edge"], 0.0)
             upper -= over
@@ -151,18 +159,24 @@ class TanksTwin:
 def tanks_parametric(overflow: bool = False) -> ParametricTwin:
     """The tanks with their numbers as free parameters, for `retwin.updating` (Eq. 2 and 3).
 
-    Five of them; with `overflow` also the upper tank's edge, and the share that spills into the
-    lower tank. The start levels are the system's own, the same in every record.
+    Five of them, of the simple physics. With `overflow` all that is known: also the upper tank's
+    edge, the share that spills into the lower tank, and the powers of the outflows. The start
+    levels are the system's own, the same in every record.
     """
     bounds = {
         "pump": ("V/(V s)", 0.005, 0.3),
         "upper": ("V/s", 0.005, 0.3),
         "lower": ("V/s", 0.005, 0.3),
-        "start_upper": ("V", 0.1, 15.0),
+        "start_upper": ("V", 0.1, 30.0 if overflow else 15.0),
         "start_lower": ("V", 0.1, 10.0),
     }
     if overflow:
-        bounds |= {"edge": ("V", 2.0, 20.0), "spill": ("1", 0.0, 1.0)}
+        bounds |= {
+            "edge": ("V", 2.0, 40.0),
+            "spill": ("1", 0.0, 1.0),
+            "upper_power": ("1", 0.25, 1.0),
+            "lower_power": ("1", 0.25, 1.0),
+        }
     twin = TanksTwin(overflow=overflow)
     free = (Parameter(name, *bound, getattr(twin, name)) for name, bound in bounds.items())
     return ParametricTwin(twin, tuple(free))

@@ -1,0 +1,163 @@
+"""Pages of the site that are made when it is built, from the code and from outside of docs/.
+
+MkDocs calls the functions that begin with `on_` (hooks in mkdocs.yml).
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+from pathlib import Path
+from typing import Any, get_origin
+
+import typer
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from typer.cli import get_docs_for_click
+
+import retwin
+from retwin.cli import app
+
+ROOT = Path(__file__).parents[2]
+OUTSIDE = {
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "examples/two_tanks": "two_tanks.md",
+    "tests/contracts/crane.xml": "crane.xml",
+}
+"""Files and folders outside of docs/ that the site has too, and their names there."""
+LANGUAGES = {".py": "python", ".toml": "toml"}
+
+
+def on_config(config: MkDocsConfig) -> None:
+    """A page per module joins the overview of the API."""
+    (reference,) = (part["Reference"] for part in config.nav if "Reference" in part)
+    (api,) = (part["API"] for part in reference if isinstance(part, dict))
+    api += [{module: f"api/{module}.md"} for module in modules()]
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add what is made from the code, and what lies elsewhere."""
+    made = {"cli.md": commands(), "api.md": overview()}
+    made |= {f"api/{module}.md": reference(module) for module in modules()}
+    for path, name in OUTSIDE.items():
+        if (ROOT / path).is_dir():
+            made[name] = listing(ROOT / path)
+        else:
+            files.append(File.generated(config, name, abs_src_path=str(ROOT / path)))
+    for name, text in made.items():
+        files.append(File.generated(config, name, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Links that lead out of docs/, or into it from outside, stay within the site."""
+    for path, name in OUTSIDE.items():
+        markdown = markdown.replace(f"](../{path})", f"]({name})")
+    if page.file.src_uri in OUTSIDE.values():
+        markdown = re.sub(r"\]\(docs/", "](", markdown)
+    return markdown
+
+
+def listing(folder: Path) -> str:
+    """The files of a folder, as a page."""
+    parts = [f"# {folder.relative_to(ROOT)}"]
+    for file in sorted(file for file in folder.iterdir() if file.suffix in LANGUAGES):
+        text = file.read_text("utf-8")
+        parts += [f"## {file.name}", f"```{LANGUAGES[file.suffix]}\n{text}```"]
+    return "\n\n".join(parts)
+
+
+def commands() -> str:
+    """The command line as a page, as Typer knows it."""
+    command: Any = typer.main.get_command(app)
+    _say_whole_lines(command)
+    context = typer.Context(command, info_name="retwin")
+    text = get_docs_for_click(obj=command, ctx=context, name="retwin", title="Command line")
+    return re.sub(r"^\* `--help`: .*\n", "", text, flags=re.M)
+
+
+def _say_whole_lines(command: Any) -> None:
+    """In lists of commands, the first line of their help is not cut short."""
+    for each in getattr(command, "commands", {}).values():
+        each.short_help = (each.help or "").strip().split("\n")[0]
+        _say_whole_lines(each)
+
+
+def modules() -> dict[str, list[str]]:
+    """What the reference tells of: module to public names, in the order of the floors.
+
+    Modules are those that `retwin` takes its names from, and those that a page imports from.
+    """
+    used = {home.split(".")[0] for home in retwin._HOME.values()} | set(retwin._MODULES)
+    for page in (ROOT / "docs").glob("*.md"):
+        used |= set(re.findall(r"^from retwin\.(\w+)", page.read_text("utf-8"), re.M))
+    drawn = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    floors = re.findall(r"^  (\w+)(?:\.py|/) ", drawn, re.M)
+    found = {}
+    for module in sorted(used, key=floors.index):
+        top = {name for name, home in retwin._HOME.items() if home.split(".")[0] == module}
+        own = set(getattr(_module(module), "__all__", []))
+        found[module] = sorted(top) + sorted(own - top)
+    return found
+
+
+def overview() -> str:
+    """Every public name with its first line."""
+    lines = ["# API reference", "", "Generated from the docstrings.", ""]
+    for module, names in modules().items():
+        lines += [f"## [retwin.{module}](api/{module}.md)", "", *_first(_module(module)), ""]
+        lines += ["| name | is |", "|---|---|"]
+        for name in names:
+            (text,) = _first(_found(module, name)) or ("",)
+            lines.append(
+                f"| [`{_shown(name, module)}`](api/{module}.md#{_path(module, name)}) | {text} |"
+            )
+        lines.append("")
+    return "\n".join(lines)
+
+
+def reference(module: str) -> str:
+    """The page of one module."""
+    lines = [f"# retwin.{module}", "", *_first(_module(module)), ""]
+    for name in modules()[module]:
+        lines += [
+            f"::: {_path(module, name)}",
+            "    options:",
+            f"      heading: {_shown(name, module)}",
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def _shown(name: str, module: str) -> str:
+    """How a user writes it."""
+    return f"retwin.{name}" if name in retwin._HOME else f"retwin.{module}.{name}"
+
+
+def _path(module: str, name: str) -> str:
+    """Where it is defined."""
+    found = _found(module, name)
+    if inspect.isclass(found) or inspect.isfunction(found):
+        return f"{found.__module__}.{found.__qualname__}"
+    return f"retwin.{module}.{name}"
+
+
+def _found(module: str, name: str) -> Any:
+    home: Any = retwin if name in retwin._HOME else _module(module)
+    return getattr(home, name)
+
+
+def _module(module: str) -> Any:
+    return importlib.import_module(f"retwin.{module}")
+
+
+def _first(documented: Any) -> list[str]:
+    """The first line of its docstring; of a value, which has none of its own, what it is."""
+    if not (inspect.ismodule(documented) or inspect.isclass(documented) or callable(documented)):
+        return [f"a constant, `{type(documented).__name__}`"]
+    if get_origin(documented) is not None:
+        return ["a type"]
+    text = inspect.getdoc(documented) or ""
+    return [text.split("\n\n")[0].replace("\n", " ").replace("|", "\\|")] if text else []

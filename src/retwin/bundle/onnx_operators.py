@@ -1,0 +1,60 @@
+"""ONNX for operators of torch that its exporter does not know, or not in the form we use them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+__all__ = ["translations"]
+
+
+def translations() -> dict[Callable[..., Any], Callable[..., Any]]:
+    """Operator of torch to what stands for it in ONNX; needs onnxscript."""
+    from onnxscript import opset18
+
+    op: Any = opset18  # its types are those of values, ours are those of a graph's names
+
+    def ints(*values: int) -> Any:
+        return op.Constant(value_ints=values)
+
+    def searchsorted(
+        boundaries: Any,
+        values: Any,
+        out_int32: bool = False,
+        right: bool = False,
+        side: Any = None,
+        sorter: Any = None,
+    ) -> Any:
+        """How many of a few boundaries (..., K) are at or below each value (..., T)."""
+        below = op.LessOrEqual if right else op.Less
+        before = below(op.Unsqueeze(boundaries, ints(-2)), op.Unsqueeze(values, ints(-1)))
+        return op.ReduceSum(op.Cast(before, to=7), ints(-1), keepdims=0)
+
+    def cummax(values: Any, dim: int) -> Any:
+        """The greatest of (n, K) so far, along the last axis, and its place; K is small."""
+        count = op.Shape(values, start=-1)
+        square = op.Expand(op.Constant(value_float=1.0), op.Concat(count, count, axis=0))
+        seen = op.Greater(op.Trilu(square, upper=0), op.Constant(value_float=0.5))
+        lowest = op.Constant(value_float=-3e38)
+        candidates = op.Where(seen, op.Unsqueeze(values, ints(-2)), lowest)
+        greatest = op.ReduceMax(candidates, ints(-1), keepdims=0)
+        return greatest, op.ArgMax(candidates, axis=-1, keepdims=0)
+
+    def amax(values: Any, dim: Any = (), keepdim: bool = False) -> Any:
+        """The greatest over some axes, or over all."""
+        axes = (dim,) if isinstance(dim, int) else tuple(dim or ())
+        kept = int(keepdim)
+        return (
+            op.ReduceMax(values, ints(*axes), keepdims=kept)
+            if axes
+            else op.ReduceMax(values, keepdims=kept)
+        )
+
+    aten = torch.ops.aten
+    return {
+        aten.searchsorted.Tensor: searchsorted,
+        aten.cummax.default: cummax,
+        aten.amax.default: amax,
+    }

@@ -1,0 +1,180 @@
+"""What the docs show is true: every Python block runs, the notebook too, and the site builds."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import nbformat
+import numpy as np
+import pytest
+from nbclient import NotebookClient
+from test_readme import ROOT, blocks, shown
+from typer.testing import CliRunner
+
+import retwin as rt
+from retwin.cli import app
+
+DOCS, TESTS = ROOT / "docs", ROOT / "tests"
+HERE = ("extending.md", "own_data.md", "own_simulator.md", "tanks.md")
+"""Pages whose blocks run below, one after the other."""
+APART = ("fmu.md", "pitfalls.md", "scale.md", "tutorial.md")
+"""Pages with a test of their own below."""
+SMALL = "--sources dt --per-class 9"
+"""What makes the tutorial's study small enough for a test."""
+DRIVE = """
+from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
+
+
+class Drive(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.torque, self.speed, self.inertia = 0.0, 0.0, 0.01
+        free = {"causality": Fmi2Causality.parameter, "variability": Fmi2Variability.tunable}
+        self.register_variable(Real("torque", causality=Fmi2Causality.input, start=0.0))
+        self.register_variable(Real("inertia", start=0.01, **free))
+        self.register_variable(Real("speed", causality=Fmi2Causality.output))
+
+    def do_step(self, current_time, step_size):
+        self.speed += step_size * self.torque / self.inertia
+        return True
+"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder to work in."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """An empty module that can be found by its name, as pickle and dataclasses do."""
+    made = ModuleType("shown")
+    monkeypatch.setitem(sys.modules, "shown", made)
+    return made
+
+
+def run(page: str, into: dict[str, Any], *codes: str) -> dict[str, Any]:
+    """The names that Python blocks of a page make: all of them, or these in their place."""
+    for code in codes or blocks(DOCS / page, "python"):
+        exec(compile(code, f"docs/{page}", "exec"), into)
+    return into
+
+
+def test_no_python_block_is_left_out() -> None:
+    """A page that does not run here is run by the test of its subject."""
+    texts = [file.read_text("utf-8") for file in TESTS.rglob("*.py") if file != Path(__file__)]
+    running = "".join(text for text in texts if '"docs" /' in text)
+    for page in DOCS.glob("*.md"):
+        if blocks(page, "python") and page.name not in (*HERE, *APART):
+            assert f'"{page.name}"' in running, f"no test runs the Python of {page.name}"
+
+
+@pytest.mark.parametrize("page", HERE)
+def test_the_code_of_a_page_runs(page: str, module: ModuleType) -> None:
+    names = run(page, vars(module))
+    if page == "extending.md":
+        tried = rt.generate(names["case"].twin, names["case"], per_class=20, seed=2)
+        assert rt.evaluate(names["nearest"], tried).macro_f1 > 0.8
+    if page == "own_simulator.md":
+        assert 0.8 < names["fidelity"].figures["coverage90"].value < 1.0
+
+
+def test_what_cannot_be_told_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.warns(UserWarning, match="not identified: motor, gear"):
+        names = run("pitfalls.md", {})
+    values = names["updated"].values
+    assert values["motor"] * values["gear"] == pytest.approx(3, rel=1e-2)
+    assert names["hidden"].shape == names["seen"].shape
+    assert "not identified: motor, gear" in capsys.readouterr().out
+
+
+def test_the_page_on_fmus(folder: Path) -> None:
+    (folder / "drive.py").write_text(DRIVE, encoding="utf-8")
+    build = [sys.executable, "-m", "pythonfmu", "build", "-f", "drive.py", "-d", "."]
+    subprocess.run(build, check=True, capture_output=True)
+    (folder / "Drive.fmu").rename("drive.fmu")
+    (code,) = blocks(DOCS / "fmu.md", "python")
+    torque = np.ones((2, 50, 1))
+    made = run("fmu.md", {"__name__": "__main__", "commands": torque}, code)["made"]
+    assert made.observed[0, -1, 0] == pytest.approx(49 * 0.01 / 0.02, rel=1e-3)
+
+
+def test_the_page_on_scale() -> None:
+    """The same code with 60 trajectories in place of a million; the one for Slurm compiles."""
+    here, slurm, reading = blocks(DOCS / "scale.md", "python")
+    small = here.replace("n=1_000_000", "n=60")
+    assert small != here
+    run("scale.md", {"__name__": "__main__"}, small)
+    assert len(run("scale.md", {}, reading)["part"]) == 60
+    ast.parse(slurm)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:jupyter_client")
+@pytest.mark.filterwarnings("ignore:only .* healthy:UserWarning")
+def test_the_tutorial(folder: Path) -> None:
+    """Its Python as a notebook, then its commands; the study with fewer sources and data."""
+    made = runpy.run_path(str(DOCS / "scripts" / "notebook.py"))["notebook"]()
+    nbformat.validate(made)
+    NotebookClient(made, timeout=600, resources={"metadata": {"path": str(folder)}}).execute()
+    told = "".join(o.get("text", "") for cell in made.cells for o in cell.get("outputs", []))
+    assert 0.8 < float(re.search(r"coverage90: ([\d.]+)", told)[1]) <= 1.0
+    first, second = (float(score) for score in re.findall(r"macro_f1 ([\d.]+)", told))
+    assert first > 3 / 9, "no better than a guess"
+    assert second > 0.7
+
+    commands = [line for line, whole in shown(DOCS / "tutorial.md") if whole]
+    assert len(commands) >= 5
+    for line in sorted(commands, key=lambda line: not line.startswith("study")):
+        words = shlex.split(line + " " + SMALL * line.startswith("study"))
+        result = CliRunner().invoke(app, words, catch_exceptions=False)
+        assert result.exit_code == 0, f"retwin {line}: {result.output}"
+    assert (folder / "study" / "report.html").stat().st_size > 1e6
+
+
+def test_every_picture_has_its_script() -> None:
+    scripts = "".join(file.read_text("utf-8") for file in (DOCS / "figures").glob("*.py"))
+    for picture in (DOCS / "images").iterdir():
+        assert f'"{picture.stem}"' in scripts, f"no script in docs/figures makes {picture.name}"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built with every warning an error."""
+    target = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(target)]
+    told = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    built = subprocess.run(command, cwd=ROOT, env=told, capture_output=True, text=True)
+    assert built.returncode == 0, built.stdout + built.stderr
+    return target
+
+
+@pytest.mark.slow
+def test_the_site_needs_no_network(site: Path) -> None:
+    for page in site.rglob("*.html"):
+        text = page.read_text("utf-8")
+        loaded = re.findall(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=\"([^\"]+)", text)
+        away = [address for address in loaded if re.match(r"(?:https?:)?//", address)]
+        assert not away, f"{page.name} loads {away}"
+        assert 'class="mermaid"' not in text, f"{page.name} would load mermaid from elsewhere"
+
+
+@pytest.mark.slow
+def test_the_references_are_whole(site: Path) -> None:
+    names = "".join(page.read_text("utf-8") for page in (site / "api").glob("*.html"))
+    missing = [name for name in rt.__all__ if f"retwin.{name}" not in names and name[0] != "_"]
+    assert not missing
+    commands = (site / "cli.html").read_text("utf-8")
+    for name in ("demo", "fit", "generate", "study", "data fetch", "twin info", "diagnose fit"):
+        assert f"retwin {name}" in commands
