@@ -117,3 +117,18 @@ def test_a_network_that_could_not_be_loaded_is_not_saved() -> None:
 
     with pytest.raises(InputError, match=r"expected one of MLP, .* got Mine"):
         to_config(Mine(), NETWORKS)
+
+
+@pytest.mark.parametrize("epochs", [1, 2, 5, 10])
+def test_any_number_of_steps_can_be_trained(epochs: int) -> None:
+    """Ten steps in all are one of warming up: none that torch's schedule could divide by."""
+    how = Training(epochs=epochs, batch=8, rate=0.1)
+    fit = train(nn.Linear(2, 1), squared, line(8), line(8), how, seed=0)
+    assert len(fit.history["train"]) == epochs
+
+
+def test_threads_are_those_of_before() -> None:
+    before = torch.get_num_threads()
+    with isolated(0):
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == before

@@ -198,18 +198,21 @@ class _Pooled(nn.Module):
         layers: list[nn.Module] = []
         for width, following in pairwise((inputs, *config.channels)):
             layers += [
-                nn.Conv1d(width, following, config.kernel, padding="same"),
-                nn.BatchNorm1d(following),
+                nn.Conv2d(width, following, (1, config.kernel), padding="same"),
+                nn.BatchNorm2d(following),
                 nn.ReLU(),
-                nn.MaxPool1d(2, ceil_mode=True),
+                nn.MaxPool2d((1, 2), ceil_mode=True),
             ]
         # No pooling behind the last one: mean and maximum over time follow.
-        self.features = nn.Sequential(*layers[:-1])
+        # In two dimensions, one of them of length 1, channels may come last in memory, as they do
+        # in what is given: that takes two thirds of the time on a processor.
+        features = nn.Sequential(*layers[:-1])
+        self.features = features.to(memory_format=torch.channels_last)
         self.dropout = nn.Dropout(config.dropout)
         self.readout = nn.Linear(2 * config.channels[-1], outputs)
 
     def represent(self, values: Tensor) -> Tensor:
-        features = self.features(values.transpose(1, 2))
+        features = self.features(values.transpose(1, 2).unsqueeze(2)).squeeze(2)
         return torch.cat([features.mean(dim=2), features.amax(dim=2)], dim=1)
 
     def forward(self, values: Tensor) -> Tensor:

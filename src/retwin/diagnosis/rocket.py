@@ -219,7 +219,12 @@ def _temperature(scores: NDArray, truth: NDArray) -> tuple[float, float]:
 
 
 def _channels(standard: Tensor) -> NDArray:
-    """Features (n, T', 2 d_y) and the running sum of r, channels first: (n, 3 d_y, T')."""
+    """Features (n, T', 2 d_y) and the running sum of r, channels first: (n, 3 d_y, T').
+
+    Chosen on the emulated arm, 200 generated trajectories per class, 540 emulated ones tested:
+    macro-F1 0.72, without the sums 0.60, without ŷ 0.69, with products of ŷ and r besides 0.71.
+    MultiRocket has 0.67 with the sums and 0.62 without, at four times the cost; a CNN has 0.79.
+    """
     residual = standard[:, :, standard.shape[2] // 2 :]
     # By the root of T', as a sum of so many independent ones grows: a size like the others'.
     sums = residual.cumsum(dim=1) / standard.shape[1] ** 0.5

@@ -16,6 +16,11 @@ from retwin.training.settings import Fit, Loss, Training
 __all__ = ["Loop"]
 
 
+WARM = 0.1001
+"""Share of steps in which the rate rises. A tenth of ten steps would leave torch nothing to divide
+by."""
+
+
 class Loop(LightningModule):
     """Trains a network; keeps history and the best weights, stops early, tells progress."""
 
@@ -62,12 +67,12 @@ class Loop(LightningModule):
         """AdamW, its rate decayed as the training says."""
         how = self.how
         optimiser = torch.optim.AdamW(
-            self.network.parameters(), lr=how.rate, weight_decay=how.weight_decay
+            self.network.parameters(), lr=how.rate, weight_decay=how.weight_decay, fused=True
         )
         total = self.steps * how.epochs
         schedule: LRScheduler
         if how.decay == "cosine":
-            schedule = OneCycleLR(optimiser, how.rate, total, pct_start=0.1, final_div_factor=1000)
+            schedule = OneCycleLR(optimiser, how.rate, total, pct_start=WARM, final_div_factor=1000)
         else:
             schedule = MultiStepLR(optimiser, [math.ceil(total * 2 / 3)], gamma=0.1)
         return {

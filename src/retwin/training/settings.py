@@ -79,10 +79,16 @@ class Fit:
 
 @contextmanager
 def isolated(seed: int) -> Iterator[None]:
-    """Run with torch's global generator seeded, and leave it as it was.
+    """Run with torch's global generator seeded and on one thread, and leave both as they were.
 
-    Fresh weights and dropout draw from the global generator and take no other.
+    Fresh weights and dropout draw from the global generator and take no other. Networks this small
+    lose time with more threads, and their last digits would depend on how many there are.
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        yield
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            yield
+    finally:
+        torch.set_num_threads(threads)

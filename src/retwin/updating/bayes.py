@@ -98,8 +98,9 @@ def _outside(problem: Problem, rng: np.random.Generator) -> float:
     points, paths = problem.prior
     seen = problem.misfit.seen
     summaries = Summaries.of(paths)
-    simulated = summaries(problem.seen_noisily(points, paths, problem.box, rng)[1], seen)
-    return outlyingness(summaries(problem.measured, seen)[0], simulated)
+    _, simulated = problem.seen_noisily(points, paths, problem.box, summaries, rng)
+    flat = simulated.reshape(-1, simulated.shape[-1])
+    return outlyingness(summaries(problem.measured, seen)[0], flat)
 
 
 def calibration_ranks(

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import warnings
-from contextlib import redirect_stdout
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,9 +22,11 @@ TAIL = 1e-3
 """Share of the posterior's draws beyond which its box ends, on either side."""
 SPARE, LEAST = 4, 0.1
 """Draws per sample wanted, and the share of these below which they are set on the edge instead."""
-HIDDEN, COMPONENTS = 32, 2
+HIDDEN, COMPONENTS = 64, 2
 """Of the mixture density network: in the last box a posterior is nearly Gaussian."""
-BATCH, RATE, PATIENCE = 500, 2e-3, 20
+BATCH, RATE, CLIP = 256, 5e-3, 5.0
+VALIDATION = 10
+"""One in so many points is held out to choose the best epoch."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +44,14 @@ class NPE:
         in the first round 200 at least, which also tell whether the twin is misspecified.
     rounds: 1 uses the whole prior only.
     samples: drawn from the posterior.
-    epochs: at most, per round.
+    epochs: of the network per round; each sees every path through `problem.NOISES` draws of noise.
 
     """
 
     simulations: int = 500
     rounds: int = 2
     samples: int = 4000
-    epochs: int = 500
+    epochs: int = 20
 
     def __post_init__(self) -> None:
         check_counts(rounds=self.rounds, epochs=self.epochs)
@@ -67,7 +66,6 @@ class NPE:
         box = problem.box
         points, paths = problem.prior
         seen = problem.misfit.seen
-        epochs = 0
         for done in range(self.rounds):
             count = self.simulations if done else max(self.simulations - len(points), 0)
             fresh = box[0] + (box[1] - box[0]) * rng.random((count, problem.size))
@@ -78,13 +76,11 @@ class NPE:
             inside = np.all((points >= box[0]) & (points <= box[1]), axis=1)
             points, paths = points[inside], paths[inside]
             summaries = Summaries.of(paths)
-            told, noisy = problem.seen_noisily(points, paths, box, rng)
-            known = summaries(noisy, seen)
+            told, known = problem.seen_noisily(points, paths, box, summaries, rng)
             measured = summaries(problem.measured, seen)
             share = (told - box[0]) / (box[1] - box[0])
-            found, taken = self._learn(share, known, measured, int(rng.integers(2**31)))
+            found, loss = self._learn(share, known, measured, int(rng.integers(2**31)))
             drawn = box[0] + (box[1] - box[0]) * found
-            epochs += taken
             if progress is not None:
                 progress((done + 1) / self.rounds)
             if done < self.rounds - 1:
@@ -92,72 +88,53 @@ class NPE:
                 wider = MARGIN * (ends[1] - ends[0]) + 1e-6
                 box = np.clip([ends[0] - wider, ends[1] + wider], box[0], box[1])
         volume = float(np.mean(np.log10(box[1] - box[0])))
-        figures = {"epochs": float(epochs), "box_log10_width": volume, "kept": float(len(points))}
-        doubt = (
-            "" if taken <= self.epochs else "the network was still learning when its epochs ended"
-        )
-        return drawn, figures, doubt
+        figures = {"loss": loss, "box_log10_width": volume, "kept": float(len(points))}
+        return drawn, figures, ""
 
     def _learn(
         self, share: NDArray, told: NDArray, measured: NDArray, seed: int
-    ) -> tuple[NDArray, int]:
-        """Draws (s, K) from 0 to 1 given what was measured, and the epochs it took."""
+    ) -> tuple[NDArray, float]:
+        """Draws (s, K) from 0 to 1 given what was measured (1, S), and the loss on held-out points.
+
+        `share` (m, c, K) are m points c times each, `told` (m, c, S) what was seen of them.
+        """
         import torch
 
-        from retwin.training import isolated
+        from retwin.training import Training, isolated, train
 
-        trainer, builder = _sbi()
-        middle, scale = told.mean(axis=0), told.std(axis=0).clip(1e-12)
-        known = torch.as_tensor((told - middle) / scale, dtype=torch.float32)
-        asked = torch.as_tensor((measured - middle) / scale, dtype=torch.float32)
+        build = _density()
+        middle, scale = told.mean(axis=(0, 1)), told.std(axis=(0, 1)).clip(1e-12)
+
+        def tensor(values: NDArray) -> torch.Tensor:
+            return torch.as_tensor(values, dtype=torch.float32).reshape(-1, values.shape[-1])
+
+        known, asked = (told - middle) / scale, tensor((measured - middle) / scale)
+        # Points are held out, not single draws of their noise: those share the path.
+        cut = len(share) - max(1, len(share) // VALIDATION)
+        fitted_on, held_out = (
+            (tensor(share[part]), tensor(known[part])) for part in (slice(cut), slice(cut, None))
+        )
+
+        def loss(network: Any, batch: tuple[torch.Tensor, ...]) -> torch.Tensor:
+            return network.loss(batch[0], condition=batch[1]).mean()
+
         with isolated(seed):
-            learner = trainer(
-                density_estimator=builder(
-                    "mdn", z_score_x="none", hidden_features=HIDDEN, num_components=COMPONENTS
-                ),
-                show_progress_bars=False,
-                tracker=_Silent(),
-            )
-            learner.append_simulations(torch.as_tensor(share, dtype=torch.float32), known)
-            # sbi prints that it is done; that the epochs are spent is told in the result's reason.
-            with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
-                warnings.filterwarnings("ignore", "Maximum number of epochs", UserWarning)
-                network = learner.train(
-                    training_batch_size=min(BATCH, max(10, len(share) // 10)),
-                    learning_rate=RATE,
-                    stop_after_epochs=PATIENCE,
-                    max_num_epochs=self.epochs,
-                )
-            with torch.no_grad():
-                drawn = (
-                    network.sample((SPARE * self.samples,), condition=asked)[:, 0].double().numpy()
-                )
+            network = build(
+                "mdn", z_score_x="none", hidden_features=HIDDEN, num_components=COMPONENTS
+            )(*fitted_on)
+        how = Training(epochs=self.epochs, batch=BATCH, rate=RATE, clip=CLIP)
+        fit = train(network, loss, fitted_on, held_out, how, seed=seed)
+        with isolated(seed), torch.no_grad():
+            drawn = network.sample((SPARE * self.samples,), condition=asked)[:, 0].double().numpy()
         # The network knows no edges: what leaks over those of the prior is drawn again.
         inside = drawn[np.all((drawn >= 0) & (drawn <= 1), axis=1)][: self.samples]
         if len(inside) < LEAST * self.samples:
             inside = drawn[: self.samples].clip(0.0, 1.0)
-        return inside, int(learner.epoch)
+        return inside, min(fit.history["validation"])
 
 
-class _Silent:
-    """Keeps sbi from writing logs into the current folder."""
-
-    log_dir = None
-
-    def log_metric(self, *_: Any, **__: Any) -> None: ...
-
-    def log_metrics(self, *_: Any, **__: Any) -> None: ...
-
-    def log_params(self, *_: Any, **__: Any) -> None: ...
-
-    def add_figure(self, *_: Any, **__: Any) -> None: ...
-
-    def flush(self) -> None: ...
-
-
-def _sbi() -> tuple[Any, Any]:
+def _density() -> Any:
     try:
-        from sbi.inference import NPE as Trainer  # noqa: N811
         from sbi.neural_nets import posterior_nn
     except ImportError:
         raise InputError(
@@ -166,4 +143,4 @@ def _sbi() -> tuple[Any, Any]:
             got="none installed",
             remedy="pip install 'retwin[bayes]'",
         ) from None
-    return Trainer, posterior_nn
+    return posterior_nn

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from retwin.updating.misfit import Misfit
 from retwin.updating.noise import Noise
+from retwin.updating.summaries import Summaries
 
 __all__ = ["Problem"]
 
 PREDICTED = 200
 """Draws from the prior that the measured data are held against."""
-NOISES = 8
+NOISES = 32
 """Draws of the noise, with scales of their own, through which each simulated path is seen."""
 TOGETHER = 64
 """Values of the parameters that are simulated at once."""
@@ -88,21 +89,30 @@ class Problem:
         return np.array([np.zeros(self.size), np.ones(self.size)])
 
     def seen_noisily(
-        self, points: NDArray, paths: NDArray, box: NDArray, rng: np.random.Generator
+        self,
+        points: NDArray,
+        paths: NDArray,
+        box: NDArray,
+        summaries: Summaries,
+        rng: np.random.Generator,
     ) -> tuple[NDArray, NDArray]:
-        """Each point and its path several times, with other noise, its scales drawn within a box.
+        """Each of m points, and summaries of its path seen through noise, `NOISES` times.
 
-        That costs no simulation.
+        (m, NOISES, K) and (m, NOISES, S); the scales of the noise are drawn within the box. That
+        costs no simulation.
         """
-        told = np.repeat(points, NOISES, axis=0)
         low, high = box[:, self.parameters :]
-        told[:, self.parameters :] = rng.uniform(low, high, size=(len(told), len(low)))
-        _, logs = self.physical(told)
         count, samples, width = self.misfit.seen.shape
-        repeated = np.repeat(logs, count, axis=0)
-        drawn = self.noise.draw(rng, repeated, samples, width, self.misfit.interval)
-        errors = drawn.reshape(len(told), count, samples, width) * self.misfit.seen
-        return told, np.repeat(paths, NOISES, axis=0) + errors
+        told, known = [], []
+        for _ in range(NOISES):
+            again = points.copy()
+            again[:, self.parameters :] = rng.uniform(low, high, size=(len(points), len(low)))
+            logs = np.repeat(self.physical(again)[1], count, axis=0)
+            errors = self.noise.draw(rng, logs, samples, width, self.misfit.interval)
+            seen = self.misfit.seen
+            told.append(again)
+            known.append(summaries(paths + errors.reshape(paths.shape) * seen, seen))
+        return np.stack(told, axis=1), np.stack(known, axis=1)
 
     @property
     def measured(self) -> NDArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, get_args
 
 import numpy as np
@@ -180,28 +181,39 @@ class Search:
         flat = self.misfit.residuals(self.theta(points)).reshape(len(points), -1)
         return np.nan_to_num(flat, nan=FAILED * self.misfit.spread)
 
-    def jacobian(self, point: NDArray, *, sides: Literal[1, 2] = 2) -> NDArray:
+    def jacobian(
+        self, point: NDArray, *, sides: Literal[1, 2] = 2, there: NDArray | None = None
+    ) -> NDArray:
         """Derivative (everything, k) at a point (k,): differences to one or both sides, one batch.
 
-        One-sided at a bound, and beside what cannot be simulated: its residual is no slope.
+        One-sided at a bound, and beside what cannot be simulated: its residual is no slope. `there`
+        are the residuals (everything,) at the point, where they are known.
         """
         step = np.diag(np.where(point > 0.5, -NUDGE, NUDGE))
         inward, outward = np.clip(point + step, 0, 1), np.clip(point - step, 0, 1)
-        points = np.concatenate([inward, outward if sides == 2 else point[None], point[None]])
+        if there is None:
+            there = self.residuals(point[None])[0]
+        points = np.concatenate([inward, outward]) if sides == 2 else inward
         residuals = self.misfit.residuals(self.theta(points)).reshape(len(points), -1)
         broken = np.isnan(residuals).any(axis=1)
-        points[broken], residuals[broken] = point, residuals[-1]
+        points[broken], residuals[broken] = point, there
         size = len(point)
-        length = np.diag(points[:size] - points[size:-1])[:, None]
-        difference = residuals[:size] - residuals[size:-1]
+        length = np.diag(points[:size] - (points[size:] if sides == 2 else point))[:, None]
+        difference = residuals[:size] - (residuals[size:] if sides == 2 else there)
         return np.divide(difference, length, out=np.zeros_like(difference), where=length != 0).T
 
     def descend(self, start: NDArray) -> OptimizeResult:
         """The optimum nearest to a start."""
+
+        # A derivative is asked for where the residuals were asked for last.
+        @lru_cache(maxsize=1)
+        def residuals(point: tuple[float, ...]) -> NDArray:
+            return self.residuals(np.array([point]))[0]
+
         return least_squares(
-            lambda point: self.residuals(point[None])[0],
+            lambda point: residuals(tuple(point)),
             start,
-            lambda point: self.jacobian(point, sides=1),
+            lambda point: self.jacobian(point, sides=1, there=residuals(tuple(point))),
             bounds=(0.0, 1.0),
             ftol=EXACT,
             xtol=EXACT,

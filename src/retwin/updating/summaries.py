@@ -17,45 +17,70 @@ LAGS = (1, 2, 4, 8, 16)
 
 
 @dataclass(frozen=True, eq=False)
-class Summaries:
-    """Where a set of paths lies on the manifold that the twin can reach, and how far off it is.
-
-    Principal components of noise-free simulated paths say where. What they leave over is noise:
-    its size, and how it differs from itself some samples later, say of what kind.
+class Principal:
+    """The directions in which noise-free simulated data differ most.
 
     Attributes
     ----------
-    components: (c, N) principal directions of flattened paths, N = n P d_y.
-    middle: (N,) mean path.
-    shape: (n, P, d_y).
+    components: (c, N) principal directions of flattened data.
+    middle: (N,) their mean.
 
     """
 
     components: NDArray
     middle: NDArray
-    shape: tuple[int, ...]
+
+    @classmethod
+    def of(cls, data: NDArray) -> Principal:
+        """From simulated data (m, ...)."""
+        flat = data.reshape(len(data), -1)
+        middle = flat.mean(axis=0)
+        _, singular, directions = np.linalg.svd(flat - middle, full_matrices=False)
+        known = singular > FLAT * singular.max(initial=0.0)
+        return cls(directions[known][:COMPONENTS], middle)
+
+    def __call__(self, data: NDArray, seen: NDArray) -> tuple[NDArray, NDArray]:
+        """Scores (m, c) of data (m, ...), and what they leave over; 0 where nothing was seen."""
+        off = data.reshape(len(data), -1) - self.middle * seen.ravel()
+        scores = off @ self.components.T
+        return scores, (off - scores @ self.components).reshape(data.shape) * seen
+
+
+@dataclass(frozen=True, eq=False)
+class Summaries:
+    """Where a set of paths lies on the manifold that the twin can reach, and how far off it is.
+
+    Principal components of noise-free simulated paths say where. So do those of their steps from
+    sample to sample: an error that lasts spoils the paths, and hardly the steps. What the former
+    leave over is noise: its size, and how it differs from itself some samples later, say of what
+    kind.
+
+    Attributes
+    ----------
+    paths, steps: the principal directions of both.
+
+    """
+
+    paths: Principal
+    steps: Principal
 
     @classmethod
     def of(cls, paths: NDArray) -> Summaries:
         """From noise-free paths (m, n, P, d_y)."""
-        flat = paths.reshape(len(paths), -1)
-        middle = flat.mean(axis=0)
-        _, singular, directions = np.linalg.svd(flat - middle, full_matrices=False)
-        known = singular > FLAT * singular.max(initial=0.0)
-        return cls(directions[known][:COMPONENTS], middle, paths.shape[1:])
+        return cls(Principal.of(paths), Principal.of(np.diff(paths, axis=2)))
 
     def __call__(self, paths: NDArray, seen: NDArray) -> NDArray:
         """Summaries (m, s) of paths (m, n, P, d_y), 0 where nothing was `seen` (n, P, d_y)."""
-        off = paths.reshape(len(paths), -1) - self.middle * seen.ravel()
-        scores = off @ self.components.T
-        rest = (off - scores @ self.components).reshape(len(paths), *self.shape) * seen
+        scores, rest = self.paths(paths, seen)
+        both = seen[:, 1:] & seen[:, :-1]
+        quick, _ = self.steps(np.diff(paths, axis=2) * both, both)
         told = [np.sum(rest**2, axis=(1, 2, 3)) / seen.sum()]
         for lag in LAGS:
-            if lag < self.shape[1] // 2:
+            if lag < paths.shape[2] // 2:
                 both = seen[:, lag:] & seen[:, :-lag]
                 steps = (rest[:, :, lag:] - rest[:, :, :-lag]) ** 2 * both
                 told.append(np.sum(steps, axis=(1, 2, 3)) / max(both.sum(), 1))
-        return np.column_stack([scores, np.log(np.array(told).T + 1e-300)])
+        return np.column_stack([scores, quick, np.log(np.array(told).T + 1e-300)])
 
 
 def outlyingness(measured: NDArray, simulated: NDArray) -> float:
