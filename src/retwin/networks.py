@@ -207,7 +207,7 @@ class _Pooled(nn.Module):
         # In two dimensions, one of them of length 1, channels may come last in memory, as they do
         # in what is given: that takes two thirds of the time on a processor.
         features = nn.Sequential(*layers[:-1])
-        self.features = features.to(memory_format=torch.channels_last)
+        self.features = features.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.dropout = nn.Dropout(config.dropout)
         self.readout = nn.Linear(2 * config.channels[-1], outputs)
 
