@@ -88,7 +88,7 @@ def test_emulated_trajectories_say_so(study: Study, write: Write) -> None:
     study[0]["emulated"] = True
     section = explorer(read_results(write(study)))
     assert section is not None
-    assert section.blocks[0].caption.startswith("Emulated robot, no real measurements.")
+    assert section.blocks[0].caption.startswith("Emulated data, no real measurements.")
 
 
 @pytest.mark.parametrize(

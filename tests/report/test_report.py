@@ -208,9 +208,9 @@ def test_emulated(study: Study, write: Write) -> None:
     assert "emulated" not in read(folder).text.lower()
     study[0]["emulated"] = True
     text = read(write(study)).text
-    assert "EMULATED robot: no real measurements" in text
-    assert text.count("Emulated robot, no real measurements.") >= len(FIGURES)
-    assert "says nothing about a real one" in text
+    assert "EMULATED data: no real measurements" in text
+    assert text.count("Emulated data, no real measurements.") >= len(FIGURES)
+    assert "says nothing about the real one" in text
 
 
 def test_no_paper_columns_without_a_paper(study: Study, write: Write) -> None:

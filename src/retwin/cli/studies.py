@@ -41,7 +41,7 @@ def study(
     real: Annotated[Path | None, typer.Option(help="One real set, split into folds.")] = None,
     folds: Annotated[int, typer.Option(help="Folds of --real.")] = 3,
     data: Annotated[
-        Path | None, typer.Option(help="One file that the case splits itself, as tanks.")
+        Path | None, typer.Option(help="One file that the case splits itself.")
     ] = None,
     sources: Annotated[
         str | None,
@@ -106,7 +106,7 @@ def demo(
     runs: Annotated[int, typer.Option(help="Runs.")] = 1,
     seed: Annotated[int, typer.Option(help="Same seed, same result.", min=0)] = 0,
 ) -> None:
-    """The whole job on the robot arm: real data in `RETWIN_DATA` if set, else emulated ones."""
+    """The whole job on the case of the paper: real data in `RETWIN_DATA` if set, else emulated ones."""
     import retwin as rt
     from retwin.study import StudyData, StudyPlan
 
@@ -155,7 +155,7 @@ def _run(case: Any, plan: Any, data: Any, out: Path, processes: int | None) -> N
 
 def _table(results: Mapping[str, Any]) -> Table:
     n, runs = results["data"]["test"]["n"], results["runs"]
-    kind = "EMULATED robot (no real measurements)" if results["emulated"] else results["title"]
+    kind = "EMULATED data (no real measurements)" if results["emulated"] else results["title"]
     counted = f"{runs} run{'s' if runs > 1 else ''}"
     what = f"{n} test trajector{'ies' if n > 1 else 'y'}"
     told = [kind + f": {what}", counted, results["classifier"]]

@@ -84,7 +84,7 @@ def info(twin: TwinName, inputs: Inputs = "", outputs: Outputs = "", rate: Rate 
 
 @app.command(
     epilog="Example: `retwin twin simulate armpi --n 20000 --fault all --seed 1 --out made.zarr`. "
-    "A module in the current folder can be named, too: `retwin twin simulate tank:twin …`"
+    "A module in the current folder can be named, too: `retwin twin simulate plant:twin …`"
 )
 def simulate(
     twin: TwinName,

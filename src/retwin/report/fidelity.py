@@ -37,7 +37,7 @@ def figure_names(results: Results) -> dict[str, str]:
 
 def groups(results: Results) -> list[Group]:
     """Delays, offsets, noise and the rest, each with a figure of its own."""
-    real = "emulated robot" if results.emulated else "real system"
+    real = "emulated system" if results.emulated else "real system"
     see = f"Where the line follows the bars, the twin generates what the {real} did."
     paper = bool(results.published)
     found = []

@@ -79,7 +79,7 @@ def _figure(width: float, height: float) -> Figure:
 
 def _png(figure: Figure, emulated: bool) -> bytes:
     if emulated:
-        figure.suptitle("EMULATED robot: no real measurements", color=ALARM, fontsize=10)
+        figure.suptitle("EMULATED data: no real measurements", color=ALARM, fontsize=10)
     figure.set_dpi(160)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()

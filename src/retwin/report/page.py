@@ -26,7 +26,7 @@ from retwin.storage import write_atomically
 
 __all__ = ["render", "write_report"]
 
-EMULATED = "EMULATED robot: no real measurements"
+EMULATED = "EMULATED data: no real measurements"
 
 
 def write_report(folder: str | os.PathLike[str]) -> Path:

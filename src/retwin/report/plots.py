@@ -35,7 +35,7 @@ FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, s
 
 def caption(results: Results, text: str) -> str:
     """What to see; with emulated data it begins by saying so."""
-    return f"Emulated robot, no real measurements. {text}" if results.emulated else text
+    return f"Emulated data, no real measurements. {text}" if results.emulated else text
 
 
 def axis(title: str, **more: Any) -> dict[str, Any]:

@@ -134,7 +134,7 @@ def surrogate(results: Results) -> Section | None:
     text = (
         f"Error of the surrogate (IBG) on twin trajectories that it was not fitted to{runs}. It "
         "should be small beside the discrepancy above, or the residual model learns the "
-        "surrogate’s errors instead of the robot’s."
+        "surrogate’s errors instead of the real system’s."
         if any(latents(results, source) for source in results.fidelity)
         else f"Error of the surrogate (IBG) on twin trajectories that it was not fitted to{runs}."
     )
