@@ -40,9 +40,7 @@ def study(
     test: Annotated[Path | None, typer.Option(help="Real set to test on.")] = None,
     real: Annotated[Path | None, typer.Option(help="One real set, split into folds.")] = None,
     folds: Annotated[int, typer.Option(help="Folds of --real.")] = 3,
-    data: Annotated[
-        Path | None, typer.Option(help="One file that the case splits itself.")
-    ] = None,
+    data: Annotated[Path | None, typer.Option(help="One file that the case splits itself.")] = None,
     sources: Annotated[
         str | None,
         typer.Option(help="Names joined by commas, or all; by default twin, IBG, IBG + RG."),
@@ -106,7 +104,7 @@ def demo(
     runs: Annotated[int, typer.Option(help="Runs.")] = 1,
     seed: Annotated[int, typer.Option(help="Same seed, same result.", min=0)] = 0,
 ) -> None:
-    """The whole job on the case of the paper: real data in `RETWIN_DATA` if set, else emulated ones."""
+    """The whole job of the paper, on real data in `RETWIN_DATA` if set, else on emulated ones."""
     import retwin as rt
     from retwin.study import StudyData, StudyPlan
 
