@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from record import record
 
 import retwin as rt
-from retwin.cases.tanks import TankSampler, load_benchmark, tanks
+from retwin.cases.tanks import VOLTAGES, benchmark, tanks
 from retwin.corrected import CorrectedTwin
 from retwin.twins.tanks import tanks_parametric
 from retwin.updating import LeastSquares, identify
@@ -80,7 +80,7 @@ def fitted(estimation: rt.Trajectories, base: str) -> tuple[rt.Twin, CorrectedTw
     made = twin.simulate(case.sampler.sample(SIMULATED, rng=rng), seed=0)
     ibg = rt.fit_surrogate(made, case.network, seed=0, training=case.training)
     told["surrogate: s"] = time.perf_counter() - began
-    whole = TankSampler(steps=estimation.steps)
+    whole = replace(VOLTAGES, steps=estimation.steps)
     fresh = twin.simulate(whole.sample(50, rng=np.random.default_rng(99)), seed=0)
     error = np.square(ibg.predict(fresh.commands) - fresh.nominal)
     for name, part in (
@@ -107,7 +107,7 @@ def main() -> None:
     parser.add_argument("--model", type=Path, help="where to keep the corrected twin")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    estimation, validation = load_benchmark(options.file)
+    estimation, validation = benchmark(tanks().twin)(options.file)
     twin, updated, told = fitted(estimation, options.base)
     record(f"tanks_{options.base}_estimation", "Estimation record", told)
     if options.model:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.cases.tanks import TankSampler
 from retwin.commands import HoldSampler, MultisineSampler, RampSampler, RecordedSampler
 
 SAMPLER = RampSampler(low=(0.0, -2.0), high=(10.0, -1.0), movements=4, steps=400, ramps=(10, 30))
@@ -130,12 +129,6 @@ def test_a_multisine_has_the_spectrum_asked_for() -> None:
         np.testing.assert_allclose(lines[:, 2:6] / lines[:, 1:2], 1, rtol=1e-3)
         np.testing.assert_allclose(lines[:, 6:21] / lines[:, 1:2], 0.04, rtol=1e-2)
         assert lines[:, 21:].max() < 1e-6 * lines[:, 1:].sum(axis=1).max()
-
-
-def test_a_multisine_is_what_the_tanks_are_told() -> None:
-    ours = MultisineSampler((0.0,), (10.0,), 320, 1024, (2.8,), (1.0,), slow=19, fast=59)
-    theirs = TankSampler().sample(50, rng=np.random.default_rng(0))
-    np.testing.assert_allclose(ours.sample(50, rng=np.random.default_rng(0)), theirs, rtol=1e-6)
 
 
 def test_pieces_of_records_come_from_everywhere() -> None:

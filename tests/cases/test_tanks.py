@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import retwin as rt
-from retwin.cases.tanks import TankSampler, load_benchmark, tanks, tanks_overflow
+from retwin.cases.tanks import VOLTAGES, benchmark, tanks, tanks_overflow
 from retwin.networks import StateSpace
 from retwin.testing import check_twin
 from retwin.twins.tanks import RATE, TanksTwin, tanks_parametric
@@ -18,7 +19,8 @@ from retwin.updating import LeastSquares, identify
 
 
 def voltages(count: int, steps: int = 1024, seed: int = 0) -> np.ndarray:
-    return TankSampler(steps).sample(count, rng=np.random.default_rng(seed)).astype(float)
+    sampler = replace(VOLTAGES, steps=steps)
+    return sampler.sample(count, rng=np.random.default_rng(seed)).astype(float)
 
 
 @pytest.mark.parametrize("overflow", [False, True])
@@ -94,8 +96,8 @@ def test_the_file_is_read_and_another_one_refused(tmp_path: Path) -> None:
         for i in range(9)
     ]
     file.write_text('"uEst","uVal","yEst","yVal","Ts",\n' + "\n".join(rows) + "\n")
-    estimation, validation = load_benchmark(file)
-    assert (estimation.ids[0], validation.ids[0]) == ("estimation", "validation")
+    estimation, validation = benchmark(TanksTwin())(file)
+    assert (estimation.ids[0], validation.ids[0]) == ("calibration", "test")
     np.testing.assert_allclose(estimation.observed[0, :, 0], 3 + np.arange(9))
     np.testing.assert_allclose(validation.commands[0, :, 0], 2 + 0.1 * np.arange(9))
     np.testing.assert_array_equal(
@@ -104,7 +106,7 @@ def test_the_file_is_read_and_another_one_refused(tmp_path: Path) -> None:
     for text in ("a,b\n1,2\n", '"uEst","uVal","yEst","yVal"\n1,2,3,x\n'):
         file.write_text(text)
         with pytest.raises(rt.InputError, match="uEst"):
-            load_benchmark(file)
+            benchmark(TanksTwin())(file)
 
 
 @pytest.mark.slow
@@ -143,7 +145,7 @@ def test_the_twin_is_what_least_squares_gives_on_the_estimation_record() -> None
     file = Path(folder or "") / "cascaded_tanks" / "dataBenchmark.csv"
     if not folder or not file.exists():
         pytest.skip("RETWIN_DATA names no folder with cascaded_tanks/dataBenchmark.csv")
-    estimation, _ = load_benchmark(file)
+    estimation, _ = benchmark(TanksTwin())(file)
     with pytest.warns(UserWarning, match="not identified"):
         found = identify(
             tanks_parametric(),
@@ -155,5 +157,5 @@ def test_the_twin_is_what_least_squares_gives_on_the_estimation_record() -> None
     assert found.figures["rms_after"] == pytest.approx(ours, abs=1e-3)
     assert ours == pytest.approx(0.603, abs=2e-3)
     # The other twin's numbers are found likewise, with all free; see docs/tanks.md.
-    told, _ = load_benchmark(file, tanks_overflow().twin)
+    told, _ = benchmark(tanks_overflow().twin)(file)
     assert np.sqrt(np.square(told.residual).mean()) == pytest.approx(0.207, abs=1e-3)

@@ -8,28 +8,19 @@ challenges in nonlinear system identification", IFAC-PapersOnLine 50 (2017).
 
 from __future__ import annotations
 
-import csv
-from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import replace
 
 from retwin.case import Case
+from retwin.cases.columns import ColumnRecords
+from retwin.commands import MultisineSampler
 from retwin.corrections import Additive
-from retwin.errors import InputError
 from retwin.networks import LSTM
 from retwin.residual import SequenceMixture
-from retwin.storage import sha256
 from retwin.training import Training
-from retwin.trajectories import Source, Trajectories
 from retwin.twins.protocol import HEALTHY
-from retwin.twins.tanks import INPUTS, OUTPUTS, RATE, TanksTwin, tanks_parametric
+from retwin.twins.tanks import RATE, TanksTwin, tanks_parametric
 
-__all__ = ["TankSampler", "load_benchmark", "tanks", "tanks_overflow"]
-
-ESTIMATION, VALIDATION = "estimation", "validation"
+__all__ = ["VOLTAGES", "benchmark", "tanks", "tanks_overflow"]
 
 FITTED = TanksTwin()
 OVERFLOWING = TanksTwin(
@@ -46,85 +37,13 @@ OVERFLOWING = TanksTwin(
 )
 """All that is known of their physics; `identify` on the estimation record, see docs/tanks.md."""
 
-
-@dataclass(frozen=True)
-class TankSampler:
-    """Voltages like the benchmark's: a multisine of random phases, most of it slow.
-
-    Parameters
-    ----------
-    steps: samples per trajectory.
-    period: samples of one period of the slowest sine.
-    mean, deviation: of the voltage, in V.
-    slow, fast: number of sines at full strength, and of all; frequencies are evenly spaced.
-    weak: amplitude of the faster ones against the slow ones'.
-
-    """
-
-    steps: int = 320
-    period: int = 1024
-    mean: float = 2.8
-    deviation: float = 1.0
-    slow: int = 19
-    fast: int = 59
-    weak: float = 0.1
-
-    def sample(
-        self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
-    ) -> NDArray:
-        """Voltages (count, steps, 1); there are no movements, so `timing` does not matter."""
-        amplitude = np.where(np.arange(1, self.fast + 1) <= self.slow, 1.0, self.weak)
-        amplitude *= self.deviation * np.sqrt(2 / np.sum(amplitude**2))
-        phase = rng.uniform(0, 2 * np.pi, size=(count, self.fast, 1))
-        turns = np.arange(1, self.fast + 1)[:, None] * np.arange(self.steps) / self.period
-        waves = amplitude[:, None] * np.cos(2 * np.pi * turns + phase)
-        voltage = self.mean + waves.sum(axis=1)
-        return voltage.clip(0.0, 10.0)[..., None].astype(np.float32)
+VOLTAGES = MultisineSampler((0.0,), (10.0,), 320, 1024, (2.8,), (1.0,), slow=19, fast=59)
+"""Voltages like the benchmark's: most of it slow, a third of a period each."""
 
 
-def load_benchmark(path: str | Path, twin: TanksTwin = FITTED) -> tuple[Trajectories, Trajectories]:
-    """The estimation record and the validation record of `dataBenchmark.csv`, one trajectory each.
-
-    The columns that count are `uEst`, `yEst`, `uVal` and `yVal`; `nominal` is what the twin
-    says. Raises InputError for a file that cannot be read or is another one.
-    """
-    path = Path(path)
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as lines:
-            rows = list(csv.DictReader(lines))
-        columns = {
-            name: np.array([float(row[name]) for row in rows])
-            for name in ("uEst", "yEst", "uVal", "yVal")
-        }
-    except (OSError, KeyError, ValueError, TypeError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(
-            str(path),
-            expected="dataBenchmark.csv, with numbers in columns uEst, yEst, uVal and yVal",
-            got=f"{type(error).__name__}: {error}",
-            remedy="take the file of the benchmark as it is",
-        ) from None
-    source = Source(path.name, sha256(path))
-    return (
-        _record(twin, columns["uEst"], columns["yEst"], ESTIMATION, source),
-        _record(twin, columns["uVal"], columns["yVal"], VALIDATION, source),
-    )
-
-
-def _record(
-    twin: TanksTwin, voltage: NDArray, level: NDArray, name: str, source: Source
-) -> Trajectories:
-    commands = voltage[None, :, None]
-    return Trajectories(
-        commands=commands,
-        nominal=twin.simulate(commands, seed=0).nominal,
-        observed=level[None, :, None],
-        rate=RATE,
-        labels=np.array([HEALTHY]),
-        ids=np.array([name]),
-        inputs=INPUTS,
-        outputs=OUTPUTS,
-        provenance=(source,),
-    )
+def benchmark(twin: TanksTwin) -> ColumnRecords:
+    """Reads `dataBenchmark.csv`: the estimation record calibrates, the validation record tests."""
+    return ColumnRecords(twin, {"pump": "uEst", "level": "yEst"}, {"pump": "uVal", "level": "yVal"})
 
 
 def tanks() -> Case:
@@ -135,7 +54,7 @@ def tanks() -> Case:
         faults={HEALTHY: None},
         twin=FITTED,
         emulator=None,
-        sampler=TankSampler(),
+        sampler=VOLTAGES,
         correction=Additive(),
         output_correction=Additive(),
         sensor_rate=RATE,
@@ -144,7 +63,7 @@ def tanks() -> Case:
         training=Training(epochs=120, batch=8, rate=5e-3),
         per_class=800,
         density=SequenceMixture(block=64, gap=32),
-        records=load_benchmark,
+        records=benchmark(FITTED),
     )
 
 
@@ -155,5 +74,5 @@ def tanks_overflow() -> Case:
         name="tanks_overflow",
         title="Cascaded tanks, their overflow known",
         twin=OVERFLOWING,
-        records=partial(load_benchmark, twin=OVERFLOWING),
+        records=benchmark(OVERFLOWING),
     )
