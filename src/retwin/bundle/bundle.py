@@ -14,7 +14,7 @@ import torch
 from retwin import __version__
 from retwin.bundle.facts import SAMPLERS, Facts
 from retwin.bundle.guard import Guard
-from retwin.bundle.seal import SCHEMA, read_sealed, seal
+from retwin.bundle.seal import SCHEMA, distrusting, read_sealed, seal
 from retwin.bundle.verdicts import Prediction
 from retwin.case import Case
 from retwin.corrected import CorrectedTwin, generate
@@ -190,7 +190,8 @@ class Bundle:
         """
         about = read_sealed(folder, "bundle")
         folder = Path(folder)
-        try:
+        remedy = "make it anew with Bundle.save"
+        with distrusting(folder, expected="a bundle", remedy=remedy):
             return cls(
                 twin=CorrectedTwin.load(folder / "twin"),
                 guard=Guard.of(*read_model(folder / "guard", "guard")),
@@ -198,13 +199,3 @@ class Bundle:
                 diagnoser=load_diagnoser(folder / "diagnoser") if about["diagnoser"] else None,
                 provenance=dict(about["provenance"]),
             )
-        except InputError:
-            raise
-        # Its seal is whole, so nothing was damaged: whoever made it put anything at all in there.
-        except Exception as error:
-            raise InputError(
-                str(folder),
-                expected="a bundle",
-                got=f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:100]}",
-                remedy="make it anew with Bundle.save",
-            ) from None

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.bundle.facts import Facts
-from retwin.bundle.seal import read_sealed
+from retwin.bundle.seal import distrusting, read_sealed
 from retwin.bundle.verdicts import Domain, Prediction
 from retwin.errors import InputError
 from retwin.faults import Fault
@@ -100,7 +100,8 @@ class Portable:
         options = runtime.SessionOptions()
         options.intra_op_num_threads = threads
         options.log_severity_level = 4  # what is wrong is raised, not printed
-        try:
+        remedy = "make it anew with retwin bundle export"
+        with distrusting(folder, expected="the ONNX export of a bundle", remedy=remedy):
             sensor, judge = _reader(about["sensor"]), _judge(about["diagnoser"])
             names = [*GRAPHS, *["sensor"] * bool(sensor), *["features", "diagnoser"] * bool(judge)]
             files = {name: Path(folder) / f"{name}.onnx" for name in names}
@@ -120,16 +121,6 @@ class Portable:
                 emulated=bool(about["emulated"]),
                 provenance=dict(about["provenance"]),
             )
-        except InputError:
-            raise
-        # Its seal is whole, so nothing was damaged: whoever made it put anything at all in there.
-        except Exception as error:
-            raise InputError(
-                str(folder),
-                expected="the ONNX export of a bundle",
-                got=f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:100]}",
-                remedy="make it anew with retwin bundle export",
-            ) from None
 
     def predict(self, trajectories: Trajectories) -> Prediction:
         """Diagnose trajectories, see `Bundle.predict`; they are as long as those it was made for.

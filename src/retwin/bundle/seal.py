@@ -8,19 +8,36 @@ doing harm is that reading it runs no code that it names.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from retwin.errors import InputError
 from retwin.storage import sha256
 
-__all__ = ["SCHEMA", "SUMS", "read_sealed", "seal", "verify_seal"]
+__all__ = ["SCHEMA", "SUMS", "distrusting", "read_sealed", "seal", "verify_seal"]
 
 SUMS = "SHA256SUMS"
 SCHEMA = 1
 """Of bundles and of their exports; older ones would be migrated in `read_sealed`."""
 LARGEST = 2**20
 """Bytes of a description at most; no bundle's is near it."""
+
+
+@contextmanager
+def distrusting(folder: str | Path, *, expected: str, remedy: str) -> Iterator[None]:
+    """InputError for whatever goes wrong when the contents of a sealed folder are read.
+
+    Its seal is whole, so nothing was damaged: whoever made it put anything at all in there.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        got = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:100]}"
+        raise InputError(str(folder), expected=expected, got=got, remedy=remedy) from None
 
 
 def seal(folder: Path) -> None:
