@@ -29,9 +29,12 @@ docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 bench: install
+	$(BIN)/retwin bench
 	$(BIN)/python benchmarks/generation.py
+	$(BIN)/python benchmarks/training.py
 	$(BIN)/python benchmarks/fitting.py
 	$(BIN)/python benchmarks/command_space.py
+	$(BIN)/python benchmarks/bands.py
 	$(BIN)/python benchmarks/inversion.py
 	$(BIN)/python benchmarks/updating.py
 	$(BIN)/python benchmarks/residual.py

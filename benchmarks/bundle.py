@@ -7,7 +7,7 @@ trajectory is spoilt in ways of which only "another one's outputs" and "random w
 the guard's energy learns from. Targets: graphs within 1e-5 of torch, a diagnosis in 5 ms (p99, one
 core), 5 MB, AUROC of 0.95 on shuffled, scaled and foreign trajectories, at most 5 % false flags.
 Latency is told by the wall clock and by processor time: the former counts what else the machine
-does. Writes benchmarks/out/bundle.json.
+does.
 """
 
 from __future__ import annotations

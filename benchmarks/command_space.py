@@ -5,8 +5,7 @@ Targets: delays within 1 sample and offsets within 0.3 degrees (mean absolute er
 movements with an F1 of 0.95, 90 % intervals that cover 85 to 95 %. Beside them the same robot, half
 as late and half as uneven. How late a movement was is seen on the joints, as their offsets are:
 dead zone and play add to the delay that was drawn. How many looks readings are worth was chosen
-with seed 11. Then the seconds for inference on 54 trajectories, and for generating 3600. Writes
-benchmarks/out/command_space.json and command_space_times.json.
+with seed 11. Then the seconds for inference on 54 trajectories, and for generating 3600.
 """
 
 from __future__ import annotations

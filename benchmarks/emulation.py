@@ -4,7 +4,7 @@ For delay (TDe), offset (TPE) and plateau noise of every movement: mean, spread 
 emulated trajectories, and the bootstrap interval of the same figure over the real ones. Movements
 that a joint missed, and glitches, are counted apart.
 
-Needs RETWIN_DATA. Writes benchmarks/out/emulation.json.
+Needs RETWIN_DATA.
 """
 
 from __future__ import annotations

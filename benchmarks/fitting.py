@@ -1,7 +1,7 @@
 """How long does fitting take, and how good is each surrogate?
 
 Targets: the RG on 54 trajectories in at most 20 s; RMSE on held-out twin trajectories at most
-0.3 mm per axis for the MLP and 2 mm for the LSTM. Writes benchmarks/out/fitting.json.
+0.3 mm per axis for the MLP and 2 mm for the LSTM.
 """
 
 from __future__ import annotations

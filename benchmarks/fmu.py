@@ -1,7 +1,7 @@
 """How long does one run of a trivial FMU of 1000 steps take?
 
 Target: at most 20 ms on one core; FMPy alone, with an instance that is reset, is beside it. The FMU
-is the one of the tests, compiled from C. Writes benchmarks/out/fmu.json.
+is the one of the tests, compiled from C.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How long does `import retwin` take? At most 1.5 s. Writes benchmarks/out/importing.json."""
+"""How long does `import retwin` take? At most 1.5 s."""
 
 from __future__ import annotations
 

@@ -1,17 +1,19 @@
-"""Print a benchmark's table and keep it as JSON."""
+"""Print a benchmark's table, and keep its last figures with the machine in results.json."""
 
 from __future__ import annotations
 
 import json
-import os
-import platform
 import resource
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
-OUT = Path(__file__).parent / "out"
+from retwin.bench import machine
+from retwin.storage import write_atomically
+
+RESULTS = Path(__file__).parent / "results.json"
 
 
 def peak_memory_gb() -> float:
@@ -20,16 +22,28 @@ def peak_memory_gb() -> float:
 
 
 def record(name: str, title: str, rows: dict[str, float] | dict[str, dict[str, float]]) -> None:
-    """Print `rows`, of one value or of a value per column, and keep them with the machine.
+    """Print `rows`, of one value or of a value per column, and keep them.
 
-    Written to benchmarks/out/`name`.json.
+    They take the place of the earlier figures of the benchmark `name` in benchmarks/results.json,
+    to four digits.
     """
     several = {what: row if isinstance(row, dict) else {"value": row} for what, row in rows.items()}
     table = Table("what", *next(iter(several.values())), title=title)
     for what, row in several.items():
         table.add_row(what, *(f"{value:.3g}" for value in row.values()))
     Console().print(table)
-    OUT.mkdir(exist_ok=True)
-    machine = {"platform": platform.platform(), "cores": os.cpu_count()}
-    text = json.dumps({"title": title, "rows": rows, "machine": machine}, indent=1)
-    (OUT / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+    keep(name, {"title": title, "machine": machine(), "rows": _rounded(rows)})
+
+
+def keep(name: str, told: dict[str, Any]) -> None:
+    """Put the figures of one benchmark beside those of the others."""
+    every = json.loads(RESULTS.read_text("utf-8")) if RESULTS.exists() else {}
+    every = dict(sorted({**every, name: told}.items()))
+    with write_atomically(RESULTS) as part:
+        part.write_text(json.dumps(every, indent=1) + "\n", encoding="utf-8")
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _rounded(each) for name, each in value.items()}
+    return float(f"{value:.4g}")

@@ -1,8 +1,7 @@
 """How long does command recovery take, and how exact is it?
 
 Needs RETWIN_DATA. Targets: forward kinematics of the recovered commands within 0.05 mm RMS of the
-desired path for at least 99 % of trajectories, and at most 60 s for 3600 trajectories. Writes
-benchmarks/out/recovery.json.
+desired path for at least 99 % of trajectories, and at most 60 s for 3600 trajectories.
 """
 
 from __future__ import annotations

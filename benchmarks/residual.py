@@ -7,7 +7,7 @@ severity of each fault inferred apart. Shapes: mixtures of one, two and three Ga
 normalising flow, and the mixture refined on outputs by the energy score. Scores are averaged over
 trajectories; `below single` is by which share the CRPS lies below that of one Gaussian, with its
 95 % bootstrap interval over trajectories, and `below mean` the same against the mean correction
-alone. Writes benchmarks/out/residual.json.
+alone.
 """
 
 from __future__ import annotations

@@ -1,8 +1,11 @@
-"""How fast are labelled trajectories written to Zarr, in how much memory and space?
+"""How fast are labelled trajectories written to Zarr and read again, in how much memory and space?
 
 Target: at most 2 GB for parent and workers together, whatever the number of trajectories. The
-closed-form arm, 1000 samples, all nine classes. Writes benchmarks/out/scale.json; a number of
-trajectories can be given as the argument.
+closed-form arm, 1000 samples, all nine classes. What reading is for is timed too: features for a
+classifier, and the samples that a surrogate learns from (it trains for one epoch, which takes the
+same time for any number of trajectories). Then, for docs/scaling.md, what several twins take of
+one processor core, in its own seconds, which other work on the machine does not count into. A
+number of trajectories can be given as the argument; 0 leaves the first part out.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import sys
 import tempfile
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -19,9 +23,12 @@ from record import record
 
 import retwin as rt
 from retwin import twins
+from retwin.bench import timed
+from retwin.diagnosis.features import Features
 from retwin.scale import SimulationPlan, simulate_to
 
 MILLION = 1_000_000
+ENOUGH = 1024
 
 
 class PeakMemory:
@@ -52,22 +59,20 @@ class PeakMemory:
         self._watcher.join()
 
 
-def main() -> None:
-    n = int(sys.argv[1]) if len(sys.argv) > 1 else 20_000
+def whole(case: rt.Case, n: int) -> None:
     workers = os.cpu_count() or 1
-    case = rt.cases.armpi()
     twin = twins.get("armpi-kinematic")
     plan = SimulationPlan(twin, case.sampler, seed=0, n=n, faults=case.faults)
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "made.zarr"
-        started = time.perf_counter()
         with PeakMemory() as peak:
-            simulate_to(target, plan, workers=workers)
-        took = time.perf_counter() - started
+            took, _ = timed(lambda: simulate_to(target, plan, workers=workers))
         size = sum(file.stat().st_size for file in target.rglob("*") if file.is_file())
-        started = time.perf_counter()
-        rt.load(target)
-        loaded = time.perf_counter() - started
+        loaded, made = timed(lambda: rt.load(target))
+        featured, _ = timed(lambda: Features.at(made)(made))
+        once = rt.Training(epochs=1, batch=256)
+        learned, _ = timed(lambda: rt.fit_surrogate(made, seed=0, training=once))
+        numbers = sum(getattr(made, name).nbytes for name in ("commands", "nominal", "observed"))
     rows = {
         "trajectories": n,
         "workers": workers,
@@ -75,11 +80,55 @@ def main() -> None:
         "trajectories/s": n / took,
         "peak memory, parent and workers (GB)": peak.gb,
         "on disk (GB)": size / 1e9,
+        "on disk, share of the numbers and the mask": size / (numbers + made.mask.nbytes),
         "loading, checked (s)": loaded,
+        "features of a classifier (s)": featured,
+        "a surrogate, one epoch (s)": learned,
         "a million, extrapolated (min)": MILLION / n * took / 60,
         "a million on disk, extrapolated (GB)": MILLION / n * size / 1e9,
     }
     record("scale", "Closed-form arm to Zarr, 1000 samples", rows)
+
+
+def per_core(case: rt.Case) -> None:
+    simulator = replace(case.twin, threads=1)
+    real = rt.generate(case.emulator, case, per_class=6, seed=1)
+    # What generating takes does not depend on how good the models are.
+    brief = rt.Training(epochs=1, batch=256, rate=5e-3)
+    said = rt.generate(simulator, case, per_class=20, seed=0)
+    ibg = rt.fit_surrogate(said, seed=0, training=brief)
+    ways = {
+        "closed form": twins.get("armpi-kinematic"),
+        "MuJoCo, 5 ms": simulator,
+        "corrected, delay and offset": rt.CorrectedTwin(
+            ibg, rt.fit_residual(ibg, real, case.output_correction, seed=0)
+        ),
+        "corrected, command space": rt.CorrectedTwin(ibg, rt.fit_residual(ibg, real, seed=0)),
+    }
+    rows, clock = {}, time.process_time
+    for name, twin in ways.items():
+        plan = SimulationPlan(twin, case.sampler, seed=0, n=ENOUGH, faults=case.faults)
+        with tempfile.TemporaryDirectory() as folder:
+            target = Path(folder) / "made.zarr"
+            made, _ = timed(lambda to=target, of=plan: simulate_to(to, of, workers=1), clock)
+            read, found = timed(lambda of=target: rt.load(of), clock)
+            looked, _ = timed(lambda of=found: Features.at(of)(of), clock)
+            size = sum(file.stat().st_size for file in target.rglob("*") if file.is_file())
+        rows[name] = {
+            "made/s": ENOUGH / made,
+            "read/s": ENOUGH / read,
+            "features/s": ENOUGH / looked,
+            "kB": size / ENOUGH / 1e3,
+        }
+    record("scale_per_core", "Trajectories per second of one core, and bytes on disk", rows)
+
+
+def main() -> None:
+    n = int(sys.argv[1]) if len(sys.argv) > 1 else 20_000
+    case = rt.cases.armpi()
+    if n:
+        whole(case, n)
+    per_core(case)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ Without `--final` only the estimation record is looked at: the RG's figures are 
 out with a gap. Choices were made on these, two of them after a first look at the validation record
 (docs/tanks.md). With it, the validation record is scored: RMSE in V;
 the share of samples within the 5 and 95 % quantiles of 500 samples, with its 95 % interval from a
-circular block bootstrap over time; and CRPS in V. Writes benchmarks/out/tanks_BASE.json.
+circular block bootstrap over time; and CRPS in V.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Agreement with the recorded Simscape twin (needs RETWIN_DATA; only the servos' s
 and delay are fitted). Targets for the MuJoCo arm: healthy paths within 0.5 mm RMS per axis over
 400 trajectories, plateaus with a steady-state error within 1.0 mm RMS, plateaus with a stuck joint
 within 2.0 mm RMS. Speed: 3600 trajectories of 10 s, at several integration steps, beside the
-kinematics in closed form. Writes benchmarks/out/twins.json and twins_speed.json.
+kinematics in closed form.
 """
 
 from __future__ import annotations

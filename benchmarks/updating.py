@@ -8,8 +8,7 @@ training; least squares on the twin's own parameters (Eq. 2), and their posterio
 twin without randomness the mean absolute error), energy score, and how much 90 % bands hold.
 Expected was: RG at least 10 times faster than least squares, and 100 times than Bayes.
 
-Seconds are of the processor, so other work on the machine does not count; one thread. Writes
-benchmarks/out/updating.json and updating_speed.json.
+Seconds are of the processor, so other work on the machine does not count; one thread.
 """
 
 from __future__ import annotations

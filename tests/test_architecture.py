@@ -17,6 +17,7 @@ FLOORS = [
     "errors",
     "configs",
     "processes",
+    "arrays",
     "trajectories",
     "storage",
     "download",
@@ -46,6 +47,8 @@ FLOORS = [
     "study",
     "report",
     "cases",
+    "bench",
+    "doctor",
     "cli",
 ]
 ONE_ROOM = {"__main__": "cli"}

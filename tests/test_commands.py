@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.commands import HoldSampler, MultisineSampler, RampSampler, RecordedSampler
+from retwin.commands import (
+    HoldSampler,
+    MultisineSampler,
+    RampSampler,
+    RecordedSampler,
+    ramps_and_holds,
+)
 
 SAMPLER = RampSampler(low=(0.0, -2.0), high=(10.0, -1.0), movements=4, steps=400, ramps=(10, 30))
 
@@ -35,6 +41,27 @@ def test_ramps_have_the_lengths_asked_for() -> None:
     moving = np.abs(np.diff(draw(), axis=1)) > 1e-6
     lengths = {int(n) for n in moving[:, :100].sum(axis=1).ravel()}
     assert lengths == {10, 30}
+
+
+def test_ramps_are_those_of_a_loop_over_all_samples() -> None:
+    """To the last digit, wherever ramps lie: crowded, left out, beyond the end."""
+    rng = np.random.default_rng(0)
+    shape = (70, 5, 3)
+    start, levels = rng.normal(size=(70, 3)), rng.normal(size=shape)
+    spans, onsets = (
+        rng.integers(1, 80, size=shape),
+        60.0 * np.arange(5) + rng.uniform(0, 40, (70, 5)),
+    )
+    onsets[rng.random((70, 5)) < 0.2] = np.nan
+    onsets[:, 3] = np.nan
+    plain = np.repeat(start[:, None], 300, axis=1)
+    before = start
+    for movement in range(5):
+        since = np.arange(300) - onsets[:, movement, None]
+        share = np.clip(since[..., None] / spans[:, None, movement], 0, 1)
+        plain += (levels[:, movement] - before)[:, None] * np.nan_to_num(share)
+        before = levels[:, movement]
+    np.testing.assert_array_equal(ramps_and_holds(start, levels, spans, onsets, 300), plain)
 
 
 def test_the_segments_are_those_that_were_drawn() -> None:

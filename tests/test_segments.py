@@ -30,6 +30,16 @@ def test_onset_and_end_are_found_between_samples(
     np.testing.assert_allclose(found.stop[0], [found.start[0, 1], 300])
 
 
+def test_many_trajectories_are_told_as_each_is_alone() -> None:
+    onsets = np.random.default_rng(0).uniform(0, 100, size=100)
+    commands = np.stack([[ramp(onset, 60), ramp(onset, 40)] for onset in onsets]).swapaxes(1, 2)
+    together = Segments.from_commands(commands)
+    for i in range(100):
+        alone = Segments.from_commands(commands[i : i + 1])
+        np.testing.assert_array_equal(together.start[i], alone.start[0])
+        np.testing.assert_array_equal(together.settle[i], alone.settle[0])
+
+
 def test_the_slowest_actuator_ends_the_motion() -> None:
     commands = np.stack([ramp(10, 60), ramp(10, 100)], axis=-1)[None]
     found = Segments.from_commands(commands)

@@ -27,6 +27,14 @@ OUTSIDE = {
     "tests/contracts/crane.xml": "crane.xml",
 }
 """Files and folders outside of docs/ that the site has too, and their names there."""
+ABOUT_COMMANDS = """
+Results go to stdout; progress, notes, warnings and errors to stderr. `retwin --quiet …`, or
+`RETWIN_QUIET=1` in the environment, leaves out progress and notes. Where a command prints a table,
+`--json` prints the same as JSON instead, and nothing else. After Ctrl-C one line says which command
+goes on. `retwin --install-completion` lets bash, zsh, fish or PowerShell complete commands, options
+and names: cases, twins, sources, faults, classifiers. Exit codes: 0 done, 1 failed, 2 bad input,
+130 interrupted.
+"""
 LANGUAGES = {".py": "python", ".toml": "toml"}
 
 
@@ -75,7 +83,11 @@ def commands() -> str:
     _say_whole_lines(command)
     context = typer.Context(command, info_name="retwin")
     text = get_docs_for_click(obj=command, ctx=context, name="retwin", title="Command line")
-    return re.sub(r"^\* `--help`: .*\n", "", text, flags=re.M)
+    text = re.sub(r"^\* `--help`: .*\n", "", text, flags=re.M)
+    text = re.sub(r"(?<!`)\*\.\w+", r"`\g<0>`", text)  # two stars would make a text italic
+    text = re.sub(r"^Example: (.*)", r"**Example**:\n\n```console\n$ \1\n```", text, flags=re.M)
+    title, rest = text.split("\n", 1)
+    return f"{title}\n{ABOUT_COMMANDS}{rest}"
 
 
 def _say_whole_lines(command: Any) -> None:

@@ -9,7 +9,17 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 
-__all__ = ["HoldSampler", "MultisineSampler", "RampSampler", "RecordedSampler", "draw_onsets"]
+__all__ = [
+    "HoldSampler",
+    "MultisineSampler",
+    "RampSampler",
+    "RecordedSampler",
+    "draw_onsets",
+    "ramps_and_holds",
+]
+
+BLOCK = 32
+"""Trajectories that are made together: their samples stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -83,14 +93,8 @@ class RampSampler:
         ramps = rng.choice(self.ramps, size=shape)
         period = self.steps / self.movements
         onsets = draw_onsets(count, self.movements, period, rng=rng, timing=timing)
-        time = np.arange(self.steps, dtype=float)
-        commands = np.tile(np.array(self.rest), (count, self.steps, 1))
-        before = np.broadcast_to(np.array(self.rest), (count, len(self.low)))
-        for movement in range(self.movements):
-            since = time[None, :, None] - onsets[:, movement, None, None]
-            share = np.clip(since / ramps[:, movement, None, :], 0.0, 1.0)
-            commands += (levels[:, movement] - before)[:, None, :] * share
-            before = levels[:, movement]
+        rest = np.broadcast_to(np.array(self.rest), (count, len(self.low)))
+        commands = ramps_and_holds(rest, levels, ramps, onsets, self.steps)
         # Sums round; and movements that are timed more closely than their ramps overshoot.
         return np.clip(commands, self.low, self.high).astype(np.float32)
 
@@ -265,6 +269,56 @@ class RecordedSampler:
         row = rng.integers(records, size=(count, 1))
         begin = rng.integers(samples - self.steps, size=(count, 1), endpoint=True)
         return self.commands[row, begin + np.arange(self.steps)].astype(np.float32)
+
+
+def ramps_and_holds(
+    start: NDArray,
+    levels: NDArray,
+    spans: NDArray,
+    onsets: NDArray,
+    steps: int,
+    *,
+    dtype: type[np.floating] = np.float64,
+) -> NDArray:
+    """Commands (n, steps, d_u) that ramp linearly from level to level and hold.
+
+    Parameters
+    ----------
+    start: (n, d_u) before the first movement.
+    levels, spans: (n, M, d_u) level that each movement reaches, and length of its ramp in samples.
+    onsets: (n, M) sample at which a movement starts, fractions allowed; NaN leaves it out.
+    steps: samples per trajectory.
+    dtype: of the commands; they are computed in double precision.
+
+    """
+    commands = np.empty((len(start), steps, start.shape[1]), dtype)
+    for begin in range(0, len(start), BLOCK):
+        part = slice(begin, begin + BLOCK)
+        commands[part] = _ramped(start[part], levels[part], spans[part], onsets[part], steps)
+    return commands
+
+
+def _ramped(
+    start: NDArray, levels: NDArray, spans: NDArray, onsets: NDArray, steps: int
+) -> NDArray:
+    """The same of a few trajectories; shares are only computed where one of them is on a ramp."""
+    there = ~np.isnan(onsets)
+    onsets = np.where(there, onsets, np.inf)
+    ways = np.diff(levels, axis=1, prepend=start[:, None]) * there[..., None]
+    first = onsets.min(axis=0)
+    last = np.where(there[..., None], onsets[..., None] + spans, 0).max(axis=(0, 2)) + 1
+    windows = np.clip([np.floor(first), np.ceil(last)], 0, steps).astype(int).T.tolist()
+    commands = np.empty((len(start), steps, start.shape[1]))
+    time, level, done = np.arange(steps), start[:, None], 0
+    for movement, (begin, end) in enumerate(windows):
+        end = max(end, done)
+        commands[:, done:end] = level
+        since = time[begin:end] - onsets[:, movement, None]
+        share = np.clip(since[..., None] / spans[:, None, movement], 0.0, 1.0)
+        commands[:, begin:end] += ways[:, None, movement] * share
+        level, done = level + ways[:, None, movement], end
+    commands[:, done:] = level
+    return commands
 
 
 def draw_onsets(

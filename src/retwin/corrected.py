@@ -88,12 +88,12 @@ class CorrectedTwin:
             context = self.residual.context(
                 self.surrogate, chunk.commands, chunk.segments, told=chunk.told, frozen=chunk.frozen
             )
-            if not self.random:
-                z = self.residual.mean(context)
-                return context.nominal.numpy(), correction.apply(context, z).numpy()
-            z = self.residual.sample(context, generator=generator)
-            outputs = correction.apply(context, z)
-            return context.nominal.numpy(), recorded(correction, outputs, generator).numpy()
+            if self.random:
+                z = self.residual.sample(context, generator=generator)
+                outputs = recorded(correction, context, z, generator)
+            else:
+                outputs = correction.apply(context, self.residual.mean(context))
+            return context.nominal.numpy(), outputs.numpy()
 
         return simulate_in_chunks(
             self,

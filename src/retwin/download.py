@@ -14,7 +14,7 @@ from retwin.errors import InputError
 from retwin.storage import Progress
 from retwin.storage import sha256 as sha256_of
 
-__all__ = ["REGISTRY", "Known", "fetch"]
+__all__ = ["REGISTRY", "Known", "cache_folder", "fetch"]
 
 CACHE_VARIABLE = "RETWIN_CACHE"
 # Seconds without an answer until a download is given up.
@@ -72,13 +72,12 @@ def fetch(
             got=known.url,
             remedy="give the address of the file",
         )
-    # It takes half a second to import, and only a download needs it.
-    import pooch
-
-    place = Path(folder or os.environ.get(CACHE_VARIABLE) or pooch.os_cache("retwin"))
+    place = Path(folder) if folder else cache_folder()
     target = place / known.file
     if target.is_file() and sha256_of(target) == known.sha256:
         return target
+    import pooch
+
     try:
         with _quiet(pooch.get_logger()):
             pooch.retrieve(
@@ -102,6 +101,17 @@ def fetch(
             "was thrown away; try again, or give another url"
         ) from None
     return target
+
+
+def cache_folder() -> Path:
+    """Where fetched files are kept: RETWIN_CACHE, else the user's cache folder."""
+    given = os.environ.get(CACHE_VARIABLE)
+    if given:
+        return Path(given)
+    # It takes half a second to import, and only downloads need it.
+    import pooch
+
+    return Path(pooch.os_cache("retwin"))
 
 
 def _known(name: str, url: str | None, sha256: str | None) -> Known:

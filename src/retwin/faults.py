@@ -5,6 +5,7 @@ A fault with an open severity is a class of faults; `drawn` fixes the severity f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
@@ -143,7 +144,7 @@ class SteadyStateError:
         if self.bias:
             return self
         count = max(movements, 1)
-        drawn = rng.uniform(*self.size, size=count) * rng.choice([-1.0, 1.0], size=count)
+        drawn = rng.uniform(*self.size, size=count) * (2.0 * rng.integers(2, size=count) - 1.0)
         return replace(self, bias=tuple(drawn.tolist()))
 
     def command(self, commands: NDArray, segments: Segments) -> NDArray:
@@ -171,15 +172,17 @@ def _along(clean: NDArray, start: NDArray, settle: NDArray, levels: NDArray) -> 
     time = np.arange(len(clean), dtype=float)
     bias = np.zeros(len(clean))
     before = 0.0
-    for begin, end, level in zip(start, settle, levels, strict=True):
-        inside = time >= begin
-        first, last = np.interp([begin, end], time, clean)
+    values = np.interp(np.stack([start, settle]), time, clean)
+    for begin, end, first, last, level in zip(start, settle, *values, levels, strict=True):
         if first != last:
-            share = (clean[inside] - first) / (last - first)
-            share[time[inside] >= end] = 1.0
+            moves = slice(math.ceil(begin), math.ceil(end))
+            share = (clean[moves] - first) / (last - first)
         else:
-            share = (time[inside] - begin) / max(end - begin, 1.0)
-        bias[inside] = before + (level - before) * np.clip(share, 0.0, 1.0)
+            length = max(end - begin, 1.0)
+            moves = slice(math.ceil(begin), math.ceil(begin + length))
+            share = (time[moves] - begin) / length
+        bias[moves] = before + (level - before) * np.clip(share, 0.0, 1.0)
+        bias[moves.stop :] = before + (level - before)
         before = level
     return bias
 
@@ -222,7 +225,7 @@ def faulty_commands(
     out = commands.copy()
     for i, fault in enumerate(faults):
         if fault is not None:
-            out[i] = fault.command(commands[i], segments[i])
+            out[i] = fault.command(commands[i], segments[i : i + 1])
     return out
 
 
@@ -252,6 +255,8 @@ def frozen_from(faults: Sequence[Fault | None], steps: int, actuators: int) -> N
         if fault is None:
             continue
         response = fault.response(rising)
+        if response is rising:
+            continue
         onset = response[-1].astype(int)
         if not np.array_equal(response, np.minimum(rising, onset)):
             raise InputError(

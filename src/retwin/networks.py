@@ -32,6 +32,10 @@ __all__ = [
 ]
 
 
+BLOCK = 2**22
+"""Rows that are summed up together, in double precision."""
+
+
 class Network(Protocol):
     """A config object that builds a network."""
 
@@ -55,11 +59,20 @@ class Standardise(nn.Module):
         self.register_buffer("scale", torch.ones(channels))
 
     def fit(self, values: Tensor) -> Standardise:
-        """Take mean and standard deviation over all but the last axis."""
-        flat = values.reshape(-1, values.shape[-1]).double()
-        scale = flat.std(dim=0, correction=0)
-        tiny = 1e-6 * flat.abs().amax(dim=0).clamp_min(1e-30)
-        self.mean.copy_(flat.mean(dim=0))
+        """Take mean and standard deviation over all but the last axis, block by block."""
+        blocks = values.reshape(-1, values.shape[-1]).split(BLOCK)
+        told = [
+            (each.mean(0), each.var(0, correction=0), each.abs().amax(0))
+            for each in map(torch.Tensor.double, blocks)
+        ]
+        means, variances, largest = map(torch.stack, zip(*told, strict=True))
+        share = torch.tensor([len(each) for each in blocks], dtype=torch.float64)
+        share /= share.sum()
+        mean = share @ means
+        # What varies within blocks, and from one to another.
+        scale = (share @ (variances + (means - mean).square())).sqrt()
+        tiny = 1e-6 * largest.amax(dim=0).clamp_min(1e-30)
+        self.mean.copy_(mean)
         self.scale.copy_(torch.where(scale > tiny, scale, torch.ones_like(scale)))
         return self
 
@@ -82,7 +95,8 @@ class MLP:
         """Dense layers with SiLU between."""
         layers: list[nn.Module] = []
         for width, following in pairwise((inputs, *self.hidden)):
-            layers += [nn.Linear(width, following), nn.SiLU()]
+            # In place: at these sizes a processor spends as long on fresh memory as on numbers.
+            layers += [nn.Linear(width, following), nn.SiLU(inplace=True)]
         return nn.Sequential(*layers, nn.Linear((inputs, *self.hidden)[-1], outputs))
 
 

@@ -6,7 +6,9 @@ by the user. Onsets jitter and may fall between samples: nothing here assumes a 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.errors import InputError
 
 __all__ = ["Segments"]
+
+BLOCK = 32
+"""Trajectories that are looked at together: their samples stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +110,21 @@ class Segments:
         A change below `tolerance` times the range of that command is none. On a ramp, the first
         step that is a part of the following one tells the fraction of a sample at which it began.
         """
-        change = np.abs(np.diff(commands.astype(np.float64), axis=1))
-        extent = np.ptp(commands, axis=(0, 1)).astype(np.float64)
-        moving = np.any(change > tolerance * np.where(extent > 0, extent, 1), axis=2)
-        return cls._from_moving(moving, change.sum(axis=2))
+        # One axis after the other: so numpy's inner loop is over a whole trajectory.
+        highest, lowest = commands.max(axis=0).max(axis=0), commands.min(axis=0).min(axis=0)
+        extent = highest - lowest
+        least = (tolerance * np.where(extent > 0, extent, 1)).astype(commands.dtype)
+        moving = np.empty((len(commands), commands.shape[1] - 1), dtype=bool)
+        for begin in range(0, len(commands), BLOCK):
+            some = commands[begin : begin + BLOCK]
+            change = np.abs(some[:, 1:] - some[:, :-1]) > least
+            moving[begin : begin + BLOCK] = reduce(np.logical_or, np.moveaxis(change, 2, 0))
+
+        def speed(row: NDArray, step: NDArray) -> NDArray:
+            after, before = (commands[row, step + late].astype(np.float64) for late in (1, 0))
+            return np.abs(after - before).sum(axis=1)
+
+        return cls._from_moving(moving, speed)
 
     @classmethod
     def from_path(cls, nominal: NDArray, *, threshold: float = 0.01) -> Segments:
@@ -119,10 +135,14 @@ class Segments:
         extent = np.ptp(nominal, axis=(0, 1)).astype(np.float64)
         step = np.diff(nominal.astype(np.float64), axis=1) / np.where(extent > 0, extent, 1)
         speed = np.linalg.norm(step, axis=2)
-        return cls._from_moving(speed > threshold * speed.max(initial=0.0), speed)
+        moving = speed > threshold * speed.max(initial=0.0)
+        return cls._from_moving(moving, lambda row, step: speed[row, step])
 
     @classmethod
-    def _from_moving(cls, moving: NDArray, speed: NDArray) -> Segments:
+    def _from_moving(
+        cls, moving: NDArray, speed: Callable[[NDArray, NDArray], NDArray]
+    ) -> Segments:
+        """Movements where `moving` (n, T - 1); `speed` tells how fast a row is in a step."""
         n, steps = moving.shape[0], moving.shape[1] + 1
         padded = np.pad(moving, ((0, 0), (1, 1)))
         # padded[:, i] tells whether step i - 1 -> i moves: edges are first and last such steps.
@@ -133,18 +153,24 @@ class Segments:
         start = np.full((n, most), float(steps))
         settle = np.full((n, most), float(steps))
         valid = np.zeros((n, most), dtype=bool)
-        start[row, order] = first + _late(speed, row, first, first + 1)
-        settle[row, order] = last - _late(speed, row, last - 1, last - 2)
+        start[row, order] = first + _late(speed, row, steps - 1, first, first + 1)
+        settle[row, order] = last - _late(speed, row, steps - 1, last - 1, last - 2)
         settle = np.maximum(settle, start)
         valid[row, order] = True
         stop = np.concatenate([start[:, 1:], np.full((n, 1), float(steps))], axis=1)[:, :most]
         return cls(start, np.minimum(settle, stop), stop, valid, steps)
 
 
-def _late(speed: NDArray, row: NDArray, edge: NDArray, inner: NDArray) -> NDArray:
+def _late(
+    speed: Callable[[NDArray, NDArray], NDArray],
+    row: NDArray,
+    steps: int,
+    edge: NDArray,
+    inner: NDArray,
+) -> NDArray:
     """Fraction of the step `edge` that was still at rest, if `inner` is a full step (0 … 1)."""
-    inside = (inner >= 0) & (inner < speed.shape[1])
-    full = speed[row, np.clip(inner, 0, speed.shape[1] - 1)]
+    inside = (inner >= 0) & (inner < steps)
+    full = speed(row, np.clip(inner, 0, steps - 1))
     with np.errstate(divide="ignore", invalid="ignore"):
-        part = np.where(inside & (full > 0), speed[row, edge] / full, 1.0)
+        part = np.where(inside & (full > 0), speed(row, edge) / full, 1.0)
     return 1.0 - np.clip(part, 0.0, 1.0)

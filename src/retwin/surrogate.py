@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from retwin.arrays import row_blocks
 from retwin.configs import from_config, to_config
 from retwin.errors import InputError
 from retwin.faults import Fault
@@ -21,10 +22,14 @@ from retwin.training import Fit, Training, isolated, train
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins.protocol import Chunk, Progress, checked_commands, simulate_in_chunks
 
-__all__ = ["Surrogate", "fit_surrogate"]
+__all__ = ["Surrogate", "distinct", "fit_surrogate", "surrogate_training"]
 
-# Larger chunks leave the processor's cache (measured with benchmarks/generation.py).
 CHUNK = 8
+"""Trajectories that a network with memory is asked at a time: more leave the cache."""
+SPAN = 128
+"""Trajectories that are gone through for commands that are held."""
+ROWS = 2048
+"""Samples that a network without memory is asked at a time, for the same reason."""
 
 
 class Surrogate(nn.Module):
@@ -76,21 +81,20 @@ class Surrogate(nn.Module):
         In chunks that fit the cache; a network without memory is asked once for a held command.
         """
         values = np.ascontiguousarray(commands, dtype=np.float32)
-        rows = self._distinct if self.memoryless else self.forward
         out = np.empty((*values.shape[:2], len(self.outputs)), dtype=np.float32)
-        for begin in range(0, len(values), CHUNK):
-            part = slice(begin, begin + CHUNK)
-            out[part] = rows(torch.tensor(values[part])).numpy()
+        ask, size = (self._once, SPAN) if self.memoryless else (self, CHUNK)
+        for begin in range(0, len(values), size):
+            part = slice(begin, begin + size)
+            out[part] = ask(torch.tensor(values[part])).numpy()
             if progress is not None:
-                progress(min(1.0, (begin + CHUNK) / len(values)))
+                progress(min(1.0, (begin + size) / len(values)))
         return out
 
-    def _distinct(self, commands: Tensor) -> Tensor:
-        """The same as `forward`, computed only where the command differs from the sample before."""
-        fresh = torch.ones(commands.shape[:2], dtype=torch.bool)
-        fresh[:, 1:] = (commands[:, 1:] != commands[:, :-1]).any(dim=-1)
-        place = fresh.flatten().cumsum(0) - 1
-        return self(commands[fresh])[place].view(*commands.shape[:2], -1)
+    def _once(self, commands: Tensor) -> Tensor:
+        """The same as `forward`, computed once where a command is held."""
+        rows, place = distinct(commands)
+        said = torch.cat([self(some) for some in rows.split(ROWS)])
+        return said.index_select(0, place.flatten()).view(*place.shape, -1)
 
     def simulate(
         self,
@@ -136,8 +140,28 @@ class Surrogate(nn.Module):
         return surrogate.eval()
 
 
+def distinct(commands: Tensor) -> tuple[Tensor, Tensor]:
+    """Those of the commands (n, T, d_u) that differ from the sample before, (k, d_u), and for each
+    sample which of them it is, (n, T): what is held says the same all over.
+    """
+    fresh = torch.ones(commands.shape[:2], dtype=torch.bool)
+    fresh[:, 1:] = (commands[:, 1:] != commands[:, :-1]).any(dim=-1)
+    index = fresh.flatten().nonzero()[:, 0]
+    place = fresh.flatten().cumsum(dim=0) - 1
+    return commands.flatten(0, 1).index_select(0, index), place.view(fresh.shape)
+
+
 ENOUGH = 10
 """Fewest trajectories to fit on: a tenth each is held out for validation and for the error."""
+
+HELD_OUT = 1000
+"""Trajectories that tell an error well enough, however many there are."""
+
+SAMPLES = 200_000
+"""Distinct samples that are enough for a network without memory."""
+
+WINDOWED = 10_000_000
+"""Samples, in whole trajectories, that are enough for a network with memory."""
 
 DEFAULTS = {
     "MLP": Training(epochs=20, batch=256, rate=5e-3),
@@ -145,6 +169,11 @@ DEFAULTS = {
     "TCN": Training(epochs=10, batch=32, rate=5e-3),
     "StateSpace": Training(epochs=40, batch=16, rate=1e-2),
 }
+
+
+def surrogate_training(network: Network) -> Training:
+    """What suits the network."""
+    return DEFAULTS.get(type(network).__name__, Training())
 
 
 def fit_surrogate(
@@ -160,7 +189,8 @@ def fit_surrogate(
     Parameters
     ----------
     twin: commands and nominal outputs; faults in `observed` do not matter. A tenth of the
-        trajectories is held out for validation and another tenth for the reported error.
+        trajectories is held out for validation and another tenth for the reported error, a
+        thousand each at most. Of a set larger than that needs, a random part is learned from.
     network: `MLP` (no memory, the default), `LSTM`, `TCN` or `StateSpace`.
     seed: same seed, same weights on the same machine.
     training: epochs, batch, rate; by default what suits the network.
@@ -181,7 +211,7 @@ def fit_surrogate(
             remedy="load the file with its case, which recovers commands, or simulate more",
         )
     order = np.random.default_rng(seed).permutation(len(twin))
-    tenth = max(1, len(twin) // 10)
+    tenth = min(max(1, len(twin) // 10), HELD_OUT)
     test, valid, train_part = order[:tenth], order[tenth : 2 * tenth], order[2 * tenth :]
     with isolated(seed):
         surrogate = Surrogate(network, inputs=twin.inputs, outputs=twin.outputs, rate=twin.rate)
@@ -201,7 +231,7 @@ def fit_surrogate(
         loss,
         fitted,
         rows(twin, valid, seed + 1),
-        training or DEFAULTS.get(type(network).__name__, Training()),
+        training or surrogate_training(network),
         seed=seed,
         progress=progress,
     )
@@ -217,9 +247,6 @@ def fit_surrogate(
     return surrogate
 
 
-SAMPLES = 200_000
-
-
 def _there(twin: Trajectories, part: NDArray) -> NDArray:
     """(len(part), T) bool, what is no padding: there a nominal output is held, not the twin's."""
     return np.arange(twin.steps) < twin.lengths[part][:, None]
@@ -227,22 +254,41 @@ def _there(twin: Trajectories, part: NDArray) -> NDArray:
 
 def _samples(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, ...]:
     """Distinct samples of those trajectories, at most SAMPLES: a hold says the same all over."""
-    commands = twin.commands[part].reshape(-1, twin.commands.shape[2])
-    nominal = twin.nominal[part].reshape(-1, twin.nominal.shape[2])
-    fresh = np.ones(len(commands), dtype=bool)
-    fresh[1:] = (commands[1:] != commands[:-1]).any(axis=1)
-    index = np.flatnonzero(fresh)
-    if len(index) > SAMPLES:
-        index = np.random.default_rng(seed).choice(index, SAMPLES, replace=False, shuffle=False)
-    return (
-        torch.as_tensor(commands[index], dtype=torch.float32),
-        torch.as_tensor(nominal[index], dtype=torch.float32),
-        torch.ones(len(index), dtype=torch.bool),
-    )
+    count = sum(len(fresh) for _, fresh in _fresh(twin, part))
+    chosen = np.arange(count)
+    if count > SAMPLES:
+        rng = np.random.default_rng(seed)
+        chosen = rng.choice(count, SAMPLES, replace=False, shuffle=False)
+    kinds = (twin.commands, twin.nominal)
+    found = [np.empty((len(chosen), kind.shape[2]), np.float32) for kind in kinds]
+    seen = 0
+    for some, fresh in _fresh(twin, part):
+        here = np.flatnonzero((chosen >= seen) & (chosen < seen + len(fresh)))
+        for values, kind in zip(found, kinds, strict=True):
+            values[here] = kind[some].reshape(-1, kind.shape[2])[fresh[chosen[here] - seen]]
+        seen += len(fresh)
+    commands, nominal = map(torch.from_numpy, found)
+    return commands, nominal, torch.ones(len(chosen), dtype=torch.bool)
+
+
+def _fresh(twin: Trajectories, part: NDArray) -> Iterator[tuple[NDArray, NDArray]]:
+    """Block by block, which trajectories, and at which of their samples the command is a new one.
+
+    The samples of a block are counted through; the first of a trajectory is new if it is not the
+    last of the one before.
+    """
+    last = np.full(twin.commands.shape[2], np.nan)
+    for rows in row_blocks(twin.commands, len(part)):
+        some = part[rows]
+        commands = twin.commands[some].reshape(-1, twin.commands.shape[2])
+        before = np.concatenate([last[None].astype(commands.dtype), commands[:-1]])
+        yield some, np.flatnonzero((commands != before).any(axis=1))
+        last = commands[-1]
 
 
 def _windows(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, ...]:
-    """Whole trajectories, and what of them is no padding."""
+    """Whole trajectories, WINDOWED samples at most, and what of them is no padding."""
+    part = part[: max(1, WINDOWED // twin.steps)]
     return (
         torch.tensor(twin.commands[part], dtype=torch.float32),
         torch.tensor(twin.nominal[part], dtype=torch.float32),

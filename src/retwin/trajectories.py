@@ -8,8 +8,9 @@ from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from retwin.arrays import check_finite, check_shapes, floating, measured, named, row_blocks
 from retwin.errors import InputError
 
 __all__ = ["Channels", "Progress", "Source", "Trajectories"]
@@ -108,32 +109,13 @@ class Trajectories:
     emulated: bool = False
 
     def __post_init__(self) -> None:
-        commands = _floating("commands", self.commands)
-        nominal = _floating("nominal", self.nominal)
-        observed = _floating("observed", self.observed)
-        _check_shapes(commands, nominal, observed)
-        _check_finite("commands", commands)
-        _check_finite("nominal", nominal)
-        if np.isinf(observed).any():
-            raise InputError(
-                "observed",
-                expected="finite measurements (NaN where one is missing)",
-                got=f"an infinite value in {_first_bad(np.isinf(observed))}",
-                remedy="replace infinite measurements by NaN",
-            )
-        mask = np.isfinite(observed) if self.mask is None else np.asarray(self.mask, bool)
-        if mask.shape != observed.shape:
-            raise InputError(
-                "mask",
-                expected=f"the shape of observed, {observed.shape}",
-                got=str(mask.shape),
-                remedy="give one flag per measurement",
-            )
-        missing = np.isnan(observed)
-        if missing.any():
-            mask = mask & ~missing
-        if not mask.all():
-            observed = np.where(mask, observed, observed.dtype.type(0))
+        commands = floating("commands", self.commands)
+        nominal = floating("nominal", self.nominal)
+        observed = floating("observed", self.observed)
+        check_shapes(commands, nominal, observed)
+        check_finite("commands", commands)
+        check_finite("nominal", nominal)
+        observed, mask = measured(observed, self.mask)
         if not (isinstance(self.rate, Real) and np.isfinite(self.rate) and self.rate > 0):
             raise InputError(
                 "rate",
@@ -142,8 +124,8 @@ class Trajectories:
                 remedy="give the sample rate in Hz",
             )
         n = len(commands)
-        labels = _names("labels", self.labels, [UNLABELLED] * n)
-        ids = _names("ids", self.ids, [f"{i:05d}" for i in range(n)])
+        labels = named("labels", self.labels, [UNLABELLED] * n)
+        ids = named("ids", self.ids, [f"{i:05d}" for i in range(n)])
         if len(set(ids.tolist())) != n:
             raise InputError(
                 "ids",
@@ -195,10 +177,13 @@ class Trajectories:
 
         All T where nothing was measured at all, as with a twin that was asked for `nominal` only.
         """
-        eventful: NDArray = np.any(self.mask, axis=2)
-        nothing: NDArray = ~np.any(eventful, axis=1)
-        eventful[:, 1:] |= (self.commands[:, 1:] != self.commands[:, :-1]).any(axis=2)
-        return self.steps - (eventful | nothing[:, None])[:, ::-1].argmax(axis=1)
+        found = np.empty(len(self), dtype=int)
+        for rows in row_blocks(self.nominal):
+            commands, eventful = self.commands[rows], np.any(self.mask[rows], axis=2)
+            nothing = ~np.any(eventful, axis=1)
+            eventful[:, 1:] |= (commands[:, 1:] != commands[:, :-1]).any(axis=2)
+            found[rows] = self.steps - (eventful | nothing[:, None])[:, ::-1].argmax(axis=1)
+        return found
 
     @property
     def residual(self) -> NDArray:
@@ -252,6 +237,11 @@ class Trajectories:
 
         Raises InputError when `fraction` is not strictly between 0 and 1.
         """
+        first, second = self.split_index(fraction, seed=seed)
+        return self[first], self[second]
+
+    def split_index(self, fraction: float, *, seed: int) -> tuple[NDArray, NDArray]:
+        """The sorted indices of the two parts that `split` gives."""
         if not 0 < fraction < 1:
             raise InputError(
                 "fraction",
@@ -269,7 +259,7 @@ class Trajectories:
             count = int(np.clip(round(taken), 0, len(members)))
             taken -= count
             first[members[:count]] = True
-        return self[first], self[~first]
+        return np.flatnonzero(first), np.flatnonzero(~first)
 
     def folds(self, count: int, *, seed: int) -> list[tuple[NDArray, NDArray]]:
         """`count` pairs (calibration, test) of sorted indices, stratified by class.
@@ -329,69 +319,3 @@ class Trajectories:
             provenance=tuple(dict.fromkeys(s for each in sets for s in each.provenance)),
             emulated=any(each.emulated for each in sets),
         )
-
-
-def _floating(name: str, array: ArrayLike) -> NDArray:
-    array = np.asarray(array)
-    if array.dtype.kind in "iub":
-        array = array.astype(np.float64)
-    if array.dtype.kind != "f" or array.ndim != 3:
-        raise InputError(
-            name,
-            expected="numbers of shape (trajectories, samples, channels)",
-            got=f"{array.dtype} of shape {array.shape}",
-            remedy="stack the trajectories into one three-dimensional array",
-        )
-    return array
-
-
-def _check_shapes(commands: NDArray, nominal: NDArray, observed: NDArray) -> None:
-    if nominal.shape != observed.shape:
-        raise InputError(
-            "observed",
-            expected=f"the shape of nominal, {nominal.shape}",
-            got=str(observed.shape),
-            remedy="give observed and nominal the same channels and samples",
-        )
-    if commands.shape[:2] != nominal.shape[:2]:
-        raise InputError(
-            "commands",
-            expected=f"{nominal.shape[0]} trajectories of {nominal.shape[1]} samples, as nominal",
-            got=str(commands.shape),
-            remedy="sample commands and outputs on the same grid",
-        )
-    if nominal.shape[1] < 2 or nominal.shape[2] < 1:
-        raise InputError(
-            "nominal",
-            expected="at least two samples and one channel",
-            got=str(nominal.shape),
-            remedy="give the outputs over time",
-        )
-
-
-def _check_finite(name: str, array: NDArray) -> None:
-    bad = ~np.isfinite(array)
-    if bad.any():
-        raise InputError(
-            name,
-            expected="finite numbers",
-            got=f"NaN or an infinite value in {_first_bad(bad)}",
-            remedy=f"{name} are known inputs: repair or drop that trajectory",
-        )
-
-
-def _first_bad(bad: NDArray) -> str:
-    trajectory, sample, channel = np.argwhere(bad)[0]
-    return f"trajectory {trajectory}, sample {sample}, channel {channel}"
-
-
-def _names(name: str, given: ArrayLike | None, default: list[str]) -> NDArray:
-    names = np.asarray(default if given is None else given, dtype=np.str_)
-    if names.shape != (len(default),):
-        raise InputError(
-            name,
-            expected=f"{len(default)} names, one per trajectory",
-            got=f"shape {names.shape}",
-            remedy="give one name per trajectory",
-        )
-    return names

@@ -247,6 +247,11 @@ def test_the_commands(call: Call, bundle: Bundle, saved: Path, tmp_path: Path) -
     assert (code, err) == (0, "")
     assert "is whole" in out
     assert "armpi" in out
+    told = json.loads(call("bundle", "verify", saved, "--json")[1])
+    assert told.keys() == {
+        *("folder", "kind", "bytes", "case", "schema", "steps", "movements", "sensor_rate"),
+        "provenance",
+    }
     code, out, err = call(
         "bundle", "generate", saved, "--per-class", 2, "--out", tmp_path / "made.npz"
     )
@@ -258,6 +263,13 @@ def test_the_commands(call: Call, bundle: Bundle, saved: Path, tmp_path: Path) -
     )
     assert code == 0, err
     assert "outside" in out
+    code, out, _ = call("bundle", "predict", saved, tmp_path / "scaled.npz", "--json")
+    told = json.loads(out)
+    assert told.keys() == {"emulated", "trajectories"}
+    assert len(told["trajectories"]) == len(made)
+    assert told["trajectories"][0].keys() == {
+        *("id", "diagnosis", "probability", "probabilities", "guard", "because_of")
+    }
     rows = (tmp_path / "found.csv").read_text().splitlines()
     assert rows[0].split(",")[:4] == ["trajectory", "guard", "because_of", "Healthy"]
     assert len(rows) == 1 + len(made)

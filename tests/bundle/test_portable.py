@@ -21,7 +21,6 @@ from retwin.bundle.graphs import FeaturesGraph, SensorGraph
 from retwin.bundle.portable import Portable, settled_at
 from retwin.bundle.seal import seal
 from retwin.corrected import CorrectedTwin
-from retwin.corrections import recorded
 from retwin.diagnosis.features import SETTLED, Features
 
 Exported = tuple[Path, dict[str, float]]
@@ -101,10 +100,10 @@ def test_it_simulates_by_the_same_law(
 
 
 def test_the_sensor_reads_as_the_operator_does(bundle: Bundle) -> None:
-    chain = bundle.twin.residual.correction
-    sensor = replace(chain.second, steps=(0.001, 0.0, 0.002), glitch_rate=0.3)
+    fitted = bundle.twin.residual.correction.second
+    sensor = replace(fitted, steps=(0.001, 0.0, 0.002), glitch_rate=0.3)
     outputs = torch.randn(6, 1000, 3, generator=torch.Generator().manual_seed(0))
-    expected = recorded(replace(chain, second=sensor), outputs, torch.Generator().manual_seed(1))
+    expected = sensor.read(outputs, torch.Generator().manual_seed(1))
     # The same draws, in the operator's order.
     generator = torch.Generator().manual_seed(1)
     choice = torch.tensor(sensor.phases)
@@ -207,6 +206,10 @@ def test_the_commands_export_and_predict(
     code, out, err = call("bundle", "predict", exported[0], tmp_path / "real.npz")
     assert code == 0, err
     assert "EMULATED" in out
+    words = ("bundle", "export", saved, "--onnx", tmp_path / "again", "--json")
+    told = json.loads(call(*words)[1])
+    assert told.keys() == {"saved", "differences"}
+    assert max(told["differences"].values()) < 0.01
     code, _, err = call("bundle", "export", exported[0], "--onnx", tmp_path / "out")
     assert code == 2
     assert "expected a bundle of schema 1" in err

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-import sys
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,46 +11,6 @@ import pytest
 from scipy.io import savemat
 
 import retwin as rt
-from retwin.cli import main
-
-
-@pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """Run `retwin …` in this process; exit code, stdout, stderr."""
-
-    def run(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["retwin", *map(str, words)])
-        monkeypatch.setenv("COLUMNS", "200")
-        with pytest.raises(SystemExit) as ended:
-            main()
-        said = capsys.readouterr()
-        return int(ended.value.code or 0), said.out, said.err
-
-    return run
-
-
-@pytest.fixture(scope="module")
-def files(
-    twin_set: rt.Trajectories,
-    emulated: rt.Trajectories,
-    updated: rt.CorrectedTwin,
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Path:
-    folder = tmp_path_factory.mktemp("files")
-    rt.save(twin_set, folder / "twin.npz")
-    rt.save(emulated, folder / "real.npz")
-    updated.save(folder / "model")
-    return folder
-
-
-def test_help_names_every_command(call) -> None:
-    code, out, _ = call("--help")
-    assert code == 0
-    for name in ("demo", "data", "fit", "generate", "diagnose", "study", "report"):
-        assert name in out
-    code, out, _ = call("study", "--help")
-    assert "Example:" in out
-    assert call("--version")[1].strip() == f"retwin {rt.__version__}"
 
 
 def test_the_steps_one_by_one(call, files: Path, tmp_path: Path) -> None:
@@ -72,7 +32,7 @@ def test_the_steps_one_by_one(call, files: Path, tmp_path: Path) -> None:
         "generate", tmp_path / "model", "--per-class", 20, "--seed", 1, "--out", made
     )
     assert code == 0, err
-    assert "180 trajectories" in out
+    assert (out, "180 trajectories" in err) == ("", True)
     code, out, err = call("diagnose", "fit", made, "--case", "armpi", "--out", tmp_path / "cnn")
     assert code == 0, err
     assert "Accuracy on the held-out fifth" in out
@@ -91,7 +51,15 @@ def test_the_steps_one_by_one(call, files: Path, tmp_path: Path) -> None:
     assert rows[0][1:] == list(rt.cases.armpi().classes)
     assert len(rows) == 91
     assert "macro_f1" not in out, "no labels, no scores"
-    assert "macro_f1" in call("diagnose", "predict", tmp_path / "cnn", files / "real.npz")[1]
+    words = ("diagnose", "predict", tmp_path / "cnn", files / "real.npz")
+    assert "macro_f1" in call(*words)[1]
+    told = json.loads(call(*words, "--json")[1])
+    assert told.keys() == {"emulated", "trajectories", "scores"}
+    assert (told["emulated"], len(told["trajectories"]), told["scores"]["n"]) == (True, 90, 90)
+    first = told["trajectories"][0]
+    assert first.keys() == {"id", "diagnosis", "probability", "probabilities", "label"}
+    assert first["probability"] == max(first["probabilities"].values())
+    assert list(first["probabilities"]) == list(rt.cases.armpi().classes)
     code, out, err = call(
         "diagnose", "invert", tmp_path / "model", files / "real.npz", "--out", tmp_path / "physics"
     )
@@ -118,6 +86,8 @@ def mat(path: Path, cells: list[np.ndarray], labels: list[str], key: str = "X_te
 
 
 GOOD = np.zeros((1000, 6))
+SCORES = ("macro_f1", "balanced_accuracy", "auroc", "healthy_recall")
+ERRORS = ("rmse", "nrmse", "crps", "coverage90")
 
 
 def spoilt(value: float, column: int) -> np.ndarray:
@@ -206,81 +176,6 @@ def test_demo_with_a_wrong_folder_is_refused(
     assert "RETWIN_DATA: expected a folder with armpi/real_a.mat" in err
 
 
-MODULE = """
-import numpy as np
-
-
-def reach(commands):
-    # How far an arm of two joints reaches, and how high, in m.
-    turned = commands.cumsum(axis=-1)
-    return np.stack([np.sin(turned).sum(axis=-1), np.cos(turned).sum(axis=-1)], axis=-1)
-
-
-def filled(commands, gain=0.1, leak=0.05):
-    level = np.zeros((*commands.shape[:2], 1))
-    for t in range(1, commands.shape[1]):
-        level[:, t] = level[:, t - 1] + gain * commands[:, t - 1] - leak * level[:, t - 1]
-    return level
-"""
-
-ARM = """
-name = "reach"
-twin = "own_module:reach"
-rate = 10
-inputs = { first = { unit = "rad", low = -1, high = 1 }, second = { low = -1, high = 1 } }
-outputs = { far = { unit = "m" }, high = { unit = "m" } }
-commands = { steps = 90, movements = 3, ramps = [8, 10] }
-network = { kind = "MLP", hidden = [32] }
-training = { epochs = 20, batch = 64, rate = 1e-2 }
-density = { kind = "Mixture", training = { epochs = 10, decay = "step" } }
-[faults]
-stuck = { kind = "Stuck", actuator = "second", onset = 12 }
-"""
-
-TANK = """
-name = "tank"
-twin = "own_module:filled"
-rate = 1
-inputs = { valve = { unit = "1", low = 0, high = 1 } }
-outputs = { level = { unit = "m" } }
-commands = { kind = "HoldSampler", steps = 100, hold = [5, 30] }
-correction = "additive"
-network = { kind = "StateSpace", states = 2, hidden = 8 }
-training = { epochs = 10, batch = 4, rate = 1e-2 }
-[density]
-kind = "SequenceMixture"
-members = 2
-network = { kind = "LSTM", hidden = 4 }
-training = { epochs = 3 }
-[parameters]
-gain = { unit = "m", low = 0.05, high = 0.2, start = 0.1 }
-leak = { unit = "1/s", low = 0.01, high = 0.1, start = 0.05 }
-[records]
-calibration = { valve = "u1", level = "y1" }
-test = { valve = "u2", level = "y2" }
-"""
-
-
-@pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Cases of a user's own in the current folder, and what was measured."""
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.chdir(tmp_path)
-    Path("own_module.py").write_text(MODULE)
-    Path("reach.toml").write_text(ARM)
-    Path("tank.toml").write_text(TANK)
-    reach, tank = (rt.cases.get(f"{name}.toml") for name in ("reach", "tank"))
-    made = rt.generate(reach.twin, reach, per_class=12, seed=5)
-    late = np.concatenate([made.observed[:, :1].repeat(2, axis=1), made.observed[:, :-2]], axis=1)
-    rt.save(made.replace(observed=late + 0.02, emulated=True), "real.npz")
-    told = tank.sampler.sample(2, rng=np.random.default_rng(6)).astype(float)
-    level = tank.parametric.with_values({"leak": 0.07}).simulate(told, seed=0).observed
-    columns = np.concatenate([*told, *level], axis=1)
-    np.savetxt("record.csv", columns, delimiter=",", header="u1,u2,y1,y2", comments="")
-    yield tmp_path
-    sys.modules.pop("own_module", None)
-
-
 def test_a_case_of_ones_own_with_classes(call, own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code, out, err = call("twin", "info", "reach.toml")
     assert (code, "first" in out, "reach" in out) == (0, True, True), err
@@ -312,6 +207,12 @@ def test_a_case_of_ones_own_without_classes(call, own: Path) -> None:
     assert "Residual model: 100 samples" in out
     assert "residual_level" in out
     assert "90 % band holds" in " ".join(out.split())
+    code, out, err = call("--quiet", *words, "--json")
+    told = json.loads(out)
+    assert (code, err) == (0, "")
+    assert told["saved"] == "model"
+    assert [each.keys() for each in told["surrogate"]] == [{"output", "unit", "rmse", "nrmse"}]
+    assert told["residual"].keys() == {"emulated", "reason", "figures"}
     assert call("generate", "model", "--per-class", 3, "--out", "made.npz")[0] == 0
     made = rt.load("made.npz")
     assert (made.steps, made.outputs.names, len(made)) == (100, ("level",), 3)
@@ -330,6 +231,17 @@ def test_a_study_of_a_case_of_ones_own(call, own: Path, words: tuple, told: str)
     code, out, err = call(*words)
     assert code == 0, err
     assert told in out
+    told_again = json.loads(call(*words, "--json")[1])
+    assert told_again.keys() == {
+        *("title", "emulated", "classifier", "runs", "test_trajectories"),
+        *("sources", "comparisons", "report"),
+    }
+    for source in told_again["sources"].values():
+        assert source.keys() in ({"title", *SCORES}, {"title", *ERRORS})
+    assert all(
+        each.keys() == {"a", "b", "metric", "mean_diff", "bootstrap_ci95"}
+        for each in told_again["comparisons"]
+    )
     page = own / "study" / "report.html"
     assert page.stat().st_size > 1000
     page.unlink()

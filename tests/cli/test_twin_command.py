@@ -7,7 +7,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -89,18 +88,9 @@ class Fragile:
 
 
 @pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def call(call):
     """Run `retwin twin …` in this process; exit code, stdout, stderr."""
-
-    def run(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["retwin", "twin", *map(str, words)])
-        monkeypatch.setenv("COLUMNS", "200")
-        with pytest.raises(SystemExit) as ended:
-            main()
-        said = capsys.readouterr()
-        return int(ended.value.code or 0), said.out, said.err
-
-    return run
+    return lambda *words: call("twin", *words)
 
 
 @pytest.fixture
@@ -123,8 +113,7 @@ def refused(call, match: str, *words: object) -> None:
     code, _, err = call(*words)
     assert code == 2, err
     assert re.search(match, err), err
-    # Without a terminal the bar leaves lines of its own.
-    assert len([line for line in err.splitlines() if not line.startswith("simulate")]) == 1
+    assert len(err.splitlines()) == 1
 
 
 # --- names ---------------------------------------------------------------------------------------
@@ -226,9 +215,9 @@ def test_info_tells_channels_units_limits_and_rate(call, mine: str, pendulum: Pa
 def test_simulate_to_both_kinds_of_files(call, tmp_path: Path, case: rt.Case) -> None:
     words = ("simulate", "armpi-kinematic", "--seed", 3, "--n", 20, "--fault", "all")
     for name in ("a.npz", "a.zarr"):
-        code, out, err = call(*words, "--out", tmp_path / name)
+        code, _, err = call(*words, "--out", tmp_path / name)
         assert code == 0, err
-        assert "Wrote 20 trajectories" in out
+        assert "Wrote 20 trajectories" in err
     one, other = (rt.load(tmp_path / name, case=case) for name in ("a.npz", "a.zarr"))
     np.testing.assert_array_equal(one.observed, other.observed)
     assert one.labels.tolist() == (3 * list(case.classes))[:20]
@@ -250,12 +239,12 @@ def test_simulate_one_class_or_none(call, tmp_path: Path) -> None:
 
 def test_simulate_commands_from_a_file(call, tmp_path: Path, twin_set: rt.Trajectories) -> None:
     rt.save(twin_set[:4], tmp_path / "given.npz")
-    code, out, err = call(
+    code, _, err = call(
         *("simulate", "armpi-kinematic", "--commands", tmp_path / "given.npz"),
         *("--out", tmp_path / "a.npz"),
     )
     assert code == 0, err
-    assert "Wrote 4 trajectories" in out
+    assert "Wrote 4 trajectories" in err
     np.testing.assert_array_equal(rt.load(tmp_path / "a.npz").commands, twin_set[:4].commands)
 
 
@@ -305,12 +294,12 @@ def test_failed_trajectories_are_named_and_the_others_written(
     call, mine: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "a.npz"
-    code, out, err = call("simulate", f"{mine}:Fragile", "--n", 40, "--out", file)
+    code, _, err = call("simulate", f"{mine}:Fragile", "--n", 40, "--out", file)
     assert code == 1
     made = rt.load(file)
     assert 20 < len(made) < 40
     assert made.commands[:, -1].max() <= 8
-    assert f"Wrote {len(made)} trajectories" in out
+    assert f"Wrote {len(made)} trajectories" in err
     assert re.search(rf"{40 - len(made)} of 40 simulations failed: trajectory \d+: melted", err)
 
 
@@ -377,10 +366,9 @@ def test_what_a_function_raises_is_one_line(
     )
     code, _, err = call(*words)
     assert code == 1
-    told = [line for line in err.splitlines() if not line.startswith("simulate")]
-    assert len(told) == 1, err
-    found = re.match(match, told[0])
-    assert found, told[0]
+    (told,) = err.splitlines()
+    found = re.match(match, told)
+    assert found, told
     line = MODULE.replace("\\\\", "\\").splitlines()[int(found[1]) - 1]
     assert "linalg" in line or "KeyError" in line
     if workers < 2:
@@ -409,31 +397,21 @@ def test_words_that_are_no_command_are_one_line(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_says_how_to_go_on(call, tmp_path: Path, number: int) -> None:
+def test_ctrl_c_says_how_to_go_on(
+    call, start, tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     words = ["simulate", "armpi-kinematic", "--n", "600", "--chunk", "4", "--workers", "1"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "retwin", "twin", *words, "--out", str(tmp_path / "a.zarr")],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
     done = tmp_path / "a.zarr.part" / "done"
-    deadline = time.monotonic() + 60
-    while not (done.exists() and any(done.glob("[0-9]*"))):
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    process.send_signal(number)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert "Traceback" not in err
-    told = re.search(r"interrupted; give the same command again to go on: retwin twin (.*)", err)
-    assert told, err
+    running = start("twin", *words, "--out", tmp_path / "a.zarr")
+    line = running.interrupt(lambda: done.exists() and any(done.glob("[0-9]*")), number)
+    told = re.search(r"interrupted; give the same command again to go on: retwin twin (.*)", line)
+    assert told, line
     finished = len(list(done.glob("[0-9]*")))
-    assert finished < 150
-    code, out, err = call(*shlex.split(told[1]))
+    assert 0 < finished < 150
+    monkeypatch.setattr("retwin.cli.terminal.MOMENT", 0.0)
+    code, _, err = call(*shlex.split(told[1]))
     assert code == 0
-    assert f"simulate: {4 * finished} of 600" in err
-    assert "Wrote 600 trajectories" in out
+    assert f"simulate: {4 * finished} of 600" in err, "begun anew"
+    assert "Wrote 600 trajectories" in err
     assert call(*words, "--out", tmp_path / "b.zarr")[0] == 0
     assert sha256(tmp_path / "a.zarr") == sha256(tmp_path / "b.zarr")

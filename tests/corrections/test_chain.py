@@ -54,16 +54,24 @@ def test_the_sensor_is_fitted_with_z(exact, measured: rt.Trajectories) -> None:
     assert sensor.glitch_rate < 0.02
     assert 1e-5 < sensor.noise[0][-4] < 3e-3
     outputs = chain.apply(context, found.z)
-    record = recorded(chain, outputs, torch.Generator().manual_seed(0))
+    record = recorded(chain, context, found.z, torch.Generator().manual_seed(0))
+    # Between readings nothing was computed, and nothing is missing.
+    whole = sensor.read(outputs, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(record, whole, rtol=0, atol=1e-6)
     off = (record - outputs)[:, ::POLL].abs()
     assert 1e-5 < off.mean() < 2e-3
     torch.testing.assert_close(chain.apply(context, 0 * found.z), context.path)
 
 
-def test_an_operator_without_a_sensor_is_recorded_as_it_is() -> None:
-    outputs = torch.randn(2, 30, 3)
-    record = recorded(rt.DelayOffset(), outputs, torch.Generator().manual_seed(0))
-    assert record is outputs
+def test_an_operator_without_a_sensor_is_recorded_as_it_is(
+    exact, measured: rt.Trajectories
+) -> None:
+    context = context_of(exact, measured)
+    z = torch.randn(*context.segments.start.shape, 4, generator=torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    record = recorded(rt.DelayOffset(), context, z, generator)
+    assert record.equal(rt.DelayOffset().apply(context, z))
+    assert generator.get_state().equal(torch.Generator().manual_seed(0).get_state())
 
 
 def test_the_second_operator_explains_what_the_first_leaves(exact, case: rt.Case) -> None:

@@ -60,7 +60,7 @@ def test_it_does_what_the_emulated_arm_does(commands: np.ndarray) -> None:
     """Against the emulator's own loop over movements, written apart."""
     segments = rt.Segments.from_commands(commands)
     z = drawn(segments.start.shape, missed=0.2)
-    when = torch.arange(1000.0, dtype=torch.float64)[:, None].expand(12, 1000, 4)
+    when = torch.arange(1000.0, dtype=torch.float64)
     ours = effective(torch.tensor(commands, dtype=torch.float64), segments, z, when)
     parts = z.numpy()
     truth = {"delay": parts[..., 0], "offset": parts[..., 1:5], "missed": parts[..., 5:] > 0}
@@ -73,7 +73,7 @@ def test_a_missed_movement_is_caught_up_with_the_next(exact) -> None:
     commands[0, :, 1] += np.clip(np.arange(600) - 350, 0, 60)
     z = torch.zeros(1, 2, 9, dtype=torch.float64)
     z[0, 0, 5 + 1] = 1.0
-    when = torch.tensor([0.0, 100, 300, 380, 500], dtype=torch.float64)[:, None].expand(1, 5, 4)
+    when = torch.tensor([0.0, 100, 300, 380, 500], dtype=torch.float64)
     segments = rt.Segments.from_commands(commands)
     told = effective(torch.tensor(commands), segments, z, when)
     np.testing.assert_allclose(told[0, :, 1], [500, 500, 500, 590, 680], atol=1e-6)
@@ -88,6 +88,31 @@ def test_a_stuck_actuator_stays_where_z_had_brought_it(exact, commands: np.ndarr
     free = rt.CommandSpace().apply(never, z)
     torch.testing.assert_close(path[:, :50], free[:, :50])
     assert (path[:, 200:] - free[:, 200:]).norm(dim=-1).max() > 0.02
+
+
+@pytest.mark.parametrize("memoryless", [True, False])
+def test_some_samples_are_those_of_the_whole(exact, commands: np.ndarray, memoryless: bool) -> None:
+    """Also of a surrogate that must be told all that came before."""
+
+    class Twin:
+        asked = 0
+
+        def __call__(self, told: Tensor) -> Tensor:
+            return exact(told) if memoryless else exact(told).cumsum(dim=1)
+
+        def predict(self, told: np.ndarray) -> np.ndarray:
+            self.asked += 1
+            return self(torch.tensor(told)).numpy()
+
+    twin = Twin()
+    twin.memoryless = memoryless  # type: ignore[attr-defined]
+    context = context_of(twin, commands, [rt.Stuck(1), rt.SteadyStateError(2), None] * 4)
+    z = drawn(context.segments.start.shape)
+    when = torch.randint(1000, (12, 30), generator=torch.Generator().manual_seed(0))
+    some = rt.CommandSpace().at(context, z, when)
+    whole = rt.CommandSpace().apply(context, z)
+    torch.testing.assert_close(some, whole[torch.arange(12)[:, None], when])
+    assert twin.asked == 1, "nobody asked what the outputs would be without z"
 
 
 def lateness(angles: np.ndarray, commands: np.ndarray, segments: rt.Segments) -> np.ndarray:

@@ -129,9 +129,9 @@ def toy(count: int, label: str, seed: int) -> tuple[rt.Trajectories, list, np.nd
     told = torch.tensor(faulty_commands(commands, faults, segments), dtype=torch.float64)
     shape = segments.start.shape
     z = [rng.normal(4, 0.5, (*shape, 1)), rng.normal(0, 0.02, (*shape, 2)), np.zeros((*shape, 2))]
-    frozen = torch.tensor(frozen_from(faults, *commands.shape[1:]))[:, None]
-    when = torch.minimum(torch.arange(400)[:, None], frozen).double()
-    done = effective(told, segments, torch.tensor(np.concatenate(z, axis=2)), when).numpy()
+    frozen = torch.tensor(frozen_from(faults, *commands.shape[1:]))
+    latent = torch.tensor(np.concatenate(z, axis=2))
+    done = effective(told, segments, latent, torch.arange(400), frozen).numpy()
     outputs = (done @ MAP.T)[:, np.arange(400) // 10 * 10]
     noise = rng.normal(0, 0.004, (count, 40, 3)).repeat(10, axis=1)
     mask = np.zeros(outputs.shape, dtype=bool)

@@ -1,4 +1,4 @@
-"""ROC, ECE floor and bins against slow or known answers."""
+"""ROC, reliability, movements and bins against slow or known answers."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 from numpy.typing import NDArray
+from scipy.stats import binom
 from sklearn.metrics import roc_auc_score, roc_curve
 
 from retwin.report.blocks import Plot
-from retwin.report.curves import bands, ece_floor, latents, micro_roc
+from retwin.report.curves import bands, latents
+from retwin.report.movement import movement
+from retwin.report.reliability import ece_floor, reliabilities
 from retwin.report.results import Results
+from retwin.report.roc import micro_roc
 from retwin.report.sections import SECTIONS
-from retwin.report.words import class_name, duration, number, p_value, signed
 
 Study = tuple[dict[str, Any], dict[str, NDArray]]
 
@@ -55,6 +58,55 @@ def test_ece_floor_falls_with_the_root_of_the_count() -> None:
     assert ece_floor(many) == pytest.approx(wanted, rel=0.1)
     assert ece_floor(few) / ece_floor(many) == pytest.approx(10, rel=0.15)
     assert ece_floor(np.eye(2)[None]) == 0
+
+
+def test_reliability_of_a_calibrated_classifier_lies_within_its_bars(study: Study) -> None:
+    """Sure by 0.9 and right in nine of ten; then with half of the right answers made wrong."""
+    truth = results_of(study).truth
+    place = np.arange(90)
+    for wrong, calibrated in ((place % 10 == 0, True), (place % 10 % 2 == 0, False)):
+        answers = np.full((2, 90, 9), 0.1 / 8)
+        answers[:, place, np.where(wrong, (truth + 1) % 9, truth)] = 0.9
+        study[1]["probabilities/dt"] = answers
+        found = reliabilities(results_of(study))["dt"]
+        assert len(found.confidence) == 10
+        np.testing.assert_allclose(found.confidence, 0.9)
+        assert found.right.mean() == pytest.approx(1 - wrong.mean())
+        kept = (found.low <= found.right) & (found.right <= found.high)
+        assert kept.all() == calibrated
+
+
+def test_bars_are_the_binomial_law_however_many_runs(study: Study) -> None:
+    """Nine answers to a bin, each right with chance 0.8, and the same nine in every run."""
+    answers = np.full((3, 90, 9), 0.2 / 8)
+    answers[..., 0] = 0.8
+    study[1]["probabilities/dt"] = answers
+    found = reliabilities(results_of(study))["dt"]
+    wanted = binom.ppf([0.05, 0.95], 9, 0.8) / 9
+    np.testing.assert_allclose(np.median([found.low, found.high], axis=1), wanted)
+
+
+def test_a_movement_is_late_and_off_by_what_was_put_in(study: Study) -> None:
+    """Two ramps of 100 mm in 0.6 s, of which the measured second one is 80 ms late and 5 mm off."""
+    time = np.arange(21) / 10
+    arrays = study[1]
+    nominal, observed = (np.zeros((90, 21, 3)) for _ in range(2))
+    nominal[..., 1] = np.interp(time, [0.1, 0.7, 1.0, 1.6], [0, 0.1, 0.1, 0.2])
+    observed[..., 1] = np.interp(time, [0.1, 0.7, 1.08, 1.68], [0, 0.1, 0.1, 0.205])
+    arrays |= {"portrait/nominal": nominal, "portrait/observed": observed}
+    arrays["portrait/times"] = np.tile([[0.1, 0.7, 1.0], [1.0, 1.7, 2.0]], (90, 1, 1))
+    found = movement(results_of(study))
+    assert found is not None
+    assert (found.output, found.unit, found.window) == ("y", "mm", (1.0, 2.0))
+    assert found.delay == pytest.approx(0.08, abs=0.01)
+    assert found.offset == pytest.approx(5)
+    assert found.half[0][1] == pytest.approx(150)
+    assert found.words == ("TDe 80 ms", "TPE 5.0 mm")
+
+
+def test_no_movement_without_one_that_was_measured(study: Study) -> None:
+    study[1]["portrait/observed"][:, 3] = np.nan
+    assert movement(results_of(study)) is None
 
 
 def test_latents_count_what_lies_outside(study: Study) -> None:
@@ -102,6 +154,8 @@ def test_plots_are_valid_for_plotly(study: Study) -> None:
     assert [plot.name for plot in plots] == [
         "scores",
         "roc",
+        "reliability",
+        "movement",
         "tde",
         "tpe",
         "noise",
@@ -112,19 +166,3 @@ def test_plots_are_valid_for_plotly(study: Study) -> None:
     for plot in plots:
         for panel in plot.panels:
             assert go.Figure(plain(panel.spec)).data
-
-
-def test_words() -> None:
-    assert class_name("Motor_1_Stuck") == "M1 stuck"
-    assert class_name("Motor_3_Steady_state_error") == "M3 bias"
-    assert class_name("Healthy") == "Healthy"
-    assert (number(-0.5), number(float("nan")), number(-0.0001)) == ("−0.500", "–", "0.000")
-    assert (signed(0.1), signed(0.0001), signed(-0.1)) == ("+0.100", "0.000", "−0.100")
-    assert (p_value(0.0002), p_value(0.04), p_value(None)) == ("< 0.001", "0.040", "–")
-    assert [duration(each) for each in (0.02, 5, 300, 30600, None)] == [
-        "20 ms",
-        "5.0 s",
-        "5.0 min",
-        "8.5 h",
-        "–",
-    ]

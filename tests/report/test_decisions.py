@@ -52,12 +52,30 @@ def test_few_healthy_trajectories_promise_nothing() -> None:
     assert np.isfinite(decide(probabilities, truth, CLASSES, 0.12).threshold)
 
 
+def test_what_the_calculator_looks_up_is_what_the_table_says(study: Study, write: Write) -> None:
+    """Every rate that ten healthy trajectories can tell apart, so 20 % is as two of eleven."""
+    results = read_results(write(study))
+    section = decisions(results)
+    assert section is not None
+    table, _, calculator = section.blocks
+    told = calculator.content["sources"][calculator.content["first"]]
+    assert told["name"] == "IBG + RG"
+    assert [round(11 * each["rate"]) for each in told["decisions"]] == list(range(1, 11))
+    row = next(row for row in table.rows if row[0].text == "20%")
+    words = [f"{cell.text} {cell.below}".strip() for cell in row[1:6]]
+    assert told["decisions"][1]["words"] == words
+    shares = results.probabilities("ibg_rg").mean(axis=0)
+    exact = decide(shares, results.truth, results.classes, 0.2)
+    assert told["decisions"][1]["detected"] == exact.detected
+
+
 def test_the_section_says_how_many_it_takes(study: Study, write: Write) -> None:
     section = decisions(read_results(write(study)))
     assert section is not None
-    table, note = section.blocks
+    table, note, calculator = section.blocks
     assert [row[0].text for row in table.rows] == ["1%", "2%", "5%", "10%", "20%", "30%"]
     assert "5% takes 19 of them at least" in note.text
+    assert calculator.content["healthy"] == 10
     study[0]["classes"] = study[0]["data"]["test"]["labels"] = []
     for source in study[0]["sources"].values():
         del source["confusion"]

@@ -126,7 +126,7 @@ def test_many_sources_are_told_shortly(study: Study, write: Write) -> None:
     text = read(write(study)).text
     assert "IBG + RG, command space minus Domain-adversarial" in text
     assert "Fault inversion minus Domain-adversarial" not in text
-    assert "Better than" in text
+    assert "Who is better than whom in macro-F1" in text
     assert text.count("On 90 test trajectories, training on IBG + RG, command space") == 1
 
 
@@ -165,6 +165,53 @@ def test_two_sources_with_a_residual_model_have_figures_of_their_own(
     assert {f"figure-{name}{more}" for name in names for more in ("", "-2")} <= set(reader.ids)
     assert len(reader.ids) == len(set(reader.ids))
     assert "IBG + RG, command space." in reader.text
+
+
+def test_the_paper_item_by_item(study: Study, write: Write) -> None:
+    """Table 1 and the figures, ours beside the paper's; each leads to a section that is there."""
+    reader = read(write(study))
+    for told in (
+        "Table 1: macro-F1",
+        "Figure 2: segments, TDe, TPE",
+        "Figure 5: TDe, KS distance – – – 0.11 (p 0.41)",
+        "Section 5: 3600 trajectories in 8.5 h 4–5 min",
+    ):
+        assert told in reader.text, told
+    inside = [each[1:] for each in reader.addresses if each.startswith("#") and "=" not in each]
+    assert set(inside) <= set(reader.ids)
+    (write(study) / "arrays.npz").unlink()
+    reader = read(write((study[0], {})))
+    assert "Figure 4" in reader.text
+    assert "#roc" not in reader.addresses
+
+
+def test_the_model_card_knows_what_went_wrong(study: Study, write: Write) -> None:
+    results, arrays = study
+    answers = np.tile(np.eye(9)[np.repeat(np.arange(9), 10)], (2, 1, 1))
+    answers[:, 3] = np.eye(9)[1]
+    arrays["probabilities/ibg_rg"] = answers
+    results["sources"]["ibg_rg"]["confusion"][8] = [60, 0, 0, 0, 0, 0, 0, 0, 40]
+    results["sources"]["ibg_rg"]["notes"] = ["one chain did not mix"]
+    reader = read(write(study))
+    for told in (
+        "motor_1 (deg)",
+        "x (mm)",
+        "2 s at 10 Hz",
+        "10 Healthy",
+        "10 real trajectories",
+        "Healthy taken for M1 stuck real_a/003",
+        "M4 bias recognised in 40%",
+        "Noise x is not generated as it was observed KS distance 0.98, p 0.05",
+        "one chain did not mix",
+        "which would not be known in the field",
+    ):
+        assert told in reader.text, told
+    assert "#trajectory=real_a%2F003" in reader.addresses
+    for name in [each for each in arrays if each.startswith("portrait/")]:
+        del arrays[name]
+    reader = read(write(study))
+    assert "Healthy taken for M1 stuck real_a/003" in reader.text
+    assert "#trajectory=real_a%2F003" not in reader.addresses
 
 
 def test_verdict_better(study: Study, write: Write) -> None:

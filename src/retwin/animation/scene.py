@@ -28,7 +28,7 @@ from retwin.processes import worker_pool
 if TYPE_CHECKING:
     from retwin.case import Body
 
-__all__ = ["mujoco_pictures"]
+__all__ = ["mujoco_pictures", "offscreen_backend"]
 
 BACKENDS = ("egl", "osmesa")
 """What draws without a screen, tried in this order unless MUJOCO_GL names one."""
@@ -36,6 +36,8 @@ CHUNK = 10
 """Pictures per task: enough to hide the transfer, few enough to show progress."""
 PATIENCE = 120.0
 """Seconds after which a task hangs."""
+BROKEN = (RuntimeError, ProcessExpired, TimeoutError)
+"""How a worker ends that cannot draw."""
 GHOSTLY = 0.6
 """Opacity of the ghost."""
 NOMINAL, OBSERVED = 1, 2
@@ -55,6 +57,24 @@ class Stage:
     size: tuple[int, int]
 
 
+def offscreen_backend() -> str:
+    """What draws here without a screen: a name that `MUJOCO_GL` knows.
+
+    Raises InputError when a package is missing, or nothing can.
+    """
+    _check_opengl()
+    reasons = []
+    for backend in _backends():
+        with worker_pool(1, _draw_with, (backend,)) as pool:
+            try:
+                pool.schedule(_open, timeout=PATIENCE).result()
+            except BROKEN as error:
+                reasons.append(f"{backend}: {_brief(error)}")
+            else:
+                return backend
+    raise _nothing_draws(reasons)
+
+
 @contextmanager
 def mujoco_pictures(shots: Shots, body: Body, size: tuple[int, int]) -> Iterator[Pictures]:
     """Pictures (height, width, 3), drawn in a worker process that lives as long as the block.
@@ -63,21 +83,29 @@ def mujoco_pictures(shots: Shots, body: Body, size: tuple[int, int]) -> Iterator
     without a screen.
     """
     stage = Stage(_model(body), body.joints, tuple(shots.root.tolist()), shots.reach, size)
-    backends = [name] if (name := os.environ.get("MUJOCO_GL", "").lower()) else list(BACKENDS)
     reasons = []
-    for backend in backends:
+    for backend in _backends():
         with ExitStack() as stack:
             pool = stack.enter_context(worker_pool(1, _draw_with, (backend,)))
             first = _ask(pool, stage, shots, 0)
             try:
                 first.result()
-            except (RuntimeError, ProcessExpired, TimeoutError) as error:
+            except BROKEN as error:
                 reasons.append(f"{backend}: {_brief(error)}")
                 continue
             with stack.pop_all():
                 yield _collect(pool, stage, shots, first)
                 return
-    raise InputError(
+    raise _nothing_draws(reasons)
+
+
+def _backends() -> tuple[str, ...]:
+    name = os.environ.get("MUJOCO_GL", "").lower()
+    return (name,) if name else BACKENDS
+
+
+def _nothing_draws(reasons: Sequence[str]) -> InputError:
+    return InputError(
         "renderer",
         expected="OpenGL that draws without a screen",
         got=f"none that works ({'; '.join(reasons)})",
@@ -94,6 +122,11 @@ def _model(body: Body) -> str:
             got="a body that is a chain of points only",
             remedy="draw it as a stick figure",
         )
+    _check_opengl()
+    return str(body.model)
+
+
+def _check_opengl() -> None:
     if importlib.util.find_spec("OpenGL") is None:
         raise InputError(
             "renderer",
@@ -101,7 +134,6 @@ def _model(body: Body) -> str:
             got="an installation without it",
             remedy='install it: pip install "retwin[render]"',
         )
-    return str(body.model)
 
 
 def _ask(pool: ProcessPool, stage: Stage, shots: Shots, first: int) -> Future[NDArray]:
@@ -150,6 +182,16 @@ def _draw(stage: Stage, joints: NDArray, tips: NDArray) -> NDArray:
         )
     except InputError:
         raise
+    except Exception as error:
+        raise RuntimeError(f"{type(error).__name__}: {error}") from None
+
+
+def _open() -> None:
+    """In the worker: what MuJoCo draws on."""
+    try:
+        import mujoco
+
+        mujoco.GLContext(64, 64).make_current()
     except Exception as error:
         raise RuntimeError(f"{type(error).__name__}: {error}") from None
 

@@ -118,9 +118,9 @@ def _context(
         told=commands,
         frozen=cast(Tensor, frozen),
         nominal=outputs,
-        path=outputs,
         segments=cast(Segments, Movements(*times, steps=steps, most=most)),
         rate=rate,
+        corrected=outputs,
     )
 
 

@@ -77,8 +77,7 @@ class ArmSampler:
             targets[:, movement] = STRAIGHT - now / UNIT
         onsets = draw_onsets(count, self.movements, self.period, rng=rng, timing=timing)
         start = np.full((count, len(self.amplitude)), STRAIGHT)
-        made = ramp_commands(start, targets, ramps, onsets, self.steps)
-        return made.astype(np.float32)
+        return ramp_commands(start, targets, ramps, onsets, self.steps, dtype=np.float32)
 
 
 def recover(trajectories: Trajectories, progress: Progress | None = None) -> Trajectories:

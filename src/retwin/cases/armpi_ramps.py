@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from retwin.cases.armpi_plane import STEP
+from retwin.commands import ramps_and_holds
 
 __all__ = ["RAMPS", "STRAIGHT", "ramp_commands", "unit_angles"]
 
@@ -28,6 +29,7 @@ def ramp_commands(
     length: int,
     *,
     closed: ArrayLike = False,
+    dtype: type[np.floating] = np.float64,
 ) -> NDArray:
     """Commands (n, length, motors) that ramp linearly from target to target and hold.
 
@@ -39,17 +41,9 @@ def ramp_commands(
     onsets: (n, M) fractional sample at which a movement starts; NaN for a movement left out.
     closed: one bool or (n,): a ramp of L samples is `linspace(old, new, L)`, both ends counted,
         instead of lasting L intervals.
+    dtype: of the commands.
 
     """
-    start, targets = np.asarray(start, float), np.asarray(targets, float)
     spans = np.asarray(ramps, float) - np.reshape(np.asarray(closed, float), (-1, 1, 1))
-    onsets = np.asarray(onsets, float)
-    time = np.arange(length)
-    commands = np.repeat(start[:, None], length, axis=1)
-    previous = start
-    for move in range(targets.shape[1]):
-        since = np.nan_to_num(time - onsets[:, move, None], nan=-1.0)
-        part = np.clip(since[..., None] / spans[:, None, move], 0, 1)
-        commands += (targets[:, move] - previous)[:, None] * part
-        previous = targets[:, move]
-    return commands
+    start, targets, onsets = (np.asarray(each, float) for each in (start, targets, onsets))
+    return ramps_and_holds(start, targets, spans, onsets, length, dtype=dtype)

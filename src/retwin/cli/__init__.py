@@ -9,20 +9,27 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from retwin import __version__
-from retwin.cli import bundle, data, models, studies, twins
+from retwin.cli import bundle, data, diagnose, models, studies, twins
+from retwin.cli.bench import bench
+from retwin.cli.doctor import doctor
 from retwin.cli.terminal import (
     BAD_INPUT,
     FAILED,
     INTERRUPTED,
     USAGE_ERROR,
+    Interrupted,
+    be_quiet,
     complain,
+    complain_of_interruption,
     complain_of_usage,
     described,
+    example,
     interrupted_by_term,
     show_warnings,
 )
@@ -30,36 +37,62 @@ from retwin.errors import InputError
 
 __all__ = ["app", "main"]
 
+
+class FirstScreen(TyperGroup):
+    """All commands; its help fits into 24 lines of 80."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """The options; of Typer's own for completion the one that most need is told, in brief."""
+        params: list[Any] = [*super().get_params(ctx)]
+        for each in params:
+            if each.name == "install_completion":
+                each.help = "Let this shell complete words."
+            each.hidden = each.name == "show_completion"
+        return params
+
+
 app = typer.Typer(
     help="Update digital twins so that they behave like the real machine.",
+    cls=FirstScreen,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
 )
-app.command("demo", epilog="Example: `retwin demo`")(studies.demo)
+app.command(epilog=example("retwin demo"))(studies.demo)
+app.command(epilog=example("retwin doctor"))(doctor)
+app.command(epilog=example("retwin bench"))(bench)
+app.command(epilog=example("retwin fit armpi --twin-data sim.mat --real real.mat --out model"))(
+    models.fit
+)
+app.command(epilog=example("retwin generate model --per-class 400 --out made.npz"))(models.generate)
+app.command(epilog=example("retwin study armpi --twin-data sim.mat --real real.mat --out study"))(
+    studies.study
+)
+app.command(epilog=example("retwin report study"))(studies.report)
 app.add_typer(data.app, name="data")
 app.add_typer(twins.app, name="twin")
-app.command(
-    "fit",
-    epilog="Example: `retwin fit armpi --twin-data sim.mat --real real.mat --out model`",
-)(models.fit)
-app.command("generate", epilog="Example: `retwin generate model --per-class 400 --out made.npz`")(
-    models.generate
-)
-app.add_typer(models.diagnose, name="diagnose")
+app.add_typer(diagnose.app, name="diagnose")
 app.add_typer(bundle.app, name="bundle")
-app.command(
-    "study",
-    epilog="Example: `retwin study armpi --twin-data sim.mat --real real.mat --out study`",
-)(studies.study)
-app.command("report", epilog="Example: `retwin report study`")(studies.report)
 
 
 @app.callback(invoke_without_command=True)
 def options(
-    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", metavar="", help="Print the version and exit.")
+    ] = False,
+    quiet: Annotated[
+        bool,
+        typer.Option(
+            "--quiet",
+            "-q",
+            metavar="",
+            envvar="RETWIN_QUIET",
+            show_envvar=False,
+            help="No progress, no notes: only results.",
+        ),
+    ] = False,
 ) -> None:
     """Update digital twins so that they behave like the real machine."""
+    be_quiet(quiet)
     if version:
         typer.echo(f"retwin {__version__}")
         raise typer.Exit
@@ -80,17 +113,24 @@ def main() -> None:
 def _run() -> int:
     """The exit code; what went wrong is told in one line."""
     try:
-        return app(standalone_mode=False) or 0
+        # Typer ends Ctrl-C without a word: with this code, or by Abort where it is older.
+        code: int = app(standalone_mode=False) or 0
+        if code != INTERRUPTED:
+            return code
+        complain_of_interruption(kept=False)
+    except Interrupted:
+        complain_of_interruption(kept=True)
+    except (KeyboardInterrupt, typer.Abort):
+        complain_of_interruption(kept=False)
     except InputError as error:
         complain(str(error))
         return BAD_INPUT
     except USAGE_ERROR as error:
         complain_of_usage(error)
         return BAD_INPUT
-    except typer.Abort:
-        return INTERRUPTED
     except Exception as error:
         if os.environ.get("RETWIN_TRACEBACK"):
             raise
         complain(described(error))
         return FAILED
+    return INTERRUPTED

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
-from retwin.cli.terminal import bar
+from retwin.cli.options import CaseOption
+from retwin.cli.reading import read
+from retwin.cli.terminal import answer, bar
 from retwin.errors import InputError
-from retwin.storage import load
 
 __all__ = ["animate"]
 
@@ -26,17 +26,21 @@ class Renderer(StrEnum):
 
 
 def animate(
-    file: Annotated[Path, typer.Argument(help="File or folder of trajectories.")],
-    out: Annotated[Path, typer.Option(help="The film, *.mp4 or *.gif.")],
-    case: Annotated[
-        str, typer.Option(help="Case the data belong to: a built-in name or module:object.")
-    ] = "armpi",
-    name: Annotated[str | None, typer.Option("--id", help="Which trajectory, by its id.")] = None,
-    index: Annotated[int, typer.Option(min=0, help="Which trajectory, by its place.")] = 0,
-    fps: Annotated[float, typer.Option(help="Pictures per second.")] = 25.0,
-    size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "640x480",
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File or folder of trajectories.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The film, *.mp4 or *.gif.")],
+    case: CaseOption = "armpi",
+    name: Annotated[
+        str | None, typer.Option("--id", metavar="ID", help="Which trajectory, by its id.")
+    ] = None,
+    index: Annotated[
+        int, typer.Option(metavar="N", min=0, help="Which trajectory, by its place.")
+    ] = 0,
+    fps: Annotated[float, typer.Option(metavar="HZ", help="Pictures per second.")] = 25.0,
+    size: Annotated[
+        str, typer.Option(metavar="WxH", help="Width and height in pixels.")
+    ] = "640x480",
     renderer: Annotated[
-        Renderer, typer.Option(help="What draws: MuJoCo, stick figures, or the best there is.")
+        Renderer, typer.Option(help="What draws; auto: the best here.")
     ] = Renderer.auto,
 ) -> None:
     """Film a trajectory: the nominal motion as a ghost, the observed one solid."""
@@ -46,9 +50,8 @@ def animate(
 
     check_film(out)
     shape = _size(size)
-    found = cases.get(case)
-    with bar("read") as tell:
-        trajectories = load(file, case=found, progress=lambda share: tell(file.name, share))
+    found = cases.get(case or "armpi")
+    trajectories = read(file, found)
     with bar("animate") as tell:
         path = film(
             trajectories,
@@ -60,7 +63,7 @@ def animate(
             renderer=renderer.value,
             progress=lambda share: tell("draw", share),
         )
-    Console().print(str(path), markup=False, highlight=False, soft_wrap=True)
+    answer(path, str(path))
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from retwin.cli.terminal import bar
-from retwin.storage import check_target, write_atomically
+from retwin.cli.diagnose import EMULATED, diagnoses, write_probabilities
+from retwin.cli.options import CaseOption, Json, OtherCase, Seed
+from retwin.cli.reading import case_named, read
+from retwin.cli.terminal import answer, bar, command_given, example, note, table
+from retwin.storage import check_target
 
 if TYPE_CHECKING:
     from retwin.bundle.bundle import Bundle
@@ -20,23 +19,26 @@ if TYPE_CHECKING:
 
 __all__ = ["app"]
 
-app = typer.Typer(help="Everything that was fitted in one sealed folder.", no_args_is_help=True)
-
-Folder = Annotated[Path, typer.Argument(help="Folder of a bundle.")]
-Seed = Annotated[int, typer.Option(help="Same seed, same result.", min=0)]
-
-
-@app.command(
-    "save", epilog="Example: `retwin bundle save model real.mat --diagnoser cnn --out bundle`"
+app = typer.Typer(
+    help="Everything that was fitted in one sealed folder.",
+    epilog=example("retwin bundle predict bundle real.mat --case armpi"),
+    no_args_is_help=True,
 )
+
+Folder = Annotated[Path, typer.Argument(metavar="BUNDLE", help="Folder of a bundle.")]
+
+
+@app.command(epilog=example("retwin bundle save model real.mat --diagnoser cnn --out bundle"))
 def save(
-    model: Annotated[Path, typer.Argument(help="Folder of a corrected twin.")],
-    real: Annotated[Path, typer.Argument(help="The trajectories it was calibrated on.")],
-    out: Annotated[Path, typer.Option(help="Folder for the bundle.")],
-    diagnoser: Annotated[Path | None, typer.Option(help="Folder of a diagnoser.")] = None,
-    case: Annotated[
-        str | None, typer.Option(help="Case, if another than the twin was fitted for.")
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of a corrected twin.")],
+    real: Annotated[
+        Path, typer.Argument(metavar="REAL", help="The trajectories it was calibrated on.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where to save the bundle.")],
+    diagnoser: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Folder of a diagnoser.")
     ] = None,
+    case: OtherCase = None,
     seed: Seed = 0,
 ) -> None:
     """Fit a guard and put it, the twin and the diagnoser into one sealed folder."""
@@ -47,83 +49,84 @@ def save(
     twin = rt.CorrectedTwin.load(model)
     system = rt.cases.get(case or twin.case)
     judge = None if diagnoser is None else rt.load_diagnoser(diagnoser)
+    calibration = read(real, system)
     with bar("bundle") as tell:
-        calibration = rt.load(real, case=system, progress=lambda s: tell("read", s))
         guard = fit_guard(twin, system, calibration, seed=seed, progress=lambda s: tell("guard", s))
-    notes = {"seed": seed, "command": " ".join(["retwin", *sys.argv[1:]])}
+    notes = {"seed": seed, "command": command_given()}
     Bundle.of(system, twin, guard, judge, data=[calibration], notes=notes).save(out)
-    Console().print(f"Saved {out}", soft_wrap=True)
+    note(f"Saved {out}")
 
 
-@app.command("verify", epilog="Example: `retwin bundle verify bundle`")
-def verify(folder: Folder) -> None:
+@app.command(epilog=example("retwin bundle verify bundle"))
+def verify(folder: Folder, as_json: Json = False) -> None:
     """Hold every file against its SHA-256, and show what the bundle is; nothing is loaded."""
     from retwin.bundle.seal import read_sealed
 
     about = read_sealed(folder, "bundle", "portable")
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    table = Table("property", "value", title=f"{about['kind']}, {size / 1e6:.2f} MB")
-    for name in ("case", "schema", "steps", "movements", "sensor_rate"):
-        table.add_row(name, str(about.get(name)))
+    told = {name: about.get(name) for name in ("case", "schema", "steps", "movements")}
+    told["sensor_rate"] = about.get("sensor_rate")
     provenance = about.get("provenance")
-    for name, value in (provenance if isinstance(provenance, dict) else {}).items():
-        table.add_row(name, str(value))
-    console = Console()
-    console.print(table)
-    console.print(f"{folder} is whole", soft_wrap=True)
+    notes = provenance if isinstance(provenance, dict) else {}
+    answer(
+        {
+            "folder": str(folder),
+            "kind": about["kind"],
+            "bytes": size,
+            **told,
+            "provenance": notes,
+        },
+        f"{about['kind']}, {size / 1e6:.2f} MB",
+        table(("property", "value"), [*told.items(), *notes.items()]),
+        "",
+        f"{folder} is whole",
+        as_json=as_json,
+    )
 
 
-@app.command("predict", epilog="Example: `retwin bundle predict bundle real.mat --case armpi`")
+@app.command(epilog=example("retwin bundle predict bundle real.mat --case armpi"))
 def predict(
-    folder: Annotated[Path, typer.Argument(help="Folder of a bundle, or of its ONNX export.")],
-    file: Annotated[Path, typer.Argument(help="Trajectories; labels are not needed.")],
-    case: Annotated[
-        str | None, typer.Option(help="Case, for files whose commands it recovers.")
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="BUNDLE", help="Folder of a bundle, or of its ONNX export."),
+    ],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Trajectories; labels are not needed.")
+    ],
+    case: CaseOption = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="CSV file for all probabilities.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="CSV file for all probabilities.")] = None,
+    as_json: Json = False,
 ) -> None:
     """Diagnose trajectories, and say which of them the bundle was not made for."""
-    import retwin as rt
-
     bundle = _opened(folder)
-    system = None if case is None else rt.cases.get(case)
-    with bar("read") as tell:
-        trajectories = rt.load(file, case=system, progress=lambda s: tell(file.name, s))
+    trajectories = read(file, case_named(case))
     found = bundle.predict(trajectories)
-    rows = list(
-        zip(
-            trajectories.ids.tolist(),
-            found.diagnosis.tolist(),
-            found.probabilities.max(axis=1).tolist(),
-            found.verdicts.verdict.tolist(),
-            found.verdicts.reason.tolist(),
-            strict=True,
-        )
+    told = diagnoses(trajectories, found.classes, found.probabilities)
+    verdicts = zip(found.verdicts.verdict.tolist(), found.verdicts.reason.tolist(), strict=True)
+    for each, (verdict, reason) in zip(told, verdicts, strict=True):
+        each |= {"guard": verdict, "because_of": reason}
+    rows = [
+        (e["id"], e["diagnosis"], f"{e['probability']:.2f}", e["guard"], e["because_of"])
+        for e in told
+    ]
+    answer(
+        {"emulated": trajectories.emulated, "trajectories": told},
+        table(("trajectory", "diagnosis", "probability", "guard", "because of"), rows),
+        *([EMULATED] if trajectories.emulated else []),
+        as_json=as_json,
     )
-    table = Table("trajectory", "diagnosis", "probability", "guard", "because of")
-    for name, best, probability, verdict, reason in rows:
-        table.add_row(name, best, f"{probability:.2f}", verdict, reason)
-    console = Console()
-    console.print(table)
-    if trajectories.emulated:
-        console.print("These trajectories are EMULATED: no real measurements.")
     if out is not None:
-        with write_atomically(out) as part, part.open("w", newline="", encoding="utf-8") as sheet:
-            writer = csv.writer(sheet)
-            writer.writerow(["trajectory", "guard", "because_of", *found.classes])
-            for row, shares in zip(rows, found.probabilities.tolist(), strict=True):
-                writer.writerow([row[0], row[3], row[4], *shares])
-        console.print(f"Wrote {out}", soft_wrap=True)
+        write_probabilities(out, found.classes, told, ("guard", "because_of"))
 
 
-@app.command("generate", epilog="Example: `retwin bundle generate bundle --out made.npz`")
+@app.command(epilog=example("retwin bundle generate bundle --out made.npz"))
 def generate(
     folder: Folder,
-    out: Annotated[Path, typer.Option(help="File to write, .npz or .zarr.")],
-    per_class: Annotated[int, typer.Option(help="Trajectories per class.")] = 400,
-    case: Annotated[
-        str | None, typer.Option(help="Case, where its own code draws commands.")
-    ] = None,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="New *.npz or *.zarr.")],
+    per_class: Annotated[int, typer.Option(metavar="N", help="Trajectories per class.")] = 400,
+    case: OtherCase = None,
     seed: Seed = 0,
 ) -> None:
     """Generate a balanced labelled set."""
@@ -132,7 +135,7 @@ def generate(
 
     check_target(out)
     bundle = Bundle.load(folder)
-    system = None if case is None else rt.cases.get(case)
+    system = case_named(case)
     # A built-in name only: code that a file names is not run, a case of one's own is given by hand.
     if system is None and bundle.facts.sampler is None and bundle.facts.case.isidentifier():
         system = rt.cases.get(bundle.facts.case)
@@ -141,13 +144,14 @@ def generate(
             system, per_class=per_class, seed=seed, progress=lambda s: tell("", s)
         )
     rt.save(made, out)
-    Console().print(f"Wrote {len(made)} trajectories to {out}", soft_wrap=True)
+    note(f"Wrote {len(made)} trajectories to {out}")
 
 
-@app.command("export", epilog="Example: `retwin bundle export bundle --onnx portable`")
+@app.command(epilog=example("retwin bundle export bundle --onnx portable"))
 def export(
     folder: Folder,
-    onnx: Annotated[Path, typer.Option(help="Folder for the ONNX graphs.")],
+    onnx: Annotated[Path, typer.Option(metavar="FOLDER", help="Where to put the ONNX graphs.")],
+    as_json: Json = False,
 ) -> None:
     """Write ONNX graphs, with which `bundle predict` needs no torch."""
     from retwin.bundle.bundle import Bundle
@@ -155,12 +159,13 @@ def export(
 
     with bar("export") as tell:
         parity = export_onnx(Bundle.load(folder), onnx, progress=lambda s: tell("", s))
-    table = Table("graph", "difference from torch")
-    for name, difference in parity.items():
-        table.add_row(name, f"{difference:.1e}")
-    console = Console()
-    console.print(table)
-    console.print(f"Wrote {onnx}", soft_wrap=True)
+    rows = [(name, f"{difference:.1e}") for name, difference in parity.items()]
+    answer(
+        {"saved": str(onnx), "differences": parity},
+        table(("graph", "difference from torch"), rows, numbers=("difference from torch",)),
+        as_json=as_json,
+    )
+    note(f"Wrote {onnx}")
 
 
 def _opened(folder: Path) -> Bundle | Portable:

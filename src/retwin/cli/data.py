@@ -2,86 +2,75 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from retwin import download
+from retwin.cli.options import CaseOption, Json, Rate, Seed
+from retwin.cli.reading import case_named, read
+from retwin.cli.terminal import answer, bar, example, note, table
+from retwin.cli.words import complete_files
 from retwin.errors import InputError
-from retwin.storage import DataCase, check_target, load, save, sha256
+from retwin.storage import check_target, save, sha256
 from retwin.trajectories import Channels, Trajectories
 
 __all__ = ["app"]
 
 app = typer.Typer(
     help="Look at, convert, split and fetch trajectories.",
+    epilog=example("retwin data info real.mat --case armpi"),
     no_args_is_help=True,
-    rich_markup_mode="markdown",
 )
 
-CaseName = Annotated[
-    str | None,
-    typer.Option("--case", help="Case the data belong to: a built-in name or module:object."),
-]
-Rate = Annotated[
-    float | None, typer.Option("--rate", help="Samples per second, when the file does not say.")
+File = Annotated[
+    Path, typer.Argument(metavar="FILE", help="File or folder of trajectories.", show_default=False)
 ]
 
 
-@app.command(epilog="Example: `retwin data info real.mat sim.mat --case armpi`")
+@app.command(epilog=example("retwin data info real.mat sim.mat --case armpi"))
 def info(
-    files: Annotated[list[Path], typer.Argument(help="Files or folders of trajectories.")],
-    case: CaseName = None,
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILES", help="Files or folders of trajectories.")
+    ],
+    case: CaseOption = None,
     rate: Rate = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Say what files hold: classes, samples, channels, missing values, SHA-256."""
-    told = []
-    for file in files:
-        trajectories = _load(file, case, rate)
-        told.append(_describe(trajectories, file))
-    if as_json:
-        typer.echo(json.dumps(told, indent=2, ensure_ascii=False))
-        return
-    console = Console()
-    for facts in told:
-        console.print(_table(facts))
+    told = [_facts(read(file, case_named(case), rate), file) for file in files]
+    answer(told, *map(_table, told), as_json=as_json)
 
 
-@app.command(epilog="Example: `retwin data convert sim.mat sim.npz --case armpi`")
+@app.command(epilog=example("retwin data convert sim.mat sim.npz --case armpi"))
 def convert(
     source: Annotated[Path, typer.Argument(metavar="IN", help="File or folder to read.")],
     target: Annotated[Path, typer.Argument(metavar="OUT", help="New *.npz or *.zarr.")],
-    case: CaseName = None,
+    case: CaseOption = None,
     rate: Rate = None,
 ) -> None:
     """Write trajectories in retwin's own format, with channels, rate and provenance."""
     check_target(target)
-    trajectories = _load(source, case, rate)
+    trajectories = read(source, case_named(case), rate)
     save(trajectories, target)
-    Console().print(f"{target}: {trajectories}", markup=False, highlight=False, soft_wrap=True)
+    note(f"Wrote {target}: {trajectories}")
 
 
-@app.command(
-    epilog="Example: `retwin data split real.mat --case armpi --fraction 0.6 --seed 0 "
-    "--out-first calibration.npz --out-second test.npz`"
-)
+@app.command(epilog=example("retwin data split real.npz --out-first fit.npz --out-second test.npz"))
 def split(
-    file: Annotated[Path, typer.Argument(help="File or folder of trajectories.")],
-    first: Annotated[Path, typer.Option("--out-first", help="First part, *.npz or *.zarr.")],
-    second: Annotated[Path, typer.Option("--out-second", help="The rest, *.npz or *.zarr.")],
-    fraction: Annotated[float, typer.Option(help="Share of the first part.")] = 0.6,
-    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same parts.")] = 0,
-    case: CaseName = None,
+    file: File,
+    first: Annotated[
+        Path, typer.Option("--out-first", metavar="FILE", help="First part, *.npz or *.zarr.")
+    ],
+    second: Annotated[
+        Path, typer.Option("--out-second", metavar="FILE", help="The rest, *.npz or *.zarr.")
+    ],
+    fraction: Annotated[float, typer.Option(metavar="X", help="Share of the first part.")] = 0.6,
+    seed: Seed = 0,
+    case: CaseOption = None,
     rate: Rate = None,
 ) -> None:
     """Split trajectories in two, at random, with the same shares of every class."""
@@ -94,41 +83,37 @@ def split(
             got=str(second),
             remedy="give each part its own file",
         )
-    parts = _load(file, case, rate).split(fraction, seed=seed)
+    parts = read(file, case_named(case), rate).split(fraction, seed=seed)
     for part, target in zip(parts, (first, second), strict=True):
         save(part, target)
-        Console().print(f"{target}: {part}", markup=False, highlight=False, soft_wrap=True)
+        note(f"Wrote {target}: {part}")
 
 
-@app.command(epilog="Example: `retwin data fetch armpi --folder data`")
+@app.command(epilog=example("retwin data fetch armpi --folder data"))
 def fetch(
-    name: Annotated[str, typer.Argument(help="Name of a public data file, such as armpi.")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="Name of a public data file, such as armpi.",
+            autocompletion=complete_files,
+        ),
+    ],
     folder: Annotated[
         Path | None,
-        typer.Option(help="Where to keep it; else RETWIN_CACHE, else the user's cache."),
+        typer.Option(
+            metavar="FOLDER",
+            help="Else RETWIN_CACHE, else the user's cache.",
+        ),
     ] = None,
 ) -> None:
     """Download a public data file, check its SHA-256 and print where it lies."""
-    with _progress(f"fetch {name}") as progress:
-        path = download.fetch(name, folder=folder, progress=progress)
-    typer.echo(path)
+    with bar("fetch") as tell:
+        path = download.fetch(name, folder=folder, progress=lambda share: tell(name, share))
+    answer(path, str(path))
 
 
-def _load(file: Path, case: str | None, rate: float | None) -> Trajectories:
-    with _progress(f"read {file.name}") as progress:
-        return load(file, case=_case(case), rate=rate, progress=progress)
-
-
-def _case(name: str | None) -> DataCase | None:
-    if name is None:
-        return None
-    from retwin import cases
-
-    found: DataCase = cases.get(name)
-    return found
-
-
-def _describe(trajectories: Trajectories, file: Path) -> dict[str, Any]:
+def _facts(trajectories: Trajectories, file: Path) -> dict[str, Any]:
     """The facts about one file, as JSON values."""
     counts = Counter(trajectories.labels.tolist())
     mask = trajectories.mask
@@ -153,15 +138,10 @@ def _pairs(channels: Channels) -> list[dict[str, str]]:
 
 
 def _table(facts: dict[str, Any]) -> Table:
-    # Text from files goes in as plain text: a class named [red] must not colour the table.
     def channels(name: str) -> str:
         return ", ".join(f"{c['name']} [{c['unit']}]" for c in facts[name]) or "none"
 
-    table = Table(title=None, show_header=False)
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
     rows = [
-        ("file", facts["file"]),
         ("SHA-256", facts["sha256"]),
         ("trajectories", f"{facts['trajectories']}{' (emulated)' if facts['emulated'] else ''}"),
         *((f"  {label or 'unlabelled'}", str(n)) for label, n in facts["per_class"].items()),
@@ -172,19 +152,4 @@ def _table(facts: dict[str, Any]) -> Table:
         ("missing", f"{facts['missing']:.2%}"),
         ("made from", "\n".join(f"{s['name']} {s['sha256']}" for s in facts["provenance"])),
     ]
-    for name, value in rows:
-        table.add_row(escape(name), escape(value))
-    return table
-
-
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[[float], None]]:
-    """A bar on stderr that is gone when the work is done."""
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    # Without a terminal rich would print one line per bar.
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bars:
-        task = bars.add_task(what, total=1.0)
-        yield lambda share: bars.update(task, completed=share)
+    return table(("file", facts["file"]), rows)

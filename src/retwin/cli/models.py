@@ -1,21 +1,20 @@
-"""`retwin fit`, `generate` and `diagnose`: the steps one by one."""
+"""`retwin fit` and `generate`: from files to a corrected twin, and from it to more files."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from retwin.cli.terminal import bar
+from retwin.cli.options import CaseArgument, Json, OtherCase, Seed
+from retwin.cli.plans import Workers, carry_out
+from retwin.cli.reading import read
+from retwin.cli.terminal import answer, bar, note, table
+from retwin.cli.words import CALIBRATED_ON, CORRECTIONS, DENSITIES, NETWORKS, one_of
 from retwin.configs import named
-from retwin.storage import check_target, write_atomically
+from retwin.storage import check_target
 from retwin.trajectories import Trajectories
 from retwin.twins.protocol import HEALTHY
 
@@ -24,44 +23,94 @@ if TYPE_CHECKING:
     from retwin.residual import ResidualModel, SequenceResidual
     from retwin.surrogate import Surrogate
 
-__all__ = ["diagnose", "fit", "generate"]
+__all__ = ["fit", "generate"]
 
-CaseName = Annotated[str, typer.Argument(help="Built-in case, case.toml, or module:object.")]
-Seed = Annotated[int, typer.Option(help="Same seed, same result.", min=0)]
+DATA, MODEL = "Data", "Model; what is not given is the case's"
+"""Panels of the help."""
 
 
 def fit(
-    case: CaseName,
-    out: Annotated[Path, typer.Option(help="Folder for the corrected twin.")],
+    case: CaseArgument,
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where to save the corrected twin.")],
     real: Annotated[
-        Path | None, typer.Option(help="Real trajectories to calibrate on.", show_default=False)
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Real trajectories to calibrate on.", rich_help_panel=DATA
+        ),
     ] = None,
     data: Annotated[
-        Path | None, typer.Option(help="Or one file that the case splits; its first part serves.")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Or one file that the case splits in two.",
+            rich_help_panel=DATA,
+        ),
     ] = None,
     twin_data: Annotated[
-        Path | None, typer.Option(help="Trajectories of the twin; simulated if not given.")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Trajectories of the twin; else simulated.",
+            rich_help_panel=DATA,
+        ),
     ] = None,
     simulations: Annotated[
-        int | None, typer.Option(help="How many, without --twin-data; the case's if not given.")
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Trajectories simulated; else the case's.",
+            rich_help_panel=DATA,
+        ),
     ] = None,
+    calibrate_on: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="healthy or all.",
+            rich_help_panel=DATA,
+            autocompletion=one_of(CALIBRATED_ON),
+        ),
+    ] = "healthy",
     network: Annotated[
-        str | None, typer.Option(help="Surrogate: mlp, lstm, tcn or state_space.")
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Surrogate: mlp, lstm, tcn or state_space.",
+            rich_help_panel=MODEL,
+            autocompletion=one_of(NETWORKS),
+        ),
     ] = None,
     correction: Annotated[
-        str | None, typer.Option(help="additive, delay_offset or command_space.")
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="additive, delay_offset or command_space.",
+            rich_help_panel=MODEL,
+            autocompletion=one_of(CORRECTIONS),
+        ),
     ] = None,
     density: Annotated[
-        str | None, typer.Option(help="Law of the gap: mixture, flow or sequence_mixture.")
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Law of the gap: mixture, flow or sequence_mixture.",
+            rich_help_panel=MODEL,
+            autocompletion=one_of(DENSITIES),
+        ),
     ] = None,
-    refine: Annotated[bool, typer.Option(help="Fine-tune on outputs afterwards.")] = False,
-    calibrate_on: Annotated[str, typer.Option(help="healthy or all.")] = "healthy",
+    refine: Annotated[
+        bool,
+        typer.Option(
+            "--refine",
+            metavar="",
+            help="Fine-tune on outputs afterwards.",
+            rich_help_panel=MODEL,
+        ),
+    ] = False,
     seed: Seed = 0,
+    as_json: Json = False,
 ) -> None:
-    """Fit surrogate and residual model; save the corrected twin.
-
-    Network, correction and density are the case's, if not given.
-    """
+    """Fit surrogate and residual model; save the corrected twin."""
     import retwin as rt
 
     system = _system(case, network, correction, density, refine)
@@ -74,7 +123,7 @@ def fit(
             system.network,
             seed=seed,
             training=system.training,
-            progress=lambda s: tell("surrogate", s),
+            progress=lambda s: tell("surrogate, 1 of 2", s),
         )
         rg = rt.fit_residual(
             ibg,
@@ -83,16 +132,12 @@ def fit(
             system.density,
             seed=seed,
             calibrate_on=system.faults if calibrate_on == "all" else calibrate_on,
-            progress=lambda s: tell("residual model", s),
+            progress=lambda s: tell("residual model, 2 of 2", s),
         )
     # A model is used from other folders, too.
     name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
     rt.CorrectedTwin(ibg, rg, case=name).save(out)
-    console = Console()
-    console.print("Surrogate on held-out twin trajectories:")
-    console.print(_of_surrogate(ibg))
-    console.print(_of_residual(rg))
-    console.print(f"Saved {out}", soft_wrap=True)
+    _tell(ibg, rg, out, as_json=as_json)
 
 
 def _system(
@@ -137,8 +182,7 @@ def _measured(system: Case, real: Path | None, data: Path | None) -> Trajectorie
             remedy="give --real FILE; or --data FILE, for a case that says how it is split",
         )
     if real is not None:
-        with bar("read") as tell:
-            return rt.load(real, case=system, progress=lambda s: tell(real.name, s))
+        return read(real, system)
     assert data is not None
     if system.records is None:
         raise rt.InputError(
@@ -155,8 +199,7 @@ def _of_twin(system: Case, file: Path | None, simulations: int, seed: int) -> Tr
     import retwin as rt
 
     if file is not None:
-        with bar("read") as tell:
-            return rt.load(file, case=system, progress=lambda s: tell(file.name, s))
+        return read(file, system)
     healthy = replace(system, faults={HEALTHY: None})
     with bar("simulate") as tell:
         return rt.generate(
@@ -164,15 +207,28 @@ def _of_twin(system: Case, file: Path | None, simulations: int, seed: int) -> Tr
         )
 
 
-def _of_surrogate(ibg: Surrogate) -> Table:
+def _tell(
+    ibg: Surrogate, rg: ResidualModel | SequenceResidual, out: Path, *, as_json: bool
+) -> None:
+    """How well both were fitted, and where they are."""
     assert ibg.fitted is not None
-    table = Table("output", "RMSE", "NRMSE")
-    figures = ibg.fitted.figures
-    for name, unit in zip(ibg.outputs.names, ibg.outputs.units, strict=True):
-        table.add_row(
-            name, f"{figures[f'rmse_{name}']:.3g} {unit}", f"{figures[f'nrmse_{name}']:.2%}"
-        )
-    return table
+    assert rg.fitted is not None
+    figures, channels = ibg.fitted.figures, ibg.outputs
+    outputs = [
+        {"output": n, "unit": u, "rmse": figures[f"rmse_{n}"], "nrmse": figures[f"nrmse_{n}"]}
+        for n, u in zip(channels.names, channels.units, strict=True)
+    ]
+    residual = {"emulated": rg.emulated, "reason": rg.fitted.reason, "figures": rg.fitted.figures}
+    rows = [(o["output"], f"{o['rmse']:.3g} {o['unit']}", f"{o['nrmse']:.2%}") for o in outputs]
+    answer(
+        {"saved": str(out), "surrogate": outputs, "residual": residual},
+        "Surrogate on held-out twin trajectories:",
+        table(("output", "RMSE", "NRMSE"), rows, numbers=("RMSE", "NRMSE")),
+        "",
+        _of_residual(rg),
+        as_json=as_json,
+    )
+    note(f"Saved {out}")
 
 
 def _of_residual(rg: ResidualModel | SequenceResidual) -> str:
@@ -195,18 +251,21 @@ def _of_residual(rg: ResidualModel | SequenceResidual) -> str:
 
 
 def generate(
-    model: Annotated[Path, typer.Argument(help="Folder of a corrected twin.")],
-    out: Annotated[Path, typer.Option(help="File to write, .npz or .zarr.")],
-    per_class: Annotated[int, typer.Option(help="Trajectories per class.")] = 400,
-    case: Annotated[
-        str | None, typer.Option(help="Case, if another than the twin was fitted for.")
-    ] = None,
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of a corrected twin.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="New *.npz, or *.zarr of any size.")],
+    per_class: Annotated[int, typer.Option(metavar="N", help="Trajectories per class.")] = 400,
+    case: OtherCase = None,
     seed: Seed = 0,
+    workers: Workers = None,
 ) -> None:
-    """Generate a balanced labelled set from a corrected twin."""
+    """Generate a balanced labelled set from a corrected twin.
+
+    A *.npz holds the classes one after the other, a *.zarr in turn, and other draws. Interrupted
+    on the way to a *.zarr, it can go on.
+    """
     import retwin as rt
 
-    check_target(out)
+    kind = check_target(out)
     updated = rt.CorrectedTwin.load(model)
     if not (case or updated.case):
         raise rt.InputError(
@@ -216,112 +275,14 @@ def generate(
             remedy="give --case",
         )
     system = rt.cases.get(case or updated.case)
+    if kind == ".zarr" or workers is not None:
+        n = per_class * len(system.faults)
+        plan = rt.SimulationPlan(updated, system.sampler, seed, n, system.faults)
+        carry_out(plan, out, "generate", workers=workers)
+        return
     with bar("generate") as tell:
         made = rt.generate(
             updated, system, per_class=per_class, seed=seed, progress=lambda s: tell("", s)
         )
     rt.save(made, out)
-    Console().print(f"Wrote {len(made)} trajectories to {out}", soft_wrap=True)
-
-
-diagnose = typer.Typer(help="Train a diagnoser, and use it.", no_args_is_help=True)
-
-
-@diagnose.command("fit", epilog="Example: `retwin diagnose fit made.npz --out cnn`")
-def diagnose_fit(
-    file: Annotated[Path, typer.Argument(help="Labelled trajectories.")],
-    out: Annotated[Path, typer.Option(help="Folder for the diagnoser.")],
-    classifier: Annotated[str, typer.Option(help="cnn, lstm or rocket.")] = "cnn",
-    case: Annotated[str | None, typer.Option(help="Case the file belongs to.")] = None,
-    rate: Annotated[float | None, typer.Option(help="Hz that the classifier looks at.")] = None,
-    seed: Seed = 0,
-) -> None:
-    """Train a diagnoser on labelled trajectories."""
-    import retwin as rt
-    from retwin.networks import CLASSIFIERS
-
-    system = None if case is None else rt.cases.get(case)
-    fit: dict[str, Callable[..., Any]] = {
-        name: partial(rt.fit_diagnoser, network=network) for name, network in CLASSIFIERS.items()
-    }
-    chosen = named(classifier, {**fit, "rocket": rt.fit_rocket}, "classifier")
-    with bar("diagnose") as tell:
-        training = rt.load(file, case=system, progress=lambda s: tell("read", s))
-        diagnoser = chosen(
-            training,
-            seed=seed,
-            classes=None if system is None else system.classes,
-            rate=rate,
-            progress=lambda s: tell("train", s),
-        )
-    diagnoser.save(out)
-    assert diagnoser.fitted is not None
-    console = Console()
-    console.print(
-        f"Accuracy on the held-out fifth of {file.name}: {diagnoser.fitted.figures['accuracy']:.3f}"
-    )
-    console.print(f"Saved {out}", soft_wrap=True)
-
-
-@diagnose.command("invert", epilog="Example: `retwin diagnose invert model real.mat --out physics`")
-def diagnose_invert(
-    model: Annotated[Path, typer.Argument(help="Folder of a corrected twin, in command space.")],
-    real: Annotated[Path, typer.Argument(help="The trajectories it was calibrated on.")],
-    out: Annotated[Path, typer.Option(help="Folder for the diagnoser.")],
-    random_onset: Annotated[
-        bool, typer.Option(help="Leave the onset of stuck motors open.")
-    ] = False,
-) -> None:
-    """Make a diagnoser by physics: no training, only healthy trajectories are used."""
-    import retwin as rt
-
-    updated = rt.CorrectedTwin.load(model)
-    system = rt.cases.get(updated.case)
-    if random_onset:
-        system = system.with_random_onset()
-    with bar("invert") as tell:
-        calibration = rt.load(real, case=system, progress=lambda s: tell("read", s))
-        diagnoser = rt.fit_inversion(
-            updated.surrogate, updated.residual, calibration, system.faults
-        )
-    diagnoser.save(out)
-    Console().print(f"Saved {out}", soft_wrap=True)
-
-
-@diagnose.command("predict", epilog="Example: `retwin diagnose predict cnn real.mat --case armpi`")
-def diagnose_predict(
-    model: Annotated[Path, typer.Argument(help="Folder of a diagnoser.")],
-    file: Annotated[Path, typer.Argument(help="Trajectories; labels are not needed.")],
-    case: Annotated[str | None, typer.Option(help="Case the file belongs to.")] = None,
-    out: Annotated[Path | None, typer.Option(help="CSV file for all probabilities.")] = None,
-) -> None:
-    """Say which class each trajectory belongs to, and score it where labels are known."""
-    import retwin as rt
-
-    diagnoser = rt.load_diagnoser(model)
-    system = None if case is None else rt.cases.get(case)
-    with bar("read") as tell:
-        trajectories = rt.load(file, case=system, progress=lambda s: tell(file.name, s))
-    probabilities = diagnoser.predict_proba(trajectories)
-    table = Table("trajectory", "diagnosis", "probability", "label")
-    best = probabilities.argmax(axis=1)
-    for i, index in enumerate(best):
-        table.add_row(
-            str(trajectories.ids[i]),
-            diagnoser.classes[index],
-            f"{probabilities[i, index]:.2f}",
-            str(trajectories.labels[i]),
-        )
-    console = Console()
-    console.print(table)
-    if trajectories.emulated:
-        console.print("These trajectories are EMULATED: no real measurements.")
-    if trajectories.known_labels and "" not in trajectories.labels:
-        console.print(str(rt.evaluate(diagnoser, trajectories)))
-    if out is not None:
-        with write_atomically(out) as part, part.open("w", newline="", encoding="utf-8") as sheet:
-            writer = csv.writer(sheet)
-            writer.writerow(["trajectory", *diagnoser.classes])
-            for name, row in zip(trajectories.ids, probabilities.tolist(), strict=True):
-                writer.writerow([name, *row])
-        console.print(f"Wrote {out}", soft_wrap=True)
+    note(f"Wrote {len(made)} trajectories to {out}")

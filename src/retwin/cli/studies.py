@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,56 +10,153 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
-from retwin.cli.terminal import INTERRUPTED, bar, complain
+from retwin.cli.options import CaseArgument, Json, Seed
+from retwin.cli.terminal import answer, bar, command_given, note, resumable, table
+from retwin.cli.words import CALIBRATED_ON, CLASSIFIERS, PRESETS, complete_sources, one_of
 from retwin.errors import InputError
 
 __all__ = ["demo", "report", "study"]
 
 COLUMNS = {
     "macro_f1": "macro-F1",
-    "balanced_accuracy": "balanced acc.",
+    "balanced_accuracy": "balanced\nacc.",
     "auroc": "AUROC",
-    "healthy_recall": "healthy recall",
+    "healthy_recall": "healthy\nrecall",
     "rmse": "RMSE",
     "nrmse": "NRMSE",
     "crps": "CRPS",
-    "coverage90": "in 90 % band",
+    "coverage90": "in 90 %\nband",
 }
+"""Scores that are shown, and the heads of their columns."""
+DATA = "Data: either --real, or --calibration and --test, or --data"
+COMPARED = "What is compared"
+"""Panels of the help."""
 
 
 def study(
-    case: Annotated[str, typer.Argument(help="Built-in case, case.toml, or module:object.")],
-    out: Annotated[Path, typer.Option(help="Folder; called again, the study goes on there.")],
-    twin_data: Annotated[Path | None, typer.Option(help="Trajectories of the twin.")] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Real set to calibrate on.")] = None,
-    test: Annotated[Path | None, typer.Option(help="Real set to test on.")] = None,
-    real: Annotated[Path | None, typer.Option(help="One real set, split into folds.")] = None,
-    folds: Annotated[int, typer.Option(help="Folds of --real.")] = 3,
-    data: Annotated[Path | None, typer.Option(help="One file that the case splits itself.")] = None,
+    case: CaseArgument,
+    out: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Called again, the study goes on there.")
+    ],
+    real: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="One real set, split into folds.", rich_help_panel=DATA),
+    ] = None,
+    folds: Annotated[
+        int, typer.Option(metavar="N", help="Folds of --real.", rich_help_panel=DATA)
+    ] = 3,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Real set to calibrate on.", rich_help_panel=DATA),
+    ] = None,
+    test: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Real set to test on.", rich_help_panel=DATA),
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="One file that the case splits itself.", rich_help_panel=DATA
+        ),
+    ] = None,
+    twin_data: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Trajectories of the twin; else simulated.",
+            rich_help_panel=DATA,
+        ),
+    ] = None,
     sources: Annotated[
         str | None,
-        typer.Option(help="Names joined by commas, or all; by default twin, IBG, IBG + RG."),
+        typer.Option(
+            metavar="NAMES",
+            help="Joined by commas, or all; else dt,ibg,ibg_rg.",
+            rich_help_panel=COMPARED,
+            autocompletion=complete_sources,
+        ),
     ] = None,
-    classifier: Annotated[str | None, typer.Option(help="cnn, lstm or rocket.")] = None,
-    runs: Annotated[int | None, typer.Option(help="Runs; the preset's if not given.")] = None,
-    seed: Annotated[int, typer.Option(help="Same seed, same result.", min=0)] = 0,
-    preset: Annotated[str, typer.Option(help="quick or paper.")] = "quick",
-    rate: Annotated[float | None, typer.Option(help="Hz that the classifier looks at.")] = None,
+    preset: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="quick or paper: classifier, training, runs.",
+            rich_help_panel=COMPARED,
+            autocompletion=one_of(PRESETS),
+        ),
+    ] = "quick",
+    classifier: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="cnn, lstm or rocket; else the preset's.",
+            rich_help_panel=COMPARED,
+            autocompletion=one_of(CLASSIFIERS),
+        ),
+    ] = None,
+    runs: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Runs; else the preset's.", rich_help_panel=COMPARED),
+    ] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            metavar="HZ",
+            help="Seen by the classifier; else the sensor's.",
+            rich_help_panel=COMPARED,
+        ),
+    ] = None,
     per_class: Annotated[
-        int | None, typer.Option(help="Generated trajectories per class; the case's if not given.")
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Generated trajectories; else the case's.",
+            rich_help_panel=COMPARED,
+        ),
     ] = None,
-    calibrate_on: Annotated[str, typer.Option(help="healthy or all.")] = "healthy",
-    random_onset: Annotated[bool, typer.Option(help="Draw the onset of stuck motors.")] = False,
+    calibrate_on: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="healthy or all.",
+            rich_help_panel=COMPARED,
+            autocompletion=one_of(CALIBRATED_ON),
+        ),
+    ] = "healthy",
+    random_onset: Annotated[
+        bool,
+        typer.Option(
+            "--random-onset",
+            metavar="",
+            help="Draw the onset of stuck motors.",
+            rich_help_panel=COMPARED,
+        ),
+    ] = False,
     encoder_noise: Annotated[
-        float, typer.Option(help="Command units of noise on frozen joints, training and test.")
+        float,
+        typer.Option(
+            metavar="X",
+            help="Noise on frozen joints, in command units.",
+            rich_help_panel=COMPARED,
+        ),
     ] = 0.0,
     learning_curve: Annotated[
-        bool, typer.Option(help="Also calibrate on 1, 2, 4, 6 … healthy trajectories.")
+        bool,
+        typer.Option(
+            "--learning-curve",
+            metavar="",
+            help="Also calibrate on 1, 2, 4, 6 … healthy ones.",
+            rich_help_panel=COMPARED,
+        ),
     ] = False,
-    processes: Annotated[int | None, typer.Option(help="Jobs at a time; one per core.")] = None,
+    seed: Seed = 0,
+    processes: Annotated[
+        int | None, typer.Option(metavar="N", help="Jobs at a time; else one per core.")
+    ] = None,
+    as_json: Json = False,
 ) -> None:
     """Compare updated twins and their rivals on real trajectories."""
     import retwin as rt
@@ -87,24 +182,33 @@ def study(
     )
     if sources == "all":
         plan = replace(plan, sources=possible_sources(system, plan))
-    _run(system, plan, StudyData(twin_data, calibration, test, real, data), out, processes)
+    given = StudyData(twin_data, calibration, test, real, data)
+    _run(system, plan, given, out, processes, as_json=as_json)
 
 
-def report(folder: Annotated[Path, typer.Argument(help="Folder of a study.")]) -> None:
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="STUDY", help="Folder of a study.")],
+) -> None:
     """Write the report page again from a study's results."""
     from retwin.report import write_report
 
-    Console().print(str(write_report(folder)), soft_wrap=True)
+    page = write_report(folder)
+    answer(page, str(page))
 
 
 def demo(
     out: Annotated[
-        Path | None, typer.Option(help="Folder for results; demo/real or demo/emulated.")
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Else demo/real, or demo/emulated without real data."),
     ] = None,
-    runs: Annotated[int, typer.Option(help="Runs.")] = 1,
-    seed: Annotated[int, typer.Option(help="Same seed, same result.", min=0)] = 0,
+    runs: Annotated[int, typer.Option(metavar="N", help="Runs.")] = 1,
+    seed: Seed = 0,
+    as_json: Json = False,
 ) -> None:
-    """The whole job of the paper, on real data in `RETWIN_DATA` if set, else on emulated ones."""
+    """The whole job of the paper, on an emulated robot or on real data.
+
+    Real data are those in the folder that `RETWIN_DATA` names.
+    """
     import retwin as rt
     from retwin.study import StudyData, StudyPlan
 
@@ -125,52 +229,83 @@ def demo(
         data = StudyData(twin=recorded if recorded.exists() else None, real=real)
     target = out or Path("demo", "real" if folder else "emulated")
     plan = StudyPlan(runs=runs, seed=seed, folds=folds)
-    _run(rt.cases.get("armpi"), plan, data, target, None)
+    _run(rt.cases.get("armpi"), plan, data, target, None, as_json=as_json)
 
 
-def _run(case: Any, plan: Any, data: Any, out: Path, processes: int | None) -> None:
+def _run(
+    case: Any, plan: Any, data: Any, out: Path, processes: int | None, *, as_json: bool
+) -> None:
     from retwin.report import write_report
     from retwin.study import run_study
 
-    command = shlex.join(["retwin", *sys.argv[1:]])
-    try:
-        with bar("study") as tell:
-            results = run_study(
-                case, plan, data, out, processes=processes, report=tell, command=command
-            )
-            tell("report", 1.0)
-            page = write_report(out)
-    except KeyboardInterrupt:
-        # Typer would end without a word.
-        complain(f"interrupted; give the same command again to go on: {command}")
-        raise typer.Exit(INTERRUPTED) from None
-    console = Console()
-    console.print(_table(results))
-    for line in _gaps(results):
-        console.print(line)
-    console.print(f"Report: {page}", soft_wrap=True)
+    with resumable(), bar("study") as tell:
+        results = run_study(
+            case, plan, data, out, processes=processes, report=tell, command=command_given()
+        )
+        tell("report", 1.0)
+        page = write_report(out)
+    answer(
+        _summary(results, page),
+        _title(results),
+        _table(results),
+        "",
+        *_gaps(results),
+        as_json=as_json,
+    )
+    note(f"Report: {page}")
 
 
-def _table(results: Mapping[str, Any]) -> Table:
+def _summary(results: Mapping[str, Any], page: Path) -> dict[str, Any]:
+    """What is shown as a table, in JSON; everything else is in results.json."""
+    shown = _metrics(results)
+    return {
+        **{key: results[key] for key in ("title", "emulated", "classifier", "runs")},
+        "test_trajectories": results["data"]["test"]["n"],
+        "sources": {
+            name: {"title": source["title"], **{metric: source[metric] for metric in shown}}
+            for name, source in results["sources"].items()
+        },
+        "comparisons": [
+            {key: row[key] for key in ("a", "b", "metric", "mean_diff", "bootstrap_ci95")}
+            for row in results["comparisons"]
+        ],
+        "report": str(page),
+    }
+
+
+def _title(results: Mapping[str, Any]) -> str:
     n, runs = results["data"]["test"]["n"], results["runs"]
     kind = "EMULATED data (no real measurements)" if results["emulated"] else results["title"]
     counted = f"{runs} run{'s' if runs > 1 else ''}"
     what = f"{n} test trajector{'ies' if n > 1 else 'y'}"
-    told = [kind + f": {what}", counted, results["classifier"]]
-    table = Table(title=", ".join(filter(None, told)))
-    sources = results["sources"]
-    shown = {
-        name: title for name, title in COLUMNS.items() if any(name in s for s in sources.values())
-    }
-    table.add_column("training data" if results["classes"] else "source")
-    for title in shown.values():
-        table.add_column(title, justify="right")
-    for source in sources.values():
-        table.add_row(source["title"], *(_over_runs(source[metric]) for metric in shown))
+    return ", ".join(filter(None, (f"{kind}: {what}", counted, results["classifier"])))
+
+
+def _table(results: Mapping[str, Any]) -> Table:
+    sources, shown = results["sources"], _metrics(results)
+    titles = [COLUMNS[metric] for metric in shown]
+    made = table(
+        ("training data" if results["classes"] else "source", *titles),
+        [
+            (source["title"], *(_over_runs(source[metric]) for metric in shown))
+            for source in sources.values()
+        ],
+        numbers=titles,
+    )
     for name, figures in results["published"].items():
         title = sources[name]["title"] if name in sources else name
-        table.add_row(f"  paper: {title}", *(figures.get(m, "") for m in shown), style="dim")
-    return table
+        cells = (f"  paper: {title}", *(figures.get(metric, "") for metric in shown))
+        made.add_row(*(escape(str(cell)) for cell in cells), style="dim")
+    return made
+
+
+def _metrics(results: Mapping[str, Any]) -> list[str]:
+    """Those that this study has: of diagnoses, or of simulations."""
+    return [
+        metric
+        for metric in COLUMNS
+        if any(metric in source for source in results["sources"].values())
+    ]
 
 
 def _over_runs(values: list[float]) -> str:

@@ -3,46 +3,46 @@
 from __future__ import annotations
 
 import json
-import shlex
-import sys
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from retwin import twins
 from retwin.cli.animate import animate
-from retwin.cli.terminal import FAILED, INTERRUPTED, bar, complain
+from retwin.cli.options import Json, Seed
+from retwin.cli.plans import Scheduler, Workers, carry_out
+from retwin.cli.reading import read
+from retwin.cli.terminal import answer, example, table
+from retwin.cli.words import CASES, complete_faults, complete_twins, one_of
 from retwin.errors import InputError
 from retwin.storage import check_target
 
 if TYPE_CHECKING:
     from retwin.case import Case
-    from retwin.twins.protocol import Twin
+    from retwin.trajectories import Channels
+    from retwin.twins.protocol import Limits, Twin
 
 __all__ = ["app"]
 
 app = typer.Typer(
     help="List, describe and simulate twins.",
+    epilog=example("retwin twin info armpi"),
     no_args_is_help=True,
-    rich_markup_mode="markdown",
 )
 
 TwinName = Annotated[
-    str, typer.Argument(metavar="TWIN", help="See `retwin twin list`; or a saved model's folder.")
+    str,
+    typer.Argument(
+        metavar="TWIN",
+        help="See `retwin twin list`; or a saved model's folder.",
+        autocompletion=complete_twins,
+    ),
 ]
-Inputs = Annotated[str, typer.Option(help="Names of the inputs, joined by commas.")]
-Outputs = Annotated[str, typer.Option(help="Names of the outputs, joined by commas.")]
-Rate = Annotated[float | None, typer.Option(help="Samples per second.", min=1e-9)]
-
-app.command(
-    "animate",
-    epilog="Example: `retwin twin animate real.mat --case armpi --id 00036 --out arm.mp4`",
-)(animate)
+Inputs = Annotated[str, typer.Option(metavar="NAMES", help="Of the inputs, joined by commas.")]
+Outputs = Annotated[str, typer.Option(metavar="NAMES", help="Of the outputs, joined by commas.")]
+Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Samples per second.", min=1e-9)]
 
 OTHERS = {
     "FILE.fmu": "an FMU for co-simulation (FMI 2 or 3)",
@@ -53,102 +53,126 @@ OTHERS = {
 }
 
 
-@app.command("list", epilog="Example: `retwin twin list`")
-def list_twins() -> None:
+@app.command("list", epilog=example("retwin twin list"))
+def list_twins(as_json: Json = False) -> None:
     """Say which twins are built in, and what else can be named."""
-    table = Table("TWIN", "is")
-    for name, (_, _, title) in twins.BUILT_IN.items():
-        table.add_row(name, title)
-    table.add_section()
-    for form, title in OTHERS.items():
-        table.add_row(form, title)
-    Console().print(table)
+    built_in = {name: title for name, (_, _, title) in twins.BUILT_IN.items()}
+    answer(
+        {
+            "built_in": [{"name": name, "title": title} for name, title in built_in.items()],
+            "forms": [{"form": form, "title": title} for form, title in OTHERS.items()],
+        },
+        table(("TWIN", "is"), built_in.items()),
+        "",
+        table(("or", "is"), OTHERS.items()),
+        as_json=as_json,
+    )
 
 
-@app.command(epilog="Example: `retwin twin info armpi`")
-def info(twin: TwinName, inputs: Inputs = "", outputs: Outputs = "", rate: Rate = None) -> None:
+@app.command(epilog=example("retwin twin info armpi"))
+def info(
+    twin: TwinName,
+    inputs: Inputs = "",
+    outputs: Outputs = "",
+    rate: Rate = None,
+    as_json: Json = False,
+) -> None:
     """Say what a twin is: its inputs with their limits, its outputs, its rate."""
     found = _twin(twin, inputs, outputs, rate)
-    limits = getattr(found, "limits", None)
-    console = Console()
-    console.print(_title(twin, found), markup=False, highlight=False, soft_wrap=True)
-    table = Table("", "name", "unit", "least", "greatest")
-    for i, (name, unit) in enumerate(zip(found.inputs.names, found.inputs.units, strict=True)):
-        ends = ("", "") if limits is None else (f"{limits.low[i]:g}", f"{limits.high[i]:g}")
-        table.add_row("input", escape(name), escape(unit), *ends)
-    for name, unit in zip(found.outputs.names, found.outputs.units, strict=True):
-        table.add_row("output", escape(name), escape(unit))
-    console.print(table)
-    console.print(f"{found.rate:g} samples per second")
+    told: dict[str, Any] = {
+        "title": _title(twin, found),
+        "rate": found.rate,
+        "inputs": _channels(found.inputs, getattr(found, "limits", None)),
+        "outputs": _channels(found.outputs, None),
+    }
+    rows = [
+        (kind.removesuffix("s"), each["name"], each["unit"], *_ends(each))
+        for kind in ("inputs", "outputs")
+        for each in told[kind]
+    ]
+    answer(
+        told,
+        told["title"],
+        table(("", "name", "unit", "least", "greatest"), rows, numbers=("least", "greatest")),
+        f"{found.rate:g} samples per second",
+        as_json=as_json,
+    )
 
 
-@app.command(
-    epilog="Example: `retwin twin simulate armpi --n 20000 --fault all --seed 1 --out made.zarr`. "
-    "A module in the current folder can be named, too: `retwin twin simulate plant:twin …`"
-)
+def _channels(channels: Channels, limits: Limits | None) -> list[dict[str, Any]]:
+    ends: list[tuple[float | None, float | None]] = [(None, None)] * len(channels)
+    if limits is not None:
+        ends = list(zip(limits.low, limits.high, strict=True))
+    return [
+        {"name": name, "unit": unit, "low": low, "high": high}
+        for name, unit, (low, high) in zip(channels.names, channels.units, ends, strict=True)
+    ]
+
+
+def _ends(channel: dict[str, Any]) -> tuple[str, str]:
+    low, high = (channel[end] for end in ("low", "high"))
+    return ("" if low is None else f"{low:g}", "" if high is None else f"{high:g}")
+
+
+@app.command(epilog=example("retwin twin simulate armpi --n 20000 --fault all --out made.zarr"))
 def simulate(
     twin: TwinName,
-    out: Annotated[Path, typer.Option(help="File *.npz, or folder *.zarr of any size.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="New *.npz, or *.zarr of any size.")],
     n: Annotated[
         int | None,
-        typer.Option("--n", help="Trajectories; by default one per row of --commands, or class."),
+        typer.Option("--n", metavar="N", help="Else one per row of --commands, or class."),
     ] = None,
     case: Annotated[
         str | None,
         typer.Option(
-            help="Case that draws commands and knows faults; a built-in twin has its own."
+            metavar="CASE",
+            help="Draws commands, knows faults; else its own.",
+            autocompletion=one_of(CASES),
         ),
     ] = None,
     commands: Annotated[
-        Path | None, typer.Option(help="Trajectories whose commands are taken in turn.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Trajectories whose commands are taken."),
     ] = None,
     fault: Annotated[
-        str, typer.Option(help="A class of the case, all (dealt in turn) or none.")
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="A class, or all (dealt in turn), or none.",
+            autocompletion=complete_faults,
+        ),
     ] = "none",
     inputs: Inputs = "",
     outputs: Outputs = "",
     rate: Rate = None,
-    seed: Annotated[int, typer.Option(help="Same seed, same result.", min=0)] = 0,
-    clip: Annotated[bool, typer.Option("--clip", help="Clip commands to the limits.")] = False,
-    workers: Annotated[
-        int | None, typer.Option(help="Processes for *.zarr; by default one per core.", min=1)
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler, in place of processes.")
-    ] = None,
-    chunk: Annotated[int, typer.Option(help="Trajectories done together.", min=1)] = 256,
+    seed: Seed = 0,
+    clip: Annotated[
+        bool, typer.Option("--clip", metavar="", help="Clip commands to the limits.")
+    ] = False,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    chunk: Annotated[
+        int, typer.Option(metavar="N", help="Trajectories done together.", min=1)
+    ] = 256,
 ) -> None:
-    """Simulate trajectories to a file; interrupted on the way to *.zarr, it can go on."""
-    from retwin.scale import SimulationPlan, simulate_to
+    """Simulate trajectories to a file; interrupted on the way to a *.zarr, it can go on."""
+    from retwin.scale import SimulationPlan
 
     check_target(out)
     found = _twin(twin, inputs, outputs, rate)
     system = _case(case, twin, found)
     faults = _faults(system, fault)
-    drawn = _sampler(system, found) if commands is None else _recorded(commands, system)
+    drawn = _sampler(system, found) if commands is None else read(commands, system)
     if commands is None and n is None:
         n = len(faults)
     plan = SimulationPlan(found, drawn, seed, n, faults, clip=clip, chunk=chunk)
-    try:
-        with bar("simulate") as tell:
-            done = simulate_to(
-                out,
-                plan,
-                workers=workers,
-                scheduler=scheduler,
-                progress=lambda share: tell(f"{share * plan.count:.0f} of {plan.count}", share),
-            )
-    except KeyboardInterrupt:
-        # Typer would end without a word.
-        again = shlex.join(["retwin", *sys.argv[1:]])
-        complain(f"interrupted; give the same command again to go on: {again}")
-        raise typer.Exit(INTERRUPTED) from None
-    Console().print(f"Wrote {done.count - len(done.failed)} trajectories to {out}", soft_wrap=True)
-    if done.failed:
-        named = "; ".join(f"trajectory {i}: {why}" for i, why in list(done.failed.items())[:5])
-        more = "; …" if len(done.failed) > 5 else ""
-        complain(f"{len(done.failed)} of {done.count} simulations failed: {named}{more}")
-        raise typer.Exit(FAILED)
+    carry_out(plan, out, "simulate", workers=workers, scheduler=scheduler)
+
+
+app.command(
+    "animate",
+    epilog=example("retwin twin animate real.mat --case armpi --id 00036 --out arm.mp4"),
+)(animate)
 
 
 def _twin(name: str, inputs: str, outputs: str, rate: float | None) -> Twin:
@@ -250,10 +274,3 @@ def _sampler(system: Case | None, found: Twin) -> Any:
             remedy="give --commands FILE, or --case NAME",
         )
     return RampSampler(limits.low, limits.high)
-
-
-def _recorded(file: Path, system: Case | None) -> Any:
-    from retwin.storage import load
-
-    with bar("read") as tell:
-        return load(file, case=system, progress=lambda share: tell(file.name, share))

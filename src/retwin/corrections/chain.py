@@ -103,7 +103,7 @@ class Chain:
     def apply(self, context: Context, z: Tensor) -> Tensor:
         """The outputs after all operators, before a sensor records them."""
         for operator, part in zip(self._operators, self._split(context, z), strict=True):
-            context = replace(context, path=operator.apply(context, part))
+            context = replace(context, corrected=operator.apply(context, part))
         return context.path
 
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
@@ -112,7 +112,7 @@ class Chain:
             return self.first.infer(context, observed, readings(self, observed, mask))
         one = self.first.infer(context, observed, mask)
         with torch.no_grad():
-            left = replace(context, path=self.first.apply(context, one.z))
+            left = replace(context, corrected=self.first.apply(context, one.z))
         other = self.second.infer(left, observed, mask)
         width = one.z.shape[-1] + other.z.shape[-1]
         covariance = one.covariance.new_zeros(*one.z.shape[:2], width, width)
@@ -132,7 +132,7 @@ class Chain:
         """The z of each operator."""
         inputs, outputs = (
             Channels.numbered(name, values.shape[2])
-            for name, values in (("u", context.commands), ("y", context.path))
+            for name, values in (("u", context.commands), ("y", context.nominal))
         )
         return z.split([len(each.latent(inputs, outputs)) for each in self._operators], dim=-1)
 
@@ -164,7 +164,19 @@ def readings(correction: Correction, observed: Tensor, mask: Tensor) -> Tensor:
     return mask if sensor is None else sensor.timed(observed, mask).readings(observed, mask)
 
 
-def recorded(correction: Correction, outputs: Tensor, generator: torch.Generator) -> Tensor:
-    """What the operator's sensor, if it has one, makes of corrected outputs (n, T, d_y)."""
+def recorded(
+    correction: Correction, context: Context, z: Tensor, generator: torch.Generator
+) -> Tensor:
+    """The corrected outputs (n, T, d_y) as the operator's sensor, if it has one, records them.
+
+    Where they are not read they are not computed, if the operator can tell them sample by sample.
+    """
     sensor = _sensor(correction)
-    return outputs if sensor is None else sensor.read(outputs, generator)
+    if sensor is None or not isinstance(correction, Chain):
+        return correction.apply(context, z)
+    at = getattr(correction.first, "at", None)
+    if at is None or sensor.every is None:
+        return sensor.read(correction.apply(context, z), generator)
+    steps = context.commands.shape[1]
+    when = sensor.polls(len(context), steps, generator)
+    return sensor.record(at(context, z, when), when, steps, generator)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from retwin.corrections.command_effect import effective
 from retwin.corrections.protocol import Context
+from retwin.surrogate import distinct
 
 if TYPE_CHECKING:
     from retwin.corrections.command_space import CommandSpace
@@ -55,11 +56,10 @@ class Problem:
         self.segments = context.segments
         self.told = context.told.double()
         start = torch.as_tensor(context.segments.start)[..., None]
-        frozen = context.frozen[:, None].double()
         bent = (context.told != context.commands).any(dim=1)[:, None]
         self.valid = torch.as_tensor(context.segments.valid)
         self.faulty = bent & self.valid[..., None]
-        self.healthy = self.valid[..., None] & ~bent & (start < frozen)
+        self.healthy = self.valid[..., None] & ~bent & (start < context.frozen[:, None])
 
         seen = mask.all(dim=-1)
         at = seen.any(dim=0).nonzero()[:, 0]
@@ -80,8 +80,8 @@ class Problem:
         every = torch.arange(context.told.shape[1])
         time = every if self.memory else self.at
         self.kept = self.at if self.memory else torch.arange(len(self.at))
-        # A frozen actuator stays where it is at its onset.
-        self.when = torch.minimum(time[:, None].double(), frozen)
+        self.when = time.double()
+        self.frozen = context.frozen.double()
 
     def __len__(self) -> int:
         return len(self.told)
@@ -91,7 +91,7 @@ class Problem:
         part = object.__new__(Problem)
         part.__dict__.update(self.__dict__)
         part.segments = self.segments[rows.numpy()]
-        for name in ("told", "valid", "healthy", "faulty", "seen", "moving", "observed", "when"):
+        for name in ("told", "valid", "healthy", "faulty", "seen", "moving", "observed", "frozen"):
             setattr(part, name, getattr(self, name)[rows])
         return part
 
@@ -104,7 +104,7 @@ class Problem:
     def commands(self, x: Tensor, missed: Tensor) -> Tensor:
         """What the actuators are effectively told, single precision."""
         z = torch.cat([x, missed], dim=-1)
-        return effective(self.told, self.segments, z, self.when).float()
+        return effective(self.told, self.segments, z, self.when, self.frozen).float()
 
     @torch.no_grad()
     def residual(self, x: Tensor, missed: Tensor) -> Tensor:
@@ -159,8 +159,8 @@ class Problem:
         told = self.commands(x, missed)
         if self.memory:
             return self.observed - self.surrogate(told)[:, self.kept].double() / self.unit
-        fresh, place = _distinct(told)
-        return self.observed - self.surrogate(told[fresh][None])[0, place].double() / self.unit
+        rows, place = distinct(told)
+        return self.observed - self.surrogate(rows[None])[0, place].double() / self.unit
 
     def _linearised(self, x: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
         if self.memory:
@@ -177,10 +177,9 @@ class Problem:
 
     def _slope(self, x: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
         """The residual (n, S, d_y), and how outputs turn with commands (n, S, d_y, d_u)."""
-        told = self.commands(x, missed)
-        fresh, place = _distinct(told)
+        rows, place = distinct(self.commands(x, missed))
         with torch.enable_grad():
-            asked = told[fresh][None].requires_grad_()
+            asked = rows[None].requires_grad_()
             said = self.surrogate(asked)
             slopes = torch.cat(
                 [
@@ -218,16 +217,8 @@ class Problem:
         count = len(moved)
         rows = torch.arange(len(x)).repeat_interleave(count)
         z = torch.cat([(x[:, None] + moved).flatten(0, 1), missed[rows]], dim=-1)
-        told = effective(self.told[rows], self.segments[rows.numpy()], z, self.when[rows])
+        segments, frozen = self.segments[rows.numpy()], self.frozen[rows]
+        told = effective(self.told[rows], segments, z, self.when, frozen)
         told = told.unflatten(0, (len(x), count))
         late, off = ((told[:, 1:] - told[:, :1]) / TURN).split(movements, dim=1)
         return late, off
-
-
-def _distinct(told: Tensor) -> tuple[Tensor, Tensor]:
-    """Where commands (n, S, d_u) differ from the sample before (bool), and for each sample the
-    index of those that it shares: what is held says the same all over.
-    """
-    fresh = torch.ones(told.shape[:2], dtype=torch.bool)
-    fresh[:, 1:] = (told[:, 1:] != told[:, :-1]).any(dim=-1)
-    return fresh, (fresh.flatten().cumsum(dim=0) - 1).view(fresh.shape)

@@ -16,6 +16,8 @@ from torch import Tensor
 from retwin.corrections.command_effect import effective
 from retwin.corrections.command_inference import infer_commands
 from retwin.corrections.protocol import Context, Discrepancy, Head
+from retwin.corrections.warp import taken
+from retwin.surrogate import distinct
 from retwin.trajectories import Channels
 
 __all__ = ["CommandSpace"]
@@ -72,10 +74,14 @@ class CommandSpace:
 
     def apply(self, context: Context, z: Tensor) -> Tensor:
         """ỹ = G_φ(T_z(u)), differentiable in z; a frozen actuator stays where z had brought it."""
-        time = torch.arange(context.told.shape[1], dtype=z.dtype)
-        held = torch.minimum(time[:, None], context.frozen[:, None].to(z.dtype))
-        told = effective(context.told.to(z.dtype), context.segments, z, held)
-        return context.surrogate(told.to(context.told.dtype))
+        return context.surrogate(_told(context, z, torch.arange(context.told.shape[1])))
+
+    def at(self, context: Context, z: Tensor, when: Tensor) -> Tensor:
+        """The same (n, S, d_y) at the samples `when` (n, S) only."""
+        if not getattr(context.surrogate, "memoryless", False):
+            return taken(self.apply(context, z), when)
+        rows, place = distinct(_told(context, z, when))
+        return context.surrogate(rows[None])[0, place]
 
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """z* and its covariance from outputs alone; see `retwin.corrections.command_inference`."""
@@ -83,3 +89,9 @@ class CommandSpace:
 
 
 KINDS = ("offset", "missed")
+
+
+def _told(context: Context, z: Tensor, when: Tensor) -> Tensor:
+    """T_z(u) at the samples `when`, (n, S) or (S,)."""
+    told = effective(context.told.to(z.dtype), context.segments, z, when, context.frozen)
+    return told.to(context.told.dtype)

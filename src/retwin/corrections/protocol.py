@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, runtime_checkable
 
 import torch
@@ -58,10 +58,9 @@ class Context:
     told: (n, T, d_u), with the faults' effect on the reference.
     frozen: (n, d_u), the sample from which a fault holds an actuator's response; T for never.
     nominal: (n, T, d_y), the surrogate's output for the clean commands.
-    path: (n, T, d_y), the surrogate's output for what the actuators are told, held where they are
-        frozen: what is corrected.
     segments: movements of the clean commands or of the nominal path.
     rate: samples per second.
+    corrected: (n, T, d_y), what operators before this one have left; None for the first.
 
     """
 
@@ -70,12 +69,30 @@ class Context:
     told: Tensor
     frozen: Tensor
     nominal: Tensor
-    path: Tensor
     segments: Segments
     rate: float
+    corrected: Tensor | None = None
+    _found: list[Tensor] = field(default_factory=list, init=False, repr=False)
 
     def __len__(self) -> int:
         return len(self.commands)
+
+    @property
+    def path(self) -> Tensor:
+        """(n, T, d_y), what is corrected: what operators before have left, else the surrogate's
+        output for what the actuators are told, held where they are frozen.
+
+        Asked of the surrogate when it is first needed: an operator on commands needs it not.
+        """
+        if self.corrected is not None:
+            return self.corrected
+        if not self._found:
+            time = torch.arange(self.told.shape[1])[:, None]
+            held = self.told.gather(1, torch.minimum(time, self.frozen[:, None]))
+            clean = held.equal(self.commands)
+            said = self.nominal if clean else torch.as_tensor(self.surrogate.predict(held.numpy()))
+            self._found.append(said)
+        return self._found[0]
 
     @property
     def unit(self) -> Tensor:
@@ -90,8 +107,8 @@ class Context:
             told=self.told[index],
             frozen=self.frozen[index],
             nominal=self.nominal[index],
-            path=self.path[index],
             segments=self.segments[index],
+            corrected=self.path[index],
         )
 
     @classmethod
@@ -105,19 +122,19 @@ class Context:
         told: NDArray | None = None,
         frozen: NDArray | None = None,
     ) -> Context:
-        """The context of those commands; the surrogate is asked once, or twice with faults."""
+        """The context of those commands, without faults by default."""
         clean = torch.tensor(commands, dtype=torch.float32)
-        nominal = torch.as_tensor(surrogate.predict(commands))
-        steps = commands.shape[1]
-        never = torch.full((len(commands), commands.shape[2]), steps)
-        if told is None and frozen is None:
-            return cls(surrogate, clean, clean, never, nominal, nominal, segments, rate)
-        reference = clean if told is None else torch.tensor(told, dtype=torch.float32)
-        since = never if frozen is None else torch.as_tensor(frozen)
-        time = torch.minimum(torch.arange(steps)[:, None], since[:, None])
-        held = reference.gather(1, time)
-        path = torch.as_tensor(surrogate.predict(held.numpy()))
-        return cls(surrogate, clean, reference, since, nominal, path, segments, rate)
+        return cls(
+            surrogate,
+            commands=clean,
+            told=clean if told is None else torch.tensor(told, dtype=torch.float32),
+            frozen=torch.full((len(clean), clean.shape[2]), clean.shape[1])
+            if frozen is None
+            else torch.as_tensor(frozen),
+            nominal=torch.as_tensor(surrogate.predict(commands)),
+            segments=segments,
+            rate=rate,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +166,9 @@ class Discrepancy:
 class Correction(Protocol):
     """An operator g with its inverse; holds settings, no data.
 
-    One may also have `pools`, true if what it infers of a trajectory leans on those beside it, and
-    `severities`, true if it tells how severe a known fault is apart from z.
+    One may also have `pools`, true if what it infers of a trajectory leans on those beside it;
+    `severities`, true if it tells how severe a known fault is apart from z; and
+    `at(context, z, when)`, what `apply` gives at some samples (n, S) only, if that costs less.
     """
 
     @property

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from retwin.corrections.warp import taken
 from retwin.errors import InputError
 from retwin.segments import Segments
 
@@ -146,27 +147,35 @@ class SampledSensor:
         """The record of outputs (n, T, d_y); differentiable, rounding passed straight through."""
         if self.every is None:
             return outputs
-        n, steps, width = outputs.shape
-        choice = torch.tensor(self.phases or range(self.every))
-        phase = choice[torch.randint(len(choice), (n,), generator=generator)][:, None]
-        count = -(-steps // self.every)
-        at = phase + self.every * torch.arange(count)
-        last = (at < steps).sum(dim=1, keepdim=True) - 1
-        values = outputs.gather(1, at.clamp_max(steps - 1)[..., None].expand(-1, -1, width))
+        steps = outputs.shape[1]
+        when = self.polls(len(outputs), steps, generator)
+        return self.record(taken(outputs, when), when, steps, generator)
+
+    def polls(self, count: int, steps: int, generator: torch.Generator) -> Tensor:
+        """When records of so many samples are read, (count, R); at the last one if beyond it."""
+        every = self.every or 1
+        choice = torch.tensor(self.phases or range(every))
+        phase = choice[torch.randint(len(choice), (count,), generator=generator)]
+        readings = -(-steps // every)
+        return (phase[:, None] + every * torch.arange(readings)).clamp_max(steps - 1)
+
+    def record(
+        self, values: Tensor, when: Tensor, steps: int, generator: torch.Generator
+    ) -> Tensor:
+        """The record (n, steps, d_y) of outputs (n, R, d_y) at their `polls` (n, R)."""
         values = values + self._errors(values, generator)
         if self.steps is not None and any(self.steps):
             step = values.new_tensor(self.steps)
             whole = torch.where(step > 0, step * (values / step.clamp_min(1e-30)).round(), values)
             values = values + (whole - values).detach()
-        if self.every == 1:
+        every, phase = self.every or 1, when[:, :1]
+        if every == 1:
             return values
-        place = ((torch.arange(steps) - phase) / self.every).clamp_min(0)
+        last = (steps - 1 - phase) // every
+        place = ((torch.arange(steps) - phase) / every).clamp_min(0)
         left = place.floor().long().minimum(last)
         share = (place - left).clamp(0, 1)[..., None].to(values)
-        before, after = (
-            values.gather(1, index[..., None].expand(-1, -1, width))
-            for index in (left, (left + 1).minimum(last))
-        )
+        before, after = (taken(values, index) for index in (left, (left + 1).minimum(last)))
         return before + share * (after - before)
 
     def _errors(self, like: Tensor, generator: torch.Generator) -> Tensor:

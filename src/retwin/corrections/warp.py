@@ -9,7 +9,7 @@ from torch import Tensor
 
 from retwin.segments import Segments
 
-__all__ = ["Knots", "read"]
+__all__ = ["Knots", "read", "taken"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,24 +48,20 @@ class Knots:
 
     def between(self, values: Tensor) -> Tensor:
         """Values (n, 2 M, k) of the knots, linear between them and constant outside: (n, T, k)."""
-        before, after = (self._of(values, place) for place in self._around)
+        before, after = (taken(values, place) for place in self._around)
         return before + self.share[..., None] * (after - before)
 
     def slope(self, values: Tensor) -> Tensor:
         """Change per sample of `between` (n, T, k)."""
         before, after = self._around
         length = self.target.gather(1, after) - self.target.gather(1, before)
-        rise = self._of(values, after) - self._of(values, before)
+        rise = taken(values, after) - taken(values, before)
         return rise / length.clamp_min(1e-9)[..., None]
 
     @property
     def _around(self) -> tuple[Tensor, Tensor]:
         """Index (n, T) of the knot before each sample, and after it; the same one outside."""
         return (self.right - 1).clamp_min(0), self.right.minimum(self.last)
-
-    @staticmethod
-    def _of(values: Tensor, place: Tensor) -> Tensor:
-        return values.gather(1, place[..., None].expand(-1, -1, values.shape[2]))
 
     def source_time(self) -> Tensor:
         """When in the uncorrected path each sample (n, T) is read."""
@@ -81,10 +77,14 @@ class Knots:
         return torch.stack([before, offset], dim=2).flatten(1, 2)
 
 
+def taken(values: Tensor, place: Tensor) -> Tensor:
+    """The values (n, T, d) at whole places (n, S) of their own: (n, S, d)."""
+    return values.gather(1, place[..., None].expand(-1, -1, values.shape[2]))
+
+
 def read(path: Tensor, when: Tensor) -> Tensor:
     """The path (n, T, d) at the fractional samples `when` (n, T), held beyond its ends."""
     when = when.clamp(0, path.shape[1] - 1)
     below = when.detach().floor().long().clamp_max(max(path.shape[1] - 2, 0))
-    index = below[..., None].expand(-1, -1, path.shape[2])
-    before, after = path.gather(1, index), path.gather(1, index + 1)
+    before, after = taken(path, below), taken(path, below + 1)
     return before + (when - below)[..., None] * (after - before)

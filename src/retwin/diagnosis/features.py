@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from retwin.arrays import row_blocks
 from retwin.errors import InputError
 from retwin.segments import Segments
 from retwin.trajectories import Channels, Trajectories
@@ -95,19 +96,23 @@ class Features:
         return self._read(trajectories, time.ravel()).unflatten(1, time.shape)
 
     def _read(self, trajectories: Trajectories, time: NDArray) -> Tensor:
-        """Features at these samples, (n, len(time), 2 d_y)."""
+        """Features at these samples, (n, len(time), 2 d_y); made block by block."""
         self._check(trajectories)
-        nominal = trajectories.nominal[:, time]
-        residual = np.where(
-            trajectories.mask[:, time], trajectories.observed[:, time] - nominal, 0.0
-        )
-        if self.hide_start:
-            settled = self._settled(trajectories)
-            hidden = (time < settled[:, None])[:, :, None]
-            at_rest = trajectories.nominal[np.arange(len(trajectories)), settled]
-            nominal = np.where(hidden, at_rest[:, None], nominal)
-            residual = np.where(hidden, 0.0, residual)
-        return torch.as_tensor(np.concatenate([nominal, residual], axis=2), dtype=torch.float32)
+        settled = self._settled(trajectories) if self.hide_start else None
+        found = np.empty((len(trajectories), len(time), self.width), np.float32)
+        for rows in row_blocks(trajectories.nominal):
+            nominal = trajectories.nominal[rows][:, time]
+            there = trajectories.mask[rows][:, time]
+            residual = np.where(there, trajectories.observed[rows][:, time] - nominal, 0.0)
+            if settled is not None:
+                hidden = (time < settled[rows, None])[:, :, None]
+                at_rest = np.take_along_axis(
+                    trajectories.nominal[rows], settled[rows, None, None], axis=1
+                )
+                nominal = np.where(hidden, at_rest, nominal)
+                residual = np.where(hidden, 0.0, residual)
+            found[rows] = np.concatenate([nominal, residual], axis=2)
+        return torch.from_numpy(found)
 
     def _settled(self, trajectories: Trajectories) -> NDArray:
         """The sample (n,) at which the first movement has come to rest; the last where none is."""

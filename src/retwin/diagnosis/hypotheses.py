@@ -229,11 +229,9 @@ class Hypotheses:
         problem = copy.copy(self.problem)
         steps, width = problem.told.shape[1:]
         mine = torch.nn.functional.one_hot(self.actuator, width).bool()
-        frozen = torch.where(mine, onset[:, None], steps)[:, None].double()
-        time = torch.arange(steps) if problem.memory else problem.at
-        problem.when = torch.minimum(time[:, None].double(), frozen)
+        problem.frozen = torch.where(mine, onset[:, None], steps).double()
         start = torch.as_tensor(problem.segments.start)[..., None]
-        problem.healthy = problem.valid[..., None] & (start < frozen)
+        problem.healthy = problem.valid[..., None] & (start < problem.frozen[:, None])
         return replace(self, problem=problem)
 
     def inverted(self, noise: Noise) -> Inversion:
@@ -296,12 +294,10 @@ class Hypotheses:
         """Where the faulty actuator ends, and the standard deviation of that."""
         problem = self.problem
         x = fit.x.clone().requires_grad_()
-        last = onset.clamp_max(problem.told.shape[1] - 1).double()[:, None, None]
+        last = onset.clamp_max(problem.told.shape[1] - 1)[:, None]
         with torch.enable_grad():
             z = torch.cat([x, fit.missed], dim=-1)
-            reached = effective(
-                problem.told, problem.segments, z, last.expand_as(problem.told[:, :1])
-            )
+            reached = effective(problem.told, problem.segments, z, last)
             level = reached[:, 0].gather(1, self.actuator[:, None])[:, 0]
             slope = torch.autograd.grad(level.sum(), x, allow_unused=True)[0]
         flat = torch.zeros_like(x) if slope is None else slope

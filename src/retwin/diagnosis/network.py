@@ -47,12 +47,14 @@ class NetworkDiagnoser(nn.Module):
         """Logits (n, classes)."""
         return self.network(self.before(features))
 
-    @torch.no_grad()
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
         """Probabilities (n, classes), see `Diagnoser`."""
-        parts = [
-            self(part).double().softmax(dim=1) for part in self.features(trajectories).split(CHUNK)
-        ]
+        return self.of_features(self.features(trajectories))
+
+    @torch.no_grad()
+    def of_features(self, features: Tensor) -> NDArray:
+        """Probabilities (n, classes) for features (n, T', d), in chunks."""
+        parts = [self(part).double().softmax(dim=1) for part in features.split(CHUNK)]
         return torch.cat(parts).numpy()
 
     def save(self, folder: str | Path) -> None:
@@ -124,8 +126,10 @@ def fit_diagnoser(
     features = Features.at(trajectories, rate)
     with isolated(seed):
         model = NetworkDiagnoser(network, features, classes=order)
-    fitted_on, held_out = trajectories.split(0.8, seed=seed)
-    sets = [(features(part), class_index(part, order)) for part in (fitted_on, held_out)]
+    # Features are split and not trajectories, which no memory may hold.
+    every, truth = features(trajectories), class_index(trajectories, order)
+    sets = [(every[part], truth[part]) for part in trajectories.split_index(0.8, seed=seed)]
+    del every
     model.before.fit(sets[0][0])
 
     def loss(module: nn.Module, batch: tuple[Tensor, ...]) -> Tensor:
@@ -140,6 +144,6 @@ def fit_diagnoser(
         seed=seed,
         progress=progress,
     )
-    right = model.predict_proba(held_out).argmax(axis=1) == sets[1][1].numpy()
+    right = model.of_features(sets[1][0]).argmax(axis=1) == sets[1][1].numpy()
     model.fitted = replace(result, figures={"accuracy": float(right.mean())})
     return model

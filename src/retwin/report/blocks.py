@@ -7,20 +7,23 @@ there. The template shows each block by its `kind`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from retwin.report.results import Results
 
 __all__ = [
     "Block",
+    "Calculator",
     "Cell",
     "Column",
+    "Command",
     "Explorer",
     "Facts",
     "Fold",
     "Forest",
     "Key",
+    "Link",
     "Matrices",
     "Matrix",
     "Panel",
@@ -52,13 +55,22 @@ class Forest:
 
 
 @dataclass(frozen=True)
+class Link:
+    """To a place on the page, by its anchor."""
+
+    text: str
+    anchor: str
+
+
+@dataclass(frozen=True)
 class Cell:
-    """One cell: text, a smaller line under it, emphasis, the colour of a source, a picture."""
+    """One cell: text, a smaller line under it, emphasis, whose colour it has, links, a picture."""
 
     text: str
     below: str = ""
     best: bool = False
-    slot: int | None = None
+    source: str = ""
+    links: Sequence[Link] = ()
     forest: Forest | None = None
     tone: str = ""
 
@@ -77,6 +89,7 @@ class Column:
 class Table:
     """Rows of cells; the first cell of a row heads it, a row of one cell heads those below it."""
 
+    title: str
     caption: str
     columns: Sequence[Column]
     rows: Sequence[Sequence[Cell]]
@@ -96,7 +109,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Key:
-    """Entry of a legend: text, colour token, and mark (a line's dash, `disc`, `bar`, `diamond`)."""
+    """Entry of a legend: text, colour token, and mark (a line's dash, a symbol, `bar`)."""
 
     text: str
     colour: str
@@ -105,13 +118,17 @@ class Key:
 
 @dataclass(frozen=True)
 class Panel:
-    """One plotly picture: `data` and `layout`, in which `@name` stands for a colour."""
+    """One plotly picture: `data` and `layout`, in which `@name` stands for a colour.
+
+    `narrow` is what of the layout is otherwise where there is little room.
+    """
 
     spec: dict[str, Any]
     alt: str
     title: str = ""
     note: str = ""
     height: int = 340
+    narrow: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -134,7 +151,7 @@ class Matrix:
     """Confusion counts of one source, with each row's shares in whole percent."""
 
     title: str
-    slot: int
+    source: str
     below: str
     counts: Sequence[Sequence[int]]
     shares: Sequence[Sequence[int]]
@@ -153,11 +170,30 @@ class Matrices:
 
 @dataclass(frozen=True)
 class Facts:
-    """Pairs of a term and what it is; `code` pairs are shown to be copied."""
+    """Pairs of a term and what it is, under a heading."""
 
+    title: str
     pairs: Sequence[tuple[str, str]]
-    code: Sequence[tuple[str, str]] = ()
     kind: ClassVar[str] = "facts"
+
+
+@dataclass(frozen=True)
+class Command:
+    """What is typed into a terminal, to be copied."""
+
+    title: str
+    text: str
+    kind: ClassVar[str] = "command"
+
+
+@dataclass(frozen=True)
+class Calculator:
+    """A form in which a reader sets rates and costs; `content` is what its script looks up."""
+
+    title: str
+    caption: str
+    content: dict[str, Any]
+    kind: ClassVar[str] = "calculator"
 
 
 @dataclass(frozen=True)
@@ -179,7 +215,7 @@ class Fold:
     kind: ClassVar[str] = "fold"
 
 
-Block = Prose | Table | Plot | Matrices | Facts | Fold | Explorer
+Block = Prose | Table | Plot | Matrices | Facts | Command | Fold | Calculator | Explorer
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from retwin.report.results import Comparison, Results
-from retwin.report.scores import headline, outcome
+from retwin.report.results import Results
+from retwin.report.verdict import between, headline, outcome
 from retwin.report.words import (
     METRICS,
     duration,
@@ -51,10 +51,11 @@ def claims(results: Results) -> list[Claim]:
 
 
 def _accuracy(results: Results, pair: tuple[str, str]) -> Claim | None:
-    metric = next((name for name in METRICS if _between(results.comparisons, *pair, name)), None)
+    told = {each.metric: each for each in between(results.comparisons, *pair)}
+    metric = next((name for name in METRICS if name in told), None)
     if metric is None:
         return None
-    found = _between(results.comparisons, *pair, metric)[0]
+    found = told[metric]
     light = LIGHTS.get(outcome(found))
     if light is None:
         return None
@@ -117,11 +118,6 @@ def _time(results: Results, pair: tuple[str, str]) -> Claim | None:
         f"Updated{made} in {duration(whole)} on one core",
         f"holds up to {duration(SOON)}, fails beyond {duration(LATE)}",
     )
-
-
-def _between(found: Sequence[Comparison], a: str, b: str, metric: str) -> list[Comparison]:
-    pair = [each for each in found if {each.a, each.b} == {a, b}]
-    return [each.seen_from(a) for each in pair if each.metric == metric]
 
 
 def _within(ends: tuple[float, float] | None) -> str:

@@ -1,4 +1,4 @@
-"""Numbers behind the figures: ROC curves over runs, binned latents, the floor of the ECE."""
+"""Numbers behind the figures of fidelity: binned latents, and bands around what was measured."""
 
 from __future__ import annotations
 
@@ -10,66 +10,7 @@ from numpy.typing import NDArray
 from retwin.report.results import Results
 from retwin.report.words import quantity
 
-__all__ = ["Band", "Latent", "Roc", "bands", "ece_floor", "latents", "micro_roc"]
-
-GRID = np.linspace(0, 1, 201)
-
-
-@dataclass(frozen=True)
-class Roc:
-    """Micro-averaged ROC over runs: false positive rate, mean true positive rate, its spread."""
-
-    rate: NDArray
-    mean: NDArray
-    spread: NDArray
-    areas: NDArray
-
-    @property
-    def band(self) -> tuple[NDArray, NDArray]:
-        """Mean ± one standard deviation, inside [0, 1]."""
-        return np.clip(self.mean - self.spread, 0, 1), np.clip(self.mean + self.spread, 0, 1)
-
-
-def micro_roc(probabilities: NDArray, truth: NDArray) -> Roc:
-    """ROC of (runs, n, classes) with every (trajectory, class) pair taken as one decision."""
-    positive = (truth[:, None] == np.arange(probabilities.shape[2])).ravel()
-    curves, areas = [], []
-    for scores in probabilities:
-        false, true = _roc(scores.ravel(), positive)
-        areas.append(np.trapezoid(true, false))
-        # Where the curve rises straight up, its upper end counts.
-        last = np.append(np.flatnonzero(np.diff(false)), len(false) - 1)
-        curves.append(np.interp(GRID, false[last], true[last]))
-    stacked = np.array(curves)
-    spread = stacked.std(axis=0, ddof=1) if len(stacked) > 1 else np.zeros(len(GRID))
-    return Roc(GRID, stacked.mean(axis=0), spread, np.array(areas))
-
-
-def _roc(scores: NDArray, positive: NDArray) -> tuple[NDArray, NDArray]:
-    falling = np.argsort(-scores, kind="stable")
-    ends = np.append(np.flatnonzero(np.diff(scores[falling])), len(scores) - 1)
-    true = np.cumsum(positive[falling])[ends]
-    false = ends + 1 - true
-    return np.r_[0, false] / max(false[-1], 1), np.r_[0, true] / max(true[-1], 1)
-
-
-def ece_floor(probabilities: NDArray, *, draws: int = 200, bins: int = 10) -> float:
-    """ECE that a perfectly calibrated classifier with these confidences would still show.
-
-    Whether each answer is right is drawn with its confidence as the chance; the mean of the
-    top-label ECE over equal-mass bins is the floor, which comes from few trajectories alone.
-    """
-    rng = np.random.default_rng(0)
-    floors = []
-    for confidence in np.sort(probabilities.max(axis=2), axis=1):
-        right = rng.random((draws, len(confidence))) < confidence
-        gaps = np.zeros(draws)
-        for bin_ in np.array_split(np.arange(len(confidence)), bins):
-            if len(bin_):
-                gap = right[:, bin_].mean(axis=1) - confidence[bin_].mean()
-                gaps += len(bin_) / len(confidence) * np.abs(gap)
-        floors.append(gaps.mean())
-    return float(np.mean(floors))
+__all__ = ["Band", "Latent", "bands", "latents"]
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,8 @@
     const minus = (text) => text.replace("-", "−");
     if (deviation < 5e-4) return minus(String(Number(value.toPrecision(3))));
     const places = Math.min(3, Math.max(0, 1 - Math.floor(Math.log10(deviation))));
-    return `${minus(value.toFixed(places))} ± ${deviation.toFixed(places)}`;
+    const rounded = Number(value.toFixed(places)) || 0;  // no negative zero
+    return `${minus(rounded.toFixed(places))} ± ${deviation.toFixed(places)}`;
   };
   let picked = 0;
   let moment = 0;
@@ -120,7 +121,7 @@
       const best = chance.indexOf(Math.max(...chance));
       const cells = chance.map((value, k) => {
         const percent = Math.round(100 * value);
-        const made = cell("td", percent ? String(percent) : "", { className: [k === truth ? "right" : "", percent >= 68 ? "half" : "", percent >= 78 ? "full" : "", k === best ? "best" : ""].join(" ").trim() });
+        const made = cell("td", percent ? String(percent) : "", { className: [k === truth ? "right" : "", k === best ? "best" : ""].join(" ").trim() });
         made.style.setProperty("--share", `${percent}%`);
         made.style.setProperty("--colour", `var(--c${source.slot})`);
         return made;
@@ -194,7 +195,17 @@
     if (go) playing = setInterval(() => move((moment + 1) % seconds.length), 1000 / Math.min(content.rate, 20));
   });
   moment = Math.round(0.3 * (seconds.length - 1));
+  // A link to #trajectory=NAME shows that trajectory.
+  const follow = () => {
+    const [what, name] = location.hash.slice(1).split("=");
+    const found = what === "trajectory" ? content.ids.indexOf(decodeURIComponent(name)) : -1;
+    if (found < 0) return;
+    pick(found);
+    place.scrollIntoView();
+  };
+  window.addEventListener("hashchange", follow);
   page.drawn.push(draw);
   pick(sequence[0]);
   move(moment);
+  follow();
 })();

@@ -11,19 +11,25 @@ from numpy.typing import NDArray
 from retwin.report.blocks import Explorer, Key, Section
 from retwin.report.plots import caption
 from retwin.report.results import Results
-from retwin.report.words import class_name, order, quantity, slot, source_name
+from retwin.report.words import DASHES, PALETTE, class_name, order, quantity, slot, source_name
 
-__all__ = ["explorer", "packed"]
+__all__ = ["explorable", "explorer", "packed"]
 
 NOTHING = -32768
 """Stands for a number that is not there."""
 STEPS = 65534
 
 
+def explorable(results: Results) -> bool:
+    """Whether the page has an explorer."""
+    there = results.portrait is not None and "portrait/bands" in results.arrays
+    return there and bool(results.data.test.ids)
+
+
 def explorer(results: Results) -> Section | None:
     """Commands, outputs and bands, movements, z, probabilities and poses of each trajectory."""
     told = results.portrait
-    if told is None or "portrait/bands" not in results.arrays or not results.data.test.ids:
+    if told is None or not explorable(results):
         return None
     keys = [
         Key("measured", "ink"),
@@ -34,6 +40,10 @@ def explorer(results: Results) -> Section | None:
             "bar",
         ),
         Key("in motion", "grid", "bar"),
+        *(
+            Key(f"command {name}", f"c{u % len(PALETTE)}", DASHES[u % len(DASHES)])
+            for u, name in enumerate(results.inputs.names)
+        ),
     ]
     text = (
         "Pick any test trajectory. Bands are those of the corrected twin with nothing broken: a "

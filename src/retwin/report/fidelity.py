@@ -1,115 +1,32 @@
-"""How real the draws of a corrected twin are: its discrepancies, its scores, its bands."""
+"""How real the draws of a corrected twin are: their scores, their bands, what is said of them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.report.blocks import Block, Cell, Column, Key, Panel, Plot, Prose, Section, Table
-from retwin.report.curves import Band, Latent, bands, latents
-from retwin.report.plots import axis, caption, latent_names, latent_plot, short, spec
-from retwin.report.results import Fidelity, Figure, Results
+from retwin.report.curves import Band, bands
+from retwin.report.discrepancy import cell, detailed, figure_names, titled, whose
+from retwin.report.parts import Fidelity, Figure
+from retwin.report.plots import axis, caption, short, spec
+from retwin.report.results import Results
 from retwin.report.words import number, order, quantity, slot, source_name
 
-__all__ = ["Group", "discrepancy", "fidelity", "figure_names", "groups"]
+__all__ = ["fidelity"]
 
 RIVALS = {"mean_only": "Mean only", "single_gaussian": "One Gaussian"}
 
 
-@dataclass(frozen=True)
-class Group:
-    """Latents that are drawn side by side: the figure's name and caption, whose they are."""
-
-    name: str
-    source: str
-    text: str
-    shown: list[Latent]
-
-
-def figure_names(results: Results) -> dict[str, str]:
-    """What is added to a figure's name for each source: nothing for the first of them."""
-    known = order(list(results.fidelity))
-    return {source: f"-{place + 1}" if place else "" for place, source in enumerate(known)}
-
-
-def groups(results: Results) -> list[Group]:
-    """Delays, offsets, noise and the rest, each with a figure of its own."""
-    real = "emulated system" if results.emulated else "real system"
-    see = f"Where the line follows the bars, the twin generates what the {real} did."
-    paper = bool(results.published)
-    found = []
-    for source, added in figure_names(results).items():
-        whose = f" {source_name(source)}." if len(results.fidelity) > 1 else ""
-        kinds = {
-            "tde": ("delay", "Delay of movements (TDe)", " The paper’s figure 5."),
-            "tpe": ("offset_", "Position error per axis (TPE)", " The paper’s figure 6."),
-            "noise": ("noise_", "Standard deviation at rest, per output and movement", ""),
-        }
-        left = latents(results, source)
-        for name, (start, title, figure) in kinds.items():
-            shown = [each for each in left if each.name.startswith(start)]
-            left = [each for each in left if each not in shown]
-            text = f"{title}, observed and generated.{whose} {see}{figure if paper else ''}"
-            if shown:
-                found.append(Group(f"{name}{added}", source, text, shown))
-        if left:
-            text = f"Discrepancy, observed and generated.{whose} {see}"
-            found.append(Group(f"z{added}", source, text, left))
-    return found
-
-
-def discrepancy(results: Results) -> Section | None:
-    """Observed against generated discrepancy (figures 5 and 6), and tests of the agreement."""
-    blocks: list[Block] = [
-        latent_plot(results, each.source, each.name, each.text, each.shown)
-        for each in groups(results)
-    ]
-    for source in figure_names(results):
-        table = _agreement(results, source)
-        if table is not None:
-            blocks.append(table)
-    return Section("discrepancy", "Discrepancy", blocks) if blocks else None
-
-
-def _agreement(results: Results, source: str) -> Table | None:
-    told = results.fidelity[source]
-    names = [name for name in told.movement if f"ks/{name}" in told.figures]
-    if not names:
-        return None
-    rows = []
-    for name in names:
-        distance = told.figures[f"ks/{name}"]
-        inside = told.figures.get(f"coverage90/{name}", Figure())
-        row = [Cell(latent_names(name)[0]), _cell(distance, 2), Cell(number(distance.p, 2))]
-        rows.append([*row, _cell(inside, 2)])
-    columns = [
-        Column("Per movement", numeric=False),
-        Column("KS distance"),
-        Column("p"),
-        Column("in the 90 % range"),
-    ]
-    held = f" on {told.movements} held-out movements" if told.movements else ""
-    text = (
-        f"{_whose(results, source)}Agreement of what was generated with what was observed{held}; "
-        "delay and offset are inferred from both in the same way. KS distance: the greatest gap "
-        "between the two cumulative distributions, 0 is best. p: the share of perfect generators "
-        "that would look at least as bad on as few trajectories, out of 20, so never below 0.05. "
-        "The share inside the generated "
-        "90 % range should be 0.90: below, the twin is too sure; above, too wide. In brackets the "
-        "95 % bootstrap interval over trajectories."
-    )
-    return Table(caption(results, text), columns, rows)
-
-
 def fidelity(results: Results) -> Section | None:
     """Scores of the draws beside those of simpler generators, calibration, and pictures of it."""
-    blocks: list[Block] = []
-    for source, added in figure_names(results).items():
-        told = results.fidelity[source]
-        if not told.figures:
+    judged = [name for name, each in results.fidelity.items() if each.figures]
+    blocks: list[Block] = [_overview(results, order(judged))] if len(judged) > 1 else []
+    for source in detailed(results):
+        added, told = figure_names(results)[source], results.fidelity[source]
+        if source not in judged:
             continue
         blocks += [_scores(results, source, told), _calibration(results, source, told)]
         pit = results.arrays.get(f"pit/{source}")
@@ -129,17 +46,43 @@ def fidelity(results: Results) -> Section | None:
     return Section("fidelity", "Fidelity", [*blocks, Prose(note, quiet=True)])
 
 
-def _whose(results: Results, source: str) -> str:
-    return f"{source_name(source)}. " if len(results.fidelity) > 1 else ""
-
-
-def _cell(figure: Figure, digits: int = 3, factor: float = 1.0) -> Cell:
-    """A figure with its interval below."""
-    if figure.value is None:
-        return Cell("–")
-    ends = figure.ends
-    below = "" if ends is None else f"[{' to '.join(number(factor * e, digits) for e in ends)}]"
-    return Cell(number(factor * figure.value, digits), below)
+def _overview(results: Results, sources: list[str]) -> Table:
+    """A row per source."""
+    first = results.fidelity[sources[0]]
+    units = [*first.units, *[""] * len(first.outputs)]
+    lengths = [(f"crps/{n}", f"CRPS {n}", u) for n, u in zip(first.outputs, units, strict=False)]
+    lengths.append(("energy", "Energy score", units[0] if len(set(first.units)) == 1 else ""))
+    shares = (
+        ("coverage50", "in the 50 % band"),
+        ("coverage90", "in the 90 % band"),
+        ("pit", "PIT from uniform"),
+        ("auroc", "AUROC, real or generated"),
+    )
+    shown = [(key, title, *quantity(unit)) for key, title, unit in lengths]
+    shown += [(key, title, 1.0, "") for key, title in shares]
+    known = {key for name in sources for key in results.fidelity[name].figures}
+    shown = [each for each in shown if each[0] in known]
+    columns = [Column("Source", numeric=False)]
+    columns += [Column(f"{title}, {unit}" if unit else title) for _, title, _, unit in shown]
+    rows = [
+        [
+            Cell(source_name(name), source=name),
+            *(
+                cell(results.fidelity[name].figures.get(key, Figure()), 2, factor)
+                for key, _, factor, _ in shown
+            ),
+        ]
+        for name in sources
+    ]
+    text = (
+        "How near each source’s draws are to held-out healthy trajectories. CRPS and energy score: "
+        "lower is better. Bands should hold 0.50 and 0.90 of the points; a source without chance "
+        "has no band, so none lies within. PIT: 0 is best; AUROC: 0.50. In brackets the 95 % "
+        "bootstrap interval over trajectories."
+    )
+    if set(sources) > set(detailed(results)):
+        text += " The updated twins are shown in full below; figures/ has the pictures of all."
+    return Table("How real, source by source", caption(results, text), columns, rows)
 
 
 def _scores(results: Results, source: str, told: Fidelity) -> Table:
@@ -159,14 +102,14 @@ def _scores(results: Results, source: str, told: Fidelity) -> Table:
     for key, title, factor, unit in lines:
         kind, *output = key.split("/", 1)
         row = [Cell(f"{title}, {unit}" if unit else title)]
-        row.append(_cell(told.figures.get(key, Figure()), 2, factor))
+        row.append(cell(told.figures.get(key, Figure()), 2, factor))
         for rival in told.rivals:
-            row.append(_cell(told.figures.get(f"{key}/{rival}", Figure()), 2, factor))
+            row.append(cell(told.figures.get(f"{key}/{rival}", Figure()), 2, factor))
             below = "/".join([f"{kind}_below", *output, rival])
-            row.append(_cell(told.figures.get(below, Figure()), 0, 100.0))
+            row.append(cell(told.figures.get(below, Figure()), 0, 100.0))
         rows.append(row)
     text = (
-        f"{_whose(results, source)}How far {told.draws or 'many'} draws per trajectory lie from "
+        f"How far {told.draws or 'many'} draws per trajectory lie from "
         f"what was measured on {told.trajectories} held-out healthy trajectories, their spread "
         "taken off; lower is better, and the truth would score best. CRPS looks at one output at "
         "one moment, the energy score at a whole trajectory. Mean only: the correction without its "
@@ -174,7 +117,8 @@ def _scores(results: Results, source: str, told: Fidelity) -> Table:
         "with one component, fitted to the same data. In brackets the 95 % bootstrap interval over "
         "trajectories; differences are paired."
     )
-    return Table(caption(results, text), columns, rows)
+    title = titled(results, source, "Scores of the draws")
+    return Table(title, caption(results, text), columns, rows)
 
 
 def _calibration(results: Results, source: str, told: Fidelity) -> Table:
@@ -205,7 +149,7 @@ def _calibration(results: Results, source: str, told: Fidelity) -> Table:
         Column("Ideal"),
     ]
     text = (
-        f"{_whose(results, source)}Bands are pointwise; the share inside is that of a trajectory’s "
+        "Bands are pointwise; the share inside is that of a trajectory’s "
         "points, averaged over trajectories. p as above, out of 100. The classifier is a forest "
         "that never saw the trajectory it judges: at 0.50 it cannot tell real from generated, at "
         "1.00 always."
@@ -217,7 +161,8 @@ def _calibration(results: Results, source: str, told: Fidelity) -> Table:
             " Widened: by a factor (split conformal) from calibration trajectories kept back from "
             "the residual model; it is shown for comparison, the twin does not use it."
         )
-    return Table(caption(results, text), columns, rows)
+    title = titled(results, source, "Calibration of the draws")
+    return Table(title, caption(results, text), columns, rows)
 
 
 def _interval(figure: Figure) -> str:
@@ -269,7 +214,7 @@ def _pit_plot(results: Results, source: str, name: str, pit: NDArray) -> Plot:
         Key("uniform", "muted", "dot"),
     ]
     text = (
-        f"{_whose(results, source)}Where the measured value lies among the draws (PIT). Flat, "
+        f"{whose(results, source)}Where the measured value lies among the draws (PIT). Flat, "
         "within the shaded range: draws spread as the measured ones do. A hump in the middle: "
         "too wide; piles at the ends: too sure; a slope: too high or too low."
     )
@@ -287,7 +232,7 @@ def _band_plot(results: Results, source: str, name: str, shown: list[Band]) -> P
     first = shown[0].trajectory
     panels = [_band_panel(each, f"@{colour}", typical=each.trajectory == first) for each in shown]
     text = (
-        f"{_whose(results, source)}Held-out trajectories, output minus nominal output: the one "
+        f"{whose(results, source)}Held-out trajectories, output minus nominal output: the one "
         "with the median energy score (typical), and the one with the worst. Spikes are movements "
         "that come late, steps between them the position errors. Half of the line should lie in "
         "the dark band, nine tenths in the light one."

@@ -8,9 +8,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from retwin.report.blocks import Key, Panel, Plot, Section
-from retwin.report.plots import DASHES, axis, caption, spec
-from retwin.report.results import CurvePoint, Interval, Results
-from retwin.report.words import order, slot, source_name
+from retwin.report.parts import CurvePoint, Interval
+from retwin.report.plots import axis, caption, spec
+from retwin.report.results import Results
+from retwin.report.words import dash, order, slot, source_name, symbol
 
 __all__ = ["learning_curve", "learning_curves"]
 
@@ -46,8 +47,7 @@ def learning_curve(results: Results) -> Section | None:
     if not curves:
         return None
     keys = [
-        Key(source_name(name), f"c{slot(name)}", DASHES[slot(name) % len(DASHES)])
-        for name in next(iter(curves.values()))
+        Key(source_name(name), f"c{slot(name)}", dash(name)) for name in next(iter(curves.values()))
     ]
     text = (
         "Scores against the healthy real trajectories that each source was calibrated on, mean "
@@ -94,8 +94,8 @@ def _trace(source: str, points: Sequence[Point]) -> dict[str, Any]:
             "thickness": 1.4,
             "width": 0,
         },
-        "line": {"color": colour, "width": 2.2, "dash": DASHES[slot(source) % len(DASHES)]},
-        "marker": {"color": colour, "size": 7},
+        "line": {"color": colour, "width": 2.2, "dash": dash(source)},
+        "marker": {"color": colour, "size": 7, "symbol": symbol(source)},
         "text": [f"{count}: {value:.3f}" for count, value, _, _ in points],
         "hovertemplate": f"{name}<br>%{{text}}<extra></extra>",
     }

@@ -21,16 +21,18 @@ const page = (() => {
 
   // The wheel scrolls the page, also over a picture in space.
   const config = { displayModeBar: false, scrollZoom: false };
-  const plot = (place, data, layout, frames) => {
+  const plot = (place, data, layout) => {
     const style = getComputedStyle(root);
     const height = layout.height * (root.dataset.print ? 0.72 : 1);
     place.style.height = height + "px";
     const painted = { ...paint(layout, style), height, width: place.clientWidth };
-    Plotly.react(place, { data: paint(data, style), layout: painted, config, frames });
+    Plotly.react(place, { data: paint(data, style), layout: painted, config });
   };
   const drawn = [() => {
     for (const [id, spec] of Object.entries(specs)) {
-      plot(document.getElementById(id), spec.data, { ...spec.layout, height: spec.height }, spec.frames);
+      const place = document.getElementById(id);
+      const narrow = place.clientWidth < 600 ? spec.narrow : {};
+      plot(place, spec.data, { ...spec.layout, ...narrow, height: spec.height });
     }
   }];
   const draw = () => drawn.forEach((each) => each());
@@ -45,13 +47,18 @@ const page = (() => {
     cancelAnimationFrame(waiting);
     waiting = requestAnimationFrame(draw);
   });
-  // Paper is white and narrower than most screens.
+  // Paper is white and narrower than most screens, and does not scroll.
+  const tables = document.querySelectorAll(".scroll > table");
   window.addEventListener("beforeprint", () => {
     root.dataset.print = "yes";
     draw();
+    tables.forEach((table) => {
+      table.style.zoom = Math.min(1, table.parentElement.clientWidth / table.offsetWidth);
+    });
   });
   window.addEventListener("afterprint", () => {
     delete root.dataset.print;
+    tables.forEach((table) => { table.style.zoom = ""; });
     draw();
   });
 

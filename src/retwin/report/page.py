@@ -15,13 +15,13 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from retwin.report.blocks import Explorer, Plot, Section
+from retwin.report.blocks import Calculator, Explorer, Plot, Section
 from retwin.report.claims import claims
 from retwin.report.figures import FIGURES, draw_figures
 from retwin.report.results import Results, read_results
-from retwin.report.scores import verdict
 from retwin.report.sections import SECTIONS
-from retwin.report.words import CHROME, PALETTE, counted
+from retwin.report.verdict import verdict
+from retwin.report.words import CHROME, PALETTE, counted, slot, symbol
 from retwin.storage import write_atomically
 
 __all__ = ["render", "write_report"]
@@ -65,7 +65,11 @@ def render(results: Results, images: dict[str, bytes]) -> str:
     made = [section for make in SECTIONS if (section := make(results)) is not None]
     specs = _specs(made)
     blocks = [block for section in made for block in section.blocks]
-    explored = [block.content for block in blocks if isinstance(block, Explorer)]
+    contents = {
+        block.kind: Markup(_script_json(block.content))
+        for block in blocks
+        if isinstance(block, Explorer | Calculator)
+    }
     environment = Environment(
         loader=FunctionLoader(_asset),
         autoescape=True,
@@ -73,8 +77,10 @@ def render(results: Results, images: dict[str, bytes]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.globals |= {"slot": slot, "symbol": symbol}
     return environment.get_template("page.html.j2").render(
         title=results.title or results.case,
+        anchors={section.key for section in made},
         subtitle=_subtitle(results),
         emulated=EMULATED if results.emulated else "",
         verdict=verdict(results),
@@ -86,10 +92,10 @@ def render(results: Results, images: dict[str, bytes]) -> str:
         },
         style=Markup(_asset("page.css")),
         script=Markup(_asset("page.js")),
-        explorer_script=Markup(_asset("explorer.js")),
         specs=Markup(_script_json(specs)),
-        explored=Markup(_script_json(explored[0])) if explored else "",
-        plotly=Markup(get_plotlyjs()) if specs or explored else "",
+        contents=contents,
+        scripts={kind: Markup(_asset(f"{kind}.js")) for kind in contents},
+        plotly=Markup(get_plotlyjs()) if specs or "explorer" in contents else "",
         images={name: base64.b64encode(data).decode() for name, data in images.items()},
     )
 
@@ -101,7 +107,7 @@ def _asset(name: str) -> str:
 def _specs(sections: Sequence[Section]) -> dict[str, Any]:
     """Plotly's data by the id of the element that shows them."""
     return {
-        f"plot-{block.name}-{place}": {**panel.spec, "height": panel.height}
+        f"plot-{block.name}-{place}": {**panel.spec, "height": panel.height, "narrow": panel.narrow}
         for section in sections
         for block in section.blocks
         if isinstance(block, Plot)

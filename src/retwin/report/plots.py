@@ -10,12 +10,20 @@ from typing import Any
 import numpy as np
 
 from retwin.report.blocks import Key, Panel, Plot
-from retwin.report.curves import Latent, Roc
+from retwin.report.curves import Latent
 from retwin.report.results import Results
-from retwin.report.words import METRICS, mean_and_spread, number, order, slot, source_name, span
+from retwin.report.words import (
+    METRICS,
+    mean_and_spread,
+    number,
+    order,
+    slot,
+    source_name,
+    span,
+    symbol,
+)
 
 __all__ = [
-    "DASHES",
     "FONT",
     "axis",
     "caption",
@@ -23,13 +31,11 @@ __all__ = [
     "latent_plot",
     "missing",
     "published_value",
-    "roc_plot",
     "scores_plot",
     "short",
     "spec",
 ]
 
-DASHES = ("solid", "dash", "dot", "dashdot")
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 
 
@@ -87,13 +93,15 @@ def scores_plot(results: Results, metrics: Sequence[str]) -> Plot | None:
     if not bounded:
         return None
     data: list[dict[str, Any]] = []
+    gap = 0.76 / max(len(sources), 2)
+    lanes = [gap * (place + 0.5) - 0.3 for place in range(len(sources))]
     for place, source in enumerate(sources):
-        lane = 0.6 * (place + 0.5) / len(sources) - 0.25
-        data += _score_traces(results, source, bounded, lane)
-    y = axis("", showticklabels=False, range=[len(bounded) - 0.5, -0.55], showgrid=False)
-    y |= {"ticks": "", "showline": False}
+        data += _score_traces(results, source, bounded, (lanes[place], gap))
+    y = axis("", range=[len(bounded) - 0.5, -0.55], showgrid=False, ticks="", showline=False)
+    y["tickvals"] = [i + lane for i in range(len(bounded)) for lane in lanes]
+    y["ticktext"] = [html.escape(source_name(name)) for name in sources] * len(bounded)
     x = axis("score", range=[-0.01, 1.02], tickformat=".1f", dtick=0.2)
-    keys = [Key(source_name(name), f"c{slot(name)}", "disc") for name in sources]
+    keys = [Key(source_name(name), f"c{slot(name)}", symbol(name)) for name in sources]
     text = "Dots are means over runs, bars the 95 % bootstrap interval over test trajectories"
     if any(trace["name"].endswith("(paper)") for trace in data):
         keys.append(Key("paper’s mean ± sd over its runs", "muted", "diamond"))
@@ -103,7 +111,8 @@ def scores_plot(results: Results, metrics: Sequence[str]) -> Plot | None:
         _lane_title(METRICS[name].name, i) for i, name in enumerate(bounded)
     ]
     height = 70 + len(bounded) * (30 + 24 * max(len(sources), 2))
-    panel = Panel(picture, "Scores of every source as dots with intervals", height=height)
+    alt = "Scores of every source as dots with intervals"
+    panel = Panel(picture, alt, height=height, narrow={"yaxis": {**y, "showticklabels": False}})
     see = (
         ". Look at the order of the sources and at how far apart they lie; bars that overlap do "
         "not settle a comparison, the paired differences do."
@@ -125,8 +134,9 @@ def _lane_title(text: str, place: int) -> dict[str, Any]:
 
 
 def _score_traces(
-    results: Results, source: str, metrics: Sequence[str], lane: float
+    results: Results, source: str, metrics: Sequence[str], lane: tuple[float, float]
 ) -> list[dict[str, Any]]:
+    """Of one source: `lane` is how far below a metric's place it is drawn, and how wide it is."""
     one, colour = results.sources[source], f"@c{slot(source)}"
     name = html.escape(source_name(source), quote=False)
     shown = [metric for metric in metrics if metric in one.scores]
@@ -138,7 +148,7 @@ def _score_traces(
             "mode": "markers",
             "name": name,
             "x": means,
-            "y": [metrics.index(metric) + lane for metric in shown],
+            "y": [metrics.index(metric) + lane[0] for metric in shown],
             "error_x": {
                 "type": "data",
                 "symmetric": False,
@@ -150,16 +160,15 @@ def _score_traces(
                 "thickness": 2,
                 "width": 0,
             },
-            "marker": {"color": colour, "size": 10},
+            "marker": {"color": colour, "size": 10, "symbol": symbol(source)},
             "text": [f"{mean_and_spread(one.scores[m])} [{span(one.interval(m))}]" for m in shown],
             "hovertemplate": f"{name}<br>%{{text}}<extra></extra>",
         }
     ]
     told = results.published.get(source, {})
     paper = {m: published_value(told[m]) for m in metrics if m in told}
-    marks = [
-        (*value, metrics.index(m) + lane + 0.09) for m, value in paper.items() if value is not None
-    ]
+    below = lane[0] + 0.35 * lane[1]
+    marks = [(*value, metrics.index(m) + below) for m, value in paper.items() if value is not None]
     for known in ([mark for mark in marks if mark[1]], [mark for mark in marks if not mark[1]]):
         traces += _paper_trace(name, colour, known)
     return traces
@@ -185,73 +194,6 @@ def _paper_trace(
             "hovertemplate": f"{name}, paper<br>%{{x:.3f}}<extra></extra>",
         }
     ]
-
-
-def roc_plot(results: Results, curves: dict[str, Roc]) -> Plot:
-    """Micro-averaged ROC: the mean over runs and one standard deviation around it."""
-    data: list[dict[str, Any]] = [
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "name": "chance",
-            "x": [0, 1],
-            "y": [0, 1],
-            "line": {"color": "@rule", "width": 1},
-            "hoverinfo": "skip",
-        }
-    ]
-    keys = []
-    for source, curve in curves.items():
-        dash = DASHES[slot(source) % len(DASHES)]
-        data += _roc_traces(source, curve, dash)
-        area = mean_and_spread(curve.areas)
-        keys.append(Key(f"{source_name(source)}: area {area}", f"c{slot(source)}", dash))
-    x = axis("false positive rate", range=[-0.01, 1.01], dtick=0.2)
-    y = axis("true positive rate", range=[-0.01, 1.01], dtick=0.2)
-    text = (
-        f"Micro-averaged ROC, mean over {results.runs} runs; shading: ± one standard deviation. "
-        "The further up and to the left, the better a source’s classifier separates the classes "
-        "at any threshold; where bands overlap, chance in training can swap the sources."
-        if results.runs > 1
-        else "Micro-averaged ROC of the one run, so there is no band. The further up and to the "
-        "left, the better a source’s classifier separates the classes at any threshold."
-    )
-    panel = Panel(spec(data, x, y), "Micro-averaged ROC curves", height=460)
-    return Plot("roc", caption(results, text), [panel], keys, narrow=True)
-
-
-def _roc_traces(source: str, curve: Roc, dash: str) -> list[dict[str, Any]]:
-    colour = f"@c{slot(source)}"
-    low, high = (short(edge) for edge in curve.band)
-    x = short(curve.rate)
-    name = html.escape(source_name(source), quote=False)
-    traces: list[dict[str, Any]] = []
-    if len(curve.areas) > 1:
-        traces.append(
-            {
-                "type": "scatter",
-                "mode": "lines",
-                "name": f"{name} ± sd",
-                "x": x + x[::-1],
-                "y": high + low[::-1],
-                "fill": "toself",
-                "fillcolor": f"{colour}/0.18",
-                "line": {"width": 0},
-                "hoverinfo": "skip",
-            }
-        )
-    traces.append(
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "name": name,
-            "x": x,
-            "y": short(curve.mean),
-            "line": {"color": colour, "width": 2.2, "dash": dash},
-            "hovertemplate": f"{name}<br>%{{y:.3f}} at %{{x:.2f}}<extra></extra>",
-        }
-    )
-    return traces
 
 
 def latent_names(name: str) -> tuple[str, str]:

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.report.blocks import Key, Panel, Plot, Section
-from retwin.report.plots import DASHES, axis, caption, short, spec
+from retwin.report.plots import axis, caption, short, spec
 from retwin.report.results import Results
-from retwin.report.words import order, quantity, slot, source_name
+from retwin.report.words import dash, order, quantity, slot, source_name
 
 __all__ = ["Record", "records", "shown_sources", "simulation"]
 
@@ -96,7 +96,7 @@ def simulation(results: Results) -> Section | None:
         return None
     sources = shown_sources(results)
     keys = [Key("measured", "ink")]
-    keys += [Key(source_name(name), f"c{slot(name)}", _dash(name)) for name in sources]
+    keys += [Key(source_name(name), f"c{slot(name)}", dash(name)) for name in sources]
     if found[0].bands is not None:
         text = f"90 % and 50 % of the draws: {source_name(sources[-1])}"
         keys.append(Key(text, f"c{slot(sources[-1])}", "bar"))
@@ -108,10 +108,6 @@ def simulation(results: Results) -> Section | None:
     )
     plot = Plot("simulation", caption(results, text), panels, keys)
     return Section("simulation", "Simulation", [plot])
-
-
-def _dash(source: str) -> str:
-    return DASHES[slot(source) % len(DASHES)]
 
 
 def _panel(each: Record) -> Panel:
@@ -156,7 +152,7 @@ def _line(source: str, time: list[float], values: NDArray) -> dict[str, Any]:
         "name": name,
         "x": time,
         "y": short(values),
-        "line": {"color": f"@c{slot(source)}", "width": 1.6, "dash": _dash(source)},
+        "line": {"color": f"@c{slot(source)}", "width": 1.6, "dash": dash(source)},
         "hovertemplate": f"{name}<br>%{{y:.3g}} at %{{x:.4g}} s<extra></extra>",
     }
 

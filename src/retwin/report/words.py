@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 
 __all__ = [
     "CHROME",
+    "DASHES",
+    "MAIN",
     "MANY",
     "METRICS",
     "PALETTE",
     "Metric",
     "class_name",
     "counted",
+    "dash",
     "duration",
     "in_sentence",
     "label",
@@ -31,9 +34,10 @@ __all__ = [
     "slot",
     "source_name",
     "span",
+    "symbol",
 ]
 
-# Source to human name; the place in this list also fixes the colour (see `slot`).
+# Source to human name; the place in this list also fixes how it is drawn (see `slot`).
 SOURCES = {
     "ibg_rg": "IBG + RG",
     "dt": "Digital twin",
@@ -44,13 +48,13 @@ SOURCES = {
     "mean_corrected": "IBG + RG mean",
     "pi_ls": "Least squares (Eq. 2)",
     "pi_bayes": "Bayesian updating (Eq. 3)",
-    "dann": "Domain-adversarial",
+    "twin": "Digital twin",
     "dann_transductive": "Domain-adversarial, transductive",
     "fine_tuned": "Fine-tuned",
-    "inversion": "Fault inversion",
-    "inversion_cnn": "Inversion with classifier",
-    "twin": "Digital twin",
     "pi_ls_rg": "Least squares, then IBG + RG",
+    "inversion_cnn": "Inversion with classifier",
+    "dann": "Domain-adversarial",
+    "inversion": "Fault inversion",
 }
 ORDER = (
     "dt",
@@ -63,7 +67,12 @@ ORDER = (
     "dann",
     "dann_transductive",
     "mean_corrected",
-    *SOURCES,
+    "ibg_rg",
+    "ibg_rg_command",
+    "fine_tuned",
+    "inversion",
+    "inversion_cnn",
+    "pi_ls_rg",
 )
 MANY = 5
 """Sources beyond which pictures and tables show the most telling ones only."""
@@ -79,6 +88,7 @@ PALETTE = (
     ("#6b6b6b", "#b9b9b9"),
     ("#8b3a2b", "#d98f80"),
 )
+DASHES = ("solid", "dash", "dot", "dashdot")
 # Everything else that has a colour: name to (light, dark).
 CHROME = {
     "ink": ("#1b1f24", "#e7eaee"),
@@ -87,7 +97,7 @@ CHROME = {
     "rule": ("#c9ced6", "#434b56"),
     "paper": ("#ffffff", "#14181d"),
     "wash": ("#f5f6f8", "#1c2127"),
-    "observed": ("#9aa3ae", "#727c89"),
+    "observed": ("#868f9a", "#727c89"),
     "go": ("#007a4d", "#3ecf8e"),
     "wait": ("#9a6700", "#e3b341"),
     "stop": ("#b3261e", "#ff8a80"),
@@ -129,6 +139,10 @@ METRICS = {
 }
 
 
+MAIN = ("macro_f1", "balanced_accuracy", "auroc", "healthy_recall", "rmse", "nrmse", "crps")
+"""The scores that a study is judged by."""
+
+
 def source_name(source: str) -> str:
     """For people; an unknown source keeps its name."""
     return SOURCES.get(source, source)
@@ -142,10 +156,29 @@ def in_sentence(name: str) -> str:
 
 
 def slot(source: str) -> int:
-    """Place of the source's colour in `PALETTE`, the same in every report."""
+    """Place of the source's colour in `PALETTE`, the same in every report.
+
+    There are more sources than colours that all eyes can tell apart, so `symbol` and `dash` tell
+    those of one colour apart.
+    """
+    return _place(source) % len(PALETTE)
+
+
+def symbol(source: str) -> str:
+    """Of the source's points: a square where its colour has come round again."""
+    return "circle" if _place(source) < len(PALETTE) else "square"
+
+
+def dash(source: str) -> str:
+    """Of the source's lines, one of `DASHES`; never that of another one of the same colour."""
+    place = _place(source)
+    return DASHES[(place + 2 * (place // len(PALETTE))) % len(DASHES)]
+
+
+def _place(source: str) -> int:
     names = list(SOURCES)
     place = names.index(source) if source in SOURCES else sum(source.encode())
-    return place % len(PALETTE)
+    return place % (2 * len(PALETTE))
 
 
 def order(sources: Sequence[str]) -> list[str]:

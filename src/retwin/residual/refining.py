@@ -60,8 +60,7 @@ def refine(
         law = network.distribution(batch[0].repeat_interleave(draws, dim=0))
         z = network.drawn(law, generator=generator).cpu()
         every = context[rows.repeat_interleave(draws).numpy()]
-        outputs = network.correction.apply(every, z)
-        made = recorded(network.correction, outputs, generator).unflatten(0, (len(rows), draws))
+        made = recorded(network.correction, every, z, generator).unflatten(0, (len(rows), draws))
         return energy_score(made / unit, observed[rows] / unit, mask[rows]).mean()
 
     seeds = iter(torch.randint(2**31, (100_000,), generator=torch.Generator().manual_seed(seed)))

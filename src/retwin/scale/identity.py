@@ -37,9 +37,12 @@ def _told(value: Any, deep: int) -> Any:
     """`value` as JSON."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
+    if isinstance(value, np.ndarray) and value.dtype.hasobject:
+        value = value.tolist()
     if isinstance(value, np.generic | np.ndarray):
         array = np.ascontiguousarray(value)
-        return [array.dtype.str, list(array.shape), hashlib.sha256(array.tobytes()).hexdigest()]
+        numbers = array.reshape(-1).view(np.uint8).data  # as they lie there: they may be a map
+        return [array.dtype.str, list(array.shape), hashlib.sha256(numbers).hexdigest()]
     if isinstance(value, Path):
         return sha256(value) if value.exists() else str(value)
     if deep == 0:

@@ -30,7 +30,7 @@ from retwin.scale.plan import Made, Recorded, SimulationPlan, make_chunk
 from retwin.scale.workers import alone, each
 from retwin.storage import check_target, save
 from retwin.storage.files import write_atomically
-from retwin.storage.header import CHUNKED_NAMES, chunked_header, restore_chunked
+from retwin.storage.header import CHUNKED_NAMES, FAILED, chunked_header, restore_chunked
 from retwin.storage.zarr_folder import create_chunked, read_header, seal_chunked, write_chunk
 from retwin.trajectories import Progress
 
@@ -220,7 +220,9 @@ def _into_npz(target: Path, plan: SimulationPlan, tell: Progress) -> Simulated:
     arrays = {name: np.concatenate([c.arrays[name] for c in chunks]) for name in CHUNKED_NAMES}
     failed = {i: reason for chunk in chunks for i, reason in chunk.failed.items()}
     header = _header(plan, failed, [], emulated=any(chunk.emulated for chunk in chunks))
-    save(restore_chunked(header, arrays, np.arange(plan.count)), target)
+    good = np.flatnonzero(arrays["labels"] != FAILED)
+    sound = {name: array[good] for name, array in arrays.items()}
+    save(restore_chunked(header, sound, good), target)
     return Simulated(target, plan.count, failed)
 
 

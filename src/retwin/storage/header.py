@@ -134,14 +134,13 @@ def restore(header: Mapping[str, Any], arrays: Mapping[str, NDArray], where: str
 def restore_chunked(
     header: Mapping[str, Any], arrays: Mapping[str, NDArray], index: NDArray
 ) -> Trajectories:
-    """The trajectories at `index` of a set written in chunks, without those that failed.
+    """The trajectories at `index` of a set written in chunks, none of which failed.
 
     `arrays` holds the rows at `index`; the ids are the indices.
     """
-    good = np.flatnonzero(arrays["labels"] != FAILED)
-    kept: dict[str, Any] = {name: arrays[name][good] for name in CHUNKED_NAMES}
+    kept: dict[str, Any] = {name: arrays[name] for name in CHUNKED_NAMES}
     kept["labels"] = np.array(header["classes"], dtype=np.str_)[kept["labels"]]
-    kept["ids"] = np.array([f"{i:05d}" for i in index[good]], dtype=np.str_)
+    kept["ids"] = np.array([f"{i:05d}" for i in index], dtype=np.str_)
     return Trajectories(**kept, **_read_about(header))
 
 

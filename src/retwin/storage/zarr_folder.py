@@ -2,12 +2,14 @@
 
 `write_zarr` writes a set that is at hand. A set that no memory holds is written by several
 processes, chunk by chunk: `create_chunked`, then `write_chunk` in any order, then `seal_chunked`.
+Of either kind, what is read is a map of an uncompressed copy on disk (`Scratch`), not memory.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from retwin.storage.border import brief
 from retwin.storage.header import (
     CHUNKED,
     CHUNKED_NAMES,
+    FAILED,
     NAMES,
     arrays_of,
     check_chunk,
@@ -28,6 +31,7 @@ from retwin.storage.header import (
     restore,
     restore_chunked,
 )
+from retwin.storage.scratch import Scratch
 from retwin.trajectories import Trajectories
 
 __all__ = [
@@ -60,17 +64,19 @@ def write_zarr(trajectories: Trajectories, path: Path) -> None:
     for name, array in arrays.items():
         chunks = (CHUNK, *(max(1, size) for size in array.shape[1:]))
         target = group.create_array(name, shape=array.shape, dtype=array.dtype, chunks=chunks)
-        if array.size:
-            target[...] = array
+        for rows in _chunks(len(array), CHUNK) if array.size else ():
+            target[rows] = array[rows]
 
 
 def read_zarr(path: Path, rows: slice = slice(None)) -> Trajectories:
     """Trajectories that `write_zarr` wrote, or that were written chunk by chunk.
 
-    Of a set in chunks, only the chunks that hold `rows` are read; each is checked as a whole.
+    Their arrays are read-only maps of a copy among the temporary files, so a set may be larger than
+    the memory. Of a set in chunks, only the chunks that hold `rows` are read; each is checked as a
+    whole.
 
-    Raises InputError for a damaged folder, one of another kind, a newer schema, or when the
-    package zarr is not installed.
+    Raises InputError for a damaged folder, one of another kind, a newer schema, no room for the
+    copy, or when the package zarr is not installed.
     """
     zarr = _zarr()
     try:
@@ -81,7 +87,7 @@ def read_zarr(path: Path, rows: slice = slice(None)) -> Trajectories:
         arrays = {name: np.array(header[name], dtype=np.str_) for name in TEXTS}
         for name in set(NAMES) - set(TEXTS):
             _check_size(group[name], header["arrays"][name]["shape"], CHUNK, path.name)
-            arrays[name] = np.asarray(group[name][...])
+            arrays[name] = _copied(group[name])
         return restore(header, arrays, path.name)[rows]
     except InputError:
         raise
@@ -139,25 +145,43 @@ def _header(group: Any, where: str) -> dict[str, Any]:
     return dict(header)
 
 
+def _copied(stored: Any) -> NDArray:
+    """An array of Zarr as a map, with one chunk at a time in memory."""
+    if not stored.size:
+        return np.empty(stored.shape, stored.dtype)
+    with Scratch(stored.shape[1:], stored.dtype) as scratch:
+        for rows in _chunks(stored.shape[0], CHUNK):
+            scratch.append(np.asarray(stored[rows]))
+        return scratch.array()
+
+
 def _read_chunks(group: Any, header: Mapping[str, Any], where: str, rows: slice) -> Trajectories:
-    """The trajectories at `rows`, with one chunk at a time in memory besides them."""
+    """The trajectories at `rows` that did not fail, with one chunk at a time in memory."""
     size = int(header["chunk"])
     for name in CHUNKED_NAMES:
         _check_size(group[name], header["arrays"][name]["shape"], size, where)
     index = np.arange(group["labels"].shape[0])[rows]
-    arrays = {
-        name: np.empty((len(index), *group[name].shape[1:]), group[name].dtype)
-        for name in CHUNKED_NAMES
-    }
-    edges = np.flatnonzero(np.diff(index // size)) + 1
-    for here in np.split(np.arange(len(index)), edges) if len(index) else []:
-        number = int(index[here[0]]) // size
-        begin = number * size
-        chunk = {name: np.asarray(group[name][begin : begin + size]) for name in CHUNKED_NAMES}
-        check_chunk(header, chunk, number, where)
-        for name, array in chunk.items():
-            arrays[name][here] = array[index[here] - begin]
-    return restore_chunked(header, arrays, index)
+    of_chunks = np.split(index, np.flatnonzero(np.diff(index // size)) + 1) if len(index) else []
+    good = [index[:0]]
+    with ExitStack() as files:
+        scratch = {
+            name: files.enter_context(Scratch(group[name].shape[1:], group[name].dtype))
+            for name in CHUNKED_NAMES
+        }
+        for some in of_chunks:
+            number = int(some[0]) // size
+            begin = number * size
+            chunk = {name: np.asarray(group[name][begin : begin + size]) for name in CHUNKED_NAMES}
+            check_chunk(header, chunk, number, where)
+            good.append(some[chunk["labels"][some - begin] != FAILED])
+            for name, array in chunk.items():
+                scratch[name].append(array[good[-1] - begin])
+        arrays = {name: each.array() for name, each in scratch.items()}
+    return restore_chunked(header, arrays, np.concatenate(good))
+
+
+def _chunks(count: int, size: int) -> list[slice]:
+    return [slice(begin, begin + size) for begin in range(0, count, size)]
 
 
 def _check_size(array: Any, shape: list[int], chunk: int, where: str) -> None:

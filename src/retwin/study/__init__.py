@@ -206,7 +206,9 @@ def _prepare(
     with write_atomically(out / "study.json") as part:
         part.write_text(json.dumps(ours, indent=1), encoding="utf-8")
     save(real, out / "work" / "real.npz")
-    save(twin, out / "work" / "twin.npz")
+    # What may not fit into memory stays in the format that is read without.
+    large = data.twin is not None and (data.twin / "zarr.json").exists()
+    save(twin, out / "work" / ("twin.zarr" if large else "twin.npz"))
     with write_atomically(out / "work" / "roles.json") as part:
         part.write_text(json.dumps(roles.folds), encoding="utf-8")
 

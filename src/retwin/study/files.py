@@ -108,8 +108,9 @@ class Files:
         return path.with_name(f"{path.name}.costs.json")
 
     def twin_data(self) -> Trajectories:
-        """What the twin says, with commands."""
-        return load(self.folder / "twin.npz")
+        """What the twin says, with commands; in Zarr if it was given so, else in NPZ."""
+        (file,) = self.folder.glob("twin.*")
+        return load(file)
 
     def real_data(self) -> Trajectories:
         """All real trajectories, with commands."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import signal
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -45,7 +46,7 @@ def train(
     steps = math.ceil(len(training_set[0]) / how.batch)
     loop = Loop(network, loss, how, steps=steps, progress=progress)
     generator = torch.Generator().manual_seed(seed)
-    with isolated(seed), _quiet():
+    with isolated(seed), _quiet(), _interruptible():
         trainer = Trainer(
             max_epochs=how.epochs,
             accelerator="auto",
@@ -80,6 +81,19 @@ def _loader(
         else RandomSampler(dataset, generator=generator)
     )
     return DataLoader(dataset, sampler=BatchSampler(order, batch, drop_last=False), batch_size=None)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Ctrl-C is a KeyboardInterrupt: lightning would end the process, deaf to the next one."""
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    except SystemExit as end:
+        if not isinstance(end.__context__, KeyboardInterrupt):
+            raise
+        signal.signal(signal.SIGINT, before)
+        raise KeyboardInterrupt from None
 
 
 @contextmanager

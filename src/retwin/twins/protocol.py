@@ -9,6 +9,7 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from retwin.arrays import check_finite, row_blocks
 from retwin.errors import InputError
 from retwin.faults import Fault, draw_faults, faulty_commands, frozen_from, frozen_response
 from retwin.segments import Segments
@@ -150,17 +151,18 @@ class Limits:
         high = np.asarray(self.high, commands.dtype)
         if self.outside == "clip":
             return np.clip(commands, low, high)
-        beyond = (commands < low) | (commands > high)
-        if beyond.any():
-            trajectory, sample, channel = np.argwhere(beyond)[0]
-            raise InputError(
-                "commands",
-                expected=f"{inputs.names[channel]} from {low[channel]:g} to {high[channel]:g} "
-                f"{inputs.units[channel]}",
-                got=f"{commands[trajectory, sample, channel]:g} in trajectory {trajectory}, "
-                f"sample {sample}",
-                remedy="keep the limits, or have commands clipped (outside='clip')",
-            )
+        for rows in row_blocks(commands):
+            beyond = (commands[rows] < low) | (commands[rows] > high)
+            if beyond.any():
+                trajectory, sample, channel = np.argwhere(beyond)[0] + (rows.start, 0, 0)
+                raise InputError(
+                    "commands",
+                    expected=f"{inputs.names[channel]} from {low[channel]:g} to {high[channel]:g} "
+                    f"{inputs.units[channel]}",
+                    got=f"{commands[trajectory, sample, channel]:g} in trajectory {trajectory}, "
+                    f"sample {sample}",
+                    remedy="keep the limits, or have commands clipped (outside='clip')",
+                )
         return commands
 
 
@@ -180,13 +182,7 @@ def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
             got=f"{array.dtype} of shape {array.shape}",
             remedy=f"give one column per input channel, {', '.join(inputs.names)}",
         )
-    if not np.isfinite(array).all():
-        raise InputError(
-            "commands",
-            expected="finite numbers",
-            got="NaN or an infinite value",
-            remedy="commands are known inputs: repair or drop that trajectory",
-        )
+    check_finite("commands", array)
     return array if array.dtype.kind == "f" else array.astype(np.float64)
 
 
@@ -291,12 +287,12 @@ def simulate_in_chunks(
         if progress is not None:
             progress(min(1.0, (begin + size) / len(commands)))
     labels = np.array([HEALTHY if fault is None else fault.label for fault in drawn])
-    good = np.setdiff1d(np.arange(len(commands)), list(failed))
+    good = np.setdiff1d(np.arange(len(commands)), list(failed)) if failed else slice(None)
     made = Trajectories(
         commands=commands[good],
         nominal=nominal[good],
         observed=observed[good],
-        ids=np.array([f"{i:05d}" for i in good], dtype=np.str_),
+        ids=np.array([f"{i:05d}" for i in range(len(commands))], dtype=np.str_)[good],
         labels=labels[good],
         rate=twin.rate,
         inputs=twin.inputs,

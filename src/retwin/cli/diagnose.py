@@ -1,0 +1,166 @@
+"""`retwin diagnose`: train a diagnoser or make one by physics, and use it."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from numpy.typing import NDArray
+
+from retwin.cli.options import CaseOption, Json, Seed
+from retwin.cli.reading import case_named, read
+from retwin.cli.terminal import answer, bar, example, note, table
+from retwin.cli.words import CLASSIFIERS as NAMES
+from retwin.cli.words import one_of
+from retwin.configs import named
+from retwin.storage import write_atomically
+from retwin.trajectories import Trajectories
+
+__all__ = ["EMULATED", "app", "diagnoses", "write_probabilities"]
+
+EMULATED = "These trajectories are EMULATED: no real measurements."
+
+app = typer.Typer(
+    help="Train a diagnoser, and use it.",
+    epilog=example("retwin diagnose predict cnn real.mat --case armpi"),
+    no_args_is_help=True,
+)
+
+Out = Annotated[Path, typer.Option(metavar="FOLDER", help="Where to save the diagnoser.")]
+
+
+@app.command(epilog=example("retwin diagnose fit made.npz --classifier cnn --out cnn"))
+def fit(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Labelled trajectories.")],
+    out: Out,
+    classifier: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="cnn, lstm or rocket.", autocompletion=one_of(NAMES)),
+    ] = "cnn",
+    case: CaseOption = None,
+    rate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="What the classifier looks at.")
+    ] = None,
+    seed: Seed = 0,
+) -> None:
+    """Train a diagnoser on labelled trajectories."""
+    import retwin as rt
+    from retwin.networks import CLASSIFIERS
+
+    system = case_named(case)
+    makers: dict[str, Callable[..., Any]] = {
+        name: partial(rt.fit_diagnoser, network=network) for name, network in CLASSIFIERS.items()
+    }
+    chosen = named(classifier, {**makers, "rocket": rt.fit_rocket}, "classifier")
+    training = read(file, system)
+    with bar("train") as tell:
+        diagnoser = chosen(
+            training,
+            seed=seed,
+            classes=None if system is None else system.classes,
+            rate=rate,
+            progress=lambda share: tell(classifier, share),
+        )
+    diagnoser.save(out)
+    assert diagnoser.fitted is not None
+    accuracy = diagnoser.fitted.figures["accuracy"]
+    answer(None, f"Accuracy on the held-out fifth of {file.name}: {accuracy:.3f}")
+    note(f"Saved {out}")
+
+
+@app.command(epilog=example("retwin diagnose invert model real.mat --out physics"))
+def invert(
+    model: Annotated[
+        Path, typer.Argument(metavar="MODEL", help="A corrected twin, in command space.")
+    ],
+    real: Annotated[
+        Path, typer.Argument(metavar="REAL", help="The trajectories it was calibrated on.")
+    ],
+    out: Out,
+    random_onset: Annotated[
+        bool,
+        typer.Option("--random-onset", metavar="", help="Leave the onset of stuck motors open."),
+    ] = False,
+) -> None:
+    """Make a diagnoser by physics: no training, only healthy trajectories are used."""
+    import retwin as rt
+
+    updated = rt.CorrectedTwin.load(model)
+    system = rt.cases.get(updated.case)
+    if random_onset:
+        system = system.with_random_onset()
+    calibration = read(real, system)
+    diagnoser = rt.fit_inversion(updated.surrogate, updated.residual, calibration, system.faults)
+    diagnoser.save(out)
+    note(f"Saved {out}")
+
+
+@app.command(epilog=example("retwin diagnose predict cnn real.mat --case armpi"))
+def predict(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of a diagnoser.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Trajectories; labels are not needed.")
+    ],
+    case: CaseOption = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="CSV file for all probabilities.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Say which class each trajectory belongs to, and score it where labels are known."""
+    import retwin as rt
+
+    diagnoser = rt.load_diagnoser(model)
+    trajectories = read(file, case_named(case))
+    probabilities = diagnoser.predict_proba(trajectories)
+    labels = trajectories.labels.tolist()
+    labelled = bool(trajectories.known_labels) and "" not in labels
+    scores = rt.evaluate(diagnoser, trajectories) if labelled else None
+    told = diagnoses(trajectories, diagnoser.classes, probabilities)
+    for each, label in zip(told, labels, strict=True):
+        each["label"] = label or None
+    rows = [(e["id"], e["diagnosis"], f"{e['probability']:.2f}", e["label"] or "") for e in told]
+    answer(
+        {"emulated": trajectories.emulated, "trajectories": told, "scores": scores},
+        table(("trajectory", "diagnosis", "probability", "label"), rows, numbers=("probability",)),
+        *([EMULATED] if trajectories.emulated else []),
+        *([str(scores)] if scores is not None else []),
+        as_json=as_json,
+    )
+    if out is not None:
+        write_probabilities(out, diagnoser.classes, told)
+
+
+def diagnoses(
+    trajectories: Trajectories, classes: Sequence[str], probabilities: NDArray
+) -> list[dict[str, Any]]:
+    """What is said of each trajectory: the best class, and the probability of every one."""
+    return [
+        {
+            "id": name,
+            "diagnosis": classes[shares.argmax()],
+            "probability": float(shares.max()),
+            "probabilities": dict(zip(classes, shares.tolist(), strict=True)),
+        }
+        for name, shares in zip(trajectories.ids.tolist(), probabilities, strict=True)
+    ]
+
+
+def write_probabilities(
+    out: Path,
+    classes: Sequence[str],
+    told: Iterable[Mapping[str, Any]],
+    besides: Sequence[str] = (),
+) -> None:
+    """Write a CSV file: the trajectory, what stands `besides`, and every class's probability."""
+    with write_atomically(out) as part, part.open("w", newline="", encoding="utf-8") as sheet:
+        writer = csv.writer(sheet)
+        writer.writerow(["trajectory", *besides, *classes])
+        for each in told:
+            beside = [each[name] for name in besides]
+            writer.writerow([each["id"], *beside, *each["probabilities"].values()])
+    note(f"Wrote {out}")

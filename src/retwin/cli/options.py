@@ -1,0 +1,46 @@
+"""Arguments and options that several commands have."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from retwin.cli.words import CASES, one_of
+
+__all__ = ["CaseArgument", "CaseOption", "Json", "OtherCase", "Rate", "Seed"]
+
+CaseArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="CASE",
+        help="Built-in case, case.toml, or module:object.",
+        autocompletion=one_of(CASES),
+    ),
+]
+CaseOption = Annotated[
+    str | None,
+    typer.Option(
+        "--case",
+        metavar="CASE",
+        help="Built-in case, case.toml, or module:object.",
+        autocompletion=one_of(CASES),
+    ),
+]
+OtherCase = Annotated[
+    str | None,
+    typer.Option(
+        "--case",
+        metavar="CASE",
+        help="If another than it was fitted for.",
+        autocompletion=one_of(CASES),
+    ),
+]
+Rate = Annotated[
+    float | None,
+    typer.Option("--rate", metavar="HZ", help="Samples per second, when the file does not say."),
+]
+Seed = Annotated[int, typer.Option("--seed", metavar="N", help="Same seed, same result.", min=0)]
+Json = Annotated[
+    bool, typer.Option("--json", metavar="", help="Print JSON instead, and nothing else.")
+]

@@ -1,0 +1,50 @@
+"""A plan of simulations carried out by a command: `retwin twin simulate`, `retwin generate`."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from retwin.cli.terminal import FAILED, bar, complain, note, resumable
+
+if TYPE_CHECKING:
+    from retwin.scale import SimulationPlan
+
+__all__ = ["Scheduler", "Workers", "carry_out"]
+
+Workers = Annotated[
+    int | None, typer.Option(metavar="N", help="Processes for *.zarr; else one per core.", min=1)
+]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler, in place of processes.")
+]
+
+
+def carry_out(
+    plan: SimulationPlan,
+    out: Path,
+    what: str,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> None:
+    """Write the trajectories of a plan; those that fail are told, and make the exit code 1."""
+    from retwin.scale import simulate_to
+
+    with resumable() if out.suffix.lower() == ".zarr" else nullcontext(), bar(what) as tell:
+        done = simulate_to(
+            out,
+            plan,
+            workers=workers,
+            scheduler=scheduler,
+            progress=lambda share: tell(f"{share * plan.count:.0f} of {plan.count}", share),
+        )
+    note(f"Wrote {done.count - len(done.failed)} trajectories to {out}")
+    if done.failed:
+        named = "; ".join(f"trajectory {i}: {why}" for i, why in list(done.failed.items())[:5])
+        more = "; …" if len(done.failed) > 5 else ""
+        complain(f"{len(done.failed)} of {done.count} simulations failed: {named}{more}")
+        raise typer.Exit(FAILED)

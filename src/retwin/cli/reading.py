@@ -1,0 +1,31 @@
+"""What names and files on the command line stand for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from retwin.cli.terminal import bar
+from retwin.storage import DataCase, load
+from retwin.trajectories import Trajectories
+
+if TYPE_CHECKING:
+    from retwin.case import Case
+
+__all__ = ["case_named", "read"]
+
+
+def case_named(name: str | None) -> Case | None:
+    """The case of that name, if one is given."""
+    if name is None:
+        return None
+    # Here and not above: it loads torch, and many commands do without.
+    from retwin import cases
+
+    return cases.get(name)
+
+
+def read(file: Path, case: DataCase | None = None, rate: float | None = None) -> Trajectories:
+    """The trajectories of a file, with a bar while they are read."""
+    with bar("read") as tell:
+        return load(file, case=case, rate=rate, progress=lambda share: tell(file.name, share))

@@ -1,0 +1,157 @@
+"""`retwin doctor`: what is there, what is missing and what to do; only the necessary can fail."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from retwin import doctor
+from retwin.doctor import EXTRAS, FOR_DEVELOPERS, Check, examine
+from retwin.errors import InputError
+from retwin.storage import sha256
+
+STATES = {"ok", "warning", "missing", "broken"}
+
+
+@pytest.fixture
+def healthy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPatch:
+    """A machine without data of its own, where drawing is not tried."""
+    monkeypatch.setenv("RETWIN_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("RETWIN_DATA", raising=False)
+    monkeypatch.setattr(doctor, "offscreen_backend", lambda: "egl")
+    return monkeypatch
+
+
+def found(name: str) -> Check:
+    (check,) = (each for each in examine() if each.name == name)
+    return check
+
+
+def test_this_very_machine(call) -> None:
+    """All of it, drawing too; the tests run, so nothing that is needed can be broken."""
+    code, out, err = call("--quiet", "doctor", "--json")
+    assert (code, err) == (0, "")
+    told = json.loads(out)
+    assert told.keys() == {"ok", "checks"}
+    assert told["ok"] is True
+    for each in told["checks"]:
+        assert each.keys() == {"group", "name", "state", "found", "remedy"}
+        assert each["state"] in STATES - {"broken"}
+        assert (each["state"] == "ok") == (each["remedy"] == ""), each
+    names = [each["name"] for each in told["checks"]]
+    assert len(names) == len(set(names))
+    assert {"Python", "torch", "mujoco", "cores", "memory", "GPU", "rendering", *EXTRAS} < {*names}
+    versions = {each["name"]: each["found"] for each in told["checks"]}
+    assert versions["torch"].startswith(metadata.version("torch"))
+
+
+def test_every_extra_is_explained() -> None:
+    extras = metadata.metadata("retwin").get_all("Provides-Extra") or []
+    assert set(extras) - set(FOR_DEVELOPERS) == set(EXTRAS)
+
+
+def test_a_screen_of_80_columns_says_what_to_do(
+    call, healthy: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    healthy.setenv("COLUMNS", "80")
+    real = metadata.version
+    healthy.setattr(
+        "importlib.metadata.version", lambda name: "0.1" if name == "zuko" else real(name)
+    )
+    code, out, _ = call("doctor")
+    assert code == 0
+    assert max(map(len, out.splitlines())) <= 80
+    whole = " ".join(out.split())
+    assert re.search(r"warning flows .*zuko is 0.1, and must be .* → pip install", whole)
+    assert "Everything that is needed is here" in whole
+    assert not (tmp_path / "cache").exists(), "nothing is changed"
+
+
+def test_what_is_needed_and_missing_is_broken(call, healthy: pytest.MonkeyPatch) -> None:
+    real = metadata.version
+
+    def without(name: str) -> str:
+        if name in ("plotly", "dask"):
+            raise metadata.PackageNotFoundError(name)
+        return real(name)
+
+    healthy.setattr("importlib.metadata.version", without)
+    code, out, _ = call("doctor")
+    assert code == 1
+    whole = " ".join(out.split())
+    assert re.search(r'broken plotly plotly is not installed → pip install "plotly', whole)
+    assert re.search(
+        r'missing scale .*dask is not installed → pip install "retwin\[scale\]"', whole
+    )
+    assert "1 broken: retwin cannot work like this" in whole
+
+
+def test_a_library_that_does_not_load(healthy: pytest.MonkeyPatch) -> None:
+    def cannot(name: str) -> object:
+        raise OSError(f"lib{name}.so.1: cannot open\nshared object file")
+
+    healthy.setattr("importlib.import_module", cannot)
+    assert found("mujoco").state == "broken"
+    assert found("mujoco").found == "OSError: libmujoco.so.1: cannot open shared object file"
+
+
+def test_a_machine_that_cannot_draw(healthy: pytest.MonkeyPatch) -> None:
+    def cannot() -> str:
+        raise InputError("renderer", expected="OpenGL", got="none", remedy="install EGL")
+
+    healthy.setattr(doctor, "offscreen_backend", cannot)
+    told = found("rendering")
+    assert (told.state, told.found, told.remedy) == (
+        "missing", "films are stick figures: none", "install EGL",
+    )  # fmt: skip
+
+
+def test_a_container_is_not_the_whole_machine(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name, text in {
+        "cpu.max": "100000 100000",
+        "memory.max": str(2**29),
+        "memory.current": str(2**28),
+    }.items():
+        (tmp_path / name).write_text(text)
+    healthy.setattr(doctor, "CONTROL", tmp_path)
+    healthy.setenv("OMP_NUM_THREADS", "64")
+    assert found("cores").state == "warning"
+    assert "OMP_NUM_THREADS=1" in found("cores").remedy
+    memory = found("memory")
+    assert (memory.state, memory.found) == ("warning", "0.2 GB free of 0.5")
+    assert "--processes 1" in memory.remedy
+
+
+def test_data_that_are_found(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert found("RETWIN_DATA").state == "missing"
+    healthy.setenv("RETWIN_DATA", str(tmp_path / "data"))
+    assert "no such folder" in found("RETWIN_DATA").found
+    (tmp_path / "data" / "arm").mkdir(parents=True)
+    assert found("RETWIN_DATA").state == "warning"
+    (tmp_path / "data" / "arm" / "real.mat").write_bytes(b"x")
+    assert found("RETWIN_DATA").state == "ok"
+    assert "arm/real.mat" in found("RETWIN_DATA").found
+
+
+def test_public_data_that_were_fetched(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    ((name, known),) = doctor.REGISTRY.items()
+    told = found(f"public {name}")
+    assert (told.state, told.remedy) == ("missing", f"retwin data fetch {name}")
+    file = tmp_path / "cache" / known.file
+    file.parent.mkdir(parents=True)
+    file.write_bytes(b"x")
+    assert found(f"public {name}").state == "warning"
+    right = type(known)(known.url, sha256(file), known.file)
+    healthy.setattr(doctor, "REGISTRY", {name: right})
+    assert found(f"public {name}").state == "ok"
+
+
+def test_a_cache_that_cannot_be_written(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    healthy.setenv("RETWIN_CACHE", str(tmp_path / "file" / "below"))
+    told = found("cache")
+    assert (told.state, "RETWIN_CACHE" in told.remedy) == ("warning", True)

@@ -1,0 +1,47 @@
+"""Ctrl-C, the real signal: a line says how to go on, and what was finished is there."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+
+@pytest.mark.slow
+def test_a_study_goes_on(call, start, own: Path) -> None:
+    words = (
+        *("study", "reach.toml", "--real", "real.npz", "--folds", 2, "--sources", "dt,ibg"),
+        *("--runs", 1, "--per-class", 12, "--processes", 1, "--out", "a study"),
+    )
+    results = own / "a study" / "work"
+
+    def finished() -> dict[Path, int]:
+        files = results.glob("run-*/**/model.json")
+        return {file: file.stat().st_mtime_ns for file in files}
+
+    line = start(*words).interrupt(lambda: len(finished()) > 0)
+    before = finished()
+    again = re.search(r"give the same command again to go on: retwin (.*)", line)
+    assert again, line
+    assert shlex.split(again[1]) == list(map(str, words))
+    code, out, err = call(*shlex.split(again[1]))
+    assert code == 0, err
+    assert "IBG" in out
+    after = finished()
+    assert len(after) > len(before)
+    assert {file: after[file] for file in before} == before, "made twice"
+
+
+@pytest.mark.slow
+def test_a_fit_leaves_nothing_half_written(start, own: Path) -> None:
+    """In the midst of training, where lightning would end the process itself."""
+    long = (own / "reach.toml").read_text().replace("epochs = 20,", "epochs = 400,")
+    (own / "long.toml").write_text(long)
+    before = {file.name for file in own.iterdir()}
+    words = ("fit", "long.toml", "--real", "real.npz", "--simulations", 40, "--out", "model")
+    running = start(*words)
+    line = running.interrupt(lambda: "fit: surrogate, 1 of 2" in running.stderr)
+    assert "to begin anew, nothing is left half-written: retwin fit long.toml" in line
+    assert {file.name for file in own.iterdir()} - before <= {"__pycache__"}

@@ -1,0 +1,174 @@
+"""Help that fits the screen and shows examples that work; tables of which nothing is cut off."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import typer
+from rich.console import Console
+from test_readme import check
+
+import retwin as rt
+from retwin.cli import app
+from retwin.cli.terminal import answer, bar, be_quiet, note, table
+
+WITHOUT_TABLES = {
+    *("data convert", "data split", "data fetch", "twin simulate", "twin animate"),
+    *("diagnose fit", "diagnose invert", "bundle save", "bundle generate", "generate", "report"),
+}
+"""Commands that print a line at most; all others have --json."""
+
+
+def commands(command: Any, *words: str) -> Iterator[tuple[str, Any]]:
+    """Every command and group below one, by its words."""
+    for name, each in getattr(command, "commands", {}).items():
+        yield " ".join((*words, name)), each
+        yield from commands(each, *words, name)
+
+
+ALL: dict[str, Any] = dict(commands(typer.main.get_command(app)))
+
+
+@pytest.fixture
+def narrow(call, monkeypatch: pytest.MonkeyPatch):
+    """Run `retwin …` as on a screen of 80 columns."""
+    monkeypatch.setenv("COLUMNS", "80")
+    return call
+
+
+@pytest.fixture
+def on_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Standard error is taken for a terminal of 80 columns."""
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    monkeypatch.setenv("TTY_INTERACTIVE", "1")
+    monkeypatch.setenv("TERM", "xterm")
+
+
+def test_all_commands_fit_one_screen(narrow) -> None:
+    code, out, err = narrow("--help")
+    assert (code, err) == (0, "")
+    lines = out.rstrip("\n").splitlines()
+    assert len(lines) <= 24
+    assert max(map(len, lines)) <= 80
+    for name in typer.main.get_command(app).commands:  # type: ignore[attr-defined]
+        (line,) = (line for line in lines if line.startswith(f"│ {name} "))
+        assert "…" not in line
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_help_shows_an_example_that_works(name: str, narrow) -> None:
+    code, out, _ = narrow(*name.split(), "--help")
+    assert code == 0
+    lines = out.splitlines()
+    assert max(map(len, lines)) <= 80
+    (shown,) = (line.strip() for line in lines if "Example: " in line)
+    example = shown.removeprefix("Example: retwin ")
+    assert example.startswith(name), "one line, of this very command"
+    check(example, whole=True)
+
+
+def test_what_prints_a_table_prints_json() -> None:
+    leaves = {name: each for name, each in ALL.items() if not hasattr(each, "commands")}
+    with_json = {
+        name for name, each in leaves.items() if any("--json" in p.opts for p in each.params)
+    }
+    assert with_json == set(leaves) - WITHOUT_TABLES
+
+
+@pytest.mark.parametrize("width", [40, 80])
+def test_nothing_in_a_table_is_cut_off(
+    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    long = "a_name_without_any_space_" * 3
+    answer(None, table(("[id]", "class"), [(long, "[red]Motor[/]"), (7, "x" * 50)]))
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= width
+    whole = "".join(out.split()).replace("─", "")
+    for text in ("[id]", "[red]Motor[/]"):
+        assert text in whole
+    assert "…" not in out
+    assert [whole.count(letter) for letter in "7x"] == [1, 50]
+    assert sum(out.count(letter) for letter in "_") == long.count("_")
+
+
+def test_json_has_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
+    told = {"a": float("nan"), "b": [float("inf"), 1.5], "c": "ö", "d": rt.Scores(*(8 * [0.5]), 2)}
+    answer(told, "for people", as_json=True)
+    read = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert (read["a"], read["b"], read["c"], read["d"]["n"]) == (None, [None, 1.5], "ö", 2)
+
+
+def test_json_is_alone_on_stdout(narrow) -> None:
+    code, out, err = narrow("twin", "list", "--json")
+    assert (code, err) == (0, "")
+    told = json.loads(out)
+    assert told.keys() == {"built_in", "forms"}
+    assert all(each.keys() == {"name", "title"} for each in told["built_in"])
+    assert all(each.keys() == {"form", "title"} for each in told["forms"])
+    code, out, err = narrow("twin", "info", "armpi-kinematic", "--json")
+    assert (code, err) == (0, "")
+    told = json.loads(out)
+    assert told.keys() == {"title", "rate", "inputs", "outputs"}
+    for each in (*told["inputs"], *told["outputs"]):
+        assert each.keys() == {"name", "unit", "low", "high"}
+    assert (told["rate"], len(told["inputs"]), len(told["outputs"])) == (100, 4, 3)
+
+
+def test_quiet_stands_before_the_command(narrow, monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+    words = ("twin", "simulate", "armpi-kinematic", "--n", 2, "--out", tmp_path / "a.npz")
+    assert narrow("--quiet", *words) == (0, "", "")
+    assert "Wrote 2" in narrow(*words)[2], "the next command is not quiet"
+    monkeypatch.setenv("RETWIN_QUIET", "1")
+    assert narrow(*words) == (0, "", "")
+    code, out, err = narrow("twin", "info", "nonsense")
+    assert (code, out) == (2, "")
+    assert "no such twin" in err, "errors are told"
+    monkeypatch.delenv("RETWIN_QUIET")
+    assert "before the command" in narrow(*words, "--quiet")[2]
+
+
+def test_a_bar_says_how_long_it_takes(on_screen, capsys: pytest.CaptureFixture[str]) -> None:
+    with bar("study") as tell:
+        for share in (0.0, 0.5, 0.9, 0.1):
+            tell("diagnosis", share)
+        time_left = capsys.readouterr().err
+    assert "study: diagnosis" in time_left
+    assert "left" in time_left
+    assert max(len(line) for line in Console().render_str(time_left).plain.splitlines()) < 200
+
+
+def test_a_log_is_told_of_long_work_only(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr("retwin.cli.terminal.time.monotonic", lambda: now[0])
+    with bar("fit") as tell:
+        for second in range(11):
+            now[0] = float(second)
+            tell("net [1]", second / 10)
+        now[0] = 20.0
+        tell("law", 0.0)
+        now[0] = 40.0
+        tell("law", 0.5)
+        tell("law", 0.51)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "fit: net [1] 20%, 8 s left"
+    assert lines[-2:] == ["fit: law 0%", "fit: law 50%, 20 s left"]
+    assert len(lines) == 11
+
+
+def test_quiet_leaves_out_bars_and_notes(on_screen, capsys: pytest.CaptureFixture[str]) -> None:
+    be_quiet(True)
+    try:
+        with bar("fit") as tell:
+            tell("net", 0.5)
+        note("saved")
+        answer(None, "result")
+    finally:
+        be_quiet(False)
+    assert tuple(capsys.readouterr()) == ("result\n", "")

@@ -1,0 +1,263 @@
+"""The page in a real browser: Debian's Chromium, headless, with the network off.
+
+The browser is the one RETWIN_BROWSER names, else `chromium`. Without it these tests are skipped;
+where RETWIN_BROWSER is set, as `.ci/run` sets it, a missing browser is a failure.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+import retwin as rt
+from retwin.report.words import CHROME
+
+PATIENCE = 120_000  # ms, for machines that are busy
+# The last one draws in space without a graphics card.
+OPTIONS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
+SCREEN = {"width": 1280, "height": 900}
+PHONE = {"width": 375, "height": 800}
+A4 = {"width": 695, "height": 1000}
+"""What is left of a sheet within its margins, in CSS pixels."""
+
+
+@dataclass
+class Opened:
+    """A page, what it complained of, and what it asked for beside itself."""
+
+    page: Page
+    errors: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    wanted = os.environ.get("RETWIN_BROWSER")
+    path = shutil.which(wanted or "chromium")
+    if path is None and wanted:
+        pytest.fail(f"RETWIN_BROWSER is {wanted}, which is not installed")
+    if path is None:
+        pytest.skip("no Chromium: apt-get install chromium, or name one in RETWIN_BROWSER")
+    with sync_playwright() as play:
+        started = play.chromium.launch(executable_path=path, args=OPTIONS, timeout=PATIENCE)
+        yield started
+        started.close()
+
+
+@pytest.fixture(scope="module")
+def study_page(
+    case: rt.Case,
+    twin_set: rt.Trajectories,
+    emulated: rt.Trajectories,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
+    """A study of the emulated robot, small, made as any other."""
+    out = tmp_path_factory.mktemp("page")
+    place = np.array([np.flatnonzero(emulated.labels == name)[:5] for name in case.classes])
+    parts = {
+        "twin": twin_set[::3],
+        "calibration": emulated[place[:, :3].ravel()],
+        "test": emulated[place[:, 3:].ravel()],
+    }
+    for name, part in parts.items():
+        rt.save(part, out / f"{name}.npz")
+    plan = rt.StudyPlan(sources=("dt", "ibg_rg"), runs=1, per_class=5, seed=3)
+    data = rt.StudyData(**{name: out / f"{name}.npz" for name in parts})
+    rt.run_study(case, plan, data, out / "study", processes=1)
+    return rt.write_report(out / "study")
+
+
+def opened(browser: Browser, file: Path, **options: Any) -> Opened:
+    """The page in a window of its own, drawn, and listened to from the beginning."""
+    found = Opened(browser.new_context(offline=True, **options).new_page())
+    page = found.page
+    page.set_default_timeout(PATIENCE)
+    page.on("console", lambda said: said.type == "error" and found.errors.append(said.text))
+    page.on("pageerror", lambda error: found.errors.append(str(error)))
+    page.on("request", lambda asked: found.asked.append(asked.url))
+    page.goto(file.as_uri())
+    page.wait_for_selector("#explore-outputs .main-svg")
+    return found
+
+
+@pytest.fixture(scope="module")
+def desk(browser: Browser, study_page: Path) -> Opened:
+    """On a desk; light until a test says otherwise."""
+    return opened(browser, study_page, viewport=SCREEN, color_scheme="light")
+
+
+@pytest.fixture(scope="module")
+def phone(browser: Browser, study_page: Path) -> Opened:
+    return opened(browser, study_page, viewport=PHONE)
+
+
+@pytest.fixture
+def dark(desk: Opened) -> Iterator[Page]:
+    """The same page in the dark, once its pictures have followed."""
+    desk.page.emulate_media(color_scheme="dark")
+    expect(desk.page.locator(".xtitle").first).to_have_css("fill", rgb(CHROME["muted"][1]))
+    yield desk.page
+    desk.page.emulate_media(color_scheme="light")
+    expect(desk.page.locator(".xtitle").first).to_have_css("fill", rgb(CHROME["muted"][0]))
+
+
+def rgb(colour: str) -> str:
+    """`#rrggbb` as browsers say it."""
+    return f"rgb({', '.join(str(int(colour[at : at + 2], 16)) for at in (1, 3, 5))})"
+
+
+def explored(page: Page) -> tuple[str, list[float]]:
+    """Which trajectory the explorer says it shows, and what it draws of it."""
+    drawn: list[float] = page.evaluate(
+        "document.getElementById('explore-outputs').data.find((t) => t.name === 'measured').y"
+    )
+    return page.locator("#explore-pick option:checked").inner_text(), drawn
+
+
+def serious(page: Page) -> list[tuple[str, str]]:
+    """What axe-core finds that is serious or critical: the rule, and where."""
+    return [
+        (each["id"], node["html"][:120])
+        for each in Axe().run(page).response["violations"]
+        if each["impact"] in ("serious", "critical")
+        for node in each["nodes"]
+    ]
+
+
+def test_it_opens_from_a_file_without_network_and_without_errors(desk: Opened) -> None:
+    assert desk.errors == []
+    assert len(desk.asked) == 1, "the page itself"
+    sizes = desk.page.eval_on_selector_all(
+        ".picture",
+        "(all) => all.map((each) => each.querySelector('svg, canvas')?.getBoundingClientRect())"
+        ".map((box) => box && [box.width, box.height])",
+    )
+    assert len(sizes) > 10
+    assert all(size and min(size) > 100 for size in sizes)
+
+
+def test_the_explorer_follows_the_mouse(desk: Opened) -> None:
+    page = desk.page
+    first = explored(page)
+    page.click("#explore-next")
+    second = explored(page)
+    assert first[0] != second[0]
+    assert first[1] != second[1]
+    page.select_option("#explore-pick", index=10)
+    third = explored(page)
+    assert third[1] not in (first[1], second[1])
+    assert "True class:" in page.inner_text("#explore-answer")
+    page.check("#explore-minus")
+    assert explored(page)[1] != third[1]
+    page.uncheck("#explore-minus")
+    link = page.locator("a[href^='#trajectory=']").first
+    link.click()
+    expect(page.locator("#explore-pick option:checked")).to_have_text(link.inner_text())
+
+
+def test_the_explorer_follows_the_keyboard(desk: Opened) -> None:
+    page = desk.page
+    page.select_option("#explore-pick", index=0)
+    page.focus("#explore-pick")
+    first = explored(page)
+    page.keyboard.press("ArrowDown")
+    second = explored(page)
+    assert first[0] != second[0]
+    assert first[1] != second[1]
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.id") == "explore-next"
+    page.keyboard.press("Enter")
+    assert explored(page)[0] not in (first[0], second[0])
+    page.focus("#explore-time")
+    before = page.inner_text("#explore-now")
+    page.keyboard.press("ArrowRight")
+    assert page.inner_text("#explore-now") != before
+
+
+def test_a_rate_of_ones_own(desk: Opened) -> None:
+    """Two healthy test trajectories tell a third and two thirds apart."""
+    page = desk.page
+    page.fill("#calculate-rate", "60")
+    told = page.inner_text("#calculate-told")
+    assert "threshold" in told
+    assert "327" in told, "a third of the 980 that are healthy, of 1000 with 2 % faulty"
+    page.fill("#calculate-broken", "10")
+    assert "300" in page.inner_text("#calculate-told")
+    page.fill("#calculate-rate", "20")
+    assert "it takes 4 of them at least" in page.inner_text("#calculate-best")
+    page.fill("#calculate-missed", "0")
+    assert "never to raise an alarm (cost 0)" in page.inner_text("#calculate-best")
+
+
+def test_dark_where_the_reader_likes_it_dark(desk: Opened, dark: Page) -> None:
+    expect(dark.locator("body")).to_have_css("background-color", rgb(CHROME["paper"][1]))
+    assert serious(dark) == []
+    assert desk.errors == []
+
+
+def test_a_phone_scrolls_one_way_only(phone: Opened) -> None:
+    page = phone.page
+    assert page.evaluate("document.scrollingElement.scrollWidth") <= PHONE["width"]
+    right = page.eval_on_selector_all(
+        ".picture .main-svg",
+        "(all) => Math.max(...all.map((e) => e.getBoundingClientRect().right))",
+    )
+    assert right <= PHONE["width"]
+    assert phone.errors == []
+
+
+@pytest.mark.parametrize("where", ["desk", "phone"])
+def test_axe_finds_nothing_serious(where: str, request: pytest.FixtureRequest) -> None:
+    found: Opened = request.getfixturevalue(where)
+    assert serious(found.page) == []
+
+
+@pytest.fixture
+def sheet(desk: Opened) -> Iterator[Page]:
+    """The same page as wide as a sheet of paper."""
+    page = desk.page
+    page.set_viewport_size(A4)
+    yield page
+    page.emulate_media(media="screen")
+    page.evaluate("window.dispatchEvent(new Event('afterprint'))")
+    page.set_viewport_size(SCREEN)
+
+
+def test_it_prints_whole(sheet: Page) -> None:
+    """Every heading is in the PDF's outline, and nothing is cut at the sheet's edge.
+
+    The first table is made wider than the sheet, as one with the paper's columns is.
+    """
+    titles = sheet.locator("h2").all_inner_texts()
+    document = sheet.pdf(tagged=True, outline=True, prefer_css_page_size=True)
+    outline = re.findall(rb"/Title \((.*?)\)", document)
+    assert {title.encode() for title in titles} <= set(outline)
+    sheet.locator(".scroll table").first.evaluate("(table) => (table.style.minWidth = '900px')")
+    sheet.emulate_media(media="print")
+    sheet.evaluate("window.dispatchEvent(new Event('beforeprint'))")
+    beyond = sheet.eval_on_selector_all(
+        "main *:not(svg *)",
+        "(all) => all.filter((e) => e.getBoundingClientRect().right > innerWidth + 1)"
+        ".map((e) => e.closest('section')?.id + ': ' + e.outerHTML.slice(0, 80))",
+    )
+    assert beyond == []
+
+
+def test_without_scripts_there_are_pictures(browser: Browser, study_page: Path) -> None:
+    with browser.new_context(java_script_enabled=False) as context:
+        page = context.new_page()
+        page.set_default_timeout(PATIENCE)
+        page.goto(study_page.as_uri())
+        shown = [image.bounding_box() for image in page.locator("noscript img").all()]
+        assert len(shown) > 8
+        assert all(box is not None and box["width"] > 300 for box in shown)
