@@ -1,8 +1,12 @@
-"""Print a benchmark's table, and keep its last figures with the machine in results.json."""
+"""Print a benchmark's table, and keep its last figures with the machine in results.json.
+
+Another file, if RETWIN_RESULTS names one.
+"""
 
 from __future__ import annotations
 
 import json
+import os
 import resource
 from pathlib import Path
 from typing import Any
@@ -13,7 +17,7 @@ from rich.table import Table
 from retwin.bench import machine
 from retwin.storage import write_atomically
 
-RESULTS = Path(__file__).parent / "results.json"
+RESULTS = Path(os.environ.get("RETWIN_RESULTS", Path(__file__).parent / "results.json"))
 
 
 def peak_memory_gb() -> float:

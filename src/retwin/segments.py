@@ -118,7 +118,8 @@ class Segments:
         for begin in range(0, len(commands), BLOCK):
             some = commands[begin : begin + BLOCK]
             change = np.abs(some[:, 1:] - some[:, :-1]) > least
-            moving[begin : begin + BLOCK] = reduce(np.logical_or, np.moveaxis(change, 2, 0))
+            none = np.zeros(change.shape[:2], dtype=bool)  # a twin may have no inputs
+            moving[begin : begin + BLOCK] = reduce(np.logical_or, np.moveaxis(change, 2, 0), none)
 
         def speed(row: NDArray, step: NDArray) -> NDArray:
             after, before = (commands[row, step + late].astype(np.float64) for late in (1, 0))

@@ -289,7 +289,7 @@ def simulate_in_chunks(
     labels = np.array([HEALTHY if fault is None else fault.label for fault in drawn])
     good = np.setdiff1d(np.arange(len(commands)), list(failed)) if failed else slice(None)
     made = Trajectories(
-        commands=commands[good],
+        commands=commands[good].copy(),  # the caller's own are the caller's to change
         nominal=nominal[good],
         observed=observed[good],
         ids=np.array([f"{i:05d}" for i in range(len(commands))], dtype=np.str_)[good],
