@@ -19,7 +19,7 @@ from matplotlib.patches import Ellipse
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 from scipy import signal
-from style import BLUE, GREEN, INK, MUTED, ORANGE, PINK, RULE, dress, new, note, save, title
+from style import BLUE, GREEN, INK, MUTED, ORANGE, PINK, RULE, blank, dress, note, save, title
 from torch import Tensor
 
 import retwin as rt
@@ -96,7 +96,7 @@ def explained(operator: rt.Correction, context: rt.Context, found: rt.Discrepanc
 
 def movements(robot: Robot, said: NDArray, paths: Mapping[str, NDArray]) -> Figure:
     """A movement that is late and off, and one that an actuator missed, by both operators."""
-    figure = new(7.2, 5.4)
+    figure = blank(7.2, 5.4)
     grid = figure.subplots(2, 2, sharey="row", sharex="row")
     names = ("late, and off its target", "a motor misses it")
     for row, (what, (i, m)) in enumerate(zip(names, examples(robot, said), strict=True)):
@@ -163,7 +163,7 @@ def unidentified(robot: Robot, found: rt.Discrepancy) -> Figure:
     order = np.argsort(np.where(seen, alike, np.inf), axis=None)[: seen.sum()]
     i, m = np.unravel_index(order[len(order) // 2], alike.shape)
     before = np.diag((np.square(z[..., 1:5]) + np.square(spread))[seen].mean(axis=0))
-    figure = new(7.2, 3.7)
+    figure = blank(7.2, 3.7)
     pairs = {"1 and 2: told": (0, 1), "3 and 4: told together, not apart": (3, 2)}
     for axes, (what, (a, b)) in zip(figure.subplots(1, 2), pairs.items(), strict=True):
         pair = np.ix_((a, b), (a, b))
@@ -214,7 +214,7 @@ def ellipse(
 
 def generated(robot: Robot) -> Figure:
     """Draws of the corrected twin: a stuck motor, and the reach of the arm."""
-    figure = new(7.2, 5.4)
+    figure = blank(7.2, 5.4)
     grid = figure.subplots(2, 2, sharex="row", sharey="row")
     operators = {"DelayOffset": rt.DelayOffset(), "CommandSpace": rt.CommandSpace()}
     commands = robot.case.sampler.sample(DRAWS, rng=np.random.default_rng(8))
@@ -284,7 +284,7 @@ def severity(robot: Robot, healthy: rt.Discrepancy) -> Figure:
     _, told = rt.infer_discrepancy(robot.surrogate, made, operator, faults=labels)
     _, untold = rt.infer_discrepancy(robot.surrogate, made, operator)
     own = np.broadcast_to(np.eye(4, dtype=bool)[motors][:, None], (*shape, 4))
-    figure = new(7.2, 3.7)
+    figure = blank(7.2, 3.7)
     left, right = figure.subplots(1, 2)
     assert told.severity is not None
     found = UNIT * (1.0 + told.severity.numpy()[own])
@@ -318,7 +318,7 @@ def polled(robot: Robot, path: NDArray) -> Figure:
     sensor = rt.SampledSensor().fitted(observed, mask, told, robot.segments)
     drawn = sensor.read(told, torch.Generator().manual_seed(2)).numpy()
     true = KINEMATIC.position(robot.hidden["angles"])
-    figure = new(7.2, 3.7)
+    figure = blank(7.2, 3.7)
     left, right = figure.subplots(1, 2)
     i, m, output = 3, 1, 0
     begin = int(robot.segments.start[i, m])
@@ -370,7 +370,7 @@ def additive() -> Figure:
     segments = rt.Segments.from_commands(commands)
     context = rt.Context.of(Identity(), commands, segments, rate=RATE)
     observed = torch.tensor(true[..., None], dtype=torch.float32)
-    figure = new(7.2, 3.7)
+    figure = blank(7.2, 3.7)
     left, right = figure.subplots(1, 2)
     left.plot(time, ramp[0], "--", color=MUTED, label="the twin")
     left.plot(time, true[0], color=INK, linewidth=3.5, alpha=0.35, label="measured")

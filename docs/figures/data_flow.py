@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyBboxPatch
-from style import BLUE, GREEN, INK, MUTED, ORANGE, new, save
+from style import BLUE, GREEN, INK, MUTED, ORANGE, blank, save
 
 WIDTH, HEIGHT = 1.7, 0.62
 THINGS = {
@@ -42,7 +42,7 @@ ARROWS = (
 
 def main() -> None:
     """Draw it."""
-    figure = new(9.6, 3.1)
+    figure = blank(9.6, 3.1)
     axes = figure.subplots()
     axes.set_axis_off()
     axes.set_xlim(-1.2, 12.6)

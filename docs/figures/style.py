@@ -6,11 +6,11 @@ import io
 from pathlib import Path
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from retwin.report.words import CHROME, PALETTE
+from retwin.report.canvas import INK, MUTED, RULE, blank, dress
+from retwin.report.words import PALETTE
 
 __all__ = [
     "BLUE",
@@ -20,37 +20,17 @@ __all__ = [
     "ORANGE",
     "PINK",
     "RULE",
+    "blank",
     "dress",
-    "new",
     "note",
     "save",
     "title",
 ]
 
 IMAGES = Path(__file__).parents[1] / "images"
-INK, MUTED, GRID, RULE = (CHROME[name][0] for name in ("ink", "muted", "grid", "rule"))
 BLUE, ORANGE, GREEN, PINK = (light for light, _ in PALETTE[:4])
 COLOURS = 128
 """Colours of a file, which keeps it small."""
-
-
-def new(width: float, height: float) -> Figure:
-    """An empty picture, in inches."""
-    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def dress(axes: Axes, x: str, y: str) -> None:
-    """Names of the axes, and no more lines than it takes."""
-    axes.set_xlabel(x, color=MUTED)
-    axes.set_ylabel(y, color=MUTED)
-    axes.tick_params(colors=MUTED, labelsize=9)
-    axes.grid(color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
-    for name, spine in axes.spines.items():
-        spine.set_color(RULE)
-        spine.set_visible(name in ("left", "bottom"))
 
 
 def title(axes: Axes, text: str) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from style import BLUE, INK, MUTED, dress, new, save
+from style import BLUE, INK, MUTED, blank, dress, save
 
 import retwin as rt
 
@@ -30,7 +30,7 @@ def main() -> None:
     observed, draws = gaps(names["updated"], names["held_out"][2:3])
     outputs = names["case"].outputs.names
     time = np.arange(len(observed)) / names["case"].rate
-    figure = new(7.2, 3.6)
+    figure = blank(7.2, 3.6)
     for place, axes in enumerate(figure.subplots(2, 1, sharex=True, sharey=True)):
         for share, alpha in ((0.9, 0.2), (0.5, 0.35)):
             low, high = np.quantile(draws[..., place], [(1 - share) / 2, (1 + share) / 2], axis=0)

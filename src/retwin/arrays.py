@@ -11,12 +11,12 @@ from retwin.errors import InputError
 
 __all__ = ["check_finite", "check_shapes", "floating", "measured", "named", "row_blocks"]
 
-BLOCK = 2**24
+BLOCK = 2**22
 """Bytes of an array that are looked at together."""
 
 
 def row_blocks(array: NDArray, count: int | None = None) -> Iterator[slice]:
-    """Slices of rows, of at most 16 MB each: of all rows of `array`, or of `count` such rows.
+    """Slices of rows, of at most 4 MB each: of all rows of `array`, or of `count` such rows.
 
     Whoever goes through a set by them needs little memory for it, also where the set is a map of
     a file that no memory holds.

@@ -178,7 +178,7 @@ class Trajectories:
         All T where nothing was measured at all, as with a twin that was asked for `nominal` only.
         """
         found = np.empty(len(self), dtype=int)
-        for rows in row_blocks(self.nominal):
+        for rows in row_blocks(max(self.commands, self.nominal, key=lambda each: each.nbytes)):
             commands, eventful = self.commands[rows], np.any(self.mask[rows], axis=2)
             nothing = ~np.any(eventful, axis=1)
             eventful[:, 1:] |= (commands[:, 1:] != commands[:, :-1]).any(axis=2)

@@ -1,17 +1,20 @@
 """A plant with long trajectories, and work on a set of it; run as a script, under a memory limit.
 
 `python plant.py WORK SMALL LARGE OUT` does WORK on the set SMALL, so that everything is imported
-and has run once, then limits its own memory and does it on the set LARGE.
+and has run once, then limits the memory of each process and does it on the set LARGE.
 """
 
 from __future__ import annotations
 
+import contextlib
 import resource
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 import retwin as rt
@@ -22,7 +25,7 @@ from retwin.training import Training
 from retwin.twins.function import FunctionTwin
 
 HEADROOM = 2**27
-"""Bytes of memory that work may take beyond what a process has that did it on a small set."""
+"""Bytes of memory that a process may take beyond the most that one took with the small set."""
 BYTES = 4 * 4 + 4 + 4 + 1
 """Of one sample: commands, nominal and observed output, mask."""
 STEPS, RATE = 16_000, 1600.0
@@ -92,29 +95,49 @@ def simulate(data: Path, out: Path) -> None:
     assert not simulate_to(out / "again.zarr", again, workers=1).failed
 
 
-def limited(headroom: int) -> None:
-    """Forbid more memory than there is now and so much.
+class Watch(threading.Thread):
+    """Looks at the memory of this process and of its workers: the most that one of them took."""
 
-    `RLIMIT_DATA`, which `ulimit -d` sets: memory that only this process can write. Not
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.most, self._over = 0, threading.Event()
+        self._own = psutil.Process()
+
+    def run(self) -> None:
+        while not self._over.wait(0.01):
+            for each in (self._own, *self._own.children(recursive=True)):
+                with contextlib.suppress(psutil.Error):  # it has ended
+                    self.most = max(self.most, each.memory_info().data)
+
+    def __enter__(self) -> Watch:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self.join()
+
+
+def limited(most: int) -> None:
+    """Forbid this process, and each that it starts, more memory than so many bytes.
+
+    `RLIMIT_DATA`, which `ulimit -d` sets: memory that only one process can write. Not
     `RLIMIT_AS` (`ulimit -v`), which counts what is mapped: of torch that is gigabytes of which
     hardly any is memory, and a read-only map of a file takes none that the system could not have
     back at once.
     """
-    told = Path("/proc/self/status").read_text("utf-8")
-    (taken,) = (line.split()[1] for line in told.splitlines() if line.startswith("VmData:"))
-    limit = 1024 * int(taken) + headroom
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
 
 
 def main(work: Callable[[Path, Path], None], small: Path, large: Path, out: Path) -> None:
-    for name, data in (("small", small), ("large", large)):
-        folder = out / name
-        folder.mkdir()
-        work(data, folder)
-        if name == "small":
-            limited(HEADROOM)
+    for name in ("small", "large"):
+        (out / name).mkdir()
+    with Watch() as watch:
+        work(small, out / "small")
+    limited(watch.most + HEADROOM)
+    work(large, out / "large")
     try:
-        np.ones(2 * HEADROOM, np.uint8)
+        np.ones(watch.most + HEADROOM, np.uint8)
     except MemoryError:
         return
     raise AssertionError("nothing limits the memory")

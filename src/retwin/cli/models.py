@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,87 +26,57 @@ if TYPE_CHECKING:
 
 __all__ = ["fit", "generate"]
 
-DATA, MODEL = "Data", "Model; what is not given is the case's"
-"""Panels of the help."""
+data_option, model_option = (
+    partial(typer.Option, rich_help_panel=panel)
+    for panel in ("Data", "Model; what is not given is the case's")
+)
 
 
 def fit(
     case: CaseArgument,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where to save the corrected twin.")],
     real: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Real trajectories to calibrate on.", rich_help_panel=DATA
-        ),
+        Path | None, data_option(metavar="FILE", help="Real trajectories to calibrate on.")
     ] = None,
     data: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Or one file that the case splits in two.",
-            rich_help_panel=DATA,
-        ),
+        Path | None, data_option(metavar="FILE", help="Or one file that the case splits in two.")
     ] = None,
     twin_data: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Trajectories of the twin; else simulated.",
-            rich_help_panel=DATA,
-        ),
+        Path | None, data_option(metavar="FILE", help="Trajectories of the twin; else simulated.")
     ] = None,
     simulations: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Trajectories simulated; else the case's.",
-            rich_help_panel=DATA,
-        ),
+        int | None, data_option(metavar="N", help="Trajectories simulated; else the case's.")
     ] = None,
     calibrate_on: Annotated[
         str,
-        typer.Option(
-            metavar="NAME",
-            help="healthy or all.",
-            rich_help_panel=DATA,
-            autocompletion=one_of(CALIBRATED_ON),
-        ),
+        data_option(metavar="NAME", help="healthy or all.", autocompletion=one_of(CALIBRATED_ON)),
     ] = "healthy",
     network: Annotated[
         str | None,
-        typer.Option(
+        model_option(
             metavar="NAME",
             help="Surrogate: mlp, lstm, tcn or state_space.",
-            rich_help_panel=MODEL,
             autocompletion=one_of(NETWORKS),
         ),
     ] = None,
     correction: Annotated[
         str | None,
-        typer.Option(
+        model_option(
             metavar="NAME",
             help="additive, delay_offset or command_space.",
-            rich_help_panel=MODEL,
             autocompletion=one_of(CORRECTIONS),
         ),
     ] = None,
     density: Annotated[
         str | None,
-        typer.Option(
+        model_option(
             metavar="NAME",
             help="Law of the gap: mixture, flow or sequence_mixture.",
-            rich_help_panel=MODEL,
             autocompletion=one_of(DENSITIES),
         ),
     ] = None,
     refine: Annotated[
-        bool,
-        typer.Option(
-            "--refine",
-            metavar="",
-            help="Fine-tune on outputs afterwards.",
-            rich_help_panel=MODEL,
-        ),
+        bool, model_option("--refine", metavar="", help="Fine-tune on outputs afterwards.")
     ] = False,
     seed: Seed = 0,
     as_json: Json = False,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,9 +32,13 @@ COLUMNS = {
     "coverage90": "in 90 %\nband",
 }
 """Scores that are shown, and the heads of their columns."""
-DATA = "Data: either --real, or --calibration and --test, or --data"
-COMPARED = "What is compared"
-"""Panels of the help."""
+data_option, compared_option = (
+    partial(typer.Option, rich_help_panel=panel)
+    for panel in (
+        "Data: either --real, or --calibration and --test, or --data",
+        "What is compared",
+    )
+)
 
 
 def study(
@@ -42,114 +47,69 @@ def study(
         Path, typer.Option(metavar="FOLDER", help="Called again, the study goes on there.")
     ],
     real: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="One real set, split into folds.", rich_help_panel=DATA),
+        Path | None, data_option(metavar="FILE", help="One real set, split into folds.")
     ] = None,
-    folds: Annotated[
-        int, typer.Option(metavar="N", help="Folds of --real.", rich_help_panel=DATA)
-    ] = 3,
+    folds: Annotated[int, data_option(metavar="N", help="Folds of --real.")] = 3,
     calibration: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Real set to calibrate on.", rich_help_panel=DATA),
+        Path | None, data_option(metavar="FILE", help="Real set to calibrate on.")
     ] = None,
-    test: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Real set to test on.", rich_help_panel=DATA),
-    ] = None,
+    test: Annotated[Path | None, data_option(metavar="FILE", help="Real set to test on.")] = None,
     data: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="One file that the case splits itself.", rich_help_panel=DATA
-        ),
+        Path | None, data_option(metavar="FILE", help="One file that the case splits itself.")
     ] = None,
     twin_data: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Trajectories of the twin; else simulated.",
-            rich_help_panel=DATA,
-        ),
+        Path | None, data_option(metavar="FILE", help="Trajectories of the twin; else simulated.")
     ] = None,
     sources: Annotated[
         str | None,
-        typer.Option(
+        compared_option(
             metavar="NAMES",
             help="Joined by commas, or all; else dt,ibg,ibg_rg.",
-            rich_help_panel=COMPARED,
             autocompletion=complete_sources,
         ),
     ] = None,
     preset: Annotated[
         str,
-        typer.Option(
+        compared_option(
             metavar="NAME",
             help="quick or paper: classifier, training, runs.",
-            rich_help_panel=COMPARED,
             autocompletion=one_of(PRESETS),
         ),
     ] = "quick",
     classifier: Annotated[
         str | None,
-        typer.Option(
+        compared_option(
             metavar="NAME",
             help="cnn, lstm or rocket; else the preset's.",
-            rich_help_panel=COMPARED,
             autocompletion=one_of(CLASSIFIERS),
         ),
     ] = None,
     runs: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Runs; else the preset's.", rich_help_panel=COMPARED),
+        int | None, compared_option(metavar="N", help="Runs; else the preset's.")
     ] = None,
     rate: Annotated[
         float | None,
-        typer.Option(
-            metavar="HZ",
-            help="Seen by the classifier; else the sensor's.",
-            rich_help_panel=COMPARED,
-        ),
+        compared_option(metavar="HZ", help="Seen by the classifier; else the sensor's."),
     ] = None,
     per_class: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Generated trajectories; else the case's.",
-            rich_help_panel=COMPARED,
-        ),
+        int | None, compared_option(metavar="N", help="Generated trajectories; else the case's.")
     ] = None,
     calibrate_on: Annotated[
         str,
-        typer.Option(
-            metavar="NAME",
-            help="healthy or all.",
-            rich_help_panel=COMPARED,
-            autocompletion=one_of(CALIBRATED_ON),
+        compared_option(
+            metavar="NAME", help="healthy or all.", autocompletion=one_of(CALIBRATED_ON)
         ),
     ] = "healthy",
     random_onset: Annotated[
-        bool,
-        typer.Option(
-            "--random-onset",
-            metavar="",
-            help="Draw the onset of stuck motors.",
-            rich_help_panel=COMPARED,
-        ),
+        bool, compared_option("--random-onset", metavar="", help="Draw the onset of stuck motors.")
     ] = False,
     encoder_noise: Annotated[
-        float,
-        typer.Option(
-            metavar="X",
-            help="Noise on frozen joints, in command units.",
-            rich_help_panel=COMPARED,
-        ),
+        float, compared_option(metavar="X", help="Noise on frozen joints, in command units.")
     ] = 0.0,
     learning_curve: Annotated[
         bool,
-        typer.Option(
-            "--learning-curve",
-            metavar="",
-            help="Also calibrate on 1, 2, 4, 6 … healthy ones.",
-            rich_help_panel=COMPARED,
+        compared_option(
+            "--learning-curve", metavar="", help="Also calibrate on 1, 2, 4, 6 … healthy ones."
         ),
     ] = False,
     seed: Seed = 0,

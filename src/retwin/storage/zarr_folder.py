@@ -44,6 +44,9 @@ __all__ = [
 ]
 
 CHUNK = 128
+"""Trajectories that are stored together; fewer where they are so long that these take more than"""
+CHUNK_BYTES = 2**23
+"""so many bytes, since a chunk is in memory as a whole, and more than once while it is packed."""
 KEY = "retwin"
 TEXTS = ("labels", "ids")
 
@@ -62,9 +65,12 @@ def write_zarr(trajectories: Trajectories, path: Path) -> None:
     texts = {name: arrays.pop(name).tolist() for name in TEXTS}
     group.attrs[KEY] = header | texts
     for name, array in arrays.items():
-        chunks = (CHUNK, *(max(1, size) for size in array.shape[1:]))
-        target = group.create_array(name, shape=array.shape, dtype=array.dtype, chunks=chunks)
-        for rows in _chunks(len(array), CHUNK) if array.size else ():
+        rest = [max(1, size) for size in array.shape[1:]]
+        count = min(CHUNK, max(1, CHUNK_BYTES // (math.prod(rest) * array.itemsize)))
+        target = group.create_array(
+            name, shape=array.shape, dtype=array.dtype, chunks=(count, *rest)
+        )
+        for rows in _chunks(len(array), count) if array.size else ():
             target[rows] = array[rows]
 
 
@@ -76,7 +82,7 @@ def read_zarr(path: Path, rows: slice = slice(None)) -> Trajectories:
     whole.
 
     Raises InputError for a damaged folder, one of another kind, a newer schema, no room for the
-    copy, or when the package zarr is not installed.
+    copy, no memory for a chunk, or when the package zarr is not installed.
     """
     zarr = _zarr()
     try:
@@ -91,6 +97,13 @@ def read_zarr(path: Path, rows: slice = slice(None)) -> Trajectories:
         return restore(header, arrays, path.name)[rows]
     except InputError:
         raise
+    except MemoryError:
+        raise InputError(
+            "path",
+            expected="memory for one chunk of the set, several times over",
+            got=f"too little to read {path.name}",
+            remedy="end what else takes memory, or read it on a larger machine",
+        ) from None
     except Exception as error:
         raise _damaged(path, error) from None
 
@@ -150,7 +163,7 @@ def _copied(stored: Any) -> NDArray:
     if not stored.size:
         return np.empty(stored.shape, stored.dtype)
     with Scratch(stored.shape[1:], stored.dtype) as scratch:
-        for rows in _chunks(stored.shape[0], CHUNK):
+        for rows in _chunks(stored.shape[0], stored.chunks[0]):
             scratch.append(np.asarray(stored[rows]))
         return scratch.array()
 
