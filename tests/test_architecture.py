@@ -29,6 +29,7 @@ FLOORS = [
     "state_space",
     "networks",
     "training",
+    "lines",
     "surrogate",
     "mixture",
     "flows",

@@ -169,22 +169,30 @@ class SteadyStateError:
 
 def _along(clean: NDArray, start: NDArray, settle: NDArray, levels: NDArray) -> NDArray:
     """The bias over time: it moves from level to level as the command moves to its target."""
-    time = np.arange(len(clean), dtype=float)
+    clean = clean.astype(np.float64)
     bias = np.zeros(len(clean))
     before = 0.0
-    values = np.interp(np.stack([start, settle]), time, clean)
-    for begin, end, first, last, level in zip(start, settle, *values, levels, strict=True):
+    movements = (start, settle, _between(clean, start), _between(clean, settle), levels)
+    # Plain numbers: numpy's own cost more than what is done with them.
+    for begin, end, first, last, level in zip(*(each.tolist() for each in movements), strict=True):
         if first != last:
             moves = slice(math.ceil(begin), math.ceil(end))
             share = (clean[moves] - first) / (last - first)
         else:
             length = max(end - begin, 1.0)
             moves = slice(math.ceil(begin), math.ceil(begin + length))
-            share = (time[moves] - begin) / length
-        bias[moves] = before + (level - before) * np.clip(share, 0.0, 1.0)
+            share = (np.arange(len(bias), dtype=float)[moves] - begin) / length
+        bias[moves] = before + (level - before) * np.minimum(np.maximum(share, 0.0), 1.0)
         bias[moves.stop :] = before + (level - before)
         before = level
     return bias
+
+
+def _between(values: NDArray, when: NDArray) -> NDArray:
+    """Values (T,) at times in samples, fractions allowed."""
+    left = np.minimum(when.astype(int), len(values) - 2)
+    share = np.minimum(when - left, 1.0)
+    return values[left] + share * (values[left + 1] - values[left])
 
 
 def _open(fault: Fault) -> InputError:

@@ -16,18 +16,19 @@ from retwin.arrays import row_blocks
 from retwin.configs import from_config, to_config
 from retwin.errors import InputError
 from retwin.faults import Fault
+from retwin.lines import told_along
 from retwin.models import read_model, write_model
 from retwin.networks import MLP, NETWORKS, Network, Standardise
 from retwin.training import Fit, Training, isolated, train
 from retwin.trajectories import Channels, Trajectories
 from retwin.twins.protocol import Chunk, Progress, checked_commands, simulate_in_chunks
 
-__all__ = ["Surrogate", "distinct", "fit_surrogate", "surrogate_training"]
+__all__ = ["Surrogate", "fit_surrogate", "surrogate_training"]
 
 CHUNK = 8
 """Trajectories that a network with memory is asked at a time: more leave the cache."""
 SPAN = 128
-"""Trajectories that are gone through for commands that are held."""
+"""Trajectories whose commands are gone through for lines."""
 ROWS = 2048
 """Samples that a network without memory is asked at a time, for the same reason."""
 
@@ -78,11 +79,12 @@ class Surrogate(nn.Module):
     def predict(self, commands: NDArray, *, progress: Progress | None = None) -> NDArray:
         """Outputs (n, T, d_y), float32, for commands (n, T, d_u), without gradient.
 
-        In chunks that fit the cache; a network without memory is asked once for a held command.
+        In chunks that fit the cache; a network without memory is asked once for a held command, and
+        at few points of a ramp.
         """
         values = np.ascontiguousarray(commands, dtype=np.float32)
         out = np.empty((*values.shape[:2], len(self.outputs)), dtype=np.float32)
-        ask, size = (self._once, SPAN) if self.memoryless else (self, CHUNK)
+        ask, size = (self._by_lines, SPAN) if self.memoryless else (self, CHUNK)
         for begin in range(0, len(values), size):
             part = slice(begin, begin + size)
             out[part] = ask(torch.tensor(values[part])).numpy()
@@ -90,11 +92,13 @@ class Surrogate(nn.Module):
                 progress(min(1.0, (begin + size) / len(values)))
         return out
 
-    def _once(self, commands: Tensor) -> Tensor:
-        """The same as `forward`, computed once where a command is held."""
-        rows, place = distinct(commands)
-        said = torch.cat([self(some) for some in rows.split(ROWS)])
-        return said.index_select(0, place.flatten()).view(*place.shape, -1)
+    def _by_lines(self, commands: Tensor) -> Tensor:
+        """As `forward`, up to rounding; asked once for a hold and at few points of a ramp."""
+
+        def ask(rows: Tensor) -> Tensor:
+            return torch.cat([self(some) for some in rows.split(ROWS)])
+
+        return told_along(ask, commands, self.after.scale)
 
     def simulate(
         self,
@@ -138,17 +142,6 @@ class Surrogate(nn.Module):
         surrogate.load_state_dict(weights)
         surrogate.fitted = Fit.of(about["fitted"])
         return surrogate.eval()
-
-
-def distinct(commands: Tensor) -> tuple[Tensor, Tensor]:
-    """Those of the commands (n, T, d_u) that differ from the sample before, (k, d_u), and for each
-    sample which of them it is, (n, T): what is held says the same all over.
-    """
-    fresh = torch.ones(commands.shape[:2], dtype=torch.bool)
-    fresh[:, 1:] = (commands[:, 1:] != commands[:, :-1]).any(dim=-1)
-    index = fresh.flatten().nonzero()[:, 0]
-    place = fresh.flatten().cumsum(dim=0) - 1
-    return commands.flatten(0, 1).index_select(0, index), place.view(fresh.shape)
 
 
 ENOUGH = 10

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from retwin.corrections.command_effect import effective
 from retwin.corrections.protocol import Context
-from retwin.surrogate import distinct
+from retwin.lines import distinct
 
 if TYPE_CHECKING:
     from retwin.corrections.command_space import CommandSpace

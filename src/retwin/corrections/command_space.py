@@ -17,7 +17,7 @@ from retwin.corrections.command_effect import effective
 from retwin.corrections.command_inference import infer_commands
 from retwin.corrections.protocol import Context, Discrepancy, Head
 from retwin.corrections.warp import taken
-from retwin.surrogate import distinct
+from retwin.lines import distinct
 from retwin.trajectories import Channels
 
 __all__ = ["CommandSpace"]
