@@ -5,6 +5,7 @@ On stderr go bars and notes, which `--quiet` leaves out, and warnings and errors
 
 from __future__ import annotations
 
+import logging
 import shlex
 import signal
 import sys
@@ -204,6 +205,8 @@ def complain_of_usage(error: Any) -> None:
 
 def complain_of_interruption(*, kept: bool) -> None:
     """One line on Ctrl-C; `kept`: the same command goes on where this one stopped."""
+    # Zarr's event loop would tell at length, as the process ends, what it was cut off in.
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
     how = "to go on" if kept else "to begin anew, nothing is left half-written"
     complain(f"interrupted; give the same command again {how}: {command_given()}")
 
