@@ -58,9 +58,11 @@ class Segments:
     def __getitem__(self, index: slice | ArrayLike) -> Segments:
         """The segments of the trajectories at `index`."""
         index = index if isinstance(index, slice) else np.atleast_1d(np.asarray(index))
-        return Segments(
-            self.start[index], self.settle[index], self.stop[index], self.valid[index], self.steps
-        )
+        part = object.__new__(Segments)  # of what is in order, a part need not be checked again
+        for name in ("start", "settle", "stop", "valid"):
+            part.__dict__[name] = getattr(self, name)[index]
+        part.__dict__["steps"] = self.steps
+        return part
 
     @property
     def most(self) -> int:

@@ -27,8 +27,8 @@ __all__ = ["Surrogate", "fit_surrogate", "surrogate_training"]
 
 CHUNK = 8
 """Trajectories that a network with memory is asked at a time: more leave the cache."""
-SPAN = 128
-"""Trajectories whose commands are gone through for lines."""
+SPAN = 2**17
+"""Samples, in whole trajectories, that are gone through for lines together."""
 ROWS = 2048
 """Samples that a network without memory is asked at a time, for the same reason."""
 
@@ -84,7 +84,8 @@ class Surrogate(nn.Module):
         """
         values = np.ascontiguousarray(commands, dtype=np.float32)
         out = np.empty((*values.shape[:2], len(self.outputs)), dtype=np.float32)
-        ask, size = (self._by_lines, SPAN) if self.memoryless else (self, CHUNK)
+        few = 1 + SPAN // (1 + values.shape[1])
+        ask, size = (self._by_lines, few) if self.memoryless else (self, CHUNK)
         for begin in range(0, len(values), size):
             part = slice(begin, begin + size)
             out[part] = ask(torch.tensor(values[part])).numpy()
