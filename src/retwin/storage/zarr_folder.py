@@ -44,9 +44,9 @@ __all__ = [
 ]
 
 CHUNK = 128
-"""Trajectories that are stored together; fewer where they are so long that these take more than"""
+"""Trajectories that are stored together, at most."""
 CHUNK_BYTES = 2**23
-"""so many bytes, since a chunk is in memory as a whole, and more than once while it is packed."""
+"""Bytes of them, at most: a chunk is in memory as a whole, and more than once while packed."""
 KEY = "retwin"
 TEXTS = ("labels", "ids")
 
