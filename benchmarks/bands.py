@@ -12,7 +12,7 @@ import torch
 from record import record
 
 import retwin as rt
-from retwin.twins.protocol import HEALTHY
+from retwin.data.trajectories import HEALTHY
 
 CALIBRATE, HELD_OUT = 4, 20
 SETS = 6

@@ -25,12 +25,12 @@ from record import record
 from sklearn.metrics import roc_auc_score
 
 import retwin as rt
-from retwin.bundle.bundle import Bundle
-from retwin.bundle.export import export_onnx
-from retwin.bundle.guard import Guard, fit_guard
-from retwin.bundle.portable import Portable
-from retwin.bundle.verdicts import OUTSIDE, Prediction
-from retwin.twins.armpi import KINEMATIC
+from retwin.cases.armpi_fpv.twin import KINEMATIC
+from retwin.deploy.bundle.bundle import Bundle
+from retwin.deploy.bundle.guard import Guard, fit_guard
+from retwin.deploy.bundle.verdicts import OUTSIDE, Prediction
+from retwin.deploy.onnx.export import export_onnx
+from retwin.deploy.onnx.portable import Portable
 
 CALLS = 500
 FOLDS = 3

@@ -19,8 +19,8 @@ import torch
 from record import record
 
 import retwin as rt
-from retwin.bench import median_seconds
-from retwin.twins.armpi import KINEMATIC, UNIT
+from retwin.cases.armpi_fpv.twin import KINEMATIC, UNIT
+from retwin.cli.benchmark import median_seconds
 
 COUNT = 100
 SURE = 1.645

@@ -20,8 +20,8 @@ from record import record
 from scipy.stats import chi2
 
 import retwin as rt
-from retwin.corrections import Context
-from retwin.twins.armpi import KINEMATIC, POLL
+from retwin.cases.armpi_fpv.twin import KINEMATIC, POLL
+from retwin.update.corrections import Context
 
 COUNT = 200
 DRAWS = 2000

@@ -17,8 +17,8 @@ from fmu import ms_per_run
 from record import peak_memory_gb, record
 
 import retwin as rt
-from retwin.bench import generating, memory_bandwidth
-from retwin.twins.armpi import KINEMATIC, ArmPiTwin
+from retwin.cases.armpi_fpv.twin import KINEMATIC, ArmPiTwin
+from retwin.cli.benchmark import generating, memory_bandwidth
 from retwin.twins.fmu import FMUTwin
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))

@@ -18,10 +18,10 @@ import torch
 from record import record
 
 import retwin as rt
+from retwin.cases.armpi_fpv.twin import UNIT
 from retwin.diagnosis import Diagnosis, Estimate, fit_inversion
-from retwin.faults import SteadyStateError, Stuck, draw_faults
-from retwin.statistics import score
-from retwin.twins.armpi import UNIT
+from retwin.scores.statistics import score
+from retwin.twins.faults import SteadyStateError, Stuck, draw_faults
 
 HEALTHY = 6
 PER_CLASS = 6

@@ -14,8 +14,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from retwin.bench import machine
-from retwin.storage import write_atomically
+from retwin.cli.benchmark import machine
+from retwin.serialisation.files import write_atomically
 
 RESULTS = Path(os.environ.get("RETWIN_RESULTS", Path(__file__).parent / "results.json"))
 

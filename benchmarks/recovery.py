@@ -14,8 +14,8 @@ from pathlib import Path
 from record import record
 
 import retwin as rt
-from retwin.cases.armpi_recovery import recover_commands
-from retwin.twins.armpi import ARM
+from retwin.cases.armpi_fpv.recovery import recover_commands
+from retwin.cases.armpi_fpv.twin import ARM
 
 
 def main() -> None:

@@ -22,9 +22,9 @@ import torch
 from record import record
 
 import retwin as rt
-from retwin.corrected import CorrectedTwin
-from retwin.fidelity import Fidelity, measure_fidelity
-from retwin.residual import Flow, Mixture, Refinement, fit_residual
+from retwin.evaluation.fidelity import Fidelity, measure_fidelity
+from retwin.update.corrected import CorrectedTwin
+from retwin.update.residual import Flow, Mixture, Refinement, fit_residual
 
 SHAPES = {
     "one Gaussian": Mixture(components=1),

@@ -23,9 +23,9 @@ from record import record
 
 import retwin as rt
 from retwin import twins
-from retwin.bench import timed
+from retwin.cli.benchmark import timed
+from retwin.deploy.simulations import SimulationPlan, simulate_to
 from retwin.diagnosis.features import Features
-from retwin.scale import SimulationPlan, simulate_to
 
 MILLION = 1_000_000
 ENOUGH = 1024

@@ -32,10 +32,10 @@ from numpy.typing import NDArray
 from record import record
 
 import retwin as rt
-from retwin.cases.tanks import VOLTAGES, benchmark, tanks
-from retwin.corrected import CorrectedTwin
-from retwin.twins.tanks import tanks_parametric
-from retwin.updating import LeastSquares, identify
+from retwin.cases.cascaded_tanks.case import VOLTAGES, benchmark, tanks
+from retwin.cases.cascaded_tanks.twin import tanks_parametric
+from retwin.update.corrected import CorrectedTwin
+from retwin.update.identification import LeastSquares, identify
 
 DRAWS = 500
 BLOCK = 64

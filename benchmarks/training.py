@@ -22,7 +22,7 @@ from torch.utils.data import DataLoader, TensorDataset
 import retwin as rt
 from retwin.diagnosis.features import Features, class_index
 from retwin.diagnosis.network import training_for
-from retwin.networks import Network
+from retwin.nets.networks import Network
 
 SEEDS = 3
 WHOLE = 3600

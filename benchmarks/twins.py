@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from record import record
 
 import retwin as rt
-from retwin.twins.armpi import KINEMATIC, ArmPiTwin
+from retwin.cases.armpi_fpv.twin import KINEMATIC, ArmPiTwin
 
 STEPS = (0.001, 0.002, 0.005, 0.01)
 SETTLED = 50

@@ -25,8 +25,8 @@ import numpy as np
 from record import record
 
 import retwin as rt
-from retwin.twins.armpi_parametric import armpi_parametric
-from retwin.updating import NPE, identify, identify_bayes
+from retwin.cases.armpi_fpv.parameters import armpi_parametric
+from retwin.update.identification import NPE, identify, identify_bayes
 
 FOLDS = 3
 PER_CLASS = 100

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import retwin as rt
-from retwin.training import Training
-from retwin.twins.armpi import KINEMATIC
+from retwin.cases.armpi_fpv.twin import KINEMATIC
+from retwin.nets.training import Training
 
 
 @pytest.hookimpl(hookwrapper=True)

@@ -1,89 +1,153 @@
-"""The house stands: a module imports only from floors below its own."""
+"""The rooms of the package: what may import what, and what each loads."""
 
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
+from dataclasses import fields, is_dataclass
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 import retwin
+from retwin import catalog
 
 ROOT = Path(retwin.__file__).parent
-# From the ground up, as docs/architecture.md draws it.
-FLOORS = [
-    "errors",
-    "configs",
-    "processes",
-    "arrays",
-    "trajectories",
-    "storage",
-    "download",
-    "models",
-    "segments",
-    "commands",
-    "faults",
-    "twins",
-    "state_space",
-    "networks",
-    "training",
-    "lines",
-    "surrogate",
-    "mixture",
-    "flows",
-    "corrections",
-    "residual",
-    "case",
-    "animation",
-    "corrected",
-    "updating",
-    "scale",
-    "diagnosis",
-    "testing",
-    "statistics",
-    "fidelity",
-    "bundle",
-    "study",
-    "report",
-    "cases",
-    "bench",
-    "doctor",
-    "cli",
-]
-ONE_ROOM = {"__main__": "cli"}
-MODULES = sorted(p for p in ROOT.rglob("*.py") if p != ROOT / "__init__.py")
+ROOMS = (
+    (
+        "_version",
+        "errors",
+        "checks",
+        "progress",
+        "arrays",
+        "processes",
+        "jobs",
+        "serialisation",
+        "catalog",
+        "results",
+    ),
+    ("data",),
+    ("scores",),
+    ("inference",),
+    ("twins",),
+    ("nets",),
+    ("update",),
+    ("diagnosis",),
+    ("evaluation",),
+    ("cases",),
+    ("study",),
+    ("report",),
+    ("deploy",),
+    ("monitor",),
+    ("cli", "__main__"),
+    ("testing",),
+)
+"""The rooms from the ground up, as docs/architecture.md lists them, and the modules of each."""
+ORDER = {module: place for place, modules in enumerate(ROOMS) for module in modules}
+FILES = {
+    path.relative_to(ROOT).with_suffix("").as_posix().replace("/", "."): path
+    for path in sorted(ROOT.rglob("*.py"))
+    if path != ROOT / "__init__.py"
+}
 
 
-def floor_of(dotted: str) -> int:
-    room = dotted.split(".")[1]
-    return FLOORS.index(ONE_ROOM.get(room, room))
-
-
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_imports_only_from_below(path: Path) -> None:
-    own = floor_of("retwin." + path.relative_to(ROOT).with_suffix("").as_posix().replace("/", "."))
-    imported = []
+def imports(path: Path) -> set[str]:
+    """The modules of retwin that a file imports, those for type checking included."""
+    found = set()
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("retwin."):
-            imported.append(node.module)
-        elif isinstance(node, ast.ImportFrom) and node.module == "retwin":
-            imported += [f"retwin.{name.name}" for name in node.names]
-    for dotted in imported:
-        if dotted == "retwin.__version__":
-            continue
-        assert floor_of(dotted) <= own, f"{path.name} reaches up to {dotted}"
+        if isinstance(node, ast.Import):
+            found |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {f"{node.module}.{name.name}" for name in node.names}
+    names = {name.removeprefix("retwin.") for name in found if name.startswith("retwin.")}
+    return {module for name in names if (module := file_of(name))}
 
 
-def test_only_cases_and_twins_know_a_robot() -> None:
-    for path in MODULES:
-        if path.relative_to(ROOT).parts[0] in ("cases", "twins", "cli"):
-            continue
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module:
-                assert "armpi" not in node.module, path
-                assert node.module not in ("retwin.twins.arm", "retwin.twins.emulated"), path
+def file_of(name: str) -> str:
+    """The file that a dotted name is in: a module, or a package's `__init__`."""
+    for candidate in (name, f"{name}.__init__"):
+        if candidate in FILES:
+            return candidate
+    parent = name.rpartition(".")[0]
+    return file_of(parent) if parent else ""
+
+
+GRAPH = {module: imports(path) for module, path in FILES.items()}
+
+
+def place_of(module: str) -> int:
+    return ORDER[module.split(".")[0]]
+
+
+def test_no_room_imports_from_a_room_above_it_and_no_file_in_a_circle() -> None:
+    upwards = [
+        f"{module} -> {other}"
+        for module, others in GRAPH.items()
+        for other in others
+        if place_of(other) > place_of(module)
+    ]
+    assert not upwards
+    inside = {
+        module: {other for other in others if not other.endswith("__init__")}
+        for module, others in GRAPH.items()
+    }
+    try:
+        TopologicalSorter(inside).prepare()
+    except CycleError as error:
+        pytest.fail(f"imports in a circle: {' <- '.join(error.args[1])}")
+
+
+def test_only_the_command_line_calls_the_package_by_its_public_names() -> None:
+    for module, path in FILES.items():
+        if place_of(module) < ORDER["cli"]:
+            assert "import retwin as rt" not in path.read_text("utf-8"), module
+
+
+def test_every_room_states_what_belongs_there() -> None:
+    for folder in {path.parent for path in FILES.values()} - {ROOT}:
+        text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text("utf-8")))
+        assert text, folder
+        if folder.parent == ROOT:
+            assert "Belongs here:" in text, folder
+            assert "Not here:" in text, folder
+
+
+def test_only_cases_know_a_robot() -> None:
+    for module, path in FILES.items():
+        if place_of(module) < ORDER["cases"] and module != "catalog":
+            assert not re.search(r"retwin[.]cases|armpi", path.read_text("utf-8")), module
+
+
+def test_the_ground_needs_no_torch() -> None:
+    modules = [f"retwin.{name}" for name in FILES if place_of(name) == 0]
+    code = (
+        "import importlib, sys\n"
+        f"for name in {modules}: importlib.import_module(name.removesuffix('.__init__'))\n"
+        "assert not {'torch', 'sklearn', 'scipy', 'matplotlib'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def targets() -> list[str]:
+    """Every dotted name that the catalog holds."""
+    entries = [
+        entry
+        for value in vars(catalog).values()
+        if isinstance(value, dict)
+        for entry in value.values()
+        if is_dataclass(entry)
+    ]
+    texts = [getattr(entry, each.name) for entry in entries for each in fields(entry)]
+    return [text for text in texts if isinstance(text, str) and re.match(r"retwin\.\S+:", text)]
+
+
+def test_the_catalog_names_what_exists() -> None:
+    assert len(targets()) > 40
+    for target in targets():
+        assert catalog.resolve(target) is not None, target
 
 
 def test_import_loads_no_torch() -> None:

@@ -23,8 +23,8 @@ from style import BLUE, GREEN, INK, MUTED, ORANGE, PINK, RULE, blank, dress, not
 from torch import Tensor
 
 import retwin as rt
-from retwin.training import Training
-from retwin.twins.armpi import ARM, KINEMATIC, POLL, UNIT
+from retwin.cases.armpi_fpv.twin import ARM, KINEMATIC, POLL, UNIT
+from retwin.nets.training import Training
 
 EMULATED, TOY = "Emulated robot, no real measurements", "A toy, no real measurements"
 COLOURS = {"CommandSpace": BLUE, "DelayOffset": ORANGE, "Additive": GREEN}

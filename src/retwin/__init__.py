@@ -10,36 +10,36 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from retwin._version import __version__
 
 # Name to module, loaded when first asked for: `import retwin` must not wait for torch.
 _HOME = {
-    "Additive": "corrections",
-    "ArmPiTwin": "twins.armpi",
-    "CNN": "networks",
-    "Case": "case",
-    "Chain": "corrections",
-    "Channels": "trajectories",
-    "CommandSpace": "corrections",
-    "Context": "corrections",
-    "CorrectedTwin": "corrected",
-    "Correction": "corrections",
-    "DelayOffset": "corrections",
+    "Additive": "update.corrections",
+    "ArmPiTwin": "cases.armpi_fpv.twin",
+    "CNN": "nets.networks",
+    "Case": "cases.case",
+    "Chain": "update.corrections",
+    "Channels": "data.trajectories",
+    "CommandSpace": "update.corrections",
+    "Context": "update.corrections",
+    "CorrectedTwin": "update.corrected",
+    "Correction": "update.corrections",
+    "DelayOffset": "update.corrections",
     "Diagnoser": "diagnosis",
-    "Discrepancy": "corrections",
+    "Discrepancy": "update.corrections",
     "FMUTwin": "twins.fmu",
-    "Fault": "faults",
-    "Fidelity": "fidelity",
-    "Flow": "residual",
+    "Fault": "twins.faults",
+    "Fidelity": "evaluation.fidelity",
+    "Flow": "update.residual",
     "FunctionTwin": "twins.function",
     "InputError": "errors",
     "InversionDiagnoser": "diagnosis",
-    "KinematicTwin": "twins.kinematic",
-    "LSTM": "networks",
-    "LSTMClassifier": "networks",
-    "Limits": "twins.protocol",
-    "MLP": "networks",
-    "Mixture": "residual",
+    "KinematicTwin": "cases.armpi_fpv.closed_form",
+    "LSTM": "nets.networks",
+    "LSTMClassifier": "nets.networks",
+    "Limits": "twins.twin",
+    "MLP": "nets.networks",
+    "Mixture": "update.residual",
     "MuJoCoTwin": "twins.mujoco",
     "NetworkDiagnoser": "diagnosis",
     "NoisyTwin": "twins.noisy",
@@ -47,46 +47,46 @@ _HOME = {
     "ParametricTwin": "twins.parametric",
     "PooledDiagnoser": "diagnosis",
     "RandomisedTwin": "twins.randomised",
-    "Refinement": "residual",
-    "ResidualModel": "residual",
-    "SampledSensor": "corrections",
-    "Scores": "statistics",
-    "Segments": "segments",
-    "SequenceMixture": "residual",
-    "SequenceResidual": "residual",
-    "SimulationError": "twins.protocol",
-    "SimulationPlan": "scale",
-    "StateSpace": "networks",
-    "SteadyStateError": "faults",
-    "Stuck": "faults",
+    "Refinement": "update.residual",
+    "ResidualModel": "update.residual",
+    "SampledSensor": "update.corrections",
+    "Scores": "scores.statistics",
+    "Segments": "data.segments",
+    "SequenceMixture": "update.residual",
+    "SequenceResidual": "update.residual",
+    "SimulationError": "twins.twin",
+    "SimulationPlan": "deploy.simulations",
+    "StateSpace": "nets.networks",
+    "SteadyStateError": "twins.faults",
+    "Stuck": "twins.faults",
     "StudyData": "study",
     "StudyPlan": "study",
-    "Surrogate": "surrogate",
-    "TCN": "networks",
-    "Training": "training",
-    "Trajectories": "trajectories",
-    "Twin": "twins.protocol",
-    "animate": "animation",
-    "evaluate": "statistics",
-    "fetch": "download",
+    "Surrogate": "update.surrogate",
+    "TCN": "nets.networks",
+    "Training": "nets.training",
+    "Trajectories": "data.trajectories",
+    "Twin": "twins.twin",
+    "animate": "cases.animation",
+    "evaluate": "evaluation.evaluate",
+    "fetch": "data.download",
     "fine_tune": "diagnosis",
     "fit_dann": "diagnosis",
     "fit_diagnoser": "diagnosis",
     "fit_inversion": "diagnosis",
-    "fit_residual": "residual",
+    "fit_residual": "update.residual",
     "fit_rocket": "diagnosis",
-    "fit_surrogate": "surrogate",
-    "generate": "corrected",
-    "identify": "updating",
-    "identify_bayes": "updating",
-    "infer_discrepancy": "residual",
-    "load": "storage",
+    "fit_surrogate": "update.surrogate",
+    "generate": "update.corrected",
+    "identify": "update.identification",
+    "identify_bayes": "update.identification",
+    "infer_discrepancy": "update.residual",
+    "load": "data.io",
     "load_diagnoser": "diagnosis",
-    "measure_fidelity": "fidelity",
-    "measure_widening": "fidelity",
+    "measure_fidelity": "evaluation.fidelity",
+    "measure_widening": "evaluation.fidelity",
     "run_study": "study",
-    "save": "storage",
-    "simulate_to": "scale",
+    "save": "data.io",
+    "simulate_to": "deploy.simulations",
     "write_report": "report",
 }
 
@@ -110,19 +110,15 @@ def __dir__() -> list[str]:
 
 if TYPE_CHECKING:
     from retwin import cases, testing, twins
-    from retwin.animation import animate
-    from retwin.case import Case
-    from retwin.corrected import CorrectedTwin, generate
-    from retwin.corrections import (
-        Additive,
-        Chain,
-        CommandSpace,
-        Context,
-        Correction,
-        DelayOffset,
-        Discrepancy,
-        SampledSensor,
-    )
+    from retwin.cases.animation import animate
+    from retwin.cases.armpi_fpv.closed_form import KinematicTwin
+    from retwin.cases.armpi_fpv.twin import ArmPiTwin
+    from retwin.cases.case import Case
+    from retwin.data.download import fetch
+    from retwin.data.io import load, save
+    from retwin.data.segments import Segments
+    from retwin.data.trajectories import Channels, Trajectories
+    from retwin.deploy.simulations import SimulationPlan, simulate_to
     from retwin.diagnosis import (
         Diagnoser,
         InversionDiagnoser,
@@ -135,13 +131,35 @@ if TYPE_CHECKING:
         fit_rocket,
         load_diagnoser,
     )
-    from retwin.download import fetch
     from retwin.errors import InputError
-    from retwin.faults import Fault, SteadyStateError, Stuck
-    from retwin.fidelity import Fidelity, measure_fidelity, measure_widening
-    from retwin.networks import CNN, LSTM, MLP, TCN, LSTMClassifier, StateSpace
+    from retwin.evaluation.evaluate import evaluate
+    from retwin.evaluation.fidelity import Fidelity, measure_fidelity, measure_widening
+    from retwin.nets.networks import CNN, LSTM, MLP, TCN, LSTMClassifier, StateSpace
+    from retwin.nets.training import Training
     from retwin.report import write_report
-    from retwin.residual import (
+    from retwin.scores.statistics import Scores
+    from retwin.study import StudyData, StudyPlan, run_study
+    from retwin.twins.faults import Fault, SteadyStateError, Stuck
+    from retwin.twins.fmu import FMUTwin
+    from retwin.twins.function import FunctionTwin
+    from retwin.twins.mujoco import MuJoCoTwin
+    from retwin.twins.noisy import NoisyTwin
+    from retwin.twins.parametric import Parameter, ParametricTwin
+    from retwin.twins.randomised import RandomisedTwin
+    from retwin.twins.twin import Limits, SimulationError, Twin
+    from retwin.update.corrected import CorrectedTwin, generate
+    from retwin.update.corrections import (
+        Additive,
+        Chain,
+        CommandSpace,
+        Context,
+        Correction,
+        DelayOffset,
+        Discrepancy,
+        SampledSensor,
+    )
+    from retwin.update.identification import identify, identify_bayes
+    from retwin.update.residual import (
         Flow,
         Mixture,
         Refinement,
@@ -151,21 +169,4 @@ if TYPE_CHECKING:
         fit_residual,
         infer_discrepancy,
     )
-    from retwin.scale import SimulationPlan, simulate_to
-    from retwin.segments import Segments
-    from retwin.statistics import Scores, evaluate
-    from retwin.storage import load, save
-    from retwin.study import StudyData, StudyPlan, run_study
-    from retwin.surrogate import Surrogate, fit_surrogate
-    from retwin.training import Training
-    from retwin.trajectories import Channels, Trajectories
-    from retwin.twins.armpi import ArmPiTwin
-    from retwin.twins.fmu import FMUTwin
-    from retwin.twins.function import FunctionTwin
-    from retwin.twins.kinematic import KinematicTwin
-    from retwin.twins.mujoco import MuJoCoTwin
-    from retwin.twins.noisy import NoisyTwin
-    from retwin.twins.parametric import Parameter, ParametricTwin
-    from retwin.twins.protocol import Limits, SimulationError, Twin
-    from retwin.twins.randomised import RandomisedTwin
-    from retwin.updating import identify, identify_bayes
+    from retwin.update.surrogate import Surrogate, fit_surrogate

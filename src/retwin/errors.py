@@ -9,7 +9,7 @@ import sysconfig
 import traceback
 from pathlib import Path
 
-__all__ = ["InputError", "place_of"]
+__all__ = ["InputError", "brief", "place_of"]
 
 
 class InputError(ValueError):
@@ -46,3 +46,9 @@ def place_of(error: BaseException) -> str:
         if file.is_file() and not any(file.is_relative_to(other) for other in others):
             return f"{file}:{frame.lineno}"
     return ""
+
+
+def brief(error: BaseException) -> str:
+    """The message of a library's exception on one line of at most 160 characters."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 160 else f"{text[:159]}…"

@@ -16,10 +16,10 @@ from fmus import python_fmu
 
 import retwin as rt
 from retwin.cases import ColumnRecords
-from retwin.commands import HoldSampler, MultisineSampler, RampSampler, RecordedSampler
-from retwin.residual import SequenceMixture
 from retwin.testing import check_twin
-from retwin.updating import LeastSquares, identify
+from retwin.twins.samplers import HoldSampler, MultisineSampler, RampSampler, RecordedSampler
+from retwin.update.identification import LeastSquares, identify
+from retwin.update.residual import SequenceMixture
 
 MODULE = """
 import numpy as np

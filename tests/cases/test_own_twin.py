@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.commands import MultisineSampler
+from retwin.twins.samplers import MultisineSampler
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "two_tanks"

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from retwin import download
 from retwin.cli import data
+from retwin.data import download
+from retwin.data.io import load, save
+from retwin.data.trajectories import Channels, Source, Trajectories
 from retwin.errors import InputError
-from retwin.storage import load, save, sha256
-from retwin.trajectories import Channels, Source, Trajectories
+from retwin.serialisation.files import sha256
 
 CLASSES = ("Healthy", "Broken [red]")
 

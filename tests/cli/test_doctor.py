@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from retwin import doctor
-from retwin.doctor import EXTRAS, FOR_DEVELOPERS, Check, examine
+from retwin.cli import environment as doctor
+from retwin.cli.environment import EXTRAS, FOR_DEVELOPERS, Check, examine
 from retwin.errors import InputError
-from retwin.storage import sha256
+from retwin.serialisation.files import sha256
 
 STATES = {"ok", "warning", "missing", "broken"}
 
@@ -138,7 +138,7 @@ def test_data_that_are_found(healthy: pytest.MonkeyPatch, tmp_path: Path) -> Non
 
 
 def test_public_data_that_were_fetched(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    ((name, known),) = doctor.REGISTRY.items()
+    ((name, known),) = doctor.DOWNLOADS.items()
     told = found(f"public {name}")
     assert (told.state, told.remedy) == ("missing", f"retwin data fetch {name}")
     file = tmp_path / "cache" / known.file
@@ -146,7 +146,7 @@ def test_public_data_that_were_fetched(healthy: pytest.MonkeyPatch, tmp_path: Pa
     file.write_bytes(b"x")
     assert found(f"public {name}").state == "warning"
     right = type(known)(known.url, sha256(file), known.file)
-    healthy.setattr(doctor, "REGISTRY", {name: right})
+    healthy.setattr(doctor, "DOWNLOADS", {name: right})
     assert found(f"public {name}").state == "ok"
 
 

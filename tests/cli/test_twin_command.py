@@ -14,8 +14,9 @@ import pytest
 
 import retwin as rt
 from retwin import twins
+from retwin.catalog import TWINS
 from retwin.cli import main
-from retwin.storage import sha256
+from retwin.serialisation.files import sha256
 from retwin.twins.function import FunctionTwin
 
 PENDULUM = """
@@ -36,7 +37,7 @@ MODULE = """
 import numpy as np
 import retwin as rt
 from retwin.twins.function import FunctionTwin
-from retwin.twins.protocol import simulate_in_chunks
+from retwin.twins.twin import simulate_in_chunks
 
 CHANNELS = rt.Channels(("u",), ("V",))
 
@@ -119,7 +120,7 @@ def refused(call, match: str, *words: object) -> None:
 # --- names ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [name for name in twins.BUILT_IN if "armpi" in name])
+@pytest.mark.parametrize("name", [name for name in TWINS if "armpi" in name])
 def test_built_in_twins_fit_the_arms_case(name: str, case: rt.Case) -> None:
     found = twins.get(name)
     assert isinstance(found, rt.Twin)
@@ -188,7 +189,7 @@ def test_a_twin_has_its_own_channels(mine: str) -> None:
 def test_list_names_all_and_says_what_else(call) -> None:
     code, out, _ = call("list")
     assert code == 0
-    for name in (*twins.BUILT_IN, "FILE.fmu", "FILE.urdf", "package.module:object", "FOLDER"):
+    for name in (*TWINS, "FILE.fmu", "FILE.urdf", "package.module:object", "FOLDER"):
         assert name in out
 
 

@@ -9,8 +9,8 @@ import torch
 import retwin as rt
 from retwin.diagnosis import fit_dann
 from retwin.diagnosis.adversarial import _Reversed
+from retwin.nets.training import Training
 from retwin.testing import check_diagnoser
-from retwin.training import Training
 
 SMALL = rt.CNN(channels=(8, 16), dropout=0.0)
 SHORT = Training(epochs=20, batch=16, rate=3e-3)

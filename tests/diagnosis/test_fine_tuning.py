@@ -7,8 +7,8 @@ import pytest
 
 import retwin as rt
 from retwin.diagnosis import fine_tune
+from retwin.nets.training import Training
 from retwin.testing import check_diagnoser
-from retwin.training import Training
 
 SMALL = rt.CNN(channels=(8, 16), dropout=0.0)
 SHORT = Training(epochs=8, batch=16, rate=1e-2)

@@ -13,16 +13,16 @@ from scipy.stats import multivariate_normal
 from torch import Tensor
 
 import retwin as rt
-from retwin.commands import RampSampler
-from retwin.corrections.command_effect import effective
-from retwin.corrections.command_problem import Problem
 from retwin.diagnosis import Diagnosis, InversionDiagnoser, evidence, fit_inversion
 from retwin.diagnosis.evidence import Belief, Noise
 from retwin.diagnosis.severity import draw_biases
-from retwin.faults import draw_faults, faulty_commands, frozen_from
-from retwin.statistics import score
+from retwin.nets.training import Training
+from retwin.scores.statistics import score
 from retwin.testing import DIAGNOSER_CHECKS, DiagnoserSubject
-from retwin.training import Training
+from retwin.twins.faults import draw_faults, faulty_commands, frozen_from
+from retwin.twins.samplers import RampSampler
+from retwin.update.corrections.command_effect import effective
+from retwin.update.corrections.command_problem import Problem
 
 CHAIN = rt.Chain(rt.CommandSpace(), rt.SampledSensor())
 MAP = np.array([[1.0, 0.5], [-0.3, 0.8], [0.2, -1.0]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.training import Training
+from retwin.nets.training import Training
 
 SMALL = rt.CNN(channels=(16, 32))
 SHORT = Training(epochs=15, batch=32, rate=5e-3)

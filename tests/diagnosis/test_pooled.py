@@ -9,8 +9,8 @@ import pytest
 
 import retwin as rt
 from retwin.diagnosis import PooledDiagnoser
+from retwin.nets.training import Training
 from retwin.testing import DIAGNOSER_CHECKS, DiagnoserSubject
-from retwin.training import Training
 
 
 @dataclass(frozen=True)

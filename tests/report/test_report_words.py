@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from retwin.catalog import SOURCES
 from retwin.report.words import (
     CHROME,
     PALETTE,
-    SOURCES,
     class_name,
     dash,
     duration,

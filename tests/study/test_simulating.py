@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.case import Case
+from retwin.cases.case import Case
 from retwin.cli import _run
-from retwin.corrections import Additive
-from retwin.networks import LSTM
+from retwin.nets.networks import LSTM
+from retwin.nets.training import Training
 from retwin.report import write_report
-from retwin.residual import SequenceMixture
 from retwin.study import possible_sources
-from retwin.training import Training
 from retwin.twins.function import FunctionTwin
 from retwin.twins.parametric import Parameter, ParametricTwin
+from retwin.update.corrections import Additive
+from retwin.update.residual import SequenceMixture
 
 STEPS, RATE = 120, 2.0
 INPUTS, OUTPUTS = rt.Channels(("valve",), ("%",)), rt.Channels(("level",), ("m",))

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.statistics import METRICS
+from retwin.scores.statistics import METRICS
 from retwin.study import possible_sources
 from retwin.study.files import Files, Job, Roles
 from retwin.study.trial import SEES, Trial

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.study import SOURCES, possible_sources
-from retwin.twins.armpi import KINEMATIC
+from retwin.cases.armpi_fpv.twin import KINEMATIC
+from retwin.catalog import SOURCES
+from retwin.study import possible_sources
 from retwin.twins.command_side import CommandSide, command_side_parameters
 from retwin.twins.parametric import ParametricTwin
 

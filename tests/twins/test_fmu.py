@@ -338,7 +338,7 @@ def test_members_stay_in_the_folder(
 
 SCRIPT = """
 import numpy as np
-from retwin.scale import SimulationPlan, simulate_to
+from retwin.deploy.simulations import SimulationPlan, simulate_to
 from retwin.twins.fmu import FMUTwin
 
 if __name__ == "__main__":

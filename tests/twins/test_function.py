@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.faults import faulty_commands, frozen_response
+from retwin.twins.faults import faulty_commands, frozen_response
 from retwin.twins.function import CHUNK, FunctionTwin
 
 INPUTS = rt.Channels(("valve", "heater"), ("1", "W"))

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import retwin as rt
+from retwin.cases.armpi_fpv.parameters import armpi_parametric
+from retwin.cases.armpi_fpv.twin import KINEMATIC
 from retwin.testing import TWIN_CHECKS, TwinSubject
-from retwin.twins.armpi import KINEMATIC
-from retwin.twins.armpi_parametric import armpi_parametric
 from retwin.twins.command_side import CommandSide, command_side_parameters
 from retwin.twins.function import FunctionTwin
 from retwin.twins.mujoco import MuJoCoTwin

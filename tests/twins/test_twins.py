@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import retwin as rt
-from retwin.twins.armpi import KINEMATIC
-from retwin.twins.kinematic import ServoLag
+from retwin.cases.armpi_fpv.closed_form import ServoLag
+from retwin.cases.armpi_fpv.twin import KINEMATIC
 
 
 def test_lag_follows_a_ramp_by_its_seconds() -> None:

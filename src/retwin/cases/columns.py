@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.data.trajectories import HEALTHY, Channels, Source, Trajectories
 from retwin.errors import InputError
-from retwin.storage import sha256
-from retwin.trajectories import Channels, Source, Trajectories
-from retwin.twins.protocol import HEALTHY, Twin
+from retwin.serialisation.files import sha256
+from retwin.twins.twin import Twin
 
 __all__ = ["ColumnRecords"]
 

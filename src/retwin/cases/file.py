@@ -12,29 +12,44 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from retwin.case import Case, CommandSampler
+from retwin import catalog
+from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords
 from retwin.cases.named_twin import imported, parametric_twin, read_twin
-from retwin.commands import HoldSampler, MultisineSampler, RampSampler, RecordedSampler
-from retwin.configs import at, checked, fits, from_config, from_settings, key, named, table
-from retwin.corrections import NAMED_OPERATORS, OPERATORS, Correction, DelayOffset
+from retwin.data.io import load
+from retwin.data.trajectories import HEALTHY, Channels, Trajectories
 from retwin.errors import InputError
-from retwin.faults import Fault, SteadyStateError, Stuck
-from retwin.networks import SURROGATES, Network
-from retwin.residual import (
-    NAMED_DENSITIES,
+from retwin.nets.networks import NETWORKS, Network
+from retwin.nets.training import Training
+from retwin.serialisation.configs import (
+    at,
+    checked,
+    fits,
+    from_config,
+    from_settings,
+    key,
+    named,
+    table,
+)
+from retwin.twins.checks import check_positive
+from retwin.twins.faults import Fault, SteadyStateError, Stuck
+from retwin.twins.parametric import Parameter
+from retwin.twins.samplers import (
+    CommandSampler,
+    HoldSampler,
+    MultisineSampler,
+    RampSampler,
+    RecordedSampler,
+)
+from retwin.twins.twin import Limits, Twin
+from retwin.update.corrections import OPERATORS, Correction, DelayOffset
+from retwin.update.residual import (
     Density,
     Flow,
     Mixture,
     Refinement,
     SequenceMixture,
 )
-from retwin.storage import load
-from retwin.training import Training
-from retwin.trajectories import Channels, Trajectories
-from retwin.twins.checks import check_positive
-from retwin.twins.parametric import Parameter
-from retwin.twins.protocol import HEALTHY, Limits, Twin
 
 __all__ = ["check_density", "read_case"]
 
@@ -43,7 +58,7 @@ FAULTS: tuple[type, ...] = (Stuck, SteadyStateError)
 MODELS: tuple[type, ...] = (
     *OPERATORS,
     *(Mixture, Flow, Refinement, SequenceMixture, Training),
-    *map(type, SURROGATES.values()),
+    *NETWORKS,
 )
 
 
@@ -86,12 +101,12 @@ def read_case(path: str | Path) -> Case:
         inside = key(place, "parameters")
         free = [_parameter(name, value, inside) for name, value in told.parameters.items()]
         twin = parametric = parametric_twin(twin, free, inside)
-    correction = _chosen(told.correction, NAMED_OPERATORS, key(place, "correction"))
+    correction = _chosen(told.correction, catalog.CORRECTIONS, key(place, "correction"))
     stepwise = correction.resolution == "step"
     density = told.density or (SequenceMixture() if stepwise else Mixture())
-    density = _chosen(density, NAMED_DENSITIES, key(place, "density"))
+    density = _chosen(density, catalog.DENSITIES, key(place, "density"))
     at_outputs = told.output_correction or (correction if stepwise else DelayOffset())
-    at_outputs = _chosen(at_outputs, NAMED_OPERATORS, key(place, "output_correction"))
+    at_outputs = _chosen(at_outputs, catalog.CORRECTIONS, key(place, "output_correction"))
     for operator in (correction, at_outputs):
         check_density(operator, density, key(place, "density"))
     sensor_rate = twin.rate if told.sensor_rate is None else told.sensor_rate
@@ -108,7 +123,7 @@ def read_case(path: str | Path) -> Case:
         output_correction=at_outputs,
         sensor_rate=sensor_rate,
         parametric=parametric,
-        network=_chosen(told.network, SURROGATES, key(place, "network")),
+        network=_chosen(told.network, catalog.NETWORKS, key(place, "network")),
         training=told.training,
         density=density,
         records=_records(told.records, twin, path.parent, key(place, "records")),
@@ -143,9 +158,9 @@ def _read(path: Path) -> dict[str, Any]:
         ) from None
 
 
-def _chosen(value: Any, known: Mapping[str, Any], place: str) -> Any:
-    """What the command line knows by that name; or what a table told of already."""
-    return named(value, known, place) if isinstance(value, str) else value
+def _chosen(value: Any, entries: Mapping[str, catalog.Entry], place: str) -> Any:
+    """What the catalog has by that name; or what a table has described already."""
+    return catalog.make(entries, value, place) if isinstance(value, str) else value
 
 
 def _own(name: str, folder: Path, place: str, protocol: type) -> Any:

@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from retwin import twins
-from retwin.configs import at, checked, from_settings, key, named, table
+from retwin.data.trajectories import Channels
 from retwin.errors import InputError
-from retwin.trajectories import Channels
+from retwin.serialisation.configs import at, checked, from_settings, key, named, table
 from retwin.twins.fmu import FMUTwin
 from retwin.twins.function import FunctionTwin
 from retwin.twins.mujoco import MuJoCoTwin, Servo
 from retwin.twins.parametric import Parameter, ParametricTwin
-from retwin.twins.protocol import Limits, Twin
+from retwin.twins.twin import Limits, Twin
 
 __all__ = ["imported", "parametric_twin", "read_twin"]
 

@@ -1,8 +1,11 @@
-"""The command line: parse, call the public API, print; no logic.
+"""The command line: parses arguments, calls the public interface, prints results.
 
-Exit codes: 0 done, 1 failed, 2 bad input with one line that says what was expected, what came, and
-what to do, 130 interrupted. With RETWIN_TRACEBACK=1 in the environment, an exception that nobody
-expected is shown in full.
+Belongs here: commands, options, completion, messages on a terminal, `doctor` and `bench`. Not
+here: anything that computes a result.
+
+Exit codes: 0 done; 1 failed; 2 bad input, with one line that states what was expected, what came
+and the remedy; 130 interrupted. With RETWIN_TRACEBACK=1 in the environment, the traceback of an
+unexpected exception is shown in full.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from retwin import __version__
+from retwin._version import __version__
 from retwin.cli import bundle, data, diagnose, models, studies, twins
 from retwin.cli.bench import bench
 from retwin.cli.doctor import doctor

@@ -45,8 +45,8 @@ def animate(
 ) -> None:
     """Film a trajectory: the nominal motion as a ghost, the observed one solid."""
     from retwin import cases
-    from retwin.animation import animate as film
-    from retwin.animation.film import check_film
+    from retwin.cases.animation import animate as film
+    from retwin.cases.animation.film import check_film
 
     check_film(out)
     shape = _size(size)

@@ -11,10 +11,10 @@ import typer
 
 from retwin.cli.options import Json
 from retwin.cli.terminal import answer, bar, note, table
-from retwin.storage import write_atomically
+from retwin.serialisation.files import write_atomically
 
 if TYPE_CHECKING:
-    from retwin.bench import Benchmark
+    from retwin.cli.benchmark import Benchmark
 
 __all__ = ["bench"]
 
@@ -32,7 +32,7 @@ def bench(
     as_json: Json = False,
 ) -> None:
     """Time twins of the arm and what learns from them, beside the paper."""
-    from retwin.bench import run_bench
+    from retwin.cli.benchmark import run_bench
 
     with bar("bench") as tell:
         found = run_bench(count=n, repeats=repeats, report=tell)

@@ -11,11 +11,11 @@ from retwin.cli.diagnose import EMULATED, diagnoses, write_probabilities
 from retwin.cli.options import CaseOption, Json, OtherCase, Seed
 from retwin.cli.reading import case_named, read
 from retwin.cli.terminal import answer, bar, command_given, example, note, table
-from retwin.storage import check_target
+from retwin.data.io import check_target
 
 if TYPE_CHECKING:
-    from retwin.bundle.bundle import Bundle
-    from retwin.bundle.portable import Portable
+    from retwin.deploy.bundle.bundle import Bundle
+    from retwin.deploy.onnx.portable import Portable
 
 __all__ = ["app"]
 
@@ -43,8 +43,8 @@ def save(
 ) -> None:
     """Fit a guard and put it, the twin and the diagnoser into one sealed folder."""
     import retwin as rt
-    from retwin.bundle.bundle import Bundle
-    from retwin.bundle.guard import fit_guard
+    from retwin.deploy.bundle.bundle import Bundle
+    from retwin.deploy.bundle.guard import fit_guard
 
     twin = rt.CorrectedTwin.load(model)
     system = rt.cases.get(case or twin.case)
@@ -60,7 +60,7 @@ def save(
 @app.command(epilog=example("retwin bundle verify bundle"))
 def verify(folder: Folder, as_json: Json = False) -> None:
     """Hold every file against its SHA-256, and show what the bundle is; nothing is loaded."""
-    from retwin.bundle.seal import read_sealed
+    from retwin.deploy.bundle.seal import read_sealed
 
     about = read_sealed(folder, "bundle", "portable")
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
@@ -131,7 +131,7 @@ def generate(
 ) -> None:
     """Generate a balanced labelled set."""
     import retwin as rt
-    from retwin.bundle.bundle import Bundle
+    from retwin.deploy.bundle.bundle import Bundle
 
     check_target(out)
     bundle = Bundle.load(folder)
@@ -154,8 +154,8 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write ONNX graphs, with which `bundle predict` needs no torch."""
-    from retwin.bundle.bundle import Bundle
-    from retwin.bundle.export import export_onnx
+    from retwin.deploy.bundle.bundle import Bundle
+    from retwin.deploy.onnx.export import export_onnx
 
     with bar("export") as tell:
         parity = export_onnx(Bundle.load(folder), onnx, progress=lambda s: tell("", s))
@@ -170,12 +170,12 @@ def export(
 
 def _opened(folder: Path) -> Bundle | Portable:
     """A bundle, or its export, for which torch is not loaded."""
-    from retwin.bundle.seal import read_sealed
+    from retwin.deploy.bundle.seal import read_sealed
 
     if read_sealed(folder, "bundle", "portable")["kind"] == "portable":
-        from retwin.bundle.portable import Portable
+        from retwin.deploy.onnx.portable import Portable
 
         return Portable.load(folder)
-    from retwin.bundle.bundle import Bundle
+    from retwin.deploy.bundle.bundle import Bundle
 
     return Bundle.load(folder)

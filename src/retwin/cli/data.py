@@ -9,14 +9,15 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from retwin import download
+from retwin.cli.completion import complete_files
 from retwin.cli.options import CaseOption, Json, Rate, Seed
 from retwin.cli.reading import case_named, read
 from retwin.cli.terminal import answer, bar, example, note, table
-from retwin.cli.words import complete_files
+from retwin.data import download
+from retwin.data.io import check_target, save
+from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
-from retwin.storage import check_target, save, sha256
-from retwin.trajectories import Channels, Trajectories
+from retwin.serialisation.files import sha256
 
 __all__ = ["app"]
 

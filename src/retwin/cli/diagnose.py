@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,14 +11,13 @@ from typing import Annotated, Any
 import typer
 from numpy.typing import NDArray
 
+from retwin import catalog
+from retwin.cli.completion import one_of
 from retwin.cli.options import CaseOption, Json, Seed
 from retwin.cli.reading import case_named, read
 from retwin.cli.terminal import answer, bar, example, note, table
-from retwin.cli.words import CLASSIFIERS as NAMES
-from retwin.cli.words import one_of
-from retwin.configs import named
-from retwin.storage import write_atomically
-from retwin.trajectories import Trajectories
+from retwin.data.trajectories import Trajectories
+from retwin.serialisation.files import write_atomically
 
 __all__ = ["EMULATED", "app", "diagnoses", "write_probabilities"]
 
@@ -39,7 +38,9 @@ def fit(
     out: Out,
     classifier: Annotated[
         str,
-        typer.Option(metavar="NAME", help="cnn, lstm or rocket.", autocompletion=one_of(NAMES)),
+        typer.Option(
+            metavar="NAME", help="cnn, lstm or rocket.", autocompletion=one_of(catalog.CLASSIFIERS)
+        ),
     ] = "cnn",
     case: CaseOption = None,
     rate: Annotated[
@@ -49,13 +50,13 @@ def fit(
 ) -> None:
     """Train a diagnoser on labelled trajectories."""
     import retwin as rt
-    from retwin.networks import CLASSIFIERS
 
     system = case_named(case)
-    makers: dict[str, Callable[..., Any]] = {
-        name: partial(rt.fit_diagnoser, network=network) for name, network in CLASSIFIERS.items()
-    }
-    chosen = named(classifier, {**makers, "rocket": rt.fit_rocket}, "classifier")
+    entry = catalog.lookup(catalog.CLASSIFIERS, classifier, "classifier")
+    target = catalog.resolve(entry.target)
+    chosen = (
+        rt.fit_rocket if classifier == "rocket" else partial(rt.fit_diagnoser, network=target())
+    )
     training = read(file, system)
     with bar("train") as tell:
         diagnoser = chosen(

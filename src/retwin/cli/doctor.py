@@ -16,7 +16,7 @@ from retwin.cli.options import Json
 from retwin.cli.terminal import FAILED, answer, bar
 
 if TYPE_CHECKING:
-    from retwin.doctor import Check
+    from retwin.cli.environment import Check
 
 __all__ = ["doctor"]
 
@@ -25,7 +25,7 @@ COLOURS = {"ok": "green", "warning": "yellow", "missing": "cyan", "broken": "bol
 
 def doctor(as_json: Json = False) -> None:
     """Look at installation, machine and data, and say what is missing."""
-    from retwin.doctor import examine
+    from retwin.cli.environment import examine
 
     with bar("doctor") as tell:
         checks = examine(tell)

@@ -9,20 +9,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from retwin import catalog
+from retwin.cli.completion import one_of
 from retwin.cli.options import CaseArgument, Json, OtherCase, Seed
 from retwin.cli.plans import Workers, carry_out
 from retwin.cli.reading import read
 from retwin.cli.terminal import answer, bar, note, table
-from retwin.cli.words import CALIBRATED_ON, CORRECTIONS, DENSITIES, NETWORKS, one_of
-from retwin.configs import named
-from retwin.storage import check_target
-from retwin.trajectories import Trajectories
-from retwin.twins.protocol import HEALTHY
+from retwin.data.io import check_target
+from retwin.data.trajectories import HEALTHY, Trajectories
 
 if TYPE_CHECKING:
-    from retwin.case import Case
-    from retwin.residual import ResidualModel, SequenceResidual
-    from retwin.surrogate import Surrogate
+    from retwin.cases.case import Case
+    from retwin.update.residual import ResidualModel, SequenceResidual
+    from retwin.update.surrogate import Surrogate
 
 __all__ = ["fit", "generate"]
 
@@ -49,14 +48,16 @@ def fit(
     ] = None,
     calibrate_on: Annotated[
         str,
-        data_option(metavar="NAME", help="healthy or all.", autocompletion=one_of(CALIBRATED_ON)),
+        data_option(
+            metavar="NAME", help="healthy or all.", autocompletion=one_of(catalog.CALIBRATE_ON)
+        ),
     ] = "healthy",
     network: Annotated[
         str | None,
         model_option(
             metavar="NAME",
             help="Surrogate: mlp, lstm, tcn or state_space.",
-            autocompletion=one_of(NETWORKS),
+            autocompletion=one_of(catalog.NETWORKS),
         ),
     ] = None,
     correction: Annotated[
@@ -64,7 +65,7 @@ def fit(
         model_option(
             metavar="NAME",
             help="additive, delay_offset or command_space.",
-            autocompletion=one_of(CORRECTIONS),
+            autocompletion=one_of(catalog.CORRECTIONS),
         ),
     ] = None,
     density: Annotated[
@@ -72,7 +73,7 @@ def fit(
         model_option(
             metavar="NAME",
             help="Law of the gap: mixture, flow or sequence_mixture.",
-            autocompletion=one_of(DENSITIES),
+            autocompletion=one_of(catalog.DENSITIES),
         ),
     ] = None,
     refine: Annotated[
@@ -117,17 +118,19 @@ def _system(
     """The case, with what the command line says otherwise."""
     import retwin as rt
     from retwin.cases.file import check_density
-    from retwin.corrections import NAMED_OPERATORS
-    from retwin.networks import SURROGATES
-    from retwin.residual import NAMED_DENSITIES, Density
+    from retwin.update.residual import Density
 
     system = rt.cases.get(case)
     if network is not None:
-        system = replace(system, network=named(network, SURROGATES, "network"), training=None)
+        system = replace(
+            system, network=catalog.make(catalog.NETWORKS, network, "network"), training=None
+        )
     if correction is not None:
-        system = replace(system, correction=named(correction, NAMED_OPERATORS, "correction"))
+        system = replace(
+            system, correction=catalog.make(catalog.CORRECTIONS, correction, "correction")
+        )
     if density is not None:
-        system = replace(system, density=named(density, NAMED_DENSITIES, "density"))
+        system = replace(system, density=catalog.make(catalog.DENSITIES, density, "density"))
     check_density(system.correction, system.density)
     if not refine:
         return system
@@ -204,7 +207,7 @@ def _tell(
 
 def _of_residual(rg: ResidualModel | SequenceResidual) -> str:
     """What a residual model learned from, and how it fared on what it did not."""
-    from retwin.residual import ResidualModel
+    from retwin.update.residual import ResidualModel
 
     assert rg.fitted is not None
     figures, reason = rg.fitted.figures, rg.fitted.reason

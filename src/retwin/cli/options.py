@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from retwin.cli.words import CASES, one_of
+from retwin.catalog import CASES
+from retwin.cli.completion import one_of
 
 __all__ = ["CaseArgument", "CaseOption", "Json", "OtherCase", "Rate", "Seed"]
 

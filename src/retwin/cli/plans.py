@@ -11,7 +11,7 @@ import typer
 from retwin.cli.terminal import FAILED, bar, complain, note, resumable
 
 if TYPE_CHECKING:
-    from retwin.scale import SimulationPlan
+    from retwin.deploy.simulations import SimulationPlan
 
 __all__ = ["Scheduler", "Workers", "carry_out"]
 
@@ -32,7 +32,7 @@ def carry_out(
     scheduler: str | None = None,
 ) -> None:
     """Write the trajectories of a plan; those that fail are told, and make the exit code 1."""
-    from retwin.scale import simulate_to
+    from retwin.deploy.simulations import simulate_to
 
     with resumable() if out.suffix.lower() == ".zarr" else nullcontext(), bar(what) as tell:
         done = simulate_to(

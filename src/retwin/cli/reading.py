@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from retwin.cli.terminal import bar
-from retwin.storage import DataCase, load
-from retwin.trajectories import Trajectories
+from retwin.data.io import DataCase, load
+from retwin.data.trajectories import Trajectories
 
 if TYPE_CHECKING:
-    from retwin.case import Case
+    from retwin.cases.case import Case
 
 __all__ = ["case_named", "read"]
 

@@ -14,9 +14,10 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from retwin import catalog
+from retwin.cli.completion import complete_sources, one_of
 from retwin.cli.options import CaseArgument, Json, Seed
 from retwin.cli.terminal import answer, bar, command_given, note, resumable, table
-from retwin.cli.words import CALIBRATED_ON, CLASSIFIERS, PRESETS, complete_sources, one_of
 from retwin.errors import InputError
 
 __all__ = ["demo", "report", "study"]
@@ -73,7 +74,7 @@ def study(
         compared_option(
             metavar="NAME",
             help="quick or paper: classifier, training, runs.",
-            autocompletion=one_of(PRESETS),
+            autocompletion=one_of(catalog.PRESETS),
         ),
     ] = "quick",
     classifier: Annotated[
@@ -81,7 +82,7 @@ def study(
         compared_option(
             metavar="NAME",
             help="cnn, lstm or rocket; else the preset's.",
-            autocompletion=one_of(CLASSIFIERS),
+            autocompletion=one_of(catalog.CLASSIFIERS),
         ),
     ] = None,
     runs: Annotated[
@@ -97,7 +98,7 @@ def study(
     calibrate_on: Annotated[
         str,
         compared_option(
-            metavar="NAME", help="healthy or all.", autocompletion=one_of(CALIBRATED_ON)
+            metavar="NAME", help="healthy or all.", autocompletion=one_of(catalog.CALIBRATE_ON)
         ),
     ] = "healthy",
     random_onset: Annotated[

@@ -10,19 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from retwin import twins
+from retwin.catalog import CASES, TWINS
 from retwin.cli.animate import animate
+from retwin.cli.completion import complete_faults, complete_twins, one_of
 from retwin.cli.options import Json, Seed
 from retwin.cli.plans import Scheduler, Workers, carry_out
 from retwin.cli.reading import read
 from retwin.cli.terminal import answer, example, table
-from retwin.cli.words import CASES, complete_faults, complete_twins, one_of
+from retwin.data.io import check_target
 from retwin.errors import InputError
-from retwin.storage import check_target
 
 if TYPE_CHECKING:
-    from retwin.case import Case
-    from retwin.trajectories import Channels
-    from retwin.twins.protocol import Limits, Twin
+    from retwin.cases.case import Case
+    from retwin.data.trajectories import Channels
+    from retwin.twins.twin import Limits, Twin
 
 __all__ = ["app"]
 
@@ -56,7 +57,7 @@ OTHERS = {
 @app.command("list", epilog=example("retwin twin list"))
 def list_twins(as_json: Json = False) -> None:
     """Say which twins are built in, and what else can be named."""
-    built_in = {name: title for name, (_, _, title) in twins.BUILT_IN.items()}
+    built_in = {name: entry.title for name, entry in TWINS.items()}
     answer(
         {
             "built_in": [{"name": name, "title": title} for name, title in built_in.items()],
@@ -156,7 +157,7 @@ def simulate(
     ] = 256,
 ) -> None:
     """Simulate trajectories to a file; interrupted on the way to a *.zarr, it can go on."""
-    from retwin.scale import SimulationPlan
+    from retwin.deploy.simulations import SimulationPlan
 
     check_target(out)
     found = _twin(twin, inputs, outputs, rate)
@@ -196,10 +197,10 @@ def _model(folder: Path) -> Twin:
     except (OSError, ValueError, LookupError, TypeError):
         kind = "damaged"
     if kind == "surrogate":
-        from retwin.surrogate import Surrogate
+        from retwin.update.surrogate import Surrogate
 
         return Surrogate.load(folder)
-    from retwin.corrected import CorrectedTwin
+    from retwin.update.corrected import CorrectedTwin
 
     return CorrectedTwin.load(folder)  # and says so of any other kind
 
@@ -209,8 +210,8 @@ def _names(given: str) -> tuple[str, ...]:
 
 
 def _title(name: str, found: Twin) -> str:
-    if name in twins.BUILT_IN:
-        return f"{name}: {twins.BUILT_IN[name][2]}"
+    if name in TWINS:
+        return f"{name}: {TWINS[name].title}"
     if _is_case(name):
         from retwin import cases
 
@@ -226,7 +227,7 @@ def _case(given: str | None, name: str, found: Twin) -> Case | None:
     own = getattr(found, "case", "")
     if _is_case(name):
         own = name
-    elif name in twins.BUILT_IN:
+    elif name in TWINS:
         own = name.partition("-")[0]
     if not (given or own):
         return None
@@ -243,7 +244,7 @@ def _case(given: str | None, name: str, found: Twin) -> Case | None:
 
 
 def _faults(system: Case | None, fault: str) -> dict[str, Any]:
-    from retwin.twins.protocol import HEALTHY
+    from retwin.data.trajectories import HEALTHY
 
     if fault == "none":
         return {HEALTHY: None}
@@ -263,7 +264,7 @@ def _faults(system: Case | None, fault: str) -> dict[str, Any]:
 def _sampler(system: Case | None, found: Twin) -> Any:
     if system is not None:
         return system.sampler
-    from retwin.commands import RampSampler
+    from retwin.twins.samplers import RampSampler
 
     limits = getattr(found, "limits", None)
     if limits is None or not all(map(isfinite, limits.low + limits.high)):

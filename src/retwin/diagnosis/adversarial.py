@@ -16,13 +16,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.features import Features, class_index, class_order, one_view
 from retwin.diagnosis.network import NetworkDiagnoser, training_for
 from retwin.errors import InputError
-from retwin.networks import CNN, Network
-from retwin.training import Training, isolated, train
-from retwin.trajectories import Trajectories
-from retwin.twins.protocol import Progress
+from retwin.nets.networks import CNN, Network
+from retwin.nets.training import Training, isolated, train
+from retwin.progress import Progress
 
 __all__ = ["fit_dann"]
 

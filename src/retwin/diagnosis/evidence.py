@@ -7,7 +7,7 @@ Assoc. 81, 82, 1986); Student's t, which lets glitches pass, is met by reweighte
 (Lange, Little and Taylor, J. Am. Stat. Assoc. 84, 881, 1989).
 
 The constants here are numerical: they trade time for accuracy. Those of the noise are those of
-`retwin.corrections.command_inference`.
+`retwin.update.corrections.command_inference`.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from retwin.corrections.command_inference import LOOKS, TAILS
-from retwin.corrections.command_problem import Problem
-from retwin.corrections.warp import read
+from retwin.update.corrections.command_inference import LOOKS, TAILS
+from retwin.update.corrections.command_problem import Problem
+from retwin.update.corrections.warp import read
 
 __all__ = ["Belief", "Fit", "Noise", "best_pattern", "reach", "solve"]
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retwin.arrays import row_blocks
+from retwin.data.segments import Segments
+from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
-from retwin.segments import Segments
-from retwin.trajectories import Channels, Trajectories
 
 __all__ = ["Features", "class_index", "class_order", "one_view"]
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.features import class_index, class_order, one_view
 from retwin.diagnosis.network import NetworkDiagnoser
-from retwin.training import Training, isolated, train
-from retwin.trajectories import Trajectories
-from retwin.twins.protocol import Progress
+from retwin.nets.training import Training, isolated, train
+from retwin.progress import Progress
 
 __all__ = ["FINE_TUNING", "fine_tune"]
 

@@ -16,16 +16,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from retwin.corrections import Chain, CommandSpace, Context, Correction, SampledSensor
-from retwin.corrections.command_effect import effective
-from retwin.corrections.command_problem import Problem
 from retwin.diagnosis.evidence import Belief, Fit, Noise, best_pattern
 from retwin.diagnosis.onsets import Onsets
 from retwin.diagnosis.severity import draw_biases
 from retwin.errors import InputError
-from retwin.faults import Fault, SteadyStateError, Stuck
-from retwin.mixture import Bernoullis, GaussianMixture
-from retwin.residual import ResidualModel
+from retwin.nets.mixtures import Bernoullis, GaussianMixture
+from retwin.twins.faults import Fault, SteadyStateError, Stuck
+from retwin.update.corrections import Chain, CommandSpace, Context, Correction, SampledSensor
+from retwin.update.corrections.command_effect import effective
+from retwin.update.corrections.command_problem import Problem
+from retwin.update.residual import ResidualModel
 
 __all__ = [
     "COVER",

@@ -19,8 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from retwin.configs import from_config, to_config
-from retwin.corrections import Context, readings
+from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis.evidence import Noise, best_pattern
 from retwin.diagnosis.hypotheses import (
     COVER,
@@ -32,12 +31,13 @@ from retwin.diagnosis.hypotheses import (
     posed,
 )
 from retwin.errors import InputError
-from retwin.faults import Fault, SteadyStateError, Stuck
-from retwin.models import read_model, write_model
-from retwin.residual import Residual, ResidualModel
-from retwin.surrogate import Surrogate
-from retwin.trajectories import Trajectories
-from retwin.twins.protocol import HEALTHY, Progress
+from retwin.progress import Progress
+from retwin.serialisation.configs import from_config, to_config
+from retwin.serialisation.models import read_model, write_model
+from retwin.twins.faults import Fault, SteadyStateError, Stuck
+from retwin.update.corrections import Context, readings
+from retwin.update.residual import Residual, ResidualModel
+from retwin.update.surrogate import Surrogate
 
 __all__ = ["Diagnosis", "Estimate", "InversionDiagnoser", "fit_inversion"]
 

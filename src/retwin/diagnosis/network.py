@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retwin.configs import from_config, to_config
+from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.features import Features, class_index, class_order
-from retwin.models import read_model, write_model
-from retwin.networks import CNN, NETWORKS, Network, Standardise
-from retwin.training import Fit, Training, isolated, train
-from retwin.trajectories import Trajectories
-from retwin.twins.protocol import Progress
+from retwin.nets.networks import CNN, NETWORKS, Network, Standardise
+from retwin.nets.training import Fit, Training, isolated, train
+from retwin.progress import Progress
+from retwin.serialisation.configs import from_config, to_config
+from retwin.serialisation.models import read_model, write_model
 
 __all__ = ["NetworkDiagnoser", "fit_diagnoser", "training_for"]
 
@@ -58,7 +58,7 @@ class NetworkDiagnoser(nn.Module):
         return torch.cat(parts).numpy()
 
     def save(self, folder: str | Path) -> None:
-        """Write weights and description, see `retwin.models`."""
+        """Write weights and description, see `retwin.serialisation.models`."""
         about = {
             "network": to_config(self.config, NETWORKS),
             "classes": self.classes,

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.diagnosis.protocol import Diagnoser
+from retwin.data.trajectories import Trajectories
+from retwin.diagnosis.diagnoser import Diagnoser
 from retwin.errors import InputError
-from retwin.trajectories import Trajectories
 
 __all__ = ["PooledDiagnoser", "pool_opinions"]
 

@@ -20,13 +20,13 @@ from scipy.optimize import minimize_scalar
 from scipy.special import log_softmax, softmax
 from torch import Tensor
 
+from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.features import Features, class_index, class_order
 from retwin.errors import InputError
-from retwin.models import read_model, write_model
-from retwin.networks import Standardise
-from retwin.training import Fit
-from retwin.trajectories import Trajectories
-from retwin.twins.protocol import Progress
+from retwin.nets.networks import Standardise
+from retwin.nets.training import Fit
+from retwin.progress import Progress
+from retwin.serialisation.models import read_model, write_model
 
 __all__ = ["RocketDiagnoser", "fit_rocket"]
 
@@ -98,7 +98,7 @@ class RocketDiagnoser:
         return softmax(convolved @ slope.T + level, axis=1)
 
     def save(self, folder: str | Path) -> None:
-        """Write weights and description, see `retwin.models`."""
+        """Write weights and description, see `retwin.serialisation.models`."""
         about = {
             "classes": self.classes,
             **self.features.about(),

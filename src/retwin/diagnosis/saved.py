@@ -7,7 +7,7 @@ from pathlib import Path
 from retwin.diagnosis.inversion import InversionDiagnoser
 from retwin.diagnosis.network import NetworkDiagnoser
 from retwin.diagnosis.rocket import RocketDiagnoser
-from retwin.models import kind_of
+from retwin.serialisation.models import kind_of
 
 __all__ = ["load_diagnoser"]
 

@@ -1,4 +1,8 @@
-"""A study's results as one self-contained HTML page, and its figures as PNG."""
+"""A study's results as one self-contained HTML page, and its figures as PNG.
+
+Belongs here: sections, templates, figures. Not here: numbers, which `scores` and `evaluation`
+compute; the report reads results and runs nothing.
+"""
 
 from retwin.report.page import write_report
 

@@ -6,17 +6,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from retwin.catalog import METRICS
 from retwin.report.results import Results
 from retwin.report.verdict import between, headline, outcome
-from retwin.report.words import (
-    METRICS,
-    duration,
-    in_sentence,
-    number,
-    signed,
-    source_name,
-    span,
-)
+from retwin.report.words import duration, in_sentence, number, signed, source_name, span
 
 __all__ = ["Claim", "claims"]
 
@@ -59,7 +52,7 @@ def _accuracy(results: Results, pair: tuple[str, str]) -> Claim | None:
     light = LIGHTS.get(outcome(found))
     if light is None:
         return None
-    name = METRICS[metric].name
+    name = METRICS[metric].title
     return Claim(
         "Accuracy",
         light,

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from retwin.catalog import METRICS
 from retwin.report.blocks import Block, Cell, Column, Forest, Section, Table
 from retwin.report.parts import Comparison
 from retwin.report.results import Results
 from retwin.report.verdict import outcome
 from retwin.report.words import (
     MANY,
-    METRICS,
     in_sentence,
     number,
     order,
@@ -55,7 +55,7 @@ def _who_beats_whom(results: Results, found: Sequence[Comparison]) -> Table:
         gaps = {e.b: Cell(signed(100 * e.mean_diff, 0), tone=outcome(e)) for e in pairs}
         name = Cell(f"{place + 1}. {source_name(source)}", source=source)
         rows.append([name, *(gaps.get(other, Cell("")) for other in sources)])
-    title = METRICS[metric].name
+    title = METRICS[metric].title
     against = [Column(str(place + 1), group="minus") for place in range(len(sources))]
     text = (
         f"{title} of the row’s source minus the column’s, in hundredths. ▲ better, ▼ worse: "
@@ -114,7 +114,7 @@ def _comparison_row(each: Comparison, low: float, high: float) -> list[Cell]:
     result = outcome(each)
     reading = "undecided" if result == "open" else result or "–"
     return [
-        Cell(METRICS[each.metric].name),
+        Cell(METRICS[each.metric].title),
         Cell(reading, tone=result),
         Cell(signed(each.mean_diff)),
         Cell(span(each.interval, sign=True)),

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
+from retwin.catalog import METRICS
 from retwin.report.canvas import (
     INK,
     MUTED,
@@ -40,7 +41,7 @@ from retwin.report.twin_figures import (
     draw_pit,
     draw_simulation,
 )
-from retwin.report.words import METRICS, class_name, mean_and_spread, order, source_name
+from retwin.report.words import class_name, mean_and_spread, order, source_name
 
 __all__ = ["FIGURES", "draw_figures"]
 
@@ -97,7 +98,7 @@ def _scores(results: Results) -> Figure | None:
     for place, source in enumerate(sources):
         lane = 0.62 * ((place + 0.5) / len(sources) - 0.5) - 0.04
         _score_marks(axes, results, source, shown, lane)
-    axes.set_yticks(range(len(shown)), [METRICS[name].name for name in shown])
+    axes.set_yticks(range(len(shown)), [METRICS[name].title for name in shown])
     axes.set_ylim(len(shown) - 0.5, -0.5)
     axes.set_xlim(-0.01, 1.02)
     paper = "; open diamonds: paper ± sd" if results.published else ""

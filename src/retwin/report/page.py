@@ -22,7 +22,7 @@ from retwin.report.results import Results, read_results
 from retwin.report.sections import SECTIONS
 from retwin.report.verdict import verdict
 from retwin.report.words import CHROME, PALETTE, counted, slot, symbol
-from retwin.storage import write_atomically
+from retwin.serialisation.files import write_atomically
 
 __all__ = ["render", "write_report"]
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from retwin.catalog import METRICS
 from retwin.report.blocks import Cell, Column, Link, Section, Table
 from retwin.report.costs import bulk_seconds
 from retwin.report.plots import caption, latent_names
 from retwin.report.results import Results
-from retwin.report.words import METRICS, duration, in_sentence, mean_and_spread, number, source_name
+from retwin.report.words import duration, in_sentence, mean_and_spread, number, source_name
 
 __all__ = ["paper"]
 
@@ -57,7 +58,7 @@ def _means(results: Results, known: list[str], metric: str) -> list[str]:
 def _scores(results: Results, known: list[str]) -> list[list[Cell]]:
     return [
         _row(
-            f"Table 1: {in_sentence(METRICS[metric].name)}",
+            f"Table 1: {in_sentence(METRICS[metric].title)}",
             _published(results, known, metric),
             _means(results, known, metric),
             Link("Scores", "scores"),

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from retwin.catalog import METRICS
 from retwin.report.blocks import Key, Panel, Plot
 from retwin.report.curves import Latent
 from retwin.report.results import Results
 from retwin.report.words import (
-    METRICS,
     mean_and_spread,
     number,
     order,
@@ -108,7 +108,7 @@ def scores_plot(results: Results, metrics: Sequence[str]) -> Plot | None:
         text += "; open diamonds are the paper’s numbers, in the colour of their source"
     picture = spec(data, x, y)
     picture["layout"]["annotations"] = [
-        _lane_title(METRICS[name].name, i) for i, name in enumerate(bounded)
+        _lane_title(METRICS[name].title, i) for i, name in enumerate(bounded)
     ]
     height = 70 + len(bounded) * (30 + 24 * max(len(sources), 2))
     alt = "Scores of every source as dots with intervals"

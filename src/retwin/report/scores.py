@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from retwin.catalog import METRICS
 from retwin.report.blocks import Cell, Column, Prose, Section, Table
 from retwin.report.plots import scores_plot
 from retwin.report.reliability import ece_floor
@@ -14,7 +15,6 @@ from retwin.report.results import Results
 from retwin.report.words import (
     MAIN,
     MANY,
-    METRICS,
     mean_and_spread,
     number,
     order,
@@ -70,7 +70,7 @@ def _score_table(results: Results, metrics: Sequence[str]) -> Table | None:
 
 def _score_columns(results: Results, name: str, paper: bool) -> list[Column]:
     """One column, or two under the score's name where the paper has it too."""
-    title = METRICS[name].name
+    title = METRICS[name].title
     if name in ("rmse", "crps") and results.outputs.units:
         title += f", {results.outputs.units[0]}"
     if not paper:

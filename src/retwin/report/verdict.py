@@ -7,11 +7,11 @@ from itertools import product
 
 import numpy as np
 
+from retwin.catalog import METRICS
 from retwin.report.parts import Comparison
 from retwin.report.results import Results
 from retwin.report.words import (
     MAIN,
-    METRICS,
     counted,
     in_sentence,
     number,
@@ -66,7 +66,8 @@ def _leading(results: Results, metric: str, pair: tuple[str, str]) -> str | None
     sure = "is ahead" if outcome(found[0]) == "better" else "has the best mean, undecided"
     return (
         f"Of all sources, {in_sentence(source_name(best))} {sure}: "
-        f"{in_sentence(METRICS[metric].name)} {number(results.sources[best].mean(metric))} ({gap})."
+        f"{in_sentence(METRICS[metric].title)} "
+        f"{number(results.sources[best].mean(metric))} ({gap})."
     )
 
 
@@ -97,7 +98,7 @@ def _first(results: Results, found: Comparison) -> str:
     ]
     count = results.data.test.n or len(results.data.test.labels)
     on = counted(count, "test trajectory") if count else "the test trajectories"
-    what = f"{in_sentence(METRICS[found.metric].name)} {means[0]} against {means[1]}"
+    what = f"{in_sentence(METRICS[found.metric].title)} {means[0]} against {means[1]}"
     difference = (
         f"difference {signed(found.mean_diff)}, 95 % interval {span(found.interval, sign=True)}"
     )
@@ -116,7 +117,7 @@ def _second(found: Sequence[Comparison]) -> list[str]:
     said = []
     for result, words in (("better", "also better"), ("worse", "worse"), ("open", "undecided")):
         each = [
-            f"{in_sentence(METRICS[one.metric].name)} "
+            f"{in_sentence(METRICS[one.metric].title)} "
             f"({signed(one.mean_diff)}, {span(one.interval, sign=True)})"
             for one in found
             if outcome(one) == result
@@ -134,7 +135,7 @@ def _third(found: Comparison) -> str:
         "worse": "so the residual model itself does harm",
         "open": "so it is not shown that the residual model itself helps",
     }[outcome(found)]
-    name = in_sentence(METRICS[found.metric].name)
+    name = in_sentence(METRICS[found.metric].title)
     gap = f"{signed(found.mean_diff)} ({span(found.interval, sign=True)})"
     return (
         f"Against {in_sentence(source_name('ibg'))}, given the same commands, the "

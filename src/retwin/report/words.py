@@ -5,19 +5,18 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from retwin.catalog import METRICS, SOURCES
 
 __all__ = [
     "CHROME",
     "DASHES",
     "MAIN",
     "MANY",
-    "METRICS",
     "PALETTE",
-    "Metric",
     "class_name",
     "counted",
     "dash",
@@ -37,43 +36,6 @@ __all__ = [
     "symbol",
 ]
 
-# Source to human name; the place in this list also fixes how it is drawn (see `slot`).
-SOURCES = {
-    "ibg_rg": "IBG + RG",
-    "dt": "Digital twin",
-    "ibg": "IBG alone",
-    "ibg_rg_command": "IBG + RG, command space",
-    "dt_noise": "IBG + output noise",
-    "randomised": "Randomised twin",
-    "mean_corrected": "IBG + RG mean",
-    "pi_ls": "Least squares (Eq. 2)",
-    "pi_bayes": "Bayesian updating (Eq. 3)",
-    "twin": "Digital twin",
-    "dann_transductive": "Domain-adversarial, transductive",
-    "fine_tuned": "Fine-tuned",
-    "pi_ls_rg": "Least squares, then IBG + RG",
-    "inversion_cnn": "Inversion with classifier",
-    "dann": "Domain-adversarial",
-    "inversion": "Fault inversion",
-}
-ORDER = (
-    "dt",
-    "twin",
-    "randomised",
-    "ibg",
-    "dt_noise",
-    "pi_ls",
-    "pi_bayes",
-    "dann",
-    "dann_transductive",
-    "mean_corrected",
-    "ibg_rg",
-    "ibg_rg_command",
-    "fine_tuned",
-    "inversion",
-    "inversion_cnn",
-    "pi_ls_rg",
-)
 MANY = 5
 """Sources beyond which pictures and tables show the most telling ones only."""
 
@@ -114,43 +76,18 @@ REAL_DATA = {
 }
 
 
-@dataclass(frozen=True)
-class Metric:
-    """How a score is called, and which way is better: 1 up, -1 down, 0 a target to meet."""
-
-    name: str
-    better: int = 1
-
-
-METRICS = {
-    "macro_f1": Metric("Macro-F1"),
-    "balanced_accuracy": Metric("Balanced accuracy"),
-    "auroc": Metric("AUROC"),
-    "healthy_recall": Metric("Healthy recall"),
-    "accuracy": Metric("Accuracy"),
-    "auroc_micro": Metric("Micro AUROC"),
-    "ece": Metric("ECE", -1),
-    "ece_classwise": Metric("Class-wise ECE", -1),
-    "rmse": Metric("RMSE", -1),
-    "nrmse": Metric("NRMSE", -1),
-    "crps": Metric("CRPS", -1),
-    "coverage50": Metric("Coverage of the 50 % band", 0),
-    "coverage90": Metric("Coverage of the 90 % band", 0),
-}
-
-
-MAIN = ("macro_f1", "balanced_accuracy", "auroc", "healthy_recall", "rmse", "nrmse", "crps")
-"""The scores that a study is judged by."""
+MAIN = tuple(name for name, metric in METRICS.items() if metric.headline)
+"""The scores that a study is summarised by."""
 
 
 def source_name(source: str) -> str:
     """For people; an unknown source keeps its name."""
-    return SOURCES.get(source, source)
+    return SOURCES[source].title if source in SOURCES else source
 
 
 def in_sentence(name: str) -> str:
     """A source's or score's name in the middle of a sentence."""
-    if name == SOURCES["dt"]:
+    if name == SOURCES["dt"].title:
         return "the digital twin"
     return name if name[:2].isupper() else f"{name[:1].lower()}{name[1:]}"
 
@@ -183,8 +120,8 @@ def _place(source: str) -> int:
 
 def order(sources: Sequence[str]) -> list[str]:
     """Known sources first, from the plain twin to what was learned most; then the others."""
-    known = {name: place for place, name in reversed(list(enumerate(ORDER)))}
-    return sorted(sources, key=lambda name: known.get(name, len(ORDER)))
+    known = {name: place for place, name in enumerate(SOURCES)}
+    return sorted(sources, key=lambda name: known.get(name, len(known)))
 
 
 def class_name(name: str) -> str:

@@ -1,4 +1,8 @@
-"""The study: sources × runs → results.json, resumable."""
+"""Studies: sources compared over runs and folds, resumable, with one results.json.
+
+Belongs here: the plan, the graph of jobs, what a source may see, and how answers are collected.
+Not here: formulas of scores, and sources' names, which stand in `retwin.catalog`.
+"""
 
 from __future__ import annotations
 
@@ -11,22 +15,23 @@ from typing import Any
 
 import numpy as np
 
-from retwin.case import Case
-from retwin.corrected import generate
+from retwin.cases.case import Case
+from retwin.catalog import SOURCES
+from retwin.data.io import load, save
+from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
-from retwin.scale.identity import identity
-from retwin.storage import load, save, sha256, write_atomically
+from retwin.serialisation.files import sha256, write_atomically
+from retwin.serialisation.identity import identity
 from retwin.study.files import Files, Roles
-from retwin.study.plan import PRESETS, StudyPlan
+from retwin.study.plan import StudyPlan
 from retwin.study.pool import run_jobs
 from retwin.study.results import write_results
-from retwin.study.sources import SOURCES, lacking
+from retwin.study.sources import lacking
 from retwin.study.work import Work
-from retwin.surrogate import ENOUGH
-from retwin.trajectories import Trajectories
-from retwin.twins.protocol import HEALTHY
+from retwin.update.corrected import generate
+from retwin.update.surrogate import ENOUGH
 
-__all__ = ["PRESETS", "SOURCES", "StudyData", "StudyPlan", "possible_sources", "run_study"]
+__all__ = ["StudyData", "StudyPlan", "possible_sources", "run_study"]
 
 Report = Callable[[str, float], None]
 """Called with what is going on and the share that is done."""
@@ -170,7 +175,7 @@ def _check_possible(case: Case, plan: StudyPlan) -> None:
             remedy=f"leave it out for the case {case.name!r}",
         )
     for name in plan.sources:
-        missing = lacking(SOURCES[name], case, plan)
+        missing = lacking(name, case, plan)
         if missing:
             raise InputError(
                 "sources",
@@ -182,7 +187,7 @@ def _check_possible(case: Case, plan: StudyPlan) -> None:
 
 def possible_sources(case: Case, plan: StudyPlan) -> tuple[str, ...]:
     """Every source that a study of this case and with this classifier can have, in order."""
-    return tuple(name for name, source in SOURCES.items() if not lacking(source, case, plan))
+    return tuple(name for name in SOURCES if not lacking(name, case, plan))
 
 
 def _prepare(

@@ -10,9 +10,11 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.catalog import SOURCES
+from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.pooled import pool_opinions
-from retwin.fidelity import Simulation
-from retwin.statistics import (
+from retwin.evaluation.fidelity import Simulation
+from retwin.scores.statistics import (
     METRICS,
     bootstrap,
     bootstrap_means,
@@ -20,9 +22,7 @@ from retwin.statistics import (
     confusion,
     score,
 )
-from retwin.study.sources import SOURCES
 from retwin.study.work import Work
-from retwin.trajectories import Trajectories
 
 __all__ = ["Answers", "Diagnoses", "Simulations", "answers"]
 

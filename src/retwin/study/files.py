@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from retwin.storage import load, write_atomically
-from retwin.trajectories import Trajectories
+from retwin.data.io import load
+from retwin.data.trajectories import Trajectories
+from retwin.serialisation.files import write_atomically
 
 __all__ = ["Files", "Job", "Roles"]
 

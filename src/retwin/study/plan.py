@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from retwin.case import Case
+from retwin.cases.case import Case
+from retwin.catalog import CALIBRATE_ON, CLASSIFIERS, PRESETS, SOURCES, resolve
+from retwin.checks import one_of
 from retwin.errors import InputError
-from retwin.networks import CLASSIFIERS, Network
-from retwin.study.sources import ROCKET, SOURCES
-from retwin.training import Training
+from retwin.nets.networks import Network
+from retwin.nets.training import Training
 
-__all__ = ["PRESETS", "Preset", "StudyPlan"]
+__all__ = ["ROCKET", "Preset", "StudyPlan"]
+
+ROCKET = "rocket"
+"""The classifier that is not a network."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +29,8 @@ class Preset:
     training: Training
 
 
-PRESETS: dict[str, Preset] = {
-    "quick": Preset("cnn", 5, Training(epochs=25, batch=64, rate=3e-3, weight_decay=1e-2)),
-    "paper": Preset("lstm", 10, Training(epochs=30, batch=32, rate=1e-3, decay="step")),
-}
+QUICK = Preset("cnn", 5, Training(epochs=25, batch=64, rate=3e-3, weight_decay=1e-2))
+PAPER = Preset("lstm", 10, Training(epochs=30, batch=32, rate=1e-3, decay="step"))
 
 
 @dataclass(frozen=True)
@@ -70,20 +71,11 @@ class StudyPlan:
     learning_curve: bool = False
 
     def __post_init__(self) -> None:
-        choices: list[tuple[str, str, Mapping[str, object]]] = [
-            ("preset", self.preset, PRESETS),
-            ("classifier", self.classifier or "cnn", {**CLASSIFIERS, ROCKET: None}),
-            ("calibrate_on", self.calibrate_on, {"healthy": None, "all": None}),
-            *(("sources", source, SOURCES) for source in self.sources),
-        ]
-        for name, value, known in choices:
-            if value not in known:
-                raise InputError(
-                    name,
-                    expected=f"one of {', '.join(known)}",
-                    got=repr(value),
-                    remedy="check the spelling",
-                )
+        one_of("preset", self.preset, PRESETS)
+        one_of("classifier", self.classifier_name, CLASSIFIERS)
+        one_of("calibrate_on", self.calibrate_on, CALIBRATE_ON)
+        for source in self.sources:
+            one_of("sources", source, SOURCES)
         for name, number in (("runs", self.number_of_runs), ("per_class", self.per_class)):
             if number is not None and number < 1:
                 raise InputError(
@@ -109,24 +101,32 @@ class StudyPlan:
         return case.per_class if self.per_class is None else self.per_class
 
     @property
+    def _preset(self) -> Preset:
+        preset: Preset = resolve(PRESETS[self.preset].target)
+        return preset
+
+    @property
     def number_of_runs(self) -> int:
         """Runs, the preset's unless given."""
-        return PRESETS[self.preset].runs if self.runs is None else self.runs
+        return self._preset.runs if self.runs is None else self.runs
 
     @property
     def classifier_name(self) -> str:
         """Classifier, the preset's unless given."""
-        return self.classifier or PRESETS[self.preset].classifier
+        return self.classifier or self._preset.classifier
 
     @property
     def network(self) -> Network | None:
         """The classifier's config; None for one that is no network."""
-        return CLASSIFIERS.get(self.classifier_name)
+        if self.classifier_name == ROCKET:
+            return None
+        network: Network = resolve(CLASSIFIERS[self.classifier_name].target)()
+        return network
 
     @property
     def training(self) -> Training:
         """The classifier's training."""
-        return PRESETS[self.preset].training
+        return self._preset.training
 
     def seed_of(self, stage: str, run: int, fold: int = 0) -> int:
         """The seed of one stage of one run, all from one SeedSequence.

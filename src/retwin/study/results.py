@@ -14,16 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.fidelity import Fidelity, Portrait
-from retwin.models import read_about
-from retwin.statistics import compare_runs, holm
-from retwin.storage import write_atomically
+from retwin.catalog import SOURCES
+from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.evaluation.fidelity import Fidelity, Portrait
+from retwin.scores.statistics import compare_runs, holm
+from retwin.serialisation.files import write_atomically
+from retwin.serialisation.models import read_about
 from retwin.study.answers import Answers, answers
 from retwin.study.files import Job
-from retwin.study.sources import SOURCES
 from retwin.study.work import Work
-from retwin.trajectories import Trajectories
-from retwin.twins.protocol import HEALTHY
 
 __all__ = ["SCHEMA", "write_results"]
 

@@ -4,28 +4,38 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.case import Case
-from retwin.corrected import generate
-from retwin.corrections import Correction
-from retwin.diagnosis import NetworkDiagnoser, RocketDiagnoser, fit_diagnoser, fit_rocket
-from retwin.models import read_about
-from retwin.networks import Network
-from retwin.residual import Residual, load_residual
-from retwin.segments import Segments
+from retwin.cases.case import Case
+from retwin.data.segments import Segments
+from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
+from retwin.diagnosis import Diagnoser, NetworkDiagnoser, RocketDiagnoser, fit_diagnoser, fit_rocket
+from retwin.nets.networks import Network
+from retwin.progress import Progress
+from retwin.serialisation.models import read_about
 from retwin.study.files import Files, Job
 from retwin.study.plan import StudyPlan
-from retwin.surrogate import Surrogate
-from retwin.trajectories import UNLABELLED, Trajectories
 from retwin.twins.parametric import ParametricTwin
-from retwin.twins.protocol import HEALTHY, Progress, Twin
-from retwin.updating import PosteriorTwin
+from retwin.twins.twin import Twin
+from retwin.update.corrected import generate
+from retwin.update.corrections import Correction
+from retwin.update.identification import PosteriorTwin
+from retwin.update.residual import Residual, load_residual
+from retwin.update.surrogate import Surrogate
 
-__all__ = ["Trial"]
+__all__ = ["Trained", "Trial"]
+
+
+class Trained(Diagnoser, Protocol):
+    """A diagnoser that can be saved."""
+
+    def save(self, folder: str | Path) -> None:
+        """Write one folder."""
+        ...
+
 
 SEES = {
     "none": (),

@@ -17,21 +17,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.case import Case
-from retwin.corrected import CorrectedTwin, generate
-from retwin.faults import Fault
-from retwin.fidelity import measure_fidelity, measure_widening, portray, simulate_records
-from retwin.models import write_model
-from retwin.residual import Density, Mixture, Residual, SequenceMixture, fit_residual
-from retwin.storage import write_atomically
+from retwin.cases.case import Case
+from retwin.catalog import SOURCES, resolve
+from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.evaluation.fidelity import measure_fidelity, measure_widening, portray, simulate_records
+from retwin.progress import Progress
+from retwin.serialisation.files import write_atomically
+from retwin.serialisation.models import write_model
 from retwin.study.files import Files, Job, Roles
 from retwin.study.plan import StudyPlan
-from retwin.study.sources import NEEDS, SOURCES, Trained
-from retwin.study.trial import Trial
-from retwin.surrogate import Surrogate, fit_surrogate
-from retwin.trajectories import Trajectories
-from retwin.twins.protocol import HEALTHY, Progress, Twin
-from retwin.updating import NPE, Posterior, Updated, identify, identify_bayes
+from retwin.study.sources import NEEDS
+from retwin.study.trial import Trained, Trial
+from retwin.twins.faults import Fault
+from retwin.twins.twin import Twin
+from retwin.update.corrected import CorrectedTwin, generate
+from retwin.update.identification import NPE, Posterior, Updated, identify, identify_bayes
+from retwin.update.residual import Density, Mixture, Residual, SequenceMixture, fit_residual
+from retwin.update.surrogate import Surrogate, fit_surrogate
 
 __all__ = ["Work"]
 
@@ -100,7 +102,7 @@ class Work:
 
         Of the first run: the chance in training is seen in the scores, at less cost.
         """
-        if not SOURCES[source].judged or (self._labels[self.roles.tested] == HEALTHY).sum() < 2:
+        if not SOURCES[source].fidelity or (self._labels[self.roles.tested] == HEALTHY).sum() < 2:
             return []
         folds = range(len(self.roles.folds))
         return [Job("fidelity", 0, fold, source, healthy) for fold in folds]
@@ -207,15 +209,14 @@ class Work:
     def _diagnosis(self, trial: Trial, path: Path) -> Costs:
         source, costs = SOURCES[trial.job.name], {}
         started = time.perf_counter()
-        if source.twin is not None:
-            made = trial.generate(source.twin(trial))
+        if source.twin:
+            made = trial.generate(resolve(source.twin)(trial))
             costs = {"generate": time.perf_counter() - started, "trajectories": len(made)}
             if not source.needs or source.parametric:
                 costs["twin_runs"] = len(made)
             diagnoser: Trained = trial.train(made)
         else:
-            assert source.diagnoser is not None
-            diagnoser = source.diagnoser(trial)
+            diagnoser = resolve(source.diagnoser)(trial)
             if not source.needs:
                 costs["twin_runs"] = len(trial.twin_data)
         trained = time.perf_counter()
@@ -229,8 +230,7 @@ class Work:
 
     def _simulation(self, trial: Trial, path: Path) -> Costs:
         """Simulate the test records from their commands alone, and score that sample by sample."""
-        make = SOURCES[trial.job.name].twin
-        assert make is not None, "checked before the study begins"
+        make = resolve(SOURCES[trial.job.name].twin)
         twin, records = make(trial), self.files.real_data()[list(trial.fold[1])]
         started = time.perf_counter()
         seed = trial.seed("simulate")
@@ -245,8 +245,7 @@ class Work:
             with write_atomically(path) as part:
                 np.savez(part)  # done, and nothing found
             return {}
-        make = SOURCES[trial.job.name].twin
-        assert make is not None
+        make = resolve(SOURCES[trial.job.name].twin)
         twin = make(trial)
         rivals: dict[str, Twin] = {}
         widening = None
@@ -266,8 +265,7 @@ class Work:
 
     def _portrait(self, trial: Trial, path: Path) -> Costs:
         """For the eye, and for no score: the fold's test trajectories beside a healthy twin."""
-        make = SOURCES[trial.job.name].twin
-        assert make is not None
+        make = resolve(SOURCES[trial.job.name].twin)
         twin, test = make(trial), self.files.real_data()[list(trial.fold[1])]
         assert isinstance(twin, CorrectedTwin), "as all in PORTRAYED"
         seed, rate = trial.seed("portrait"), self.case.sensor_rate

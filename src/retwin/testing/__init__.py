@@ -1,6 +1,8 @@
-"""Contract suites: what every twin, correction and diagnoser must do, to be run on your own too.
+"""Contract suites: checks that every twin, correction and diagnoser passes, for users too.
 
-A suite is a tuple of checks. A check takes a subject, and raises AssertionError with what is wrong.
+Belongs here: checks that take an implementation and its subject. Not here: tests of this package.
+
+A suite is a tuple of checks. A check takes a subject and raises AssertionError with what is wrong.
 With pytest, which is not needed:
 
     SUBJECT = TwinSubject(MyTwin(), commands)
@@ -9,7 +11,7 @@ With pytest, which is not needed:
     def test_contract(check):
         check(SUBJECT)
 
-Without, `check_twin(MyTwin(), commands)` runs them all and lists everything that is broken.
+Without pytest, `check_twin(MyTwin(), commands)` runs them all and lists every failure.
 """
 
 from __future__ import annotations

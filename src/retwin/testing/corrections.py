@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from retwin.data.segments import Segments
+from retwin.data.trajectories import Channels
 from retwin.errors import InputError
-from retwin.segments import Segments
 from retwin.testing.suite import (
     quiet_randomness,
     require,
@@ -17,12 +18,11 @@ from retwin.testing.suite import (
     require_same,
     run_checks,
 )
-from retwin.trajectories import Channels
 
 if TYPE_CHECKING:  # torch takes seconds to load, and twins can be checked without it
     from torch import Tensor
 
-    from retwin.corrections import Context, Correction, Discrepancy
+    from retwin.update.corrections import Context, Correction, Discrepancy
 
 __all__ = ["CORRECTION_CHECKS", "CorrectionSubject", "check_correction"]
 
@@ -81,7 +81,7 @@ class CorrectionSubject:
 
 def check_protocol(subject: CorrectionSubject) -> None:
     """It has resolution, latent, heads, apply and infer."""
-    from retwin.corrections import Correction
+    from retwin.update.corrections import Correction
 
     require(
         isinstance(subject.correction, Correction),

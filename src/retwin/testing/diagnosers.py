@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.data.trajectories import Channels, Source, Trajectories
 from retwin.errors import InputError
 from retwin.testing.suite import (
     quiet_randomness,
@@ -18,7 +19,6 @@ from retwin.testing.suite import (
     require_same,
     run_checks,
 )
-from retwin.trajectories import Channels, Source, Trajectories
 
 if TYPE_CHECKING:  # torch takes seconds to load, and twins can be checked without it
     from retwin.diagnosis import Diagnoser

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.data.segments import Segments
+from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
-from retwin.faults import Fault, Stuck, draw_faults, faulty_commands, frozen_response
-from retwin.segments import Segments
 from retwin.testing.suite import (
     quiet_randomness,
     require,
@@ -20,8 +20,8 @@ from retwin.testing.suite import (
     require_same,
     run_checks,
 )
-from retwin.trajectories import Trajectories
-from retwin.twins.protocol import HEALTHY, Limits, Twin
+from retwin.twins.faults import Fault, Stuck, draw_faults, faulty_commands, frozen_response
+from retwin.twins.twin import Limits, Twin
 
 __all__ = ["TWIN_CHECKS", "TwinSubject", "check_twin"]
 

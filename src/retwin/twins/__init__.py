@@ -1,36 +1,24 @@
-"""Twins: commands in, outputs out; and `get`, which finds one by its name."""
+"""Simulators: the `Twin` protocol, faults, command samplers, and one file per kind of twin.
+
+Belongs here: whatever turns commands into outputs and needs nothing but its own equations or files.
+Not here: learned twins (see `update`) and the twins of built-in systems (see `cases`).
+"""
 
 from __future__ import annotations
 
-import importlib
 import inspect
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from retwin.catalog import TWINS, resolve
+from retwin.data.trajectories import Channels
 from retwin.errors import InputError
-from retwin.trajectories import Channels
 
 if TYPE_CHECKING:  # whoever needs one twin need not load what another one needs
-    from retwin.twins.protocol import Twin
+    from retwin.twins.twin import Twin
 
-__all__ = ["BUILT_IN", "get"]
-
-BUILT_IN: dict[str, tuple[str, str, str]] = {
-    "armpi": ("retwin.twins.armpi", "ArmPiTwin", "ArmPi FPV robot arm, simulated by MuJoCo"),
-    "armpi-kinematic": (
-        "retwin.twins.armpi",
-        "KINEMATIC",
-        "the same arm in closed form: kinematics behind a servo lag",
-    ),
-    "armpi-emulated": (
-        "retwin.twins.emulated",
-        "EmulatedArmPi",
-        "stands in for the real arm: delays, backlash, missed movements, polling",
-    ),
-    "tanks": ("retwin.twins.tanks", "TanksTwin", "two cascaded tanks, the upper level hidden"),
-}
-"""Name to the module, the twin in it or what makes one, and what it is."""
+__all__ = ["get"]
 
 FORMS = "package.module:object, *.fmu, *.xml or *.urdf"
 
@@ -47,7 +35,7 @@ def get(
 
     | name | is |
     |---|---|
-    | `armpi`, `armpi-kinematic`, … | one of `BUILT_IN` |
+    | `armpi`, `armpi-kinematic`, … | one of `retwin.catalog.TWINS` |
     | `package.module:object` | a twin, or what makes one when called without arguments |
     | `package.module:function` | a function from commands (n, T, d_u) to outputs (n, T, d_y) |
     | `*.fmu` | an FMU for co-simulation |
@@ -67,7 +55,7 @@ def get(
 
     """
     suffix = Path(name).suffix.lower()
-    if name in BUILT_IN or ":" in name:
+    if name in TWINS or ":" in name:
         return _from_module(name, inputs, outputs, rate)
     options: dict[str, Any] = {"inputs": tuple(inputs), "outputs": tuple(outputs)}
     if rate is not None:
@@ -88,13 +76,10 @@ def get(
 def _from_module(
     name: str, inputs: Sequence[str], outputs: Sequence[str], rate: float | None
 ) -> Twin:
-    from retwin.twins.protocol import Twin
+    from retwin.twins.twin import Twin
 
-    module, attribute = name.partition(":")[::2]
-    if name in BUILT_IN:
-        module, attribute, _ = BUILT_IN[name]
     try:
-        found = getattr(importlib.import_module(module), attribute)
+        found = resolve(TWINS[name].target if name in TWINS else name)
     except (ImportError, AttributeError, ValueError) as error:
         raise _unknown(name, str(error)) from None
     # A class satisfies the protocol too, but it makes a twin and is none.
@@ -146,7 +131,7 @@ def _takes_none(function: Callable[..., Any]) -> bool:
 def _unknown(name: str, got: str) -> InputError:
     return InputError(
         f"twin {name!r}",
-        expected=f"{', '.join(BUILT_IN)}, {FORMS}",
+        expected=f"{', '.join(TWINS)}, {FORMS}",
         got=" ".join(got.split()),
         remedy="check the spelling, or that the module or file can be read",
     )

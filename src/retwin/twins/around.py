@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.faults import Fault
-from retwin.trajectories import Channels
-from retwin.twins.protocol import Chunk, Limits, SimulationError, Twin
+from retwin.data.trajectories import Channels
+from retwin.twins.faults import Fault
+from retwin.twins.twin import Chunk, Limits, SimulationError, Twin
 
 __all__ = ["Around", "ask_inside", "generator_of"]
 

@@ -9,19 +9,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.faults import Fault
-from retwin.segments import Segments
-from retwin.trajectories import Channels, Trajectories
+from retwin.data.segments import Segments
+from retwin.data.trajectories import Channels, Trajectories
+from retwin.progress import Progress
 from retwin.twins.around import Around, ask_inside
 from retwin.twins.checks import ideal_outputs
+from retwin.twins.faults import Fault
 from retwin.twins.parametric import TOGETHER, Parameter, values_per_simulation
-from retwin.twins.protocol import (
-    Chunk,
-    Progress,
-    Twin,
-    checked_commands,
-    simulate_in_chunks,
-)
+from retwin.twins.twin import Chunk, Twin, checked_commands, simulate_in_chunks
 
 __all__ = ["CommandSide", "command_side_parameters"]
 

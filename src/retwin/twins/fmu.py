@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pebble import ProcessExpired, ProcessPool
 
+from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
-from retwin.faults import Fault
 from retwin.processes import scratch_folder, worker_pool
-from retwin.trajectories import Channels, Trajectories
+from retwin.progress import Progress
 from retwin.twins import fmu_worker
 from retwin.twins.checks import check_positive, ideal_outputs, substeps
+from retwin.twins.faults import Fault
 from retwin.twins.fmu_model import (
     channels_of,
     extract,
@@ -30,7 +31,7 @@ from retwin.twins.fmu_model import (
     read_description,
     start_column,
 )
-from retwin.twins.protocol import Chunk, Limits, Progress, checked_commands, simulate_in_chunks
+from retwin.twins.twin import Chunk, Limits, checked_commands, simulate_in_chunks
 
 __all__ = ["FMUTwin"]
 

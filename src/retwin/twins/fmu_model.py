@@ -10,10 +10,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from retwin.errors import InputError
-from retwin.storage.border import brief
-from retwin.trajectories import Channels
-from retwin.twins.protocol import Limits
+from retwin.data.trajectories import Channels
+from retwin.errors import InputError, brief
+from retwin.twins.twin import Limits
 
 __all__ = [
     "channels_of",

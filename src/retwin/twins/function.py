@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pebble import ProcessExpired, ProcessPool
 
+from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
-from retwin.faults import Fault
 from retwin.processes import sendable_errors, worker_pool
-from retwin.trajectories import Channels, Trajectories
+from retwin.progress import Progress
 from retwin.twins.checks import check_positive
-from retwin.twins.protocol import Chunk, Limits, Progress, simulate_in_chunks
+from retwin.twins.faults import Fault
+from retwin.twins.twin import Chunk, Limits, simulate_in_chunks
 
 __all__ = ["FunctionTwin"]
 

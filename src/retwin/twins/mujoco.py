@@ -16,10 +16,11 @@ import numpy as np
 from mujoco import batch as mujoco_batch
 from numpy.typing import ArrayLike, NDArray
 
+from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
-from retwin.faults import Fault
-from retwin.trajectories import Channels, Trajectories
+from retwin.progress import Progress
 from retwin.twins.checks import check_positive, ideal_outputs, substeps
+from retwin.twins.faults import Fault
 from retwin.twins.mujoco_model import (
     FILTERS,
     Servo,
@@ -31,7 +32,7 @@ from retwin.twins.mujoco_model import (
     resting,
 )
 from retwin.twins.mujoco_parameters import per_simulation, set_parameter
-from retwin.twins.protocol import Chunk, Limits, Progress, checked_commands, simulate_in_chunks
+from retwin.twins.twin import Chunk, Limits, checked_commands, simulate_in_chunks
 
 __all__ = ["MuJoCoTwin", "Servo"]
 

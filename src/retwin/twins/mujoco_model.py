@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.data.trajectories import Channels
 from retwin.errors import InputError
-from retwin.trajectories import Channels
 
 __all__ = [
     "FILTERS",

@@ -8,17 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
 from retwin.errors import InputError
-from retwin.faults import Fault
-from retwin.trajectories import UNLABELLED, Trajectories
+from retwin.progress import Progress
 from retwin.twins.around import Around, ask_inside, generator_of
-from retwin.twins.protocol import (
-    HEALTHY,
-    Chunk,
-    Progress,
-    Twin,
-    simulate_in_chunks,
-)
+from retwin.twins.faults import Fault
+from retwin.twins.twin import Chunk, Twin, simulate_in_chunks
 
 __all__ = ["NoisyTwin", "between_readings", "readings", "residual_scale"]
 

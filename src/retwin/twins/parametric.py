@@ -16,17 +16,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
-from retwin.faults import Fault
-from retwin.trajectories import Trajectories
+from retwin.progress import Progress
 from retwin.twins.around import Around, ask_inside
-from retwin.twins.protocol import (
-    Chunk,
-    Progress,
-    Twin,
-    checked_commands,
-    simulate_in_chunks,
-)
+from retwin.twins.faults import Fault
+from retwin.twins.twin import Chunk, Twin, checked_commands, simulate_in_chunks
 
 __all__ = [
     "Parameter",

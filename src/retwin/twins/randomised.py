@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.faults import Fault
-from retwin.trajectories import Trajectories
+from retwin.data.trajectories import Trajectories
+from retwin.progress import Progress
 from retwin.twins.around import Around, ask_inside, generator_of
 from retwin.twins.checks import ideal_outputs
+from retwin.twins.faults import Fault
 from retwin.twins.parametric import ParametricTwin
-from retwin.twins.protocol import Chunk, Progress, simulate_in_chunks
+from retwin.twins.twin import Chunk, simulate_in_chunks
 
 __all__ = ["RandomisedTwin", "ask_with"]
 

@@ -1,0 +1,61 @@
+"""Stick figures: the skeleton drawn with matplotlib, where nothing better can be had."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.cases.animation.shots import GHOST, PAPER, RING, SOLID, Shots, rings
+
+__all__ = ["stick_pictures"]
+
+DPI = 100
+
+
+def stick_pictures(shots: Shots, size: tuple[int, int]) -> Iterator[NDArray]:
+    """Pictures (height, width, 3) of the two skeletons and the paths of their tips."""
+    # Beside pyplot, so that no window system and no global state are touched.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI, facecolor=PAPER)
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_axes(
+        (0, 0.04, 1, 0.96), projection="3d", facecolor=PAPER, computed_zorder=False
+    )
+    _stage(axes, shots)
+    unit = min(size) / 480
+    drawn: list[tuple[NDArray, Any, Any]] = []
+    for place, (points, colour, alpha, thick) in enumerate(
+        ((shots.nominal_points, GHOST, 0.55, 5.0), (shots.observed_points, SOLID, 1.0, 4.0))
+    ):
+        (trace,) = axes.plot([], [], [], color=colour, linewidth=1.2 * unit, zorder=2 + place)
+        (chain,) = axes.plot(
+            [], [], [], color=colour, alpha=alpha, linewidth=thick * unit, zorder=4 + place
+        )
+        chain.set(marker="o", markersize=1.7 * thick * unit, solid_capstyle="round")
+        drawn.append((points, trace, chain))
+    for i in range(len(shots)):
+        for points, trace, chain in drawn:
+            trace.set_data_3d(*points[: i + 1, -1].T)
+            chain.set_data_3d(*points[i].T)
+        canvas.draw()
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _stage(axes: Any, shots: Shots) -> None:
+    """The whole workspace in view, seen from slightly above, on a light floor."""
+    root, reach = shots.root, shots.reach
+    axes.set(
+        xlim=(root[0] - reach, root[0] + reach),
+        ylim=(root[1] - reach, root[1] + reach),
+        zlim=(root[2], root[2] + reach),
+    )
+    axes.set_box_aspect((2, 2, 1), zoom=1.5)
+    axes.view_init(elev=18, azim=-50)
+    axes.set_axis_off()
+    for ring in rings(root, reach):
+        axes.plot(*ring.T, color=RING, linewidth=1, zorder=1, clip_on=False)

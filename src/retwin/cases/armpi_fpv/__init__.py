@@ -1,0 +1,1 @@
+"""The ArmPi FPV robot arm: MuJoCo and closed-form twins, emulator, command recovery."""

@@ -1,0 +1,58 @@
+"""The ArmPi arm with what is not known of it as parameters (Eq. 2 and 3)."""
+
+from __future__ import annotations
+
+from retwin.cases.armpi_fpv.twin import KINEMATIC, STRAIGHT, ArmPiTwin
+from retwin.twins.command_side import CommandSide, command_side_parameters
+from retwin.twins.parametric import Parameter, ParametricTwin
+
+__all__ = ["armpi_parametric"]
+
+SERVOS = tuple(f"actuator.motor_{i}" for i in range(1, 6))
+GAIN, DAMPING = 0.008, 0.000082
+"""Of the servos in `armpi.xml`, whose length is a command unit."""
+PER_RAD = KINEMATIC.scale**2
+"""What makes such a gain of one per rad."""
+
+
+def armpi_parametric(arm: ArmPiTwin | None = None) -> ParametricTwin:
+    """The MuJoCo arm with seven free parameters, at the values of `armpi.xml`.
+
+    | parameter | unit | range |
+    |---|---|---|
+    | `stiffness`, of all servos | N m/rad | 150 to 900 |
+    | `damping`, of all servos | N m s/rad | 1 to 40 |
+    | `delay`, beyond the servos' own | samples of 10 ms | 0 to 20 |
+    | `offset.motor_1` … `offset.motor_4` | command units of 0.24 degrees | -25 to 25 |
+
+    `arm` is by default that of the case; its `outside` must be "refuse", and its step 5 ms at most.
+    With longer ones the stiffest and least damped arms of this box break loose, and a fit to data
+    likes the brink of that: noise of the integration explains noise of the data.
+    """
+    arm = ArmPiTwin() if arm is None else arm
+    stiffness = Parameter(
+        "stiffness",
+        "N m/rad",
+        150.0,
+        900.0,
+        GAIN / PER_RAD,
+        {
+            f"{servo}.{place}": factor * PER_RAD
+            for servo in SERVOS
+            for place, factor in (
+                ("gainprm[0]", 1.0),
+                ("biasprm[0]", -STRAIGHT),
+                ("biasprm[1]", -1.0),
+            )
+        },
+    )
+    damping = Parameter(
+        "damping",
+        "N m s/rad",
+        1.0,
+        40.0,
+        DAMPING / PER_RAD,
+        {f"{servo}.biasprm[2]": -PER_RAD for servo in SERVOS},
+    )
+    free = command_side_parameters(KINEMATIC.inputs, delay=(0.0, 20.0), offset=25.0)
+    return ParametricTwin(CommandSide(arm, nominal=KINEMATIC.position), (stiffness, damping, *free))

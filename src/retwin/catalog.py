@@ -1,0 +1,450 @@
+"""Everything that is chosen by name, declared once: cases, twins, sources, metrics, formats, …
+
+An entry states a name, a title and where the implementation is, as `package.module:object`. The
+implementation is imported when it is resolved, so that the command line, its completion, the
+report and the documentation read this module without waiting for torch. To add an implementation,
+write its module and add one entry here.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from retwin.checks import one_of
+
+__all__ = [
+    "CALIBRATE_ON",
+    "CASES",
+    "CLASSIFIERS",
+    "CORRECTIONS",
+    "DENSITIES",
+    "DIAGNOSERS",
+    "DOWNLOADS",
+    "FORMATS",
+    "METRICS",
+    "NETWORKS",
+    "PRESETS",
+    "SOURCES",
+    "TWINS",
+    "CaseEntry",
+    "Entry",
+    "FormatEntry",
+    "Metric",
+    "PublicFile",
+    "SourceEntry",
+    "lookup",
+    "make",
+    "resolve",
+]
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An implementation.
+
+    Parameters
+    ----------
+    target : str
+        The object, as "package.module:object".
+    title : str
+        What it is, in a few words.
+    extra : str
+        The extra of the package that it needs; "" if it needs none.
+
+    """
+
+    target: str
+    title: str
+    extra: str = ""
+
+
+@dataclass(frozen=True)
+class CaseEntry:
+    """A built-in case.
+
+    Parameters
+    ----------
+    target : str
+        A function without arguments that returns the `Case`.
+    title : str
+        What it is, in a few words.
+    classes : str
+        The class names in their fixed order, a tuple that can be imported without torch; "" for a
+        case without classes.
+
+    """
+
+    target: str
+    title: str
+    classes: str = ""
+
+
+@dataclass(frozen=True)
+class SourceEntry:
+    """A source of a study: an updated twin, or a rival of one.
+
+    Exactly one of `twin`, `diagnoser` and `pool` is given.
+
+    Parameters
+    ----------
+    title : str
+        The name in tables and figures.
+    real_data : str
+        What it may learn from: "none", "timing" (of commands), "healthy", "unlabelled",
+        "transductive" (outputs of the test set without labels) or "labelled".
+    needs : sequence of (str, str)
+        Kind and name of the jobs that must be done first.
+    twin : str
+        A function of a `Trial` that returns the twin on whose trajectories the study's classifier
+        is trained, or that simulates the test records.
+    diagnoser : str
+        A function of a `Trial` that returns the diagnoser itself.
+    pool : sequence of str
+        The sources whose probabilities are pooled.
+    network : bool
+        Whether the study's classifier must be a neural network.
+    parametric : bool
+        Whether the case must declare the free parameters of its twin.
+    extra : str
+        The extra of the package that it needs.
+    simulates : bool
+        Whether it has a place only in studies of cases without classes.
+
+    """
+
+    title: str
+    real_data: str
+    needs: Sequence[tuple[str, str]] = ()
+    twin: str = ""
+    diagnoser: str = ""
+    pool: Sequence[str] = ()
+    network: bool = False
+    parametric: bool = False
+    extra: str = ""
+    simulates: bool = False
+
+    @property
+    def per_fold(self) -> bool:
+        """Whether it depends on the calibration set, so that it is made once per fold."""
+        return self.real_data != "none"
+
+    @property
+    def fidelity(self) -> bool:
+        """Whether its trajectories are compared with measured ones."""
+        return bool(self.twin) and self.real_data == "healthy"
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A score.
+
+    Parameters
+    ----------
+    title : str
+        The name in tables and figures.
+    better : int
+        1 if larger values are better, -1 if smaller ones are, 0 for a target to be met.
+    headline : bool
+        Whether a study is summarised by it.
+    unit : str
+        "output" for the unit of the outputs; "1" for numbers without a unit.
+
+    """
+
+    title: str
+    better: int = 1
+    headline: bool = False
+    unit: str = "1"
+
+
+@dataclass(frozen=True)
+class FormatEntry:
+    """A file format of trajectories.
+
+    Parameters
+    ----------
+    title : str
+        What it holds.
+    reader : str
+        The function that reads it.
+    writer : str
+        The function that writes it; "" if the format is only read.
+    extra : str
+        The extra of the package that it needs.
+
+    """
+
+    title: str
+    reader: str
+    writer: str = ""
+    extra: str = ""
+
+
+@dataclass(frozen=True)
+class PublicFile:
+    """A public file.
+
+    Parameters
+    ----------
+    url : str
+        Its address.
+    sha256 : str
+        The SHA-256 of its contents, in hexadecimal.
+    file : str
+        Its name below the cache folder.
+
+    """
+
+    url: str
+    sha256: str
+    file: str
+
+
+def resolve(target: str) -> Any:
+    """The object that "package.module:object" names.
+
+    Raises ImportError or AttributeError if there is none; each entry of this module has one.
+    """
+    module, _, attribute = target.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def lookup(entries: Mapping[str, T], name: str, argument: str) -> T:
+    """The entry of that name.
+
+    Raises InputError, about `argument`, if there is none.
+    """
+    return entries[one_of(argument, name, entries)]
+
+
+def make(entries: Mapping[str, Entry], name: str, argument: str) -> Any:
+    """What the target of that entry makes when it is called without arguments.
+
+    Raises InputError, about `argument`, if there is no entry of that name.
+    """
+    return resolve(lookup(entries, name, argument).target)()
+
+
+CASES: Mapping[str, CaseEntry] = {
+    "armpi": CaseEntry(
+        "retwin.cases.armpi_fpv.case:armpi",
+        "ArmPi FPV robot arm",
+        "retwin.cases.armpi_fpv.classes:CLASSES",
+    ),
+    "tanks": CaseEntry(
+        "retwin.cases.cascaded_tanks.case:tanks", "two cascaded tanks, without overflow"
+    ),
+    "tanks_overflow": CaseEntry(
+        "retwin.cases.cascaded_tanks.case:tanks_overflow", "two cascaded tanks that overflow"
+    ),
+}
+
+TWINS: Mapping[str, Entry] = {
+    "armpi": Entry(
+        "retwin.cases.armpi_fpv.twin:ArmPiTwin", "ArmPi FPV robot arm, simulated by MuJoCo"
+    ),
+    "armpi-kinematic": Entry(
+        "retwin.cases.armpi_fpv.twin:KINEMATIC",
+        "the same arm in closed form: kinematics behind a servo lag",
+    ),
+    "armpi-emulated": Entry(
+        "retwin.cases.armpi_fpv.emulator:EmulatedArmPi",
+        "emulation of the real arm: delays, backlash, missed segments, polling",
+    ),
+    "tanks": Entry(
+        "retwin.cases.cascaded_tanks.twin:TanksTwin",
+        "two cascaded tanks, the upper level hidden",
+    ),
+}
+"""Targets are twins, or make one when they are called without arguments."""
+
+CORRECTIONS: Mapping[str, Entry] = {
+    "additive": Entry("retwin.update.corrections:Additive", "a residual of each output sample"),
+    "delay_offset": Entry(
+        "retwin.update.corrections:DelayOffset",
+        "a delay and an output offset per segment (the paper's)",
+    ),
+    "command_space": Entry(
+        "retwin.update.corrections:command_space",
+        "effective commands per segment and actuator, behind a sampled sensor",
+    ),
+}
+
+DENSITIES: Mapping[str, Entry] = {
+    "mixture": Entry("retwin.update.residual:Mixture", "Gaussian mixture per segment (Eq. 6)"),
+    "flow": Entry("retwin.update.residual:Flow", "normalising flow per segment", "flows"),
+    "sequence_mixture": Entry(
+        "retwin.update.residual:SequenceMixture", "autoregressive mixture per sample"
+    ),
+}
+
+NETWORKS: Mapping[str, Entry] = {
+    "mlp": Entry("retwin.nets.networks:MLP", "multi-layer perceptron, without memory"),
+    "lstm": Entry("retwin.nets.networks:LSTM", "recurrent network"),
+    "tcn": Entry("retwin.nets.networks:TCN", "causal convolutions"),
+    "state_space": Entry("retwin.nets.networks:StateSpace", "neural state-space model"),
+}
+"""Networks of a surrogate."""
+
+CLASSIFIERS: Mapping[str, Entry] = {
+    "cnn": Entry("retwin.nets.networks:CNN", "convolutional network"),
+    "lstm": Entry("retwin.nets.networks:LSTMClassifier", "LSTM, last step (the paper's)"),
+    "rocket": Entry("retwin.diagnosis.rocket:fit_rocket", "MiniRocket and a ridge", "rocket"),
+}
+"""Classifiers that are trained on generated trajectories."""
+
+DIAGNOSERS: Mapping[str, Entry] = {
+    "diagnoser": Entry("retwin.diagnosis.network:NetworkDiagnoser", "neural network"),
+    "inversion": Entry("retwin.diagnosis.inversion:InversionDiagnoser", "fault inversion"),
+    "rocket": Entry("retwin.diagnosis.rocket:RocketDiagnoser", "MiniRocket and a ridge", "rocket"),
+}
+"""The kind that a saved diagnoser's model.json states, and the class whose `load` reads it."""
+
+FORMATS: Mapping[str, FormatEntry] = {
+    ".mat": FormatEntry(
+        "X_array, y_array or X_test_array, y_test_array: cells of (T, 2 d_y)",
+        "retwin.data.io.mat:read_mat",
+    ),
+    ".npz": FormatEntry(
+        "one file, as `save` wrote it",
+        "retwin.data.io.npz:read_npz",
+        "retwin.data.io.npz:write_npz",
+    ),
+    ".zarr": FormatEntry(
+        "a folder in chunks, as `save` or `simulate_to` wrote it",
+        "retwin.data.io.zarr_folder:read_zarr",
+        "retwin.data.io.zarr_folder:write_zarr",
+        "scale",
+    ),
+}
+"""By the suffix of the name. A folder without a suffix holds one folder per class."""
+
+DOWNLOADS: Mapping[str, PublicFile] = {
+    "armpi": PublicFile(
+        url="https://raw.githubusercontent.com/JialingRichard/Digital-Twin-Fault-Diagnosis/"
+        "HEAD/mydataset/my_dataset_test.mat",
+        sha256="5d87fcdba86f6000dee5b7ec31a6e9a72276a9c4ff0b3a67d39a821cc5931b67",
+        file="armpi/my_dataset_test.mat",
+    ),
+}
+
+_SURROGATE = ("surrogate", "")
+_OUTPUT = ("residual", "output")
+_COMMAND = ("residual", "command")
+_LEAST_SQUARES = ("update", "pi_ls")
+_BAYES = ("update", "pi_bayes")
+_IDENTIFIED = ("surrogate", "pi_ls")
+_IDENTIFIED_OUTPUT = ("residual", "pi_ls")
+
+SOURCES: Mapping[str, SourceEntry] = {
+    "dt": SourceEntry("Digital twin", "none", diagnoser="retwin.study.sources:recorded_twin"),
+    "twin": SourceEntry(
+        "Digital twin", "none", twin="retwin.study.sources:plain_twin", simulates=True
+    ),
+    "randomised": SourceEntry(
+        "Randomised twin", "none", twin="retwin.study.sources:randomised_twin", parametric=True
+    ),
+    "ibg": SourceEntry(
+        "IBG alone", "timing", (_SURROGATE,), twin="retwin.study.sources:surrogate_alone"
+    ),
+    "dt_noise": SourceEntry(
+        "IBG + output noise", "healthy", (_SURROGATE,), twin="retwin.study.sources:noisy_surrogate"
+    ),
+    "pi_ls": SourceEntry(
+        "Least squares (Eq. 2)",
+        "healthy",
+        (_LEAST_SQUARES,),
+        twin="retwin.study.sources:least_squares_twin",
+        parametric=True,
+    ),
+    "pi_bayes": SourceEntry(
+        "Bayesian updating (Eq. 3)",
+        "healthy",
+        (_BAYES,),
+        twin="retwin.study.sources:posterior_twin",
+        parametric=True,
+        extra="bayes",
+    ),
+    "dann": SourceEntry(
+        "Domain-adversarial",
+        "unlabelled",
+        diagnoser="retwin.study.sources:adversarial",
+        network=True,
+    ),
+    "dann_transductive": SourceEntry(
+        "Domain-adversarial, transductive",
+        "transductive",
+        diagnoser="retwin.study.sources:adversarial_transductive",
+        network=True,
+    ),
+    "mean_corrected": SourceEntry(
+        "IBG + RG mean",
+        "healthy",
+        (_SURROGATE, _OUTPUT),
+        twin="retwin.study.sources:mean_corrected",
+    ),
+    "ibg_rg": SourceEntry(
+        "IBG + RG", "healthy", (_SURROGATE, _OUTPUT), twin="retwin.study.sources:output_corrected"
+    ),
+    "pi_ls_rg": SourceEntry(
+        "Least squares, then IBG + RG",
+        "healthy",
+        (_IDENTIFIED, _IDENTIFIED_OUTPUT),
+        twin="retwin.study.sources:identified_corrected",
+        parametric=True,
+        simulates=True,
+    ),
+    "ibg_rg_command": SourceEntry(
+        "IBG + RG, command space",
+        "healthy",
+        (_SURROGATE, _COMMAND),
+        twin="retwin.study.sources:command_corrected",
+    ),
+    "fine_tuned": SourceEntry(
+        "Fine-tuned on labels",
+        "labelled",
+        (_SURROGATE, _COMMAND, ("diagnosis", "ibg_rg_command")),
+        diagnoser="retwin.study.sources:fine_tuned",
+        network=True,
+    ),
+    "inversion": SourceEntry(
+        "Fault inversion",
+        "healthy",
+        (_SURROGATE, _COMMAND),
+        diagnoser="retwin.study.sources:inversion",
+    ),
+    "inversion_cnn": SourceEntry(
+        "Inversion with classifier", "healthy", pool=("inversion", "ibg_rg_command")
+    ),
+}
+"""In the order in which they are reported."""
+
+CALIBRATE_ON = ("healthy", "all")
+"""The real trajectories that a residual model may learn from."""
+
+PRESETS: Mapping[str, Entry] = {
+    "quick": Entry("retwin.study.plan:QUICK", "CNN at the sensor's rate, 5 runs"),
+    "paper": Entry("retwin.study.plan:PAPER", "LSTM as in the paper, 10 runs"),
+}
+"""Classifier, training and number of runs of a study."""
+
+METRICS: Mapping[str, Metric] = {
+    "macro_f1": Metric("Macro-F1", headline=True),
+    "balanced_accuracy": Metric("Balanced accuracy", headline=True),
+    "auroc": Metric("AUROC", headline=True),
+    "healthy_recall": Metric("Healthy recall", headline=True),
+    "accuracy": Metric("Accuracy"),
+    "auroc_micro": Metric("Micro AUROC"),
+    "ece": Metric("ECE", -1),
+    "ece_classwise": Metric("Class-wise ECE", -1),
+    "rmse": Metric("RMSE", -1, headline=True, unit="output"),
+    "nrmse": Metric("NRMSE", -1, headline=True),
+    "crps": Metric("CRPS", -1, headline=True, unit="output"),
+    "coverage50": Metric("Coverage of the 50 % band", 0),
+    "coverage90": Metric("Coverage of the 90 % band", 0),
+}

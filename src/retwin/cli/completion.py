@@ -1,0 +1,69 @@
+"""Completion in a shell: of names from the catalog, and of the classes of a case."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import typer
+
+from retwin import catalog
+
+__all__ = [
+    "complete_faults",
+    "complete_files",
+    "complete_sources",
+    "complete_twins",
+    "one_of",
+]
+
+Complete = Callable[[str], list[str]]
+
+
+def one_of(names: Iterable[str]) -> Complete:
+    """Completes to one of these names."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [name for name in names if name.startswith(incomplete)]
+
+    return complete
+
+
+def complete_sources(incomplete: str) -> list[str]:
+    """Completes the last of several names that are joined by commas, none of them twice."""
+    *chosen, last = incomplete.split(",")
+    before = "".join(f"{name}," for name in chosen)
+    left = [
+        name for name in (*catalog.SOURCES, *(() if chosen else ("all",))) if name not in chosen
+    ]
+    return [before + name for name in left if name.startswith(last)]
+
+
+def complete_twins(incomplete: str) -> list[tuple[str, str]]:
+    """Completes to a built-in twin, and says what it is."""
+    known = ((name, entry.title) for name, entry in catalog.TWINS.items())
+    return [(name, title) for name, title in known if name.startswith(incomplete)]
+
+
+def complete_files(incomplete: str) -> list[str]:
+    """Completes to a public data file that can be fetched."""
+    return one_of(sorted(catalog.DOWNLOADS))(incomplete)
+
+
+def complete_faults(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Completes to a class of the case, or of the twin's own case, that stands on the line."""
+    # An option that still lacks its value leaves arguments where they are.
+    named = ctx.params.get("case") or ctx.params.get("twin") or next(iter(ctx.args), "")
+    return one_of(("none", "all", *_faults(named)))(incomplete)
+
+
+def _faults(named: str) -> Sequence[str]:
+    if not named.endswith(".toml"):
+        entry = catalog.CASES.get(named.partition("-")[0])
+        return catalog.resolve(entry.classes) if entry and entry.classes else ()
+    try:
+        faults = tomllib.loads(Path(named).read_text("utf-8")).get("faults", {})
+    except (OSError, ValueError):
+        return ()  # the command itself reports what is wrong with the file
+    return ("Healthy", *faults)

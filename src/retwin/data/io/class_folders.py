@@ -1,0 +1,253 @@
+"""Folders with one folder per class: of CSV files, or of the arm's authors' `dataset_*.mat`."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.io.assembly import DataCase, Raw, assemble, split_columns
+from retwin.data.io.mat import mat_variables, matrix
+from retwin.data.io.mat5 import Opaque
+from retwin.data.trajectories import Channels, Source, Trajectories
+from retwin.errors import InputError, brief
+from retwin.progress import Progress
+from retwin.serialisation.files import sha256
+
+__all__ = ["read_class_folders"]
+
+Reader = Callable[[Path, str, "DataCase | None"], Raw]
+COORDINATES = 3
+
+
+def read_class_folders(
+    path: Path, *, case: DataCase | None, rate: float | None, progress: Progress | None
+) -> Trajectories:
+    """Trajectories of the files `path`/class name/*.csv or `path`/class name/dataset_*.mat.
+
+    CSV: no header, one row per sample, columns nominal then observed (with a case that has the
+    width for it: commands first); `nan` is a missing measurement. MAT: `trajCmds` (desired),
+    `trajResps` (realised), `motorCmdsRadius` (commands in rad), or the older `dataset` of six
+    columns. Commands that MATLAB stored as `timeseries` objects cannot be decoded without MATLAB:
+    then the set has none, and the case completes them from the desired path.
+
+    Raises
+    ------
+    InputError: no such files, files of both kinds, or one that does not hold what is expected.
+
+    """
+    kinds: list[tuple[str, Reader]] = [("*.csv", _read_csv), ("dataset_*.mat", _read_dataset)]
+    found = [(_in_order(path, pattern), read) for pattern, read in kinds]
+    found = [(files, read) for files, read in found if files]
+    if len(found) != 1:
+        raise InputError(
+            "path",
+            expected="a folder per class with *.csv or dataset_*.mat files",
+            got=f"{'both kinds' if found else 'no such file'} in {path}",
+            remedy="keep the kinds apart" if found else "give the folder above the class folders",
+        )
+    files, read = found[0]
+    raws = []
+    for i, file in enumerate(files):
+        raws.append(read(file, f"{file.parent.name}/{file.name}", case))
+        if progress is not None:
+            progress((i + 1) / len(files))
+    raws, inputs = _commands_of_case(raws, case, radians=read is _read_dataset)
+    return assemble(
+        raws, source=Source(path.resolve().name, sha256(path)), case=case, rate=rate, inputs=inputs
+    )
+
+
+def _in_order(path: Path, pattern: str) -> list[Path]:
+    """Files of the class folders, the numbers in their names in numerical order."""
+    files = [file for file in path.glob(f"*/{pattern}") if not file.parent.name.startswith(".")]
+
+    def key(file: Path) -> tuple[Any, ...]:
+        parts = re.split(r"(\d+)", file.name)
+        # Equal names (2 and 02) fall back on the text, so that the order never depends on the disk.
+        numbers = tuple(int(p) if p.isdigit() else p for p in parts)
+        return file.parent.name, numbers, file.name
+
+    return sorted(files, key=key)
+
+
+def _read_csv(file: Path, where: str, case: DataCase | None) -> Raw:
+    try:
+        with file.open(encoding="utf-8-sig") as lines, warnings.catch_warnings():
+            warnings.simplefilter("error")  # numpy only warns when there is no row at all
+            block = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
+    except Exception as error:
+        raise _csv_error(file, where, brief(error)) from None
+    commands, nominal, observed = split_columns(block, where, case)
+    return Raw(
+        where=where,
+        label=file.parent.name,
+        nominal=nominal,
+        observed=observed,
+        commands=commands if commands.shape[1] else None,
+        id=f"{file.parent.name}/{file.stem}",
+    )
+
+
+def _csv_error(file: Path, where: str, fallback: str) -> InputError:
+    """The error that names the first bad line of a CSV file, or `fallback` when none stands out."""
+    got, width = None, 0
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+        for number, line in enumerate(lines, start=1):
+            if not line.strip():
+                continue
+            fields = line.strip().split(",")
+            bad = [field for field in fields if not _is_number(field)]
+            if bad:
+                got = f"{bad[0].strip()[:40]!r} in line {number}"
+                break
+            width = width or len(fields)
+            if len(fields) != width:
+                got = f"{len(fields)} columns in line {number} after {width} before"
+                break
+    got = got or (fallback if width else "no rows")
+    return InputError(
+        where,
+        expected="rows of numbers with commas between, all of one length, without a header",
+        got=got,
+        remedy="repair that line ('nan' stands for a missing measurement)",
+    )
+
+
+def _is_number(field: str) -> bool:
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
+
+
+def _read_dataset(file: Path, where: str, case: DataCase | None) -> Raw:
+    width = len(case.outputs) if case is not None else COORDINATES
+    paths = mat_variables(file, ["trajCmds", "trajResps", "dataset"])
+    if {"trajCmds", "trajResps"} <= set(paths):
+        nominal = _upright(paths["trajCmds"], width, f"{where}: trajCmds")
+        observed = _upright(paths["trajResps"], width, f"{where}: trajResps")
+        commands, clock = _motor_commands(file, where, len(nominal))
+    elif "dataset" in paths:
+        both = _upright(paths["dataset"], 2 * width, f"{where}: dataset")
+        nominal, observed = both[:, :width], both[:, width:]
+        commands, clock = None, None
+    else:
+        raise InputError(
+            where,
+            expected="the variables trajCmds and trajResps, or dataset",
+            got=", ".join(sorted(mat_variables(file))) or "none",
+            remedy="give the folder of the authors' data as it is",
+        )
+    if len(nominal) != len(observed):
+        raise InputError(
+            f"{where}: trajResps",
+            expected=f"{len(nominal)} samples, as trajCmds",
+            got=f"{len(observed)}",
+            remedy="sample both on the same grid",
+        )
+    label = file.parent.name
+    return Raw(where, label, nominal, observed, commands, f"{label}/{file.stem}", clock)
+
+
+def _upright(value: Any, width: int, where: str) -> NDArray:
+    """`value` as (T, width), turned when it lies on its side and there is no doubt about it."""
+    block = matrix(value, where)
+    if (block.shape[0] == width) == (block.shape[1] == width):
+        raise InputError(
+            where,
+            expected=f"samples by {width} columns, or {width} rows by samples",
+            got=f"shape {block.shape}",
+            remedy="save samples by columns, with another number of samples than columns",
+        )
+    return block if block.shape[1] == width else block.T
+
+
+def _motor_commands(file: Path, where: str, steps: int) -> tuple[NDArray | None, float | None]:
+    """Commands (T, motors) in rad and their sample rate, as far as the file tells them.
+
+    A table of numbers, or a cell per motor with a vector or with a struct of `Data` and `Time`.
+    """
+    value = mat_variables(file, ["motorCmdsRadius"]).get("motorCmdsRadius")
+    where = f"{where}: motorCmdsRadius"
+    if value is None or isinstance(value, Opaque):
+        return None, None
+    cells = np.asarray(value)
+    if cells.dtype != object:
+        return _upright(np.transpose(cells), steps, where).T, None
+    series = [_series(cell, where) for cell in cells.ravel()]
+    if not series or any(data is None for data, _ in series):
+        return None, None
+    vectors = [data for data, _ in series if data is not None]
+    if any(len(data) != steps for data in vectors):
+        raise InputError(
+            where,
+            expected=f"{steps} samples per motor, as trajCmds",
+            got=", ".join(str(len(data)) for data in vectors),
+            remedy="sample commands and paths on the same grid",
+        )
+    rates = {round(rate, 3) for _, rate in series if rate is not None}
+    if len(rates) > 1:
+        raise InputError(
+            where,
+            expected="one sample rate",
+            got=", ".join(f"{rate:g} Hz" for rate in sorted(rates)),
+            remedy="sample all motors on the same grid",
+        )
+    return np.stack(vectors, axis=1), next(iter(rates), None)
+
+
+def _series(cell: Any, where: str) -> tuple[NDArray | None, float | None]:
+    """Values (T,) and sample rate of one motor; no values when they cannot be decoded."""
+    if isinstance(cell, Opaque):
+        return None, None
+    data = _vector(cell.get("Data") if isinstance(cell, dict) else cell, where)
+    if not isinstance(cell, dict) or "Time" not in cell:
+        return data, None
+    times = _vector(cell["Time"], where)
+    gaps = np.diff(times)
+    if len(times) != len(data) or not len(gaps) or not np.all(np.isfinite(gaps) & (gaps > 0)):
+        raise InputError(
+            where,
+            expected="one growing time per value",
+            got=f"{len(times)} times for {len(data)} values, or times that do not grow",
+            remedy="repair the Time of the motor commands",
+        )
+    if gaps.max() > 1.5 * gaps.min():
+        raise InputError(
+            where,
+            expected="a constant sample rate",
+            got=f"steps from {gaps.min():g} to {gaps.max():g} s",
+            remedy="resample the commands",
+        )
+    return data, float(1 / np.median(gaps))
+
+
+def _vector(value: Any, where: str) -> NDArray:
+    """`value` (T, 1), (1, T) or (1, 1, T) as (T,)."""
+    return matrix(np.atleast_2d(np.squeeze(np.asarray(value))), where).ravel()
+
+
+def _commands_of_case(
+    raws: list[Raw], case: DataCase | None, *, radians: bool
+) -> tuple[list[Raw], Channels | None]:
+    """`raws` with commands in the unit of the case, and the names of the command channels.
+
+    Without a case commands in rad stay as they are. A case that does not take rad does not get
+    them, and recovers its commands from the nominal path.
+    """
+    if not radians or any(raw.commands is None for raw in raws):
+        return raws, None
+    motors = {raw.commands.shape[1] for raw in raws if raw.commands is not None}
+    if case is None:
+        return raws, Channels.numbered("motor_", max(motors), "rad") if len(motors) == 1 else None
+    if set(case.inputs.units) == {"rad"} and motors == {len(case.inputs)}:
+        return raws, case.inputs
+    return [replace(raw, commands=None) for raw in raws], None

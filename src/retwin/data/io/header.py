@@ -1,0 +1,201 @@
+"""The header of retwin's own formats.
+
+Schema 1, in NPZ and Zarr: a set that was saved as a whole, with the SHA-256 of every array. Schema
+2, in Zarr only: a set that was written chunk by chunk, in any order, with the SHA-256 of every
+chunk; labels are numbers and ids are indices there, since a million texts do not fit a header.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.trajectories import Channels, Source, Trajectories
+from retwin.errors import InputError
+
+__all__ = [
+    "CHUNKED",
+    "CHUNKED_NAMES",
+    "FAILED",
+    "NAMES",
+    "SCHEMA",
+    "arrays_of",
+    "check_chunk",
+    "check_header",
+    "chunk_digest",
+    "chunked_header",
+    "header_of",
+    "restore",
+    "restore_chunked",
+]
+
+FORMAT = "retwin-trajectories"
+SCHEMA = 1
+CHUNKED = 2
+"""The schema of sets that were written chunk by chunk."""
+NAMES = ("commands", "nominal", "observed", "mask", "labels", "ids")
+CHUNKED_NAMES = NAMES[:-1]
+FAILED = -1
+"""In place of the class's number: this trajectory could not be simulated."""
+
+
+def arrays_of(trajectories: Trajectories) -> dict[str, NDArray]:
+    """The arrays to write, in an order, byte order and text width that only content decides."""
+    arrays = {}
+    for name in NAMES:
+        array = np.asarray(getattr(trajectories, name))
+        if array.dtype.kind == "U":
+            # A part of a set inherits the text width of the whole: measure it anew.
+            array = np.array(array.tolist(), dtype=np.str_)
+        arrays[name] = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+    return arrays
+
+
+def header_of(trajectories: Trajectories, arrays: Mapping[str, NDArray]) -> dict[str, Any]:
+    """What the arrays do not say, as JSON values, and their shapes and SHA-256."""
+    return _about(trajectories, SCHEMA) | {
+        "arrays": {
+            name: {"shape": list(arrays[name].shape), "sha256": _digest(arrays[name])}
+            for name in NAMES
+        },
+    }
+
+
+def chunked_header(
+    some: Trajectories,
+    *,
+    count: int,
+    classes: Sequence[str],
+    chunk: int,
+    digests: Sequence[str],
+    failed: Mapping[int, str],
+) -> dict[str, Any]:
+    """What the arrays of a set written in chunks do not say, as JSON values.
+
+    Parameters
+    ----------
+    some: trajectories of the set, or none of them: for samples, channels, rate and provenance.
+    count: trajectories, with those that failed.
+    classes: the class names that the numbers in `labels` stand for.
+    chunk: trajectories per chunk; the last one may be shorter.
+    digests: the `chunk_digest` of every chunk, in order.
+    failed: index of every trajectory that could not be simulated, and the reason.
+
+    """
+    shapes = {name: [count, *getattr(some, name).shape[1:]] for name in CHUNKED_NAMES}
+    return _about(some, CHUNKED) | {
+        "arrays": {name: {"shape": shape} for name, shape in shapes.items()},
+        "classes": list(classes),
+        "chunk": chunk,
+        "chunks": list(digests),
+        "failed": {str(index): failed[index] for index in sorted(failed)},
+    }
+
+
+def check_header(header: Any, where: str, newest: int = SCHEMA) -> None:
+    """Refuse a header of another format or of a schema above `newest`, the last one known."""
+    schema = header.get("schema") if isinstance(header, dict) else None
+    if not isinstance(header, dict) or header.get("format") != FORMAT or type(schema) is not int:
+        raise InputError(
+            where,
+            expected="trajectories saved by retwin",
+            got="another kind of file",
+            remedy="give a file that `retwin data convert` wrote",
+        )
+    if not 1 <= schema <= newest:
+        raise InputError(
+            where,
+            expected=f"schema {newest} or older",
+            got=f"schema {schema}",
+            remedy="upgrade retwin: pip install --upgrade retwin",
+        )
+
+
+def restore(header: Mapping[str, Any], arrays: Mapping[str, NDArray], where: str) -> Trajectories:
+    """The trajectories that `header` and `arrays` describe, checked against their SHA-256.
+
+    Raises InputError when the arrays are not those that were written.
+    """
+    for name in NAMES:
+        if header["arrays"][name]["sha256"] != _digest(arrays[name]):
+            raise InputError(
+                where,
+                expected=f"the array {name!r} as it was written",
+                got="other bytes",
+                remedy="the file is damaged: get or make it again",
+            )
+    return Trajectories(**{**arrays, **_read_about(header)})
+
+
+def restore_chunked(
+    header: Mapping[str, Any], arrays: Mapping[str, NDArray], index: NDArray
+) -> Trajectories:
+    """The trajectories at `index` of a set written in chunks, none of which failed.
+
+    `arrays` holds the rows at `index`; the ids are the indices.
+    """
+    kept: dict[str, Any] = {name: arrays[name] for name in CHUNKED_NAMES}
+    kept["labels"] = np.array(header["classes"], dtype=np.str_)[kept["labels"]]
+    kept["ids"] = np.array([f"{i:05d}" for i in index], dtype=np.str_)
+    return Trajectories(**kept, **_read_about(header))
+
+
+def chunk_digest(arrays: Mapping[str, NDArray]) -> str:
+    """The SHA-256 of one chunk: its arrays' own, in their fixed order."""
+    total = hashlib.sha256()
+    for name in CHUNKED_NAMES:
+        total.update(f"{name} {_digest(arrays[name])}\n".encode())
+    return total.hexdigest()
+
+
+def check_chunk(
+    header: Mapping[str, Any], arrays: Mapping[str, NDArray], number: int, where: str
+) -> None:
+    """Raise InputError when the arrays of a chunk are not those that were written."""
+    if header["chunks"][number] != chunk_digest(arrays):
+        raise InputError(
+            where,
+            expected=f"chunk {number} as it was written",
+            got="other bytes",
+            remedy="the folder is damaged: get or make it again",
+        )
+
+
+def _digest(array: NDArray) -> str:
+    total = hashlib.sha256(f"{array.dtype.str} {array.shape}".encode())
+    total.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+    return total.hexdigest()
+
+
+def _about(trajectories: Trajectories, schema: int) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "schema": schema,
+        "rate": trajectories.rate,
+        "inputs": _channels(trajectories.inputs),
+        "outputs": _channels(trajectories.outputs),
+        "provenance": [{"name": s.name, "sha256": s.sha256} for s in trajectories.provenance],
+        "emulated": trajectories.emulated,
+    }
+
+
+def _read_about(header: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "rate": header["rate"],
+        "inputs": _read_channels(header["inputs"]),
+        "outputs": _read_channels(header["outputs"]),
+        "provenance": tuple(Source(s["name"], s["sha256"]) for s in header["provenance"]),
+        "emulated": bool(header["emulated"]),
+    }
+
+
+def _channels(channels: Channels) -> dict[str, list[str]]:
+    return {"names": list(channels.names), "units": list(channels.units)}
+
+
+def _read_channels(told: Mapping[str, Any]) -> Channels:
+    return Channels(tuple(map(str, told["names"])), tuple(map(str, told["units"])))

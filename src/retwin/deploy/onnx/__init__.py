@@ -1,0 +1,1 @@
+"""The ONNX export of a bundle, and its use without torch."""

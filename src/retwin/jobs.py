@@ -1,0 +1,167 @@
+"""Where chunks are made: in this process, in worker processes, or on a Dask cluster.
+
+All three call the same function on the same numbers; both kinds of workers give standard futures.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, as_completed
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from pebble import ProcessExpired
+
+from retwin.errors import InputError
+from retwin.processes import sendable_errors, worker_pool
+from retwin.progress import Progress
+
+__all__ = ["alone", "each"]
+
+ATTEMPTS = 3
+"""How often a chunk is begun when worker processes die of it, before that is an error."""
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+
+def each(
+    task: Callable[..., Result],
+    job: Job,
+    numbers: Sequence[int],
+    *,
+    workers: int,
+    scheduler: str | None,
+    progress: Progress,
+) -> Iterator[Result]:
+    """The results of `task(job, number)` for all numbers, as they come.
+
+    `progress` is told the share of one chunk, where that is seen: in this process, which does the
+    work when there is one worker. A chunk whose worker process dies is done again by another.
+
+    Raises
+    ------
+    InputError: no scheduler at that address, no package distributed, or a job that cannot be sent.
+    RuntimeError: workers died again and again.
+    Exception: whatever the first task that fails raises; the other workers are then stopped.
+
+    """
+    if scheduler is None and workers == 1:
+        yield from (task(job, number, progress) for number in numbers)
+        return
+    _check_sendable(job)
+    if scheduler is not None:
+        with _on_cluster(scheduler, task, job) as submit:
+            yield from _as_they_come(submit, numbers)
+    else:
+        with worker_pool(workers) as pool:
+            yield from _as_they_come(
+                lambda number: pool.schedule(_in_worker, args=(task, job, number)), numbers
+            )
+
+
+def alone(twin: Any) -> Any:
+    """The twin, told to start no processes or threads of its own: the workers are enough.
+
+    Looks for fields `workers` and `threads` of dataclasses, also of those inside; what a twin says
+    does not depend on them.
+    """
+    if not dataclasses.is_dataclass(twin) or isinstance(twin, type):
+        return twin
+    changes = {}
+    for field in dataclasses.fields(twin):
+        value = getattr(twin, field.name)
+        fewer = 1 if field.name in ("workers", "threads") else alone(value)
+        if field.init and fewer is not value and fewer != value:
+            changes[field.name] = fewer
+    return dataclasses.replace(twin, **changes) if changes else twin
+
+
+def _as_they_come(
+    submit: Callable[[int], Future[Result]], numbers: Sequence[int]
+) -> Iterator[Result]:
+    for _ in range(ATTEMPTS):
+        futures = {submit(number): number for number in numbers}
+        lost = []
+        for future in as_completed(futures):
+            try:
+                result = future.result()
+            except ProcessExpired:
+                lost.append(futures[future])
+            else:
+                yield result
+        if not lost:
+            return
+        numbers = lost
+    raise RuntimeError(
+        f"worker processes died {ATTEMPTS} times on chunks {', '.join(map(str, numbers[:5]))}; "
+        "the computer may be short of memory: use fewer workers or smaller chunks"
+    )
+
+
+@contextmanager
+def _on_cluster(
+    address: str, task: Callable[..., Result], job: object
+) -> Iterator[Callable[[int], Future[Result]]]:
+    """Submit tasks to the Dask cluster whose scheduler is at `address`."""
+    try:
+        from distributed import Client, KilledWorker
+    except ImportError:
+        raise InputError(
+            "scheduler",
+            expected="the package distributed, which speaks to it",
+            got="an installation without it",
+            remedy='install it: pip install "retwin[scale]"',
+        ) from None
+    try:
+        client = Client(address, set_as_default=False, timeout=20)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            "scheduler",
+            expected="the address of a Dask scheduler, such as tcp://10.0.0.1:8786",
+            got=f"{address} ({' '.join(str(error).split()) or type(error).__name__})",
+            remedy="start it with `dask scheduler`, and see that it can be reached from here",
+        ) from None
+    with client:
+        executor = client.get_executor(pure=False)
+        # The job travels once. As a task's result it is made again if its worker dies.
+        sent = client.submit(_same, job, pure=False)
+        try:
+            yield lambda number: executor.submit(task, sent, number)
+        except KilledWorker as error:
+            raise RuntimeError(f"workers of the cluster died of a chunk: {error}") from None
+        except AssertionError as error:
+            if "daemonic" not in str(error):
+                raise
+            raise InputError(
+                "scheduler",
+                expected="workers that may start processes, as this twin does",
+                got="daemonic ones",
+                remedy="start them with DASK_DISTRIBUTED__WORKER__DAEMON=False",
+            ) from None
+        finally:
+            # Not waiting: after an error or Ctrl-C, what is not begun is not wanted.
+            executor.shutdown(wait=False)
+
+
+def _in_worker(task: Callable[..., Result], job: object, number: int) -> Result:
+    with sendable_errors():
+        return task(job, number)
+
+
+def _same(job: Job) -> Job:
+    return job
+
+
+def _check_sendable(job: object) -> None:
+    try:
+        pickle.dumps(job)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise InputError(
+            "plan",
+            expected="a twin, sampler and faults that other processes can import",
+            got=str(error).splitlines()[0],
+            remedy="define them in a module of their own, or use one worker",
+        ) from None

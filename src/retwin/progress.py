@@ -1,0 +1,10 @@
+"""`Progress`: how long work reports the share of it that is done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+__all__ = ["Progress"]
+
+Progress = Callable[[float], None]
+"""Called with the share of the work that is done, from 0 to 1."""

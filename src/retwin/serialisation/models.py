@@ -1,0 +1,85 @@
+"""Fitted models on disk: a folder of safetensors weights and a JSON description, never pickle."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from retwin.errors import InputError
+from retwin.serialisation.files import write_atomically
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["kind_of", "read_about", "read_model", "write_model"]
+
+SCHEMA = 1
+
+
+@contextmanager
+def write_model(
+    folder: str | Path, kind: str, about: dict[str, Any], weights: dict[str, Tensor]
+) -> Iterator[Path]:
+    """Write `folder`/model.json and `folder`/weights.safetensors, moved into place when whole.
+
+    Inside the `with` block more can be put into the folder that is given.
+    """
+    from safetensors.torch import save_file
+
+    with write_atomically(folder) as temporary:
+        temporary.mkdir()
+        text = json.dumps({"schema": SCHEMA, "kind": kind, **about}, indent=1)
+        (temporary / "model.json").write_text(text + "\n", encoding="utf-8")
+        if weights:
+            contiguous = {name: weight.contiguous() for name, weight in weights.items()}
+            save_file(contiguous, temporary / "weights.safetensors")
+        yield temporary
+
+
+def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Description and weights of a model folder.
+
+    Raises InputError when the folder is missing, damaged, newer, or holds another kind of model.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    folder = Path(folder)
+    remedy = "give the folder of a saved model, or save it again"
+    try:
+        about = json.loads((folder / "model.json").read_text(encoding="utf-8"))
+        file = folder / "weights.safetensors"
+        weights = load_file(file) if file.exists() else {}
+    except (OSError, ValueError, SafetensorError) as error:
+        raise InputError(
+            str(folder),
+            expected=f"a {kind} model (model.json and weights.safetensors)",
+            got=f"{type(error).__name__}: {str(error).splitlines()[0]}",
+            remedy=remedy,
+        ) from None
+    found = (about.get("schema"), about.get("kind")) if isinstance(about, dict) else (None, None)
+    if found != (SCHEMA, kind):
+        raise InputError(
+            str(folder),
+            expected=f"a {kind} model of schema {SCHEMA}",
+            got=f"kind {found[1]!r}, schema {found[0]!r}",
+            remedy=remedy,
+        )
+    return about, weights
+
+
+def read_about(folder: str | Path, kind: str) -> dict[str, Any]:
+    """The description of a model folder without its weights; raises as `read_model` does."""
+    return read_model(folder, kind)[0]
+
+
+def kind_of(folder: str | Path) -> str:
+    """What kind of model a folder says it holds; empty where it says nothing."""
+    try:
+        about = json.loads((Path(folder) / "model.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return ""
+    return str(about.get("kind", "")) if isinstance(about, dict) else ""

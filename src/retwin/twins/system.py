@@ -1,0 +1,30 @@
+"""`System`: the classes, faults and commands from which labelled trajectories are generated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from retwin.twins.faults import Fault
+from retwin.twins.samplers import CommandSampler
+
+__all__ = ["System"]
+
+
+class System(Protocol):
+    """What `generate` needs of a system; a `Case` satisfies it."""
+
+    @property
+    def faults(self) -> Mapping[str, Fault | None]:
+        """Class name to fault, `None` for healthy, in the fixed order of the classes."""
+        ...
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Class names in their fixed order."""
+        ...
+
+    @property
+    def sampler(self) -> CommandSampler:
+        """Draws the commands."""
+        ...

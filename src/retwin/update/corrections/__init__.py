@@ -1,0 +1,35 @@
+"""Correction operators g: how a discrepancy z changes nominal outputs, and how z is inferred."""
+
+from __future__ import annotations
+
+from retwin.update.corrections.additive import Additive
+from retwin.update.corrections.chain import Chain, calibrated, readings, recorded
+from retwin.update.corrections.command_space import CommandSpace
+from retwin.update.corrections.correction import Context, Correction, Discrepancy, Head
+from retwin.update.corrections.delay_offset import DelayOffset
+from retwin.update.corrections.sampled_sensor import SampledSensor
+
+__all__ = [
+    "OPERATORS",
+    "Additive",
+    "Chain",
+    "CommandSpace",
+    "Context",
+    "Correction",
+    "DelayOffset",
+    "Discrepancy",
+    "Head",
+    "SampledSensor",
+    "calibrated",
+    "command_space",
+    "readings",
+    "recorded",
+]
+
+OPERATORS: tuple[type, ...] = (Additive, DelayOffset, CommandSpace, SampledSensor, Chain)
+"""The kinds that a saved model may name."""
+
+
+def command_space() -> Chain:
+    """`CommandSpace` behind a `SampledSensor`, both with their default settings."""
+    return Chain(CommandSpace(), SampledSensor())

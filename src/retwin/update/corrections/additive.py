@@ -1,0 +1,52 @@
+"""`Additive`: z is added to the nominal output at every sample (Eq. 4 and 6 per time step)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from retwin.data.trajectories import Channels
+from retwin.update.corrections.correction import Context, Discrepancy, Head
+
+__all__ = ["Additive"]
+
+
+@dataclass(frozen=True)
+class Additive:
+    """ỹ_t = ŷ_t + z_t: one z per output and sample, so M is T.
+
+    It can express any gap, and explains none: what is measured and what is noise is all one z. For
+    systems whose gap goes on all the time, such as hidden dynamics that the twin lacks; where
+    movements err one by one, other operators say more with less.
+    """
+
+    @property
+    def resolution(self) -> str:
+        """One z per sample."""
+        return "step"
+
+    def latent(self, inputs: Channels, outputs: Channels) -> Channels:
+        """A residual of every output, in its unit."""
+        return Channels(tuple(f"residual_{name}" for name in outputs.names), outputs.units)
+
+    def heads(self, inputs: Channels, outputs: Channels) -> tuple[Head, ...]:
+        """One block: residuals of the outputs at a sample belong together."""
+        return (Head("residual", len(outputs)),)
+
+    def apply(self, context: Context, z: Tensor) -> Tensor:
+        """The path plus z, both (n, T, d_y)."""
+        return context.path + z
+
+    def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
+        """z* = y - ŷ where y was measured, and nothing elsewhere; exact, so without covariance."""
+        with torch.no_grad():
+            z = torch.where(mask, observed - context.path, 0.0)
+        width = z.shape[-1]
+        return Discrepancy(
+            z=z,
+            covariance=z.new_zeros(*z.shape, width),
+            identified=mask.clone(),
+            noise=z.new_zeros(len(z)),
+        )

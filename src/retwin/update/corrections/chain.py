@@ -1,0 +1,182 @@
+"""`Chain`: operators in series, the measuring chain at the end."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from retwin.data.trajectories import Channels
+from retwin.errors import InputError
+from retwin.update.corrections.correction import Context, Correction, Discrepancy, Head
+from retwin.update.corrections.sampled_sensor import SampledSensor
+
+__all__ = ["Chain", "calibrated", "readings", "recorded"]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """What `first` leaves is corrected, or recorded, by `second`; chains may be chained again.
+
+    z is that of the first operator, then that of the second; a sensor has none: its errors are
+    reading by reading, and drawn when a record is made (`recorded`). z of the first is inferred as
+    if it were alone, z of the second from what then is left; of a sensor's record only the readings
+    count.
+
+    Parameters
+    ----------
+    first: the operator that acts on the system.
+    second: one that acts on what comes out, or a sensor that records it.
+
+    Raises
+    ------
+    InputError: operators that do not have one z for the same, or an operator behind a sensor.
+
+    """
+
+    first: Correction
+    second: Correction | SampledSensor
+
+    def __post_init__(self) -> None:
+        if isinstance(self.first, SampledSensor) or _sensor(self.first) is not None:
+            raise InputError(
+                "first",
+                expected="an operator that acts on the system, the sensor being last",
+                got=type(self.first).__name__,
+                remedy="give the sensor as the second",
+            )
+        if isinstance(self.second, SampledSensor):
+            return
+        if self.first.resolution != self.second.resolution:
+            raise InputError(
+                "second",
+                expected=f"an operator with one z per {self.first.resolution}, as the first has",
+                got=f"{type(self.second).__name__}, one per {self.second.resolution}",
+                remedy="chain operators of the same resolution",
+            )
+
+    @property
+    def resolution(self) -> str:
+        """As the operators in it."""
+        return self.first.resolution
+
+    @property
+    def pools(self) -> bool:
+        """Whether what is inferred of one trajectory leans on those beside it."""
+        return any(getattr(each, "pools", False) for each in self._operators)
+
+    @property
+    def severities(self) -> bool:
+        """Whether `infer` tells how severe a known fault is."""
+        return any(getattr(each, "severities", False) for each in self._operators)
+
+    @property
+    def _operators(self) -> tuple[Correction, ...]:
+        """Those that have a z."""
+        sensor = isinstance(self.second, SampledSensor)
+        return (self.first,) if sensor else (self.first, self.second)  # type: ignore[return-value]
+
+    def latent(self, inputs: Channels, outputs: Channels) -> Channels:
+        """Components of the first, then of the second; what both have gets the operator's name."""
+        parts = [(each, each.latent(inputs, outputs)) for each in self._operators]
+        once = Counter(name for _, part in parts for name in part.names)
+        names = [
+            name if once[name] == 1 else f"{type(each).__name__}.{name}"
+            for each, part in parts
+            for name in part.names
+        ]
+        return Channels(tuple(names), tuple(unit for _, part in parts for unit in part.units))
+
+    def heads(self, inputs: Channels, outputs: Channels) -> tuple[Head, ...]:
+        """Blocks of the first, then of the second, named likewise."""
+        parts = [(each, head) for each in self._operators for head in each.heads(inputs, outputs)]
+        once = Counter(head.name for _, head in parts)
+        return tuple(
+            head
+            if once[head.name] == 1
+            else replace(head, name=f"{type(each).__name__}.{head.name}")
+            for each, head in parts
+        )
+
+    def apply(self, context: Context, z: Tensor) -> Tensor:
+        """The outputs after all operators, before a sensor records them."""
+        for operator, part in zip(self._operators, self._split(context, z), strict=True):
+            context = replace(context, corrected=operator.apply(context, part))
+        return context.path
+
+    def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
+        """z* of one operator after the other, each from what those before it left."""
+        if isinstance(self.second, SampledSensor):
+            return self.first.infer(context, observed, readings(self, observed, mask))
+        one = self.first.infer(context, observed, mask)
+        with torch.no_grad():
+            left = replace(context, corrected=self.first.apply(context, one.z))
+        other = self.second.infer(left, observed, mask)
+        width = one.z.shape[-1] + other.z.shape[-1]
+        covariance = one.covariance.new_zeros(*one.z.shape[:2], width, width)
+        covariance[..., : one.z.shape[-1], : one.z.shape[-1]] = one.covariance
+        covariance[..., one.z.shape[-1] :, one.z.shape[-1] :] = other.covariance
+        return Discrepancy(
+            z=torch.cat([one.z, other.z.to(one.z)], dim=-1),
+            covariance=covariance,
+            identified=torch.cat([one.identified, other.identified], dim=-1),
+            noise=other.noise,
+            severity=one.severity,
+            # Where one operator can only give points, both do.
+            posterior=one.posterior and other.posterior,
+        )
+
+    def _split(self, context: Context, z: Tensor) -> tuple[Tensor, ...]:
+        """The z of each operator."""
+        inputs, outputs = (
+            Channels.numbered(name, values.shape[2])
+            for name, values in (("u", context.commands), ("y", context.nominal))
+        )
+        return z.split([len(each.latent(inputs, outputs)) for each in self._operators], dim=-1)
+
+
+def _sensor(correction: Correction) -> SampledSensor | None:
+    """The sensor at the end of a chain, if there is one."""
+    last = correction.second if isinstance(correction, Chain) else None
+    return last if isinstance(last, SampledSensor) else None
+
+
+def calibrated(
+    correction: Correction, context: Context, observed: Tensor, mask: Tensor
+) -> tuple[Correction, Discrepancy]:
+    """The operator, its sensor fitted to measured outputs (n, T, d_y), and their z*."""
+    sensor = _sensor(correction)
+    if sensor is None or not isinstance(correction, Chain):
+        return correction, correction.infer(context, observed, mask)
+    chain = replace(correction, second=sensor.timed(observed, mask))
+    found = chain.infer(context, observed, mask)
+    with torch.no_grad():
+        explained = chain.apply(context, found.z)
+    fitted = sensor.fitted(observed, mask, explained, context.segments)
+    return replace(chain, second=fitted), found
+
+
+def readings(correction: Correction, observed: Tensor, mask: Tensor) -> Tensor:
+    """`mask` (n, T, d_y) where a record holds a reading of the operator's sensor, if it has one."""
+    sensor = _sensor(correction)
+    return mask if sensor is None else sensor.timed(observed, mask).readings(observed, mask)
+
+
+def recorded(
+    correction: Correction, context: Context, z: Tensor, generator: torch.Generator
+) -> Tensor:
+    """The corrected outputs (n, T, d_y) as the operator's sensor, if it has one, records them.
+
+    Where they are not read they are not computed, if the operator can tell them sample by sample.
+    """
+    sensor = _sensor(correction)
+    if sensor is None or not isinstance(correction, Chain):
+        return correction.apply(context, z)
+    at = getattr(correction.first, "at", None)
+    if at is None or sensor.every is None:
+        return sensor.read(correction.apply(context, z), generator)
+    steps = context.commands.shape[1]
+    when = sensor.polls(len(context), steps, generator)
+    return sensor.record(at(context, z, when), when, steps, generator)

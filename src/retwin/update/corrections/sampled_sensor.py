@@ -1,0 +1,266 @@
+"""`SampledSensor`: what lies between a system's outputs and their record.
+
+Outputs are read every so many samples, each reading errs a little and now and then grossly, is
+rounded, and the record joins the readings by straight lines. Only readings tell something: between
+them a record has no information, however many samples it holds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from retwin.data.segments import Segments
+from retwin.errors import InputError
+from retwin.update.corrections.warp import taken
+
+__all__ = ["SampledSensor"]
+
+SLOWEST = 50
+"""Most samples between two readings that are looked for."""
+FEW = 20
+"""Least readings of a record from which their period is told."""
+PLAIN = 0.2
+"""At readings a record must bend so much more than the next most bent phase: 1 to this."""
+SMOOTH = 1e-6
+"""Bends, in standard deviations of an output, that are nothing but the precision of a number."""
+USUAL, GROSS = 0.9, 30.0
+"""A reading is a glitch when it is so many times further off than this share of readings."""
+LEVELS = np.linspace(0, 1, 33)
+"""Of the quantiles by which the law of a reading's error is told."""
+
+
+@dataclass(frozen=True)
+class SampledSensor:
+    """Polling, reading errors, glitches and rounding; what is left out is fitted from data.
+
+    Parameters
+    ----------
+    every: samples from one reading to the next.
+    phases: sample of the first reading; where there are several, each trajectory has one of them.
+    noise: quantiles of a reading's error at levels evenly from 0 to 1, per output in its unit; no
+        law's shape is presumed, since rounding may leave most readings without any error.
+    steps: distance of the values that a reading can take, per output; 0 for any.
+    glitch_rate: share of readings that are glitches.
+    glitch_size: standard deviation of their errors, per output.
+
+    Raises
+    ------
+    InputError: a period below one sample, a first reading outside the first period, a negative
+        size, quantiles that do not rise, a rate outside 0 to 1.
+
+    """
+
+    every: int | None = None
+    phases: tuple[int, ...] | None = None
+    noise: tuple[tuple[float, ...], ...] | None = None
+    steps: tuple[float, ...] | None = None
+    glitch_rate: float | None = None
+    glitch_size: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        sizes = [*(self.steps or ()), *(self.glitch_size or ())]
+        every = self.every or 1
+        sound = (
+            (self.every is None or self.every >= 1)
+            and (self.phases is None or (self.phases and self.every))
+            and all(0 <= phase < every for phase in self.phases or ())
+            and all(np.isfinite(size) and size >= 0 for size in sizes)
+            and 0 <= (self.glitch_rate or 0.0) <= 1
+            and all(len(law) > 1 and sorted(law) == list(law) for law in self.noise or ())
+        )
+        if not sound:
+            raise InputError(
+                "sensor",
+                expected="every of at least 1, phases from 0 to below every, finite sizes of at "
+                "least 0, rising quantiles and a rate from 0 to 1",
+                got=repr(self),
+                remedy="leave out what you do not know: it is fitted from data",
+            )
+
+    def timed(self, observed: Tensor, mask: Tensor) -> SampledSensor:
+        """Period, phases and rounding as found in a record (n, T, d_y), where not given."""
+        if self.every is None:
+            every, phases = _timing(observed, mask)
+        else:
+            every = self.every
+            phases = self.phases or tuple(
+                sorted(set(_phases(_kinks(observed, mask, every)).tolist()))
+            )
+        made = replace(self, every=every, phases=self.phases or phases)
+        if made.steps is not None:
+            return made
+        readings = observed[made.readings(observed, mask).all(dim=-1)].double().numpy()
+        return replace(made, steps=tuple(_step(values) for values in readings.T))
+
+    def fitted(
+        self, observed: Tensor, mask: Tensor, explained: Tensor, segments: Segments
+    ) -> SampledSensor:
+        """Everything that is not given, from a record and the outputs that explain it.
+
+        A reading's error is seen where the system rests: in the second half of each steady part,
+        about that part's median.
+        """
+        made = self.timed(observed, mask)
+        errors = _at_rest(observed - explained, made.readings(observed, mask), segments)
+        size = np.abs(errors)
+        usual = np.quantile(size, USUAL, axis=0) if len(errors) else np.zeros(errors.shape[1])
+        gross = (size > GROSS * np.where(usual > 0, usual, np.inf)).any(axis=1)
+        # An error is as likely as its opposite.
+        plain = np.concatenate([errors[~gross], -errors[~gross], np.zeros((1, len(usual)))])
+        strong = np.sqrt(np.square(errors[gross]).mean(axis=0)) if gross.any() else 0 * usual
+        return made._filled(
+            noise=tuple(tuple(np.quantile(each, LEVELS).tolist()) for each in plain.T),
+            glitch_rate=float(gross.mean()) if len(gross) else 0.0,
+            glitch_size=tuple(strong.tolist()),
+        )
+
+    def _filled(self, **found: Any) -> SampledSensor:
+        """Itself, with what was found where nothing was given."""
+        return replace(self, **{k: v for k, v in found.items() if getattr(self, k) is None})
+
+    def readings(self, observed: Tensor, mask: Tensor) -> Tensor:
+        """`mask` (n, T, d_y) where a record was read; in between, it tells nothing."""
+        if self.every is None:
+            raise InputError(
+                "sensor",
+                expected="one whose timing is known",
+                got=repr(self),
+                remedy="call timed or fitted first",
+            )
+        several = self.phases is None or len(self.phases) > 1
+        phase = (
+            _phases(_kinks(observed, mask, self.every))
+            if several
+            else torch.tensor(self.phases).expand(len(observed))
+        )
+        time = torch.arange(observed.shape[1])
+        read = (time - phase[:, None]) % self.every == 0
+        return mask & (read & (time >= phase[:, None]))[..., None]
+
+    def read(self, outputs: Tensor, generator: torch.Generator) -> Tensor:
+        """The record of outputs (n, T, d_y); differentiable, rounding passed straight through."""
+        if self.every is None:
+            return outputs
+        steps = outputs.shape[1]
+        when = self.polls(len(outputs), steps, generator)
+        return self.record(taken(outputs, when), when, steps, generator)
+
+    def polls(self, count: int, steps: int, generator: torch.Generator) -> Tensor:
+        """When records of so many samples are read, (count, R); at the last one if beyond it."""
+        every = self.every or 1
+        choice = torch.tensor(self.phases or range(every))
+        phase = choice[torch.randint(len(choice), (count,), generator=generator)]
+        readings = -(-steps // every)
+        return (phase[:, None] + every * torch.arange(readings)).clamp_max(steps - 1)
+
+    def record(
+        self, values: Tensor, when: Tensor, steps: int, generator: torch.Generator
+    ) -> Tensor:
+        """The record (n, steps, d_y) of outputs (n, R, d_y) at their `polls` (n, R)."""
+        values = values + self._errors(values, generator)
+        if self.steps is not None and any(self.steps):
+            step = values.new_tensor(self.steps)
+            whole = torch.where(step > 0, step * (values / step.clamp_min(1e-30)).round(), values)
+            values = values + (whole - values).detach()
+        every, phase = self.every or 1, when[:, :1]
+        if every == 1:
+            return values
+        last = (steps - 1 - phase) // every
+        following = (torch.arange(values.shape[1]) + 1).minimum(last)
+        ends = torch.stack([values, taken(values, following) - values])
+        # A line from each reading to the next, all at once: as a product of matrices it is quick.
+        share = torch.arange(every).to(values) / every
+        join = torch.stack([torch.ones_like(share), share], dim=1)
+        lines = torch.einsum("ek,knrd->nred", join, ends).flatten(1, 2)
+        return taken(lines, (torch.arange(steps) - phase).clamp_min(0))
+
+    def _errors(self, like: Tensor, generator: torch.Generator) -> Tensor:
+        """Errors of readings (n, R, d_y)."""
+        wrong = torch.zeros_like(like)
+        if self.noise is not None:
+            chance = torch.rand(like.shape, generator=generator, dtype=torch.float64)
+            for j, law in enumerate(self.noise):
+                quantile = chance.new_tensor(law)
+                place = chance[..., j] * (len(law) - 1)
+                left = place.long().clamp_max(len(law) - 2)
+                wrong[..., j] = torch.lerp(quantile[left], quantile[left + 1], place - left)
+        if self.glitch_rate and self.glitch_size is not None:
+            hit = torch.rand(like.shape[:2], generator=generator) < self.glitch_rate
+            size = torch.randn(like.shape, generator=generator).to(like)
+            wrong = wrong + hit[..., None] * like.new_tensor(self.glitch_size) * size
+        return wrong
+
+
+def _timing(observed: Tensor, mask: Tensor) -> tuple[int, tuple[int, ...]]:
+    """Samples between readings, and the first one's: the longest period with plain kinks."""
+    measured = int(mask.any(dim=-1).any(dim=0).sum())
+    for every in range(min(SLOWEST, measured // FEW), 1, -1):
+        kinks = _kinks(observed, mask, every)
+        plain = _plain(kinks)
+        if 2 * plain.sum() > (kinks.amax(dim=1) > 0).sum():
+            return every, tuple(sorted(set(_phases(kinks).tolist())))
+    return 1, (0,)
+
+
+def _kinks(observed: Tensor, mask: Tensor, every: int) -> Tensor:
+    """How far a record bends at the samples of each phase, (n, every).
+
+    Straight lines bend at readings only; a little elsewhere too, in motion, where what was read was
+    turned into outputs after it had been joined.
+    """
+    seen = mask.all(dim=-1)
+    values = observed.double()
+    bend = torch.zeros_like(values)
+    bend[:, 1:-1] = values[:, 2:] - 2 * values[:, 1:-1] + values[:, :-2]
+    unit = values[seen].std(dim=0).clamp_min(1e-12) if seen.any() else 1.0
+    told = torch.zeros_like(seen)
+    told[:, 1:-1] = seen[:, 2:] & seen[:, 1:-1] & seen[:, :-2]
+    size = torch.where(told, (bend / unit).norm(dim=-1), torch.nan)
+    whole = nn.functional.pad(size, (0, -size.shape[1] % every), value=torch.nan)
+    return whole.unflatten(1, (-1, every)).nanmean(dim=1).nan_to_num(0.0)
+
+
+def _plain(kinks: Tensor) -> Tensor:
+    """Whether a record (n,) bends at one phase and hardly at others."""
+    most, next_to_it = kinks.topk(2, dim=1).values.unbind(dim=1)
+    return (most > SMOOTH) & (next_to_it < PLAIN * most)
+
+
+def _phases(kinks: Tensor) -> Tensor:
+    """The first reading (n,) of each trajectory, the most common one where it is not plain."""
+    own = kinks.argmax(dim=1)
+    plain = _plain(kinks)
+    return own if not plain.any() else torch.where(plain, own, own[plain].mode().values)
+
+
+def _step(readings: NDArray) -> float:
+    """The distance of neighbouring values of one output, 0 where there is no lattice."""
+    values = np.unique(readings)
+    if len(values) < 3 or 4 * len(values) > len(readings):
+        return 0.0
+    gaps = np.diff(values)
+    step = float(gaps[gaps > 1e-6 * np.abs(values).max()].min(initial=np.inf))
+    off = (values - values[0]) / step
+    return step if np.isfinite(step) and np.abs(off - np.round(off)).max() < 0.05 else 0.0
+
+
+def _at_rest(errors: Tensor, read: Tensor, segments: Segments) -> NDArray:
+    """Deviations (k, d_y) of readings at rest from the median of their steady part."""
+    kept = []
+    told = read.all(dim=-1).numpy()
+    values = errors.detach().double().numpy()
+    for i, m in np.argwhere(segments.valid):
+        settle, stop = segments.settle[i, m], segments.stop[i, m]
+        part = slice(int(np.ceil((settle + stop) / 2)), int(stop))
+        rest = values[i, part][told[i, part]]
+        if len(rest) > 2:
+            # A median takes one degree of freedom.
+            spread = np.sqrt(len(rest) / (len(rest) - 1))
+            kept.append((rest - np.median(rest, axis=0)) * spread)
+    return np.concatenate(kept) if kept else np.zeros((0, values.shape[2]))

@@ -1,0 +1,27 @@
+"""Updating a twin's own parameters: least squares (Eq. 2) and Bayes (Eq. 3), the rivals."""
+
+from retwin.update.identification.bayes import calibration_ranks, identify_bayes
+from retwin.update.identification.identify import Updated, identify
+from retwin.update.identification.mcmc import MCMC
+from retwin.update.identification.noise import Noise
+from retwin.update.identification.npe import NPE
+from retwin.update.identification.posterior import Posterior, PosteriorTwin
+from retwin.update.identification.profile import Profile, profile
+from retwin.update.identification.search import Evolution, LeastSquares, Optimum
+
+__all__ = [
+    "MCMC",
+    "NPE",
+    "Evolution",
+    "LeastSquares",
+    "Noise",
+    "Optimum",
+    "Posterior",
+    "PosteriorTwin",
+    "Profile",
+    "Updated",
+    "calibration_ranks",
+    "identify",
+    "identify_bayes",
+    "profile",
+]

@@ -1,0 +1,24 @@
+"""Residual Generator (RG), Eq. 6–10: the distribution of the gap z, given what was commanded."""
+
+from __future__ import annotations
+
+from retwin.update.residual.fitting import fit_residual, infer_discrepancy
+from retwin.update.residual.model import ResidualModel, segment
+from retwin.update.residual.residual import Residual, load_residual
+from retwin.update.residual.sequence import SequenceMixture, SequenceResidual
+from retwin.update.residual.settings import Density, Flow, Mixture, Refinement
+
+__all__ = [
+    "Density",
+    "Flow",
+    "Mixture",
+    "Refinement",
+    "Residual",
+    "ResidualModel",
+    "SequenceMixture",
+    "SequenceResidual",
+    "fit_residual",
+    "infer_discrepancy",
+    "load_residual",
+    "segment",
+]

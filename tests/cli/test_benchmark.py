@@ -1,0 +1,115 @@
+"""The benchmark: what it reckons is right, and what it says is what it has timed."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import retwin as rt
+from retwin.cli import benchmark as bench
+from retwin.cli.benchmark import Benchmark, Timed, generating, median_seconds, memory_bandwidth
+from retwin.nets.training import Training
+
+BY_HAND = Benchmark(
+    count=1000,
+    generation={"twin": Timed("twin", 50.0, 0.1), "corrected": Timed("corrected", 10.0)},
+    learning={
+        "twin_data": Timed("data", 5.0),
+        "surrogate": Timed("surrogate", 20.0),
+        "residual": Timed("residual", 3.0),
+        "residual_command": Timed("another", 100.0),
+        "classifier": Timed("classifier", 100.0),
+    },
+    machine={},
+)
+
+
+def test_what_follows_from_the_times() -> None:
+    assert BY_HAND.ratio("twin") == 5.0
+    assert BY_HAND.paper_ratio == pytest.approx(30600 / 270)
+    # 28 s once, 40 ms gained with every trajectory.
+    assert BY_HAND.pays_from == pytest.approx(700)
+    slow = Benchmark(1, {"twin": Timed("", 1.0), "corrected": Timed("", 2.0)}, BY_HAND.learning, {})
+    assert slow.pays_from == float("inf")
+    told = BY_HAND.told()
+    assert told["generation"]["twin"] == {
+        "what": "twin",
+        "seconds": 50.0,
+        "share": 0.1,
+        "paper": None,
+        "ratio": 5.0,
+    }
+
+
+def test_training_is_reckoned_from_few_epochs() -> None:
+    asked: list[int] = []
+
+    def fit(how: Training) -> str:
+        asked.append(how.epochs)
+        time.sleep(0.3 + 0.1 * how.epochs)
+        return "model"
+
+    model, timed = bench._trained(fit, Training(epochs=20), "net")
+    assert (model, asked) == ("model", [1, 3])
+    assert timed.seconds == pytest.approx(0.3 + 0.1 * 20, rel=0.2)
+    assert timed.share == 0.15
+
+
+class Counted:
+    """A twin that takes ten milliseconds for each trajectory."""
+
+    def __init__(self, twin: rt.Twin) -> None:
+        self.twin, self.made = twin, []
+        self.inputs, self.outputs, self.rate = twin.inputs, twin.outputs, twin.rate
+
+    def simulate(self, commands, **options):
+        self.made.append(len(commands))
+        time.sleep(0.01 * len(commands))
+        return self.twin.simulate(commands, **options)
+
+
+def test_fewer_are_made_and_scaled_up(case: rt.Case) -> None:
+    twin = Counted(rt.twins.get("armpi-kinematic"))
+    seconds, share = generating(twin, case, 90, share=0.25, repeats=2)
+    assert twin.made == [18, 18]
+    assert share == 0.2
+    assert seconds > 0.9
+
+
+def test_seconds_are_the_median() -> None:
+    pauses = iter([0.0, 0.2, 0.1])
+    assert median_seconds(lambda: time.sleep(next(pauses)), 3) == pytest.approx(0.1, rel=0.5)
+    assert 1e8 < memory_bandwidth() < 1e12
+
+
+@pytest.mark.slow
+def test_the_command(tmp_path: Path) -> None:
+    words = ["bench", "--n", "18", "--repeats", "1", "--json", "--out", tmp_path / "a.json"]
+    done = subprocess.run(
+        [sys.executable, "-m", "retwin", *words], check=True, capture_output=True, text=True
+    )
+    told = json.loads(done.stdout)
+    assert told == json.loads((tmp_path / "a.json").read_text("utf-8"))
+    assert told["trajectories"] == 18
+    ways = told["generation"]
+    assert list(ways) == [
+        "twin",
+        "twin_default",
+        "corrected",
+        "corrected_command",
+        "surrogate",
+        "closed_form",
+        "memory",
+    ]
+    for way in ways.values():
+        assert way["seconds"] > 0
+        assert way["ratio"] == pytest.approx(way["seconds"] / ways["corrected"]["seconds"])
+    assert (ways["twin"]["paper"], ways["corrected"]["paper"]) == (30600, 270)
+    assert all(each["seconds"] > 0 for each in told["learning"].values())
+    assert told["machine"]["retwin"] == rt.__version__
+    assert told["machine"]["cores"] >= 1

@@ -1,0 +1,88 @@
+"""Completion in a shell: of commands, options and names, as those who own the names know them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from retwin import cases, catalog
+
+PROGRAM = Path(sys.executable).with_name("retwin")
+
+
+def completed(*typed: str, folder: Path, **environment: str) -> list[str]:
+    """What bash would offer for the last of these words."""
+    told = {
+        **os.environ,
+        "_RETWIN_COMPLETE": "complete_bash",
+        "COMP_WORDS": " ".join(("retwin", *typed)),
+        "COMP_CWORD": str(len(typed)),
+        **environment,
+    }
+    done = subprocess.run([PROGRAM], env=told, cwd=folder, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout.split()
+
+
+def test_the_classes_of_a_case_are_those_of_the_catalog() -> None:
+    for name, entry in catalog.CASES.items():
+        classes = catalog.resolve(entry.classes) if entry.classes else ("Healthy",)
+        assert cases.get(name).classes == classes, name
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        (("stu",), ["study"]),
+        (("study", "--lea"), ["--learning-curve"]),
+        (("study", ""), list(catalog.CASES)),
+        (
+            ("study", "armpi", "--sources", "ibg,dt,ibg_"),
+            ["ibg,dt,ibg_rg", "ibg,dt,ibg_rg_command"],
+        ),
+        (("study", "armpi", "--sources", "a"), ["all"]),
+        (("study", "armpi", "--preset", ""), ["quick", "paper"]),
+        (("diagnose", "fit", "made.npz", "--classifier", "r"), ["rocket"]),
+        (("fit", "armpi", "--density", "f"), ["flow"]),
+        (("twin", "info", ""), list(catalog.TWINS)),
+        (
+            ("twin", "simulate", "armpi-kinematic", "--fault", "Motor_2"),
+            ["Motor_2_Stuck", "Motor_2_Steady_state_error"],
+        ),
+        (("twin", "simulate", "mine.toml", "--fault", ""), ["none", "all", "Healthy", "leak"]),
+        (("data", "fetch", ""), ["armpi"]),
+        (("data", "info", "re"), []),
+    ],
+    ids=" ".join,
+)
+def test_what_bash_offers(typed: tuple[str, ...], offered: list[str], tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text("[faults]\nleak = { kind = 'Stuck' }\n")
+    assert completed(*typed, folder=tmp_path) == offered
+
+
+def test_a_shell_with_what_was_installed(tmp_path: Path) -> None:
+    """The script that is installed, in a real bash."""
+    told = {**os.environ, "HOME": str(tmp_path), "PATH": f"{PROGRAM.parent}:{os.environ['PATH']}"}
+    told["_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"] = "1"
+    install = [PROGRAM, "--install-completion", "bash"]
+    subprocess.run(install, env=told, check=True, capture_output=True)
+    typed = "COMP_WORDS=(retwin bundle ver); COMP_CWORD=2; _retwin_completion retwin"
+    script = f"source ~/.bashrc; {typed}; printf '%s\\n' \"${{COMPREPLY[@]}}\""
+    command = ["bash", "--norc", "-c", script]
+    done = subprocess.run(command, env=told, check=True, capture_output=True, text=True)
+    assert done.stdout == "verify\n"
+
+
+def test_neither_help_nor_completion_waits_for_torch() -> None:
+    code = (
+        "import sys; sys.argv = ['retwin', '--help']\n"
+        "from retwin.cli import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "assert not {'torch', 'lightning', 'sklearn', 'matplotlib'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)

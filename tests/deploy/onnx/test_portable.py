@@ -1,0 +1,224 @@
+"""The export says the same as torch, without torch."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+import pytest
+import torch
+
+import retwin as rt
+from retwin.deploy.bundle.bundle import Bundle
+from retwin.deploy.bundle.seal import seal
+from retwin.deploy.onnx.export import PARITY, export_onnx
+from retwin.deploy.onnx.graphs import FeaturesGraph, SensorGraph
+from retwin.deploy.onnx.portable import Portable, settled_at
+from retwin.diagnosis.features import SETTLED, Features
+from retwin.update.corrected import CorrectedTwin
+
+Exported = tuple[Path, dict[str, float]]
+
+WITHOUT_TORCH = """
+import sys
+import numpy as np
+from retwin.deploy.onnx.portable import Portable
+from retwin.data.io import load
+portable, trajectories = Portable.load(sys.argv[1]), load(sys.argv[2])
+found = portable.predict(trajectories)
+made = portable.simulate(trajectories.commands, seed=0)
+np.savez(sys.argv[3], found=found.probabilities, scores=found.verdicts.scores, made=made.observed)
+assert not {"torch", "lightning", "sklearn"} & set(sys.modules), "torch was loaded"
+"""
+
+
+@pytest.fixture(scope="module")
+def portable(exported: Exported) -> Portable:
+    return Portable.load(exported[0])
+
+
+def test_every_graph_agrees_with_torch(exported: Exported) -> None:
+    folder, parity = exported
+    names = {"surrogate", "residual", "correction", "sensor", "guard", "features", "diagnoser"}
+    assert set(parity) == names == {file.stem for file in folder.glob("*.onnx")}
+    assert max(parity.values()) <= PARITY
+    assert sum(file.stat().st_size for file in folder.iterdir()) < 5e6
+    # Nothing of the machine it was made on.
+    assert all(b"/retwin/" not in file.read_bytes() for file in folder.glob("*.onnx"))
+
+
+def test_it_predicts_the_same_in_a_process_without_torch(
+    exported: Exported, bundle: Bundle, emulated: rt.Trajectories, tmp_path: Path
+) -> None:
+    rt.save(emulated, tmp_path / "real.npz")
+    told = [exported[0], tmp_path / "real.npz", tmp_path / "found.npz"]
+    subprocess.run([sys.executable, "-c", WITHOUT_TORCH, *map(str, told)], check=True)
+    expected = bundle.predict(emulated)
+    with np.load(tmp_path / "found.npz") as found:
+        np.testing.assert_allclose(found["found"], expected.probabilities, atol=1e-5)
+        np.testing.assert_allclose(found["scores"], expected.verdicts.scores, rtol=1e-3, atol=1e-4)
+        assert np.isfinite(found["made"]).all()
+
+
+def test_a_diagnosis_is_quick(portable: Portable, emulated: rt.Trajectories) -> None:
+    """Processor time of one trajectory, whatever else the machine does."""
+    times = []
+    for i in range(len(emulated)):
+        one = emulated[i : i + 1]
+        begin = process_time()
+        portable.predict(one)
+        times.append(process_time() - begin)
+    assert np.quantile(times, 0.9) < 5e-3
+
+
+@pytest.mark.slow
+def test_it_simulates_by_the_same_law(
+    portable: Portable, updated: CorrectedTwin, case: rt.Case
+) -> None:
+    assert isinstance(portable, rt.Twin)
+    commands = case.sampler.sample(200, rng=np.random.default_rng(3), timing=updated.timing)
+    faults = [case.faults["Motor_2_Stuck"], None] * 100
+    made, again, other = (
+        twin.simulate(commands, faults=faults, seed=9) for twin in (portable, portable, updated)
+    )
+    np.testing.assert_array_equal(made.observed, again.observed)
+    np.testing.assert_allclose(made.nominal, other.nominal, atol=1e-6)
+    assert made.labels.tolist() == other.labels.tolist()
+    assert made.emulated
+    for label in ("Stuck", "Healthy"):
+        sizes = [
+            np.quantile(np.abs(each.with_label(label).residual), [0.25, 0.5, 0.9], axis=(0, 1))
+            for each in (made, other)
+        ]
+        np.testing.assert_allclose(*sizes, rtol=0.15, atol=1e-4)
+
+
+def test_the_sensor_reads_as_the_operator_does(bundle: Bundle) -> None:
+    fitted = bundle.twin.residual.correction.second
+    sensor = replace(fitted, steps=(0.001, 0.0, 0.002), glitch_rate=0.3)
+    outputs = torch.randn(6, 1000, 3, generator=torch.Generator().manual_seed(0))
+    expected = sensor.read(outputs, torch.Generator().manual_seed(1))
+    # The same draws, in the operator's order.
+    generator = torch.Generator().manual_seed(1)
+    choice = torch.tensor(sensor.phases)
+    phase = choice[torch.randint(len(choice), (6,), generator=generator)][:, None]
+    shape = 6, -(-1000 // sensor.every), 3
+    level = torch.rand(shape, generator=generator, dtype=torch.float64).float()
+    chance = torch.rand(shape[:2], generator=generator)[..., None]
+    glitch = torch.randn(shape, generator=generator)
+    made = SensorGraph(sensor, 3)(outputs, phase, level, chance, glitch)
+    torch.testing.assert_close(made, expected, atol=2e-5, rtol=0)
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_features_are_those_of_the_diagnoser(emulated: rt.Trajectories, hidden: bool) -> None:
+    seen = emulated.replace(mask=np.random.default_rng(0).random(emulated.mask.shape) < 0.8)
+    features = Features.at(seen, hide_start=hidden)
+    settled = settled_at(seen, features.stride, SETTLED if hidden else None)
+    arrays = map(torch.tensor, (seen.nominal, seen.observed, seen.mask, settled))
+    torch.testing.assert_close(FeaturesGraph(features)(*arrays), features(seen))
+
+
+def test_what_it_was_not_made_for_is_refused(
+    portable: Portable,
+    bundle: Bundle,
+    emulated: rt.Trajectories,
+    exported: Exported,
+    tmp_path: Path,
+) -> None:
+    short = emulated[:2].replace(
+        **{name: getattr(emulated, name)[:2, :500] for name in ("commands", "nominal", "observed")},
+        mask=None,
+    )
+    with pytest.raises(rt.InputError, match="1000 samples and at most 5 movements"):
+        portable.predict(short)
+    with pytest.raises(rt.InputError, match=r"trajectories\.rate"):
+        portable.predict(emulated.replace(rate=50.0))
+    restless = 500 + 50 * np.sign(np.sin(np.arange(1000) / 20))[None, :, None] * np.ones(4)
+    with pytest.raises(rt.InputError, match="at most 5 movements"):
+        portable.simulate(restless, seed=0)
+    with pytest.raises(rt.InputError, match="expected a portable of schema 1"):
+        bundle.save(tmp_path / "bundle")
+        Portable.load(tmp_path / "bundle")
+
+
+def test_a_damaged_export_is_refused(exported: Exported, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(exported[0], tmp_path / "copy"))
+    graph = folder / "diagnoser.onnx"
+    graph.write_bytes(graph.read_bytes()[:-100] + bytes(100))
+    with pytest.raises(rt.InputError, match=r"diagnoser\.onnx.*changed"):
+        Portable.load(folder)
+    for data in (b"", b"no graph", graph.read_bytes()[:5000]):
+        graph.write_bytes(data)
+        seal(folder)
+        with pytest.raises(rt.InputError, match="expected the ONNX export of a bundle"):
+            Portable.load(folder)
+    shutil.copy(exported[0] / graph.name, graph)
+    about = json.loads((folder / "model.json").read_text())
+    for name in ("kind", "schema", "faults", "steps", "inputs", "rate", "domain", "sensor"):
+        (folder / "model.json").write_text(json.dumps(about | {name: [[]]}))
+        seal(folder)
+        with pytest.raises(rt.InputError, match=r"ONNX export|schema 1"):
+            Portable.load(folder)
+
+
+def test_what_has_no_graph_is_named(bundle: Bundle, tmp_path: Path) -> None:
+    twin = bundle.twin
+    moving = rt.Surrogate(rt.StateSpace(), inputs=twin.inputs, outputs=twin.outputs, rate=100.0)
+    for part, made in (
+        ("surrogate", replace(bundle, twin=CorrectedTwin(moving, twin.residual))),
+        ("diagnoser", replace(bundle, diagnoser=rt.PooledDiagnoser([bundle.diagnoser]))),
+    ):
+        with pytest.raises(rt.InputError, match=f"a {part} without one: it"):
+            export_onnx(made, tmp_path / "portable")
+    assert not (tmp_path / "portable").exists()
+
+
+@pytest.mark.slow
+def test_the_correction_of_the_paper_has_a_graph(
+    bundle: Bundle,
+    ibg: rt.Surrogate,
+    rg: rt.ResidualModel,
+    emulated: rt.Trajectories,
+    tmp_path: Path,
+) -> None:
+    assert isinstance(rg.correction, rt.DelayOffset)
+    made = replace(bundle, twin=CorrectedTwin(ibg, rg), diagnoser=None)
+    parity = export_onnx(made, tmp_path / "portable")
+    assert set(parity) == {"surrogate", "residual", "correction", "guard"}
+    portable = Portable.load(tmp_path / "portable")
+    commands = emulated.commands[:3]
+    assert np.isfinite(portable.simulate(commands, seed=0).observed).all()
+    with pytest.raises(rt.InputError, match="one with a diagnoser"):
+        portable.predict(emulated)
+
+
+def test_the_commands_export_and_predict(
+    call, saved: Path, exported: Exported, emulated: rt.Trajectories, tmp_path: Path
+) -> None:
+    rt.save(emulated, tmp_path / "real.npz")
+    code, out, err = call("bundle", "predict", exported[0], tmp_path / "real.npz")
+    assert code == 0, err
+    assert "EMULATED" in out
+    words = ("bundle", "export", saved, "--onnx", tmp_path / "again", "--json")
+    told = json.loads(call(*words)[1])
+    assert told.keys() == {"saved", "differences"}
+    assert max(told["differences"].values()) < 0.01
+    code, _, err = call("bundle", "export", exported[0], "--onnx", tmp_path / "out")
+    assert code == 2
+    assert "expected a bundle of schema 1" in err
+
+
+def test_a_missing_extra_is_named(
+    bundle: Bundle, exported: Exported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    for use in (lambda: Portable.load(exported[0]), lambda: export_onnx(bundle, tmp_path / "x")):
+        with pytest.raises(rt.InputError, match=r'pip install "retwin\[onnx\]"'):
+            use()

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from retwin import InputError, Segments, SteadyStateError, Stuck
+from retwin.twins.faults import draw_faults, faulty_commands, frozen_response
+
+
+@pytest.fixture
+def commands() -> np.ndarray:
+    time = np.arange(400)
+    first = np.clip((time - 20) / 60, 0, 1) * 100
+    second = np.clip((time - 220) / 80, 0, 1) * -30
+    still = np.zeros(400)
+    return np.stack([first + second, still], axis=-1)[None].astype(float)
+
+
+def test_stuck_holds_the_response_from_its_onset(commands: np.ndarray) -> None:
+    held = frozen_response(commands, [Stuck(0, onset=49)])
+    np.testing.assert_array_equal(held[0, :50], commands[0, :50])
+    assert (held[0, 49:, 0] == commands[0, 49, 0]).all()
+    np.testing.assert_array_equal(held[0, :, 1], commands[0, :, 1])
+
+
+def test_stuck_onset_is_drawn_in_its_range(commands: np.ndarray) -> None:
+    segments = Segments.from_commands(np.repeat(commands, 200, axis=0))
+    drawn = draw_faults([Stuck(0, onset=(10, 30))] * 200, segments, seed=0)
+    onsets = {fault.onset for fault in drawn}
+    assert onsets == set(range(10, 31))
+
+
+def test_bias_is_reached_with_the_movement_and_kept(commands: np.ndarray) -> None:
+    segments = Segments.from_commands(commands)
+    fault = SteadyStateError(0, bias=(20.0, -10.0))
+    bias = faulty_commands(commands, [fault], segments)[0, :, 0] - commands[0, :, 0]
+    assert (bias[:21] == 0).all(), "the actuator starts at rest, without bias"
+    np.testing.assert_allclose(bias[50], 10.0, atol=1e-6)
+    np.testing.assert_allclose(bias[81:220], 20.0, atol=1e-6)
+    np.testing.assert_allclose(bias[260], 5.0, atol=1e-6)
+    np.testing.assert_allclose(bias[301:], -10.0, atol=1e-6)
+
+
+def test_an_actuator_that_is_told_nothing_still_gets_its_bias(commands: np.ndarray) -> None:
+    segments = Segments.from_commands(commands)
+    biased = faulty_commands(commands, [SteadyStateError(1, bias=(20.0, -10.0))], segments)
+    np.testing.assert_allclose(biased[0, 81:220, 1], 20.0)
+    np.testing.assert_allclose(biased[0, 301:, 1], -10.0)
+
+
+def test_drawn_biases_follow_the_protocol(commands: np.ndarray) -> None:
+    segments = Segments.from_commands(np.repeat(commands, 500, axis=0))
+    drawn = draw_faults([SteadyStateError(0)] * 500, segments, seed=1)
+    biases = np.array([fault.bias for fault in drawn])
+    assert biases.shape == (500, 2), "one bias per movement"
+    assert (np.abs(biases) >= 10).all()
+    assert (np.abs(biases) <= 50).all()
+    assert abs((biases > 0).mean() - 0.5) < 0.05
+    assert abs(np.abs(biases).mean() - 30) < 1.5
+
+
+def test_the_same_seed_gives_the_same_severity(commands: np.ndarray) -> None:
+    segments = Segments.from_commands(commands)
+    one, two, other = (draw_faults([SteadyStateError(0)], segments, seed=s) for s in (3, 3, 4))
+    assert one == two
+    assert one != other
+
+
+def test_an_open_severity_is_refused(commands: np.ndarray) -> None:
+    segments = Segments.from_commands(commands)
+    with pytest.raises(InputError, match="draw_faults first"):
+        faulty_commands(commands, [SteadyStateError(0)], segments)
+    with pytest.raises(InputError, match="draw_faults first"):
+        frozen_response(commands, [Stuck(0, onset=(0, 9))])
+    with pytest.raises(InputError, match="one per trajectory"):
+        draw_faults([None, None], segments, seed=0)
+
+
+@pytest.mark.parametrize("onset", [(8, 3), -1, (-2, 3), 1.5, (1, 2, 3), None, ()])
+def test_an_onset_that_cannot_be_is_refused(onset: object) -> None:
+    with pytest.raises(InputError, match=r"onset: expected a sample from 0 on, or a pair \(low, "):
+        Stuck(0, onset)  # type: ignore[arg-type]
+
+
+def test_onsets_may_be_numpys_and_listed() -> None:
+    assert Stuck(0, np.int64(3)) == Stuck(0, 3)
+    assert Stuck(0, [np.int64(3), 8]) == Stuck(0, (3, 8))
+
+
+@pytest.mark.parametrize("size", [(50.0, 10.0), (-5.0, 5.0), (0.0, np.inf), (np.nan, 1.0), (1.0,)])
+def test_sizes_that_cannot_be_are_refused(size: tuple) -> None:
+    with pytest.raises(InputError, match="size: expected a pair"):
+        SteadyStateError(0, size=size)

@@ -1,0 +1,105 @@
+"""`Chain`: operators in series, and a record at the end."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import retwin as rt
+from retwin.cases.armpi_fpv.twin import POLL
+from retwin.serialisation.configs import from_config, to_config
+from retwin.update.corrections import OPERATORS, calibrated, readings, recorded
+
+ROBOT = rt.Chain(rt.CommandSpace(), rt.SampledSensor())
+
+
+@pytest.fixture(scope="module")
+def measured(case: rt.Case) -> rt.Trajectories:
+    commands = case.sampler.sample(12, rng=np.random.default_rng(4))
+    return case.emulator.simulate(commands, seed=2)
+
+
+def context_of(exact, made: rt.Trajectories) -> rt.Context:
+    segments = rt.Segments.from_commands(made.commands)
+    return rt.Context.of(exact, made.commands, segments, rate=made.rate)
+
+
+def arrays(made: rt.Trajectories) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.tensor(made.observed), torch.tensor(made.mask)
+
+
+def test_between_readings_a_record_tells_nothing(exact, measured: rt.Trajectories) -> None:
+    """The chain finds the readings itself: the same as being told where they are."""
+    context = context_of(exact, measured)
+    observed, mask = arrays(measured)
+    told = mask.clone()
+    told[:] = False
+    told[:, ::POLL] = mask[:, ::POLL]
+    ours, truth = (
+        ROBOT.infer(context, observed, mask),
+        rt.CommandSpace().infer(context, observed, told),
+    )
+    torch.testing.assert_close(ours.z, truth.z)
+    torch.testing.assert_close(ours.covariance, truth.covariance)
+    assert readings(ROBOT, observed, mask).equal(told)
+
+
+def test_the_sensor_is_fitted_with_z(exact, measured: rt.Trajectories) -> None:
+    """Real noise is a unit or so of a joint, tenths of a millimetre; a glitch is much more."""
+    context = context_of(exact, measured)
+    chain, found = calibrated(ROBOT, context, *arrays(measured))
+    sensor = chain.second
+    assert (sensor.every, sensor.phases) == (POLL, (0,))
+    assert sensor.glitch_rate < 0.02
+    assert 1e-5 < sensor.noise[0][-4] < 3e-3
+    outputs = chain.apply(context, found.z)
+    record = recorded(chain, context, found.z, torch.Generator().manual_seed(0))
+    # Between readings nothing was computed, and nothing is missing.
+    whole = sensor.read(outputs, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(record, whole, rtol=0, atol=1e-6)
+    off = (record - outputs)[:, ::POLL].abs()
+    assert 1e-5 < off.mean() < 2e-3
+    torch.testing.assert_close(chain.apply(context, 0 * found.z), context.path)
+
+
+def test_an_operator_without_a_sensor_is_recorded_as_it_is(
+    exact, measured: rt.Trajectories
+) -> None:
+    context = context_of(exact, measured)
+    z = torch.randn(*context.segments.start.shape, 4, generator=torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    record = recorded(rt.DelayOffset(), context, z, generator)
+    assert record.equal(rt.DelayOffset().apply(context, z))
+    assert generator.get_state().equal(torch.Generator().manual_seed(0).get_state())
+
+
+def test_the_second_operator_explains_what_the_first_leaves(exact, case: rt.Case) -> None:
+    """An error off what the arm can reach: the joints cannot explain it, an offset can."""
+    commands = case.sampler.sample(10, rng=np.random.default_rng(5))
+    context = rt.Context.of(exact, commands, rt.Segments.from_commands(commands), rate=100.0)
+    chain = rt.Chain(rt.CommandSpace(), rt.DelayOffset())
+    assert len(chain.latent(case.inputs, case.outputs)) == 9 + 4
+    z = torch.zeros(*context.segments.start.shape, 13, dtype=torch.float64)
+    z[..., 0] = 4.0
+    z[..., 12] = 0.01  # every output a centimetre higher than the joints say
+    observed = chain.apply(context, z)
+    one = rt.CommandSpace().infer(context, observed, observed == observed)
+    both = chain.infer(context, observed, observed == observed)
+    torch.testing.assert_close(both.z[..., :9], one.z)
+    assert not both.posterior
+    assert both.covariance.shape == (*z.shape, 13)
+    left = (chain.apply(context, both.z.to(z)) - observed).square().mean().sqrt()
+    alone = (rt.CommandSpace().apply(context, one.z) - observed).square().mean().sqrt()
+    assert left <= alone
+
+
+def test_chains_are_checked_and_survive_json() -> None:
+    assert from_config(to_config(ROBOT, OPERATORS), OPERATORS) == ROBOT
+    nested = rt.Chain(rt.Chain(rt.CommandSpace(), rt.DelayOffset()), rt.SampledSensor(every=4))
+    assert from_config(to_config(nested, OPERATORS), OPERATORS) == nested
+    assert nested.pools
+    assert nested.severities
+    for bad in ((rt.SampledSensor(), rt.DelayOffset()), (ROBOT, rt.SampledSensor())):
+        with pytest.raises(rt.InputError, match="sensor being last"):
+            rt.Chain(*bad)

@@ -1,0 +1,262 @@
+"""`CommandSpace`: what z does to commands, and z from outputs alone where the truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import retwin as rt
+from retwin.cases.armpi_fpv.emulator import _effective
+from retwin.cases.armpi_fpv.twin import KINEMATIC, POLL
+from retwin.serialisation.configs import from_config, to_config
+from retwin.twins.faults import draw_faults, faulty_commands, frozen_from
+from retwin.update.corrections import OPERATORS
+from retwin.update.corrections.command_effect import effective
+
+UNIT = 0.24  # degrees per command unit
+
+
+def context_of(exact, commands: np.ndarray, faults: list | None = None) -> rt.Context:
+    segments = rt.Segments.from_commands(commands)
+    if faults is None:
+        return rt.Context.of(exact, commands, segments, rate=100.0)
+    drawn = draw_faults(faults, segments, 0)
+    told = faulty_commands(commands, drawn, segments)
+    frozen = frozen_from(drawn, *commands.shape[1:])
+    return rt.Context.of(exact, commands, segments, rate=100.0, told=told, frozen=frozen)
+
+
+def polled(n: int, steps: int = 1000) -> Tensor:
+    """True where the arm was read: between readings there is nothing new."""
+    mask = torch.zeros(n, steps, 3, dtype=torch.bool)
+    mask[:, ::POLL] = True
+    return mask
+
+
+@pytest.fixture(scope="module")
+def commands(case: rt.Case) -> np.ndarray:
+    return case.sampler.sample(12, rng=np.random.default_rng(4))
+
+
+def drawn(shape: tuple[int, int], *, missed: float = 0.05, seed: int = 0) -> Tensor:
+    rng = np.random.default_rng(seed)
+    return torch.tensor(
+        np.concatenate(
+            [
+                rng.gamma(6, 0.8, (*shape, 1)),
+                4 * rng.normal(size=(*shape, 4)),
+                rng.random((*shape, 4)) < missed,
+            ],
+            axis=2,
+        )
+    )
+
+
+def test_it_does_what_the_emulated_arm_does(commands: np.ndarray) -> None:
+    """Against the emulator's own loop over movements, written apart."""
+    segments = rt.Segments.from_commands(commands)
+    z = drawn(segments.start.shape, missed=0.2)
+    when = torch.arange(1000.0, dtype=torch.float64)
+    ours = effective(torch.tensor(commands, dtype=torch.float64), segments, z, when)
+    parts = z.numpy()
+    truth = {"delay": parts[..., 0], "offset": parts[..., 1:5], "missed": parts[..., 5:] > 0}
+    np.testing.assert_allclose(ours.numpy(), _effective(commands, segments, truth), atol=1e-3)
+
+
+def test_a_missed_movement_is_caught_up_with_the_next(exact) -> None:
+    commands = np.full((1, 600, 4), 500.0)
+    commands[0, :, 1] += 2 * np.clip(np.arange(600) - 50, 0, 60)
+    commands[0, :, 1] += np.clip(np.arange(600) - 350, 0, 60)
+    z = torch.zeros(1, 2, 9, dtype=torch.float64)
+    z[0, 0, 5 + 1] = 1.0
+    when = torch.tensor([0.0, 100, 300, 380, 500], dtype=torch.float64)
+    segments = rt.Segments.from_commands(commands)
+    told = effective(torch.tensor(commands), segments, z, when)
+    np.testing.assert_allclose(told[0, :, 1], [500, 500, 500, 590, 680], atol=1e-6)
+    assert (told[0, :, [0, 2, 3]] == 500).all()
+
+
+def test_a_stuck_actuator_stays_where_z_had_brought_it(exact, commands: np.ndarray) -> None:
+    context = context_of(exact, commands, [rt.Stuck(1)] * 12)
+    z = drawn(context.segments.start.shape, missed=0.0)
+    path = rt.CommandSpace().apply(context, z)
+    never = replace(context, frozen=torch.full_like(context.frozen, 1000))
+    free = rt.CommandSpace().apply(never, z)
+    torch.testing.assert_close(path[:, :50], free[:, :50])
+    assert (path[:, 200:] - free[:, 200:]).norm(dim=-1).max() > 0.02
+
+
+@pytest.mark.parametrize("memoryless", [True, False])
+def test_some_samples_are_those_of_the_whole(exact, commands: np.ndarray, memoryless: bool) -> None:
+    """Also of a surrogate that must be told all that came before."""
+
+    class Twin:
+        asked = 0
+
+        def __call__(self, told: Tensor) -> Tensor:
+            return exact(told) if memoryless else exact(told).cumsum(dim=1)
+
+        def predict(self, told: np.ndarray) -> np.ndarray:
+            self.asked += 1
+            return self(torch.tensor(told)).numpy()
+
+    twin = Twin()
+    twin.memoryless = memoryless  # type: ignore[attr-defined]
+    context = context_of(twin, commands, [rt.Stuck(1), rt.SteadyStateError(2), None] * 4)
+    z = drawn(context.segments.start.shape)
+    when = torch.randint(1000, (12, 30), generator=torch.Generator().manual_seed(0))
+    some = rt.CommandSpace().at(context, z, when)
+    whole = rt.CommandSpace().apply(context, z)
+    torch.testing.assert_close(some, whole[torch.arange(12)[:, None], when])
+    assert twin.asked == 1, "nobody asked what the outputs would be without z"
+
+
+def lateness(angles: np.ndarray, commands: np.ndarray, segments: rt.Segments) -> np.ndarray:
+    """How late the joints were, (n, M) in samples, seen on themselves; NaN where none moved.
+
+    A joint's delay is the area between the shares of its way that it was told to have gone and that
+    it has gone; joints count by the square of their way, as in least squares.
+    """
+    late = np.full(segments.start.shape, np.nan)
+    for i, m in np.argwhere(segments.valid):
+        begin, stop = int(segments.start[i, m]), int(np.ceil(segments.stop[i, m]))
+        path, told = angles[i, begin:stop], commands[i, begin:stop].astype(float)
+        way, meant = path[-1] - path[0], told[-1] - told[0]
+        moved = np.minimum(np.abs(way), np.abs(meant)) > 20
+        if moved.any():
+            behind = ((told - told[0])[:, moved] / meant[moved]).sum(axis=0)
+            behind -= ((path - path[0])[:, moved] / way[moved]).sum(axis=0)
+            late[i, m] = np.average(behind, weights=way[moved] ** 2)
+    return late
+
+
+def test_the_ruler_of_delays_is_straight(case: rt.Case, commands: np.ndarray) -> None:
+    """Where servos have neither dead zone nor play, joints are as late as was drawn."""
+    hidden: dict[str, np.ndarray] = {}
+    tight = replace(case.emulator, dead_zone=0.0, backlash=0.0, missed=0.0)
+    tight.simulate(commands, seed=3, hidden=hidden)
+    late = lateness(hidden["angles"], commands, rt.Segments.from_commands(commands))
+    drawn_delay = hidden["delay"] + 100 * KINEMATIC.lag.seconds
+    np.testing.assert_allclose(late, drawn_delay, atol=0.05)
+
+
+@pytest.fixture(scope="module")
+def understood(exact, case: rt.Case) -> dict[str, np.ndarray]:
+    """z* of 100 emulated trajectories beside the truth."""
+    commands = case.sampler.sample(100, rng=np.random.default_rng(11))
+    hidden: dict[str, np.ndarray] = {}
+    made = case.emulator.simulate(commands, seed=3, hidden=hidden)
+    context = context_of(exact, commands)
+    observed = torch.as_tensor(made.observed.copy())
+    found = rt.CommandSpace().infer(context, observed, polled(100))
+    each, segments = np.arange(100)[:, None], context.segments
+    reached = hidden["angles"][each, np.ceil(segments.stop).astype(int) - 1]
+    targets = commands[each, np.ceil(segments.settle).astype(int).clip(max=999)]
+    z = found.z.numpy()
+    deviation = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt().numpy()
+    good = ~hidden["missed"] & (z[..., 5:] < 0.5)
+    return {
+        "missed": hidden["missed"],
+        "found": z[..., 5:] > 0.5,
+        "offset error": (z[..., 1:5] - (reached - targets))[good],
+        "offset": (reached - targets)[good],
+        "offset deviation": deviation[..., 1:5][good],
+        "delay error": z[..., 0] - lateness(hidden["angles"], commands, segments),
+        "delay": hidden["delay"],
+        "delay deviation": deviation[..., 0],
+    }
+
+
+@pytest.mark.slow
+def test_emulated_arm_is_understood_from_outputs_alone(understood: dict) -> None:
+    """Offsets within 0.3 degrees, delays within a sample, missed movements found."""
+    assert UNIT * np.abs(understood["offset error"]).mean() <= 0.3
+    assert UNIT * np.abs(understood["offset"]).mean() > 0.7, "what knowing nothing would give"
+    assert np.abs(understood["delay error"]).mean() <= 1.0
+    truth, found = understood["missed"], understood["found"]
+    assert 2 * (truth & found).sum() / (truth.sum() + found.sum()) >= 0.95
+
+
+@pytest.mark.slow
+def test_intervals_of_offsets_cover(understood: dict) -> None:
+    """Nine in ten true offsets lie in their 90 % intervals."""
+    inside = np.abs(understood["offset error"]) < 1.645 * understood["offset deviation"]
+    assert 0.85 <= inside.mean() <= 0.95
+
+
+@pytest.mark.slow
+def test_intervals_of_delays_cover(understood: dict) -> None:
+    """Nine in ten delays lie in their 90 % intervals, and these say more than the prior."""
+    inside = np.abs(understood["delay error"]) < 1.645 * understood["delay deviation"]
+    assert 0.85 <= inside.mean() <= 0.95
+    assert understood["delay deviation"].mean() < 0.5 * understood["delay"].std()
+
+
+def test_what_the_outputs_do_not_tell_is_said(exact, commands: np.ndarray) -> None:
+    """Three outputs, four joints: not all offsets of the planar joints can be known."""
+    context = context_of(exact, commands)
+    z = drawn(context.segments.start.shape, missed=0.0)
+    noise = torch.tensor(np.random.default_rng(1).normal(0, 5e-4, context.path.shape))
+    observed = rt.CommandSpace().apply(context, z).double() + noise
+    found = rt.CommandSpace().infer(context, observed, polled(12))
+    share = found.identified[..., 1:5].double().mean(dim=(0, 1))
+    assert share[0] > 0.95, "the yaw is seen, but where the record ends with the motion"
+    assert share[1:].min() < 1.0, "one of the others is not, somewhere"
+    deviation = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    assert deviation[..., 4].mean() > 3 * deviation[..., 1].mean()
+
+
+def test_a_fault_does_not_pass_for_a_discrepancy(exact, commands: np.ndarray) -> None:
+    """The bias of a faulty motor is told as severity, and leaves the offsets alone."""
+    faults = [rt.SteadyStateError(0, bias=(30.0, -20.0, 40.0, -35.0, 25.0)), *[None] * 11]
+    truth = context_of(exact, commands, faults)
+    z = drawn(truth.segments.start.shape, missed=0.0)
+    observed = rt.CommandSpace().apply(truth, z).double()
+    # The class is known, its severity is not: any bias on motor 1 stands for it.
+    guess = [rt.SteadyStateError(0, bias=(1.0,) * 5), *[None] * 11]
+    found = rt.CommandSpace().infer(context_of(exact, commands, guess), observed, polled(12))
+    assert found.severity is not None
+    bias = found.severity[0, :, 0].numpy() + 1.0 - z[0, :, 1].numpy()
+    np.testing.assert_allclose(bias, [30.0, -20.0, 40.0, -35.0, 25.0], atol=3.0)
+    assert (found.z[0, :, 1] == 0).all()
+    assert not found.identified[0, :, 1].any()
+    assert (found.severity[1:] == 0).all()
+    error = (found.z - z)[..., 1:5]
+    assert error[0, :, 1:].abs().mean() < 2 * error[1:, :, 1:].abs().mean()
+
+
+def test_a_surrogate_with_memory_gives_the_same(exact, commands: np.ndarray) -> None:
+    class Remembering:
+        def __call__(self, values: Tensor) -> Tensor:
+            return exact(values)
+
+        predict = staticmethod(exact.predict)
+
+    z = drawn((4, 5), missed=0.0)
+    plain = context_of(exact, commands[:4])
+    observed = rt.CommandSpace().apply(plain, z).double()
+    one = rt.CommandSpace().infer(plain, observed, polled(4))
+    other = rt.CommandSpace().infer(replace(plain, surrogate=Remembering()), observed, polled(4))
+    assert (one.z - other.z)[..., 1:5].abs().mean() < 0.2
+    assert (one.z - other.z)[..., 0].abs().mean() < 0.1
+    spread = [found.covariance[..., 0, 0].sqrt() for found in (one, other)]
+    torch.testing.assert_close(spread[0], spread[1], rtol=0.1, atol=0.02)
+
+
+def test_names_units_and_config() -> None:
+    operator = rt.CommandSpace()
+    inputs, outputs = rt.Channels(("a", "b"), ("V", "A")), rt.Channels(("x",), ("m",))
+    latent = operator.latent(inputs, outputs)
+    assert latent.names == ("delay", "offset_a", "offset_b", "missed_a", "missed_b")
+    assert latent.units == ("samples", "V", "A", "1", "1")
+    assert [head.kind for head in operator.heads(inputs, outputs)] == [
+        "mixture",
+        "mixture",
+        "bernoulli",
+    ]
+    assert from_config(to_config(operator, OPERATORS), OPERATORS) == operator
+    assert isinstance(operator, rt.Correction)

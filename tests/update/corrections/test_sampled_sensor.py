@@ -1,0 +1,140 @@
+"""`SampledSensor`: its settings found again in records that it made, and what a record holds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import retwin as rt
+from retwin.serialisation.configs import from_config, to_config
+from retwin.update.corrections import OPERATORS
+
+STEPS = 600
+ERRORS = tuple(np.linspace(-0.004, 0.004, 33).tolist())
+
+
+def paths(n: int = 12) -> Tensor:
+    """Smooth outputs that rest now and then, (n, STEPS, 2)."""
+    rng = np.random.default_rng(0)
+    time = np.arange(STEPS)
+    out = np.zeros((n, STEPS, 2))
+    for start in (50, 250, 450):
+        ramp = np.clip((time - start) / 60, 0, 1)
+        out += rng.uniform(-1, 1, (n, 1, 2)) * (3 * ramp**2 - 2 * ramp**3)[:, None]
+    return torch.tensor(out)
+
+
+def everything(outputs: Tensor) -> Tensor:
+    return torch.ones(outputs.shape, dtype=torch.bool)
+
+
+def movements(n: int) -> rt.Segments:
+    start = np.tile([50.0, 250.0, 450.0], (n, 1))
+    stop = np.tile([250.0, 450.0, 600.0], (n, 1))
+    return rt.Segments(start, start + 60, stop, np.ones((n, 3), dtype=bool), STEPS)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize(("every", "phases"), [(10, (0,)), (7, (3,)), (10, (2, 5)), (4, (1,))])
+def test_timing_is_found_again(every: int, phases: tuple[int, ...]) -> None:
+    made = rt.SampledSensor(every=every, phases=phases, noise=(ERRORS, ERRORS))
+    record = made.read(paths(), generator())
+    found = rt.SampledSensor().timed(record, everything(record))
+    assert (found.every, found.phases) == (every, phases)
+
+
+def test_a_record_of_every_sample_has_no_period() -> None:
+    path = paths()
+    noisy = path + 0.001 * torch.tensor(np.random.default_rng(1).normal(size=path.shape))
+    for record in (path, noisy):
+        assert rt.SampledSensor().timed(record, everything(record)).every == 1
+
+
+def test_errors_glitches_and_rounding_are_found_again() -> None:
+    n = 60
+    made = rt.SampledSensor(
+        every=5, phases=(2,), noise=(ERRORS, (0.0, 0.0)), steps=(0.0, 0.05),
+        glitch_rate=0.02, glitch_size=(0.5, 0.0),
+    )  # fmt: skip
+    path = paths(n)
+    record = made.read(path, generator())
+    found = rt.SampledSensor().fitted(record, everything(record), path, movements(n))
+    assert found.steps == (0.0, pytest.approx(0.05, rel=1e-6))
+    assert found.glitch_rate == pytest.approx(0.02, abs=0.01)
+    assert found.glitch_size[0] == pytest.approx(0.5, rel=0.4)
+    # Evenly spread between -0.004 and 0.004: quartiles half-way.
+    assert found.noise[0][8] == pytest.approx(-0.002, rel=0.15)
+    assert found.noise[0][24] == pytest.approx(0.002, rel=0.15)
+
+
+def test_what_is_given_is_kept() -> None:
+    path = paths()
+    given = rt.SampledSensor(every=3, phases=(1,), glitch_rate=0.25, noise=(ERRORS, ERRORS))
+    found = given.fitted(path, everything(path), path, movements(len(path)))
+    kept = (found.every, found.phases, found.glitch_rate, found.noise)
+    assert kept == (3, (1,), 0.25, (ERRORS, ERRORS))
+
+
+def test_a_record_joins_readings_by_straight_lines() -> None:
+    path = torch.arange(23.0)[None, :, None] ** 2
+    record = rt.SampledSensor(every=5, phases=(2,)).read(path, generator())
+    at = [2, 7, 12, 17, 22]
+    expected = np.interp(np.arange(23), at, np.square(at))
+    np.testing.assert_allclose(record[0, :, 0], expected, atol=1e-4)
+    cut = rt.SampledSensor(every=5, phases=(2,)).read(path[:, :21], generator())
+    assert (cut[0, 17:, 0] == 17.0**2).all(), "after its last reading a record stays"
+
+
+def test_only_readings_count() -> None:
+    path = paths()
+    mask = everything(path)
+    mask[0, :100] = False
+    read = rt.SampledSensor(every=10, phases=(4,)).readings(path, mask)
+    time = np.flatnonzero(read[1].all(dim=-1))
+    np.testing.assert_array_equal(time, np.arange(4, STEPS, 10))
+    assert not read[0, :100].any()
+    several = rt.SampledSensor(every=10, phases=(2, 5))
+    record = several.read(path, generator())
+    told = several.readings(record, everything(record))
+    first = told.all(dim=-1).int().argmax(dim=1)
+    assert set(first.tolist()) == {2, 5}
+
+
+def test_errors_are_those_of_a_reading_and_drawn_from_their_law() -> None:
+    still = torch.zeros(400, 100, 1, dtype=torch.float64)
+    sensor = rt.SampledSensor(every=10, phases=(0,), noise=((-1.0, 0.0, 0.0, 0.0, 1.0),))
+    record = sensor.read(still, generator())
+    readings = record[:, ::10].flatten()
+    assert (readings == 0).double().mean() == pytest.approx(0.5, abs=0.03)
+    assert readings.abs().max() <= 1
+    torch.testing.assert_close(record, sensor.read(still, generator()), rtol=0, atol=0)
+
+
+def test_gradients_pass_through_rounding() -> None:
+    path = paths(2).requires_grad_()
+    record = rt.SampledSensor(every=10, phases=(0,), steps=(0.1, 0.1)).read(path, generator())
+    record.sum().backward()
+    assert path.grad is not None
+    assert path.grad[:, ::10].abs().sum() > 0
+
+
+def test_settings_survive_json_and_bad_ones_are_refused() -> None:
+    sensor = rt.SampledSensor(every=5, phases=(2,), noise=(ERRORS, ERRORS), glitch_rate=0.1)
+    assert from_config(to_config(sensor, OPERATORS), OPERATORS) == sensor
+    for bad in (
+        {"every": 0},
+        {"every": 5, "phases": (5,)},
+        {"phases": (1,)},
+        {"steps": (-1.0,)},
+        {"noise": ((1.0, 0.0),)},
+        {"glitch_rate": 1.5},
+    ):
+        with pytest.raises(rt.InputError, match="sensor: expected"):
+            rt.SampledSensor(**bad)
+    with pytest.raises(rt.InputError, match="timing is known"):
+        rt.SampledSensor().readings(paths(), everything(paths()))

@@ -1,0 +1,164 @@
+"""Eq. 2: known parameters are found again, and what cannot be found is said to be so."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from toys import LAG, LINE, PRODUCT, commands, lag, measured, parametric
+
+import retwin as rt
+from retwin.cases.armpi_fpv.parameters import armpi_parametric
+from retwin.testing import TWIN_CHECKS, TwinSubject
+from retwin.update.identification import Evolution, LeastSquares, identify, profile
+from retwin.update.identification.search import Loss
+
+GAIN, SHARE = 1.7, 0.8
+
+
+@pytest.mark.parametrize("method", [LeastSquares(starts=3), Evolution(5, 10)])
+def test_known_parameters_are_found_within_their_errors(method) -> None:
+    observed = measured(LAG, 0.05, seed=1, gain=GAIN, share=SHARE)
+    updated = identify(LAG, observed, seed=0, method=method)
+    assert abs(updated.values["gain"] - GAIN) < 3 * updated.errors["gain"] < 0.1
+    assert abs(updated.values["share"] - SHARE) < 3 * updated.errors["share"] < 0.1
+    assert updated.identifiability.identified.all()
+    assert updated.figures["rms_after"] == pytest.approx(0.05, rel=0.15)
+    assert updated.figures["rms_before"] > 4 * updated.figures["rms_after"]
+    residual = observed.observed - updated.twin.simulate(observed.commands, seed=0).observed
+    assert updated.objective == pytest.approx(np.linalg.norm(residual))
+
+
+def test_standard_errors_are_those_of_the_linear_model() -> None:
+    observed = measured(LINE, 0.2, seed=2, a=1.0, b=-0.5)
+    updated = identify(LINE, observed, seed=0, method=LeastSquares(2, "linear"))
+    design = observed.commands.reshape(-1, 2)
+    best, rest, *_ = np.linalg.lstsq(design, observed.observed.ravel())
+    assert list(updated.values.values()) == pytest.approx(best, abs=1e-5)
+    variance = rest[0] / (len(design) - 2) * np.linalg.inv(design.T @ design)
+    # Beyond the formula, an error may only allow for what looks like correlated noise.
+    ratio = np.array(list(updated.errors.values())) / np.sqrt(np.diag(variance))
+    assert (ratio >= 0.999).all()
+    assert (ratio < 1.2).all()
+
+
+@pytest.mark.parametrize("loss", ["linear", "soft_l1"])
+def test_errors_cover_the_truth_as_often_as_they_say(loss: Loss) -> None:
+    inside = []
+    for seed in range(40):
+        observed = measured(LINE, 0.5, seed=seed, count=2, a=1.0, b=-0.5)
+        updated = identify(LINE, observed, seed=0, method=LeastSquares(1, loss))
+        inside.append(abs(updated.values["a"] - 1.0) < 1.96 * updated.errors["a"])
+    assert 0.88 <= np.mean(inside) < 1.0
+
+
+def test_a_product_of_two_parameters_is_not_identified() -> None:
+    observed = measured(PRODUCT, 0.05, seed=3, a=1.2, b=0.9)
+    with pytest.warns(UserWarning, match="not identified: a, b"):
+        updated = identify(PRODUCT, observed, seed=0, method=LeastSquares(starts=4))
+    assert not updated.identifiability.identified.any()
+    assert updated.values["a"] * updated.values["b"] == pytest.approx(1.08, abs=0.03)
+    assert np.isinf(updated.errors["a"])
+    assert "not identified" in updated.reason
+
+
+def test_a_best_value_on_a_bound_is_told() -> None:
+    narrow = parametric(lag, gain=(0.1, 1.0), share=(0.1, 0.98))
+    observed = measured(LAG, 0.05, seed=4, gain=GAIN, share=SHARE)
+    with pytest.warns(UserWarning, match="at a bound: gain"):
+        updated = identify(narrow, observed, seed=0, method=LeastSquares(starts=2))
+    assert updated.values["gain"] == pytest.approx(1.0, abs=1e-2)
+
+
+def test_a_robust_loss_forgives_outliers_and_a_mask_hides_them() -> None:
+    clean = measured(LAG, 0.02, seed=5, gain=GAIN, share=SHARE)
+    spoilt = clean.observed.copy()
+    spoilt[0, 20:35] += 8.0
+    observed = clean.replace(observed=spoilt)
+
+    def gain(data: rt.Trajectories, loss: str) -> float:
+        method = LeastSquares(starts=2, loss=loss)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return identify(LAG, data, seed=0, method=method).values["gain"]
+
+    assert abs(gain(observed, "linear") - GAIN) > 0.1
+    assert gain(observed, "cauchy") == pytest.approx(GAIN, abs=0.02)
+    seen = np.ones_like(clean.mask)
+    seen[0, 20:35] = False
+    assert gain(observed.replace(mask=seen), "linear") == pytest.approx(GAIN, abs=0.02)
+
+
+@pytest.mark.parametrize(("loss", "exact"), [("linear", 1e-2), ("soft_l1", 0.15)])
+def test_profile_is_the_parabola_of_the_linear_model(loss: Loss, exact: float) -> None:
+    observed = measured(LINE, 0.2, seed=6, a=1.0, b=-0.5)
+    updated = identify(LINE, observed, seed=0, method=LeastSquares(1, loss))
+    found = profile(updated, observed, "a", points=7)
+    wanted = ((found.values - updated.values["a"]) / updated.errors["a"]) ** 2
+    assert found.rise == pytest.approx(wanted, rel=exact, abs=1e-3)
+    low, high = found.interval
+    half = 1.96 * updated.errors["a"]
+    assert (high - low) / 2 == pytest.approx(half, rel=0.15)
+
+
+def test_the_same_seed_gives_the_same_result_over_processes() -> None:
+    observed = measured(LAG, 0.05, seed=7, gain=GAIN, share=SHARE)
+    method = LeastSquares(starts=2)
+    told: list[float] = []
+    alone = identify(LAG, observed, seed=3, method=method, progress=told.append)
+    spread = identify(LAG, observed, seed=3, method=method, processes=2)
+    assert alone.values == spread.values
+    assert alone.twin_runs == spread.twin_runs > 0
+    assert told[-1] == 1.0
+    assert told == sorted(told)
+
+
+def test_bad_input_is_named() -> None:
+    observed = measured(LAG, 0.05, seed=8, gain=GAIN, share=SHARE)
+    faulty = observed.replace(labels=np.full(len(observed), "Stuck"))
+    plain = LAG.twin.twin  # type: ignore[attr-defined]
+    for match, call in {
+        "twin: expected a ParametricTwin": lambda: identify(plain, observed, seed=0),
+        "observed: expected healthy": lambda: identify(LAG, faulty, seed=0),
+        "observed.rate": lambda: identify(LAG, observed.replace(rate=20.0), seed=0),
+        "rate: expected": lambda: identify(LAG, observed, seed=0, rate=3.0),
+        "more measurements": lambda: identify(
+            LAG, observed.replace(mask=np.zeros_like(observed.mask)), seed=0
+        ),
+        "seed": lambda: identify(LAG, observed, seed=-1),
+        "processes": lambda: identify(LAG, observed, seed=0, processes=0),
+        "starts": lambda: LeastSquares(starts=0),
+        "loss": lambda: Evolution(loss="none"),  # type: ignore[arg-type]
+    }.items():
+        with pytest.raises(rt.InputError, match=match):
+            call()
+
+
+@pytest.fixture(scope="module")
+def updated_twin() -> rt.Twin:
+    observed = measured(LAG, 0.05, seed=9, gain=GAIN, share=SHARE)
+    return identify(LAG, observed, seed=0, method=LeastSquares(starts=1)).twin
+
+
+@pytest.mark.parametrize("check", TWIN_CHECKS, ids=lambda check: check.__name__)
+def test_the_updated_twin_keeps_the_contract(updated_twin: rt.Twin, check: Callable) -> None:
+    faults = (None, rt.Stuck(0, onset=12), rt.Stuck(0, onset=25))
+    check(TwinSubject(updated_twin, commands(3, 40), faults))
+
+
+def test_delay_and_joint_offsets_of_the_emulated_robot(case: rt.Case) -> None:
+    told = case.sampler.sample(6, rng=np.random.default_rng(0))
+    hidden: dict[str, np.ndarray] = {}
+    observed = case.emulator.simulate(told, seed=1, hidden=hidden)
+    assert hidden["missed"].any()  # one movement of joint 2: the plain norm is led astray by it
+    twin = armpi_parametric(rt.ArmPiTwin(step=0.01)).holding("stiffness", "damping")
+    method = LeastSquares(starts=1, loss="cauchy")
+    updated = identify(twin, observed, seed=0, rate=case.sensor_rate, method=method)
+    late = hidden["delay"].mean()
+    assert updated.errors["delay"] < 1
+    assert abs(updated.values["delay"] - late) < 2 * updated.errors["delay"]
+    for joint, off in enumerate(hidden["offset"].mean(axis=(0, 1)), 1):
+        name = f"offset.motor_{joint}"
+        assert abs(updated.values[name] - off) < 2 * updated.errors[name]

@@ -1,0 +1,377 @@
+"""Truth tests of the residual model: a gap whose law is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scoringrules
+import torch
+from scipy import stats
+
+import retwin as rt
+from retwin.nets.flows import FlowHead
+from retwin.nets.mixtures import Blocks, GaussianMixture
+from retwin.nets.training import Training, isolated
+from retwin.update.residual.refining import energy_score
+
+STEPS = 60
+
+
+def toy_commands(n: int, rng: np.random.Generator) -> np.ndarray:
+    """One movement of a random height."""
+    height = rng.uniform(-1, 1, n)
+    ramp = np.clip((np.arange(STEPS) - 5) / 20, 0, 1)
+    return (height[:, None] * ramp)[..., None]
+
+
+def law(height: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weights, means and deviations (n, 2) of the offset: bimodal and heteroscedastic."""
+    weight = 0.25 + 0.5 * (height + 1) / 2
+    deviation = 0.02 + 0.03 * np.abs(height)
+    mean = 0.2 + 0.1 * height
+    return (
+        np.stack([weight, 1 - weight], -1),
+        np.stack([mean, -mean], -1),
+        np.stack([deviation, deviation], -1),
+    )
+
+
+def toy(n: int, seed: int) -> tuple[rt.Trajectories, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    commands = toy_commands(n, rng)
+    height = commands[:, -1, 0]
+    weights, means, deviations = law(height)
+    mode = (rng.random(n) > weights[:, 0]).astype(int)
+    row = np.arange(n)
+    offset = means[row, mode] + deviations[row, mode] * rng.normal(size=n)
+    # Read as DelayOffset applies it, with a delay of 2 samples.
+    late = toy_commands(n, np.random.default_rng(seed))
+    late = np.concatenate([late[:, :1], late[:, :1], late[:, :-2]], axis=1)
+    ramp = np.clip((np.arange(STEPS) - 7) / 20, 0, 1)
+    observed = late + (offset[:, None] * ramp)[..., None]
+    made = rt.Trajectories(
+        commands=commands,
+        nominal=commands,
+        observed=observed,
+        rate=10.0,
+        labels=np.array(["Healthy"] * n),
+    )
+    return made, offset
+
+
+def true_log_density(height: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    weights, means, deviations = law(height)
+    return np.log((weights * stats.norm.pdf(offset[:, None], means, deviations)).sum(-1))
+
+
+@pytest.fixture(scope="module")
+def identity() -> rt.Surrogate:
+    """A surrogate of the twin y = u."""
+    commands = toy_commands(400, np.random.default_rng(9))
+    twin = rt.Trajectories(commands=commands, nominal=commands, observed=commands, rate=10.0)
+    return rt.fit_surrogate(
+        twin, rt.MLP((32,)), seed=0, training=Training(epochs=40, batch=128, rate=1e-2)
+    )
+
+
+LEARN = Training(epochs=250, batch=256, rate=5e-3, decay="cosine", patience=60)
+
+
+@pytest.fixture(scope="module")
+def fitted(identity: rt.Surrogate) -> dict[int, rt.ResidualModel]:
+    calibration, _ = toy(2500, seed=1)
+    return {
+        k: rt.fit_residual(
+            identity,
+            calibration,
+            rt.DelayOffset(),
+            rt.Mixture(components=k, hidden=(32, 32), dropout=0.0, smoothness=0.0, training=LEARN),
+            seed=0,
+        )
+        for k in (1, 3)
+    }
+
+
+def offset_law(
+    model: rt.ResidualModel, identity: rt.Surrogate, test: rt.Trajectories
+) -> GaussianMixture:
+    context, _ = rt.infer_discrepancy(identity, test, rt.DelayOffset())
+    with torch.no_grad():
+        told = model(context)
+    assert isinstance(told, Blocks)
+    return told.blocks[1]
+
+
+def test_a_bimodal_heteroscedastic_law_is_recovered(
+    fitted: dict[int, rt.ResidualModel], identity: rt.Surrogate
+) -> None:
+    test, offset = toy(1500, seed=2)
+    told = offset_law(fitted[3], identity, test)
+    value = torch.tensor(offset)[:, None, None].float()
+    log_density = told.log_prob(value)[:, 0].numpy()
+    truth = true_log_density(test.commands[:, -1, 0], offset)
+    assert abs(truth.mean() - log_density.mean()) < 0.05
+    pit = told.marginal_cdf(value)[:, 0, 0].numpy()
+    assert stats.kstest(pit, "uniform").pvalue > 0.01
+
+
+def test_it_beats_a_single_gaussian(
+    fitted: dict[int, rt.ResidualModel], identity: rt.Surrogate
+) -> None:
+    test, offset = toy(500, seed=3)
+    value = torch.tensor(offset)[:, None, None].float()
+    scores = {
+        k: offset_law(m, identity, test).log_prob(value).mean().item() for k, m in fitted.items()
+    }
+    assert scores[3] > scores[1] + 0.3
+
+
+@pytest.fixture(scope="module")
+def flow(identity: rt.Surrogate) -> rt.ResidualModel:
+    calibration, _ = toy(2500, seed=1)
+    density = rt.Flow(hidden=(32, 32), dropout=0.0, smoothness=0.0, training=LEARN)
+    return rt.fit_residual(identity, calibration, rt.DelayOffset(), density, seed=0)
+
+
+def test_a_flow_recovers_the_law_too(
+    flow: rt.ResidualModel, identity: rt.Surrogate, tmp_path: Path
+) -> None:
+    test, offset = toy(1500, seed=2)
+    flow.save(tmp_path / "flow")
+    told = offset_law(rt.ResidualModel.load(tmp_path / "flow"), identity, test)
+    value = torch.tensor(offset)[:, None, None].float()
+    with torch.no_grad():
+        log_density = told.log_prob(value)[:, 0].numpy()
+        scores = told.normal_scores(value)[:, 0, 0].numpy()
+        drawn = told.from_noise(value, torch.tensor(scores)[:, None, None])
+        mean = told.mean[:, 0, 0].numpy()
+    truth = true_log_density(test.commands[:, -1, 0], offset)
+    assert abs(truth.mean() - log_density.mean()) < 0.1
+    assert stats.kstest(scores, "norm").pvalue > 0.001
+    torch.testing.assert_close(drawn, value, atol=1e-3, rtol=0)
+    weights, means, _ = law(test.commands[:, -1, 0])
+    assert np.abs(mean - (weights * means).sum(axis=-1)).mean() < 0.04
+
+
+def test_a_flow_starts_as_a_normal_law_in_any_unit() -> None:
+    with isolated(0):
+        head = FlowHead(4, 3, transforms=2, bins=6)
+    head.initialise(np.zeros((1, 3)), seed=0)
+    shift, scale = torch.tensor([1.0, -2.0, 0.0]), torch.tensor([0.1, 5.0, 1.0])
+    drawn = head(torch.randn(7, 4, generator=torch.Generator().manual_seed(0)), shift, scale)
+    value = shift + scale * torch.tensor([0.3, -1.2, 2.0])
+    expected = stats.norm.logpdf(value.numpy(), shift.numpy(), scale.numpy()).sum()
+    np.testing.assert_allclose(drawn.log_prob(value).detach(), expected, atol=1e-4)
+    torch.testing.assert_close(drawn.mean[0].detach(), shift, atol=0.1, rtol=0)
+    torch.testing.assert_close(drawn.variance[0].detach().sqrt(), scale, atol=0, rtol=0.2)
+
+
+def test_draws_follow_the_law_and_the_bounds(
+    fitted: dict[int, rt.ResidualModel], identity: rt.Surrogate
+) -> None:
+    test, offset = toy(1500, seed=4)
+    context, _ = rt.infer_discrepancy(identity, test, rt.DelayOffset())
+    generator = torch.Generator().manual_seed(0)
+    drawn = fitted[3].sample(context, generator=generator)
+    assert stats.ks_2samp(drawn[:, 0, 1].numpy(), offset).pvalue > 0.01
+    tight = rt.fit_residual(identity, toy(60, seed=5)[0], seed=0, bounds=np.array([1.0, 0.1]))
+    assert tight.sample(context, generator=generator).abs().amax((0, 1)).tolist() == pytest.approx(
+        [1.0, 0.1]
+    )
+
+
+def test_a_density_integrates_to_one() -> None:
+    generator = torch.Generator().manual_seed(0)
+    factor = torch.randn(3, 2, 2, generator=generator).tril(-1) + torch.diag_embed(
+        torch.rand(3, 2, generator=generator) + 0.5
+    )
+    mixture = GaussianMixture(
+        torch.randn(3, generator=generator), torch.randn(3, 2, generator=generator), factor
+    )
+    axis = torch.linspace(-12, 12, 600)
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1)
+    volume = mixture.log_prob(grid).exp().sum() * (axis[1] - axis[0]) ** 2
+    assert volume == pytest.approx(1.0, abs=1e-3)
+    marginal = mixture.marginal_cdf(torch.tensor([0.3, -0.2]))
+    below = (grid[..., 0] <= 0.3) * mixture.log_prob(grid).exp()
+    assert marginal[0] == pytest.approx((below.sum() * (axis[1] - axis[0]) ** 2).item(), abs=1e-2)
+
+
+def test_draws_from_noise_have_the_mixture_s_moments() -> None:
+    mixture = GaussianMixture(
+        torch.tensor([0.0, 1.0]),
+        torch.tensor([[0.0, 1.0], [3.0, -1.0]]),
+        torch.tensor([[[1.0, 0], [0.5, 0.2]], [[0.3, 0], [0, 2.0]]]),
+    )
+    both = Blocks([mixture, mixture])
+    drawn = both.sample((40_000,), generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(drawn.mean(0), both.mean, atol=0.05, rtol=0)
+    torch.testing.assert_close(drawn.var(0), both.variance, atol=0.1, rtol=0.05)
+    again = both.sample((40_000,), generator=torch.Generator().manual_seed(0))
+    assert torch.equal(drawn, again)
+
+
+def test_calibrates_on_healthy_by_default(ibg: rt.Surrogate, emulated: rt.Trajectories) -> None:
+    brief = rt.Mixture(training=Training(epochs=3, batch=64))
+    few = rt.fit_residual(ibg, emulated, density=brief, seed=0)
+    assert few.fitted.figures["trajectories"] == 10
+    every = rt.fit_residual(ibg, emulated, density=brief, seed=0, calibrate_on="all")
+    assert every.fitted.figures["trajectories"] == 90
+    assert every.scale[1:].max() > 1.5 * few.scale[1:].max(), "the offset absorbs the faults"
+
+
+def test_six_healthy_trajectories_are_enough(ibg: rt.Surrogate, emulated: rt.Trajectories) -> None:
+    model = rt.fit_residual(ibg, emulated.with_label("Healthy")[:6], seed=0)
+    context, _ = rt.infer_discrepancy(ibg, emulated.with_label("Healthy"), rt.DelayOffset())
+    drawn = model.sample(context, generator=torch.Generator().manual_seed(0))
+    assert torch.isfinite(drawn).all()
+    assert 2 < drawn[..., 0].median() < 9
+
+
+def test_too_few_to_validate_is_a_warning(ibg: rt.Surrogate, emulated: rt.Trajectories) -> None:
+    brief = rt.Mixture(training=Training(epochs=3))
+    with pytest.warns(UserWarning, match="2 trajectories to calibrate on, at least three"):
+        model = rt.fit_residual(ibg, emulated.with_label("Healthy")[:2], density=brief, seed=0)
+    assert model.fitted.history["validation"] == []
+
+
+def test_nothing_to_calibrate_on_is_refused(ibg: rt.Surrogate, emulated: rt.Trajectories) -> None:
+    with pytest.raises(rt.InputError, match="at least one trajectory labelled 'Healthy'"):
+        rt.fit_residual(ibg, emulated.with_label("Motor_1_Stuck"), seed=0)
+    with pytest.raises(rt.InputError, match="'healthy', 'all', or what fault"):
+        rt.fit_residual(ibg, emulated, seed=0, calibrate_on="some")
+    still = emulated.replace(commands=np.full_like(emulated.commands, 500))
+    with pytest.raises(rt.InputError, match="commands that never change"):
+        rt.fit_residual(ibg, still, seed=0)
+
+
+def test_saved_and_loaded_is_the_same(
+    rg: rt.ResidualModel, ibg: rt.Surrogate, emulated: rt.Trajectories, tmp_path: Path
+) -> None:
+    rg.save(tmp_path / "rg")
+    back = rt.ResidualModel.load(tmp_path / "rg")
+    context, _ = rt.infer_discrepancy(ibg, emulated[:4], back.correction)
+    draws = [m.sample(context, generator=torch.Generator().manual_seed(1)) for m in (rg, back)]
+    assert torch.equal(*draws)
+    assert back.fitted == rg.fitted
+    np.testing.assert_array_equal(back.timing, rg.timing)
+
+
+def test_calibration_data_must_speak_of_the_same_system(
+    ibg: rt.Surrogate, emulated: rt.Trajectories
+) -> None:
+    with pytest.raises(rt.InputError, match=r"calibration.rate: expected .* 100.0, got 50.0"):
+        rt.fit_residual(ibg, emulated.replace(rate=50.0), seed=0)
+    millimetres = rt.Channels(("x", "y", "z"), ("mm",) * 3)
+    with pytest.raises(rt.InputError, match=r"calibration.outputs"):
+        rt.fit_residual(ibg, emulated.replace(outputs=millimetres), seed=0)
+    with pytest.raises(rt.InputError, match="one positive bound for each of delay, offset_x"):
+        rt.fit_residual(ibg, emulated, seed=0, bounds=np.ones(3))
+    with pytest.raises(rt.InputError, match="components: expected at least 1, got 0"):
+        rt.Mixture(components=0)
+
+
+def test_what_was_calibrated_on_emulated_data_says_so(
+    rg: rt.ResidualModel, updated: rt.CorrectedTwin, case: rt.Case, tmp_path: Path
+) -> None:
+    assert rg.emulated
+    updated.save(tmp_path / "twin")
+    back = rt.CorrectedTwin.load(tmp_path / "twin")
+    assert rt.generate(back, case, per_class=1, seed=0).emulated
+
+
+def test_the_energy_score_is_the_one_of_the_literature() -> None:
+    generator = torch.Generator().manual_seed(0)
+    made = torch.randn(4, 30, 20, 2, generator=generator, dtype=torch.float64)
+    observed = torch.randn(4, 20, 2, generator=generator, dtype=torch.float64)
+    mask = torch.ones(4, 20, 2, dtype=torch.bool)
+    mask[:, 15:] = False
+    ours = energy_score(made, observed, mask)
+    kept = (made[:, :, :15].flatten(2), observed[:, :15].flatten(1))
+    theirs = scoringrules.es_ensemble(
+        kept[1].numpy() / np.sqrt(15), kept[0].numpy() / np.sqrt(15), estimator="fair"
+    )
+    np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def poor(identity: rt.Surrogate) -> dict[str, rt.ResidualModel]:
+    """A model that stopped too early, with and without refinement."""
+    calibration, _ = toy(60, seed=4)
+    brief = {"dropout": 0.0, "training": Training(epochs=1)}
+    how = rt.Refinement(training=Training(epochs=25, batch=16, rate=1e-2, patience=10))
+    bounds = np.array([6.0, 0.6])
+    return {
+        name: rt.fit_residual(
+            identity, calibration, rt.DelayOffset(), density, seed=0, bounds=bounds
+        )
+        for name, density in (
+            ("before", rt.Flow(**brief)),
+            ("after", rt.Flow(**brief, refinement=how)),
+        )
+    }
+
+
+def test_refinement_helps_a_poor_model_on_trajectories_it_never_saw(
+    poor: dict[str, rt.ResidualModel], identity: rt.Surrogate
+) -> None:
+    figures = poor["after"].fitted.figures
+    assert figures["refined"] == 1.0
+    assert figures["energy after"] < figures["energy before"]
+    test, _ = toy(300, seed=5)
+    scores = {}
+    for name, model in poor.items():
+        draws = np.stack(
+            [rt.CorrectedTwin(identity, model).simulate(test.commands, seed=s).observed
+             for s in range(20)], axis=1,
+        )  # fmt: skip
+        observed = torch.tensor(test.observed)
+        scores[name] = energy_score(torch.tensor(draws), observed, observed == observed).mean()
+    assert scores["after"] < scores["before"]
+
+
+def test_refinement_that_does_not_help_changes_nothing(identity: rt.Surrogate) -> None:
+    calibration, _ = toy(30, seed=6)
+    wild = rt.Refinement(draws=2, training=Training(epochs=1, batch=30, rate=50.0, decay="step"))
+    models = [
+        rt.fit_residual(
+            identity,
+            calibration,
+            rt.DelayOffset(),
+            rt.Mixture(training=Training(epochs=20), refinement=how),
+            seed=0,
+        )
+        for how in (None, wild)
+    ]
+    assert models[1].fitted.figures["refined"] == 0.0
+    one, other = (model.state_dict() for model in models)
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.slow
+def test_faulty_trajectories_calibrate_without_their_fault_in_the_gap(
+    ibg: rt.Surrogate, emulated: rt.Trajectories, case: rt.Case
+) -> None:
+    """All nine classes, faults named: offsets as small as those of healthy ones alone."""
+    some = emulated[np.flatnonzero(np.arange(len(emulated)) % 10 < 3)]
+    healthy = some.with_label("Healthy")
+    named = [case.faults[label] for label in some.labels]
+    size = {}
+    for name, used, faults in (
+        ("healthy", healthy, None),
+        ("named", some, named),
+        ("all", some, None),
+    ):
+        context, found = rt.infer_discrepancy(ibg, used, case.correction, faults=faults)
+        free = torch.tensor(context.segments.start)[..., None] < context.frozen[:, None]
+        free = free & (context.told == context.commands).all(dim=1)[:, None]
+        size[name] = found.z[..., 1:5][free].square().mean().sqrt()
+    assert size["named"] < 1.3 * size["healthy"]
+    assert size["all"] > 1.3 * size["named"]
+    brief = rt.Mixture(training=Training(epochs=3))
+    fitted = rt.fit_residual(
+        ibg, emulated[::10], case.correction, brief, seed=0, calibrate_on=case.faults
+    )
+    assert fitted.fitted.figures["trajectories"] == 9

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import retwin as rt
+from retwin.nets.training import Training
+
+
+def test_default_reaches_a_third_of_a_millimetre(case: rt.Case) -> None:
+    """RMSE <= 0.3 mm per axis on held-out trajectories, for the default network and training."""
+    twin = rt.generate(case.twin, case, per_class=400, seed=0)
+    ibg = rt.fit_surrogate(twin, seed=0)
+    assert ibg.fitted.figures["held_out"] == 360
+    for axis in "xyz":
+        assert ibg.fitted.figures[f"rmse_{axis}"] <= 3e-4
+
+
+@pytest.mark.parametrize("network", [rt.LSTM(16), rt.TCN(16, levels=3)], ids=repr)
+def test_networks_with_memory_learn_too(
+    network: rt.LSTM | rt.TCN, twin_set: rt.Trajectories
+) -> None:
+    short = Training(epochs=8, batch=8, rate=1e-2)
+    ibg = rt.fit_surrogate(twin_set, network, seed=0, training=short)
+    for axis in "xyz":
+        assert ibg.fitted.figures[f"nrmse_{axis}"] < 0.5, "far better than the mean"
+
+
+def test_the_fast_path_is_the_plain_one(ibg: rt.Surrogate, twin_set: rt.Trajectories) -> None:
+    commands = twin_set.commands[:20]
+    with torch.no_grad():
+        plain = ibg(torch.tensor(commands)).numpy()
+    np.testing.assert_allclose(ibg.predict(commands), plain, atol=1e-6)
+
+
+def test_same_seed_same_bytes(twin_set: rt.Trajectories, tmp_path: Path) -> None:
+    brief = Training(epochs=1)
+    for name in ("a", "b"):
+        rt.fit_surrogate(twin_set, rt.MLP((8,)), seed=7, training=brief).save(tmp_path / name)
+    for file in ("model.json", "weights.safetensors"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_saved_and_loaded_is_the_same(
+    ibg: rt.Surrogate, twin_set: rt.Trajectories, tmp_path: Path
+) -> None:
+    ibg.save(tmp_path / "ibg")
+    back = rt.Surrogate.load(tmp_path / "ibg")
+    np.testing.assert_array_equal(
+        back.predict(twin_set.commands[:3]), ibg.predict(twin_set.commands[:3])
+    )
+    assert back.fitted == ibg.fitted
+    assert (back.inputs, back.outputs, back.rate) == (ibg.inputs, ibg.outputs, ibg.rate)
+
+
+def test_bad_input_is_refused(twin_set: rt.Trajectories, tmp_path: Path) -> None:
+    with pytest.raises(rt.InputError, match="at least 10 trajectories"):
+        rt.fit_surrogate(twin_set[:5], seed=0)
+    bare = twin_set.replace(commands=twin_set.commands[..., :0], inputs=None)
+    with pytest.raises(rt.InputError, match="0 command channels"):
+        rt.fit_surrogate(bare, seed=0)
+    with pytest.raises(rt.InputError, match="expected a surrogate model"):
+        rt.Surrogate.load(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("damage", ["truncate", "not json", "other kind", "newer"])
+def test_damaged_models_are_refused(ibg: rt.Surrogate, tmp_path: Path, damage: str) -> None:
+    ibg.save(tmp_path / "m")
+    about, weights = tmp_path / "m" / "model.json", tmp_path / "m" / "weights.safetensors"
+    if damage == "truncate":
+        weights.write_bytes(weights.read_bytes()[:100])
+    elif damage == "not json":
+        about.write_text("{")
+    elif damage == "other kind":
+        about.write_text(about.read_text().replace('"surrogate"', '"residual"'))
+    else:
+        about.write_text(about.read_text().replace('"schema": 1', '"schema": 99'))
+    with pytest.raises(rt.InputError, match="expected a surrogate model"):
+        rt.Surrogate.load(tmp_path / "m")
