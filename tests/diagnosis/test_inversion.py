@@ -89,6 +89,33 @@ def test_evidence_is_that_of_a_gaussian(monkeypatch: pytest.MonkeyPatch) -> None
     np.testing.assert_allclose(gaps, common, atol=1e-3)
 
 
+def test_correlated_noise_is_learned_at_every_polling_phase() -> None:
+    """Samples of one trajectory are neighbours whatever lies between them in another one."""
+    commands = SAMPLER.sample(4, rng=np.random.default_rng(0))
+    segments = rt.Segments.from_commands(commands)
+    context = rt.Context.of(Linear(), commands, segments, rate=100.0)
+    # Each error of a sample repeats, a little changed, in the next one that is polled.
+    rng, error = np.random.default_rng(1), np.zeros((4, 100, 3))
+    for k in range(1, 100):
+        error[:, k] = 0.95 * error[:, k - 1] + rng.normal(0, 0.01, (4, 3))
+    observed = torch.tensor(context.nominal.numpy() + error.repeat(4, axis=1))
+    thinning = []
+    for phases in ((0, 0, 0, 0), (0, 0, 2, 2)):
+        mask = torch.zeros(4, 400, 3, dtype=torch.bool)
+        for row, phase in enumerate(phases):
+            mask[row, phase::4] = True
+        problem = Problem(rt.CommandSpace(), context, observed, mask)
+        problem.observed, problem.unit = problem.observed * problem.unit, torch.ones(())
+        x, missed = problem.nothing()
+        size = x[0].numel()
+        covariance = 1e-8 * torch.eye(size, dtype=torch.float64).expand(4, -1, -1)
+        fit = evidence.Fit(x, missed, covariance, torch.zeros(4, dtype=torch.float64))
+        noise = Noise.first(problem.residual(x, missed), problem)
+        thinning.append(noise.learned(problem, fit).thinning)
+    assert thinning[0][0] > 10
+    torch.testing.assert_close(thinning[1], thinning[0], rtol=0.2, atol=0.0)
+
+
 @pytest.mark.parametrize("mean", [(25.0, -30.0), (3.0, 20.0), (0.0, -9.0)])
 def test_limits_of_a_bias_are_integrated(mean: tuple[float, float]) -> None:
     """Against a fine grid over the four boxes of two movements."""

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import retwin as rt
 from retwin.diagnosis import RocketDiagnoser, fit_rocket
@@ -51,6 +52,18 @@ def test_is_as_sure_as_it_is_right() -> None:
 
 def test_is_a_diagnoser(rocket: RocketDiagnoser) -> None:
     check_diagnoser(rocket, toy(5, seed=2))
+
+
+def test_what_is_not_finite_has_no_probabilities(rocket: RocketDiagnoser) -> None:
+    weights = {**rocket.weights, "mean": torch.full_like(rocket.weights["mean"], np.nan)}
+    broken = RocketDiagnoser(
+        rocket.features,
+        classes=rocket.classes,
+        samples=rocket.samples,
+        weights=weights,
+        figures={},
+    )
+    assert np.isnan(broken.predict_proba(toy(5, seed=2))).all()
 
 
 def test_saved_and_loaded_is_the_same(rocket: RocketDiagnoser, tmp_path: Path) -> None:

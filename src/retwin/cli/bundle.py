@@ -99,7 +99,10 @@ def predict(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Diagnose trajectories, and say which of them the bundle was not made for."""
+    """Diagnose trajectories, and say which of them the bundle was not made for.
+
+    A trajectory that is outside has no diagnosis and no probabilities.
+    """
     bundle = _opened(folder)
     trajectories = read(file, case_named(case))
     found = bundle.predict(trajectories)
@@ -108,7 +111,13 @@ def predict(
     for each, (verdict, reason) in zip(told, verdicts, strict=True):
         each |= {"guard": verdict, "because_of": reason}
     rows = [
-        (e["id"], e["diagnosis"], f"{e['probability']:.2f}", e["guard"], e["because_of"])
+        (
+            e["id"],
+            e["diagnosis"],
+            "" if e["probability"] is None else f"{e['probability']:.2f}",
+            e["guard"],
+            e["because_of"],
+        )
         for e in told
     ]
     answer(

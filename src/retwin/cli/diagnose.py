@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from numpy.typing import NDArray
 
@@ -17,6 +18,7 @@ from retwin.cli.options import CaseOption, Json, Seed
 from retwin.cli.reading import case_named, read
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data.trajectories import Trajectories
+from retwin.errors import InputError
 from retwin.serialisation.files import write_atomically
 
 __all__ = ["EMULATED", "app", "diagnoses", "write_probabilities"]
@@ -118,6 +120,7 @@ def predict(
     diagnoser = rt.load_diagnoser(model)
     trajectories = read(file, case_named(case))
     probabilities = diagnoser.predict_proba(trajectories)
+    _check_finite(trajectories, probabilities)
     labels = trajectories.labels.tolist()
     labelled = bool(trajectories.known_labels) and "" not in labels
     scores = rt.evaluate(diagnoser, trajectories) if labelled else None
@@ -139,16 +142,37 @@ def predict(
 def diagnoses(
     trajectories: Trajectories, classes: Sequence[str], probabilities: NDArray
 ) -> list[dict[str, Any]]:
-    """What is said of each trajectory: the best class, and the probability of every one."""
-    return [
-        {
-            "id": name,
-            "diagnosis": classes[shares.argmax()],
-            "probability": float(shares.max()),
-            "probabilities": dict(zip(classes, shares.tolist(), strict=True)),
-        }
-        for name, shares in zip(trajectories.ids.tolist(), probabilities, strict=True)
-    ]
+    """For each trajectory the best class, and the probability of every class.
+
+    Without a class, and with None for each probability, where one of them is not finite.
+    """
+    made = []
+    for name, shares in zip(trajectories.ids.tolist(), probabilities, strict=True):
+        finite = bool(np.isfinite(shares).all())
+        values = shares.tolist() if finite else [None] * len(classes)
+        made.append(
+            {
+                "id": name,
+                "diagnosis": classes[shares.argmax()] if finite else "",
+                "probability": float(shares.max()) if finite else None,
+                "probabilities": dict(zip(classes, values, strict=True)),
+            }
+        )
+    return made
+
+
+def _check_finite(trajectories: Trajectories, probabilities: NDArray) -> None:
+    """Raise InputError, which names the trajectories, where a probability is not finite."""
+    bad = trajectories.ids[~np.isfinite(probabilities).all(axis=1)].tolist()
+    if bad:
+        more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+        raise InputError(
+            "probabilities",
+            expected="finite probabilities from the diagnoser",
+            got=f"NaN for {', '.join(bad[:5])}{more}",
+            remedy="replace sentinel values in these trajectories by NaN, or train the diagnoser "
+            "anew if it gives NaN for others too",
+        )
 
 
 def write_probabilities(

@@ -33,9 +33,9 @@ def fetch(
     """The path of a public file, downloaded when it is not in the cache yet.
 
     The cache is `folder`, else the environment variable RETWIN_CACHE, else the user's cache folder.
-    The file lies there as `armpi/my_dataset_test.mat` and the like, so that the cache can serve as
-    RETWIN_DATA. `url` names another place to get it from; the SHA-256 stays the known one. A name
-    that is not in `DOWNLOADS` needs both `url` and `sha256`. A cached file whose SHA-256 is wrong is
+    The file lies there under the name that the catalog states, so that the cache can serve as
+    RETWIN_DATA. `url` names another address; the SHA-256 stays the known one. A name that is not
+    in `catalog.DOWNLOADS` needs both `url` and `sha256`. A cached file whose SHA-256 is wrong is
     fetched again. `progress` is called with the share that is done.
 
     Raises

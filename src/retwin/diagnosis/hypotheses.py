@@ -309,7 +309,7 @@ class Hypotheses:
         problem = self.problem
         told = problem.commands(fit.x, fit.missed)
         step = torch.nn.functional.one_hot(self.actuator, told.shape[2])[:, None]
-        turn = (problem.surrogate(told + step) - problem.surrogate(told))[:, problem.kept]
+        turn = problem.predicted(told + step) - problem.predicted(told)
         square = (turn.double() / noise.scale[0]).square().sum(dim=-1) * problem.seen
         return problem.seen.sum(dim=1) / square.sum(dim=1).clamp_min(1e-12)
 

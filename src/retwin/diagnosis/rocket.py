@@ -95,7 +95,10 @@ class RocketDiagnoser:
             )
         convolved = _convolved(self._transform, standard)
         slope, level = (self.weights[name].double().numpy() for name in ("slope", "level"))
-        return softmax(convolved @ slope.T + level, axis=1)
+        found: NDArray = softmax(convolved @ slope.T + level, axis=1)
+        # The comparison with a bias gives a finite share also where a channel is not finite.
+        found[~np.isfinite(_channels(standard)).all(axis=(1, 2))] = np.nan
+        return found
 
     def save(self, folder: str | Path) -> None:
         """Write weights and description, see `retwin.serialisation.models`."""

@@ -6,10 +6,12 @@ import json
 import shutil
 import subprocess
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -273,6 +275,22 @@ def test_the_commands(call: Call, bundle: Bundle, saved: Path, tmp_path: Path) -
     rows = (tmp_path / "found.csv").read_text().splitlines()
     assert rows[0].split(",")[:4] == ["trajectory", "guard", "because_of", "Healthy"]
     assert len(rows) == 1 + len(made)
+
+
+def test_a_diagnoser_alone_names_what_it_cannot_diagnose(
+    call: Call, bundle: Bundle, emulated: rt.Trajectories, tmp_path: Path
+) -> None:
+    rt.save(emulated[:7], tmp_path / "real.npz")
+    broken = deepcopy(bundle.diagnoser)
+    with torch.no_grad():
+        next(broken.network.parameters()).fill_(np.nan)
+    broken.save(tmp_path / "broken")
+    words = ("diagnose", "predict", tmp_path / "broken", tmp_path / "real.npz")
+    code, out, err = call(*words, "--out", tmp_path / "found.csv")
+    assert (code, out) == (2, "")
+    assert f"NaN for {emulated.ids[0]}, {emulated.ids[1]}" in " ".join(err.split())
+    assert "and 2 more" in " ".join(err.split())
+    assert not (tmp_path / "found.csv").exists()
 
 
 @pytest.mark.slow

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 
 import retwin as rt
 from retwin.deploy.bundle.guard import Guard, fit_guard, implausible
-from retwin.deploy.bundle.verdicts import CHECKS, Domain
+from retwin.deploy.bundle.verdicts import CHECKS, Domain, Prediction, Verdicts
 from retwin.nets.training import Training
 
 RNG = np.random.default_rng(0)
@@ -24,15 +26,20 @@ def toy(commands: list[float], observed: list[float]) -> rt.Trajectories:
     return rt.Trajectories(commands=told, nominal=np.zeros_like(seen), observed=seen, rate=1.0)
 
 
+def always(value: float) -> Callable[[rt.Trajectories], NDArray]:
+    """A mismatch or an energy that is the same for all trajectories."""
+    return lambda trajectories: np.full(len(trajectories), value)
+
+
 def test_the_scores_are_multiples_of_what_is_usual() -> None:
-    # Commands 4 beyond a range of 100, speed 10 over 5, an output 0.2 beyond a range of 2.
-    odd = toy([98.0, 104.0, 94.0, 94.0], [0.0, 1.2, np.nan, 0.0])
-    verdicts = RANGES.judge(odd, np.array([0.2]), np.array([2.0 + np.log(3.0)]))
-    expected = [4 / 100 / 0.02, 5 / 5 / 0.02, 0.2 / 2 / 0.02, 2.0, 0.25 / 0.25, 3.0]
+    # Commands 4 beyond a range of 100, speed 0.5 over 5, an output 0.2 beyond a range of 2.
+    odd = toy([98.5, 104.0, 99.0, 99.0], [0.0, 1.2, np.nan, 0.0])
+    verdicts = RANGES.judge(odd, always(0.2), always(2.0 + np.log(3.0)), steps=6)
+    expected = [2.0, 5.0, 5.0, 2.0, 0.25 / 0.25, 6 / 4 / 2, 3.0, 0.0]
     np.testing.assert_allclose(verdicts.scores[0], expected, rtol=1e-6)
     assert verdicts.reason.tolist() == ["speed"]
-    assert verdicts.verdict.tolist() == ["outside"]
-    usual = RANGES.judge(toy([0.0, 5.0, 10.0], [0.0, 1.0, -1.0]), np.array([0.1]), np.array([2.0]))
+    assert verdicts.verdict.tolist() == ["unusual"]
+    usual = RANGES.judge(toy([0.0, 5.0, 10.0], [0.0, 1.0, -1.0]), always(0.1), always(2.0))
     assert (usual.verdict.tolist(), usual.reason.tolist()) == (["ok"], [""])
     assert usual.suspicion.tolist() == [1.0]
 
@@ -40,7 +47,71 @@ def test_the_scores_are_multiples_of_what_is_usual() -> None:
 def test_without_commands_it_says_so() -> None:
     bare = toy([0.0, 0.0], [0.0, 0.0]).replace(commands=np.zeros((1, 2, 0)), inputs=None)
     with pytest.raises(rt.InputError, match="without commands nothing says what is usual"):
-        RANGES.judge(bare, np.zeros(1), np.zeros(1))
+        RANGES.judge(bare, always(0.0), always(0.0))
+
+
+def never(trajectories: rt.Trajectories) -> NDArray:
+    raise AssertionError("a network was run")
+
+
+@pytest.mark.parametrize("value", [3.4e38, -3.4e38, 1e37, 1e308, -1e308])
+@pytest.mark.parametrize("name", ["commands", "nominal", "observed"])
+def test_sentinels_reach_no_network(name: str, value: float) -> None:
+    usual = toy([0.0, 5.0, 10.0], [0.0, 1.0, -1.0])
+    array = getattr(usual, name).copy()
+    array[0, 1] = value
+    verdicts = RANGES.judge(usual.replace(**{name: array}), never, never)
+    assert verdicts.verdict.tolist() == ["outside"]
+    reason = {"commands": "commands", "nominal": "nominal", "observed": "outputs"}[name]
+    # 1e308 overflows the speed as well, in which case either of the two is named.
+    assert verdicts.reason.tolist()[0] in (reason, "speed" if name == "commands" else reason)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["nominal", "residual"])
+def test_what_is_not_finite_is_outside(name: str, value: float) -> None:
+    usual = toy([0.0, 5.0, 10.0], [0.0, 1.0, -1.0])
+    mismatch, energy = (value, 0.0) if name == "nominal" else (0.1, value)
+    verdicts = RANGES.judge(usual, always(mismatch), always(energy))
+    assert verdicts.verdict.tolist() == ["outside"]
+    assert verdicts.reason.tolist() == [name]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_score_that_is_not_finite_is_the_largest(value: float) -> None:
+    scores = np.zeros((1, len(CHECKS)))
+    scores[0, 2], scores[0, 4] = 5.0, value
+    verdicts = Verdicts(scores)
+    assert (verdicts.verdict.tolist(), verdicts.reason.tolist()) == (["outside"], ["missing"])
+
+
+def test_nothing_measured_and_another_length_are_outside() -> None:
+    usual = toy([0.0, 5.0, 10.0], [0.0, 1.0, -1.0])
+    nothing = usual.replace(mask=np.zeros_like(usual.mask))
+    assert RANGES.judge(nothing, never, never).reason.tolist() == ["missing"]
+    for steps, verdict in ((6, "ok"), (7, "unusual"), (61, "outside")):
+        assert RANGES.judge(usual, always(0.1), always(0.0), steps=steps).verdict == verdict
+
+
+@pytest.mark.parametrize("row", [[np.nan, 0.5], [np.inf, 0.0], [7.0, -6.0], [0.5, 0.6], [0, 0]])
+def test_what_are_no_probabilities_are_no_class(row: list[float]) -> None:
+    given = np.array([[0.2, 0.8], row])
+    found = Prediction(("a", "b"), given, Verdicts(np.zeros((2, len(CHECKS)))))
+    assert found.diagnosis.tolist() == ["b", ""]
+    assert found.verdicts.verdict.tolist() == ["ok", "outside"]
+    assert found.verdicts.reason.tolist() == ["", "probabilities"]
+    np.testing.assert_array_equal(found.probabilities, [[0.2, 0.8], [np.nan, np.nan]])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("energy", np.nan), ("mismatch", np.inf), ("low", (np.nan,)), ("ceiling", (np.inf,))],
+)
+def test_a_domain_that_is_not_finite_is_refused(name: str, value: object) -> None:
+    with pytest.raises(rt.InputError, match="expected finite ranges and limits"):
+        replace(RANGES, **{name: value})
+    with pytest.raises(rt.InputError, match="expected finite ranges and limits"):
+        replace(RANGES, low=(-1e308,), high=(1e308,))
 
 
 def test_ranges_take_in_all_that_was_seen() -> None:
@@ -112,12 +183,13 @@ def test_each_check_tells_its_reason(
     commands[:, 300:] += 600
     jumps = healthy.commands.copy()
     jumps[:, ::2] += 10
+    # The observed outputs stay: where they are outside, the surrogate is not run.
     shifted = healthy.nominal + np.float32(0.1)
     changes = {
         "commands": {"commands": commands},
         "speed": {"commands": jumps},
         "outputs": {"observed": healthy.observed + np.float32(3)},
-        "nominal": {"nominal": shifted, "observed": healthy.observed + np.float32(0.1)},
+        "nominal": {"nominal": shifted},
         "missing": {"mask": np.zeros_like(healthy.mask)},
     }
     for name, change in changes.items():

@@ -6,11 +6,13 @@ import json
 import shutil
 import subprocess
 import sys
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from time import process_time
 
 import numpy as np
+import onnx
 import pytest
 import torch
 
@@ -148,6 +150,109 @@ def test_what_it_was_not_made_for_is_refused(
         Portable.load(tmp_path / "bundle")
 
 
+@pytest.mark.parametrize("value", [3.4e38, -3.4e38, 1e37])
+def test_a_sentinel_is_outside_with_torch_and_without(
+    portable: Portable, bundle: Bundle, emulated: rt.Trajectories, value: float
+) -> None:
+    observed = emulated.observed[:4].copy()
+    observed[1, 500, 0] = value
+    nominal = emulated.nominal[:4].copy()
+    nominal[2, 503, 1] = value  # between the samples that the guard looks at
+    mask = emulated.mask[:4].copy()
+    mask[3] = False
+    odd = emulated[:4].replace(observed=observed, nominal=nominal, mask=mask)
+    for each in (bundle, portable):
+        found = each.predict(odd)
+        assert found.verdicts.verdict[1:].tolist() == ["outside"] * 3
+        assert found.verdicts.reason[1:].tolist() == ["outputs", "nominal", "missing"]
+        assert found.diagnosis[1:].tolist() == [""] * 3
+        assert np.isnan(found.probabilities[1:]).all()
+        alone = each.predict(emulated[:1])
+        np.testing.assert_allclose(found.probabilities[0], alone.probabilities[0], atol=1e-6)
+        assert found.diagnosis[0] == alone.diagnosis[0] != ""
+
+
+def test_another_length_is_outside_with_torch_and_without(
+    portable: Portable, bundle: Bundle, emulated: rt.Trajectories
+) -> None:
+    arrays = {name: getattr(emulated, name)[:3, :2] for name in ("commands", "nominal", "observed")}
+    short = emulated[:3].replace(**arrays, mask=None)
+    for each in (bundle, portable):
+        found = each.predict(short)
+        assert found.verdicts.verdict.tolist() == ["outside"] * 3
+        assert found.verdicts.reason.tolist() == ["length"] * 3
+
+
+def test_a_diagnoser_or_a_guard_with_nan_weights_is_no_diagnosis(
+    bundle: Bundle, emulated: rt.Trajectories
+) -> None:
+    for part, reason in (("diagnoser", "probabilities"), ("guard", "residual")):
+        broken = replace(bundle, **{part: deepcopy(getattr(bundle, part))})
+        with torch.no_grad():
+            next(getattr(broken, part).network.parameters()).fill_(np.nan)
+        found = broken.predict(emulated[:3])
+        assert found.verdicts.verdict.tolist() == ["outside"] * 3
+        assert found.verdicts.reason.tolist() == [reason] * 3
+        assert found.diagnosis.tolist() == [""] * 3
+
+
+@pytest.mark.parametrize(
+    ("name", "operators"),
+    [
+        ("diagnoser", [("Concat", ["{0}", "{0}"], {"axis": 1})]),
+        ("diagnoser", [("Add", ["{0}", "seven"], {})]),
+        ("diagnoser", [("Sqrt", ["minus"], {}), ("Add", ["{0}", "{1}"], {})]),
+        ("guard", [("Sqrt", ["minus"], {}), ("Add", ["{0}", "{1}"], {})]),
+        ("surrogate", [("Sqrt", ["minus"], {}), ("Add", ["{0}", "{1}"], {})]),
+        ("surrogate", [("Concat", ["{0}", "{0}"], {"axis": 2})]),
+    ],
+)
+def test_a_forged_graph_is_refused(
+    exported: Exported,
+    emulated: rt.Trajectories,
+    tmp_path: Path,
+    name: str,
+    operators: list[tuple[str, list[str], dict[str, int]]],
+) -> None:
+    """Sealed anew, with another width, probabilities of 7 and more, or NaN."""
+    folder = Path(shutil.copytree(exported[0], tmp_path / "copy"))
+    file = folder / f"{name}.onnx"
+    model = onnx.load(file)
+    graph = model.graph
+    for constant, value in (("seven", 7.0), ("minus", -1.0)):
+        graph.initializer.append(onnx.numpy_helper.from_array(np.float32(value), constant))
+    names = [graph.output[0].name]
+    for i, (operator, inputs, attributes) in enumerate(operators):
+        given = [each.format(*names) for each in inputs]
+        graph.node.append(onnx.helper.make_node(operator, given, [f"forged{i}"], **attributes))
+        names.append(f"forged{i}")
+    graph.output[0].CopyFrom(onnx.helper.make_empty_tensor_value_info(names[-1]))
+    graph.output[0].type.tensor_type.elem_type = onnx.TensorProto.FLOAT
+    onnx.save(model, file)
+    seal(folder)
+    forged = Portable.load(folder)
+    with pytest.raises(rt.InputError, match=rf"{name}\.onnx.*retwin bundle export"):
+        forged.predict(emulated[:3])
+
+
+@pytest.mark.parametrize("name", ["energy", "mismatch", "floor", "spread"])
+def test_constants_that_are_not_finite_are_refused(
+    exported: Exported, saved: Path, tmp_path: Path, name: str
+) -> None:
+    for source, about_in, load in (
+        (exported[0], "model.json", Portable.load),
+        (saved, "guard/model.json", Bundle.load),
+    ):
+        folder = Path(shutil.copytree(source, tmp_path / source.name))
+        about = json.loads((folder / about_in).read_text())
+        value = about["domain"][name]
+        about["domain"][name] = [np.nan, *value[1:]] if isinstance(value, list) else np.nan
+        (folder / about_in).write_text(json.dumps(about))
+        seal(folder)
+        with pytest.raises(rt.InputError, match="expected finite ranges and limits"):
+            load(folder)
+
+
 def test_a_damaged_export_is_refused(exported: Exported, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(exported[0], tmp_path / "copy"))
     graph = folder / "diagnoser.onnx"
@@ -206,6 +311,23 @@ def test_the_commands_export_and_predict(
     code, out, err = call("bundle", "predict", exported[0], tmp_path / "real.npz")
     assert code == 0, err
     assert "EMULATED" in out
+    observed = emulated.observed.copy()
+    observed[0, 500, 0] = 3.4e38
+    rt.save(emulated.replace(observed=observed), tmp_path / "odd.npz")
+    for folder in (saved, exported[0]):
+        odd = ("bundle", "predict", folder, tmp_path / "odd.npz", "--out", tmp_path / "odd.csv")
+        code, out, err = call(*odd, "--json")
+        assert (code, "Warning" in err) == (0, False), err
+        first = json.loads(out)["trajectories"][0]
+        assert (first["diagnosis"], first["guard"], first["because_of"]) == (
+            *("", "outside", "outputs"),
+        )
+        assert first["probability"] is None
+        assert set(first["probabilities"].values()) == {None}
+        rows = (tmp_path / "odd.csv").read_text().splitlines()
+        assert rows[1].split(",")[1:] == ["outside", "outputs", *[""] * 9]
+        assert len(rows) == 1 + len(emulated)
+        assert call(*odd)[0] == 0
     words = ("bundle", "export", saved, "--onnx", tmp_path / "again", "--json")
     told = json.loads(call(*words)[1])
     assert told.keys() == {"saved", "differences"}

@@ -12,10 +12,12 @@ from torch import Tensor
 import retwin as rt
 from retwin.cases.armpi_fpv.emulator import _effective
 from retwin.cases.armpi_fpv.twin import KINEMATIC, POLL
+from retwin.errors import InputError
 from retwin.serialisation.configs import from_config, to_config
 from retwin.twins.faults import draw_faults, faulty_commands, frozen_from
 from retwin.update.corrections import OPERATORS
 from retwin.update.corrections.command_effect import effective
+from retwin.update.corrections.command_problem import Problem
 
 UNIT = 0.24  # degrees per command unit
 
@@ -245,6 +247,96 @@ def test_a_surrogate_with_memory_gives_the_same(exact, commands: np.ndarray) -> 
     assert (one.z - other.z)[..., 0].abs().mean() < 0.1
     spread = [found.covariance[..., 0, 0].sqrt() for found in (one, other)]
     torch.testing.assert_close(spread[0], spread[1], rtol=0.1, atol=0.02)
+
+
+PERIOD, SHIFT = 6, 3
+"""Polling period and the second polling phase, in samples. There are 167 polls of 1000 samples, so
+that only two phases together exceed `CommandSpace.most`."""
+
+
+@pytest.fixture(scope="module")
+def two_phases(exact, commands: np.ndarray) -> tuple[rt.Context, Tensor, Tensor]:
+    """Six trajectories polled at phase 0, then the same ones later by `SHIFT`, polled as late."""
+    first = context_of(exact, commands[:6])
+    z = drawn(first.segments.start.shape, missed=0.0)
+    noise = np.random.default_rng(1).normal(0, 5e-4, first.path.shape)
+    early = rt.CommandSpace().apply(first, z).double().numpy() + noise
+    both, observed = (
+        np.concatenate([a, np.concatenate([a[:, :1].repeat(SHIFT, 1), a[:, :-SHIFT]], axis=1)])
+        for a in (commands[:6], early)
+    )
+    mask = torch.zeros(12, 1000, 3, dtype=torch.bool)
+    mask[:6, :990:PERIOD] = True
+    mask[6:, SHIFT : 990 + SHIFT : PERIOD] = True
+    return context_of(exact, both), torch.tensor(observed), mask
+
+
+@pytest.mark.parametrize("most", [200, 50])
+def test_polling_phases_do_not_compete_for_samples(
+    two_phases: tuple[rt.Context, Tensor, Tensor], most: int
+) -> None:
+    """Of a batch, each trajectory contributes the very samples that it contributes alone."""
+    context, observed, mask = two_phases
+    operator = rt.CommandSpace(most=most)
+    batch = Problem(operator, context, observed, mask)
+    assert (batch.seen.sum(dim=1) <= most).all()
+    for i in range(12):
+        one = slice(i, i + 1)
+        alone = Problem(operator, context[one], observed[one], mask[one])
+        used = batch.at[i, batch.seen[i] > 0]
+        assert len(used) > most / 2
+        assert used.equal(alone.at[0])
+        assert mask[i, used].all()
+
+
+@pytest.mark.parametrize("most", [200, 50])
+def test_the_polling_phase_does_not_change_z(
+    two_phases: tuple[rt.Context, Tensor, Tensor], most: int
+) -> None:
+    """The same trajectory, earlier or later, has the same z*; so it has with one phase only.
+
+    The prior is learned from the whole batch. Here the batch holds everything twice, so that only
+    the pseudo-observations of the prior make a difference to one half alone.
+    """
+    context, observed, mask = two_phases
+    operator = rt.CommandSpace(most=most)
+    z = operator.infer(context, observed, mask).z
+    torch.testing.assert_close(z[6:], z[:6], rtol=0, atol=1e-3)
+    for half in (slice(0, 6), slice(6, 12)):
+        alone = operator.infer(context[half], observed[half], mask[half]).z
+        difference = (z[half] - alone).abs()
+        assert difference[..., 0].mean() < 0.1
+        assert UNIT * difference[..., 1:5].mean() < 0.05
+
+
+def test_rows_with_fewer_samples_are_not_filled_with_evidence(exact, commands: np.ndarray) -> None:
+    """A short record in a batch of long ones counts each of its samples once."""
+    context = context_of(exact, commands[:2])
+    mask = polled(2)
+    mask[1, 300:] = False
+    observed = context.path.double()
+    batch = Problem(rt.CommandSpace(), context, observed, mask)
+    assert batch.seen.sum(dim=1).tolist() == [100, 30]
+    assert batch.at[1, :30].tolist() == list(range(0, 300, POLL))
+    assert (batch.at[1, 30:] == 290).all()
+    assert (batch.inside()[1, :, 30:] == 0).all()
+
+
+@pytest.mark.parametrize("split", [False, True])
+def test_a_trajectory_without_a_usable_sample_is_named(
+    exact, commands: np.ndarray, split: bool
+) -> None:
+    """Without any measurement, or with outputs that are never measured at the same sample."""
+    context = context_of(exact, commands)
+    mask = polled(12)
+    mask[7] = False
+    if split:
+        mask[7, ::10, 0], mask[7, 5::10, 1:] = True, True
+    with pytest.raises(InputError, match=r"^mask: .*all outputs.* trajectory 7; leave it out"):
+        rt.CommandSpace().infer(context, context.path.double(), mask)
+    mask[9] = False
+    with pytest.raises(InputError, match="trajectories 7, 9; leave them out"):
+        rt.CommandSpace().infer(context, context.path.double(), mask)
 
 
 def test_names_units_and_config() -> None:

@@ -130,6 +130,8 @@ class Bundle:
     def predict(self, trajectories: Trajectories) -> Prediction:
         """Diagnose trajectories, and say which of them the bundle was not made for.
 
+        A trajectory that is outside has no diagnosis, and its probabilities are NaN.
+
         Raises
         ------
         InputError: a bundle without a diagnoser; other channels or another rate than it was made
@@ -143,9 +145,10 @@ class Bundle:
                 got="one without",
                 remedy="train a diagnoser and make the bundle anew",
             )
-        verdicts = self.guard.judge(self.twin.surrogate, trajectories)
-        probabilities = self.diagnoser.predict_proba(trajectories)
-        return Prediction(self.diagnoser.classes, probabilities, verdicts)
+        verdicts = self.guard.judge(self.twin.surrogate, trajectories, steps=self.facts.steps)
+        return Prediction.of(
+            self.diagnoser.classes, verdicts, trajectories, self.diagnoser.predict_proba
+        )
 
     def generate(
         self,

@@ -10,6 +10,7 @@ residual being something else than what the twin, its faults and its corrections
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -90,8 +91,10 @@ class Guard(nn.Module):
         predicted = surrogate.predict(trajectories.commands[:, every])
         return self.domain.differences(trajectories.nominal[:, every], predicted)
 
-    def judge(self, surrogate: Surrogate, trajectories: Trajectories) -> Verdicts:
-        """The verdict on each trajectory.
+    def judge(
+        self, surrogate: Surrogate, trajectories: Trajectories, *, steps: int | None = None
+    ) -> Verdicts:
+        """The verdict on each trajectory; `steps` as for `Domain.judge`.
 
         Raises InputError for other channels or another rate, or trajectories without commands.
         """
@@ -102,8 +105,8 @@ class Guard(nn.Module):
                 got=f"{trajectories.inputs}",
                 remedy="read the file with its case, which recovers commands",
             )
-        mismatch = self.mismatch(surrogate, trajectories)
-        return self.domain.judge(trajectories, mismatch, self.energy(trajectories))
+        mismatch = partial(self.mismatch, surrogate)
+        return self.domain.judge(trajectories, mismatch, self.energy, steps=steps)
 
     def about(self) -> dict[str, Any]:
         """Everything but the weights, for JSON."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.deploy.bundle.facts import Facts
 from retwin.deploy.bundle.seal import distrusting, read_sealed
-from retwin.deploy.bundle.verdicts import Domain, Prediction
+from retwin.deploy.bundle.verdicts import Domain, Prediction, distributions
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
@@ -27,6 +28,8 @@ __all__ = ["Portable", "padded_times", "settled_at"]
 
 GRAPHS = ("surrogate", "residual", "correction", "guard")
 """Those that every export has."""
+EXPORTED = "a graph that retwin bundle export wrote"
+REMEDY = "make it anew with retwin bundle export"
 
 
 @dataclass(frozen=True)
@@ -95,14 +98,15 @@ class Portable:
         options = runtime.SessionOptions()
         options.intra_op_num_threads = threads
         options.log_severity_level = 4  # what is wrong is raised, not printed
-        remedy = "make it anew with retwin bundle export"
-        with distrusting(folder, expected="the ONNX export of a bundle", remedy=remedy):
+        with distrusting(folder, expected="the ONNX export of a bundle", remedy=REMEDY):
             sensor, judge = _reader(about["sensor"]), _judge(about["diagnoser"])
             names = [*GRAPHS, *["sensor"] * bool(sensor), *["features", "diagnoser"] * bool(judge)]
             files = {name: Path(folder) / f"{name}.onnx" for name in names}
             return cls(
                 graphs={
-                    name: Graph(runtime.InferenceSession(file, options, ["CPUExecutionProvider"]))
+                    name: Graph(
+                        runtime.InferenceSession(file, options, ["CPUExecutionProvider"]), file
+                    )
                     for name, file in files.items()
                 },
                 facts=Facts.of(about),
@@ -122,8 +126,9 @@ class Portable:
 
         Raises
         ------
-        InputError: an export without a diagnoser; other channels, another rate or length than it
-            was made for, or no commands.
+        InputError: an export without a diagnoser; other channels or another rate than it was made
+            for, or no commands; another length that is not outside; a graph whose output has
+            another shape, is not finite, or is no probabilities.
 
         """
         judge = self.diagnoser
@@ -135,19 +140,35 @@ class Portable:
                 remedy="train a diagnoser, then make the bundle and its export anew",
             )
         self._check(trajectories)
-        seen = {
-            "nominal": _single(trajectories.nominal),
-            "observed": _single(trajectories.observed),
-            "mask": trajectories.mask,
-        }
+        verdicts = self.domain.judge(
+            trajectories, self._mismatch, self._energy, steps=self.facts.steps
+        )
+        return Prediction.of(
+            judge.classes, verdicts, trajectories, partial(self._probabilities, judge)
+        )
+
+    def _mismatch(self, trajectories: Trajectories) -> NDArray:
+        """See `Guard.mismatch`."""
+        self._fits(trajectories.steps, 0)
         every = slice(None, None, self.stride)
-        predicted = self.graphs["surrogate"](commands=_single(trajectories.commands[:, every]))
-        mismatch = self.domain.differences(seen["nominal"][:, every], predicted)
-        verdicts = self.domain.judge(trajectories, mismatch, self.graphs["guard"](**seen))
+        nominal = trajectories.nominal[:, every]
+        commands = _single(trajectories.commands[:, every])
+        predicted = self.graphs["surrogate"].checked(nominal.shape, commands=commands)
+        return self.domain.differences(nominal, predicted)
+
+    def _energy(self, trajectories: Trajectories) -> NDArray:
+        """See `Guard.energy`."""
+        return self.graphs["guard"].checked((len(trajectories),), **_seen(trajectories))
+
+    def _probabilities(self, judge: Judge, trajectories: Trajectories) -> NDArray:
+        """Probabilities (n, classes) as the diagnoser gives them."""
         settled = settled_at(trajectories, judge.stride, judge.settled)
-        features = self.graphs["features"](**seen, settled=settled)
-        probabilities = self.graphs["diagnoser"](features=features)
-        return Prediction(judge.classes, probabilities.astype(np.float64), verdicts)
+        features = self.graphs["features"](**_seen(trajectories), settled=settled)
+        shape = len(trajectories), len(judge.classes)
+        found = self.graphs["diagnoser"].checked(shape, features=features).astype(np.float64)
+        if not distributions(found).all():
+            raise self.graphs["diagnoser"].refused("numbers that are no probabilities")
+        return found
 
     def simulate(
         self,
@@ -218,7 +239,6 @@ class Portable:
                     got=f"{theirs}",
                     remedy="resample or rename, and read files with their case",
                 )
-        self._fits(trajectories.steps, 0)
 
     def _fits(self, steps: int, movements: int) -> None:
         if steps != self.facts.steps or movements > self.facts.movements:
@@ -233,15 +253,30 @@ class Portable:
 class Graph:
     """A session of onnxruntime as a function of named arrays; what it does not take is left out."""
 
-    def __init__(self, session: InferenceSession) -> None:
+    def __init__(self, session: InferenceSession, file: Path) -> None:
         self.session = session
+        self.file = file
         self.inputs = {each.name: each.shape for each in session.get_inputs()}
 
     def __call__(self, **arrays: NDArray) -> NDArray:
-        """The one output."""
+        """The one output; InputError where the graph does not run."""
         given = {name: array for name, array in arrays.items() if name in self.inputs}
-        result: NDArray = self.session.run(None, given)[0]
+        with distrusting(self.file, expected=EXPORTED, remedy=REMEDY):
+            result: NDArray = self.session.run(None, given)[0]
         return result
+
+    def checked(self, shape: tuple[int, ...], **arrays: NDArray) -> NDArray:
+        """The output for arrays of usual size; InputError if it has another shape or NaN."""
+        result = self(**arrays)
+        if result.shape != shape:
+            raise self.refused(f"an output of shape {result.shape} for {shape}")
+        if not np.isfinite(result).all():
+            raise self.refused("an output that is not finite")
+        return result
+
+    def refused(self, got: str) -> InputError:
+        """The error for an output that no graph of `export_onnx` has."""
+        return InputError(str(self.file), expected=EXPORTED, got=got, remedy=REMEDY)
 
     def width(self, name: str) -> int:
         """Size of the last axis of an input."""
@@ -274,6 +309,15 @@ def _judge(about: Mapping[str, Any] | None) -> Judge | None:
     settled = about["settled"]
     names = tuple(str(name) for name in about["classes"])
     return Judge(names, int(about["stride"]), None if settled is None else int(settled))
+
+
+def _seen(trajectories: Trajectories) -> dict[str, NDArray]:
+    """The inputs of the graphs that look at trajectories."""
+    return {
+        "nominal": _single(trajectories.nominal),
+        "observed": _single(trajectories.observed),
+        "mask": trajectories.mask,
+    }
 
 
 def _single(values: NDArray) -> NDArray:

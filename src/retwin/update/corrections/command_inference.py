@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from retwin.errors import InputError
 from retwin.update.corrections.command_delays import delay_variance
 from retwin.update.corrections.command_problem import TAILS, Problem
 from retwin.update.corrections.correction import Context, Discrepancy
-from retwin.update.corrections.warp import read
+from retwin.update.corrections.warp import read, taken
 
 if TYPE_CHECKING:
     from retwin.update.corrections.command_space import CommandSpace
@@ -42,6 +43,7 @@ def infer_commands(
     operator: CommandSpace, context: Context, observed: Tensor, mask: Tensor
 ) -> Discrepancy:
     """z* (n, M, 1 + 2 d_u) for measured outputs (n, T, d_y), see `CommandSpace.infer`."""
+    _require_samples(mask)
     problem = Problem(operator, context, observed, mask)
     x, missed = problem.nothing()
     if not x.shape[1]:
@@ -59,6 +61,25 @@ def infer_commands(
         prior = prior.learned(problem, fit, missed)
     fit = _solve(problem, x, missed, prior, STEPS)
     return _told(problem, fit, missed, chance, prior)
+
+
+def _require_samples(mask: Tensor) -> None:
+    """InputError that names the trajectories of `mask` (n, T, d_y) without a usable sample.
+
+    Where nothing at all was measured the prior stands for every trajectory, and nothing is
+    identified: that is what `Correction` requires.
+    """
+    empty = ~mask.all(dim=-1).any(dim=1)
+    if not mask.any() or not empty.any():
+        return
+    index = empty.nonzero()[:, 0].tolist()
+    several = len(index) > 1
+    raise InputError(
+        "mask",
+        expected="in every trajectory at least one sample at which all outputs are measured",
+        got=f"none in {'trajectories' if several else 'trajectory'} {', '.join(map(str, index))}",
+        remedy=f"leave {'them' if several else 'it'} out, or correct the mask",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +128,7 @@ class _Prior:
         seen = problem.seen > 0
         # Of nothing at all, the median and the spread are NaN.
         noise = residual.norm(dim=-1)[seen].median().nan_to_num(1.0).clamp_min(1e-6).repeat(2)
-        told = problem.told[:, problem.at][seen]
+        told = taken(problem.told, problem.at)[seen]
         extent = (told - told.mean(dim=0)).square().mean(dim=0).sqrt()
         width = 0.05 * extent.nan_to_num(1.0).clamp_min(1e-9)
         one = torch.ones((), dtype=torch.float64)

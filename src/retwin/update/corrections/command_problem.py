@@ -11,6 +11,7 @@ from torch import Tensor
 
 from retwin.update.corrections.command_effect import effective
 from retwin.update.corrections.correction import Context
+from retwin.update.corrections.warp import taken
 from retwin.update.piecewise_linear import distinct
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ TAILS = 4.0
 """Degrees of freedom of the noise (Student's t): glitches do not count."""
 CHUNK = 64
 """Trajectories linearised together."""
+ROWS = ("told", "at", "seen", "moving", "observed", "valid", "healthy", "faulty", "frozen")
+"""Attributes of `Problem` that have one row per trajectory."""
 
 
 class Problem:
@@ -37,8 +40,9 @@ class Problem:
     Attributes
     ----------
     told: (n, T, d_u), the reference, faults included.
-    at: (S,) the samples that are looked at.
-    seen: (n, S), 1 where there is a measurement.
+    at: (n, S), the samples used of each trajectory, in order. A trajectory that has fewer than S
+        repeats its last one.
+    seen: (n, S), 1 where `at` is a measured sample, 0 where it only fills the row.
     moving: (n, S), 1 where a movement may be under way: there the surrogate is told less exactly.
     observed: (n, S, d_y), in `unit` (d_y,), the standard deviation of the outputs.
     valid: (n, M) bool, movements that exist.
@@ -62,25 +66,21 @@ class Problem:
         self.healthy = self.valid[..., None] & ~bent & (start < context.frozen[:, None])
 
         seen = mask.all(dim=-1)
-        at = seen.any(dim=0).nonzero()[:, 0]
-        self.at = at[:: max(1, -(-len(at) // operator.most))]
-        self.seen = seen[:, self.at].double()
+        self.at, used = _thinned(seen, operator.most)
+        self.seen = used.double()
         told = observed.double()[seen]
         unit = context.unit.double()
         spread = told.std(dim=0, correction=0) / unit if len(told) else torch.ones_like(unit)
         self.unit = unit * spread.mean().clamp_min(1e-12)
         values = torch.where(seen[..., None], observed.double(), 0.0)
-        self.observed = values[:, self.at] / self.unit
+        self.observed = taken(values, self.at) / self.unit
         begin = start + operator.delay_range[0]
         end = torch.as_tensor(context.segments.settle)[..., None] + MARGIN
-        near = (self.at >= begin) & (self.at <= end) & self.valid[..., None]
+        at = self.at[:, None]
+        near = (at >= begin) & (at <= end) & self.valid[..., None]
         self.moving = near.any(dim=1).double()
         # A surrogate with memory must be told everything that came before.
         self.memory = not getattr(context.surrogate, "memoryless", False)
-        every = torch.arange(context.told.shape[1])
-        time = every if self.memory else self.at
-        self.kept = self.at if self.memory else torch.arange(len(self.at))
-        self.when = time.double()
         self.frozen = context.frozen.double()
 
     def __len__(self) -> int:
@@ -91,9 +91,21 @@ class Problem:
         part = object.__new__(Problem)
         part.__dict__.update(self.__dict__)
         part.segments = self.segments[rows.numpy()]
-        for name in ("told", "valid", "healthy", "faulty", "seen", "moving", "observed", "frozen"):
+        for name in ROWS:
             setattr(part, name, getattr(self, name)[rows])
         return part
+
+    @property
+    def when(self) -> Tensor:
+        """Samples (n, ·) at which the surrogate needs commands: with memory, all of them."""
+        if self.memory:
+            return torch.arange(self.told.shape[1]).expand(len(self), -1)
+        return self.at
+
+    def predicted(self, commands: Tensor) -> Tensor:
+        """The surrogate's outputs (n, S, d_y) at `at` for commands at `when`."""
+        outputs = self.surrogate(commands)
+        return taken(outputs, self.at) if self.memory else outputs
 
     def nothing(self) -> tuple[Tensor, Tensor]:
         """What x and missed are of trajectories without any discrepancy."""
@@ -135,7 +147,8 @@ class Problem:
             torch.as_tensor(times)[..., None]
             for times in (self.segments.start, self.segments.settle)
         )
-        near = ((self.at >= start + low) & (self.at <= settle + high)).double()
+        at = self.at[:, None]
+        near = ((at >= start + low) & (at <= settle + high)).double()
         x, missed = self.nothing()
         costs = []
         for delay in grid:
@@ -149,7 +162,8 @@ class Problem:
         start, stop = (
             torch.as_tensor(times)[..., None] for times in (self.segments.start, self.segments.stop)
         )
-        return ((self.at >= start) & (self.at < stop)).double() * self.seen[:, None]
+        at = self.at[:, None]
+        return ((at >= start) & (at < stop)).double() * self.seen[:, None]
 
     def _parts(self, *given: Tensor) -> Iterator[tuple[Problem, tuple[Tensor, ...]]]:
         for rows in torch.arange(len(self)).split(CHUNK):
@@ -158,7 +172,7 @@ class Problem:
     def _residual(self, x: Tensor, missed: Tensor) -> Tensor:
         told = self.commands(x, missed)
         if self.memory:
-            return self.observed - self.surrogate(told)[:, self.kept].double() / self.unit
+            return self.observed - self.predicted(told).double() / self.unit
         rows, place = distinct(told)
         return self.observed - self.surrogate(rows[None])[0, place].double() / self.unit
 
@@ -195,12 +209,12 @@ class Problem:
         if not self.memory:
             return torch.einsum("nsyu,nmsu->nsymu", self._slope(x, missed)[1], late).flatten(3)
         told = self.commands(x, missed)
-        said = self.surrogate(told)[:, self.kept]
+        said = self.predicted(told)
         columns = []
         for movement, actuator in itertools.product(*map(range, missed.shape[1:])):
             moved = told.clone()
             moved[..., actuator] += (NUDGE * late[:, movement, :, actuator]).to(told)
-            columns.append((self.surrogate(moved)[:, self.kept] - said).double() / NUDGE)
+            columns.append((self.predicted(moved) - said).double() / NUDGE)
         return torch.stack(columns, dim=-1) / self.unit[..., None]
 
     def _turns(self, x: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
@@ -218,7 +232,25 @@ class Problem:
         rows = torch.arange(len(x)).repeat_interleave(count)
         z = torch.cat([(x[:, None] + moved).flatten(0, 1), missed[rows]], dim=-1)
         segments, frozen = self.segments[rows.numpy()], self.frozen[rows]
-        told = effective(self.told[rows], segments, z, self.when, frozen)
+        told = effective(self.told[rows], segments, z, self.when[rows], frozen)
         told = told.unflatten(0, (len(x), count))
         late, off = ((told[:, 1:] - told[:, :1]) / TURN).split(movements, dim=1)
         return late, off
+
+
+def _thinned(measured: Tensor, most: int) -> tuple[Tensor, Tensor]:
+    """At most `most` evenly chosen samples of each row of `measured` (n, T) bool.
+
+    Each trajectory is thinned by itself: trajectories may be polled at different phases.
+
+    Returns the samples (n, S), where shorter rows repeat their last one, and which of them are no
+    such repetition (n, S) bool. A row without any measurement has only False.
+
+    """
+    rank = measured.cumsum(dim=1)
+    every = (-(-rank[:, -1:] // most)).clamp_min(1)
+    used = measured & ((rank - 1) % every == 0)
+    count = used.sum(dim=1, keepdim=True)
+    column = torch.arange(int(count.amax()) if len(count) else 0)
+    order = used.byte().argsort(dim=1, descending=True, stable=True)
+    return order.gather(1, column.minimum((count - 1).clamp_min(0))), column < count
