@@ -21,7 +21,7 @@ import retwin as rt
 from retwin.cases.armpi_fpv.twin import UNIT
 from retwin.diagnosis import Diagnosis, Estimate, fit_inversion
 from retwin.scores.statistics import score
-from retwin.twins.faults import SteadyStateError, Stuck, draw_faults
+from retwin.twins.faults import ActuatorBias, Stuck, draw_faults
 
 HEALTHY = 6
 PER_CLASS = 6
@@ -75,7 +75,7 @@ def severities(
     found: Diagnosis, truth: np.ndarray, faults: list[rt.Fault | None], ends: np.ndarray
 ) -> dict[str, float]:
     """Errors and coverage of what is told of the true class; `ends` (n, d_u): the last angles."""
-    biased = [i for i, fault in enumerate(faults) if isinstance(fault, SteadyStateError)]
+    biased = [i for i, fault in enumerate(faults) if isinstance(fault, ActuatorBias)]
     stuck = [i for i, fault in enumerate(faults) if isinstance(fault, Stuck)]
     bias = np.array([faults[i].bias for i in biased])
     level = np.array([ends[i, faults[i].actuator] for i in stuck])

@@ -70,7 +70,7 @@ def whole(case: rt.Case, n: int) -> None:
         size = sum(file.stat().st_size for file in target.rglob("*") if file.is_file())
         loaded, made = timed(lambda: rt.load(target))
         featured, _ = timed(lambda: Features.at(made)(made))
-        once = rt.Training(epochs=1, batch=256)
+        once = rt.Training(max_epochs=1, batch_size=256)
         learned, _ = timed(lambda: rt.fit_surrogate(made, seed=0, training=once))
         numbers = sum(getattr(made, name).nbytes for name in ("commands", "nominal", "observed"))
     rows = {
@@ -94,7 +94,7 @@ def per_core(case: rt.Case) -> None:
     simulator = replace(case.twin, threads=1)
     real = rt.generate(case.emulator, case, per_class=6, seed=1)
     # What generating takes does not depend on how good the models are.
-    brief = rt.Training(epochs=1, batch=256, rate=5e-3)
+    brief = rt.Training(max_epochs=1, batch_size=256, learning_rate=5e-3)
     said = rt.generate(simulator, case, per_class=20, seed=0)
     ibg = rt.fit_surrogate(said, seed=0, training=brief)
     ways = {

@@ -66,7 +66,7 @@ def agreement(published: rt.Trajectories, twin: rt.Twin) -> dict[str, float]:
                 faults: list[rt.Fault | None] = [rt.Stuck(actuator)] * len(those)
             else:
                 found = biases(those, actuator)
-                faults = [rt.SteadyStateError(actuator, bias=tuple(b)) for b in found.tolist()]
+                faults = [rt.ActuatorBias(actuator, bias=tuple(b)) for b in found.tolist()]
             made = twin.simulate(those.commands, faults=faults, seed=0)
             each, at = np.arange(len(those))[:, None, None], plateaus(those)
             gaps.append(made.observed[each, at] - those.observed[each, at])

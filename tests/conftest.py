@@ -24,7 +24,7 @@ def pytest_runtest_makereport(item: pytest.Item):
 
 
 # A surrogate that is good to a millimetre takes a second; the default one is tried in one test.
-BRISK = Training(epochs=6, batch=256, rate=1e-2)
+BRISK = Training(max_epochs=6, batch_size=256, learning_rate=1e-2)
 
 
 @pytest.fixture(scope="session")

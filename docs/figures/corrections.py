@@ -52,7 +52,7 @@ class Robot:
         case = rt.cases.armpi()
         twin = rt.generate(case.twin, case, per_class=40, seed=1)
         surrogate = rt.fit_surrogate(
-            twin, seed=0, training=Training(epochs=12, batch=256, rate=5e-3)
+            twin, seed=0, training=Training(max_epochs=12, batch_size=256, learning_rate=5e-3)
         )
         commands = case.sampler.sample(COUNT, rng=np.random.default_rng(4))
         hidden: dict[str, NDArray] = {}
@@ -276,11 +276,11 @@ def severity(robot: Robot, healthy: rt.Discrepancy) -> Figure:
     shape = (len(motors), robot.segments.most)
     bias = rng.uniform(10, 50, size=shape) * rng.choice([-1, 1], size=shape)
     commands = robot.case.sampler.sample(len(motors), rng=rng)
-    faults = [rt.SteadyStateError(j, bias=tuple(b)) for j, b in zip(motors, bias, strict=True)]
+    faults = [rt.ActuatorBias(j, bias=tuple(b)) for j, b in zip(motors, bias, strict=True)]
     made = robot.case.emulator.simulate(commands, faults=faults, seed=6)
     operator = robot.operators["CommandSpace"]
     # Which motor is told, and not how far off it is: one unit stands for any bias.
-    labels = [rt.SteadyStateError(j, bias=(1.0,) * shape[1]) for j in motors]
+    labels = [rt.ActuatorBias(j, bias=(1.0,) * shape[1]) for j in motors]
     _, told = rt.infer_discrepancy(robot.surrogate, made, operator, faults=labels)
     _, untold = rt.infer_discrepancy(robot.surrogate, made, operator)
     own = np.broadcast_to(np.eye(4, dtype=bool)[motors][:, None], (*shape, 4))

@@ -57,7 +57,7 @@ _HOME = {
     "SimulationError": "twins.twin",
     "SimulationPlan": "deploy.simulations",
     "StateSpace": "nets.networks",
-    "SteadyStateError": "twins.faults",
+    "ActuatorBias": "twins.faults",
     "Stuck": "twins.faults",
     "StudyData": "study",
     "StudyPlan": "study",
@@ -139,7 +139,7 @@ if TYPE_CHECKING:
     from retwin.report import write_report
     from retwin.scores.statistics import Scores
     from retwin.study import StudyData, StudyPlan, run_study
-    from retwin.twins.faults import Fault, SteadyStateError, Stuck
+    from retwin.twins.faults import ActuatorBias, Fault, Stuck
     from retwin.twins.fmu import FMUTwin
     from retwin.twins.function import FunctionTwin
     from retwin.twins.mujoco import MuJoCoTwin

@@ -49,7 +49,7 @@ def split(path):
     return path, path
 
 
-leak = rt.SteadyStateError(1, (1.0, 2.0))
+leak = rt.ActuatorBias(1, (1.0, 2.0))
 TWIN = rt.FunctionTwin(turned, rt.Channels(("a", "b"), ("V", "V")), rt.Channels(("y",), ("m",)), 10)
 """
 
@@ -85,7 +85,7 @@ known_delay = 1
 [density]
 kind = "Mixture"
 components = 2
-training = { epochs = 5 }
+training = { max_epochs = 5 }
 refinement = { draws = 4 }
 [training]
 epochs = 3
@@ -101,7 +101,7 @@ high = 1
 start = 0.5
 [faults]
 b_stuck = { kind = "Stuck", actuator = "b", onset = [3, 9] }
-a_off = { kind = "SteadyStateError", actuator = 0, size = [0.5, 1] }
+a_off = { kind = "ActuatorBias", actuator = 0, size = [0.5, 1] }
 leak = "toy_module:leak"
 [records]
 calibration = { a = "a1", b = "b1", y = "y1" }
@@ -167,14 +167,14 @@ def test_everything_can_be_told(read: Callable[..., rt.Case]) -> None:
     assert case.correction == rt.Chain(space, rt.SampledSensor(every=2))
     assert case.output_correction == rt.DelayOffset(known_delay=1)
     assert case.density == rt.Mixture(
-        components=2, training=rt.Training(epochs=5), refinement=rt.Refinement(draws=4)
+        components=2, training=rt.Training(max_epochs=5), refinement=rt.Refinement(draws=4)
     )
-    assert case.training == rt.Training(epochs=3, decay="step")
+    assert case.training == rt.Training(max_epochs=3, decay="step")
     assert dict(case.faults) == {
         "Healthy": None,
         "b_stuck": rt.Stuck(1, (3, 9)),
-        "a_off": rt.SteadyStateError(0, (0.5, 1.0)),
-        "leak": rt.SteadyStateError(1, (1.0, 2.0)),
+        "a_off": rt.ActuatorBias(0, (0.5, 1.0)),
+        "leak": rt.ActuatorBias(1, (1.0, 2.0)),
     }
     assert case.parametric is case.twin
     assert case.parametric.parameters == (
@@ -413,7 +413,11 @@ WRONG = [
     ),
     (BASE, 'density = "sequence_mixture"\n' + BASE, r"case\.toml: density: expected Mixture or"),
     (BASE, "network = { kind = 'CNN' }\n" + BASE, r"case\.toml: network\.kind: expected one of"),
-    (BASE, BASE + "[training]\nepochs = 2.5\n", r"case\.toml: training\.epochs: expected a valid"),
+    (
+        BASE,
+        BASE + "[training]\nmax_epochs = 2.5\n",
+        r"case\.toml: training\.max_epochs: expected a valid",
+    ),
     (
         BASE,
         BASE + "[parameters.mass]\nunit = 'kg'\nlow = 1\nhigh = 2\n",

@@ -42,8 +42,8 @@ inputs = { first = { unit = "rad", low = -1, high = 1 }, second = { low = -1, hi
 outputs = { far = { unit = "m" }, high = { unit = "m" } }
 commands = { steps = 90, movements = 3, ramps = [8, 10] }
 network = { kind = "MLP", hidden = [32] }
-training = { epochs = 20, batch = 64, rate = 1e-2 }
-density = { kind = "Mixture", training = { epochs = 10, decay = "step" } }
+training = { max_epochs = 20, batch = 64, rate = 1e-2 }
+density = { kind = "Mixture", training = { max_epochs = 10, decay = "step" } }
 [faults]
 stuck = { kind = "Stuck", actuator = "second", onset = 12 }
 """
@@ -57,12 +57,12 @@ outputs = { level = { unit = "m" } }
 commands = { kind = "HoldSampler", steps = 100, hold = [5, 30] }
 correction = "additive"
 network = { kind = "StateSpace", states = 2, hidden = 8 }
-training = { epochs = 10, batch = 4, rate = 1e-2 }
+training = { max_epochs = 10, batch = 4, rate = 1e-2 }
 [density]
 kind = "SequenceMixture"
 members = 2
 network = { kind = "LSTM", hidden = 4 }
-training = { epochs = 3 }
+training = { max_epochs = 3 }
 [parameters]
 gain = { unit = "m", low = 0.05, high = 0.2, start = 0.1 }
 leak = { unit = "1/s", low = 0.01, high = 0.1, start = 0.05 }

@@ -50,11 +50,11 @@ def test_training_is_reckoned_from_few_epochs() -> None:
     asked: list[int] = []
 
     def fit(how: Training) -> str:
-        asked.append(how.epochs)
-        time.sleep(0.3 + 0.1 * how.epochs)
+        asked.append(how.max_epochs)
+        time.sleep(0.3 + 0.1 * how.max_epochs)
         return "model"
 
-    model, timed = bench._trained(fit, Training(epochs=20), "net")
+    model, timed = bench._trained(fit, Training(max_epochs=20), "net")
     assert (model, asked) == ("model", [1, 3])
     assert timed.seconds == pytest.approx(0.3 + 0.1 * 20, rel=0.2)
     assert timed.share == 0.15

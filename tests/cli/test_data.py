@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from retwin.cli import data
 from retwin.data import download
 from retwin.data.io import load, save
-from retwin.data.trajectories import Channels, Source, Trajectories
+from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.serialisation.files import sha256
 
@@ -42,7 +42,7 @@ def file(tmp_path):
         observed=observed,
         rate=100.0,
         labels=[CLASSES[i % 2] for i in range(10)],
-        provenance=(Source("robot.mat", "ab12"),),
+        provenance=(Provenance("robot.mat", "ab12"),),
     )
     save(made, tmp_path / "set.npz")
     return tmp_path / "set.npz"
@@ -118,7 +118,7 @@ def test_convert_keeps_everything_and_completes(file, tmp_path, suffix, cases):
     assert written.outputs == Case.outputs
     np.testing.assert_array_equal(written.commands, written.nominal[..., :2])
     np.testing.assert_array_equal(written.observed, load(file).observed)
-    assert written.provenance == (Source("robot.mat", "ab12"),)
+    assert written.provenance == (Provenance("robot.mat", "ab12"),)
 
 
 def test_convert_of_csv_takes_a_rate(tmp_path):

@@ -22,7 +22,7 @@ from scipy.io import loadmat, savemat
 
 from retwin.data.io import check_target, load, save
 from retwin.data.io.mat5 import Opaque, read_mat5
-from retwin.data.trajectories import Channels, Source, Trajectories
+from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.serialisation.files import sha256, write_atomically
 
@@ -78,7 +78,7 @@ def example(**changes):
         "ids": list("abcd"),
         "inputs": Channels(("left", "right"), ("V", "V")),
         "outputs": Channels(("x", "y", "z"), ("m", "m", "°")),
-        "provenance": (Source("made", "00"), Source("by hand")),
+        "provenance": (Provenance("made", "00"), Provenance("by hand")),
         "emulated": True,
     }
     return Trajectories(**(parts | changes))
@@ -119,7 +119,7 @@ def test_mat_of_both_key_pairs(tmp_path, prefix, dtype):
     assert read.labels.tolist() == ["Healthy", "Broken", "Healthy", "Broken"]
     assert read.commands.shape == (4, 20, 0)
     assert read.rate == 50
-    assert read.provenance == (Source("a.mat", sha256(file)),)
+    assert read.provenance == (Provenance("a.mat", sha256(file)),)
     assert not read.emulated
 
 
@@ -289,7 +289,7 @@ def test_csv_folder(tmp_path):
     assert read.labels.tolist() == ["Broken", "Broken", "Healthy", "Healthy"]
     np.testing.assert_array_equal(read.nominal[3], arrays[0][:, :3])
     assert np.argwhere(~read.mask).tolist() == [[3, 2, 2]]
-    assert read.provenance == (Source("set", sha256(tmp_path / "set")),)
+    assert read.provenance == (Provenance("set", sha256(tmp_path / "set")),)
     assert done == [0.25, 0.5, 0.75, 1.0]
     assert load(tmp_path / "set", case=Case()).inputs == Case.inputs
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from retwin.data.trajectories import Channels, Source, Trajectories
+from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError
 
 
@@ -212,14 +212,14 @@ def test_folds_refuse_a_count_that_cannot_be(count):
 
 
 def test_concatenate_joins_and_renumbers_only_when_ids_repeat():
-    source = Source("a.mat", "00")
+    source = Provenance("a.mat", "00")
     one = make(labels=["a"] * 6, provenance=(source,))
-    other = make(labels=["long name"] * 6, provenance=(source, Source("b")), emulated=True)
+    other = make(labels=["long name"] * 6, provenance=(source, Provenance("b")), emulated=True)
     both = Trajectories.concatenate([one, other])
     assert len(both) == 12
     assert len(set(both.ids.tolist())) == 12
     assert both.labels.tolist() == ["a"] * 6 + ["long name"] * 6
-    assert both.provenance == (source, Source("b"))
+    assert both.provenance == (source, Provenance("b"))
     assert both.emulated
     named = one.replace(ids=list("abcdef"))
     assert Trajectories.concatenate([named, other]).ids[0] == "a"

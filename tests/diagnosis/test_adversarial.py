@@ -13,7 +13,7 @@ from retwin.nets.training import Training
 from retwin.testing import check_diagnoser
 
 SMALL = rt.CNN(channels=(8, 16), dropout=0.0)
-SHORT = Training(epochs=20, batch=16, rate=3e-3)
+SHORT = Training(max_epochs=20, batch_size=16, learning_rate=3e-3)
 
 
 def toy(count: int, *, seed: int, real: bool) -> rt.Trajectories:
@@ -62,7 +62,7 @@ def test_labels_of_the_target_are_not_read(
     source: rt.Trajectories, target: rt.Trajectories, tmp_path: Path
 ) -> None:
     shuffled = np.random.default_rng(0).permutation(target.labels)
-    how = Training(epochs=2)
+    how = Training(max_epochs=2)
     for name, labels in (("known", target.labels), ("shuffled", shuffled), ("none", None)):
         given = target.replace(labels=labels)
         fit_dann(source, given, SMALL, seed=0, training=how).save(tmp_path / name)

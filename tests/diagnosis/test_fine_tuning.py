@@ -11,7 +11,7 @@ from retwin.nets.training import Training
 from retwin.testing import check_diagnoser
 
 SMALL = rt.CNN(channels=(8, 16), dropout=0.0)
-SHORT = Training(epochs=8, batch=16, rate=1e-2)
+SHORT = Training(max_epochs=8, batch_size=16, learning_rate=1e-2)
 
 
 def toy(count: int, *, seed: int, gain: float = 1.0, leak: float = 0.0) -> rt.Trajectories:
@@ -78,7 +78,7 @@ def test_is_saved_with_what_it_does_not_look_at(
 ) -> None:
     real = toy(4, seed=1, leak=0.3)
     for name in ("a", "b"):
-        tuned = fine_tune(base, generated, real, seed=3, training=Training(epochs=1))
+        tuned = fine_tune(base, generated, real, seed=3, training=Training(max_epochs=1))
         tuned.save(tmp_path / name)
     for file in ("model.json", "weights.safetensors"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()

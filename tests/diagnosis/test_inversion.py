@@ -143,7 +143,7 @@ def test_limits_of_a_bias_are_integrated(mean: tuple[float, float]) -> None:
 TOY: dict[str, rt.Fault | None] = {
     "Healthy": None,
     "First stuck": rt.Stuck(0, onset=(0, 320)),
-    "Second biased": rt.SteadyStateError(1, size=(0.2, 0.5)),
+    "Second biased": rt.ActuatorBias(1, size=(0.2, 0.5)),
 }
 
 
@@ -178,7 +178,10 @@ def toy(count: int, label: str, seed: int) -> tuple[rt.Trajectories, list, np.nd
 def toy_diagnoser() -> InversionDiagnoser:
     plain = toy(60, "Healthy", 1)[0]
     ibg = rt.fit_surrogate(
-        plain, rt.MLP((32,)), seed=0, training=Training(epochs=30, batch=64, rate=1e-2)
+        plain,
+        rt.MLP((32,)),
+        seed=0,
+        training=Training(max_epochs=30, batch_size=64, learning_rate=1e-2),
     )
     healthy = toy(8, "Healthy", 2)[0]
     return fit_inversion(
@@ -322,8 +325,8 @@ def test_what_cannot_be_inverted_is_refused(
     inversion: InversionDiagnoser, rg: rt.ResidualModel, emulated: rt.Trajectories
 ) -> None:
     parts = (inversion.surrogate, inversion.residual)
-    known = {"Healthy": None, "known": rt.SteadyStateError(0, bias=(20.0,) * 5)}
-    with pytest.raises(rt.InputError, match="SteadyStateError with its bias open"):
+    known = {"Healthy": None, "known": rt.ActuatorBias(0, bias=(20.0,) * 5)}
+    with pytest.raises(rt.InputError, match="ActuatorBias with its bias open"):
         InversionDiagnoser(*parts, known, noise=inversion.noise)
     with pytest.raises(rt.InputError, match="at least two classes"):
         InversionDiagnoser(*parts, {"Healthy": None}, noise=inversion.noise)

@@ -9,7 +9,7 @@ import retwin as rt
 from retwin.nets.training import Training
 
 SMALL = rt.CNN(channels=(16, 32))
-SHORT = Training(epochs=15, batch=32, rate=5e-3)
+SHORT = Training(max_epochs=15, batch_size=32, learning_rate=5e-3)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,9 @@ def test_missing_samples_are_zero_residual(
 
 def test_same_seed_same_bytes(training: rt.Trajectories, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        rt.fit_diagnoser(training, SMALL, seed=2, training=Training(epochs=2)).save(tmp_path / name)
+        rt.fit_diagnoser(training, SMALL, seed=2, training=Training(max_epochs=2)).save(
+            tmp_path / name
+        )
     for file in ("model.json", "weights.safetensors"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
@@ -75,7 +77,7 @@ def test_saved_and_loaded_is_the_same(
 
 def test_classes_keep_the_order_given(training: rt.Trajectories, case: rt.Case) -> None:
     named = rt.fit_diagnoser(
-        training, SMALL, seed=0, classes=case.classes, training=Training(epochs=1)
+        training, SMALL, seed=0, classes=case.classes, training=Training(max_epochs=1)
     )
     assert named.classes == case.classes
     assert named.predict_proba(training[:2]).shape == (2, 9)
@@ -83,7 +85,7 @@ def test_classes_keep_the_order_given(training: rt.Trajectories, case: rt.Case) 
 
 def test_the_paper_s_lstm_trains(training: rt.Trajectories) -> None:
     model = rt.fit_diagnoser(
-        training, rt.LSTMClassifier(16), seed=0, training=Training(epochs=2, batch=16)
+        training, rt.LSTMClassifier(16), seed=0, training=Training(max_epochs=2, batch_size=16)
     )
     assert np.isfinite(model.predict_proba(training[:3])).all()
 

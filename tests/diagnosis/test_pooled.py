@@ -55,7 +55,7 @@ def test_members_must_know_the_same_classes() -> None:
 
 @pytest.fixture(scope="module")
 def pool(twin_set: rt.Trajectories, case: rt.Case) -> PooledDiagnoser:
-    training = Training(epochs=1, batch=64, rate=1e-3)
+    training = Training(max_epochs=1, batch_size=64, learning_rate=1e-3)
     members = [
         rt.fit_diagnoser(twin_set, seed=seed, classes=order, training=training)
         for seed, order in enumerate((case.classes, case.classes[::-1]))

@@ -106,7 +106,7 @@ def test_unknown_settings_are_refused() -> None:
     with pytest.raises(InputError, match="decay 'linear'"):
         Training(decay="linear")
     with pytest.raises(InputError, match="0 epochs"):
-        Training(epochs=0)
+        Training(max_epochs=0)
 
 
 def test_a_network_that_could_not_be_loaded_is_not_saved() -> None:
@@ -122,7 +122,7 @@ def test_a_network_that_could_not_be_loaded_is_not_saved() -> None:
 @pytest.mark.parametrize("epochs", [1, 2, 5, 10])
 def test_any_number_of_steps_can_be_trained(epochs: int) -> None:
     """Ten steps in all are one of warming up: none that torch's schedule could divide by."""
-    how = Training(epochs=epochs, batch=8, rate=0.1)
+    how = Training(max_epochs=epochs, batch_size=8, learning_rate=0.1)
     fit = train(nn.Linear(2, 1), squared, line(8), line(8), how, seed=0)
     assert len(fit.history["train"]) == epochs
 

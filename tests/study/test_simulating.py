@@ -23,8 +23,8 @@ from retwin.update.residual import SequenceMixture
 
 STEPS, RATE = 120, 2.0
 INPUTS, OUTPUTS = rt.Channels(("valve",), ("%",)), rt.Channels(("level",), ("m",))
-SHORT = Training(epochs=8, batch=8, rate=1e-2)
-LONGER = Training(epochs=40, batch=4, rate=2e-2)
+SHORT = Training(max_epochs=8, batch_size=8, learning_rate=1e-2)
+LONGER = Training(max_epochs=40, batch_size=4, learning_rate=2e-2)
 
 
 def lag(commands: np.ndarray, gain: float = 1.0) -> np.ndarray:

@@ -16,10 +16,10 @@ from retwin.testing import DIAGNOSER_CHECKS, DiagnoserSubject, check_diagnoser
 
 DIAGNOSERS: dict[str, Callable[[rt.Trajectories], rt.Diagnoser]] = {
     "convolutional": lambda training: rt.fit_diagnoser(
-        training, rt.CNN(channels=(4, 8)), seed=0, training=Training(epochs=1)
+        training, rt.CNN(channels=(4, 8)), seed=0, training=Training(max_epochs=1)
     ),
     "recurrent": lambda training: rt.fit_diagnoser(
-        training, rt.LSTMClassifier(4), seed=0, training=Training(epochs=1)
+        training, rt.LSTMClassifier(4), seed=0, training=Training(max_epochs=1)
     ),
 }
 

@@ -28,7 +28,7 @@ from retwin.twins.samplers import RampSampler
 from retwin.update.corrections import Additive
 from retwin.update.residual import Density, SequenceMixture
 
-QUICK = Training(epochs=80, batch=512, rate=2e-2, decay="cosine")
+QUICK = Training(max_epochs=80, batch_size=512, learning_rate=2e-2, decay="cosine")
 LAW = rt.Mixture(
     components=1, hidden=(8,), dropout=0.0, training=replace(rt.Mixture().training, epochs=60)
 )
@@ -42,7 +42,7 @@ STEPWISE = SequenceMixture(
     window=200,
     burn_in=5,
     dropout=0.0,
-    training=Training(epochs=20, batch=6, rate=2e-2),
+    training=Training(max_epochs=20, batch_size=6, learning_rate=2e-2),
 )
 MEAN, SPREAD, NOISE = 0.15, 0.03, 0.004
 """Of the gap of every output or command, and of measuring; in the toys' units."""
@@ -114,7 +114,7 @@ class Toy:
         count = max(12, 4000 // self.steps)
         made = self.case.twin.simulate(self.commands(count, 1), seed=0)
         epochs = max(30, 300_000 // (count * self.steps))
-        brisk = Training(epochs=epochs, batch=512, rate=2e-2, decay="cosine")
+        brisk = Training(max_epochs=epochs, batch_size=512, learning_rate=2e-2, decay="cosine")
         return rt.fit_surrogate(made, rt.MLP((16,)), seed=0, training=brisk)
 
     def measured(self, seed: int, count: int | None = None) -> rt.Trajectories:
@@ -324,7 +324,7 @@ def test_a_twin_with_memory_learns_nothing_from_padding() -> None:
     made = toy.case.twin.simulate(toy.commands(12, 1), seed=0)
     lag = lfilter([0.2], [1, -0.8], made.nominal, axis=1)
     made = made.replace(nominal=lag, observed=lag)
-    how = Training(epochs=3, batch=4)
+    how = Training(max_epochs=3, batch_size=4)
     alone = rt.fit_surrogate(made, LSTM(4), seed=0, training=how)
     padded = rt.fit_surrogate(made.padded(90), LSTM(4), seed=0, training=how)
     for name, weight in alone.state_dict().items():

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from retwin import InputError, Segments, SteadyStateError, Stuck
+from retwin import ActuatorBias, InputError, Segments, Stuck
 from retwin.twins.faults import draw_faults, faulty_commands, frozen_response
 
 
@@ -32,7 +32,7 @@ def test_stuck_onset_is_drawn_in_its_range(commands: np.ndarray) -> None:
 
 def test_bias_is_reached_with_the_movement_and_kept(commands: np.ndarray) -> None:
     segments = Segments.from_commands(commands)
-    fault = SteadyStateError(0, bias=(20.0, -10.0))
+    fault = ActuatorBias(0, bias=(20.0, -10.0))
     bias = faulty_commands(commands, [fault], segments)[0, :, 0] - commands[0, :, 0]
     assert (bias[:21] == 0).all(), "the actuator starts at rest, without bias"
     np.testing.assert_allclose(bias[50], 10.0, atol=1e-6)
@@ -43,14 +43,14 @@ def test_bias_is_reached_with_the_movement_and_kept(commands: np.ndarray) -> Non
 
 def test_an_actuator_that_is_told_nothing_still_gets_its_bias(commands: np.ndarray) -> None:
     segments = Segments.from_commands(commands)
-    biased = faulty_commands(commands, [SteadyStateError(1, bias=(20.0, -10.0))], segments)
+    biased = faulty_commands(commands, [ActuatorBias(1, bias=(20.0, -10.0))], segments)
     np.testing.assert_allclose(biased[0, 81:220, 1], 20.0)
     np.testing.assert_allclose(biased[0, 301:, 1], -10.0)
 
 
 def test_drawn_biases_follow_the_protocol(commands: np.ndarray) -> None:
     segments = Segments.from_commands(np.repeat(commands, 500, axis=0))
-    drawn = draw_faults([SteadyStateError(0)] * 500, segments, seed=1)
+    drawn = draw_faults([ActuatorBias(0)] * 500, segments, seed=1)
     biases = np.array([fault.bias for fault in drawn])
     assert biases.shape == (500, 2), "one bias per movement"
     assert (np.abs(biases) >= 10).all()
@@ -61,7 +61,7 @@ def test_drawn_biases_follow_the_protocol(commands: np.ndarray) -> None:
 
 def test_the_same_seed_gives_the_same_severity(commands: np.ndarray) -> None:
     segments = Segments.from_commands(commands)
-    one, two, other = (draw_faults([SteadyStateError(0)], segments, seed=s) for s in (3, 3, 4))
+    one, two, other = (draw_faults([ActuatorBias(0)], segments, seed=s) for s in (3, 3, 4))
     assert one == two
     assert one != other
 
@@ -69,7 +69,7 @@ def test_the_same_seed_gives_the_same_severity(commands: np.ndarray) -> None:
 def test_an_open_severity_is_refused(commands: np.ndarray) -> None:
     segments = Segments.from_commands(commands)
     with pytest.raises(InputError, match="draw_faults first"):
-        faulty_commands(commands, [SteadyStateError(0)], segments)
+        faulty_commands(commands, [ActuatorBias(0)], segments)
     with pytest.raises(InputError, match="draw_faults first"):
         frozen_response(commands, [Stuck(0, onset=(0, 9))])
     with pytest.raises(InputError, match="one per trajectory"):
@@ -90,4 +90,4 @@ def test_onsets_may_be_numpys_and_listed() -> None:
 @pytest.mark.parametrize("size", [(50.0, 10.0), (-5.0, 5.0), (0.0, np.inf), (np.nan, 1.0), (1.0,)])
 def test_sizes_that_cannot_be_are_refused(size: tuple) -> None:
     with pytest.raises(InputError, match="size: expected a pair"):
-        SteadyStateError(0, size=size)
+        ActuatorBias(0, size=size)

@@ -74,7 +74,7 @@ def trajectories(count: int = 5, steps: int = 40) -> np.ndarray:
 
 def test_says_what_the_function_says() -> None:
     commands = trajectories()
-    faults = [None, rt.Stuck(0, onset=12), None, None, rt.SteadyStateError(1, bias=(4.0,))]
+    faults = [None, rt.Stuck(0, onset=12), None, None, rt.ActuatorBias(1, bias=(4.0,))]
     told = faulty_commands(commands, faults, rt.Segments.from_commands(commands))
     held = frozen_response(told, faults)
     for each in (twin(), twin(vectorised=False)):
@@ -129,7 +129,7 @@ def test_noise_is_in_the_residual(settings: dict) -> None:
 
 def test_same_bytes_whatever_the_workers() -> None:
     commands = trajectories(CHUNK + 3)
-    faults = [rt.Stuck(0, onset=(5, 20)), None, rt.SteadyStateError(1)] * CHUNK
+    faults = [rt.Stuck(0, onset=(5, 20)), None, rt.ActuatorBias(1)] * CHUNK
     made = [
         twin(noisy, nominal=level, vectorised=False, workers=workers).simulate(
             commands, faults=faults[: len(commands)], seed=8

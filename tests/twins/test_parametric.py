@@ -87,7 +87,7 @@ def test_command_side_delays_by_fractions_and_shifts() -> None:
 
 def test_command_side_at_rest_is_the_twin_itself(case: rt.Case) -> None:
     told = arm_commands(case)
-    faults = (None, rt.Stuck(1, onset=(20, 80)), rt.SteadyStateError(2))
+    faults = (None, rt.Stuck(1, onset=(20, 80)), rt.ActuatorBias(2))
     for plain, sided in ((KINEMATIC, CommandSide(KINEMATIC)), (case.twin, armpi_parametric())):
         for name in ("nominal", "observed"):
             wanted = getattr(plain.simulate(told, faults=faults, seed=0), name)
@@ -161,12 +161,12 @@ SUBJECTS = {
             (2.5, 1.0, -2.0, 3.0, -4.0),
         ),
         arm_commands(case),
-        (None, rt.Stuck(1, onset=(20, 80)), rt.SteadyStateError(2)),
+        (None, rt.Stuck(1, onset=(20, 80)), rt.ActuatorBias(2)),
     ),
     "arm": lambda case: TwinSubject(
         armpi_parametric(rt.ArmPiTwin(step=0.01)),
         arm_commands(case),
-        (None, rt.Stuck(1, onset=(20, 80)), rt.SteadyStateError(2)),
+        (None, rt.Stuck(1, onset=(20, 80)), rt.ActuatorBias(2)),
     ),
 }
 

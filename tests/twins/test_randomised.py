@@ -107,7 +107,7 @@ SUBJECTS = {
 @pytest.mark.parametrize("check", TWIN_CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("kind", SUBJECTS)
 def test_contract(case: rt.Case, kind: str, check: Callable) -> None:
-    faults = (None, rt.Stuck(1, onset=(20, 80)), rt.SteadyStateError(2))
+    faults = (None, rt.Stuck(1, onset=(20, 80)), rt.ActuatorBias(2))
     check(TwinSubject(SUBJECTS[kind], arm_commands(case), faults))
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from retwin.twins.samplers import HoldSampler, MultisineSampler, RampSampler
-from retwin.update.piecewise_linear import told_along
+from retwin.update.piecewise_linear import evaluate_piecewise_linear
 
 LOW, HIGH = (100.0, -3.0), (900.0, 2.0)
 SMALL = 5e-6
@@ -40,7 +40,7 @@ def both(answer: Callable[[Tensor], Tensor], commands: np.ndarray | Tensor) -> t
     """The largest difference from asking at each sample, and the share that was asked."""
     commands = torch.as_tensor(commands)
     ask = Counted(answer)
-    found = told_along(ask, commands)
+    found = evaluate_piecewise_linear(ask, commands)
     one_by_one = answer(commands.flatten(0, 1)).view(*commands.shape[:2], -1)
     assert found.shape == one_by_one.shape
     return float((found - one_by_one).abs().max()), ask.asked / commands[..., 0].numel()
@@ -101,7 +101,7 @@ def test_what_is_not_finite_stays_where_it_is() -> None:
     commands = torch.full((3, 50, 2), 5.0)
     commands[1, 20, 0] = torch.nan
     commands[2, 30, 1] = torch.inf
-    found = told_along(lambda rows: rows.sum(dim=1, keepdim=True), commands)
+    found = evaluate_piecewise_linear(lambda rows: rows.sum(dim=1, keepdim=True), commands)
     assert torch.equal(found.isfinite()[..., 0], commands.isfinite().all(dim=-1))
 
 
@@ -114,8 +114,10 @@ def test_short(steps: int) -> None:
 def test_each_trajectory_for_itself() -> None:
     commands = RampSampler(LOW, HIGH).sample(8, rng=np.random.default_rng(1))
     commands[3:] *= 1e3  # others of another size must not change what counts as straight
-    together = told_along(smooth, torch.as_tensor(commands))
-    apart = torch.cat([told_along(smooth, torch.as_tensor(each[None])) for each in commands])
+    together = evaluate_piecewise_linear(smooth, torch.as_tensor(commands))
+    apart = torch.cat(
+        [evaluate_piecewise_linear(smooth, torch.as_tensor(each[None])) for each in commands]
+    )
     torch.testing.assert_close(together[:3], apart[:3], rtol=0, atol=SMALL)
 
 

@@ -23,7 +23,7 @@ def test_default_reaches_a_third_of_a_millimetre(case: rt.Case) -> None:
 def test_networks_with_memory_learn_too(
     network: rt.LSTM | rt.TCN, twin_set: rt.Trajectories
 ) -> None:
-    short = Training(epochs=8, batch=8, rate=1e-2)
+    short = Training(max_epochs=8, batch_size=8, learning_rate=1e-2)
     ibg = rt.fit_surrogate(twin_set, network, seed=0, training=short)
     for axis in "xyz":
         assert ibg.fitted.figures[f"nrmse_{axis}"] < 0.5, "far better than the mean"
@@ -37,7 +37,7 @@ def test_the_fast_path_is_the_plain_one(ibg: rt.Surrogate, twin_set: rt.Trajecto
 
 
 def test_same_seed_same_bytes(twin_set: rt.Trajectories, tmp_path: Path) -> None:
-    brief = Training(epochs=1)
+    brief = Training(max_epochs=1)
     for name in ("a", "b"):
         rt.fit_surrogate(twin_set, rt.MLP((8,)), seed=7, training=brief).save(tmp_path / name)
     for file in ("model.json", "weights.safetensors"):

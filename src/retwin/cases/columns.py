@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.data.trajectories import HEALTHY, Channels, Source, Trajectories
+from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.serialisation.files import sha256
 from retwin.twins.twin import Twin
@@ -57,13 +57,13 @@ class ColumnRecords:
         """The record to calibrate on, and the one to test."""
         path = Path(path)
         table = _read(path, [*self.calibration.values(), *self.test.values()])
-        source = Source(path.name, sha256(path))
+        source = Provenance(path.name, sha256(path))
         return (
             self._record(table, "calibration", source),
             self._record(table, "test", source),
         )
 
-    def _record(self, table: Mapping[str, NDArray], name: str, source: Source) -> Trajectories:
+    def _record(self, table: Mapping[str, NDArray], name: str, source: Provenance) -> Trajectories:
         columns = getattr(self, name)
 
         def values(channels: Channels) -> NDArray:

@@ -32,7 +32,7 @@ from retwin.serialisation.configs import (
     table,
 )
 from retwin.twins.checks import check_positive
-from retwin.twins.faults import Fault, SteadyStateError, Stuck
+from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.parametric import Parameter
 from retwin.twins.samplers import (
     CommandSampler,
@@ -54,7 +54,7 @@ from retwin.update.residual import (
 __all__ = ["check_density", "read_case"]
 
 SAMPLERS: tuple[type, ...] = (RampSampler, HoldSampler, MultisineSampler, RecordedSampler)
-FAULTS: tuple[type, ...] = (Stuck, SteadyStateError)
+FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
 MODELS: tuple[type, ...] = (
     *OPERATORS,
     *(Mixture, Flow, Refinement, SequenceMixture, Training),

@@ -278,11 +278,11 @@ def _trained(
     """
     brief = (1, 3)
     (first, _), (second, model) = (
-        timed(partial(fit, replace(training, epochs=epochs))) for epochs in brief
+        timed(partial(fit, replace(training, max_epochs=epochs))) for epochs in brief
     )
     slope = max(0.0, second - first) / (brief[1] - brief[0])
-    share = min(1.0, brief[1] / training.epochs)
-    return model, Timed(what, first + (training.epochs - brief[0]) * slope, share)
+    share = min(1.0, brief[1] / training.max_epochs)
+    return model, Timed(what, first + (training.max_epochs - brief[0]) * slope, share)
 
 
 def _bytes_of_one(case: Case) -> int:

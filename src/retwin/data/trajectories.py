@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from retwin.arrays import check_finite, check_shapes, floating, measured, named, row_blocks
 from retwin.errors import InputError
 
-__all__ = ["HEALTHY", "UNLABELLED", "Channels", "Source", "Trajectories"]
+__all__ = ["HEALTHY", "UNLABELLED", "Channels", "Provenance", "Trajectories"]
 
 PER_TRAJECTORY = ("commands", "nominal", "observed", "mask", "labels", "ids")
 """The fields with one entry per trajectory."""
@@ -62,7 +62,7 @@ class Channels:
 
 
 @dataclass(frozen=True)
-class Source:
+class Provenance:
     """Where data came from: a file name and its SHA-256, or the maker's name with a seed."""
 
     name: str
@@ -106,7 +106,7 @@ class Trajectories:
     ids: NDArray = None  # type: ignore[assignment]
     inputs: Channels = None  # type: ignore[assignment]
     outputs: Channels = None  # type: ignore[assignment]
-    provenance: tuple[Source, ...] = field(default=())
+    provenance: tuple[Provenance, ...] = field(default=())
     emulated: bool = False
 
     def __post_init__(self) -> None:

@@ -83,7 +83,7 @@ def fit_dann(
     views, unlabelled = features.views(fitted_on), features.views(target)
     pair.diagnoser.before.fit(views)
     how = training or training_for(network)
-    steps = how.epochs * math.ceil(len(views) / how.batch)
+    steps = how.max_epochs * math.ceil(len(views) / how.batch_size)
     loss = _Loss(unlabelled, torch.Generator().manual_seed(seed), steps)
     labelled = (views, class_index(fitted_on, order))
     result = train(pair, loss, labelled, None, how, seed=seed, progress=progress)

@@ -15,7 +15,7 @@ from retwin.progress import Progress
 
 __all__ = ["FINE_TUNING", "fine_tune"]
 
-FINE_TUNING = Training(epochs=10, batch=48, rate=1e-3, weight_decay=1e-2)
+FINE_TUNING = Training(max_epochs=10, batch_size=48, learning_rate=1e-3, weight_decay=1e-2)
 """A third of the first training's rate; fixed beforehand, as labelled trajectories are too few to
 choose it on."""
 

@@ -21,7 +21,7 @@ from retwin.diagnosis.onsets import Onsets
 from retwin.diagnosis.severity import draw_biases
 from retwin.errors import InputError
 from retwin.nets.mixtures import Bernoullis, GaussianMixture
-from retwin.twins.faults import Fault, SteadyStateError, Stuck
+from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.update.corrections import Chain, CommandSpace, Context, Correction, SampledSensor
 from retwin.update.corrections.command_effect import effective
 from retwin.update.corrections.command_problem import Problem
@@ -322,11 +322,11 @@ def _told(fault: Fault | None, steps: int) -> tuple[int, tuple[float, float], tu
         case Stuck(actuator=actuator, onset=onset):
             low, high = (onset, onset) if isinstance(onset, int) else onset
             return actuator, (0.0, 0.0), (min(low, steps - 1), min(high, steps - 1))
-        case SteadyStateError(actuator=actuator, size=size, bias=()):
+        case ActuatorBias(actuator=actuator, size=size, bias=()):
             return actuator, size, (steps, steps)
     raise InputError(
         "faults",
-        expected="None, Stuck, or SteadyStateError with its bias open",
+        expected="None, Stuck, or ActuatorBias with its bias open",
         got=repr(fault),
         remedy="leave out what cannot be inverted, or train a diagnoser",
     )

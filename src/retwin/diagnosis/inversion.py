@@ -34,8 +34,8 @@ from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
-from retwin.twins.faults import Fault, SteadyStateError, Stuck
-from retwin.update.corrections import Context, readings
+from retwin.twins.faults import ActuatorBias, Fault, Stuck
+from retwin.update.corrections import Context, sample_mask
 from retwin.update.residual import Residual, ResidualModel
 from retwin.update.surrogate import Surrogate
 
@@ -177,7 +177,7 @@ class InversionDiagnoser:
         )
 
 
-FAULTS: tuple[type, ...] = (Stuck, SteadyStateError)
+FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
 """Those that can be inverted, and that a model folder may name."""
 
 
@@ -268,7 +268,10 @@ class _Readings:
         correction = residual.correction
         # One by one: when a sensor was read must not be told by the trajectories beside.
         read = torch.cat(
-            [readings(correction, observed[i : i + 1], mask[i : i + 1]) for i in range(len(mask))]
+            [
+                sample_mask(correction, observed[i : i + 1], mask[i : i + 1])
+                for i in range(len(mask))
+            ]
         )
         # Where there are many, every so many of them tell enough.
         order = read.all(dim=-1).cumsum(dim=1)

@@ -83,8 +83,8 @@ class NetworkDiagnoser(nn.Module):
 
 
 DEFAULTS = {
-    "CNN": Training(epochs=25, batch=64, rate=3e-3, weight_decay=1e-2),
-    "LSTMClassifier": Training(epochs=30, batch=32, rate=1e-3, decay="step"),
+    "CNN": Training(max_epochs=25, batch_size=64, learning_rate=3e-3, weight_decay=1e-2),
+    "LSTMClassifier": Training(max_epochs=30, batch_size=32, learning_rate=1e-3, decay="step"),
 }
 
 

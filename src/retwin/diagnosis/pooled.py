@@ -11,7 +11,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.diagnoser import Diagnoser
 from retwin.errors import InputError
 
-__all__ = ["PooledDiagnoser", "pool_opinions"]
+__all__ = ["PooledDiagnoser", "pool_probabilities"]
 
 FLOOR = 1e-3
 """Least probability that a member's opinion is taken for: none may rule a class out alone.
@@ -61,10 +61,10 @@ class PooledDiagnoser:
         for member in self.members:
             order = [member.classes.index(name) for name in self.classes]
             opinions.append(member.predict_proba(trajectories)[:, order])
-        return pool_opinions(opinions)
+        return pool_probabilities(opinions)
 
 
-def pool_opinions(opinions: Sequence[NDArray]) -> NDArray:
+def pool_probabilities(opinions: Sequence[NDArray]) -> NDArray:
     """The logarithmic pool of probabilities (..., classes), see `PooledDiagnoser`."""
     logs = np.mean([np.log(np.maximum(each, FLOOR)) for each in opinions], axis=0)
     pooled: NDArray = np.exp(logs)

@@ -28,6 +28,13 @@ __all__ = [
 
 T = TypeVar("T")
 
+RENAMED_KINDS = {"SteadyStateError": "ActuatorBias"}
+"""Kinds in files of versions before 0.1.0, and their present names."""
+RENAMED_SETTINGS = {
+    "Training": {"epochs": "max_epochs", "batch": "batch_size", "rate": "learning_rate"},
+}
+"""Per kind, settings in files of versions before 0.1.0, and their present names."""
+
 
 def to_config(value: Any, kinds: Sequence[type]) -> dict[str, Any]:
     """The settings of a frozen dataclass and of those inside it.
@@ -53,6 +60,7 @@ def from_config(values: Mapping[str, Any], kinds: Sequence[type], *, place: str 
     """
     known = {kind.__name__: kind for kind in kinds}
     kind = values.get("kind")
+    kind = RENAMED_KINDS.get(kind, kind) if isinstance(kind, str) else kind
     if not isinstance(kind, str) or kind not in known:
         raise InputError(
             key(place, "kind"),
@@ -103,7 +111,9 @@ def checked(
     hints = get_type_hints(kind)
     known = [each.name for each in fields(kind) if each.name not in besides]
     made = {}
-    for name, value in table(settings, place).items():
+    renamed = RENAMED_SETTINGS.get(kind.__name__, {})
+    for given, value in table(settings, place).items():
+        name = renamed.get(given, given)
         if name not in known:
             raise InputError(
                 key(place, name),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from retwin.catalog import SOURCES
 from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.pooled import pool_opinions
+from retwin.diagnosis.pooled import pool_probabilities
 from retwin.evaluation.fidelity import Simulation
 from retwin.scores.statistics import (
     METRICS,
@@ -92,7 +92,7 @@ class Diagnoses:
     def _probabilities(self, source: str, healthy: int = 0) -> NDArray:
         members = SOURCES[source].pool
         if members:
-            return pool_opinions([self._probabilities(member, healthy) for member in members])
+            return pool_probabilities([self._probabilities(member, healthy) for member in members])
         place = {index: i for i, index in enumerate(self._tested)}
         runs = self.work.plan.number_of_runs
         out = np.full((runs, len(self._tested), len(self.work.case.classes)), np.nan)

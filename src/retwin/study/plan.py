@@ -29,8 +29,10 @@ class Preset:
     training: Training
 
 
-QUICK = Preset("cnn", 5, Training(epochs=25, batch=64, rate=3e-3, weight_decay=1e-2))
-PAPER = Preset("lstm", 10, Training(epochs=30, batch=32, rate=1e-3, decay="step"))
+QUICK = Preset(
+    "cnn", 5, Training(max_epochs=25, batch_size=64, learning_rate=3e-3, weight_decay=1e-2)
+)
+PAPER = Preset("lstm", 10, Training(max_epochs=30, batch_size=32, learning_rate=1e-3, decay="step"))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from retwin.catalog import SOURCES
 from retwin.data.trajectories import HEALTHY, Trajectories
-from retwin.evaluation.fidelity import Fidelity, Portrait
+from retwin.evaluation.fidelity import Fidelity, Overlay
 from retwin.scores.statistics import compare_runs, holm
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.models import read_about
@@ -276,17 +276,17 @@ def _fidelity_arrays(source: str, found: Fidelity) -> dict[str, NDArray]:
     }
 
 
-def _portrait(work: Work) -> Portrait | None:
+def _portrait(work: Work) -> Overlay | None:
     """Of all test trajectories; None where no twin was corrected."""
-    made = [Portrait.load(work.files.path(job)) for job in work.portraits()]
-    return Portrait.concatenate(made) if made else None
+    made = [Overlay.load(work.files.path(job)) for job in work.portraits()]
+    return Overlay.concatenate(made) if made else None
 
 
-def _portrait_arrays(work: Work, test: Trajectories, portrait: Portrait) -> dict[str, NDArray]:
+def _portrait_arrays(work: Work, test: Trajectories, portrait: Overlay) -> dict[str, NDArray]:
     """Every test trajectory at the sensor's rate, in the order of `data.test.ids`.
 
     `portrait/commands` (n, P, d_u), `/nominal`, `/observed` (n, P, d), the latter NaN where not
-    measured, and `/rate` in Hz; the rest as in `Portrait`.
+    measured, and `/rate` in Hz; the rest as in `Overlay`.
     """
     every = max(1, round(test.rate / work.case.sensor_rate))
     names = portrait.ids.tolist()

@@ -20,7 +20,12 @@ from numpy.typing import NDArray
 from retwin.cases.case import Case
 from retwin.catalog import SOURCES, resolve
 from retwin.data.trajectories import HEALTHY, Trajectories
-from retwin.evaluation.fidelity import measure_fidelity, measure_widening, portray, simulate_records
+from retwin.evaluation.fidelity import (
+    measure_fidelity,
+    measure_widening,
+    predictive_overlay,
+    simulate_records,
+)
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.models import write_model
@@ -108,7 +113,7 @@ class Work:
         return [Job("fidelity", 0, fold, source, healthy) for fold in folds]
 
     def portraits(self) -> list[Job]:
-        """The jobs that portray all test trajectories, beside the twin that was corrected most."""
+        """Jobs that draw every test trajectory over the predictions of the most corrected twin."""
         corrected = [name for name in PORTRAYED if name in self.plan.sources]
         if not corrected or not self.case.diagnosed:
             return []
@@ -269,7 +274,7 @@ class Work:
         twin, test = make(trial), self.files.real_data()[list(trial.fold[1])]
         assert isinstance(twin, CorrectedTwin), "as all in PORTRAYED"
         seed, rate = trial.seed("portrait"), self.case.sensor_rate
-        portray(twin, test, seed=seed, rate=rate, progress=trial.progress).save(path)
+        predictive_overlay(twin, test, seed=seed, rate=rate, progress=trial.progress).save(path)
         return {}
 
     def _rivals(self, trial: Trial, twin: CorrectedTwin) -> dict[str, Twin]:

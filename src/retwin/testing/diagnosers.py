@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.data.trajectories import Channels, Source, Trajectories
+from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.testing.suite import (
     quiet_randomness,
@@ -93,7 +93,7 @@ def check_blindness(subject: DiagnoserSubject) -> None:
         "the labels": subject.trajectories.replace(labels=wrong),
         "whether there are labels": subject.trajectories.replace(labels=None),
         "the ids": subject.trajectories.replace(ids=[f"another {i}" for i in range(n)]),
-        "the provenance": subject.trajectories.replace(provenance=(Source("elsewhere"),)),
+        "the provenance": subject.trajectories.replace(provenance=(Provenance("elsewhere"),)),
         "whether they are emulated": subject.trajectories.replace(
             emulated=not subject.trajectories.emulated
         ),

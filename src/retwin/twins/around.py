@@ -12,7 +12,7 @@ from retwin.data.trajectories import Channels
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, Limits, SimulationError, Twin
 
-__all__ = ["Around", "ask_inside", "generator_of"]
+__all__ = ["Around", "generator_of", "simulate_chunk"]
 
 
 class Around:
@@ -45,7 +45,7 @@ class Around:
         return getattr(self.twin, "limits", None)
 
 
-def ask_inside(
+def simulate_chunk(
     twin: Twin,
     chunk: Chunk,
     rows: NDArray,

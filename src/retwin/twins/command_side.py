@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
-from retwin.twins.around import Around, ask_inside
+from retwin.twins.around import Around, simulate_chunk
 from retwin.twins.checks import ideal_outputs
 from retwin.twins.faults import Fault
 from retwin.twins.parametric import TOGETHER, Parameter, values_per_simulation
@@ -67,11 +67,13 @@ class CommandSide(Around):
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             rows = np.arange(len(chunk.commands))
             options = {name: each[chunk.index] for name, each in theirs.items()}
-            late = _delayed(chunk.told, delay[chunk.index]) + offset[chunk.index][:, None]
+            late = (
+                _delayed(chunk.faulty_commands, delay[chunk.index]) + offset[chunk.index][:, None]
+            )
             held: list[Fault | None] = [
                 None if fault is None else _ResponseOnly(fault) for fault in chunk.faults
             ]
-            ask = partial(ask_inside, self.twin, chunk, rows, seed=seed, parameters=options)
+            ask = partial(simulate_chunk, self.twin, chunk, rows, seed=seed, parameters=options)
             _, observed = ask(self._kept(late), held)
             if self.nominal is not None:
                 return ideal_outputs(self.nominal, chunk.commands, len(self.outputs)), observed

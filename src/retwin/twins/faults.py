@@ -17,8 +17,8 @@ from retwin.data.segments import Segments
 from retwin.errors import InputError
 
 __all__ = [
+    "ActuatorBias",
     "Fault",
-    "SteadyStateError",
     "Stuck",
     "draw_faults",
     "faulty_commands",
@@ -106,7 +106,7 @@ class Stuck:
 
 
 @dataclass(frozen=True)
-class SteadyStateError:
+class ActuatorBias:
     """A bias on the actuator's reference, one per movement.
 
     The bias is reached along the movement's ramp: the reference goes from the biased old target to
@@ -139,7 +139,7 @@ class SteadyStateError:
                 remedy="leave the sign out, it is drawn",
             )
 
-    def drawn(self, rng: np.random.Generator, *, steps: int, movements: int) -> SteadyStateError:
+    def drawn(self, rng: np.random.Generator, *, steps: int, movements: int) -> ActuatorBias:
         """The same fault with one bias per movement."""
         if self.bias:
             return self

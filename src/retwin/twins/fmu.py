@@ -221,7 +221,7 @@ class FMUTwin:
         tell: Callable[[float], None],
     ) -> tuple[NDArray, NDArray]:
         """Nominal and observed outputs of a chunk, which tells how many trajectories are done."""
-        clean, held = chunk.commands, chunk.held
+        clean, held = chunk.commands, chunk.held_commands
         observed = np.zeros((*clean.shape[:2], len(self.outputs)))
         nominal = np.zeros_like(observed)
         runs = [(observed, i, held[i]) for i in range(len(clean))]

@@ -126,7 +126,7 @@ class FunctionTwin:
     def _run(
         self, chunk: Chunk, *, seed: int, pool: ProcessPool | None, tell: Callable
     ) -> tuple[NDArray, NDArray]:
-        held = chunk.held
+        held = chunk.held_commands
         every = np.arange(len(held))
         # Without a nominal of its own, the function need not say twice what a healthy one does.
         fresh = every

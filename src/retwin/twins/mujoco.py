@@ -213,7 +213,12 @@ class MuJoCoTwin:
             own = {name: each[chunk.index] for name, each in values.items()}
             some = np.arange(len(chunk.commands))
             observed, *state = self._integrate(
-                chunk.told, chunk.frozen, own, some, chunk.failed, states=hidden is not None
+                chunk.faulty_commands,
+                chunk.frozen,
+                own,
+                some,
+                chunk.failed,
+                states=hidden is not None,
             )
             if hidden is not None:
                 states.append((state[0], state[1]))

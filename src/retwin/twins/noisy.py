@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.twins.around import Around, ask_inside, generator_of
+from retwin.twins.around import Around, generator_of, simulate_chunk
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, Twin, simulate_in_chunks
 
-__all__ = ["NoisyTwin", "between_readings", "readings", "residual_scale"]
+__all__ = ["NoisyTwin", "interpolate_samples", "readings", "residual_scale"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +72,11 @@ class NoisyTwin(Around):
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             rows = np.arange(len(chunk.commands))
-            nominal, observed = ask_inside(self.twin, chunk, rows, seed=seed)
+            nominal, observed = simulate_chunk(self.twin, chunk, rows, seed=seed)
             count, steps, width = observed.shape
             shape = (count, readings(steps, self.stride), width)
             read = self.scale * generator_of(seed, chunk, 4).normal(size=shape)
-            return nominal, observed + between_readings(read, self.stride, steps)
+            return nominal, observed + interpolate_samples(read, self.stride, steps)
 
         return simulate_in_chunks(
             self, run, commands, faults, seed=seed, progress=progress, emulated=self.emulated
@@ -113,7 +113,7 @@ def readings(steps: int, stride: int) -> int:
     return (steps - 1) // stride + 2
 
 
-def between_readings(read: NDArray, stride: int, steps: int) -> NDArray:
+def interpolate_samples(read: NDArray, stride: int, steps: int) -> NDArray:
     """Samples (n, steps, d) on straight lines between readings (n, r, d), r of `readings`."""
     time = np.arange(steps)
     before, share = time // stride, (time % stride / stride)[:, None]

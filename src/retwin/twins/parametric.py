@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.twins.around import Around, ask_inside
+from retwin.twins.around import Around, simulate_chunk
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, Twin, checked_commands, simulate_in_chunks
 
@@ -282,7 +282,7 @@ class RebuiltTwin(Around):
             for i, theta in enumerate(distinct):
                 rows = np.flatnonzero(group.ravel() == i)
                 twin = self.build(dict(zip(names, theta.tolist(), strict=True)))
-                nominal[rows], observed[rows] = ask_inside(twin, chunk, rows, seed=seed)
+                nominal[rows], observed[rows] = simulate_chunk(twin, chunk, rows, seed=seed)
             return nominal, observed
 
         return simulate_in_chunks(

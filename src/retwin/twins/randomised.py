@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.twins.around import Around, ask_inside, generator_of
+from retwin.twins.around import Around, generator_of, simulate_chunk
 from retwin.twins.checks import ideal_outputs
 from retwin.twins.faults import Fault
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import Chunk, simulate_in_chunks
 
-__all__ = ["RandomisedTwin", "ask_with"]
+__all__ = ["RandomisedTwin", "simulate_with_parameters"]
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,12 @@ class RandomisedTwin(Around):
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             rng = generator_of(seed, chunk, 3)
             drawn = rng.uniform(low, high, size=(len(chunk.commands), len(low)))
-            return ask_with(self.twin, chunk, drawn, seed=seed)
+            return simulate_with_parameters(self.twin, chunk, drawn, seed=seed)
 
         return simulate_in_chunks(self, run, commands, faults, seed=seed, progress=progress)
 
 
-def ask_with(
+def simulate_with_parameters(
     twin: ParametricTwin, chunk: Chunk, values: NDArray, *, seed: int
 ) -> tuple[NDArray, NDArray]:
     """Nominal and observed outputs of a chunk, every trajectory with parameters (n, k) of its own.
@@ -64,8 +64,8 @@ def ask_with(
     """
     rows = np.arange(len(chunk.commands))
     named = dict(zip(twin.names, values.T, strict=True))
-    _, observed = ask_inside(twin, chunk, rows, seed=seed, parameters=named)
+    _, observed = simulate_chunk(twin, chunk, rows, seed=seed, parameters=named)
     if twin.nominal is not None:
         return ideal_outputs(twin.nominal, chunk.commands, len(twin.outputs)), observed
-    ideal, _ = ask_inside(twin, chunk, rows, faults=[None] * len(rows), seed=seed)
+    ideal, _ = simulate_chunk(twin, chunk, rows, faults=[None] * len(rows), seed=seed)
     return ideal, observed

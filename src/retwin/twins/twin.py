@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.arrays import check_finite, row_blocks
 from retwin.data.segments import Segments
-from retwin.data.trajectories import HEALTHY, Channels, Source, Trajectories
+from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.twins.faults import Fault, draw_faults, faulty_commands, frozen_from, frozen_response
@@ -216,7 +216,7 @@ class Chunk:
     ----------
     index: which of all they are.
     commands: (n, T, d_u), clean.
-    told: (n, T, d_u), with the faults' effect on the reference.
+    faulty_commands: (n, T, d_u), the commands with the effect of the faults on the reference.
     faults: drawn, one per trajectory.
     segments: movements of the clean commands.
     failed: for `run` to fill in: which trajectories of this chunk, counted from 0, could not be
@@ -226,7 +226,7 @@ class Chunk:
 
     index: slice
     commands: NDArray
-    told: NDArray
+    faulty_commands: NDArray
     faults: Sequence[Fault | None]
     segments: Segments
     failed: dict[int, str] = field(default_factory=dict)
@@ -237,12 +237,12 @@ class Chunk:
         return frozen_from(self.faults, *self.commands.shape[1:])
 
     @property
-    def held(self) -> NDArray:
-        """`told`, with the faults' effect on the response put on the commands themselves.
+    def held_commands(self) -> NDArray:
+        """`faulty_commands`, held from the sample at which an actuator freezes.
 
         For twins whose actuators are not visible: a frozen response is a held command.
         """
-        return frozen_response(self.told, self.faults)
+        return frozen_response(self.faulty_commands, self.faults)
 
 
 def simulate_in_chunks(
@@ -294,7 +294,7 @@ def simulate_in_chunks(
         rate=twin.rate,
         inputs=twin.inputs,
         outputs=twin.outputs,
-        provenance=(Source(f"{type(twin).__name__} seed={seed}"),),
+        provenance=(Provenance(f"{type(twin).__name__} seed={seed}"),),
         emulated=emulated,
     )
     if failed:

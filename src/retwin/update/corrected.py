@@ -23,7 +23,7 @@ from retwin.twins.twin import (
     checked_seed,
     simulate_in_chunks,
 )
-from retwin.update.corrections import recorded
+from retwin.update.corrections import measured_outputs
 from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
 
@@ -86,11 +86,15 @@ class CorrectedTwin:
         @torch.no_grad()
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             context = self.residual.context(
-                self.surrogate, chunk.commands, chunk.segments, told=chunk.told, frozen=chunk.frozen
+                self.surrogate,
+                chunk.commands,
+                chunk.segments,
+                faulty_commands=chunk.faulty_commands,
+                frozen=chunk.frozen,
             )
             if self.random:
                 z = self.residual.sample(context, generator=generator)
-                outputs = recorded(correction, context, z, generator)
+                outputs = measured_outputs(correction, context, z, generator)
             else:
                 outputs = correction.apply(context, self.residual.mean(context))
             return context.nominal.numpy(), outputs.numpy()

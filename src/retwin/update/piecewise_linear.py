@@ -16,7 +16,7 @@ import torch
 from numpy.polynomial import chebyshev
 from torch import Tensor
 
-__all__ = ["distinct", "told_along"]
+__all__ = ["distinct", "evaluate_piecewise_linear"]
 
 ROUND = 4
 """A line is straight where it is off by so many roundings of its larger end at most."""
@@ -29,7 +29,7 @@ RESOLVED = 3e-6
 geometrically, so that what it leaves out is some thirty times less."""
 
 
-def told_along(
+def evaluate_piecewise_linear(
     ask: Callable[[Tensor], Tensor], commands: Tensor, unit: Tensor | float = 1.0
 ) -> Tensor:
     """Answers (n, T, d_y) to commands (n, T, d_u), asked for as few of them as it takes.

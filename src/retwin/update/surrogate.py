@@ -22,7 +22,7 @@ from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
-from retwin.update.piecewise_linear import told_along
+from retwin.update.piecewise_linear import evaluate_piecewise_linear
 
 __all__ = ["Surrogate", "fit_surrogate", "surrogate_training"]
 
@@ -100,7 +100,7 @@ class Surrogate(nn.Module):
         def ask(rows: Tensor) -> Tensor:
             return torch.cat([self(some) for some in rows.split(ROWS)])
 
-        return told_along(ask, commands, self.after.scale)
+        return evaluate_piecewise_linear(ask, commands, self.after.scale)
 
     def simulate(
         self,
@@ -114,7 +114,7 @@ class Surrogate(nn.Module):
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             nominal = self.predict(chunk.commands)
-            return nominal, self.predict(chunk.held) if any(chunk.faults) else nominal
+            return nominal, self.predict(chunk.held_commands) if any(chunk.faults) else nominal
 
         checked = checked_commands(commands, self.inputs).astype(np.float32, copy=False)
         return simulate_in_chunks(self, run, checked, faults, seed=seed, progress=progress)
@@ -159,10 +159,10 @@ WINDOWED = 10_000_000
 """Samples, in whole trajectories, that are enough for a network with memory."""
 
 DEFAULTS = {
-    "MLP": Training(epochs=20, batch=256, rate=5e-3),
-    "LSTM": Training(epochs=10, batch=32, rate=5e-3),
-    "TCN": Training(epochs=10, batch=32, rate=5e-3),
-    "StateSpace": Training(epochs=40, batch=16, rate=1e-2),
+    "MLP": Training(max_epochs=20, batch_size=256, learning_rate=5e-3),
+    "LSTM": Training(max_epochs=10, batch_size=32, learning_rate=5e-3),
+    "TCN": Training(max_epochs=10, batch_size=32, learning_rate=5e-3),
+    "StateSpace": Training(max_epochs=40, batch_size=16, learning_rate=1e-2),
 }
 
 

@@ -91,7 +91,9 @@ def test_the_real_robot_is_as_described() -> None:
     assert real.known_labels == set(rt.cases.armpi().classes)
     case = rt.cases.armpi()
     twin = rt.generate(case.twin, case, per_class=60, seed=0)
-    ibg = rt.fit_surrogate(twin, seed=0, training=rt.Training(epochs=8, batch=256, rate=1e-2))
+    ibg = rt.fit_surrogate(
+        twin, seed=0, training=rt.Training(max_epochs=8, batch_size=256, learning_rate=1e-2)
+    )
     healthy = real.with_label("Healthy")
     context, found = rt.infer_discrepancy(ibg, healthy, rt.DelayOffset())
     assert context.segments.valid.sum() >= 4 * len(healthy)
@@ -110,7 +112,9 @@ def test_a_corrected_twin_is_nearer_to_the_real_robot() -> None:
     case = rt.cases.armpi()
     calibration, test = real.split(0.5, seed=0)
     twin = rt.generate(case.twin, case, per_class=60, seed=0)
-    ibg = rt.fit_surrogate(twin, seed=0, training=rt.Training(epochs=8, batch=256, rate=1e-2))
+    ibg = rt.fit_surrogate(
+        twin, seed=0, training=rt.Training(max_epochs=8, batch_size=256, learning_rate=1e-2)
+    )
     updated = rt.CorrectedTwin(ibg, rt.fit_residual(ibg, calibration, seed=0))
     held_out = test.with_label("Healthy")
     made = updated.simulate(held_out.commands, seed=0)

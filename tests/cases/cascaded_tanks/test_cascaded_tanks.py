@@ -114,7 +114,7 @@ def test_a_state_space_surrogate_does_not_drift() -> None:
     """On inputs it has not seen, four times as long as those it was trained on."""
     case = tanks()
     made = case.twin.simulate(voltages(160)[:, :256], seed=0)
-    training = rt.Training(epochs=10, batch=8, rate=1e-2)
+    training = rt.Training(max_epochs=10, batch_size=8, learning_rate=1e-2)
     surrogate = rt.fit_surrogate(made, StateSpace(), seed=0, training=training)
     fresh = voltages(8, seed=2)
     truth = case.twin.simulate(fresh, seed=0).nominal
@@ -129,7 +129,7 @@ def test_a_state_space_surrogate_does_not_drift() -> None:
 
 def test_a_state_space_network_is_saved_and_starts_where_the_twin_does(tmp_path: Path) -> None:
     made = TanksTwin().simulate(voltages(10, 40), seed=0)
-    quick = rt.Training(epochs=2, batch=4, rate=1e-2)
+    quick = rt.Training(max_epochs=2, batch_size=4, learning_rate=1e-2)
     surrogate = rt.fit_surrogate(made, StateSpace(states=3), seed=0, training=quick)
     surrogate.save(tmp_path / "ibg")
     commands = voltages(2, 40, seed=1)

@@ -14,7 +14,7 @@ from retwin.deploy.bundle.guard import Guard, fit_guard
 from retwin.deploy.onnx.export import export_onnx
 from retwin.nets.training import Training
 
-QUICK = Training(epochs=8, batch=32, rate=3e-3, weight_decay=1e-2)
+QUICK = Training(max_epochs=8, batch_size=32, learning_rate=3e-3, weight_decay=1e-2)
 
 
 @pytest.fixture(scope="session")

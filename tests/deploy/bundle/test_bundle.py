@@ -206,7 +206,7 @@ def test_what_it_names_is_not_run(
     faults = about["faults"] | {"Healthy": {"kind": "evil:Fault"}}
     (folder / "model.json").write_text(json.dumps(about | {"faults": faults}))
     seal(folder)
-    with pytest.raises(rt.InputError, match="one of Stuck, SteadyStateError"):
+    with pytest.raises(rt.InputError, match="one of Stuck, ActuatorBias"):
         Bundle.load(folder)
 
 

@@ -202,7 +202,7 @@ def test_each_check_tells_its_reason(
 def test_the_same_seed_gives_the_same_guard(
     updated: rt.CorrectedTwin, case: rt.Case, emulated: rt.Trajectories
 ) -> None:
-    short = Training(epochs=1, batch=32)
+    short = Training(max_epochs=1, batch_size=32)
     one, two = (
         fit_guard(updated, case, emulated, seed=4, count=45, training=short) for _ in range(2)
     )

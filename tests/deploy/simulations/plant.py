@@ -29,8 +29,8 @@ HEADROOM = 2**27
 BYTES = 4 * 4 + 4 + 4 + 1
 """Of one sample: commands, nominal and observed output, mask."""
 STEPS, RATE = 16_000, 1600.0
-BRIEF = Training(epochs=1, batch=512, rate=1e-2)
-OF_CLASSES = Training(epochs=1, batch=32, rate=1e-2)
+BRIEF = Training(max_epochs=1, batch_size=512, learning_rate=1e-2)
+OF_CLASSES = Training(max_epochs=1, batch_size=32, learning_rate=1e-2)
 
 
 def level(commands: NDArray) -> NDArray:
@@ -41,7 +41,7 @@ def level(commands: NDArray) -> NDArray:
 CASE = rt.Case(
     name="plant",
     title="A plant",
-    faults={"Healthy": None, "Stuck": rt.Stuck(0, 3000), "Biased": rt.SteadyStateError(1)},
+    faults={"Healthy": None, "Stuck": rt.Stuck(0, 3000), "Biased": rt.ActuatorBias(1)},
     twin=FunctionTwin(
         level, rt.Channels.numbered("u", 4, "%"), rt.Channels.numbered("y", 1, "m"), RATE
     ),

@@ -32,7 +32,7 @@ from retwin.serialisation.identity import identity
 from retwin.twins.samplers import RampSampler
 from retwin.twins.twin import Chunk, SimulationError, simulate_in_chunks
 
-FAULTS = {"Healthy": None, "Stuck": rt.Stuck(0, 3), "Biased": rt.SteadyStateError(1)}
+FAULTS = {"Healthy": None, "Stuck": rt.Stuck(0, 3), "Biased": rt.ActuatorBias(1)}
 SAMPLER = RampSampler((0.0, 0.0), (100.0, 100.0), movements=2, steps=30, ramps=(3, 5))
 
 
@@ -74,8 +74,8 @@ class Toy:
             last = chunk.commands[:, -1, 0]
             for i in np.flatnonzero(last > self.fails_above):
                 chunk.failed[int(i)] = f"ends at\n{last[i]:.1f}"
-            noise = rng.normal(size=(*chunk.held.shape[:2], 1))
-            return chunk.commands[..., :1], chunk.held[..., :1] + noise
+            noise = rng.normal(size=(*chunk.held_commands.shape[:2], 1))
+            return chunk.commands[..., :1], chunk.held_commands[..., :1] + noise
 
         return simulate_in_chunks(self, run, commands, faults, seed=seed, progress=progress)
 

@@ -9,7 +9,7 @@ import torch
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import POLL
 from retwin.serialisation.configs import from_config, to_config
-from retwin.update.corrections import OPERATORS, calibrated, readings, recorded
+from retwin.update.corrections import OPERATORS, fit_sensor, measured_outputs, sample_mask
 
 ROBOT = rt.Chain(rt.CommandSpace(), rt.SampledSensor())
 
@@ -42,19 +42,19 @@ def test_between_readings_a_record_tells_nothing(exact, measured: rt.Trajectorie
     )
     torch.testing.assert_close(ours.z, truth.z)
     torch.testing.assert_close(ours.covariance, truth.covariance)
-    assert readings(ROBOT, observed, mask).equal(told)
+    assert sample_mask(ROBOT, observed, mask).equal(told)
 
 
 def test_the_sensor_is_fitted_with_z(exact, measured: rt.Trajectories) -> None:
     """Real noise is a unit or so of a joint, tenths of a millimetre; a glitch is much more."""
     context = context_of(exact, measured)
-    chain, found = calibrated(ROBOT, context, *arrays(measured))
+    chain, found = fit_sensor(ROBOT, context, *arrays(measured))
     sensor = chain.second
     assert (sensor.every, sensor.phases) == (POLL, (0,))
     assert sensor.glitch_rate < 0.02
     assert 1e-5 < sensor.noise[0][-4] < 3e-3
     outputs = chain.apply(context, found.z)
-    record = recorded(chain, context, found.z, torch.Generator().manual_seed(0))
+    record = measured_outputs(chain, context, found.z, torch.Generator().manual_seed(0))
     # Between readings nothing was computed, and nothing is missing.
     whole = sensor.read(outputs, torch.Generator().manual_seed(0))
     torch.testing.assert_close(record, whole, rtol=0, atol=1e-6)
@@ -69,7 +69,7 @@ def test_an_operator_without_a_sensor_is_recorded_as_it_is(
     context = context_of(exact, measured)
     z = torch.randn(*context.segments.start.shape, 4, generator=torch.Generator().manual_seed(0))
     generator = torch.Generator().manual_seed(0)
-    record = recorded(rt.DelayOffset(), context, z, generator)
+    record = measured_outputs(rt.DelayOffset(), context, z, generator)
     assert record.equal(rt.DelayOffset().apply(context, z))
     assert generator.get_state().equal(torch.Generator().manual_seed(0).get_state())
 

@@ -29,7 +29,7 @@ def context_of(exact, commands: np.ndarray, faults: list | None = None) -> rt.Co
     drawn = draw_faults(faults, segments, 0)
     told = faulty_commands(commands, drawn, segments)
     frozen = frozen_from(drawn, *commands.shape[1:])
-    return rt.Context.of(exact, commands, segments, rate=100.0, told=told, frozen=frozen)
+    return rt.Context.of(exact, commands, segments, rate=100.0, faulty_commands=told, frozen=frozen)
 
 
 def polled(n: int, steps: int = 1000) -> Tensor:
@@ -108,7 +108,7 @@ def test_some_samples_are_those_of_the_whole(exact, commands: np.ndarray, memory
 
     twin = Twin()
     twin.memoryless = memoryless  # type: ignore[attr-defined]
-    context = context_of(twin, commands, [rt.Stuck(1), rt.SteadyStateError(2), None] * 4)
+    context = context_of(twin, commands, [rt.Stuck(1), rt.ActuatorBias(2), None] * 4)
     z = drawn(context.segments.start.shape)
     when = torch.randint(1000, (12, 30), generator=torch.Generator().manual_seed(0))
     some = rt.CommandSpace().at(context, z, when)
@@ -214,12 +214,12 @@ def test_what_the_outputs_do_not_tell_is_said(exact, commands: np.ndarray) -> No
 
 def test_a_fault_does_not_pass_for_a_discrepancy(exact, commands: np.ndarray) -> None:
     """The bias of a faulty motor is told as severity, and leaves the offsets alone."""
-    faults = [rt.SteadyStateError(0, bias=(30.0, -20.0, 40.0, -35.0, 25.0)), *[None] * 11]
+    faults = [rt.ActuatorBias(0, bias=(30.0, -20.0, 40.0, -35.0, 25.0)), *[None] * 11]
     truth = context_of(exact, commands, faults)
     z = drawn(truth.segments.start.shape, missed=0.0)
     observed = rt.CommandSpace().apply(truth, z).double()
     # The class is known, its severity is not: any bias on motor 1 stands for it.
-    guess = [rt.SteadyStateError(0, bias=(1.0,) * 5), *[None] * 11]
+    guess = [rt.ActuatorBias(0, bias=(1.0,) * 5), *[None] * 11]
     found = rt.CommandSpace().infer(context_of(exact, commands, guess), observed, polled(12))
     assert found.severity is not None
     bias = found.severity[0, :, 0].numpy() + 1.0 - z[0, :, 1].numpy()

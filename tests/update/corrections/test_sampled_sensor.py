@@ -94,13 +94,13 @@ def test_only_readings_count() -> None:
     path = paths()
     mask = everything(path)
     mask[0, :100] = False
-    read = rt.SampledSensor(every=10, phases=(4,)).readings(path, mask)
+    read = rt.SampledSensor(every=10, phases=(4,)).sample_mask(path, mask)
     time = np.flatnonzero(read[1].all(dim=-1))
     np.testing.assert_array_equal(time, np.arange(4, STEPS, 10))
     assert not read[0, :100].any()
     several = rt.SampledSensor(every=10, phases=(2, 5))
     record = several.read(path, generator())
-    told = several.readings(record, everything(record))
+    told = several.sample_mask(record, everything(record))
     first = told.all(dim=-1).int().argmax(dim=1)
     assert set(first.tolist()) == {2, 5}
 
@@ -137,4 +137,4 @@ def test_settings_survive_json_and_bad_ones_are_refused() -> None:
         with pytest.raises(rt.InputError, match="sensor: expected"):
             rt.SampledSensor(**bad)
     with pytest.raises(rt.InputError, match="timing is known"):
-        rt.SampledSensor().readings(paths(), everything(paths()))
+        rt.SampledSensor().sample_mask(paths(), everything(paths()))

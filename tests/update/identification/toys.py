@@ -60,7 +60,7 @@ class Batched:
 
         def run(chunk: Chunk) -> tuple[np.ndarray, np.ndarray]:
             some = chunk.index
-            told = (line(each, a[some], b[some]) for each in (chunk.commands, chunk.held))
+            told = (line(each, a[some], b[some]) for each in (chunk.commands, chunk.held_commands))
             nominal, observed = told
             return nominal, observed
 

@@ -72,11 +72,14 @@ def identity() -> rt.Surrogate:
     commands = toy_commands(400, np.random.default_rng(9))
     twin = rt.Trajectories(commands=commands, nominal=commands, observed=commands, rate=10.0)
     return rt.fit_surrogate(
-        twin, rt.MLP((32,)), seed=0, training=Training(epochs=40, batch=128, rate=1e-2)
+        twin,
+        rt.MLP((32,)),
+        seed=0,
+        training=Training(max_epochs=40, batch_size=128, learning_rate=1e-2),
     )
 
 
-LEARN = Training(epochs=250, batch=256, rate=5e-3, decay="cosine", patience=60)
+LEARN = Training(max_epochs=250, batch_size=256, learning_rate=5e-3, decay="cosine", patience=60)
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +217,7 @@ def test_draws_from_noise_have_the_mixture_s_moments() -> None:
 
 
 def test_calibrates_on_healthy_by_default(ibg: rt.Surrogate, emulated: rt.Trajectories) -> None:
-    brief = rt.Mixture(training=Training(epochs=3, batch=64))
+    brief = rt.Mixture(training=Training(max_epochs=3, batch_size=64))
     few = rt.fit_residual(ibg, emulated, density=brief, seed=0)
     assert few.fitted.figures["trajectories"] == 10
     every = rt.fit_residual(ibg, emulated, density=brief, seed=0, calibrate_on="all")
@@ -231,7 +234,7 @@ def test_six_healthy_trajectories_are_enough(ibg: rt.Surrogate, emulated: rt.Tra
 
 
 def test_too_few_to_validate_is_a_warning(ibg: rt.Surrogate, emulated: rt.Trajectories) -> None:
-    brief = rt.Mixture(training=Training(epochs=3))
+    brief = rt.Mixture(training=Training(max_epochs=3))
     with pytest.warns(UserWarning, match="2 trajectories to calibrate on, at least three"):
         model = rt.fit_residual(ibg, emulated.with_label("Healthy")[:2], density=brief, seed=0)
     assert model.fitted.history["validation"] == []
@@ -300,8 +303,10 @@ def test_the_energy_score_is_the_one_of_the_literature() -> None:
 def poor(identity: rt.Surrogate) -> dict[str, rt.ResidualModel]:
     """A model that stopped too early, with and without refinement."""
     calibration, _ = toy(60, seed=4)
-    brief = {"dropout": 0.0, "training": Training(epochs=1)}
-    how = rt.Refinement(training=Training(epochs=25, batch=16, rate=1e-2, patience=10))
+    brief = {"dropout": 0.0, "training": Training(max_epochs=1)}
+    how = rt.Refinement(
+        training=Training(max_epochs=25, batch_size=16, learning_rate=1e-2, patience=10)
+    )
     bounds = np.array([6.0, 0.6])
     return {
         name: rt.fit_residual(
@@ -334,13 +339,15 @@ def test_refinement_helps_a_poor_model_on_trajectories_it_never_saw(
 
 def test_refinement_that_does_not_help_changes_nothing(identity: rt.Surrogate) -> None:
     calibration, _ = toy(30, seed=6)
-    wild = rt.Refinement(draws=2, training=Training(epochs=1, batch=30, rate=50.0, decay="step"))
+    wild = rt.Refinement(
+        draws=2, training=Training(max_epochs=1, batch_size=30, learning_rate=50.0, decay="step")
+    )
     models = [
         rt.fit_residual(
             identity,
             calibration,
             rt.DelayOffset(),
-            rt.Mixture(training=Training(epochs=20), refinement=how),
+            rt.Mixture(training=Training(max_epochs=20), refinement=how),
             seed=0,
         )
         for how in (None, wild)
@@ -366,11 +373,11 @@ def test_faulty_trajectories_calibrate_without_their_fault_in_the_gap(
     ):
         context, found = rt.infer_discrepancy(ibg, used, case.correction, faults=faults)
         free = torch.tensor(context.segments.start)[..., None] < context.frozen[:, None]
-        free = free & (context.told == context.commands).all(dim=1)[:, None]
+        free = free & (context.faulty_commands == context.commands).all(dim=1)[:, None]
         size[name] = found.z[..., 1:5][free].square().mean().sqrt()
     assert size["named"] < 1.3 * size["healthy"]
     assert size["all"] > 1.3 * size["named"]
-    brief = rt.Mixture(training=Training(epochs=3))
+    brief = rt.Mixture(training=Training(max_epochs=3))
     fitted = rt.fit_residual(
         ibg, emulated[::10], case.correction, brief, seed=0, calibrate_on=case.faults
     )

@@ -30,7 +30,7 @@ SMALL = SequenceMixture(
     window=120,
     burn_in=30,
     dropout=0.0,
-    training=Training(epochs=40, batch=6, rate=1e-2),
+    training=Training(max_epochs=40, batch_size=6, learning_rate=1e-2),
 )
 
 
@@ -133,7 +133,11 @@ def test_trust_is_a_share_of_the_way_and_leaves_the_shape() -> None:
 
 def test_without_persistence_draws_are_white(twin: rt.Surrogate, record: rt.Trajectories) -> None:
     quick = replace(
-        SMALL, persistent=False, members=2, refit=False, training=Training(epochs=2, batch=6)
+        SMALL,
+        persistent=False,
+        members=2,
+        refit=False,
+        training=Training(max_epochs=2, batch_size=6),
     )
     rg = fit_residual(twin, record, Additive(), quick, seed=0)
     context = rg.context(twin, np.repeat(record.commands, 200, axis=0))
@@ -161,7 +165,7 @@ def test_it_is_causal(twin: rt.Surrogate, rg: SequenceResidual) -> None:
 
 
 def test_what_is_not_measured_does_not_count(twin: rt.Surrogate, record: rt.Trajectories) -> None:
-    quick = replace(SMALL, members=2, training=Training(epochs=2, batch=6))
+    quick = replace(SMALL, members=2, training=Training(max_epochs=2, batch_size=6))
     mask = np.random.default_rng(0).random(record.mask.shape) > 0.2
     fits = [
         fit_residual(
@@ -210,7 +214,9 @@ def test_its_fidelity_is_measured(twin: rt.Surrogate, rg: SequenceResidual) -> N
 
 
 def test_the_same_seed_gives_the_same_weights(twin: rt.Surrogate, record: rt.Trajectories) -> None:
-    quick = replace(SMALL, network=TCN(8, 3, 3), members=2, training=Training(epochs=2, batch=6))
+    quick = replace(
+        SMALL, network=TCN(8, 3, 3), members=2, training=Training(max_epochs=2, batch_size=6)
+    )
     one, two = (fit_residual(twin, record, Additive(), quick, seed=3) for _ in range(2))
     for name, value in one.state_dict().items():
         assert value.equal(two.state_dict()[name]), name

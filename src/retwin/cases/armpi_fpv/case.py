@@ -17,7 +17,7 @@ from retwin.cases.armpi_fpv.twin import ARM, KINEMATIC, POLL, STRAIGHT, UNIT, Ar
 from retwin.cases.case import Case
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.progress import Progress
-from retwin.twins.faults import Fault, SteadyStateError, Stuck, frozen_response
+from retwin.twins.faults import ActuatorBias, Fault, Stuck, frozen_response
 from retwin.twins.samplers import draw_onsets
 from retwin.update.corrections import Chain, CommandSpace, DelayOffset, SampledSensor
 
@@ -102,7 +102,7 @@ ONSET = 49
 FAULTS: dict[str, Fault | None] = {
     HEALTHY: None,
     **{label: Stuck(i, ONSET) for i, label in enumerate(STUCK)},
-    **{label: SteadyStateError(i) for i, label in enumerate(BIASED)},
+    **{label: ActuatorBias(i) for i, label in enumerate(BIASED)},
 }
 """The nine classes in their fixed order; the published protocol freezes at sample 49 (0-based)."""
 

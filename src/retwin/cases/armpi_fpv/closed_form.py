@@ -97,5 +97,5 @@ class KinematicTwin:
         return simulate_in_chunks(self, self._run, commands, faults, seed=seed, progress=progress)
 
     def _run(self, chunk: Chunk) -> tuple[NDArray, NDArray]:
-        response = frozen_response(self.respond(chunk.told), chunk.faults)
+        response = frozen_response(self.respond(chunk.faulty_commands), chunk.faults)
         return self.position(chunk.commands), self.position(response)

@@ -125,7 +125,7 @@ class EmulatedArmPi:
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             rng = np.random.default_rng([seed, 1, chunk.index.start])
             z = self._draw(chunk.segments, rng)
-            effective = _play(_effective(chunk.told, chunk.segments, z), self.dead_zone)
+            effective = _play(_effective(chunk.faulty_commands, chunk.segments, z), self.dead_zone)
             frozen = chunk.frozen
             driven = self.arm.respond(effective, frozen, chunk.failed)
             angles = _play(driven, self.backlash / 2)

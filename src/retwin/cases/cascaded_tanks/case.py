@@ -60,7 +60,7 @@ def tanks() -> Case:
         sensor_rate=RATE,
         parametric=tanks_parametric(overflow=True),
         network=LSTM(64),
-        training=Training(epochs=120, batch=8, rate=5e-3),
+        training=Training(max_epochs=120, batch_size=8, learning_rate=5e-3),
         per_class=800,
         density=SequenceMixture(block=64, gap=32),
         records=benchmark(FITTED),

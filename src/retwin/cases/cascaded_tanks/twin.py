@@ -110,7 +110,9 @@ class TanksTwin:
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             some = {name: values[chunk.index] for name, values in numbers.items()}
             nominal = self._levels(chunk.commands, some)
-            return nominal, self._levels(chunk.held, some) if any(chunk.faults) else nominal
+            return nominal, self._levels(chunk.held_commands, some) if any(
+                chunk.faults
+            ) else nominal
 
         return simulate_in_chunks(
             self, run, commands, faults, seed=seed, progress=progress, size=512

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.data.trajectories import Channels, Source, Trajectories
+from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
 
@@ -91,7 +91,7 @@ def split_columns(block: NDArray, where: str, case: DataCase | None) -> tuple[ND
 def assemble(
     raws: Sequence[Raw],
     *,
-    source: Source,
+    source: Provenance,
     case: DataCase | None,
     rate: float | None,
     inputs: Channels | None = None,

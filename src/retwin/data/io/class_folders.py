@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from retwin.data.io.assembly import DataCase, Raw, assemble, split_columns
 from retwin.data.io.mat import mat_variables, matrix
 from retwin.data.io.mat5 import Opaque
-from retwin.data.trajectories import Channels, Source, Trajectories
+from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError, brief
 from retwin.progress import Progress
 from retwin.serialisation.files import sha256
@@ -60,7 +60,11 @@ def read_class_folders(
             progress((i + 1) / len(files))
     raws, inputs = _commands_of_case(raws, case, radians=read is _read_dataset)
     return assemble(
-        raws, source=Source(path.resolve().name, sha256(path)), case=case, rate=rate, inputs=inputs
+        raws,
+        source=Provenance(path.resolve().name, sha256(path)),
+        case=case,
+        rate=rate,
+        inputs=inputs,
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.data.trajectories import Channels, Source, Trajectories
+from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError
 
 __all__ = [
@@ -188,7 +188,7 @@ def _read_about(header: Mapping[str, Any]) -> dict[str, Any]:
         "rate": header["rate"],
         "inputs": _read_channels(header["inputs"]),
         "outputs": _read_channels(header["outputs"]),
-        "provenance": tuple(Source(s["name"], s["sha256"]) for s in header["provenance"]),
+        "provenance": tuple(Provenance(s["name"], s["sha256"]) for s in header["provenance"]),
         "emulated": bool(header["emulated"]),
     }
 

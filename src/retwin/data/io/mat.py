@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from retwin.data.io.assembly import DataCase, Raw, assemble, split_columns
 from retwin.data.io.mat5 import NewerMat, read_mat5
-from retwin.data.trajectories import Source, Trajectories
+from retwin.data.trajectories import Provenance, Trajectories
 from retwin.errors import InputError, brief
 from retwin.serialisation.files import sha256
 
@@ -63,7 +63,7 @@ def read_mat(path: Path, *, case: DataCase | None, rate: float | None) -> Trajec
                 commands=commands if commands.shape[1] else None,
             )
         )
-    return assemble(raws, source=Source(path.name, sha256(path)), case=case, rate=rate)
+    return assemble(raws, source=Provenance(path.name, sha256(path)), case=case, rate=rate)
 
 
 def mat_variables(path: Path, names: list[str] | None = None) -> dict[str, Any]:

@@ -8,12 +8,12 @@ from typing import Any
 
 from retwin.errors import InputError
 from retwin.serialisation.configs import from_config, to_config
-from retwin.twins.faults import Fault, SteadyStateError, Stuck
+from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.samplers import RampSampler
 
 __all__ = ["Facts"]
 
-FAULTS = (Stuck, SteadyStateError)
+FAULTS = (Stuck, ActuatorBias)
 SAMPLERS = (RampSampler,)
 
 

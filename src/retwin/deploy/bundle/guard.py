@@ -33,7 +33,7 @@ from retwin.update.surrogate import Surrogate
 __all__ = ["Guard", "fit_guard"]
 
 NETWORK = CNN(channels=(32, 64), dropout=0.1)
-TRAINING = Training(epochs=15, batch=64, rate=3e-3, weight_decay=1e-2)
+TRAINING = Training(max_epochs=15, batch_size=64, learning_rate=3e-3, weight_decay=1e-2)
 SHARE = 0.99
 """Of generated trajectories are usual."""
 TWICE = 2.0

@@ -115,7 +115,7 @@ def _context(
     return Context(
         surrogate=cast(Any, surrogate),
         commands=commands,
-        told=commands,
+        faulty_commands=commands,
         frozen=cast(Tensor, frozen),
         nominal=outputs,
         segments=cast(Segments, Movements(*times, steps=steps, most=most)),

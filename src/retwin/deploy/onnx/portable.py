@@ -215,7 +215,7 @@ class Portable:
             common=rng.standard_normal((count, 1, size), np.float32),
         )
         outputs = self.graphs["correction"](
-            told=_single(chunk.told), frozen=chunk.frozen.astype(np.int64), **moves, z=z
+            told=_single(chunk.faulty_commands), frozen=chunk.frozen.astype(np.int64), **moves, z=z
         )
         if self.sensor is None:
             return nominal, outputs

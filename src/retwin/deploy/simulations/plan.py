@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from retwin.data.io.header import CHUNKED_NAMES, FAILED
-from retwin.data.trajectories import HEALTHY, Channels, Source, Trajectories
+from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError, place_of
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
@@ -145,7 +145,7 @@ class SimulationPlan:
             rate=self.twin.rate,
             inputs=self.twin.inputs,
             outputs=self.twin.outputs,
-            provenance=(Source(f"{type(self.twin).__name__} seed={self.seed}"),),
+            provenance=(Provenance(f"{type(self.twin).__name__} seed={self.seed}"),),
             emulated=emulated,
         )
 

@@ -2,16 +2,16 @@
 
 from retwin.evaluation.fidelity.figures import Fidelity, Figure
 from retwin.evaluation.fidelity.measure import measure_fidelity, measure_widening
-from retwin.evaluation.fidelity.portrait import Portrait, portray
+from retwin.evaluation.fidelity.portrait import Overlay, predictive_overlay
 from retwin.evaluation.fidelity.simulation import Simulation, simulate_records
 
 __all__ = [
     "Fidelity",
     "Figure",
-    "Portrait",
+    "Overlay",
     "Simulation",
     "measure_fidelity",
     "measure_widening",
-    "portray",
+    "predictive_overlay",
     "simulate_records",
 ]

@@ -16,13 +16,13 @@ from retwin.serialisation.files import write_atomically
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.residual import infer_discrepancy, segment
 
-__all__ = ["Portrait", "portray"]
+__all__ = ["Overlay", "predictive_overlay"]
 
 _ARRAYS = ("ids", "bands", "z", "deviation", "times")
 
 
 @dataclass(frozen=True, eq=False)
-class Portrait:
+class Overlay:
     """n trajectories at P moments in d outputs, with at most M movements.
 
     Attributes
@@ -51,14 +51,14 @@ class Portrait:
             np.savez_compressed(part, allow_pickle=False, latent=latent, **arrays)
 
     @classmethod
-    def load(cls, file: str | Path) -> Portrait:
+    def load(cls, file: str | Path) -> Overlay:
         """Read what `save` wrote."""
         with np.load(file, allow_pickle=False) as found:
             latent = Channels(*(tuple(row.tolist()) for row in found["latent"]))
             return cls(latent, **{name: found[name] for name in _ARRAYS})
 
     @classmethod
-    def concatenate(cls, parts: list[Portrait]) -> Portrait:
+    def concatenate(cls, parts: list[Overlay]) -> Overlay:
         """Several sets of trajectories as one; those with fewer movements are filled up."""
         most = max(part.times.shape[1] for part in parts)
 
@@ -77,7 +77,7 @@ class Portrait:
         )
 
 
-def portray(
+def predictive_overlay(
     twin: CorrectedTwin,
     trajectories: Trajectories,
     *,
@@ -85,7 +85,7 @@ def portray(
     seed: int,
     rate: float,
     progress: Progress | None = None,
-) -> Portrait:
+) -> Overlay:
     """Simulate each trajectory's commands `draws` times as if healthy, and infer its z likewise.
 
     Where something is broken, outputs leave the bands and z is not believable: that is what a
@@ -116,7 +116,7 @@ def portray(
         bands.append(np.quantile(made, LEVELS, axis=0, method="weibull"))
         if progress is not None:
             progress((i + 1) / len(trajectories))
-    return Portrait(
+    return Overlay(
         latent,
         trajectories.ids,
         np.stack(bands).astype(np.float32),

@@ -43,12 +43,12 @@ def train(
 
     from retwin.nets.training.loop import Loop
 
-    steps = math.ceil(len(training_set[0]) / how.batch)
+    steps = math.ceil(len(training_set[0]) / how.batch_size)
     loop = Loop(network, loss, how, steps=steps, progress=progress)
     generator = torch.Generator().manual_seed(seed)
     with isolated(seed), _quiet(), _interruptible():
         trainer = Trainer(
-            max_epochs=how.epochs,
+            max_epochs=how.max_epochs,
             accelerator="auto",
             devices=1,
             logger=False,
@@ -60,8 +60,8 @@ def train(
         )
         trainer.fit(
             loop,
-            _loader(training_set, how.batch, generator),
-            None if validation_set is None else _loader(validation_set, 4 * how.batch, None),
+            _loader(training_set, how.batch_size, generator),
+            None if validation_set is None else _loader(validation_set, 4 * how.batch_size, None),
         )
     network.cpu()
     if loop.weights is not None:

@@ -67,12 +67,17 @@ class Loop(LightningModule):
         """AdamW, its rate decayed as the training says."""
         how = self.how
         optimiser = torch.optim.AdamW(
-            self.network.parameters(), lr=how.rate, weight_decay=how.weight_decay, fused=True
+            self.network.parameters(),
+            lr=how.learning_rate,
+            weight_decay=how.weight_decay,
+            fused=True,
         )
-        total = self.steps * how.epochs
+        total = self.steps * how.max_epochs
         schedule: LRScheduler
         if how.decay == "cosine":
-            schedule = OneCycleLR(optimiser, how.rate, total, pct_start=WARM, final_div_factor=1000)
+            schedule = OneCycleLR(
+                optimiser, how.learning_rate, total, pct_start=WARM, final_div_factor=1000
+            )
         else:
             schedule = MultiStepLR(optimiser, [math.ceil(total * 2 / 3)], gamma=0.1)
         return {
@@ -99,7 +104,7 @@ class Loop(LightningModule):
         self.history["train"].append(torch.stack(self._train_losses).mean().item())
         self._train_losses.clear()
         if self.progress is not None:
-            done = (self.current_epoch + 1) / self.how.epochs
+            done = (self.current_epoch + 1) / self.how.max_epochs
             self.progress(1.0 if self.stopped else done)
 
     def result(self) -> Fit:

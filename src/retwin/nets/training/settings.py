@@ -24,9 +24,9 @@ class Training:
 
     Parameters
     ----------
-    epochs: at most.
-    batch: examples per step.
-    rate: highest learning rate of AdamW.
+    max_epochs: at most.
+    batch_size: examples per step.
+    learning_rate: highest learning rate of AdamW.
     decay: "cosine" rises over a tenth of the steps and falls to nothing (one cycle); "step" starts
         at the full rate and drops tenfold after two thirds of the steps.
     patience: epochs without a better validation loss before it stops; 0 never stops early.
@@ -35,20 +35,20 @@ class Training:
 
     """
 
-    epochs: int = 100
-    batch: int = 64
-    rate: float = 1e-3
+    max_epochs: int = 100
+    batch_size: int = 64
+    learning_rate: float = 1e-3
     decay: str = "cosine"
     patience: int = 0
     weight_decay: float = 0.0
     clip: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.decay not in ("cosine", "step") or min(self.epochs, self.batch) < 1:
+        if self.decay not in ("cosine", "step") or min(self.max_epochs, self.batch_size) < 1:
             raise InputError(
                 "training",
                 expected="decay 'cosine' or 'step', at least one epoch and one example per batch",
-                got=f"decay {self.decay!r}, {self.epochs} epochs, batch {self.batch}",
+                got=f"decay {self.decay!r}, {self.max_epochs} epochs, batch {self.batch_size}",
                 remedy="see the parameters of Training",
             )
 

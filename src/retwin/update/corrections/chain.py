@@ -13,7 +13,7 @@ from retwin.errors import InputError
 from retwin.update.corrections.correction import Context, Correction, Discrepancy, Head
 from retwin.update.corrections.sampled_sensor import SampledSensor
 
-__all__ = ["Chain", "calibrated", "readings", "recorded"]
+__all__ = ["Chain", "fit_sensor", "measured_outputs", "sample_mask"]
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Chain:
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """z* of one operator after the other, each from what those before it left."""
         if isinstance(self.second, SampledSensor):
-            return self.first.infer(context, observed, readings(self, observed, mask))
+            return self.first.infer(context, observed, sample_mask(self, observed, mask))
         one = self.first.infer(context, observed, mask)
         with torch.no_grad():
             left = replace(context, corrected=self.first.apply(context, one.z))
@@ -143,7 +143,7 @@ def _sensor(correction: Correction) -> SampledSensor | None:
     return last if isinstance(last, SampledSensor) else None
 
 
-def calibrated(
+def fit_sensor(
     correction: Correction, context: Context, observed: Tensor, mask: Tensor
 ) -> tuple[Correction, Discrepancy]:
     """The operator, its sensor fitted to measured outputs (n, T, d_y), and their z*."""
@@ -158,13 +158,13 @@ def calibrated(
     return replace(chain, second=fitted), found
 
 
-def readings(correction: Correction, observed: Tensor, mask: Tensor) -> Tensor:
+def sample_mask(correction: Correction, observed: Tensor, mask: Tensor) -> Tensor:
     """`mask` (n, T, d_y) where a record holds a reading of the operator's sensor, if it has one."""
     sensor = _sensor(correction)
-    return mask if sensor is None else sensor.timed(observed, mask).readings(observed, mask)
+    return mask if sensor is None else sensor.timed(observed, mask).sample_mask(observed, mask)
 
 
-def recorded(
+def measured_outputs(
     correction: Correction, context: Context, z: Tensor, generator: torch.Generator
 ) -> Tensor:
     """The corrected outputs (n, T, d_y) as the operator's sensor, if it has one, records them.

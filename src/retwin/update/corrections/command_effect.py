@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from retwin.data.segments import Segments
-from retwin.update.corrections.warp import Knots, read, taken
+from retwin.update.corrections.warp import Knots, gather_samples, read
 
 __all__ = ["effective"]
 
@@ -59,7 +59,7 @@ def _free(told: Tensor, segments: Segments, z: Tensor, when: Tensor) -> Tensor:
     here = read(told, source)
     index = torch.searchsorted(start, source.detach().contiguous(), right=True).minimum(count)
     which = (index - 1).clamp_min(0)
-    a, b = taken(first, which), taken(last, which)
+    a, b = gather_samples(first, which), gather_samples(last, which)
     begin, end = (times.gather(1, which)[..., None] for times in (start, settle))
     # An actuator errs as far as it has moved; one that is told nothing, as time has passed.
     size = told.abs().amax(dim=0).amax(dim=0).clamp_min(1e-12)
@@ -69,6 +69,6 @@ def _free(told: Tensor, segments: Segments, z: Tensor, when: Tensor) -> Tensor:
     passed = (source - begin) / (end - begin).clamp_min(1e-9)
     share = torch.where(moves, along, passed).clamp(0, 1)
     share = torch.where(source >= end, torch.ones_like(share), share)
-    before, after = taken(errors, which), taken(errors, which + 1)
+    before, after = gather_samples(errors, which), gather_samples(errors, which + 1)
     wrong = before + share * (after - before)
     return here + torch.where(index[..., None] > 0, wrong, torch.zeros_like(wrong))

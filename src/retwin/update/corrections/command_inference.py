@@ -18,7 +18,7 @@ from retwin.errors import InputError
 from retwin.update.corrections.command_delays import delay_variance
 from retwin.update.corrections.command_problem import TAILS, Problem
 from retwin.update.corrections.correction import Context, Discrepancy
-from retwin.update.corrections.warp import read, taken
+from retwin.update.corrections.warp import gather_samples, read
 
 if TYPE_CHECKING:
     from retwin.update.corrections.command_space import CommandSpace
@@ -128,7 +128,7 @@ class _Prior:
         seen = problem.seen > 0
         # Of nothing at all, the median and the spread are NaN.
         noise = residual.norm(dim=-1)[seen].median().nan_to_num(1.0).clamp_min(1e-6).repeat(2)
-        told = taken(problem.told, problem.at)[seen]
+        told = gather_samples(problem.told, problem.at)[seen]
         extent = (told - told.mean(dim=0)).square().mean(dim=0).sqrt()
         width = 0.05 * extent.nan_to_num(1.0).clamp_min(1e-9)
         one = torch.ones((), dtype=torch.float64)

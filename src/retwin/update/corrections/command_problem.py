@@ -11,7 +11,7 @@ from torch import Tensor
 
 from retwin.update.corrections.command_effect import effective
 from retwin.update.corrections.correction import Context
-from retwin.update.corrections.warp import taken
+from retwin.update.corrections.warp import gather_samples
 from retwin.update.piecewise_linear import distinct
 
 if TYPE_CHECKING:
@@ -58,9 +58,9 @@ class Problem:
         self.operator = operator
         self.surrogate = context.surrogate
         self.segments = context.segments
-        self.told = context.told.double()
+        self.told = context.faulty_commands.double()
         start = torch.as_tensor(context.segments.start)[..., None]
-        bent = (context.told != context.commands).any(dim=1)[:, None]
+        bent = (context.faulty_commands != context.commands).any(dim=1)[:, None]
         self.valid = torch.as_tensor(context.segments.valid)
         self.faulty = bent & self.valid[..., None]
         self.healthy = self.valid[..., None] & ~bent & (start < context.frozen[:, None])
@@ -73,7 +73,7 @@ class Problem:
         spread = told.std(dim=0, correction=0) / unit if len(told) else torch.ones_like(unit)
         self.unit = unit * spread.mean().clamp_min(1e-12)
         values = torch.where(seen[..., None], observed.double(), 0.0)
-        self.observed = taken(values, self.at) / self.unit
+        self.observed = gather_samples(values, self.at) / self.unit
         begin = start + operator.delay_range[0]
         end = torch.as_tensor(context.segments.settle)[..., None] + MARGIN
         at = self.at[:, None]
@@ -105,7 +105,7 @@ class Problem:
     def predicted(self, commands: Tensor) -> Tensor:
         """The surrogate's outputs (n, S, d_y) at `at` for commands at `when`."""
         outputs = self.surrogate(commands)
-        return taken(outputs, self.at) if self.memory else outputs
+        return gather_samples(outputs, self.at) if self.memory else outputs
 
     def nothing(self) -> tuple[Tensor, Tensor]:
         """What x and missed are of trajectories without any discrepancy."""

@@ -17,7 +17,7 @@ from retwin.data.trajectories import Channels
 from retwin.update.corrections.command_effect import effective
 from retwin.update.corrections.command_inference import infer_commands
 from retwin.update.corrections.correction import Context, Discrepancy, Head
-from retwin.update.corrections.warp import taken
+from retwin.update.corrections.warp import gather_samples
 from retwin.update.piecewise_linear import distinct
 
 __all__ = ["CommandSpace"]
@@ -74,12 +74,12 @@ class CommandSpace:
 
     def apply(self, context: Context, z: Tensor) -> Tensor:
         """ỹ = G_φ(T_z(u)), differentiable in z; a frozen actuator stays where z had brought it."""
-        return context.surrogate(_told(context, z, torch.arange(context.told.shape[1])))
+        return context.surrogate(_told(context, z, torch.arange(context.faulty_commands.shape[1])))
 
     def at(self, context: Context, z: Tensor, when: Tensor) -> Tensor:
         """The same (n, S, d_y) at the samples `when` (n, S) only."""
         if not getattr(context.surrogate, "memoryless", False):
-            return taken(self.apply(context, z), when)
+            return gather_samples(self.apply(context, z), when)
         rows, place = distinct(_told(context, z, when))
         return context.surrogate(rows[None])[0, place]
 
@@ -93,5 +93,5 @@ KINDS = ("offset", "missed")
 
 def _told(context: Context, z: Tensor, when: Tensor) -> Tensor:
     """T_z(u) at the samples `when`, (n, S) or (S,)."""
-    told = effective(context.told.to(z.dtype), context.segments, z, when, context.frozen)
-    return told.to(context.told.dtype)
+    told = effective(context.faulty_commands.to(z.dtype), context.segments, z, when, context.frozen)
+    return told.to(context.faulty_commands.dtype)

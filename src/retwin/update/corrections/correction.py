@@ -55,7 +55,7 @@ class Context:
     ----------
     surrogate: commands (n, T, d_u) to outputs (n, T, d_y), differentiable.
     commands: (n, T, d_u), clean.
-    told: (n, T, d_u), with the faults' effect on the reference.
+    faulty_commands: (n, T, d_u), the commands with the effect of the faults on the reference.
     frozen: (n, d_u), the sample from which a fault holds an actuator's response; T for never.
     nominal: (n, T, d_y), the surrogate's output for the clean commands.
     segments: movements of the clean commands or of the nominal path.
@@ -66,7 +66,7 @@ class Context:
 
     surrogate: DifferentiableTwin
     commands: Tensor
-    told: Tensor
+    faulty_commands: Tensor
     frozen: Tensor
     nominal: Tensor
     segments: Segments
@@ -87,8 +87,8 @@ class Context:
         if self.corrected is not None:
             return self.corrected
         if not self._found:
-            time = torch.arange(self.told.shape[1])[:, None]
-            held = self.told.gather(1, torch.minimum(time, self.frozen[:, None]))
+            time = torch.arange(self.faulty_commands.shape[1])[:, None]
+            held = self.faulty_commands.gather(1, torch.minimum(time, self.frozen[:, None]))
             clean = held.equal(self.commands)
             said = self.nominal if clean else torch.as_tensor(self.surrogate.predict(held.numpy()))
             self._found.append(said)
@@ -104,7 +104,7 @@ class Context:
         return replace(
             self,
             commands=self.commands[index],
-            told=self.told[index],
+            faulty_commands=self.faulty_commands[index],
             frozen=self.frozen[index],
             nominal=self.nominal[index],
             segments=self.segments[index],
@@ -119,7 +119,7 @@ class Context:
         segments: Segments,
         *,
         rate: float,
-        told: NDArray | None = None,
+        faulty_commands: NDArray | None = None,
         frozen: NDArray | None = None,
     ) -> Context:
         """The context of those commands, without faults by default."""
@@ -127,7 +127,9 @@ class Context:
         return cls(
             surrogate,
             commands=clean,
-            told=clean if told is None else torch.tensor(told, dtype=torch.float32),
+            faulty_commands=clean
+            if faulty_commands is None
+            else torch.tensor(faulty_commands, dtype=torch.float32),
             frozen=torch.full((len(clean), clean.shape[2]), clean.shape[1])
             if frozen is None
             else torch.as_tensor(frozen),

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from retwin.data.segments import Segments
 from retwin.errors import InputError
-from retwin.update.corrections.warp import taken
+from retwin.update.corrections.warp import gather_samples
 
 __all__ = ["SampledSensor"]
 
@@ -95,7 +95,7 @@ class SampledSensor:
         made = replace(self, every=every, phases=self.phases or phases)
         if made.steps is not None:
             return made
-        readings = observed[made.readings(observed, mask).all(dim=-1)].double().numpy()
+        readings = observed[made.sample_mask(observed, mask).all(dim=-1)].double().numpy()
         return replace(made, steps=tuple(_step(values) for values in readings.T))
 
     def fitted(
@@ -107,7 +107,7 @@ class SampledSensor:
         about that part's median.
         """
         made = self.timed(observed, mask)
-        errors = _at_rest(observed - explained, made.readings(observed, mask), segments)
+        errors = _at_rest(observed - explained, made.sample_mask(observed, mask), segments)
         size = np.abs(errors)
         usual = np.quantile(size, USUAL, axis=0) if len(errors) else np.zeros(errors.shape[1])
         gross = (size > GROSS * np.where(usual > 0, usual, np.inf)).any(axis=1)
@@ -124,7 +124,7 @@ class SampledSensor:
         """Itself, with what was found where nothing was given."""
         return replace(self, **{k: v for k, v in found.items() if getattr(self, k) is None})
 
-    def readings(self, observed: Tensor, mask: Tensor) -> Tensor:
+    def sample_mask(self, observed: Tensor, mask: Tensor) -> Tensor:
         """`mask` (n, T, d_y) where a record was read; in between, it tells nothing."""
         if self.every is None:
             raise InputError(
@@ -149,7 +149,7 @@ class SampledSensor:
             return outputs
         steps = outputs.shape[1]
         when = self.polls(len(outputs), steps, generator)
-        return self.record(taken(outputs, when), when, steps, generator)
+        return self.record(gather_samples(outputs, when), when, steps, generator)
 
     def polls(self, count: int, steps: int, generator: torch.Generator) -> Tensor:
         """When records of so many samples are read, (count, R); at the last one if beyond it."""
@@ -173,12 +173,12 @@ class SampledSensor:
             return values
         last = (steps - 1 - phase) // every
         following = (torch.arange(values.shape[1]) + 1).minimum(last)
-        ends = torch.stack([values, taken(values, following) - values])
+        ends = torch.stack([values, gather_samples(values, following) - values])
         # A line from each reading to the next, all at once: as a product of matrices it is quick.
         share = torch.arange(every).to(values) / every
         join = torch.stack([torch.ones_like(share), share], dim=1)
         lines = torch.einsum("ek,knrd->nred", join, ends).flatten(1, 2)
-        return taken(lines, (torch.arange(steps) - phase).clamp_min(0))
+        return gather_samples(lines, (torch.arange(steps) - phase).clamp_min(0))
 
     def _errors(self, like: Tensor, generator: torch.Generator) -> Tensor:
         """Errors of readings (n, R, d_y)."""

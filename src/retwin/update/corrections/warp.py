@@ -9,7 +9,7 @@ from torch import Tensor
 
 from retwin.data.segments import Segments
 
-__all__ = ["Knots", "read", "taken"]
+__all__ = ["Knots", "gather_samples", "read"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +48,14 @@ class Knots:
 
     def between(self, values: Tensor) -> Tensor:
         """Values (n, 2 M, k) of the knots, linear between them and constant outside: (n, T, k)."""
-        before, after = (taken(values, place) for place in self._around)
+        before, after = (gather_samples(values, place) for place in self._around)
         return before + self.share[..., None] * (after - before)
 
     def slope(self, values: Tensor) -> Tensor:
         """Change per sample of `between` (n, T, k)."""
         before, after = self._around
         length = self.target.gather(1, after) - self.target.gather(1, before)
-        rise = taken(values, after) - taken(values, before)
+        rise = gather_samples(values, after) - gather_samples(values, before)
         return rise / length.clamp_min(1e-9)[..., None]
 
     @property
@@ -77,7 +77,7 @@ class Knots:
         return torch.stack([before, offset], dim=2).flatten(1, 2)
 
 
-def taken(values: Tensor, place: Tensor) -> Tensor:
+def gather_samples(values: Tensor, place: Tensor) -> Tensor:
     """The values (n, T, d) at whole places (n, S) of their own: (n, S, d)."""
     return values.gather(1, place[..., None].expand(-1, -1, values.shape[2]))
 
@@ -86,5 +86,5 @@ def read(path: Tensor, when: Tensor) -> Tensor:
     """The path (n, T, d) at the fractional samples `when` (n, T), held beyond its ends."""
     when = when.clamp(0, path.shape[1] - 1)
     below = when.detach().floor().long().clamp_max(max(path.shape[1] - 2, 0))
-    before, after = taken(path, below), taken(path, below + 1)
+    before, after = gather_samples(path, below), gather_samples(path, below + 1)
     return before + (when - below)[..., None] * (after - before)

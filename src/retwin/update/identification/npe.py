@@ -122,7 +122,7 @@ class NPE:
             network = build(
                 "mdn", z_score_x="none", hidden_features=HIDDEN, num_components=COMPONENTS
             )(*fitted_on)
-        how = Training(epochs=self.epochs, batch=BATCH, rate=RATE, clip=CLIP)
+        how = Training(max_epochs=self.epochs, batch_size=BATCH, learning_rate=RATE, clip=CLIP)
         fit = train(network, loss, fitted_on, held_out, how, seed=seed)
         with isolated(seed), torch.no_grad():
             drawn = network.sample((SPARE * self.samples,), condition=asked)[:, 0].double().numpy()

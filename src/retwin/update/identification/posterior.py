@@ -17,9 +17,9 @@ from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.twins.around import Around, generator_of
 from retwin.twins.faults import Fault
-from retwin.twins.noisy import between_readings, readings
+from retwin.twins.noisy import interpolate_samples, readings
 from retwin.twins.parametric import ParametricTwin
-from retwin.twins.randomised import ask_with
+from retwin.twins.randomised import simulate_with_parameters
 from retwin.twins.twin import Chunk, simulate_in_chunks
 from retwin.update.identification.noise import Noise
 
@@ -66,7 +66,9 @@ class PosteriorTwin(Around):
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             rng = generator_of(seed, chunk, 2)
             drawn = rng.integers(len(self.samples), size=len(chunk.commands))
-            ideal, observed = ask_with(self.twin, chunk, self.samples[drawn], seed=seed)
+            ideal, observed = simulate_with_parameters(
+                self.twin, chunk, self.samples[drawn], seed=seed
+            )
             return ideal, observed + self._error(rng, self.logs[drawn], observed.shape[1])
 
         return simulate_in_chunks(
@@ -77,7 +79,7 @@ class PosteriorTwin(Around):
         """Errors (n, steps, d_y) in output units, drawn at the sensor's rate."""
         count = readings(steps, self.stride)
         read = self.noise.draw(rng, logs, count, len(self.outputs), self.stride / self.rate)
-        return self.unit * between_readings(read, self.stride, steps)
+        return self.unit * interpolate_samples(read, self.stride, steps)
 
     def save(self, folder: str | Path) -> None:
         """Write the draws and what they are of; the twin itself is not written."""

@@ -24,8 +24,8 @@ from retwin.update.corrections import (
     Correction,
     DelayOffset,
     Discrepancy,
-    calibrated,
-    readings,
+    fit_sensor,
+    sample_mask,
 )
 from retwin.update.residual.model import ResidualModel, segment
 from retwin.update.residual.penalties import penalties
@@ -142,7 +142,7 @@ def fit_residual(
             remedy="give segments='path', or the movements themselves",
         )
     context = _context(surrogate, used, parts, faults)
-    correction, found = calibrated(correction, context, *_measured(used))
+    correction, found = fit_sensor(correction, context, *_measured(used))
     if not found.identified.any():
         raise InputError(
             "calibration",
@@ -175,7 +175,7 @@ def fit_residual(
     figures = {"trajectories": float(len(used)), "movements": float(parts.valid.sum())}
     if density.refinement is not None and held is not None:
         observed, mask = _measured(used)
-        read = readings(correction, observed, mask)
+        read = sample_mask(correction, observed, mask)
         figures |= refine(
             model, context, observed, read, fitted=fitted, held=held, how=density.refinement,
             seed=seed, progress=progress,
@@ -206,7 +206,7 @@ def _context(
         commands,
         parts,
         rate=trajectories.rate,
-        told=faulty_commands(commands, drawn, parts),
+        faulty_commands=faulty_commands(commands, drawn, parts),
         frozen=frozen_from(drawn, *commands.shape[1:]),
     )
 

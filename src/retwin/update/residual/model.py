@@ -91,7 +91,7 @@ class ResidualModel(nn.Module):
         commands: NDArray,
         segments: Segments | None = None,
         *,
-        told: NDArray | None = None,
+        faulty_commands: NDArray | None = None,
         frozen: NDArray | None = None,
     ) -> Context:
         """What this model is called on, for commands (n, T, d_u), movements found by its rule."""
@@ -99,7 +99,12 @@ class ResidualModel(nn.Module):
             nominal = surrogate.predict(commands) if self.segmentation == "path" else commands
             segments = segment(commands, nominal, self.segmentation)
         return Context.of(
-            surrogate, commands, segments, rate=surrogate.rate, told=told, frozen=frozen
+            surrogate,
+            commands,
+            segments,
+            rate=surrogate.rate,
+            faulty_commands=faulty_commands,
+            frozen=frozen,
         )
 
     def forward(self, context: Context) -> Blocks:

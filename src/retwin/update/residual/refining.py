@@ -19,7 +19,7 @@ from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import BernoulliHead
 from retwin.nets.training import train
 from retwin.progress import Progress
-from retwin.update.corrections import Context, recorded
+from retwin.update.corrections import Context
 from retwin.update.residual.model import ResidualModel, describe
 from retwin.update.residual.settings import Refinement
 
@@ -60,7 +60,9 @@ def refine(
         law = network.distribution(batch[0].repeat_interleave(draws, dim=0))
         z = network.drawn(law, generator=generator).cpu()
         every = context[rows.repeat_interleave(draws).numpy()]
-        made = recorded(network.correction, every, z, generator).unflatten(0, (len(rows), draws))
+        made = measured_outputs(network.correction, every, z, generator).unflatten(
+            0, (len(rows), draws)
+        )
         return energy_score(made / unit, observed[rows] / unit, mask[rows]).mean()
 
     seeds = iter(torch.randint(2**31, (100_000,), generator=torch.Generator().manual_seed(seed)))

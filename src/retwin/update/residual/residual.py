@@ -45,7 +45,7 @@ class Residual(Protocol):
         commands: NDArray,
         segments: Segments | None = None,
         *,
-        told: NDArray | None = None,
+        faulty_commands: NDArray | None = None,
         frozen: NDArray | None = None,
     ) -> Context:
         """What it is called on, for commands (n, T, d_u)."""

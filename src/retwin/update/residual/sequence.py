@@ -74,7 +74,7 @@ class SequenceMixture:
     refit: bool = True
     persistent: bool = True
     training: Training = Training(  # noqa: RUF009 - frozen
-        epochs=80, batch=6, rate=5e-3, weight_decay=0.1
+        max_epochs=80, batch_size=6, learning_rate=5e-3, weight_decay=0.1
     )
 
     def __post_init__(self) -> None:
@@ -182,12 +182,19 @@ class SequenceResidual(nn.Module):
         commands: NDArray,
         segments: Segments | None = None,
         *,
-        told: NDArray | None = None,
+        faulty_commands: NDArray | None = None,
         frozen: NDArray | None = None,
     ) -> Context:
         """What this model is called on, for commands (n, T, d_u)."""
         parts = Segments.from_commands(commands) if segments is None else segments
-        return Context.of(surrogate, commands, parts, rate=surrogate.rate, told=told, frozen=frozen)
+        return Context.of(
+            surrogate,
+            commands,
+            parts,
+            rate=surrogate.rate,
+            faulty_commands=faulty_commands,
+            frozen=frozen,
+        )
 
     def forward(self, context: Context) -> Blocks:
         """q_ψ(z_t | past of u and ŷ): every member as likely as the others."""

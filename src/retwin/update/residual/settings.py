@@ -28,7 +28,7 @@ class Refinement:
 
     draws: int = 16
     training: Training = Training(  # noqa: RUF009 - frozen
-        epochs=60, batch=8, rate=1e-3, decay="step", patience=15
+        max_epochs=60, batch_size=8, learning_rate=1e-3, decay="step", patience=15
     )
 
     def __post_init__(self) -> None:
@@ -57,7 +57,12 @@ class Density(ABC):
     smoothness: float = 0.01
     boundedness: float = 1.0
     training: Training = Training(  # noqa: RUF009 - frozen
-        epochs=300, batch=64, rate=3e-3, decay="step", patience=40, weight_decay=1e-2
+        max_epochs=300,
+        batch_size=64,
+        learning_rate=3e-3,
+        decay="step",
+        patience=40,
+        weight_decay=1e-2,
     )
     refinement: Refinement | None = None
 
