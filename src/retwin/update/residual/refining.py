@@ -19,7 +19,7 @@ from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import BernoulliHead
 from retwin.nets.training import train
 from retwin.progress import Progress
-from retwin.update.corrections import Context
+from retwin.update.corrections import Context, measured_outputs
 from retwin.update.residual.model import ResidualModel, describe
 from retwin.update.residual.settings import Refinement
 
