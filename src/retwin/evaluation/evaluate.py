@@ -7,7 +7,7 @@ import numpy as np
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis import Diagnoser
 from retwin.errors import InputError
-from retwin.scores.statistics import Scores, score
+from retwin.scores.classification import Scores, score
 
 __all__ = ["evaluate"]
 

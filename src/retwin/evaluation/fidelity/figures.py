@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Channels
-from retwin.scores.statistics import bootstrap_weights
+from retwin.scores.bootstrap import bootstrap_weights
 from retwin.serialisation.files import write_atomically
 
 __all__ = ["BINS", "LEVELS", "Fidelity", "Figure"]
