@@ -20,6 +20,7 @@ from retwin.catalog import SOURCES
 from retwin.data.io import load, save
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
+from retwin.results import Results
 from retwin.serialisation.files import sha256, write_atomically
 from retwin.serialisation.identity import identity
 from retwin.study.files import Files, Roles
@@ -80,7 +81,7 @@ def run_study(
     processes: int | None = None,
     report: Report | None = None,
     command: str = "",
-) -> dict[str, Any]:
+) -> Results:
     """Run or resume a study; writes `results.json` and `arrays.npz` in `out`, returns the former.
 
     Parameters
