@@ -11,6 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from retwin.report.page import render
+from retwin.report.sections import sections_of
+from retwin.report.study import read_study
+
 MOTORS = range(1, 5)
 CLASSES = [
     "Healthy",
@@ -309,3 +313,14 @@ def write(tmp_path: Path) -> Callable[[Study], Path]:
         return tmp_path
 
     return _write
+
+
+@pytest.fixture
+def rendered() -> Callable[[Path], str]:
+    """The page of the study in a folder, without images."""
+
+    def _rendered(folder: Path) -> str:
+        whole = read_study(folder)
+        return render(whole, sections_of(whole), {})
+
+    return _rendered

@@ -20,7 +20,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 import retwin as rt
-from retwin.report.words import CHROME
+from retwin.report.style import CHROME
 
 PATIENCE = 120_000  # ms, for machines that are busy
 # The last one draws in space without a graphics card.
@@ -188,11 +188,11 @@ def test_a_rate_of_ones_own(desk: Opened) -> None:
     """Two healthy test trajectories tell a third and two thirds apart."""
     page = desk.page
     page.fill("#calculate-rate", "60")
-    told = page.inner_text("#calculate-told")
+    told = page.inner_text("#calculate-result")
     assert "threshold" in told
     assert "327" in told, "a third of the 980 that are healthy, of 1000 with 2 % faulty"
-    page.fill("#calculate-broken", "10")
-    assert "300" in page.inner_text("#calculate-told")
+    page.fill("#calculate-faulty", "10")
+    assert "300" in page.inner_text("#calculate-result")
     page.fill("#calculate-rate", "20")
     assert "it takes 4 of them at least" in page.inner_text("#calculate-best")
     page.fill("#calculate-missed", "0")

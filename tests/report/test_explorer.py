@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 import retwin as rt
 from retwin.errors import InputError
-from retwin.report.explorer import explorer, packed
-from retwin.report.page import render
-from retwin.report.results import read_results
+from retwin.report.sections.explorer import packed
+from retwin.report.study import read_study
 from retwin.study.files import Roles
 from retwin.study.results import _poses
 from retwin.study.work import Work
@@ -40,9 +39,11 @@ def content_of(page: str) -> dict[str, Any]:
     return told
 
 
-def test_all_trajectories_are_in_the_page(study: Study, write: Write) -> None:
+def test_all_trajectories_are_in_the_page(
+    study: Study, write: Write, rendered: Callable[[Path], str]
+) -> None:
     results, arrays = study
-    told = content_of(render(read_results(write(study)), {}))
+    told = content_of(rendered(write(study)))
     assert told["ids"] == results["data"]["test"]["ids"]
     assert [told["classes"][k] for k in told["truth"][::10]][:2] == ["Healthy", "M1 stuck"]
     observed = unpacked(told["observed"])
@@ -71,24 +72,28 @@ def test_packed_numbers_come_back() -> None:
     assert np.isnan(unpacked(packed(np.full(3, np.nan)))).all()
 
 
-def test_what_is_not_there_is_left_out(study: Study, write: Write) -> None:
+def test_what_is_not_there_is_left_out(
+    study: Study, write: Write, rendered: Callable[[Path], str]
+) -> None:
     for name in ("pose/nominal", "pose/observed"):
         del study[1][name]
-    page = render(read_results(write(study)), {})
+    page = rendered(write(study))
     assert content_of(page)["pose"] is None
     assert "explore-pose" not in page.split("<script")[0]
     assert "an inference and not a measurement" not in page
     del study[0]["portrait"]
-    page = render(read_results(write(study)), {})
+    page = rendered(write(study))
     assert '<section id="explorer">' not in page
     assert "explorer-content" not in page
 
 
-def test_emulated_trajectories_say_so(study: Study, write: Write) -> None:
+def test_emulated_trajectories_say_so(
+    study: Study, write: Write, rendered: Callable[[Path], str]
+) -> None:
     study[0]["emulated"] = True
-    section = explorer(read_results(write(study)))
-    assert section is not None
-    assert section.blocks[0].caption.startswith("Emulated data, no real measurements.")
+    page = rendered(write(study))
+    section = page[page.index('<section id="explorer">') :]
+    assert "<figcaption>Emulated data, no real measurements. Pick any" in section
 
 
 @pytest.mark.parametrize(
@@ -107,8 +112,8 @@ def test_emulated_trajectories_say_so(study: Study, write: Write) -> None:
 )
 def test_arrays_that_do_not_fit(study: Study, write: Write, name: str, value: NDArray) -> None:
     study[1][name] = value
-    with pytest.raises(InputError, match=r"portrait/bands|test's outputs"):
-        read_results(write(study))
+    with pytest.raises(InputError, match=f"^{name}: expected"):
+        read_study(write(study))
 
 
 def test_what_a_study_keeps_of_poses(
