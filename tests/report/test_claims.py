@@ -18,7 +18,7 @@ Study = tuple[dict[str, Any], dict[str, NDArray]]
 Write = Callable[[Study], Path]
 
 
-def test_what_the_calculator_looks_up_is_what_the_table_says(study: Study, write: Write) -> None:
+def test_what_the_calculator_looks_up_equals_the_table(study: Study, write: Write) -> None:
     """Every rate that ten healthy trajectories can tell apart, so 20 % is as two of eleven."""
     whole = read_study(write(study))
     section = decisions(whole)
@@ -81,8 +81,8 @@ def test_lights_follow_their_rules(
     source["healthy_recall"] = [recall] * 10
     source["intervals"]["healthy_recall"] = [recall - 0.11, recall + 0.11]
     source["update_s"] = seconds
-    told = results["fidelity"]["ibg_rg"]["figures"]
-    told["coverage90"] = {"value": covered, "interval": [covered - 0.06, covered + 0.06]}
+    figures = results["fidelity"]["ibg_rg"]["figures"]
+    figures["coverage90"] = {"value": covered, "interval": [covered - 0.06, covered + 0.06]}
     found = claims(read_study(write(study)))
     assert [each.title for each in found] == ["Accuracy", "Calibration", "False alarms", "Time"]
     assert [each.light for each in found] == lights

@@ -25,43 +25,43 @@ Study = tuple[dict[str, Any], dict[str, NDArray]]
 Write = Callable[[Study], Path]
 
 
-def unpacked(told: dict[str, Any]) -> NDArray:
+def unpacked(code: dict[str, Any]) -> NDArray:
     """What the page's script does."""
-    codes = np.frombuffer(base64.b64decode(told["codes"]), "<i2").reshape(told["shape"])
-    values = told["low"] + told["step"] * (codes.astype(float) + 32767)
+    codes = np.frombuffer(base64.b64decode(code["codes"]), "<i2").reshape(code["shape"])
+    values = code["low"] + code["step"] * (codes.astype(float) + 32767)
     return np.where(codes == -32768, np.nan, values)
 
 
 def content_of(page: str) -> dict[str, Any]:
     found = re.search(r'<script type="application/json" id="explorer-content">(.*?)</script>', page)
     assert found is not None
-    told: dict[str, Any] = json.loads(found[1])
-    return told
+    content: dict[str, Any] = json.loads(found[1])
+    return content
 
 
 def test_all_trajectories_are_in_the_page(
     study: Study, write: Write, rendered: Callable[[Path], str]
 ) -> None:
     results, arrays = study
-    told = content_of(rendered(write(study)))
-    assert told["ids"] == results["data"]["test"]["ids"]
-    assert [told["classes"][k] for k in told["truth"][::10]][:2] == ["Healthy", "M1 stuck"]
-    observed = unpacked(told["observed"])
+    content = content_of(rendered(write(study)))
+    assert content["ids"] == results["data"]["test"]["ids"]
+    assert [content["classes"][k] for k in content["truth"][::10]][:2] == ["Healthy", "M1 stuck"]
+    observed = unpacked(content["observed"])
     expected = 1000 * arrays["portrait/observed"]
-    np.testing.assert_allclose(observed, expected, atol=told["observed"]["step"])
+    np.testing.assert_allclose(observed, expected, atol=content["observed"]["step"])
     np.testing.assert_allclose(
-        unpacked(told["probabilities"]),
+        unpacked(content["probabilities"]),
         np.array(
             [arrays[f"probabilities/{name}"].mean(axis=0) for name in ("dt", "ibg", "ibg_rg")]
         ),
         atol=1e-4,
     )
-    assert told["inputs"]["units"] == ["deg"] * 4
-    np.testing.assert_allclose(unpacked(told["commands"])[0, 0], 0.24 * 400, atol=0.01)
-    latent = told["latent"]
+    assert content["inputs"]["units"] == ["deg"] * 4
+    np.testing.assert_allclose(unpacked(content["commands"])[0, 0], 0.24 * 400, atol=0.01)
+    latent = content["latent"]
     assert (latent["names"], latent["units"]) == (["delay", "offset motor 1"], ["samples", "deg"])
     assert latent["z"][0][1][0] is None
-    pose = unpacked(told["pose"]["observed"]) - unpacked(told["pose"]["nominal"])
+    pose = unpacked(content["pose"]["observed"]) - unpacked(content["pose"]["nominal"])
     np.testing.assert_allclose(pose[1, :, -1, 1], 0.01, atol=1e-4)
 
 

@@ -22,7 +22,7 @@ def contrast(one: str, other: str) -> float:
 
 @pytest.mark.parametrize("scheme", [0, 1], ids=["light", "dark"])
 def test_contrast(scheme: int) -> None:
-    """AA: 4.5 for words, 3 for what is drawn."""
+    """AA: 4.5 for text, 3 for marks."""
     assert contrast("#000000", "#ffffff") == pytest.approx(21)
     for ground in (CHROME["paper"][scheme], CHROME["wash"][scheme]):
         for name in ("ink", "muted"):

@@ -1,4 +1,7 @@
-"""Figures as plotly's data, drawn by the page; `@NAME` stands for a colour of the page."""
+"""Figures as plotly's data, which `page.js` draws in the page's style.
+
+`@NAME` stands for a colour of the page.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,6 @@ from retwin.report.figure import (
 
 __all__ = ["panel_spec"]
 
-FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 FORMATS = {"share": ".1f", "percent": ".0%"}
 HOVER = {"share": ".3f", "percent": ".1%"}
 UPPER, LOWER = [0.38, 1], [0, 0.3]
@@ -36,17 +38,7 @@ def panel_spec(panel: Panel) -> dict[str, Any]:
     """Data and layout of a panel; `narrow` holds what of the layout differs on a narrow screen."""
     first, *others = panel.rows
     x, y = _axis(panel.x), _axis(first.y)
-    layout: dict[str, Any] = {
-        "xaxis": x,
-        "yaxis": y,
-        "font": {"family": FONT, "size": 13, "color": "@muted"},
-        "paper_bgcolor": "rgba(0,0,0,0)",
-        "plot_bgcolor": "rgba(0,0,0,0)",
-        "margin": {"l": 8, "r": 12, "t": 8, "b": 8},
-        "showlegend": False,
-        "dragmode": False,
-        "hoverlabel": {"font": {"family": FONT, "size": 13}},
-    }
+    layout: dict[str, Any] = {"xaxis": x, "yaxis": y}
     data = _traces(first, panel.x)
     if others:
         y["domain"], x["anchor"] = UPPER, "y2"
@@ -62,18 +54,7 @@ def panel_spec(panel: Panel) -> dict[str, Any]:
 
 
 def _axis(axis: Axis) -> dict[str, Any]:
-    title = {"text": _escaped(axis.title), "standoff": 8, "font": {"size": 13}}
-    made: dict[str, Any] = {
-        "title": title,
-        "gridcolor": "@grid",
-        "linecolor": "@rule",
-        "zeroline": False,
-        "fixedrange": True,
-        "automargin": True,
-        "ticks": "outside",
-        "tickcolor": "@rule",
-        "ticklen": 4,
-    }
+    made: dict[str, Any] = {"title": {"text": _escaped(axis.title)}}
     if axis.limits is not None:
         made["range"] = _numbers(axis.limits)
     if axis.kind == "log":

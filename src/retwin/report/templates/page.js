@@ -19,6 +19,21 @@ const page = (() => {
     return value;
   };
 
+  // What all plots have in common; the title of an axis is escaped already where it comes from a spec.
+  const family = getComputedStyle(document.body).fontFamily;
+  const escaped = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
+  const styled = (given) => ({
+    gridcolor: "@grid", linecolor: "@rule", zeroline: false, fixedrange: true, automargin: true,
+    ticks: "outside", tickcolor: "@rule", ticklen: 4,
+    ...given, title: { standoff: 8, font: { size: 13 }, ...given.title },
+  });
+  const axis = (text) => styled({ title: { text: escaped(text) } });
+  const layout = {
+    font: { family, size: 13, color: "@muted" }, paper_bgcolor: "rgba(0,0,0,0)",
+    plot_bgcolor: "rgba(0,0,0,0)", margin: { l: 8, r: 12, t: 8, b: 8 }, showlegend: false,
+    dragmode: false, hoverlabel: { font: { family, size: 13 } },
+  };
+
   // The wheel scrolls the page, also over a picture in space.
   const config = { displayModeBar: false, scrollZoom: false };
   const plot = (place, data, layout) => {
@@ -31,8 +46,10 @@ const page = (() => {
   const drawn = [() => {
     for (const [id, spec] of Object.entries(specs)) {
       const place = document.getElementById(id);
-      const narrow = place.clientWidth < 600 ? spec.narrow : {};
-      plot(place, spec.data, { ...spec.layout, ...narrow, height: spec.height });
+      const given = { ...spec.layout, ...(place.clientWidth < 600 ? spec.narrow : {}) };
+      const axes = Object.entries(given).filter(([key]) => key.includes("axis"));
+      const dressed = Object.fromEntries(axes.map(([key, each]) => [key, styled(each)]));
+      plot(place, spec.data, { ...layout, ...given, ...dressed, height: spec.height });
     }
   }];
   const draw = () => drawn.forEach((each) => each());
@@ -62,17 +79,5 @@ const page = (() => {
     draw();
   });
 
-  // As `axis` and `spec` in plots.py.
-  const family = getComputedStyle(document.body).fontFamily;
-  const escaped = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
-  const axis = (text) => ({
-    title: { text: escaped(text), standoff: 8, font: { size: 13 } }, gridcolor: "@grid", linecolor: "@rule",
-    zeroline: false, fixedrange: true, automargin: true, ticks: "outside", tickcolor: "@rule", ticklen: 4,
-  });
-  const layout = {
-    font: { family, size: 13, color: "@muted" }, paper_bgcolor: "rgba(0,0,0,0)",
-    plot_bgcolor: "rgba(0,0,0,0)", margin: { l: 8, r: 12, t: 8, b: 8 }, showlegend: false,
-    dragmode: false, hoverlabel: { font: { family, size: 13 } },
-  };
   return { axis, drawn, escaped, layout, plot };
 })();
