@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from retwin.report.sections.decisions import decisions
 from retwin.report.study import read_study
-from retwin.report.verdict import claims
+from retwin.report.verdict import claims, headline
+from retwin.results import Results
 from retwin.scores.decisions import decide
 
 Study = tuple[dict[str, Any], dict[str, NDArray]]
@@ -94,3 +95,16 @@ def test_what_was_not_measured_is_not_claimed(study: Study, write: Write) -> Non
         each["bootstrap_ci95"] = None
     found = claims(read_study(write(study)))
     assert [each.title for each in found] == ["False alarms", "Time"]
+
+
+def test_the_headline_is_the_last_updated_source_and_the_plain_one() -> None:
+    def of(*pairs: tuple[str, str]) -> tuple[str, str] | None:
+        rows = [{"a": a, "b": b, "metric": "macro_f1", "mean_diff": 0.1} for a, b in pairs]
+        content = {"schema": 1, "case": "a", "runs": 1, "sources": {"dt": {}}, "comparisons": rows}
+        return headline(Results.model_validate(content))
+
+    updated = ("dt", "ibg_rg_command")
+    assert of(("ibg", "dt"), ("ibg_rg", "dt"), updated) == ("ibg_rg_command", "dt")
+    assert of(("ibg_rg", "twin"), ("ibg_rg_command", "ibg")) == ("ibg_rg", "twin")
+    assert of(("mine", "yours"), ("mine", "theirs")) == ("mine", "yours")
+    assert of() is None

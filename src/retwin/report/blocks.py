@@ -8,7 +8,7 @@ from typing import Any
 
 from retwin.report.figure import Figure, Matrices
 
-__all__ = ["Cell", "Column", "Forest", "Link", "Section", "Table"]
+__all__ = ["Cell", "Column", "Forest", "Link", "Section", "Table", "columns"]
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,11 @@ class Column:
     group: str = ""
     numeric: bool = True
     paper: bool = False
+
+
+def columns(text: str, *numbers: str) -> list[Column]:
+    """A column of text, and columns of numbers."""
+    return [Column(text, numeric=False), *map(Column, numbers)]
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ def _scale(axes: Axes, axis: Axis, which: Literal["x", "y"]) -> None:
     elif axis.kind != "log":
         made.set_major_locator(MaxNLocator(axis.count))
     if axis.kind == "percent":
-        made.set_major_formatter(PercentFormatter(1, decimals=0))
+        made.set_major_formatter(PercentFormatter(1))
     if axis.kind == "names":
         axes.grid(visible=False, axis=which)
         axes.tick_params(axis=which, length=0, labelcolor=hexadecimal("ink"))

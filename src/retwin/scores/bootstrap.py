@@ -21,9 +21,22 @@ BLOCKS = 16
 
 
 def bootstrap_weights(truth: NDArray, *, draws: int, seed: int) -> NDArray:
-    """Counts (draws, n) of each trajectory in draws with replacement within its class.
+    """Counts of each trajectory in draws with replacement within its class.
 
-    `truth` (n,) holds the class indices.
+    Parameters
+    ----------
+    truth : array (n,)
+        True class indices.
+    draws : int
+        Bootstrap draws.
+    seed : int
+        The same seed draws the same trajectories, so that two sources are paired.
+
+    Returns
+    -------
+    array (draws, n)
+        The counts; those of a class sum to its number of trajectories.
+
     """
     rng = np.random.default_rng(seed)
     weights = np.zeros((draws, len(truth)))

@@ -45,7 +45,18 @@ class Reliability:
 def calibration_error(happened: NDArray, probability: NDArray) -> float:
     """Expected calibration error over `BINS` bins of equal mass.
 
-    `happened` (n,) states whether the event occurred, `probability` (n,) what was predicted.
+    Parameters
+    ----------
+    happened : array (n,)
+        Whether each event occurred.
+    probability : array (n,)
+        The predicted probability of each event.
+
+    Returns
+    -------
+    float
+        The mean absolute difference of mean probability and frequency per bin, in [0, 1].
+
     """
     order = np.argsort(probability, kind="stable")
     bins = np.array_split(order, min(BINS, len(order)))
@@ -84,10 +95,20 @@ def calibration_floor(probabilities: NDArray, *, draws: int = 200) -> float:
 
 
 def reliability(probabilities: NDArray, truth: NDArray) -> Reliability:
-    """The reliability diagram of probabilities (runs, n, classes), given class indices (n,).
+    """The reliability diagram of predicted probabilities.
 
+    Parameters
+    ----------
+    probabilities : array (runs, n, classes)
+        Predicted probabilities.
+    truth : array (n,)
+        True class indices.
+
+    Notes
+    -----
     All runs diagnose the same trajectories, so a drawn classifier has one uniform number per
     trajectory in all runs; numbers of their own would make the bars too narrow.
+
     """
     uniform = np.random.default_rng(0).random((DRAWS, len(truth)))
     bins = max(1, min(BINS, len(truth) // PER_BIN))

@@ -71,7 +71,23 @@ METRICS = tuple(each.name for each in fields(Scores) if each.name != "n")
 
 
 def score(truth: NDArray, probabilities: NDArray, classes: Sequence[str]) -> Scores:
-    """Scores of probabilities (n, classes), given the true class indices (n,)."""
+    """All scores of predicted probabilities.
+
+    Parameters
+    ----------
+    truth : array (n,)
+        True class indices.
+    probabilities : array (n, classes)
+        Predicted probabilities.
+    classes : sequence of str
+        The names of the classes; "Healthy" is the one whose recall is a score of its own.
+
+    Returns
+    -------
+    Scores
+        NaN where a score is not defined.
+
+    """
     weights = np.ones((1, len(truth)))
     each = {
         name: float(weighted_score(name, truth, probabilities, weights, classes)[0])
@@ -90,12 +106,38 @@ def score(truth: NDArray, probabilities: NDArray, classes: Sequence[str]) -> Sco
 
 
 def confusion(truth: NDArray, predicted: NDArray, classes: int) -> NDArray:
-    """Counts (classes, classes) of class indices (n,); rows are true."""
+    """Counts of every pair of true and predicted class.
+
+    Parameters
+    ----------
+    truth, predicted : array (n,)
+        Class indices.
+    classes : int
+        The number of classes.
+
+    Returns
+    -------
+    array (classes, classes)
+        Rows are true, columns predicted classes.
+
+    """
     return np.bincount(truth * classes + predicted, minlength=classes**2).reshape(classes, classes)
 
 
 def row_shares(counts: Sequence[Sequence[int]] | NDArray) -> NDArray:
-    """Each count (classes, classes) divided by the sum of its row; 0 in a row without counts."""
+    """Confusion counts divided by the sums of their rows.
+
+    Parameters
+    ----------
+    counts : array (classes, classes)
+        Rows are true classes.
+
+    Returns
+    -------
+    array (classes, classes)
+        Shares, recalls on the diagonal; 0 in a row without counts.
+
+    """
     table = np.asarray(counts, dtype=float)
     return table / np.maximum(table.sum(axis=1, keepdims=True), 1)
 

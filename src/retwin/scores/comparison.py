@@ -48,7 +48,23 @@ def compare_runs(a: Sequence[float], b: Sequence[float]) -> dict[str, float | No
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Holm's step-down adjustment of the p-values of a family, in the same order."""
+    """Holm's step-down adjustment for several tests.
+
+    Parameters
+    ----------
+    p : sequence of float
+        The p-values of a family of tests, in [0, 1].
+
+    Returns
+    -------
+    list of float
+        Adjusted p-values in the same order.
+
+    References
+    ----------
+    Holm, A simple sequentially rejective multiple test procedure, 1979.
+
+    """
     values = np.asarray(p, dtype=float)
     order = np.argsort(values)
     factors = len(values) - np.arange(len(values))
@@ -87,8 +103,21 @@ def compliance(
 ) -> str:
     """Whether a value lies in its required range.
 
-    Returns "holds" if `value` lies within `low` and `high`, "open" if only a part of its interval
-    does, else "fails".
+    Parameters
+    ----------
+    value : float
+        The value, finite.
+    interval : (float, float)
+        Its confidence interval; None if there is none.
+    low, high : float
+        The ends of the required range.
+
+    Returns
+    -------
+    str
+        "holds" if the value lies in the range, "open" if only a part of its interval does, else
+        "fails".
+
     """
     if low <= value <= high:
         return "holds"

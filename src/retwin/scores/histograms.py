@@ -33,8 +33,20 @@ class Histogram:
 
 
 def common_histogram(observed: NDArray, generated: NDArray) -> Histogram | None:
-    """The histogram of the finite values of both; None if one has none.
+    """The histogram of two samples.
 
+    Parameters
+    ----------
+    observed, generated : array (n,), array (m,)
+        Values in the same unit; those that are not finite are left out.
+
+    Returns
+    -------
+    Histogram or None
+        None if either has no finite value.
+
+    Notes
+    -----
     The bins cover the values without outliers. Their width is Freedman and Diaconis' for the
     observed values, within 12 to 48 bins.
 

@@ -41,9 +41,15 @@ class Roc:
 
 
 def micro_roc(probabilities: NDArray, truth: NDArray) -> Roc:
-    """ROC of probabilities (runs, n, classes), given class indices (n,).
+    """ROC curves in which every pair of trajectory and class counts as one decision.
 
-    Every pair of trajectory and class counts as one decision.
+    Parameters
+    ----------
+    probabilities : array (runs, n, classes)
+        Predicted probabilities.
+    truth : array (n,)
+        True class indices.
+
     """
     positive = (truth[:, None] == np.arange(probabilities.shape[2])).ravel()
     curves, areas = [], []

@@ -48,9 +48,22 @@ class SegmentError:
 def median_error_trajectory(
     nominal: NDArray, observed: NDArray, times: NDArray, candidates: NDArray
 ) -> int | None:
-    """Index of the completely observed candidate with the median RMS error; None if there is none.
+    """The completely observed candidate with the median RMS error.
 
-    `nominal` and `observed` (n, P, d), `times` (n, M, 3) in s, `candidates` (n,) bool.
+    Parameters
+    ----------
+    nominal, observed : array (n, P, d)
+        Outputs; observed is NaN where nothing was measured.
+    times : array (n, M, 3)
+        Onset, start of the steady part and end of every segment in s; NaN for no segment.
+    candidates : array (n,)
+        Whether each trajectory may be chosen.
+
+    Returns
+    -------
+    int or None
+        Its index; None if there is no such trajectory.
+
     """
     error = np.sqrt(np.nanmean(np.square(observed - nominal), axis=(1, 2)))
     known = np.isfinite(observed).all(axis=(1, 2)) & np.isfinite(times).any(axis=(1, 2))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from retwin.report.blocks import Cell, Column, Section, Table
+from retwin.report.blocks import Cell, Column, Section, Table, columns
 from retwin.report.labels import duration, real_data, source_name, stage_name
 from retwin.report.study import Study
 
@@ -35,8 +35,7 @@ def _stages(study: Study) -> Table | None:
         for name, value in named.items()
         if isinstance(value, int | float) and math.isfinite(value)
     ]
-    columns = [Column("Stage", numeric=False), Column("Time")]
-    return Table("Time of the stages", columns, rows) if rows else None
+    return Table("Time of the stages", columns("Stage", "Time"), rows) if rows else None
 
 
 def _costs(study: Study) -> Table | None:
@@ -55,15 +54,15 @@ def _costs(study: Study) -> Table | None:
         return None
     published = study.results.published
     paper = bulk in kept and any("generate" in published.get(name, {}) for name in study.sources)
-    columns = [
+    heads = [
         Column("Training data" if study.results.classes else "Source", numeric=False),
         Column(f"{study.word.capitalize()} data used", numeric=False),
     ]
     for name in kept:
         if paper and name == bulk:
-            columns += [Column("this study", group=bulk), Column("paper", group=bulk, paper=True)]
+            heads += [Column("this study", group=bulk), Column("paper", group=bulk, paper=True)]
         else:
-            columns.append(Column(name))
+            heads.append(Column(name))
     rows = []
     for place, (source, each) in enumerate(study.sources.items()):
         row = [Cell(source_name(source), source=source), Cell(real_data(each.real_data))]
@@ -72,4 +71,4 @@ def _costs(study: Study) -> Table | None:
             if paper and name == bulk:
                 row.append(Cell(published.get(source, {}).get("generate", "–")))
         rows.append(row)
-    return Table("Cost of a source in one run", columns, rows)
+    return Table("Cost of a source in one run", heads, rows)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from retwin.report.blocks import Cell, Column, Section, Table
+from retwin.report.blocks import Cell, Section, Table, columns
 from retwin.report.figure import Axis, Bars, Figure, Key, Line, Mark, Panel, Row
 from retwin.report.labels import (
     latent_names,
@@ -163,10 +163,5 @@ def _agreement(study: Study, source: str) -> Table | None:
         ]
         for name, distance in fidelity.agreement.items()
     ]
-    columns = [
-        Column("Per movement", numeric=False),
-        Column("KS distance"),
-        Column("p"),
-        Column("in the 90 % range"),
-    ]
-    return Table(titled(study, source, "Agreement per movement"), columns, rows) if rows else None
+    heads = columns("Per movement", "KS distance", "p", "in the 90 % range")
+    return Table(titled(study, source, "Agreement per movement"), heads, rows) if rows else None

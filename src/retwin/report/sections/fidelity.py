@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.report.blocks import Cell, Column, Section, Table
+from retwin.report.blocks import Cell, Column, Section, Table, columns
 from retwin.report.figure import (
     Axis,
     Band,
@@ -86,8 +86,7 @@ def _overview(study: Study, sources: list[str]) -> Table:
     lengths = _lengths(study.results.fidelity[sources[0]], "")
     shown = [*lengths, *((key, title, 1.0, "") for key, title in SHARES.items())]
     shown = [each for each in shown if any(each[0] in figures for figures in known.values())]
-    columns = [Column("Source", numeric=False)]
-    columns += [Column(with_unit(title, unit)) for _, title, _, unit in shown]
+    heads = columns("Source", *(with_unit(title, unit) for _, title, _, unit in shown))
     rows = [
         [
             Cell(source_name(name), source=name),
@@ -95,16 +94,16 @@ def _overview(study: Study, sources: list[str]) -> Table:
         ]
         for name, figures in known.items()
     ]
-    return Table("How real, source by source", columns, rows)
+    return Table("How real, source by source", heads, rows)
 
 
 def _scores(study: Study, source: str) -> Table:
     """CRPS and energy score of this twin and its rivals, and the paired differences."""
     each = study.results.fidelity[source]
-    columns = [Column("Score", numeric=False), Column(source_name(source))]
+    heads = columns("Score", source_name(source))
     for rival in each.rivals:
         name = RIVALS.get(rival, rival)
-        columns += [Column("score", group=name), Column("ours below by, %", group=name)]
+        heads += [Column("score", group=name), Column("ours below by, %", group=name)]
     rows = []
     for key, title, factor, unit in _lengths(each, "CRPS, mean over outputs"):
         kind, *output = key.split("/", 1)
@@ -114,7 +113,7 @@ def _scores(study: Study, source: str) -> Table:
             below = "/".join([f"{kind}_below", *output, rival])
             row.append(figure_cell(each.figures.get(below), 0, 100.0))
         rows.append(row)
-    return Table(titled(study, source, "Scores of the draws"), columns, rows)
+    return Table(titled(study, source, "Scores of the draws"), heads, rows)
 
 
 def _calibration(study: Study, source: str) -> Table:
@@ -138,14 +137,8 @@ def _calibration(study: Study, source: str) -> Table:
         for key, (title, ideal) in lines.items()
         if key in each.figures
     ]
-    columns = [
-        Column("Calibration", numeric=False),
-        Column("Value"),
-        Column("95 % interval"),
-        Column("p"),
-        Column("Ideal"),
-    ]
-    return Table(titled(study, source, "Calibration of the draws"), columns, rows)
+    heads = columns("Calibration", "Value", "95 % interval", "p", "Ideal")
+    return Table(titled(study, source, "Calibration of the draws"), heads, rows)
 
 
 def _figures(study: Study, source: str) -> dict[str, Figure]:

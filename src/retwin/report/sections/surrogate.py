@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from retwin.report.blocks import Cell, Column, Section, Table
+from retwin.report.blocks import Cell, Section, Table, columns
 from retwin.report.labels import number, quantity, with_unit
 from retwin.report.sections.discrepancy import latents
 from retwin.report.study import Study
@@ -16,9 +16,7 @@ def surrogate(study: Study) -> Section | None:
     if not error.rmse:
         return None
     factor, unit = quantity(error.unit)
-    columns = [Column("Output", numeric=False), Column(with_unit("RMSE", unit))]
-    if error.nrmse:
-        columns.append(Column("NRMSE, %"))
+    heads = columns("Output", with_unit("RMSE", unit), *(["NRMSE, %"] if error.nrmse else []))
     rows = []
     for name, value in error.rmse.items():
         row = [Cell(name), Cell(number(factor * value))]
@@ -27,5 +25,5 @@ def surrogate(study: Study) -> Section | None:
             row.append(Cell("–" if relative is None else number(100 * relative, 2)))
         rows.append(row)
     compared = any(latents(study, source) for source in study.results.fidelity)
-    values = {"table": Table("Error of the surrogate", columns, rows), "compared": compared}
+    values = {"table": Table("Error of the surrogate", heads, rows), "compared": compared}
     return Section("surrogate", "Surrogate error", values)
