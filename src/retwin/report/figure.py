@@ -178,7 +178,6 @@ class Panel:
     rows: Sequence[Row]
     alt: str
     title: str = ""
-    note: str = ""
     height: int = 340
     narrow_bare: bool = False
 

@@ -49,6 +49,7 @@ FILTERS = {
     "counted": labels.counted,
     "duration": labels.duration,
     "in_sentence": labels.in_sentence,
+    "mean_and_deviation": labels.mean_and_deviation,
     "metric": labels.metric_name,
     "number": labels.number,
     "signed": labels.signed,

@@ -56,7 +56,12 @@ def discrepancy(study: Study) -> Section | None:
     if example is None and not shown and not tables:
         return None
     figures = ([example] if example else []) + [group["figure"] for group in shown]
-    further = [group["figure"] for each in groups for group in each if group not in shown]
+    further = [
+        group["figure"]
+        for each in groups
+        for group in each
+        if group["source"] not in detailed(study)
+    ]
     values = {"segment": found, "example": example, "groups": shown, "tables": tables}
     return Section("discrepancy", "Discrepancy", values, figures, further)
 
@@ -111,7 +116,7 @@ def _groups(study: Study, source: str) -> list[dict[str, Any]]:
         left = [each for each in left if each not in shown]
         if shown:
             figure = _figure(source, f"{name}{suffixes(study)[source]}", shown)
-            groups.append({"source": source, "kind": name, "figure": figure})
+            groups.append({"source": source, "kind": name, "figure": figure, "latents": shown})
     return groups
 
 
@@ -133,21 +138,12 @@ def _panel(latent: Latent, colour: str) -> Panel:
         Bars(values.edges, values.observed, "observed", "observed"),
         Line(edges, shares, "generated", colour, width=2.2, step=True),
     ]
-    observed, generated = values.counts
-    out_observed, out_generated = values.outside
-    note = f"All {observed} observed and {generated} generated values are shown."
-    if any(values.outside):
-        note = (
-            f"Outside the range shown: {out_observed} of {observed} observed, "
-            f"{out_generated} of {generated} generated."
-        )
     limits = f"{number(low, 1)} to {number(high, 1)}"
     return Panel(
         Axis(label, latent.unit, (low, high), count=7),
         [Row(Axis("share per bin", kind="percent", from_zero=True), marks)],
         with_unit(f"{title}, observed and generated, {limits}", latent.unit),
         title,
-        note,
         height=300,
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from retwin.report.blocks import Section
 from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Points, Row
-from retwin.report.labels import mean_and_deviation, number, source_name
+from retwin.report.labels import source_name
 from retwin.report.sections.roc import selected
 from retwin.report.study import Study
 from retwin.report.style import colour_of, symbol
@@ -28,12 +28,16 @@ def reliability(study: Study) -> Section | None:
         Key("as sure as right", "muted", "dot"),
     ]
     figure = Figure("reliability", [_panel(study, name) for name in sources], keys)
-    return Section("reliability", "Reliability", {"figure": figure}, [figure])
+    errors = [
+        (study.sources[name].runs("ece"), calibration.calibration_floor(study.probabilities(name)))
+        for name in sources
+    ]
+    values = {"figure": figure, "errors": errors}
+    return Section("reliability", "Reliability", values, [figure])
 
 
 def _panel(study: Study, source: str) -> Panel:
-    probabilities = study.probabilities(source)
-    found = calibration.reliability(probabilities, study.truth)
+    found = calibration.reliability(study.probabilities(source), study.truth)
     title, colour = source_name(source), colour_of(source)
     gaps = np.full(len(found.confidence), np.nan)
     bars = np.stack([found.low, found.high, gaps], axis=1).ravel()
@@ -51,13 +55,10 @@ def _panel(study: Study, source: str) -> Panel:
         ),
         Points(found.confidence, found.accuracy, title, colour, symbol(source)),
     ]
-    ece = study.sources[source].runs("ece")
-    floor = number(calibration.calibration_floor(probabilities))
     return Panel(
         Axis("confidence", **share),
         [Row(Axis("share that is right", **share), marks)],
         f"{title}: share of right answers against their confidence",
         title,
-        note=f"ECE {mean_and_deviation(ece)}; floor {floor}." if ece else "",
         height=300,
     )
