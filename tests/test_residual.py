@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy import stats
 import retwin as rt
 from retwin.flows import FlowHead
 from retwin.mixture import Blocks, GaussianMixture
-from retwin.residual.refining import energy_score
+from retwin.residual.refining import energy_score, refine
 from retwin.training import Training, isolated
 
 STEPS = 60
@@ -114,7 +115,8 @@ def test_a_bimodal_heteroscedastic_law_is_recovered(
 ) -> None:
     """Density and distribution function of each trajectory, compared with the true ones.
 
-    @BIMODAL@
+    Over 12 retrainings the mean log densities differ by 0.018, standard deviation
+    0.005, the distributions on average by 0.023, standard deviation 0.001.
     """
     test, offset = toy(1500, seed=2)
     told = offset_law(fitted[3], identity, test)
@@ -149,7 +151,8 @@ def test_a_flow_recovers_the_law_too(
 ) -> None:
     """As of the mixture, beside what a flow inverts.
 
-    @FLOW@
+    Over 3 retrainings the mean log densities differ by 0.036, standard deviation 0.0028,
+    the distributions on average by 0.022, standard deviation 0.0008.
     """
     test, offset = toy(1500, seed=2)
     flow.save(tmp_path / "flow")
@@ -317,40 +320,38 @@ def test_the_energy_score_is_the_one_of_the_literature() -> None:
     np.testing.assert_allclose(ours, theirs, rtol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def poor(identity: rt.Surrogate) -> dict[str, rt.ResidualModel]:
-    """A model that stopped too early, with and without refinement."""
-    calibration, _ = toy(60, seed=4)
-    brief = {"dropout": 0.0, "training": Training(epochs=1)}
-    how = rt.Refinement(training=Training(epochs=25, batch=16, rate=1e-2, patience=10))
-    bounds = np.array([6.0, 0.6])
-    return {
-        name: rt.fit_residual(
-            identity, calibration, rt.DelayOffset(), density, seed=0, bounds=bounds
-        )
-        for name, density in (
-            ("before", rt.Flow(**brief)),
-            ("after", rt.Flow(**brief, refinement=how)),
-        )
-    }
-
-
 def test_refinement_helps_a_poor_model_on_trajectories_it_never_saw(
-    poor: dict[str, rt.ResidualModel], identity: rt.Surrogate
+    identity: rt.Surrogate,
 ) -> None:
-    figures = poor["after"].fitted.figures
+    """Its offsets are 0.5 ± 0.1, where the true ones are about ±0.2: the weights are given.
+
+    Over 12 refinements the energy of held-out trajectories falls by 0.385, standard deviation
+    0.007, and that of others by 0.1863, standard deviation 0.0003.
+    """
+    with isolated(0):
+        density = rt.Mixture(components=1, hidden=(8,), dropout=0.0)
+        channels = {"inputs": identity.inputs, "outputs": identity.outputs}
+        before = rt.ResidualModel(rt.DelayOffset(), density, **channels).eval()
+    for name, values in {"shift": (2, 0.5), "scale": (0.5, 0.1), "bounds": (6, 1.5)}.items():
+        getattr(before, name).copy_(torch.tensor(values))
+    calibration, _ = toy(60, seed=4)
+    context, _ = rt.infer_discrepancy(identity, calibration, rt.DelayOffset())
+    observed = torch.tensor(calibration.observed)
+    rows = {"fitted": torch.arange(45), "held": torch.arange(45, 60)}
+    how = rt.Refinement(training=Training(epochs=100, batch=16, rate=1e-2, patience=100))
+    after = copy.deepcopy(before)
+    figures = refine(after, context, observed, observed == observed, **rows, how=how, seed=0)
     assert figures["refined"] == 1.0
-    assert figures["energy after"] < figures["energy before"]
+    assert figures["energy before"] - figures["energy after"] > 0.3
     test, _ = toy(300, seed=5)
-    scores = {}
-    for name, model in poor.items():
-        draws = np.stack(
-            [rt.CorrectedTwin(identity, model).simulate(test.commands, seed=s).observed
-             for s in range(20)], axis=1,
-        )  # fmt: skip
-        observed = torch.tensor(test.observed)
-        scores[name] = energy_score(torch.tensor(draws), observed, observed == observed).mean()
-    assert scores["after"] < scores["before"]
+    measured = torch.tensor(test.observed)
+    scores = []
+    for model in (before, after.eval()):
+        twin = rt.CorrectedTwin(identity, model)
+        draws = [twin.simulate(test.commands, seed=seed).observed for seed in range(20)]
+        made = torch.tensor(np.stack(draws, axis=1))
+        scores.append(energy_score(made, measured, measured == measured).mean())
+    assert scores[0] - scores[1] > 0.15
 
 
 def test_refinement_that_does_not_help_changes_nothing(identity: rt.Surrogate) -> None:
