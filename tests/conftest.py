@@ -59,13 +59,13 @@ def updated(ibg: rt.Surrogate, rg: rt.ResidualModel) -> rt.CorrectedTwin:
     return rt.CorrectedTwin(ibg, rg, case="armpi")
 
 
-class ExactArm:
+class ExactArm(torch.nn.Module):
     """The arm's kinematics as a differentiable twin: a surrogate without any error."""
 
     memoryless = True
     inputs, outputs, rate = KINEMATIC.inputs, KINEMATIC.outputs, KINEMATIC.rate
 
-    def __call__(self, commands: torch.Tensor) -> torch.Tensor:
+    def forward(self, commands: torch.Tensor) -> torch.Tensor:
         angles = (commands - KINEMATIC.centre) * KINEMATIC.scale
         pitch = angles[..., 1:].cumsum(dim=-1)
         links = torch.tensor(KINEMATIC.arm.links, dtype=commands.dtype)
