@@ -9,7 +9,7 @@ def levels(commands, pump, upper, lower, start_upper, start_lower, edge, spill):
     level = np.empty(commands.shape)
     for sample in range(commands.shape[1]):
         level[:, sample, 0] = np.minimum(y, 10)
-        for _ in range(8):  # half a second each; Torricelli: the outflow is proportional to the root
+        for _ in range(8):  # half a second each; Torricelli: outflow ~ root of the level
             between, over = upper * np.sqrt(x), np.maximum(x - edge, 0)
             x = x + 0.5 * (pump * commands[:, sample, 0] - between - over)
             y = y + 0.5 * (between + spill * over - lower * np.sqrt(y) - np.maximum(y - 10, 0))

@@ -326,17 +326,16 @@ def test_control_c_ends_it_at_once(tmp_path: Path) -> None:
     with in_a_script(tmp_path, body) as process:
         assert process.stdout is not None
         assert float(process.stdout.readline()) > 0
-        begin = time.monotonic()
         process.send_signal(signal.SIGINT)
-        # 500 trajectories would take minutes; how fast it ends depends on what else is running.
-        _, told = process.communicate(timeout=60)
-    assert time.monotonic() - begin < 30
+        shares, told = process.communicate(timeout=60)
+    # It ends with trajectories left to do, however fast or slow the machine is.
+    assert all(float(share) < 1 for share in shares.split())
     assert "KeyboardInterrupt" in told
 
 
 def test_a_script_without_a_guard_is_advised(tmp_path: Path) -> None:
     with in_a_script(tmp_path, "twin.simulate(np.ones((3, 4, 1)), seed=0)\n") as process:
-        _, told = process.communicate(timeout=20)
+        _, told = process.communicate(timeout=120)
     assert re.search(r"InputError: workers: .*under `if __name__ == '__main__':`", told)
 
 

@@ -8,13 +8,14 @@ import subprocess
 import sys
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from time import process_time
 
 import numpy as np
 import onnx
 import pytest
 import torch
+from scipy.stats import kstest
 
 import retwin as rt
 from retwin.deploy.bundle.bundle import Bundle
@@ -68,37 +69,96 @@ def test_it_predicts_the_same_in_a_process_without_torch(
         assert np.isfinite(found["made"]).all()
 
 
-def test_a_diagnosis_is_quick(portable: Portable, emulated: rt.Trajectories) -> None:
-    """Processor time of one trajectory, whatever else the machine does."""
-    times = []
-    for i in range(len(emulated)):
-        one = emulated[i : i + 1]
-        begin = process_time()
-        portable.predict(one)
-        times.append(process_time() - begin)
-    assert np.quantile(times, 0.9) < 5e-3
+def test_a_diagnosis_runs_each_graph_once(portable: Portable, emulated: rt.Trajectories) -> None:
+    """What makes it quick; its time depends on the machine, and benchmarks/bundle.py measures it.
+
+    The surrogate runs at every tenth sample only.
+    """
+    runs: list[str] = []
+    lengths: list[int] = []
+
+    def counted(name: str, **arrays: np.ndarray) -> np.ndarray:
+        runs.append(name)
+        if name == "surrogate":
+            lengths.append(arrays["commands"].shape[1])
+        return portable.graphs[name](**arrays)
+
+    graphs = {name: partial(counted, name) for name in portable.graphs}
+    replace(portable, graphs=graphs).predict(emulated[:1])
+    assert sorted(runs) == ["diagnoser", "features", "guard", "surrogate"]
+    assert lengths == [emulated.steps // 10]
 
 
-@pytest.mark.slow
-def test_it_simulates_by_the_same_law(
-    portable: Portable, updated: CorrectedTwin, case: rt.Case
+def noise_of_torch(twin: CorrectedTwin, count: int, movements: int, steps: int, seed: int):
+    """What `CorrectedTwin.simulate` draws for `count` trajectories, by the names of `Portable`."""
+    generator = torch.Generator().manual_seed(seed)
+    residual, sensor = twin.residual, twin.residual.correction.second
+    moves, size = (count, movements), len(residual.latent)
+    noise = {
+        "uniform": torch.rand(*moves, len(residual.sizes), generator=generator),
+        "own": torch.randn(*moves, size, generator=generator),
+        "common": torch.zeros(count, 1, size),
+    }
+    if residual.persistence.any():
+        noise["common"] = torch.randn(count, 1, size, generator=generator)
+    when = sensor.polls(count, steps, generator)
+    shape = *when.shape, len(twin.outputs)
+    level = torch.rand(shape, generator=generator, dtype=torch.float64).float()
+    noise |= {"phase": when[:, :1], "level": level}
+    noise |= {"chance": torch.ones(*when.shape, 1), "glitch": torch.zeros(shape)}
+    if sensor.glitch_rate:
+        noise["chance"] = torch.rand(when.shape, generator=generator)[..., None]
+        noise["glitch"] = torch.randn(shape, generator=generator)
+    return {name: values.numpy() for name, values in noise.items()}
+
+
+def test_the_same_noise_gives_the_same_outputs(
+    portable: Portable,
+    updated: CorrectedTwin,
+    case: rt.Case,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Both draw the same noise, so whatever weights were trained, outputs differ by rounding.
+
+    Rounding itself is 2e-7, the same over three retrainings. It may also choose another mixture
+    component, or miss a segment or not: of 100 × 5 segments with at most 9 such choices each,
+    whose limits differ by 1e-7, that is 5e-4 expected trajectories. Two of them, where this test
+    fails, have a probability of 1e-7.
+    """
     assert isinstance(portable, rt.Twin)
-    commands = case.sampler.sample(200, rng=np.random.default_rng(3), timing=updated.timing)
-    faults = [case.faults["Motor_2_Stuck"], None] * 100
-    made, again, other = (
-        twin.simulate(commands, faults=faults, seed=9) for twin in (portable, portable, updated)
-    )
-    np.testing.assert_array_equal(made.observed, again.observed)
-    np.testing.assert_allclose(made.nominal, other.nominal, atol=1e-6)
+    commands = case.sampler.sample(100, rng=np.random.default_rng(3), timing=updated.timing)
+    faults = [case.faults["Motor_2_Stuck"], None] * 50
+    noise = noise_of_torch(updated, 100, portable.facts.movements, commands.shape[1], seed=9)
+    monkeypatch.setattr(Portable, "_noise", lambda *_: noise)
+    made, other = (twin.simulate(commands, faults=faults, seed=9) for twin in (portable, updated))
     assert made.labels.tolist() == other.labels.tolist()
     assert made.emulated
-    for label in ("Stuck", "Healthy"):
-        sizes = [
-            np.quantile(np.abs(each.with_label(label).residual), [0.25, 0.5, 0.9], axis=(0, 1))
-            for each in (made, other)
-        ]
-        np.testing.assert_allclose(*sizes, rtol=0.15, atol=1e-4)
+    np.testing.assert_allclose(made.nominal, other.nominal, atol=1e-6)
+    differences = np.abs(made.observed - other.observed).max(axis=(1, 2))
+    assert np.sort(differences)[-2] < 1e-5
+    # What was compared is noise, and more than the tolerance.
+    assert np.abs(made.residual).max(axis=(1, 2)).min() > 1e-4
+
+
+def test_its_noise_is_uniform_and_normal(portable: Portable) -> None:
+    """All of it at once, by Kolmogorov and Smirnov; numpy's draws are the same on any machine."""
+    noise, again, other = (portable._noise(100, np.random.default_rng(seed)) for seed in (0, 0, 1))
+    for name, values in noise.items():
+        np.testing.assert_array_equal(values, again[name])
+    assert set(noise["phase"].flat) <= set(portable.sensor.phases)
+    known = {"uniform": "uniform", "level": "uniform", "chance": "uniform"}
+    known |= {"own": "norm", "common": "norm", "glitch": "norm"}
+    for name, distribution in known.items():
+        assert not np.array_equal(noise[name], other[name])
+        assert kstest(noise[name].ravel(), distribution).pvalue > 1e-3, name
+
+
+def test_the_same_seed_simulates_the_same(portable: Portable, emulated: rt.Trajectories) -> None:
+    made, again, other = (
+        portable.simulate(emulated.commands[:3], seed=seed).observed for seed in (9, 9, 10)
+    )
+    np.testing.assert_array_equal(made, again)
+    assert np.abs(made - other).max(axis=(1, 2)).min() > 0
 
 
 def test_the_sensor_reads_as_the_operator_does(bundle: Bundle) -> None:

@@ -74,7 +74,10 @@ def rg(twin: rt.Surrogate, record: rt.Trajectories) -> SequenceResidual:
 
 
 def test_one_record_teaches_the_gap(twin: rt.Surrogate, rg: SequenceResidual) -> None:
-    """On inputs it has not seen, it errs by less than a third of the gap."""
+    """On inputs it has not seen, it errs by less than a quarter of the gap.
+
+    Over 12 retrainings by 0.130 of it, standard deviation 0.007.
+    """
     commands = commands_of(5, 99)
     z = rg.mean(rg.context(twin, commands)).numpy()
     error = np.sqrt(np.square(z - gap(commands)).mean())
@@ -85,6 +88,11 @@ def test_one_record_teaches_the_gap(twin: rt.Surrogate, rg: SequenceResidual) ->
 def test_draws_have_the_law_and_the_memory_of_the_noise(
     twin: rt.Surrogate, rg: SequenceResidual
 ) -> None:
+    """The limits are eight standard deviations away from what 12 retrainings give.
+
+    The spread is 0.202 with a standard deviation of 0.009; the autocorrelation, drawn as well as
+    fitted, 0.767 with one of 0.010.
+    """
     commands = np.repeat(commands_of(1, 98), 300, axis=0)
     context = rg.context(twin, commands)
     draws = rg.sample(context, generator=torch.Generator().manual_seed(0)).numpy()[..., 0]
@@ -96,6 +104,10 @@ def test_draws_have_the_law_and_the_memory_of_the_noise(
 
 
 def test_bands_hold_records_it_has_not_seen(twin: rt.Surrogate, rg: SequenceResidual) -> None:
+    """Over 12 retrainings the coverage is 0.880, standard deviation 0.0135: limits at six of them.
+
+    On held-out parts it is 0.909, standard deviation 0.007.
+    """
     fresh = measured(twin, 5, 50)
     inside = []
     for i in range(len(fresh)):
@@ -104,7 +116,7 @@ def test_bands_hold_records_it_has_not_seen(twin: rt.Surrogate, rg: SequenceResi
         low, high = np.quantile(draws, [0.05, 0.95], axis=0)
         z = fresh.residual[i]
         inside.append((low <= z) & (z <= high))
-    assert 0.82 < np.mean(inside) < 0.98
+    assert 0.80 < np.mean(inside) < 0.96
     assert 0.82 < rg.fitted.figures["coverage90"] < 0.98
 
 
@@ -204,10 +216,11 @@ def test_the_corrected_twin_takes_it(
     assert first.observed.tobytes() != updated.simulate(commands, seed=5).observed.tobytes()
     assert load_residual(tmp_path / "model" / "residual").fitted == rg.fitted
     mean = replace(updated, random=False).simulate(commands, seed=4)
-    assert mean.observed.std() < first.observed.std()
+    np.testing.assert_allclose(mean.residual, rg.mean(rg.context(twin, commands)), atol=1e-6)
 
 
 def test_its_fidelity_is_measured(twin: rt.Surrogate, rg: SequenceResidual) -> None:
+    """Over 12 retrainings: coverage 0.903, standard deviation 0.011; CRPS 0.287 below, 0.003."""
     found = rt.measure_fidelity(CorrectedTwin(twin, rg), measured(twin, 3, 70), draws=40, seed=0)
     assert 0.75 < found.figures["coverage90"].value <= 1.0
     assert found.figures["crps_below/mean_only"].value > 0.1

@@ -187,7 +187,7 @@ class Portable:
         self._fits(checked.shape[1], Segments.from_commands(checked).most)
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            return self._corrected(chunk, rng)
+            return self._corrected(chunk, self._noise(len(chunk.commands), rng))
 
         return simulate_in_chunks(
             self,
@@ -199,35 +199,44 @@ class Portable:
             emulated=self.emulated,
         )
 
-    def _corrected(self, chunk: Chunk, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
-        """Nominal outputs, and corrected and recorded ones, with noise from `rng`."""
-        nominal = self.graphs["surrogate"](commands=chunk.commands)
-        moves = padded_times(chunk.segments, self.facts.movements)
-        count, most = moves["valid"].shape
+    def _noise(self, count: int, rng: np.random.Generator) -> dict[str, NDArray]:
+        """What the graphs of the residual model and of the sensor take, for `count` trajectories.
+
+        Each is independent: `uniform` (n, M, blocks), `own` (n, M, d_z) and `common` (n, 1, d_z)
+        of the residual model; `phase` (n, 1), `level` (n, R, d_y), `chance` (n, R, 1) and `glitch`
+        (n, R, d_y) of a sensor. `uniform`, `level` and `chance` are uniform on [0, 1); `own`,
+        `common` and `glitch` are standard normal.
+        """
         residual = self.graphs["residual"]
         blocks, size = residual.width("uniform"), residual.width("own")
-        z = residual(
-            commands=chunk.commands,
-            nominal=nominal,
-            **moves,
-            uniform=rng.random((count, most, blocks), np.float32),
-            own=rng.standard_normal((count, most, size), np.float32),
-            common=rng.standard_normal((count, 1, size), np.float32),
-        )
+        moves = count, self.facts.movements
+        noise: dict[str, NDArray] = {
+            "uniform": rng.random((*moves, blocks), np.float32),
+            "own": rng.standard_normal((*moves, size), np.float32),
+            "common": rng.standard_normal((count, 1, size), np.float32),
+        }
+        if self.sensor is None:
+            return noise
+        readings = count, -(-self.facts.steps // self.sensor.every)
+        width = len(self.outputs)
+        return noise | {
+            "phase": rng.choice(self.sensor.phases, size=(count, 1)).astype(np.int64),
+            "level": rng.random((*readings, width), np.float32),
+            "chance": rng.random((*readings, 1), np.float32),
+            "glitch": rng.standard_normal((*readings, width), np.float32),
+        }
+
+    def _corrected(self, chunk: Chunk, noise: Mapping[str, NDArray]) -> tuple[NDArray, NDArray]:
+        """Nominal outputs, and corrected and recorded ones, as this `_noise` has them."""
+        nominal = self.graphs["surrogate"](commands=chunk.commands)
+        moves = padded_times(chunk.segments, self.facts.movements)
+        z = self.graphs["residual"](commands=chunk.commands, nominal=nominal, **moves, **noise)
         outputs = self.graphs["correction"](
             told=_single(chunk.faulty_commands), frozen=chunk.frozen.astype(np.int64), **moves, z=z
         )
         if self.sensor is None:
             return nominal, outputs
-        readings = count, -(-outputs.shape[1] // self.sensor.every), outputs.shape[2]
-        recorded = self.graphs["sensor"](
-            outputs=outputs,
-            phase=rng.choice(self.sensor.phases, size=(count, 1)).astype(np.int64),
-            level=rng.random(readings, np.float32),
-            chance=rng.random((*readings[:2], 1), np.float32),
-            glitch=rng.standard_normal(readings, np.float32),
-        )
-        return nominal, recorded
+        return nominal, self.graphs["sensor"](outputs=outputs, **noise)
 
     def _check(self, trajectories: Trajectories) -> None:
         for name in ("inputs", "outputs", "rate"):
