@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import struct
+import subprocess
 import sys
 import warnings
 import zipfile
@@ -1014,3 +1015,20 @@ def test_the_arms_files(tmp_path, name, n, dtype):
     assert np.linalg.norm(read.observed, axis=2).max() < 0.35
     save(read[:9], tmp_path / "part.npz")
     assert_same(load(tmp_path / "part.npz"), read[:9])
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_data_need_no_learning_library(tmp_path, suffix):
+    save(example(), tmp_path / f"a{suffix}")
+    code = f"""
+import sys
+import retwin as rt
+from retwin.serialisation import configs, files, identity, models
+
+first, second = rt.load({str(tmp_path / f"a{suffix}")!r}).split(0.5, seed=0)
+rt.Segments.from_commands(first.commands)
+rt.save(rt.Trajectories.concatenate([first, second]), {str(tmp_path / f"b{suffix}")!r})
+loaded = {{"torch", "scipy", "sklearn", "lightning", "matplotlib"}} & set(sys.modules)
+assert not loaded, loaded
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

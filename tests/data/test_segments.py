@@ -56,7 +56,7 @@ def test_trajectories_may_have_different_numbers_of_movements() -> None:
 
 def test_commands_that_never_change_have_no_movement() -> None:
     found = Segments.from_commands(np.ones((2, 50, 3)))
-    assert found.most == 0
+    assert found.max_count == 0
     assert len(found) == 2
 
 

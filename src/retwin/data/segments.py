@@ -78,7 +78,7 @@ class Segments:
         return part
 
     @property
-    def most(self) -> int:
+    def max_count(self) -> int:
         """The largest number of segments in one trajectory, M."""
         return self.start.shape[1]
 

@@ -242,10 +242,8 @@ class Trajectories:
             `steps` is smaller than T.
 
         """
-        more = (
-            whole("steps", steps, least=self.steps, remedy="padding makes them longer") - self.steps
-        )
-        longer = ((0, 0), (0, more), (0, 0))
+        steps = whole("steps", steps, least=self.steps, remedy="padding makes them longer")
+        longer = ((0, 0), (0, steps - self.steps), (0, 0))
         return self.replace(
             commands=np.pad(self.commands, longer, mode="edge"),
             nominal=np.pad(self.nominal, longer, mode="edge"),
