@@ -666,9 +666,9 @@ def test_zarr_with_a_lost_or_damaged_chunk(tmp_path):
 def test_zarr_of_a_size_that_was_not_written_takes_no_memory(tmp_path, part):
     save(example(), tmp_path / "a.zarr")
     file = tmp_path / "a.zarr/nominal/zarr.json"
-    told = json.loads(file.read_text())
-    (told if part == "shape" else told["chunk_grid"]["configuration"])[part] = [10**9, 20, 3]
-    file.write_text(json.dumps(told))
+    stored = json.loads(file.read_text())
+    (stored if part == "shape" else stored["chunk_grid"]["configuration"])[part] = [10**9, 20, 3]
+    file.write_text(json.dumps(stored))
     refused(r"nominal.*\(4, 20, 3\), got.*1000000000", tmp_path / "a.zarr")
 
 

@@ -16,7 +16,7 @@ from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, PlainValidator, ValidationError, create_model
-from pydantic_core import PydanticCustomError
+from pydantic_core import ErrorDetails, PydanticCustomError
 
 from retwin.checks import one_of, require
 from retwin.errors import InputError
@@ -148,11 +148,11 @@ def _validated(model: type[BaseModel], settings: Any, place: str) -> dict[str, A
         remedy="write { key = value, … }",
     )
     renamed = RENAMED_SETTINGS.get(model.__name__, {})
-    given = {renamed.get(name, name): _tuples(value) for name, value in settings.items()}
+    given = {renamed.get(name, name): value for name, value in settings.items()}
     for name in given:
         one_of(key(place, name), name, model.model_fields, remedy="check the spelling")
     try:
-        made = model.model_validate(given)
+        made = model.model_validate(_tuples(given))
         return {name: getattr(made, name) for name in made.model_fields_set}
     except ValidationError as error:
         errors = error.errors(include_url=False)
@@ -164,13 +164,18 @@ def _validated(model: type[BaseModel], settings: Any, place: str) -> dict[str, A
         if "error" in each.get("ctx", {}):  # an InputError from inside a config object
             with at(where):
                 raise each["ctx"]["error"]
-    kinds = dict.fromkeys(each["msg"].removeprefix("Input should be ") for each in errors)
     raise InputError(
         where,
-        expected=" or ".join(kinds).replace("dictionary", "table"),
+        expected=" or ".join(dict.fromkeys(map(_expected, errors))),
         got=repr(given[name]),
         remedy="see what this key may hold",
     )
+
+
+def _expected(error: ErrorDetails) -> str:
+    """What pydantic expected, in the words of TOML."""
+    text = {"missing": "more items", "too_long": "fewer items"}.get(error["type"], error["msg"])
+    return re.sub("dictionary|mapping", "table", text.removeprefix("Input should be "))
 
 
 @cache
