@@ -52,7 +52,7 @@ def at_rest(commands: np.ndarray) -> tuple[Problem, np.ndarray]:
     observed = torch.tensor(context.nominal.numpy() + noise)
     problem = Problem(rt.CommandSpace(), context, observed, mask)
     problem.observed, problem.unit = problem.observed * problem.unit, torch.ones(())
-    return problem, np.repeat(np.arange(segments.most), 2)
+    return problem, np.repeat(np.arange(segments.max_count), 2)
 
 
 def test_evidence_is_that_of_a_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:

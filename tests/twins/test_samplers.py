@@ -66,7 +66,7 @@ def test_ramps_are_those_of_a_loop_over_all_samples() -> None:
 
 def test_the_segments_are_those_that_were_drawn() -> None:
     segments = rt.Segments.from_commands(draw())
-    assert segments.most == 4
+    assert segments.max_count == 4
     np.testing.assert_allclose(segments.start, [[0, 100, 200, 300]] * 50, atol=1e-3)
 
 

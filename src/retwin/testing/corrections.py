@@ -170,7 +170,7 @@ def check_no_movement(subject: CorrectionSubject) -> None:
     corrected = subject.apply(subject.z).detach()
     mask = corrected == corrected
     more = replace(subject.context, segments=_with_another(subject.context.segments))
-    z = subject.z.new_zeros(len(more), more.segments.most, subject.z.shape[2])
+    z = subject.z.new_zeros(len(more), more.segments.max_count, subject.z.shape[2])
     z[:, :-1] = subject.z
     message = "a movement that does not exist, z = 0, must change nothing"
     require_alike(subject.apply(z, more), corrected, message)

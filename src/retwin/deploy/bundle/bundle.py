@@ -82,13 +82,13 @@ class Bundle:
                 remedy="train it on trajectories of this case",
             )
         probe = case.sampler.sample(8, rng=np.random.default_rng(0))
-        movements = [Segments.from_commands(each.commands).most for each in data if len(each)]
+        movements = [Segments.from_commands(each.commands).max_count for each in data if len(each)]
         facts = Facts(
             case=case.name,
             faults=dict(case.faults),
             sensor_rate=case.sensor_rate,
             steps=case.sampler.steps,
-            movements=max([Segments.from_commands(probe).most, *movements]),
+            movements=max([Segments.from_commands(probe).max_count, *movements]),
             sampler=case.sampler if isinstance(case.sampler, SAMPLERS) else None,
         )
         provenance = {

@@ -37,7 +37,7 @@ class Movements:
     stop: Tensor
     valid: Tensor
     steps: int
-    most: int
+    max_count: int
 
 
 class ResidualGraph(nn.Module):
@@ -118,7 +118,7 @@ def _context(
         faulty_commands=commands,
         frozen=cast(Tensor, frozen),
         nominal=outputs,
-        segments=cast(Segments, Movements(*times, steps=steps, most=most)),
+        segments=cast(Segments, Movements(*times, steps=steps, max_count=most)),
         rate=rate,
         corrected=outputs,
     )

@@ -184,7 +184,7 @@ class Portable:
         """
         rng = np.random.default_rng(checked_seed(seed))
         checked = _single(checked_commands(commands, self.inputs))
-        self._fits(checked.shape[1], Segments.from_commands(checked).most)
+        self._fits(checked.shape[1], Segments.from_commands(checked).max_count)
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             return self._corrected(chunk, self._noise(len(chunk.commands), rng))
@@ -335,7 +335,7 @@ def _single(values: NDArray) -> NDArray:
 
 def padded_times(segments: Segments, movements: int) -> dict[str, NDArray]:
     """Times of movements (n, movements), padded as `Segments` pads."""
-    missing = ((0, 0), (0, movements - segments.most))
+    missing = ((0, 0), (0, movements - segments.max_count))
     padded = {
         name: _single(np.pad(getattr(segments, name), missing, constant_values=segments.steps))
         for name in ("start", "settle", "stop")
@@ -349,7 +349,7 @@ def settled_at(trajectories: Trajectories, stride: int, margin: int | None) -> N
     if margin is None:
         return np.zeros((len(trajectories), 1), dtype=np.int64)
     segments = Segments.from_commands(trajectories.commands)
-    if segments.most == 0:
+    if segments.max_count == 0:
         return np.full((len(trajectories), 1), last)
     end = np.ceil(segments.settle[:, :1]).astype(np.int64) + margin * stride
     return np.minimum(end, last)

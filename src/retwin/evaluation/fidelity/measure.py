@@ -306,7 +306,7 @@ def _movements(twin: Twin, made: Trajectories, segments: Segments, stride: int) 
 
 def _plateau_noise(made: Trajectories, segments: Segments, stride: int) -> NDArray:
     """Standard deviation (m, M, d) in the second half of each steady part, when all is at rest."""
-    noise = np.full((len(made), segments.most, len(made.outputs)), np.nan)
+    noise = np.full((len(made), segments.max_count, len(made.outputs)), np.nan)
     time = np.arange(0, made.steps, stride)
     seen = made.mask[0, ::stride].all(axis=1)
     for m in np.flatnonzero(segments.valid[0]):

@@ -98,7 +98,7 @@ def predictive_overlay(
         twin.surrogate.predict(trajectories.commands),
         twin.residual.segmentation or "commands",
     )
-    shape = (len(trajectories), movements.most, len(latent))
+    shape = (len(trajectories), movements.max_count, len(latent))
     z, deviation = np.full(shape, np.nan), np.full(shape, np.nan)
     if correction.resolution == "segment":
         _, found = infer_discrepancy(twin.surrogate, trajectories, correction, segments=movements)
