@@ -177,8 +177,8 @@ def fit_residual(
         observed, mask = _measured(used)
         read = sample_mask(correction, observed, mask)
         figures |= refine(
-            model, context, observed, read, fitted=fitted, held=held, how=density.refinement,
-            seed=seed, progress=progress,
+            model, context, observed, read, fitted=fitted, held_out=held,
+            how=density.refinement, seed=seed, progress=progress,
         )  # fmt: skip
     model.emulated = used.emulated
     onsets = Segments.from_commands(calibration.commands)
