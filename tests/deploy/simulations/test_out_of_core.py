@@ -105,7 +105,7 @@ def test_standardised_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     values = torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)) * 5 + 100
     values[:, 2] = 7.0
     whole = Standardise(3).fit(values)
-    monkeypatch.setattr("retwin.nets.networks.BLOCK", 70)
+    monkeypatch.setattr("retwin.nets.networks.ROWS_PER_BLOCK", 70)
     parts = Standardise(3).fit(values.view(10, 100, 3))
     np.testing.assert_allclose(parts.mean, values.double().mean(0), rtol=1e-6)
     np.testing.assert_allclose(parts.scale[:2], values.double().std(0, correction=0)[:2], rtol=1e-6)
