@@ -29,7 +29,7 @@ from retwin.study.results import write_results
 from retwin.study.sources import lacking
 from retwin.study.work import Work
 from retwin.update.corrected import generate
-from retwin.update.surrogate import ENOUGH
+from retwin.update.surrogate import MIN_TRAJECTORIES
 
 __all__ = ["StudyData", "StudyPlan", "possible_sources", "run_study"]
 
@@ -201,10 +201,10 @@ def _prepare(
     real, roles = _real(case, plan, data, tell)
     _check_healthy(plan, real, roles)
     twin = _twin(case, plan, data, tell)
-    if len(twin) < ENOUGH:
+    if len(twin) < MIN_TRAJECTORIES:
         raise InputError(
             "twin-data",
-            expected=f"at least {ENOUGH} trajectories of the twin",
+            expected=f"at least {MIN_TRAJECTORIES} trajectories of the twin",
             got=f"{len(twin)}",
             remedy="give more of them, or a larger per_class",
         )

@@ -1,4 +1,4 @@
-"""Truth tests of the residual model: a gap whose law is known."""
+"""Truth tests of the residual model: a discrepancy of known distribution."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scoringrules
 import torch
 from scipy import stats
 
@@ -15,19 +14,20 @@ import retwin as rt
 from retwin.nets.flows import FlowHead
 from retwin.nets.mixtures import Blocks, GaussianMixture
 from retwin.nets.training import Training, isolated
-from retwin.update.residual.refining import energy_score, refine
+from retwin.scores.energy import energy_score
+from retwin.update.residual.refining import refine
 
 STEPS = 60
 
 
 def toy_commands(n: int, rng: np.random.Generator) -> np.ndarray:
-    """One movement of a random height."""
+    """One segment of a random height."""
     height = rng.uniform(-1, 1, n)
     ramp = np.clip((np.arange(STEPS) - 5) / 20, 0, 1)
     return (height[:, None] * ramp)[..., None]
 
 
-def law(height: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def true_mixture(height: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weights, means and deviations (n, 2) of the offset: bimodal and heteroscedastic."""
     weight = 0.25 + 0.5 * (height + 1) / 2
     deviation = 0.02 + 0.03 * np.abs(height)
@@ -43,15 +43,15 @@ def toy(n: int, seed: int) -> tuple[rt.Trajectories, np.ndarray]:
     rng = np.random.default_rng(seed)
     commands = toy_commands(n, rng)
     height = commands[:, -1, 0]
-    weights, means, deviations = law(height)
+    weights, means, deviations = true_mixture(height)
     mode = (rng.random(n) > weights[:, 0]).astype(int)
     row = np.arange(n)
     offset = means[row, mode] + deviations[row, mode] * rng.normal(size=n)
-    # Read as DelayOffset applies it, with a delay of 2 samples.
-    late = toy_commands(n, np.random.default_rng(seed))
-    late = np.concatenate([late[:, :1], late[:, :1], late[:, :-2]], axis=1)
+    # The output as DelayOffset gives it, with a delay of 2 samples.
+    delayed = toy_commands(n, np.random.default_rng(seed))
+    delayed = np.concatenate([delayed[:, :1], delayed[:, :1], delayed[:, :-2]], axis=1)
     ramp = np.clip((np.arange(STEPS) - 7) / 20, 0, 1)
-    observed = late + (offset[:, None] * ramp)[..., None]
+    observed = delayed + (offset[:, None] * ramp)[..., None]
     made = rt.Trajectories(
         commands=commands,
         nominal=commands,
@@ -63,12 +63,12 @@ def toy(n: int, seed: int) -> tuple[rt.Trajectories, np.ndarray]:
 
 
 def true_log_density(height: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    weights, means, deviations = law(height)
+    weights, means, deviations = true_mixture(height)
     return np.log((weights * stats.norm.pdf(offset[:, None], means, deviations)).sum(-1))
 
 
 def true_distribution(height: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    weights, means, deviations = law(height)
+    weights, means, deviations = true_mixture(height)
     return (weights * stats.norm.cdf(offset[:, None], means, deviations)).sum(-1)
 
 
@@ -103,17 +103,17 @@ def fitted(identity: rt.Surrogate) -> dict[int, rt.ResidualModel]:
     }
 
 
-def offset_law(
+def offset_distribution(
     model: rt.ResidualModel, identity: rt.Surrogate, test: rt.Trajectories
 ) -> GaussianMixture:
     context, _ = rt.infer_discrepancy(identity, test, rt.DelayOffset())
     with torch.no_grad():
-        told = model(context)
-    assert isinstance(told, Blocks)
-    return told.blocks[1]
+        distribution = model(context)
+    assert isinstance(distribution, Blocks)
+    return distribution.blocks[1]
 
 
-def test_a_bimodal_heteroscedastic_law_is_recovered(
+def test_a_bimodal_heteroscedastic_distribution_is_recovered(
     fitted: dict[int, rt.ResidualModel], identity: rt.Surrogate
 ) -> None:
     """Density and distribution function of each trajectory, compared with the true ones.
@@ -122,12 +122,12 @@ def test_a_bimodal_heteroscedastic_law_is_recovered(
     0.005, the distributions on average by 0.023, standard deviation 0.001.
     """
     test, offset = toy(1500, seed=2)
-    told = offset_law(fitted[3], identity, test)
+    predicted = offset_distribution(fitted[3], identity, test)
     value = torch.tensor(offset)[:, None, None].float()
-    log_density = told.log_prob(value)[:, 0].numpy()
+    log_density = predicted.log_prob(value)[:, 0].numpy()
     height = test.commands[:, -1, 0]
     assert abs(true_log_density(height, offset).mean() - log_density.mean()) < 0.08
-    pit = told.marginal_cdf(value)[:, 0, 0].numpy()
+    pit = predicted.marginal_cdf(value)[:, 0, 0].numpy()
     assert np.abs(pit - true_distribution(height, offset)).mean() < 0.05
 
 
@@ -137,7 +137,8 @@ def test_it_beats_a_single_gaussian(
     test, offset = toy(500, seed=3)
     value = torch.tensor(offset)[:, None, None].float()
     scores = {
-        k: offset_law(m, identity, test).log_prob(value).mean().item() for k, m in fitted.items()
+        k: offset_distribution(m, identity, test).log_prob(value).mean().item()
+        for k, m in fitted.items()
     }
     assert scores[3] > scores[1] + 0.3
 
@@ -149,7 +150,7 @@ def flow(identity: rt.Surrogate) -> rt.ResidualModel:
     return rt.fit_residual(identity, calibration, rt.DelayOffset(), density, seed=0)
 
 
-def test_a_flow_recovers_the_law_too(
+def test_a_flow_recovers_the_distribution_too(
     flow: rt.ResidualModel, identity: rt.Surrogate, tmp_path: Path
 ) -> None:
     """As of the mixture, beside what a flow inverts.
@@ -159,23 +160,23 @@ def test_a_flow_recovers_the_law_too(
     """
     test, offset = toy(1500, seed=2)
     flow.save(tmp_path / "flow")
-    told = offset_law(rt.ResidualModel.load(tmp_path / "flow"), identity, test)
+    predicted = offset_distribution(rt.ResidualModel.load(tmp_path / "flow"), identity, test)
     value = torch.tensor(offset)[:, None, None].float()
     with torch.no_grad():
-        log_density = told.log_prob(value)[:, 0].numpy()
-        scores = told.normal_scores(value)[:, 0, 0].numpy()
-        drawn = told.from_noise(value, torch.tensor(scores)[:, None, None])
-        mean = told.mean[:, 0, 0].numpy()
+        log_density = predicted.log_prob(value)[:, 0].numpy()
+        scores = predicted.normal_scores(value)[:, 0, 0].numpy()
+        drawn = predicted.from_noise(value, torch.tensor(scores)[:, None, None])
+        mean = predicted.mean[:, 0, 0].numpy()
     height = test.commands[:, -1, 0]
     assert abs(true_log_density(height, offset).mean() - log_density.mean()) < 0.1
     distribution = stats.norm.cdf(scores)
     assert np.abs(distribution - true_distribution(height, offset)).mean() < 0.05
     torch.testing.assert_close(drawn, value, atol=1e-3, rtol=0)
-    weights, means, _ = law(height)
+    weights, means, _ = true_mixture(height)
     assert np.abs(mean - (weights * means).sum(axis=-1)).mean() < 0.04
 
 
-def test_a_flow_starts_as_a_normal_law_in_any_unit() -> None:
+def test_a_flow_starts_as_a_normal_distribution_in_any_unit() -> None:
     with isolated(0):
         head = FlowHead(4, 3, transforms=2, bins=6)
     head.initialise(np.zeros((1, 3)), seed=0)
@@ -188,7 +189,7 @@ def test_a_flow_starts_as_a_normal_law_in_any_unit() -> None:
     torch.testing.assert_close(drawn.variance[0].detach().sqrt(), scale, atol=0, rtol=0.2)
 
 
-def test_draws_follow_the_law_and_the_bounds(
+def test_draws_follow_the_distribution_and_the_bounds(
     fitted: dict[int, rt.ResidualModel], identity: rt.Surrogate
 ) -> None:
     """Draws are distributed as their own model says, so its distribution of them is uniform.
@@ -267,7 +268,7 @@ def test_too_few_to_validate_is_a_warning(ibg: rt.Surrogate, emulated: rt.Trajec
 def test_nothing_to_calibrate_on_is_refused(ibg: rt.Surrogate, emulated: rt.Trajectories) -> None:
     with pytest.raises(rt.InputError, match="at least one trajectory labelled 'Healthy'"):
         rt.fit_residual(ibg, emulated.with_label("Motor_1_Stuck"), seed=0)
-    with pytest.raises(rt.InputError, match="'healthy', 'all', or what fault"):
+    with pytest.raises(rt.InputError, match="'healthy', 'all', or a mapping"):
         rt.fit_residual(ibg, emulated, seed=0, calibrate_on="some")
     still = emulated.replace(commands=np.full_like(emulated.commands, 500))
     with pytest.raises(rt.InputError, match="commands that never change"):
@@ -286,7 +287,7 @@ def test_saved_and_loaded_is_the_same(
     np.testing.assert_array_equal(back.timing, rg.timing)
 
 
-def test_calibration_data_must_speak_of_the_same_system(
+def test_calibration_data_must_be_of_the_same_system(
     ibg: rt.Surrogate, emulated: rt.Trajectories
 ) -> None:
     with pytest.raises(rt.InputError, match=r"calibration.rate: expected .* 100.0, got 50.0"):
@@ -296,31 +297,17 @@ def test_calibration_data_must_speak_of_the_same_system(
         rt.fit_residual(ibg, emulated.replace(outputs=millimetres), seed=0)
     with pytest.raises(rt.InputError, match="one positive bound for each of delay, offset_x"):
         rt.fit_residual(ibg, emulated, seed=0, bounds=np.ones(3))
-    with pytest.raises(rt.InputError, match="components: expected at least 1, got 0"):
+    with pytest.raises(rt.InputError, match=r"components: expected .* at least 1, got 0"):
         rt.Mixture(components=0)
 
 
-def test_what_was_calibrated_on_emulated_data_says_so(
+def test_what_was_calibrated_on_emulated_data_is_marked(
     rg: rt.ResidualModel, updated: rt.CorrectedTwin, case: rt.Case, tmp_path: Path
 ) -> None:
     assert rg.emulated
     updated.save(tmp_path / "twin")
     back = rt.CorrectedTwin.load(tmp_path / "twin")
     assert rt.generate(back, case, per_class=1, seed=0).emulated
-
-
-def test_the_energy_score_is_the_one_of_the_literature() -> None:
-    generator = torch.Generator().manual_seed(0)
-    made = torch.randn(4, 30, 20, 2, generator=generator, dtype=torch.float64)
-    observed = torch.randn(4, 20, 2, generator=generator, dtype=torch.float64)
-    mask = torch.ones(4, 20, 2, dtype=torch.bool)
-    mask[:, 15:] = False
-    ours = energy_score(made, observed, mask)
-    kept = (made[:, :, :15].flatten(2), observed[:, :15].flatten(1))
-    theirs = scoringrules.es_ensemble(
-        kept[1].numpy() / np.sqrt(15), kept[0].numpy() / np.sqrt(15), estimator="fair"
-    )
-    np.testing.assert_allclose(ours, theirs, rtol=1e-6)
 
 
 def test_refinement_helps_a_poor_model_on_trajectories_it_never_saw(
@@ -349,13 +336,12 @@ def test_refinement_helps_a_poor_model_on_trajectories_it_never_saw(
     assert figures["refined"] == 1.0
     assert figures["energy before"] - figures["energy after"] > 0.3
     test, _ = toy(300, seed=5)
-    measured = torch.tensor(test.observed)
     scores = []
     for model in (before, after.eval()):
         twin = rt.CorrectedTwin(identity, model)
         draws = [twin.simulate(test.commands, seed=seed).observed for seed in range(20)]
-        made = torch.tensor(np.stack(draws, axis=1))
-        scores.append(energy_score(made, measured, measured == measured).mean())
+        pairs = zip(np.stack(draws, axis=1), test.observed, strict=True)
+        scores.append(np.mean([energy_score(*pair) for pair in pairs]))
     assert scores[0] - scores[1] > 0.15
 
 
@@ -380,7 +366,7 @@ def test_refinement_that_does_not_help_changes_nothing(identity: rt.Surrogate) -
 
 
 @pytest.mark.slow
-def test_faulty_trajectories_calibrate_without_their_fault_in_the_gap(
+def test_faulty_trajectories_calibrate_without_their_fault_in_the_discrepancy(
     exact, emulated: rt.Trajectories, case: rt.Case
 ) -> None:
     """All nine classes, faults named: offsets as small as those of healthy ones alone.

@@ -16,6 +16,7 @@ from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Trajectories
 from retwin.errors import InputError
 from retwin.evaluation.fidelity.figures import BINS, LEVELS, Fidelity
 from retwin.progress import Progress
+from retwin.scores.energy import energy_score
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import DelayOffset
@@ -227,7 +228,6 @@ def _accuracy(one: Trajectories, made: Trajectories, stride: int) -> tuple[NDArr
     Both without the bias of few draws ("fair"), so a point forecast and an ensemble compare.
     """
     import scoringrules
-    from scipy.spatial.distance import pdist
 
     seen = made.mask[0, ::stride].all(axis=1)
     values = made.observed[:, ::stride][:, seen].astype(np.float64)
@@ -235,10 +235,8 @@ def _accuracy(one: Trajectories, made: Trajectories, stride: int) -> tuple[NDArr
     # Outputs of different units must be made comparable before they are put into one vector.
     spread = one.nominal[0, ::stride][seen].std(axis=0, dtype=np.float64)
     unit = 1.0 if one.outputs.comparable else np.where(spread > 0, spread, 1.0)
-    flat = (values / unit).reshape(len(values), -1) / np.sqrt(len(values[0]))
-    # scipy's distances, as scoringrules' energy score holds draws² × samples numbers at once.
-    error = np.linalg.norm(flat[1:] - flat[0], axis=1).mean()
-    return crps.mean(axis=0), float(error - 0.5 * pdist(flat[1:]).mean())
+    values /= unit
+    return crps.mean(axis=0), float(energy_score(values[1:], values[0]))
 
 
 def _pit(values: NDArray, rng: np.random.Generator) -> NDArray:
