@@ -7,7 +7,6 @@ import pytest
 import torch
 
 import retwin as rt
-from retwin.diagnosis import fit_dann
 from retwin.diagnosis.adversarial import _Reversed
 from retwin.nets.training import Training
 from retwin.testing import check_diagnoser
@@ -49,7 +48,7 @@ def test_gives_up_what_only_the_twin_shows(
 ) -> None:
     test = toy(100, seed=2, real=True)
     plain = rt.fit_diagnoser(source, SMALL, seed=0, training=SHORT)
-    adapted = fit_dann(source, target, SMALL, seed=0, training=SHORT)
+    adapted = rt.fit_diagnoser(source, rt.DANN(SMALL), target=target, seed=0, training=SHORT)
     assert rt.evaluate(plain, test).accuracy < 0.7
     assert rt.evaluate(adapted, test).accuracy > 0.9
     assert adapted.fitted is not None
@@ -65,7 +64,8 @@ def test_labels_of_the_target_are_not_read(
     how = Training(max_epochs=2)
     for name, labels in (("known", target.labels), ("shuffled", shuffled), ("none", None)):
         given = target.replace(labels=labels)
-        fit_dann(source, given, SMALL, seed=0, training=how).save(tmp_path / name)
+        adapted = rt.fit_diagnoser(source, rt.DANN(SMALL), target=given, seed=0, training=how)
+        adapted.save(tmp_path / name)
     for file in ("model.json", "weights.safetensors"):
         known = (tmp_path / "known" / file).read_bytes()
         assert (tmp_path / "shuffled" / file).read_bytes() == known
@@ -82,10 +82,17 @@ def test_a_reversed_gradient() -> None:
 
 def test_bad_input_is_refused(source: rt.Trajectories, target: rt.Trajectories) -> None:
     with pytest.raises(rt.InputError, match="label every trajectory"):
-        fit_dann(source.replace(labels=None), target, SMALL, seed=0)
+        rt.fit_diagnoser(source.replace(labels=None), rt.DANN(SMALL), target=target, seed=0)
     with pytest.raises(rt.InputError, match="target: expected at least one"):
-        fit_dann(source, target[:0], SMALL, seed=0)
+        rt.fit_diagnoser(source, rt.DANN(SMALL), target=target[:0], seed=0)
     with pytest.raises(rt.InputError, match="network: expected a classifier"):
-        fit_dann(source, target, rt.MLP((4,)), seed=0)
+        rt.fit_diagnoser(source, rt.DANN(rt.MLP((4,))), target=target, seed=0)
     with pytest.raises(rt.InputError, match=r"trajectories\.rate"):
-        fit_dann(source, target.replace(rate=50.0), SMALL, seed=0)
+        rt.fit_diagnoser(source, rt.DANN(SMALL), target=target.replace(rate=50.0), seed=0)
+    with pytest.raises(rt.InputError, match="target: expected real trajectories for DANN"):
+        rt.fit_diagnoser(source, rt.DANN(SMALL), seed=0)
+    with pytest.raises(rt.InputError, match="target: expected none for CNN"):
+        rt.fit_diagnoser(source, SMALL, target=target, seed=0)
+    for setting in ({"hidden": 0}, {"gamma": float("nan")}):
+        with pytest.raises(rt.InputError, match=next(iter(setting))):
+            rt.DANN(SMALL, **setting)

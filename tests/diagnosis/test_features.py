@@ -18,16 +18,16 @@ def test_every_phase_is_a_view() -> None:
     given = ramp(2, onset=40, length=80)
     features = Features.at(given)
     assert (features.stride, features.width) == (10, 2)
-    views = features.views(given)
-    assert views.shape == (2, 10, 40, 2)
-    np.testing.assert_array_equal(views[:, 0], features(given))
-    np.testing.assert_allclose(views[:, 7, :, 0], given.nominal[:, 7::10, 0], rtol=1e-6)
-    np.testing.assert_allclose(views[..., 1], 0.1, rtol=1e-5)
+    phases = features.phases(given)
+    assert phases.shape == (2, 10, 40, 2)
+    np.testing.assert_array_equal(phases[:, 0], features(given))
+    np.testing.assert_allclose(phases[:, 7, :, 0], given.nominal[:, 7::10, 0], rtol=1e-6)
+    np.testing.assert_allclose(phases[..., 1], 0.1, rtol=1e-5)
 
 
 def test_a_last_reading_beyond_the_end_is_the_last_sample() -> None:
     given = ramp(1, onset=40, length=80, steps=395)
-    assert Features.at(given).views(given)[0, 9, -1, 0] == given.nominal[0, -1, 0]
+    assert Features.at(given).phases(given)[0, 9, -1, 0] == given.nominal[0, -1, 0]
 
 
 def test_the_start_is_hidden_until_the_first_movement_rests() -> None:
@@ -49,7 +49,7 @@ def test_what_is_hidden_cannot_be_seen() -> None:
     shown, hidden = Features.at(given), Features.at(given, hide_start=True)
     assert not np.array_equal(shown(moved), shown(given))
     np.testing.assert_array_equal(hidden(moved), hidden(given))
-    np.testing.assert_array_equal(hidden.views(moved), hidden.views(given))
+    np.testing.assert_array_equal(hidden.phases(moved), hidden.phases(given))
 
 
 def test_each_trajectory_has_a_start_of_its_own() -> None:

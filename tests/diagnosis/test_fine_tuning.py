@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.diagnosis import fine_tune
 from retwin.nets.training import Training
 from retwin.testing import check_diagnoser
 
@@ -51,7 +50,9 @@ def test_learns_what_the_generated_ones_do_not_hold(
     test = real(40, seed=2)
     assert rt.evaluate(base, test).accuracy < 0.8
     before = base.predict_proba(test)
-    tuned = fine_tune(base, generated, real(8, seed=1), seed=0, training=SHORT)
+    method = rt.FineTune(base)
+    few = real(8, seed=1)
+    tuned = rt.fit_diagnoser(generated, method, target=few, seed=0, training=SHORT)
     assert rt.evaluate(tuned, test).accuracy > 0.95
     assert rt.evaluate(tuned, toy(40, seed=3)).accuracy > 0.95
     np.testing.assert_array_equal(base.predict_proba(test), before)
@@ -60,8 +61,9 @@ def test_learns_what_the_generated_ones_do_not_hold(
 def test_where_a_recording_began_tells_it_nothing(
     base: rt.NetworkDiagnoser, generated: rt.Trajectories
 ) -> None:
-    told = toy(8, seed=1, gain=0.0, leak=0.8)
-    tuned = fine_tune(base, generated, told, seed=0, training=SHORT)
+    leaking = toy(8, seed=1, gain=0.0, leak=0.8)
+    method = rt.FineTune(base)
+    tuned = rt.fit_diagnoser(generated, method, target=leaking, seed=0, training=SHORT)
     test = toy(40, seed=2, gain=0.0, leak=0.8)
     other = toy(40, seed=2, gain=0.0, leak=-0.8)
     np.testing.assert_array_equal(other.observed[:, 80:], test.observed[:, 80:])
@@ -78,7 +80,8 @@ def test_is_saved_with_what_it_does_not_look_at(
 ) -> None:
     real = toy(4, seed=1, leak=0.3)
     for name in ("a", "b"):
-        tuned = fine_tune(base, generated, real, seed=3, training=Training(max_epochs=1))
+        brief = Training(max_epochs=1)
+        tuned = rt.fit_diagnoser(generated, rt.FineTune(base), target=real, seed=3, training=brief)
         tuned.save(tmp_path / name)
     for file in ("model.json", "weights.safetensors"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
@@ -90,11 +93,19 @@ def test_is_saved_with_what_it_does_not_look_at(
 
 
 def test_bad_input_is_refused(base: rt.NetworkDiagnoser, generated: rt.Trajectories) -> None:
-    real = toy(4, seed=1)
+    real, method = toy(4, seed=1), rt.FineTune(base)
     with pytest.raises(rt.InputError, match="label every trajectory"):
-        fine_tune(base, generated, real.replace(labels=None), seed=0)
-    with pytest.raises(rt.InputError, match=r"unknown \['strange'\]"):
-        strange = real.replace(labels=np.array(["high", "low", "low", "strange"]))
-        fine_tune(base, generated, strange, seed=0)
+        rt.fit_diagnoser(generated, method, target=real.replace(labels=None), seed=0)
+    with pytest.raises(rt.InputError, match=r"unknown \['third'\]"):
+        other = real.replace(labels=np.array(["high", "low", "low", "third"]))
+        rt.fit_diagnoser(generated, method, target=other, seed=0)
     with pytest.raises(rt.InputError, match=r"trajectories\.rate"):
-        fine_tune(base, generated, real.replace(rate=50.0), seed=0)
+        rt.fit_diagnoser(generated, method, target=real.replace(rate=50.0), seed=0)
+    with pytest.raises(rt.InputError, match="target: expected real trajectories for FineTune"):
+        rt.fit_diagnoser(generated, method, seed=0)
+    with pytest.raises(rt.InputError, match="keeps those of its base"):
+        rt.fit_diagnoser(generated, method, target=real, rate=5.0, seed=0)
+    with pytest.raises(rt.InputError, match="base: expected a NetworkDiagnoser, got CNN"):
+        rt.FineTune(SMALL)
+    with pytest.raises(rt.InputError, match="generated_per_labelled: expected a whole number"):
+        rt.FineTune(base, 0)

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 import retwin as rt
-from retwin.diagnosis import RocketDiagnoser, fit_rocket
+from retwin.diagnosis import RocketDiagnoser
 from retwin.testing import check_diagnoser
 
 pytest.importorskip("numba")
 pytest.importorskip("sktime")
 
-KERNELS = 504
+SMALL = rt.Rocket(504)
 
 
 def toy(count: int, *, seed: int, noise: float = 0.3) -> rt.Trajectories:
@@ -32,7 +32,7 @@ def toy(count: int, *, seed: int, noise: float = 0.3) -> rt.Trajectories:
 
 @pytest.fixture(scope="module")
 def rocket() -> RocketDiagnoser:
-    return fit_rocket(toy(240, seed=0), seed=0, kernels=KERNELS)
+    return rt.fit_diagnoser(toy(240, seed=0), SMALL, seed=0)
 
 
 def test_learns_what_can_be_learnt(rocket: RocketDiagnoser) -> None:
@@ -41,7 +41,7 @@ def test_learns_what_can_be_learnt(rocket: RocketDiagnoser) -> None:
 
 def test_is_as_sure_as_it_is_right() -> None:
     """In noise that hides the waves often, so that there is something to be unsure of."""
-    unsure = fit_rocket(toy(600, seed=0, noise=1.5), seed=0, kernels=KERNELS)
+    unsure = rt.fit_diagnoser(toy(600, seed=0, noise=1.5), SMALL, seed=0)
     test = toy(600, seed=1, noise=1.5)
     probabilities = unsure.predict_proba(test)
     right = np.array(unsure.classes)[probabilities.argmax(axis=1)] == test.labels
@@ -78,7 +78,7 @@ def test_saved_and_loaded_is_the_same(rocket: RocketDiagnoser, tmp_path: Path) -
 
 def test_same_seed_same_bytes(tmp_path: Path) -> None:
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        fit_rocket(toy(60, seed=0), seed=seed, kernels=84).save(tmp_path / name)
+        rt.fit_diagnoser(toy(60, seed=0), rt.Rocket(84), seed=seed).save(tmp_path / name)
     for file in ("model.json", "weights.safetensors"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
     a, c = (tmp_path / name / "weights.safetensors" for name in "ac")
@@ -90,7 +90,7 @@ def test_classes_keep_the_order_given() -> None:
     two = toy(120, seed=0)
     two = two[two.labels != "slow"]
     order = ("quick", "never", "none")
-    fitted = fit_rocket(two, seed=0, classes=order, kernels=KERNELS)
+    fitted = rt.fit_diagnoser(two, SMALL, seed=0, classes=order)
     assert fitted.classes == order
     probabilities = fitted.predict_proba(two)
     assert (np.array(order)[probabilities.argmax(axis=1)] == two.labels).mean() > 0.95
@@ -100,14 +100,18 @@ def test_classes_keep_the_order_given() -> None:
 def test_bad_input_is_refused(rocket: RocketDiagnoser) -> None:
     given = toy(12, seed=0)
     with pytest.raises(rt.InputError, match="label every trajectory"):
-        fit_rocket(given.replace(labels=None), seed=0)
-    with pytest.raises(rt.InputError, match="rate: expected at least 9 readings"):
-        fit_rocket(given, seed=0, rate=1.0)
+        rt.fit_diagnoser(given.replace(labels=None), SMALL, seed=0)
+    with pytest.raises(rt.InputError, match="rate: expected at least 9 samples"):
+        rt.fit_diagnoser(given, SMALL, seed=0, rate=1.0)
+    with pytest.raises(rt.InputError, match="training: expected none for Rocket"):
+        rt.fit_diagnoser(given, SMALL, seed=0, training=rt.Training())
+    with pytest.raises(rt.InputError, match="kernels: expected a multiple of 84"):
+        rt.Rocket(100)
     short = given.replace(
         **{
             name: getattr(given, name)[:, :300]
             for name in ("commands", "nominal", "observed", "mask")
         }
     )
-    with pytest.raises(rt.InputError, match=r"trajectories\.steps: .*50 readings"):
+    with pytest.raises(rt.InputError, match=r"trajectories\.steps: .*50 samples"):
         rocket.predict_proba(short)

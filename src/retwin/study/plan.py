@@ -8,16 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from retwin.cases.case import Case
-from retwin.catalog import CALIBRATE_ON, CLASSIFIERS, PRESETS, SOURCES, resolve
+from retwin.catalog import CALIBRATE_ON, CLASSIFIERS, PRESETS, SOURCES, make, resolve
 from retwin.checks import one_of
+from retwin.diagnosis import Rocket
 from retwin.errors import InputError
 from retwin.nets.networks import Network
 from retwin.nets.training import Training
 
-__all__ = ["ROCKET", "Preset", "StudyPlan"]
-
-ROCKET = "rocket"
-"""The classifier that is not a network."""
+__all__ = ["Preset", "StudyPlan"]
 
 
 @dataclass(frozen=True)
@@ -118,17 +116,15 @@ class StudyPlan:
         return self.classifier or self._preset.classifier
 
     @property
-    def network(self) -> Network | None:
-        """The classifier's config; None for one that is no network."""
-        if self.classifier_name == ROCKET:
-            return None
-        network: Network = resolve(CLASSIFIERS[self.classifier_name].target)()
-        return network
+    def classifier_config(self) -> Network | Rocket:
+        """The config of the classifier."""
+        config: Network | Rocket = make(CLASSIFIERS, self.classifier_name, "classifier")
+        return config
 
     @property
-    def training(self) -> Training:
-        """The classifier's training."""
-        return self._preset.training
+    def training(self) -> Training | None:
+        """The preset's training; None for a classifier whose weights have a closed form."""
+        return None if isinstance(self.classifier_config, Rocket) else self._preset.training
 
     def seed_of(self, stage: str, run: int, fold: int = 0) -> int:
         """The seed of one stage of one run, all from one SeedSequence.

@@ -12,9 +12,10 @@ from importlib.util import find_spec
 
 from retwin.cases.case import Case
 from retwin.catalog import SOURCES, SourceEntry
-from retwin.diagnosis import fine_tune, fit_dann, fit_inversion
-from retwin.study.plan import ROCKET, StudyPlan
-from retwin.study.trial import Trained, Trial
+from retwin.data.trajectories import Trajectories
+from retwin.diagnosis import DANN, FineTune, FittedDiagnoser, Rocket, fit_diagnoser, fit_inversion
+from retwin.study.plan import StudyPlan
+from retwin.study.trial import Trial
 from retwin.twins.noisy import NoisyTwin, residual_scale
 from retwin.twins.randomised import RandomisedTwin
 from retwin.twins.twin import Twin
@@ -40,7 +41,7 @@ EXTRAS = {"bayes": "sbi"}
 """An extra, and the package that shows whether it is installed."""
 
 
-def recorded_twin(trial: Trial) -> Trained:
+def recorded_twin(trial: Trial) -> FittedDiagnoser:
     """The classifier, trained on the recorded trajectories of the twin."""
     return trial.train(trial.twin_data)
 
@@ -77,14 +78,20 @@ def posterior_twin(trial: Trial) -> Twin:
     return trial.updated("pi_bayes")
 
 
-def adversarial(trial: Trial) -> Trained:
+def adversarial(trial: Trial) -> FittedDiagnoser:
     """A domain-adversarial network on unlabelled calibration outputs."""
-    return fit_dann(trial.twin_data, trial.unlabelled, trial.network, **trial.fitting)
+    return _adversarial(trial, trial.unlabelled)
 
 
-def adversarial_transductive(trial: Trial) -> Trained:
+def adversarial_transductive(trial: Trial) -> FittedDiagnoser:
     """The same on the outputs of the test set, without labels."""
-    return fit_dann(trial.twin_data, trial.test_outputs, trial.network, **trial.fitting)
+    return _adversarial(trial, trial.test_outputs)
+
+
+def _adversarial(trial: Trial, target: Trajectories) -> FittedDiagnoser:
+    classifier = trial.plan.classifier_config
+    assert not isinstance(classifier, Rocket), "checked before the study begins"
+    return fit_diagnoser(trial.twin_data, DANN(classifier), target=target, **trial.fitting)
 
 
 def mean_corrected(trial: Trial) -> Twin:
@@ -107,14 +114,15 @@ def identified_corrected(trial: Trial) -> Twin:
     return CorrectedTwin(trial.surrogate("pi_ls"), trial.residual("pi_ls"))
 
 
-def fine_tuned(trial: Trial) -> Trained:
+def fine_tuned(trial: Trial) -> FittedDiagnoser:
     """The network of `ibg_rg_command`, fine-tuned on labelled calibration trajectories."""
     base = trial.diagnoser("ibg_rg_command")
     made = trial.generate(command_corrected(trial))
-    return fine_tune(base, made, trial.labelled, seed=trial.seed("fine-tuning"))
+    seed = trial.seed("fine-tuning")
+    return fit_diagnoser(made, FineTune(base), target=trial.labelled, seed=seed)
 
 
-def inversion(trial: Trial) -> Trained:
+def inversion(trial: Trial) -> FittedDiagnoser:
     """The Bayesian inversion of faults, without training of a classifier."""
     residual = trial.residual("command")
     assert isinstance(residual, ResidualModel), "checked before the study begins"
@@ -134,7 +142,7 @@ def lacking(name: str, case: Case, plan: StudyPlan) -> str:
         return "a correction per segment"
     if source.parametric and case.parametric is None:
         return f"a case that declares the free parameters of its twin; {case.name!r} does not"
-    if source.network and plan.classifier_name == ROCKET:
+    if source.network and isinstance(plan.classifier_config, Rocket):
         return "a classifier that is a network"
     package = EXTRAS.get(source.extra)
     if package and find_spec(package) is None:

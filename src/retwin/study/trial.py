@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from retwin.cases.case import Case
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
-from retwin.diagnosis import Diagnoser, NetworkDiagnoser, RocketDiagnoser, fit_diagnoser, fit_rocket
-from retwin.nets.networks import Network
+from retwin.diagnosis import FittedDiagnoser, NetworkDiagnoser, fit_diagnoser
 from retwin.progress import Progress
 from retwin.serialisation.models import read_about
 from retwin.study.files import Files, Job
@@ -26,16 +25,7 @@ from retwin.update.identification import PosteriorTwin
 from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["Trained", "Trial"]
-
-
-class Trained(Diagnoser, Protocol):
-    """A diagnoser that can be saved."""
-
-    def save(self, folder: str | Path) -> None:
-        """Write one folder."""
-        ...
-
+__all__ = ["Trial"]
 
 SEES = {
     "none": (),
@@ -200,19 +190,10 @@ class Trial:
         return self._noisy(made, self.seed("encoder noise in training"))
 
     @property
-    def network(self) -> Network:
-        """The study's classifier, where it is one."""
-        assert self.plan.network is not None, "checked before the study begins"
-        return self.plan.network
-
-    @property
     def fitting(self) -> dict[str, Any]:
-        """How every network is trained."""
-        return {**self._fitting, "training": self.plan.training}
-
-    @property
-    def _fitting(self) -> dict[str, Any]:
+        """Arguments of `fit_diagnoser` that all sources share."""
         return {
+            "training": self.plan.training,
             "seed": self.seed("diagnoser"),
             "classes": self.case.classes,
             "rate": self.plan.rate or self.case.sensor_rate,
@@ -228,11 +209,9 @@ class Trial:
             "progress": self.progress,
         }
 
-    def train(self, made: Trajectories) -> NetworkDiagnoser | RocketDiagnoser:
+    def train(self, made: Trajectories) -> FittedDiagnoser:
         """The study's classifier, trained on labelled trajectories."""
-        if self.plan.network is None:
-            return fit_rocket(made, **self._fitting)
-        return fit_diagnoser(made, self.network, **self.fitting)
+        return fit_diagnoser(made, self.plan.classifier_config, **self.fitting)
 
     def tested(self) -> Trajectories:
         """The test set, to predict and for nothing else."""

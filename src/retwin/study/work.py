@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from retwin.cases.case import Case
 from retwin.catalog import SOURCES, resolve
 from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.diagnosis import FittedDiagnoser
 from retwin.evaluation.fidelity import (
     measure_fidelity,
     measure_widening,
@@ -32,7 +33,7 @@ from retwin.serialisation.models import write_model
 from retwin.study.files import Files, Job, Roles
 from retwin.study.plan import StudyPlan
 from retwin.study.sources import NEEDS
-from retwin.study.trial import Trained, Trial
+from retwin.study.trial import Trial
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin, generate
@@ -219,7 +220,7 @@ class Work:
             costs = {"generate": time.perf_counter() - started, "trajectories": len(made)}
             if not source.needs or source.parametric:
                 costs["twin_runs"] = len(made)
-            diagnoser: Trained = trial.train(made)
+            diagnoser: FittedDiagnoser = trial.train(made)
         else:
             diagnoser = resolve(source.diagnoser)(trial)
             if not source.needs:
