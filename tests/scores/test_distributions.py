@@ -13,7 +13,6 @@ from retwin.scores.distributions import (
     central_band,
     crps,
     cumulative_counts,
-    energy_score,
     grouped_quantile,
     inside,
     ks_distance,
@@ -52,13 +51,6 @@ def test_crps_is_that_of_the_gaussian_for_small_ensembles_too() -> None:
     got = crps(np.broadcast_to(observed, draws.shape[1:]), draws).mean(axis=0)
     np.testing.assert_allclose(got, wanted, atol=0.01)
     assert np.isnan(crps(np.array([np.nan]), draws[:, 0, :1])).all()
-
-
-def test_the_energy_score_of_one_output_is_its_crps() -> None:
-    draws = RNG.normal(size=(50, 1))
-    assert energy_score(np.array([0.3]), draws) == pytest.approx(
-        float(crps(np.array([0.3]), draws)[0])
-    )
 
 
 def test_the_pit_of_exchangeable_members_is_uniform_with_ties_too() -> None:

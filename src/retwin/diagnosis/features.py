@@ -165,7 +165,7 @@ class Features:
             remedy="recover them, or take a diagnoser that does not hide the start",
         )
         segments = Segments.from_commands(trajectories.commands)
-        if segments.most == 0:
+        if segments.valid.shape[1] == 0:
             return np.full(len(trajectories), trajectories.steps - 1)
         end = np.ceil(segments.settle[:, 0]).astype(int) + SETTLED * self.stride
         return np.minimum(end, trajectories.steps - 1)

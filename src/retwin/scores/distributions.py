@@ -1,4 +1,4 @@
-"""Scores of predictive distributions that are given as draws: CRPS, energy score, PIT, coverage.
+"""Scores of predictive distributions that are given as draws: CRPS, PIT, coverage.
 
 All functions are pure functions of arrays. The draws of an ensemble are along the first axis.
 """
@@ -17,7 +17,6 @@ __all__ = [
     "central_band",
     "crps",
     "cumulative_counts",
-    "energy_score",
     "grouped_quantile",
     "inside",
     "ks_distance",
@@ -98,22 +97,6 @@ def crps(observed: NDArray, draws: NDArray) -> NDArray:
 
     found: NDArray = scoringrules.crps_ensemble(observed, draws, m_axis=0, estimator="pwm")
     return found
-
-
-def energy_score(observed: NDArray, draws: NDArray) -> float:
-    """Energy score of a vector (k,) with m draws (m, k), without the bias of a finite ensemble.
-
-    References
-    ----------
-    Gneiting and Raftery, "Strictly proper scoring rules, prediction, and estimation", JASA 102
-    (2007), section 4.3.
-
-    """
-    from scipy.spatial.distance import pdist
-
-    # scipy's distances, since scoringrules' energy score needs m² k numbers at once.
-    error = np.linalg.norm(draws - observed, axis=1).mean()
-    return float(error - 0.5 * pdist(draws).mean())
 
 
 def pit_histograms(

@@ -125,19 +125,19 @@ def run_study(
     """
     workers = (os.cpu_count() or 1) if processes is None else whole("processes", processes, least=1)
     out = Path(out)
-    tell = report or (lambda _text, _share: None)
+    report = report or (lambda _stage, _share: None)
     digests = _digests(data)
     found = _identity(case, plan, digests)
     _check_free(out, found)
     _check_possible(case, plan)
     work_folder = out / "work"
     if not (work_folder / "roles.json").exists():
-        _prepare(case, plan, data, out, found, tell)
+        _prepare(case, plan, data, out, found, report)
     roles = Roles.of(json.loads((work_folder / "roles.json").read_text("utf-8")))
     _check_healthy(plan, Files(work_folder).real_data(), roles)
     work = Work(work_folder, case, plan, roles)
-    run_jobs(work, workers, tell)
-    tell("scores", 1.0)
+    run_jobs(work, workers, report)
+    report("scores", 1.0)
     provenance = {"command": command, "seed": plan.seed}
     return write_results(work, out, about=_about(case, plan, data, digests), provenance=provenance)
 
@@ -236,16 +236,21 @@ def possible_sources(case: Case, plan: StudyPlan) -> tuple[str, ...]:
 
 
 def _prepare(
-    case: Case, plan: StudyPlan, data: StudyData, out: Path, found: Mapping[str, Any], tell: Report
+    case: Case,
+    plan: StudyPlan,
+    data: StudyData,
+    out: Path,
+    found: Mapping[str, Any],
+    report: Report,
 ) -> None:
     """Read and check all data, then write them with commands for the jobs, and the roles.
 
     Nothing is written before everything is checked. The roles are written last, so that their
     file marks the folder as complete.
     """
-    real, roles = _real(case, plan, data, tell)
+    real, roles = _real(case, plan, data, report)
     _check_healthy(plan, real, roles)
-    twin = _twin(case, plan, data, tell)
+    twin = _twin(case, plan, data, report)
     remedy = "give more of them, or a larger per_class"
     at_least("twin-data", twin, ENOUGH, "trajectories of the twin", remedy=remedy)
     with write_atomically(out / "study.json") as part:
@@ -292,11 +297,11 @@ def _check_healthy(plan: StudyPlan, real: Trajectories, roles: Roles) -> None:
         )
 
 
-def _twin(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> Trajectories:
+def _twin(case: Case, plan: StudyPlan, data: StudyData, report: Report) -> Trajectories:
     """The trajectories of the twin, read or simulated."""
 
     def progress(share: float) -> None:
-        tell("twin data", share)
+        report("twin data", share)
 
     if data.twin is not None:
         return _labelled(load(data.twin, case=case, progress=progress), case, "twin-data")
@@ -304,11 +309,13 @@ def _twin(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> Traject
     return generate(case.twin, case, per_class=plan.generated(case), seed=seed, progress=progress)
 
 
-def _real(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> tuple[Trajectories, Roles]:
+def _real(
+    case: Case, plan: StudyPlan, data: StudyData, report: Report
+) -> tuple[Trajectories, Roles]:
     """The real trajectories and their roles."""
 
     def read(path: Path) -> Trajectories:
-        found = load(path, case=case, progress=lambda share: tell(path.name, share))
+        found = load(path, case=case, progress=lambda share: report(path.name, share))
         return _labelled(found, case, path.name)
 
     if data.records is not None:

@@ -19,11 +19,11 @@ from retwin.progress import Progress
 from retwin.scores.distributions import (
     LEVELS,
     crps,
-    energy_score,
     grouped_quantile,
     pit_histograms,
     quantiles,
 )
+from retwin.scores.energy import energy_score
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import DelayOffset
@@ -158,7 +158,7 @@ def measure_widening(
     Returns
     -------
     float
-        Infinite if more than a tenth of the samples are off bands without width.
+        Infinite if more than a tenth of the samples lie outside bands without width.
 
     Raises
     ------
@@ -211,7 +211,7 @@ def _checked(twin: Twin, trajectories: Trajectories, rate: float | None, draws: 
             got=given,
             remedy="load the file with its case, or convert it",
         )
-    whole("draws", draws, least=INFERRED, remedy="200 are usual")
+    whole("draws", draws, least=INFERRED, remedy="take the default of 200")
     stride = 1 if rate is None else round(trajectories.rate / rate) if rate > 0 else 0
     require(
         stride >= 1 and (rate is None or abs(stride * rate - trajectories.rate) <= 1e-6),
@@ -287,9 +287,9 @@ class _Ensemble:
         nominal = self.one.nominal[0, :: self.stride][self.seen]
         scale = nominal.std(axis=0, dtype=np.float64)
         unit = 1.0 if self.one.outputs.comparable else np.where(scale > 0, scale, 1.0)
-        vectors = (values / unit).reshape(len(values), -1) / np.sqrt(len(values[0]))
         score = crps(values[0], values[1:]).mean(axis=0)
-        return score, energy_score(vectors[0], vectors[1:])
+        values /= unit
+        return score, float(energy_score(values[1:], values[0]))
 
 
 def _features(residual: NDArray) -> NDArray:
