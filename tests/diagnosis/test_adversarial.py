@@ -16,10 +16,10 @@ SHORT = Training(max_epochs=20, batch_size=16, learning_rate=3e-3)
 
 
 def toy(count: int, *, seed: int, real: bool) -> rt.Trajectories:
-    """Two classes told by the first output, in noise.
+    """Two classes that differ in the first output, in noise.
 
-    A twin's second output tells them too, without noise; a real one's is a constant that the twin
-    shows for the class "high". The first output alone is right in Φ(2) = 0.977.
+    In a twin they differ in the second output too, without noise; a real one's is a constant, that
+    of the twin's class "high". The first output alone gives an accuracy of Φ(2) = 0.977.
     """
     rng = np.random.default_rng(seed)
     side = np.resize([1.0, -1.0], count)
@@ -43,7 +43,7 @@ def target() -> rt.Trajectories:
     return toy(24, seed=1, real=True)
 
 
-def test_gives_up_what_only_the_twin_shows(
+def test_ignores_a_difference_that_only_the_twin_has(
     source: rt.Trajectories, target: rt.Trajectories
 ) -> None:
     test = toy(100, seed=2, real=True)
@@ -57,7 +57,7 @@ def test_gives_up_what_only_the_twin_shows(
     check_diagnoser(adapted, target[:5])
 
 
-def test_labels_of_the_target_are_not_read(
+def test_labels_of_the_target_have_no_effect(
     source: rt.Trajectories, target: rt.Trajectories, tmp_path: Path
 ) -> None:
     shuffled = np.random.default_rng(0).permutation(target.labels)

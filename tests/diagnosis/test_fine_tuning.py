@@ -14,9 +14,9 @@ SHORT = Training(max_epochs=8, batch_size=16, learning_rate=1e-2)
 
 
 def toy(count: int, *, seed: int, gain: float = 1.0, leak: float = 0.0) -> rt.Trajectories:
-    """Two classes that differ after a movement: r is about 0.5 or -0.5, times `gain`.
+    """Two classes that differ after a motion: r is about 0.5 or -0.5, times `gain`.
 
-    With a `leak`, where it begins tells the class as well, in nominal and observed path.
+    With a `leak`, the initial pose depends on the class too, in nominal and observed path.
     """
     rng = np.random.default_rng(seed)
     side = np.resize([1.0, -1.0], count)[:, None, None]
@@ -39,13 +39,13 @@ def base(generated: rt.Trajectories) -> rt.NetworkDiagnoser:
     return rt.fit_diagnoser(generated, SMALL, seed=0, training=SHORT)
 
 
-def test_learns_what_the_generated_ones_do_not_hold(
+def test_learns_a_difference_that_generated_trajectories_lack(
     base: rt.NetworkDiagnoser, generated: rt.Trajectories
 ) -> None:
     def real(count: int, seed: int) -> rt.Trajectories:
-        """The sensor is the wrong way round, and its noise is another: two things at once."""
-        turned = toy(count, seed=seed, gain=-3.0)
-        return turned.replace(observed=turned.observed + 2.0)
+        """The sensor has another sign and scale, and an offset."""
+        inverted = toy(count, seed=seed, gain=-3.0)
+        return inverted.replace(observed=inverted.observed + 2.0)
 
     test = real(40, seed=2)
     assert rt.evaluate(base, test).accuracy < 0.8
@@ -58,7 +58,7 @@ def test_learns_what_the_generated_ones_do_not_hold(
     np.testing.assert_array_equal(base.predict_proba(test), before)
 
 
-def test_where_a_recording_began_tells_it_nothing(
+def test_the_initial_pose_has_no_effect(
     base: rt.NetworkDiagnoser, generated: rt.Trajectories
 ) -> None:
     leaking = toy(8, seed=1, gain=0.0, leak=0.8)
@@ -68,14 +68,14 @@ def test_where_a_recording_began_tells_it_nothing(
     other = toy(40, seed=2, gain=0.0, leak=-0.8)
     np.testing.assert_array_equal(other.observed[:, 80:], test.observed[:, 80:])
     np.testing.assert_array_equal(tuned.predict_proba(other), tuned.predict_proba(test))
-    # Nothing else tells these classes apart: at 40 trajectories, chance stays below 0.75 ...
+    # The classes differ in nothing else: of 40 trajectories, guessing gets less than 0.75 right.
     assert rt.evaluate(tuned, test).accuracy < 0.75
-    # ... but whoever sees the start needs nothing else.
+    # A network that sees the start needs nothing else.
     seeing = rt.fit_diagnoser(toy(160, seed=3, gain=0.0, leak=0.8), SMALL, seed=0, training=SHORT)
     assert rt.evaluate(seeing, test).accuracy > 0.95
 
 
-def test_is_saved_with_what_it_does_not_look_at(
+def test_is_saved_with_the_start_hidden(
     base: rt.NetworkDiagnoser, generated: rt.Trajectories, tmp_path: Path
 ) -> None:
     real = toy(4, seed=1, leak=0.3)

@@ -17,7 +17,7 @@ SMALL = rt.Rocket(504)
 
 
 def toy(count: int, *, seed: int, noise: float = 0.3) -> rt.Trajectories:
-    """Three classes by what the residual does: nothing, a slow wave, a quick one; in noise."""
+    """Three classes of residuals in noise: none, a slow wave and a fast one."""
     rng = np.random.default_rng(seed)
     kind = np.resize([0, 1, 2], count)
     time = np.arange(500) / 100.0
@@ -35,19 +35,19 @@ def rocket() -> RocketDiagnoser:
     return rt.fit_diagnoser(toy(240, seed=0), SMALL, seed=0)
 
 
-def test_learns_what_can_be_learnt(rocket: RocketDiagnoser) -> None:
+def test_learns_classes_that_differ(rocket: RocketDiagnoser) -> None:
     assert rt.evaluate(rocket, toy(90, seed=1)).macro_f1 > 0.95
 
 
-def test_is_as_sure_as_it_is_right() -> None:
-    """In noise that hides the waves often, so that there is something to be unsure of."""
-    unsure = rt.fit_diagnoser(toy(600, seed=0, noise=1.5), SMALL, seed=0)
+def test_probabilities_are_calibrated() -> None:
+    """Noise often hides the waves, so that the probabilities are well below 1."""
+    noisy = rt.fit_diagnoser(toy(600, seed=0, noise=1.5), SMALL, seed=0)
     test = toy(600, seed=1, noise=1.5)
-    probabilities = unsure.predict_proba(test)
-    right = np.array(unsure.classes)[probabilities.argmax(axis=1)] == test.labels
-    assert 0.5 < right.mean() < 0.95
+    probabilities = noisy.predict_proba(test)
+    correct = np.array(noisy.classes)[probabilities.argmax(axis=1)] == test.labels
+    assert 0.5 < correct.mean() < 0.95
     # Two standard errors: 0.04 each, most of it from the 120 that set the temperature.
-    assert abs(probabilities.max(axis=1).mean() - right.mean()) < 0.08
+    assert abs(probabilities.max(axis=1).mean() - correct.mean()) < 0.08
 
 
 def test_is_a_diagnoser(rocket: RocketDiagnoser) -> None:
@@ -69,7 +69,8 @@ def test_what_is_not_finite_has_no_probabilities(rocket: RocketDiagnoser) -> Non
 def test_saved_and_loaded_is_the_same(rocket: RocketDiagnoser, tmp_path: Path) -> None:
     test = toy(9, seed=3)
     rocket.save(tmp_path / "rocket")
-    back = RocketDiagnoser.load(tmp_path / "rocket")
+    back = rt.load_diagnoser(tmp_path / "rocket")
+    assert isinstance(back, RocketDiagnoser)
     assert (back.classes, back.features) == (rocket.classes, rocket.features)
     np.testing.assert_array_equal(back.predict_proba(test), rocket.predict_proba(test))
     with pytest.raises(rt.InputError, match="a diagnoser model"):
