@@ -1,4 +1,4 @@
-"""The study end to end on the emulated robot, small: what it writes, and that it resumes."""
+"""A small study of the emulated robot from end to end: its results, and that it resumes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def finished(case: rt.Case, tmp_path_factory: pytest.TempPathFactory) -> tuple[d
 
 
 def comparable(out: Path) -> dict[str, Any]:
-    """results.json without what depends on the clock and the machine."""
+    """The contents of results.json without what depends on time and machine."""
     results = json.loads((out / "results.json").read_text("utf-8"))
     for name in ("timing", "provenance"):
         del results[name]
@@ -48,7 +48,7 @@ def test_results_follow_the_schema(finished: tuple[dict, Path], case: rt.Case) -
     results = json.loads((out / "results.json").read_text("utf-8"))
     assert results["schema"] == 1
     assert results["emulated"] is True
-    assert results["published"] == {}, "the paper's figures do not stand beside emulated ones"
+    assert results["published"] == {}, "the paper's figures are compared with real data alone"
     assert results["classes"] == list(case.classes)
     assert list(results["sources"]) == ["dt", "ibg", "ibg_rg"]
     assert results["data"]["test"]["n"] == 90
@@ -249,9 +249,9 @@ def test_a_study_grows(finished: tuple[dict, Path], case: rt.Case, tmp_path: Pat
 
 
 def test_a_study_that_cannot_be_is_refused_at_once(case: rt.Case, tmp_path: Path) -> None:
-    blind = replace(case, parametric=None)
+    fixed = replace(case, parametric=None)
     for sources, system, classifier, message in (
-        (("dt", "pi_ls"), blind, None, "declares the free parameters of its twin"),
+        (("dt", "pi_ls"), fixed, None, "declares the free parameters of its twin"),
         (("dann",), case, "rocket", "a classifier that is a network"),
     ):
         plan = rt.StudyPlan(sources=sources, classifier=classifier)
@@ -261,7 +261,7 @@ def test_a_study_that_cannot_be_is_refused_at_once(case: rt.Case, tmp_path: Path
         with pytest.raises(rt.InputError, match="processes: expected a whole number of at least 1"):
             rt.run_study(case, PLAN, rt.StudyData(), tmp_path / "out", processes=processes)
     assert not (tmp_path / "out").exists()
-    assert "pi_ls" not in possible_sources(blind, rt.StudyPlan())
+    assert "pi_ls" not in possible_sources(fixed, rt.StudyPlan())
 
 
 @pytest.mark.parametrize(

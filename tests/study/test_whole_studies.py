@@ -1,4 +1,4 @@
-"""Whole studies, apart from the other tests of studies so that they run beside them."""
+"""Whole studies, in a file of their own so that they run in parallel with other tests."""
 
 from __future__ import annotations
 

@@ -22,6 +22,7 @@ from retwin.cases.case import Case
 from retwin.catalog import SOURCES, resolve
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis import FittedDiagnoser
+from retwin.evaluation.evaluate import finite_probabilities
 from retwin.evaluation.fidelity import (
     measure_fidelity,
     measure_widening,
@@ -251,7 +252,7 @@ class Work:
                 costs["twin_runs"] = len(trial.twin_data)
         trained = time.perf_counter()
         test = trial.tested()
-        probabilities = diagnoser.predict_proba(test)
+        probabilities = finite_probabilities(diagnoser, test)
         costs["predict"] = (time.perf_counter() - trained) / len(test)
         diagnoser.save(self.files.diagnoser(trial.job))
         with write_atomically(path) as part:

@@ -264,7 +264,7 @@ class _Ensemble:
         return values
 
     def scores(self, rng: np.random.Generator) -> dict[str, Any]:
-        """What `Fidelity` holds of one trajectory, its segments apart."""
+        """The fields of `Fidelity` for one trajectory, except those per segment."""
         every = slice(None, None, self.stride)
         observed = self.members.observed[:, every]
         residual = self.members.residual[: INFERRED + 1, : self.one.lengths[0] : self.stride]
