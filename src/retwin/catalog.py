@@ -309,7 +309,7 @@ NETWORKS: Mapping[str, Entry] = {
 CLASSIFIERS: Mapping[str, Entry] = {
     "cnn": Entry("retwin.nets.networks:CNN", "convolutional network"),
     "lstm": Entry("retwin.nets.networks:LSTMClassifier", "LSTM, last step (the paper's)"),
-    "rocket": Entry("retwin.diagnosis.rocket:fit_rocket", "MiniRocket and a ridge", "rocket"),
+    "rocket": Entry("retwin.diagnosis.rocket:Rocket", "MiniRocket and a ridge", "rocket"),
 }
 """Classifiers that are trained on generated trajectories."""
 

@@ -1,4 +1,4 @@
-"""Whole studies, apart from the other tests of studies so that they run beside them."""
+"""Whole studies, in a file of their own so that they run in parallel with other tests."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from retwin.twins.parametric import ParametricTwin
 def test_every_source_is_made(
     emulated: rt.Trajectories, twin_set: rt.Trajectories, case: rt.Case, tmp_path: Path
 ) -> None:
-    """All fourteen, small: each predicts every trajectory and says what it cost."""
+    """All fourteen, small: each predicts every trajectory and reports its costs."""
     free = command_side_parameters(KINEMATIC.inputs, delay=(0.0, 20.0), offset=25.0)
     quick = ParametricTwin(CommandSide(KINEMATIC, nominal=KINEMATIC.position), free)
     case = replace(case, parametric=quick)
@@ -44,10 +44,10 @@ def test_every_source_is_made(
         assert np.array(source["predictions"]).shape == (1, 18)
         assert source["twin_runs"] > 0, name
         assert (source["update_s"] > 0) == (name not in untouched)
-    told = results["sources"]["inversion"]
-    assert told["macro_f1"][0] > 0.8, "it needs no training set, however small the study is"
-    assert told["generate_s"] is None
-    assert told["predict_s"] > 0
+    inversion = results["sources"]["inversion"]
+    assert inversion["macro_f1"][0] > 0.8, "it needs no training set, however small the study is"
+    assert inversion["generate_s"] is None
+    assert inversion["predict_s"] > 0
     assert rt.write_report(tmp_path / "all").stat().st_size < 10_000_000
 
 

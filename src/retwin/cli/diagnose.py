@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -54,15 +53,12 @@ def fit(
     import retwin as rt
 
     system = case_named(case)
-    entry = catalog.lookup(catalog.CLASSIFIERS, classifier, "classifier")
-    target = catalog.resolve(entry.target)
-    chosen = (
-        rt.fit_rocket if classifier == "rocket" else partial(rt.fit_diagnoser, network=target())
-    )
+    chosen = catalog.make(catalog.CLASSIFIERS, classifier, "classifier")
     training = read(file, system)
     with bar("train") as tell:
-        diagnoser = chosen(
+        diagnoser = rt.fit_diagnoser(
             training,
+            chosen,
             seed=seed,
             classes=None if system is None else system.classes,
             rate=rate,

@@ -19,8 +19,7 @@ from retwin.deploy.bundle.facts import SAMPLERS, Facts
 from retwin.deploy.bundle.guard import Guard
 from retwin.deploy.bundle.seal import SCHEMA, distrusting, read_sealed, seal
 from retwin.deploy.bundle.verdicts import Prediction
-from retwin.diagnosis import load_diagnoser
-from retwin.diagnosis.saved import Saved
+from retwin.diagnosis import FittedDiagnoser, load_diagnoser
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.models import read_model, write_model
@@ -46,7 +45,7 @@ class Bundle:
     twin: CorrectedTwin
     guard: Guard
     facts: Facts
-    diagnoser: Saved | None = None
+    diagnoser: FittedDiagnoser | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -55,7 +54,7 @@ class Bundle:
         case: Case,
         twin: CorrectedTwin,
         guard: Guard,
-        diagnoser: Saved | None = None,
+        diagnoser: FittedDiagnoser | None = None,
         *,
         data: Sequence[Trajectories] = (),
         notes: Mapping[str, Any] | None = None,
