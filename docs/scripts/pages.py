@@ -24,7 +24,7 @@ OUTSIDE = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
     "examples/two_tanks": "two_tanks.md",
-    "tests/contracts/crane.xml": "crane.xml",
+    "tests/testing/crane.xml": "crane.xml",
 }
 """Files and folders outside of docs/ that the site has too, and their names there."""
 ABOUT_COMMANDS = """
