@@ -218,7 +218,7 @@ def test_a_bundle_generates_without_its_case_where_it_can(bundle: Bundle) -> Non
         faults=bundle.facts.faults,
         sensor_rate=10.0,
         steps=200,
-        movements=2,
+        max_segments=2,
         sampler=RampSampler((400.0,) * 4, (600.0,) * 4, 2, 200),
     )
     alone = Bundle(bundle.twin, bundle.guard, Facts.of(json.loads(json.dumps(facts.about()))))
@@ -307,5 +307,5 @@ def test_a_bundle_is_made_of_what_was_fitted(
     assert made.provenance["seed"] == 3
     assert made.provenance["data"][0]["name"].startswith("EmulatedArmPi")
     assert (
-        made.guard.judge(made.twin.surrogate, emulated.with_label("Healthy")).suspicion.max() <= 1
+        made.guard.assess(made.twin.surrogate, emulated.with_label("Healthy")).max_score.max() <= 1
     )

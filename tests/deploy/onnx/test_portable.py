@@ -1,4 +1,4 @@
-"""The export says the same as torch, without torch."""
+"""The export computes the same as torch, without torch."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def test_it_predicts_the_same_in_a_process_without_torch(
     exported: Exported, bundle: Bundle, emulated: rt.Trajectories, tmp_path: Path
 ) -> None:
     rt.save(emulated, tmp_path / "real.npz")
-    told = [exported[0], tmp_path / "real.npz", tmp_path / "found.npz"]
-    subprocess.run([sys.executable, "-c", WITHOUT_TORCH, *map(str, told)], check=True)
+    arguments = [exported[0], tmp_path / "real.npz", tmp_path / "found.npz"]
+    subprocess.run([sys.executable, "-c", WITHOUT_TORCH, *map(str, arguments)], check=True)
     expected = bundle.predict(emulated)
     with np.load(tmp_path / "found.npz") as found:
         np.testing.assert_allclose(found["found"], expected.probabilities, atol=1e-5)
@@ -80,14 +80,14 @@ def test_a_diagnosis_is_quick(portable: Portable, emulated: rt.Trajectories) -> 
 
 
 @pytest.mark.slow
-def test_it_simulates_by_the_same_law(
-    portable: Portable, updated: CorrectedTwin, case: rt.Case
+def test_it_simulates_from_the_same_distribution(
+    portable: Portable, exportable: CorrectedTwin, case: rt.Case
 ) -> None:
     assert isinstance(portable, rt.Twin)
-    commands = case.sampler.sample(200, rng=np.random.default_rng(3), timing=updated.timing)
+    commands = case.sampler.sample(200, rng=np.random.default_rng(3), timing=exportable.timing)
     faults = [case.faults["Motor_2_Stuck"], None] * 100
     made, again, other = (
-        twin.simulate(commands, faults=faults, seed=9) for twin in (portable, portable, updated)
+        twin.simulate(commands, faults=faults, seed=9) for twin in (portable, portable, exportable)
     )
     np.testing.assert_array_equal(made.observed, again.observed)
     np.testing.assert_allclose(made.nominal, other.nominal, atol=1e-6)
@@ -101,7 +101,7 @@ def test_it_simulates_by_the_same_law(
         np.testing.assert_allclose(*sizes, rtol=0.15, atol=1e-4)
 
 
-def test_the_sensor_reads_as_the_operator_does(bundle: Bundle) -> None:
+def test_the_sensor_records_as_the_operator_does(bundle: Bundle) -> None:
     fitted = bundle.twin.residual.correction.second
     sensor = replace(fitted, steps=(0.001, 0.0, 0.002), glitch_rate=0.3)
     outputs = torch.randn(6, 1000, 3, generator=torch.Generator().manual_seed(0))
@@ -112,9 +112,9 @@ def test_the_sensor_reads_as_the_operator_does(bundle: Bundle) -> None:
     phase = choice[torch.randint(len(choice), (6,), generator=generator)][:, None]
     shape = 6, -(-1000 // sensor.every), 3
     level = torch.rand(shape, generator=generator, dtype=torch.float64).float()
-    chance = torch.rand(shape[:2], generator=generator)[..., None]
-    glitch = torch.randn(shape, generator=generator)
-    made = SensorGraph(sensor, 3)(outputs, phase, level, chance, glitch)
+    glitch_level = torch.rand(shape[:2], generator=generator)[..., None]
+    glitch_noise = torch.randn(shape, generator=generator)
+    made = SensorGraph(sensor, 3)(outputs, phase, level, glitch_level, glitch_noise)
     torch.testing.assert_close(made, expected, atol=2e-5, rtol=0)
 
 
@@ -127,7 +127,7 @@ def test_features_are_those_of_the_diagnoser(emulated: rt.Trajectories, hidden: 
     torch.testing.assert_close(FeaturesGraph(features)(*arrays), features(seen))
 
 
-def test_what_it_was_not_made_for_is_refused(
+def test_other_lengths_rates_and_folders_are_refused(
     portable: Portable,
     bundle: Bundle,
     emulated: rt.Trajectories,
@@ -138,14 +138,14 @@ def test_what_it_was_not_made_for_is_refused(
         **{name: getattr(emulated, name)[:2, :500] for name in ("commands", "nominal", "observed")},
         mask=None,
     )
-    with pytest.raises(rt.InputError, match="1000 samples and at most 5 movements"):
+    with pytest.raises(rt.InputError, match="1000 samples and at most 5 segments"):
         portable.predict(short)
     with pytest.raises(rt.InputError, match=r"trajectories\.rate"):
         portable.predict(emulated.replace(rate=50.0))
     restless = 500 + 50 * np.sign(np.sin(np.arange(1000) / 20))[None, :, None] * np.ones(4)
-    with pytest.raises(rt.InputError, match="at most 5 movements"):
+    with pytest.raises(rt.InputError, match="at most 5 segments"):
         portable.simulate(restless, seed=0)
-    with pytest.raises(rt.InputError, match="expected a portable of schema 1"):
+    with pytest.raises(rt.InputError, match="expected a portable of schema 2"):
         bundle.save(tmp_path / "bundle")
         Portable.load(tmp_path / "bundle")
 
@@ -269,7 +269,7 @@ def test_a_damaged_export_is_refused(exported: Exported, tmp_path: Path) -> None
     for name in ("kind", "schema", "faults", "steps", "inputs", "rate", "domain", "sensor"):
         (folder / "model.json").write_text(json.dumps(about | {name: [[]]}))
         seal(folder)
-        with pytest.raises(rt.InputError, match=r"ONNX export|schema 1"):
+        with pytest.raises(rt.InputError, match=r"ONNX export|schema 2"):
             Portable.load(folder)
 
 
