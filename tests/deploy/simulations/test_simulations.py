@@ -183,7 +183,7 @@ def clean(whole: dict[str, Any]) -> Path:
 SCRIPT = """
 import sys
 sys.path.insert(0, {tests!r})
-from test_scale import Toy, plan
+from test_simulations import Toy, plan
 from retwin.deploy.simulations import simulate_to
 if __name__ == "__main__":
     twin = Toy({calls!r}, pause=0.1, fails_above=90.0)
@@ -565,7 +565,7 @@ def test_what_a_twin_raises_tells_where(
     leaking = plan(twin=Leaking(fails_above=9.0), commands=given(12), n=None, chunk=4)
     with pytest.raises(kind, match="valve 3 leaks") as caught:
         simulate_to(tmp_path / "a.zarr", leaking, workers=workers)
-    assert re.fullmatch(r".*test_scale\.py:\d+, in trajectories 8 to 11", caught.value.__notes__[0])
+    assert re.fullmatch(r".*test_simulations\.py:\d+, in trajectories 8 to 11", caught.value.__notes__[0])
     assert (tmp_path / "a.zarr.part").exists(), "it may go on when the twin is mended"
 
 
