@@ -48,7 +48,7 @@ def shown(page: Path) -> list[tuple[str, bool]]:
 
 
 def check(line: str, *, whole: bool) -> None:
-    """Hold a command against what the command line knows; `whole`: nothing may be missing."""
+    """Compare a command with the command line; `whole`: no argument may be missing."""
     command: Any = typer.main.get_command(app)
     words = shlex.split(re.split(r"\s(?:&&|\||>)\s", line)[0], comments=True)
     while words and hasattr(command, "commands") and not words[0].startswith("-"):
@@ -99,13 +99,13 @@ def test_every_command_shown_exists(page: Path) -> None:
 
 
 def test_the_readme_shows_every_command() -> None:
-    told = [line for line, _ in shown(ROOT / "README.md")]
+    commands = [line for line, _ in shown(ROOT / "README.md")]
     for name in ("study", "report", "fit", "generate", "diagnose fit", "diagnose predict"):
-        assert any(line.startswith(name) for line in told), name
+        assert any(line.startswith(name) for line in commands), name
     for name in ("info", "convert", "split", "fetch"):
-        assert any(line.startswith(f"data {name}") for line in told), name
+        assert any(line.startswith(f"data {name}") for line in commands), name
     for name in ("list", "info", "simulate", "animate"):
-        assert any(line.startswith(f"twin {name}") for line in told), name
+        assert any(line.startswith(f"twin {name}") for line in commands), name
 
 
 @pytest.mark.parametrize("line", ["nonsense", "data nonsense", "fit armpi --nonsense 1", "data"])

@@ -100,8 +100,8 @@ def doctor(
     as_json: Json = False,
 ) -> None:
     """Check installation, machine and data, and name what is missing."""
-    with bar("doctor") as tell:
-        checks = examine(tell, deep=deep)
+    with bar("doctor") as show:
+        checks = examine(show, deep=deep)
     broken = any(check.state == "broken" for check in checks)
     answer({"ok": not broken, "checks": checks}, _shown(checks), as_json=as_json)
     if broken:
@@ -126,7 +126,7 @@ def examine(
         Results in the order of the output.
 
     """
-    tell = progress or (lambda what, share: None)
+    show = progress or (lambda what, share: None)
     found: list[Check] = []
     steps: dict[str, Callable[[], Iterator[Check]]] = {
         "installation": lambda: _installation(deep),
@@ -136,7 +136,7 @@ def examine(
         "data": _data,
     }
     for i, (name, step) in enumerate(steps.items()):
-        tell(name, i / len(steps))
+        show(name, i / len(steps))
         found += step()
     return found
 

@@ -249,8 +249,8 @@ def test_the_commands(call: Call, bundle: Bundle, saved: Path, tmp_path: Path) -
     assert (code, err) == (0, "")
     assert "is whole" in out
     assert "armpi" in out
-    told = json.loads(call("bundle", "verify", saved, "--json")[1])
-    assert told.keys() == {
+    printed = json.loads(call("bundle", "verify", saved, "--json")[1])
+    assert printed.keys() == {
         *("folder", "kind", "bytes", "case", "schema", "steps", "movements", "sensor_rate"),
         "provenance",
     }
@@ -266,10 +266,10 @@ def test_the_commands(call: Call, bundle: Bundle, saved: Path, tmp_path: Path) -
     assert code == 0, err
     assert "outside" in out
     code, out, _ = call("bundle", "predict", saved, tmp_path / "scaled.npz", "--json")
-    told = json.loads(out)
-    assert told.keys() == {"emulated", "trajectories"}
-    assert len(told["trajectories"]) == len(made)
-    assert told["trajectories"][0].keys() == {
+    printed = json.loads(out)
+    assert printed.keys() == {"emulated", "trajectories"}
+    assert len(printed["trajectories"]) == len(made)
+    assert printed["trajectories"][0].keys() == {
         *("id", "diagnosis", "probability", "probabilities", "guard", "because_of")
     }
     rows = (tmp_path / "found.csv").read_text().splitlines()

@@ -84,8 +84,9 @@ def test_it_simulates_from_the_same_distribution(
     portable: Portable, exportable: CorrectedTwin, case: rt.Case
 ) -> None:
     assert isinstance(portable, rt.Twin)
-    commands = case.sampler.sample(200, rng=np.random.default_rng(3), timing=exportable.timing)
-    faults = [case.faults["Motor_2_Stuck"], None] * 100
+    # With 800 trajectories the sampling error of these quantiles is about 5 %.
+    commands = case.sampler.sample(800, rng=np.random.default_rng(3), timing=exportable.timing)
+    faults = [case.faults["Motor_2_Stuck"], None] * 400
     made, again, other = (
         twin.simulate(commands, faults=faults, seed=9) for twin in (portable, portable, exportable)
     )
@@ -329,9 +330,9 @@ def test_the_commands_export_and_predict(
         assert len(rows) == 1 + len(emulated)
         assert call(*odd)[0] == 0
     words = ("bundle", "export", saved, "--onnx", tmp_path / "again", "--json")
-    told = json.loads(call(*words)[1])
-    assert told.keys() == {"saved", "differences"}
-    assert max(told["differences"].values()) < 0.01
+    printed = json.loads(call(*words)[1])
+    assert printed.keys() == {"saved", "differences"}
+    assert max(printed["differences"].values()) < 0.01
     code, _, err = call("bundle", "export", exported[0], "--onnx", tmp_path / "out")
     assert code == 2
     assert "expected a bundle of schema 1" in err

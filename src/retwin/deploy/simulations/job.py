@@ -280,7 +280,8 @@ def _finished(target: Path, plan: SimulationPlan, about: dict[str, Any]) -> Simu
         header = read_header(target)
     except InputError:
         header = {}
-    require("plan" in header, "path", expected=free, got=f"{target}, neither", remedy=remedy)
+    got = f"{target}, which is neither"
+    require("plan" in header, "path", expected=free, got=got, remedy=remedy)
     _check_same(target, header["plan"], about)
     # A kill between the last two steps leaves the rest of the work behind.
     part = _part(target)
