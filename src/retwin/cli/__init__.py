@@ -115,7 +115,7 @@ def _run() -> int:
     """Run the command; print an error as one line, and return the exit code."""
     try:
         # Typer ends Ctrl-C with this code and no message; older versions raise Abort.
-        code: int = app(standalone_mode=False) or 0
+        code: int = app(prog_name="retwin", standalone_mode=False) or 0
         if code != INTERRUPTED:
             return code
         complain_of_interruption(kept=False)

@@ -242,13 +242,13 @@ def generate(
 
     kind = check_target(out)
     updated = rt.CorrectedTwin.load(model)
-    if not (case or updated.case):
-        raise rt.InputError(
-            "case",
-            expected="the name of a case",
-            got=f"none, and {model} was saved without one",
-            remedy="give --case",
-        )
+    require(
+        case or updated.case,
+        "case",
+        expected="the name of a case",
+        got=f"none, and {model} was saved without one",
+        remedy="give --case",
+    )
     system = rt.cases.get(case or updated.case)
     if kind == ".zarr" or workers is not None:
         n = per_class * len(system.faults)

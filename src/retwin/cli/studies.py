@@ -166,7 +166,7 @@ def demo(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Run the whole method of the paper, on an emulated robot or on real data.
+    """Run the method of the paper on an emulated robot or on real data.
 
     Real data are those in the folder that `RETWIN_DATA` names.
     """

@@ -274,6 +274,19 @@ def test_a_damaged_export_is_refused(exported: Exported, tmp_path: Path) -> None
             Portable.load(folder)
 
 
+def test_an_export_of_schema_1_names_the_command_that_makes_it_anew(
+    exported: Exported, call, emulated: rt.Trajectories, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(exported[0], tmp_path / "copy"))
+    about = json.loads((folder / "model.json").read_text())
+    (folder / "model.json").write_text(json.dumps(about | {"schema": 1}))
+    seal(folder)
+    rt.save(emulated, tmp_path / "real.npz")
+    code, out, err = call("bundle", "predict", folder, tmp_path / "real.npz")
+    assert (code, out) == (2, "")
+    assert "got 'portable' of schema 1; make it anew with retwin bundle export" in err
+
+
 def test_what_has_no_graph_is_named(bundle: Bundle, tmp_path: Path) -> None:
     twin = bundle.twin
     moving = rt.Surrogate(rt.StateSpace(), inputs=twin.inputs, outputs=twin.outputs, rate=100.0)

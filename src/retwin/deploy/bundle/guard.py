@@ -45,9 +45,9 @@ ENERGY_QUANTILE = 0.99
 MISMATCH_FACTOR = 2.0
 """Limit of the nominal mismatch, in multiples of the largest one of calibration trajectories."""
 MIN_MISMATCH = 0.05
-"""Least limit of the nominal mismatch, in standard deviations of the nominal output."""
+"""Smallest limit of the nominal mismatch, in standard deviations of the nominal output."""
 MIN_ODDS = 10.0
-"""Least limit of the odds against a trajectory, since most trajectories are plausible.
+"""Smallest limit of the odds against a trajectory, as implausible trajectories are rare.
 
 MIN_MISMATCH and MIN_ODDS were chosen after scores of set A were known, see docs/bundle.md.
 """

@@ -164,14 +164,14 @@ def _context(
     frozen: Tensor | None = None,
 ) -> Context:
     """A context whose nominal and corrected outputs are both `outputs`."""
-    steps, most = commands.shape[1], times[0].shape[1]
+    steps, count = commands.shape[1], times[0].shape[1]
     return Context(
         surrogate=cast(Any, surrogate),
         commands=commands,
         faulty_commands=commands,
         frozen=cast(Tensor, frozen),
         nominal=outputs,
-        segments=cast(Segments, TensorSegments(*times, steps=steps, most=most)),
+        segments=cast(Segments, TensorSegments(*times, steps=steps, most=count)),
         rate=rate,
         corrected=outputs,
     )

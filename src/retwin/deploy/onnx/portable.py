@@ -276,16 +276,16 @@ class Portable:
         """Nominal outputs and recorded corrected outputs, with noise from `rng`."""
         nominal = self.graphs["surrogate"](commands=chunk.commands)
         segments = padded_times(chunk.segments, self.facts.max_segments)
-        count, most = segments["valid"].shape
+        shape = segments["valid"].shape
         residual = self.graphs["residual"]
         blocks, size = residual.width("uniform"), residual.width("segment_noise")
         z = residual(
             commands=chunk.commands,
             nominal=nominal,
             **segments,
-            uniform=rng.random((count, most, blocks), np.float32),
-            segment_noise=rng.standard_normal((count, most, size), np.float32),
-            trajectory_noise=rng.standard_normal((count, 1, size), np.float32),
+            uniform=rng.random((*shape, blocks), np.float32),
+            segment_noise=rng.standard_normal((*shape, size), np.float32),
+            trajectory_noise=rng.standard_normal((shape[0], 1, size), np.float32),
         )
         outputs = self.graphs["correction"](
             faulty_commands=_single(chunk.faulty_commands),
@@ -295,7 +295,8 @@ class Portable:
         )
         if self.sensor is None:
             return nominal, outputs
-        shape = count, -(-outputs.shape[1] // self.sensor.every), outputs.shape[2]
+        count, steps, width = outputs.shape
+        shape = count, -(-steps // self.sensor.every), width
         recorded = self.graphs["sensor"](
             outputs=outputs,
             phase=rng.choice(self.sensor.phases, size=(count, 1)).astype(np.int64),
