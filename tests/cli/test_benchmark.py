@@ -1,4 +1,4 @@
-"""The benchmark: what it reckons is right, and what it says is what it has timed."""
+"""The benchmark: what it computes from times, and what the command prints."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ BY_HAND = Benchmark(
 )
 
 
-def test_what_follows_from_the_times() -> None:
+def test_ratios_and_break_even_follow_from_the_times() -> None:
     assert BY_HAND.ratio("twin") == 5.0
     assert BY_HAND.paper_ratio == pytest.approx(30600 / 270)
     # 28 s once, 40 ms gained with every trajectory.
     assert BY_HAND.pays_from == pytest.approx(700)
     slow = Benchmark(1, {"twin": Timed("", 1.0), "corrected": Timed("", 2.0)}, BY_HAND.learning, {})
     assert slow.pays_from == float("inf")
-    told = BY_HAND.told()
-    assert told["generation"]["twin"] == {
+    figures = BY_HAND.about()
+    assert figures["generation"]["twin"] == {
         "what": "twin",
         "seconds": 50.0,
         "share": 0.1,
@@ -66,7 +66,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return made
 
 
-def test_training_is_reckoned_from_few_epochs(clock: Clock) -> None:
+def test_training_is_extrapolated_from_few_epochs(clock: Clock) -> None:
     asked: list[int] = []
 
     def fit(how: Training) -> str:
@@ -116,10 +116,10 @@ def test_the_command(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "retwin", *words], check=True, capture_output=True, text=True
     )
-    told = json.loads(done.stdout)
-    assert told == json.loads((tmp_path / "a.json").read_text("utf-8"))
-    assert told["trajectories"] == 18
-    ways = told["generation"]
+    figures = json.loads(done.stdout)
+    assert figures == json.loads((tmp_path / "a.json").read_text("utf-8"))
+    assert figures["trajectories"] == 18
+    ways = figures["generation"]
     assert list(ways) == [
         "twin",
         "twin_default",
@@ -133,6 +133,6 @@ def test_the_command(tmp_path: Path) -> None:
         assert way["seconds"] > 0
         assert way["ratio"] == pytest.approx(way["seconds"] / ways["corrected"]["seconds"])
     assert (ways["twin"]["paper"], ways["corrected"]["paper"]) == (30600, 270)
-    assert all(each["seconds"] > 0 for each in told["learning"].values())
-    assert told["machine"]["retwin"] == rt.__version__
-    assert told["machine"]["cores"] >= 1
+    assert all(each["seconds"] > 0 for each in figures["learning"].values())
+    assert figures["machine"]["retwin"] == rt.__version__
+    assert figures["machine"]["cores"] >= 1

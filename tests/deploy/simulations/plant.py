@@ -60,7 +60,7 @@ def plan(n: int) -> SimulationPlan:
 
 
 def learn(data: Path, out: Path) -> None:
-    """A surrogate and a classifier, and what the latter says of all that it has seen."""
+    """Fit a surrogate and a classifier, and diagnose the whole training set."""
     made = rt.load(data, case=CASE)
     surrogate = rt.fit_surrogate(made, CASE.network, seed=0, training=BRIEF)
     diagnoser = rt.fit_diagnoser(made, seed=0, rate=CASE.sensor_rate, training=OF_CLASSES)
