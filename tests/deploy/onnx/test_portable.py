@@ -114,7 +114,7 @@ def noise_of_torch(twin: CorrectedTwin, count: int, movements: int, steps: int, 
 
 def test_the_same_noise_gives_the_same_outputs(
     portable: Portable,
-    updated: CorrectedTwin,
+    exportable: CorrectedTwin,
     case: rt.Case,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -126,11 +126,11 @@ def test_the_same_noise_gives_the_same_outputs(
     fails, have a probability of 1e-7.
     """
     assert isinstance(portable, rt.Twin)
-    commands = case.sampler.sample(100, rng=np.random.default_rng(3), timing=updated.timing)
+    commands = case.sampler.sample(100, rng=np.random.default_rng(3), timing=exportable.timing)
     faults = [case.faults["Motor_2_Stuck"], None] * 50
-    noise = noise_of_torch(updated, 100, portable.facts.max_segments, commands.shape[1], seed=9)
+    noise = noise_of_torch(exportable, 100, portable.facts.max_segments, commands.shape[1], seed=9)
     monkeypatch.setattr(Portable, "_noise", lambda *_: noise)
-    made, other = (twin.simulate(commands, faults=faults, seed=9) for twin in (portable, updated))
+    made, other = (twin.simulate(commands, faults=faults, seed=9) for twin in (portable, exportable))
     assert made.labels.tolist() == other.labels.tolist()
     assert made.emulated
     np.testing.assert_allclose(made.nominal, other.nominal, atol=1e-6)
