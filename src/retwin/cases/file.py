@@ -16,6 +16,7 @@ from retwin import catalog
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords
 from retwin.cases.named_twin import imported, parametric_twin, read_twin
+from retwin.checks import positive
 from retwin.data.io import load
 from retwin.data.trajectories import HEALTHY, Channels, Trajectories
 from retwin.errors import InputError
@@ -31,8 +32,8 @@ from retwin.serialisation.configs import (
     named,
     table,
 )
-from retwin.twins.checks import check_positive
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
+from retwin.twins.limits import Limits
 from retwin.twins.parametric import Parameter
 from retwin.twins.samplers import (
     CommandSampler,
@@ -41,7 +42,7 @@ from retwin.twins.samplers import (
     RampSampler,
     RecordedSampler,
 )
-from retwin.twins.twin import Limits, Twin
+from retwin.twins.twin import Twin
 from retwin.update.corrections import OPERATORS, Correction, DelayOffset
 from retwin.update.residual import (
     Density,
@@ -111,7 +112,7 @@ def read_case(path: str | Path) -> Case:
         check_density(operator, density, key(place, "density"))
     sensor_rate = twin.rate if told.sensor_rate is None else told.sensor_rate
     with at(place):
-        check_positive("sensor_rate", sensor_rate, "Hz")
+        positive("sensor_rate", sensor_rate, unit="Hz")
     return Case(
         name=told.name,
         title=told.title or told.name,

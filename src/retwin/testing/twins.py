@@ -21,7 +21,8 @@ from retwin.testing.suite import (
     run_checks,
 )
 from retwin.twins.faults import Fault, Stuck, draw_faults, faulty_commands, frozen_response
-from retwin.twins.twin import Limits, Twin
+from retwin.twins.limits import Limits
+from retwin.twins.twin import Twin
 
 __all__ = ["TWIN_CHECKS", "TwinSubject", "check_twin"]
 

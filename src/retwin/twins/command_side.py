@@ -12,11 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
-from retwin.twins.around import Around, simulate_chunk
-from retwin.twins.checks import ideal_outputs
 from retwin.twins.faults import Fault
 from retwin.twins.parametric import TOGETHER, Parameter, values_per_simulation
-from retwin.twins.twin import Chunk, Twin, checked_commands, simulate_in_chunks
+from retwin.twins.twin import (
+    Chunk,
+    Twin,
+    checked_commands,
+    nominal_outputs,
+    simulate_in_chunks,
+)
+from retwin.twins.wrapper import TwinWrapper, simulate_chunk
 
 __all__ = ["CommandSide", "command_side_parameters"]
 
@@ -25,7 +30,7 @@ OFFSET = "offset"
 
 
 @dataclass(frozen=True)
-class CommandSide(Around):
+class CommandSide(TwinWrapper):
     """Any twin whose commands arrive late and shifted: parameters `delay` and `offset.CHANNEL`.
 
     A transport delay in samples (fractions allowed, all actuators alike) and for every actuator an
@@ -76,7 +81,7 @@ class CommandSide(Around):
             ask = partial(simulate_chunk, self.twin, chunk, rows, seed=seed, parameters=options)
             _, observed = ask(self._kept(late), held)
             if self.nominal is not None:
-                return ideal_outputs(self.nominal, chunk.commands, len(self.outputs)), observed
+                return nominal_outputs(self.nominal, chunk.commands, len(self.outputs)), observed
             healthy: list[Fault | None] = [None] * len(rows)
             nominal, _ = ask(chunk.commands, healthy)
             return nominal, observed

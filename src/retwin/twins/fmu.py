@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pebble import ProcessExpired, ProcessPool
 
+from retwin.checks import positive
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
 from retwin.processes import scratch_folder, worker_pool
 from retwin.progress import Progress
 from retwin.twins import fmu_worker
-from retwin.twins.checks import check_positive, ideal_outputs, substeps
 from retwin.twins.faults import Fault
 from retwin.twins.fmu_model import (
     channels_of,
@@ -31,7 +31,9 @@ from retwin.twins.fmu_model import (
     read_description,
     start_column,
 )
-from retwin.twins.twin import Chunk, Limits, checked_commands, simulate_in_chunks
+from retwin.twins.limits import Limits
+from retwin.twins.time_step import steps_per_sample
+from retwin.twins.twin import Chunk, checked_commands, nominal_outputs, simulate_in_chunks
 
 __all__ = ["FMUTwin"]
 
@@ -84,8 +86,8 @@ class FMUTwin:
     workers: int = 0
 
     def __post_init__(self) -> None:
-        check_positive("rate", self.rate, "Hz")
-        check_positive("timeout", self.timeout, "s")
+        positive("rate", self.rate, unit="Hz")
+        positive("timeout", self.timeout, unit="s")
         for name, rate in self.rates.items():
             if name not in self.inputs.names or not 0 < rate <= self.rate:
                 raise InputError(
@@ -156,7 +158,7 @@ class FMUTwin:
 
         Raises InputError when the step does not divide the sample period.
         """
-        return 1 if self.step is None else substeps(self.rate, self.step)
+        return 1 if self.step is None else steps_per_sample(self.rate, self.step)
 
     def simulate(
         self,
@@ -239,7 +241,7 @@ class FMUTwin:
                 outputs[i] = outcome
             tell(chunk.index.start + len(clean) * done / len(runs))
         if self.nominal is not None:
-            return ideal_outputs(self.nominal, clean, len(self.outputs)), observed
+            return nominal_outputs(self.nominal, clean, len(self.outputs)), observed
         nominal[~bent] = observed[~bent]
         return nominal, observed
 

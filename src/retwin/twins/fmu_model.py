@@ -12,7 +12,7 @@ import numpy as np
 
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError, brief
-from retwin.twins.twin import Limits
+from retwin.twins.limits import Limits
 
 __all__ = [
     "channels_of",

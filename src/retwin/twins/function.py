@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pebble import ProcessExpired, ProcessPool
 
+from retwin.checks import positive
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
 from retwin.processes import sendable_errors, worker_pool
 from retwin.progress import Progress
-from retwin.twins.checks import check_positive
 from retwin.twins.faults import Fault
-from retwin.twins.twin import Chunk, Limits, simulate_in_chunks
+from retwin.twins.limits import Limits
+from retwin.twins.twin import Chunk, simulate_in_chunks
 
 __all__ = ["FunctionTwin"]
 
@@ -85,7 +86,7 @@ class FunctionTwin:
                 got="None",
                 remedy="give nominal=, the same without noise",
             )
-        check_positive("rate", self.rate, "Hz")
+        positive("rate", self.rate, unit="Hz")
         if self.workers < 1 or (self.vectorised and self.workers > 1):
             raise InputError(
                 "workers",

@@ -16,11 +16,12 @@ import numpy as np
 from mujoco import batch as mujoco_batch
 from numpy.typing import ArrayLike, NDArray
 
+from retwin.checks import positive
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.twins.checks import check_positive, ideal_outputs, substeps
 from retwin.twins.faults import Fault
+from retwin.twins.limits import Limits
 from retwin.twins.mujoco_model import (
     FILTERS,
     Servo,
@@ -32,7 +33,8 @@ from retwin.twins.mujoco_model import (
     resting,
 )
 from retwin.twins.mujoco_parameters import per_simulation, set_parameter
-from retwin.twins.twin import Chunk, Limits, checked_commands, simulate_in_chunks
+from retwin.twins.time_step import steps_per_sample
+from retwin.twins.twin import Chunk, checked_commands, nominal_outputs, simulate_in_chunks
 
 __all__ = ["MuJoCoTwin", "Servo"]
 
@@ -91,9 +93,9 @@ class MuJoCoTwin:
     threads: int = 0
 
     def __post_init__(self) -> None:
-        check_positive("rate", self.rate, "Hz")
+        positive("rate", self.rate, unit="Hz")
         if self.step is not None:
-            check_positive("step", self.step, "s")
+            positive("step", self.step, unit="s")
         for name, unit in (("settle", "s"), ("threads", "threads, or 0 for all cores")):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
@@ -175,7 +177,7 @@ class MuJoCoTwin:
 
         Raises InputError when the step does not divide the sample period.
         """
-        return substeps(self.rate, self.model.opt.timestep)
+        return steps_per_sample(self.rate, self.model.opt.timestep)
 
     def simulate(
         self,
@@ -223,7 +225,7 @@ class MuJoCoTwin:
             if hidden is not None:
                 states.append((state[0], state[1]))
             if self.nominal is not None:
-                return ideal_outputs(self.nominal, chunk.commands, len(self.outputs)), observed
+                return nominal_outputs(self.nominal, chunk.commands, len(self.outputs)), observed
             nominal = observed.copy()
             faulty = np.flatnonzero([fault is not None for fault in chunk.faults])
             if len(faulty):

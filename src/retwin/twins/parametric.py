@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.twins.around import Around, simulate_chunk
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, Twin, checked_commands, simulate_in_chunks
+from retwin.twins.wrapper import TwinWrapper, simulate_chunk
 
 __all__ = [
     "Parameter",
@@ -98,7 +98,7 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class ParametricTwin(Around):
+class ParametricTwin(TwinWrapper):
     """A twin at certain values of its free parameters; satisfies `Twin` as it is.
 
     Parameters
@@ -231,7 +231,7 @@ class ParametricTwin(Around):
 
 
 @dataclass(frozen=True)
-class RebuiltTwin(Around):
+class RebuiltTwin(TwinWrapper):
     """Takes parameters by being built anew for every value; those that share one go together.
 
     Parameters

@@ -10,17 +10,16 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.twins.around import Around, generator_of, simulate_chunk
-from retwin.twins.checks import ideal_outputs
 from retwin.twins.faults import Fault
 from retwin.twins.parametric import ParametricTwin
-from retwin.twins.twin import Chunk, simulate_in_chunks
+from retwin.twins.twin import Chunk, nominal_outputs, simulate_in_chunks
+from retwin.twins.wrapper import TwinWrapper, chunk_generator, simulate_chunk
 
 __all__ = ["RandomisedTwin", "simulate_with_parameters"]
 
 
 @dataclass(frozen=True)
-class RandomisedTwin(Around):
+class RandomisedTwin(TwinWrapper):
     """A twin whose every parameter is drawn uniformly within its bounds, per trajectory.
 
     Domain randomisation (Tobin et al. 2017): the rival that asks for no real data. It is as good as
@@ -47,7 +46,7 @@ class RandomisedTwin(Around):
         low, high = self.twin.bounds
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            rng = generator_of(seed, chunk, 3)
+            rng = chunk_generator(seed, chunk, 3)
             drawn = rng.uniform(low, high, size=(len(chunk.commands), len(low)))
             return simulate_with_parameters(self.twin, chunk, drawn, seed=seed)
 
@@ -66,6 +65,6 @@ def simulate_with_parameters(
     named = dict(zip(twin.names, values.T, strict=True))
     _, observed = simulate_chunk(twin, chunk, rows, seed=seed, parameters=named)
     if twin.nominal is not None:
-        return ideal_outputs(twin.nominal, chunk.commands, len(twin.outputs)), observed
+        return nominal_outputs(twin.nominal, chunk.commands, len(twin.outputs)), observed
     ideal, _ = simulate_chunk(twin, chunk, rows, faults=[None] * len(rows), seed=seed)
     return ideal, observed

@@ -12,7 +12,8 @@ from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults import Fault, frozen_response
-from retwin.twins.twin import Chunk, Limits, simulate_in_chunks
+from retwin.twins.limits import Limits
+from retwin.twins.twin import Chunk, simulate_in_chunks
 
 __all__ = ["KinematicTwin", "ServoLag"]
 

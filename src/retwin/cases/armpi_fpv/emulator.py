@@ -20,7 +20,8 @@ from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
-from retwin.twins.twin import Chunk, Limits, simulate_in_chunks
+from retwin.twins.limits import Limits
+from retwin.twins.twin import Chunk, simulate_in_chunks
 
 __all__ = ["EmulatedArmPi"]
 

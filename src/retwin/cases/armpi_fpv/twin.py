@@ -16,7 +16,7 @@ from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
-from retwin.twins.twin import Limits
+from retwin.twins.limits import Limits
 
 if TYPE_CHECKING:
     from retwin.twins.mujoco import MuJoCoTwin

@@ -23,8 +23,9 @@ from scipy.integrate import RK45
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
+from retwin.twins.limits import Limits
 from retwin.twins.parametric import Parameter, ParametricTwin, values_per_simulation
-from retwin.twins.twin import Chunk, Limits, simulate_in_chunks
+from retwin.twins.twin import Chunk, simulate_in_chunks
 
 __all__ = ["TanksTwin", "tanks_parametric"]
 
