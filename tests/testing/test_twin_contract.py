@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +20,7 @@ from retwin.testing import TWIN_CHECKS, TwinSubject, check_twin
 from retwin.twins.fmu import FMUTwin
 from retwin.twins.function import FunctionTwin
 from retwin.twins.mujoco import MuJoCoTwin
+from retwin.twins.workers import keep_workers
 
 Subject = Callable[[pytest.FixtureRequest], TwinSubject]
 
@@ -68,6 +69,13 @@ def of_crane(**options: Any) -> Subject:
     pushes = ramps()[:, :, :1] - 0.4
     faults = (None, rt.ActuatorBias(0, size=(0.5, 1.0)), rt.Stuck(0, onset=30))
     return lambda request: TwinSubject(twin, pushes, faults)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def workers() -> Iterator[None]:
+    """All checks of a twin share its worker processes, as in `check_twin`."""
+    with keep_workers():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -266,7 +266,7 @@ def test_native_code_stays_out_of_this_process_and_off_the_disk(
         ({"start": {"gain": "high"}}, r"start: expected for gain \(Float64\) .* got 'high'"),
         ({"start": {"gain": float("inf")}}, "start: .* got inf"),
         ({"inputs": ["u"], "start": {"trouble": 0.5}}, r"start: .* trouble \(Int32\) .*got 0.5"),
-        ({"outside": "ignore"}, "outside: expected 'refuse' or 'clip'"),
+        ({"outside": "ignore"}, "outside: expected one of refuse, clip, got 'ignore'"),
     ],
 )
 def test_bad_options_are_refused(lag: Path, options: dict, message: str) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 import retwin as rt
 from retwin.twins.faults import faulty_commands, frozen_response
-from retwin.twins.function import CHUNK, FunctionTwin
+from retwin.twins.function import TRAJECTORIES_PER_CHUNK, FunctionTwin
 
 INPUTS = rt.Channels(("valve", "heater"), ("1", "W"))
 OUTPUTS = rt.Channels(("level",), ("m",))
@@ -128,8 +128,8 @@ def test_noise_is_in_the_residual(settings: dict) -> None:
 
 
 def test_same_bytes_whatever_the_workers() -> None:
-    commands = trajectories(CHUNK + 3)
-    faults = [rt.Stuck(0, onset=(5, 20)), None, rt.ActuatorBias(1)] * CHUNK
+    commands = trajectories(TRAJECTORIES_PER_CHUNK + 3)
+    faults = [rt.Stuck(0, onset=(5, 20)), None, rt.ActuatorBias(1)] * TRAJECTORIES_PER_CHUNK
     made = [
         twin(noisy, nominal=level, vectorised=False, workers=workers).simulate(
             commands, faults=faults[: len(commands)], seed=8

@@ -23,6 +23,7 @@ from retwin.testing.suite import (
 from retwin.twins.faults import Fault, Stuck, draw_faults, faulty_commands, frozen_response
 from retwin.twins.limits import Limits
 from retwin.twins.twin import Twin
+from retwin.twins.workers import keep_workers
 
 __all__ = ["TWIN_CHECKS", "TwinSubject", "check_twin"]
 
@@ -378,4 +379,5 @@ def check_twin(twin: Twin, commands: NDArray, faults: Sequence[Fault | None] = (
     AssertionError: one that lists everything the twin breaks.
 
     """
-    run_checks(TWIN_CHECKS, TwinSubject(twin, commands, faults), type(twin).__name__)
+    with keep_workers():
+        run_checks(TWIN_CHECKS, TwinSubject(twin, commands, faults), type(twin).__name__)

@@ -13,7 +13,7 @@ from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
-from retwin.twins.parametric import TOGETHER, Parameter, values_per_simulation
+from retwin.twins.parametric import TRAJECTORIES_PER_CHUNK, Parameter, values_per_simulation
 from retwin.twins.twin import (
     Chunk,
     Twin,
@@ -87,7 +87,7 @@ class CommandSide(TwinWrapper):
             return nominal, observed
 
         return simulate_in_chunks(
-            self, run, commands, faults, seed=seed, progress=progress, size=TOGETHER
+            self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
         )
 
     def _kept(self, commands: NDArray) -> NDArray:

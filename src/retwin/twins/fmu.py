@@ -6,9 +6,11 @@ Needs the extra `fmu`. An FMU runs native code with your rights: run only FMUs t
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,10 +36,11 @@ from retwin.twins.fmu_model import (
 from retwin.twins.limits import Limits
 from retwin.twins.time_step import steps_per_sample
 from retwin.twins.twin import Chunk, checked_commands, nominal_outputs, simulate_in_chunks
+from retwin.twins.workers import worker_processes
 
 __all__ = ["FMUTwin"]
 
-TOGETHER = 256
+TRAJECTORIES_PER_CHUNK = 256
 """Trajectories per chunk."""
 
 
@@ -187,33 +190,46 @@ class FMUTwin:
         commands = checked_commands(commands, self.inputs)
         count = len(commands)
         values = self._start_values(read_description(self.path), parameters or {}, count)
+
+        def report(finished: float) -> None:
+            if progress is not None:
+                progress(min(1.0, finished / count))
+
+        with ExitStack() as stack:
+            # No process is started before commands and faults are found good.
+            pool = cache(lambda: stack.enter_context(self._workers(count)))
+
+            def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+                return self._run(pool(), chunk, values[chunk.index], report)
+
+            return simulate_in_chunks(
+                self, run, commands, faults, seed=seed, progress=None, size=TRAJECTORIES_PER_CHUNK
+            )
+
+    def _workers(self, count: int) -> AbstractContextManager[ProcessPool]:
+        """Processes that have loaded the FMU, for `count` trajectories."""
+        job = fmu_worker.Job(
+            inputs=self.inputs.names,
+            outputs=self.outputs.names,
+            rate=self.rate,
+            substeps=self.substeps,
+            rates=dict(self.rates),
+            reuse=self.reuse,
+        )
+        workers = min(self.workers or os.cpu_count() or 1, count)
+        state = self.path.stat()
+        version = (self.path, state.st_mtime_ns, state.st_size)
+        return worker_processes((version, job, workers), lambda: self._start(job, workers))
+
+    @contextmanager
+    def _start(self, job: fmu_worker.Job, workers: int) -> Iterator[ProcessPool]:
+        """Start the processes on an unpacked FMU, which is removed when they end."""
+        begin, orphaned = fmu_worker.start, fmu_worker.orphaned
         with scratch_folder() as folder:
             extract(self.path, folder)
-            job = fmu_worker.Job(
-                folder,
-                self.inputs.names,
-                self.outputs.names,
-                self.rate,
-                self.substeps,
-                dict(self.rates),
-                self.reuse,
-            )
-            workers = min(self.workers or os.cpu_count() or 1, count)
-            begin, orphaned = fmu_worker.start, fmu_worker.orphaned
-            with worker_pool(workers, begin, (job,), orphaned=orphaned) as pool:
-
-                def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-                    if chunk.index.start == 0:
-                        self._try_to_load(pool)
-                    return self._run(pool, chunk, values[chunk.index], tell)
-
-                def tell(finished: float) -> None:
-                    if progress is not None:
-                        progress(min(1.0, finished / count))
-
-                return simulate_in_chunks(
-                    self, run, commands, faults, seed=seed, progress=None, size=TOGETHER
-                )
+            with worker_pool(workers, begin, (folder, job), orphaned=orphaned) as pool:
+                self._check_loads(pool)
+                yield pool
 
     def _run(
         self,
@@ -262,7 +278,7 @@ class FMUTwin:
                     return _death(error.exitcode)
                 future = self._ask(pool, commands, values)
 
-    def _try_to_load(self, pool: ProcessPool) -> None:
+    def _check_loads(self, pool: ProcessPool) -> None:
         """Refuse an FMU that no run could load, before every run says so."""
         try:
             reason = pool.schedule(fmu_worker.load, timeout=self.timeout).result()

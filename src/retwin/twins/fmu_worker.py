@@ -35,7 +35,6 @@ class Job:
 
     Parameters
     ----------
-    folder: the extracted FMU.
     inputs, outputs: names of variables, in order.
     rate: samples per second.
     substeps: communication steps per sample.
@@ -44,7 +43,6 @@ class Job:
 
     """
 
-    folder: str
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     rate: float
@@ -53,25 +51,26 @@ class Job:
     reuse: bool
 
 
+_folder: str
 _job: Job
 _instance: Instance | None = None
 
 
-def start(job: Job) -> None:
-    """Make this process ready for runs of `job`."""
+def start(folder: str, job: Job) -> None:
+    """Make this process ready for runs of `job` with the FMU unpacked in `folder`."""
     import fmpy  # noqa: F401  loaded here, so that no run's time limit pays for it
 
-    global _job
-    _job = job
+    global _folder, _job
+    _folder, _job = folder, job
     # Python's handlers wait for the native code to return, which a hung FMU never does.
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     # What an FMU prints must not mix with what the program prints.
     os.dup2(2, 1)
 
 
-def orphaned(job: Job) -> None:
-    """Remove the extracted FMU, when the process that would have done it is no more."""
-    shutil.rmtree(job.folder, ignore_errors=True)
+def orphaned(folder: str, job: Job) -> None:
+    """Remove the unpacked FMU when the parent process, which would have done it, has died."""
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def load() -> str:
@@ -79,7 +78,7 @@ def load() -> str:
     global _instance
     if _instance is None:
         try:
-            _instance = Instance(_job)
+            _instance = Instance(_folder, _job)
         except Exception as error:  # FMPy raises nothing more special
             return " ".join(str(error).split())
     return ""
@@ -103,12 +102,12 @@ class Instance:
     Raises what FMPy raises when it cannot be loaded.
     """
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, folder: str, job: Job) -> None:
         from fmpy import read_model_description
         from fmpy.simulation import instantiate_fmu
 
         self.job = job
-        self.description = read_model_description(job.folder, validate=False)
+        self.description = read_model_description(folder, validate=False)
         self.version = self.description.fmiMajorVersion
         named = {variable.name: variable for variable in self.description.modelVariables}
         self.inputs = [named[name] for name in job.inputs]
@@ -116,9 +115,7 @@ class Instance:
         self.said = ""
         self.made = 1
         self.fresh, self.sound, self.spent = True, True, False
-        self.slave = instantiate_fmu(
-            job.folder, self.description, "CoSimulation", logger=self._listen
-        )
+        self.slave = instantiate_fmu(folder, self.description, "CoSimulation", logger=self._listen)
 
     def run(self, commands: NDArray, values: Start) -> NDArray | str:
         """See `run` of this module."""

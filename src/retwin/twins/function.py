@@ -6,9 +6,9 @@ import inspect
 import pickle
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import KW_ONLY, dataclass
-from functools import partial
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,10 +22,11 @@ from retwin.progress import Progress
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.twin import Chunk, simulate_in_chunks
+from retwin.twins.workers import worker_processes
 
 __all__ = ["FunctionTwin"]
 
-CHUNK = 128
+TRAJECTORIES_PER_CHUNK = 128
 """Trajectories that a vectorised function gets at once."""
 
 Function = Callable[..., ArrayLike]
@@ -112,20 +113,34 @@ class FunctionTwin:
         ones; `SimulationError` names trajectories whose worker process died.
         """
 
-        def tell(chunk: Chunk, share: float) -> None:
+        def report(chunk: Chunk, share: float) -> None:
             if progress is not None:
                 done = chunk.index.start + share * len(chunk.commands)
                 progress(done / len(commands))
 
-        # No process is started before commands and faults are found good.
-        with nullcontext() if self.workers == 1 else worker_pool(self.workers) as pool:
-            run = partial(self._run, seed=seed, pool=pool, tell=tell)
+        with ExitStack() as stack:
+            # No process is started before commands and faults are found good.
+            pool = cache(lambda: stack.enter_context(self._workers()) if self.workers > 1 else None)
+
+            def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+                return self._run(pool(), chunk, seed, report)
+
             return simulate_in_chunks(
-                self, run, commands, faults, seed=seed, progress=progress, size=CHUNK
+                self,
+                run,
+                commands,
+                faults,
+                seed=seed,
+                progress=progress,
+                size=TRAJECTORIES_PER_CHUNK,
             )
 
+    def _workers(self) -> AbstractContextManager[ProcessPool]:
+        key = (FunctionTwin, self.workers)
+        return worker_processes(key, lambda: worker_pool(self.workers))
+
     def _run(
-        self, chunk: Chunk, *, seed: int, pool: ProcessPool | None, tell: Callable
+        self, pool: ProcessPool | None, chunk: Chunk, seed: int, report: Callable
     ) -> tuple[NDArray, NDArray]:
         held = chunk.held_commands
         every = np.arange(len(held))
@@ -139,7 +154,7 @@ class FunctionTwin:
         answers = []
         for answer in _answers(calls, pool, chunk):
             answers.append(answer)
-            tell(chunk, len(answers) / len(calls))
+            report(chunk, len(answers) / len(calls))
         nominal = np.concatenate(answers[: len(clean)]).astype(chunk.commands.dtype)
         observed = nominal.copy()
         if len(fresh):

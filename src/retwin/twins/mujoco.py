@@ -40,7 +40,7 @@ __all__ = ["MuJoCoTwin", "Servo"]
 
 LOCKED = 1e12
 """Damping in N m s/rad (N s/m) of a joint that is held: under tons it creeps by less than 1 um."""
-TOGETHER = 128
+TRAJECTORIES_PER_CHUNK = 128
 """Trajectories per batch: their records at every step take tens of MB."""
 
 
@@ -236,7 +236,7 @@ class MuJoCoTwin:
             return nominal, observed
 
         made = simulate_in_chunks(
-            self, run, commands, faults, seed=seed, progress=progress, size=TOGETHER
+            self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
         )
         if hidden is not None:
             hidden["positions"] = np.concatenate([positions for positions, _ in states])

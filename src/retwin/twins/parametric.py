@@ -31,7 +31,7 @@ __all__ = [
     "values_per_simulation",
 ]
 
-TOGETHER = 512
+TRAJECTORIES_PER_CHUNK = 512
 """Trajectories that are handed on at once."""
 
 
@@ -286,7 +286,7 @@ class RebuiltTwin(TwinWrapper):
             return nominal, observed
 
         return simulate_in_chunks(
-            self, run, commands, faults, seed=seed, progress=progress, size=TOGETHER
+            self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
         )
 
 
