@@ -218,11 +218,11 @@ def test_model_without_the_joints(
     ("changes", "said"),
     [
         ({"path": "arm.avi"}, r"\.mp4 or \.gif"),
-        ({"index": 2}, "a place from 0 to 1, got 2"),
+        ({"index": 2}, "a position from 0 to 1, got 2"),
         ({"index": "third"}, "one of 2 ids .first, second., got 'third'"),
         ({"fps": 0}, "fps"),
         ({"size": (321, 240)}, "even width and height"),
-        ({"renderer": "crayon"}, "auto or mujoco or stick"),
+        ({"renderer": "crayon"}, "one of auto, mujoco, stick"),
     ],
 )
 def test_bad_input_writes_nothing(

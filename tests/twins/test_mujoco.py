@@ -286,7 +286,7 @@ def test_the_how_to_is_true(
 ) -> None:
     tests = Path(__file__).parents[1]
     page = (tests.parent / "docs" / "mujoco.md").read_text("utf-8")
-    (tmp_path / "crane.xml").write_text((tests / "contracts" / "crane.xml").read_text("utf-8"))
+    (tmp_path / "crane.xml").write_text((tests / "testing" / "crane.xml").read_text("utf-8"))
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
     names: dict[str, object] = {}

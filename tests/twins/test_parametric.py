@@ -60,7 +60,7 @@ def test_one_parameter_may_stand_behind_several_places() -> None:
 
 
 def test_a_mujoco_twin_takes_parameters_as_it_is() -> None:
-    path = Path(__file__).parents[1] / "contracts" / "crane.xml"
+    path = Path(__file__).parents[1] / "testing" / "crane.xml"
     crane = MuJoCoTwin.from_file(path, rate=50.0, inputs=["limited"], outputs=["hook"])
     twin = ParametricTwin(crane, (Parameter("body.load.mass", "kg", 0.1, 2.0),))
     pushes = np.zeros((2, 60, 1))
@@ -144,7 +144,9 @@ def test_bad_parameters_are_named() -> None:
         "no name twice": lambda: ParametricTwin(GAIN.twin, (one, one)),
         "at least one": lambda: GAIN.holding("gain"),
         "some of gain": lambda: GAIN.simulate(RAMP, seed=0, parameters={"mass": 1.0}),
-        "one for all, or 3": lambda: GAIN.simulate(RAMP, seed=0, parameters={"gain": [1.0, 2.0]}),
+        "one for all, or one per trajectory, 3": lambda: GAIN.simulate(
+            RAMP, seed=0, parameters={"gain": [1.0, 2.0]}
+        ),
         "finite numbers, one per parameter": lambda: GAIN.with_values([1.0, 2.0]),
         "returns a twin": lambda: ParametricTwin.built(dict, [one]).inputs,
     }.items():

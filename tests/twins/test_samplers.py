@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 import retwin as rt
+from retwin.twins.ramps import ramps_and_holds
 from retwin.twins.samplers import (
     HoldSampler,
     MultisineSampler,
     RampSampler,
     RecordedSampler,
-    ramps_and_holds,
 )
 
-SAMPLER = RampSampler(low=(0.0, -2.0), high=(10.0, -1.0), movements=4, steps=400, ramps=(10, 30))
+SAMPLER = RampSampler(low=(0.0, -2.0), high=(10.0, -1.0), segments=4, steps=400, ramps=(10, 30))
 
 
 def draw(count: int = 50, seed: int = 0, timing: np.ndarray | None = None) -> np.ndarray:
@@ -94,14 +94,14 @@ def test_same_seed_same_commands() -> None:
         ("limits", {"low": (), "high": ()}),
         ("start", {"start": (5.0, 0.0)}),
         ("start", {"start": (5.0,)}),
-        ("movements", {"movements": 0}),
-        ("ramps: expected lengths from 1 to 100", {"ramps": (10, 101)}),
+        ("segments", {"segments": 0}),
+        ("ramps: expected durations from 1 to 100", {"ramps": (10, 101)}),
         ("ramps", {"ramps": ()}),
         ("ramps", {"ramps": (0,)}),
     ],
 )
 def test_settings_that_cannot_be_are_refused(match: str, changes: dict) -> None:
-    settings = {"low": (0.0, -2.0), "high": (10.0, -1.0), "movements": 4, "steps": 400}
+    settings = {"low": (0.0, -2.0), "high": (10.0, -1.0), "segments": 4, "steps": 400}
     with pytest.raises(rt.InputError, match=match) as caught:
         RampSampler(**{**settings, "ramps": (10, 30), **changes})
     assert "\n" not in str(caught.value)

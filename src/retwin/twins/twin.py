@@ -211,15 +211,16 @@ def nominal_outputs(
 
 def _check_actuators(faults: Sequence[Fault | None], inputs: Channels) -> None:
     """A fault of one actuator must name one that exists."""
-    for fault in faults:
-        actuator = getattr(fault, "actuator", 0)
-        require(
-            0 <= actuator < len(inputs),
-            "faults",
-            expected=f"an actuator from 0 to {len(inputs) - 1}",
-            got=repr(fault),
-            remedy=f"count the command channels from 0: {', '.join(inputs.names)}",
-        )
+    count = len(inputs)
+    wrong = (fault for fault in faults if not 0 <= getattr(fault, "actuator", 0) < count)
+    first = next(wrong, None)
+    require(
+        first is None,
+        "faults",
+        expected=f"an actuator from 0 to {count - 1}",
+        got=first,
+        remedy=f"count the command channels from 0: {', '.join(inputs.names)}",
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from scipy.io import loadmat
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.cases.armpi_fpv.ramps import unit_angles
 from retwin.cases.armpi_fpv.recovery import RAMPS, Recovery, ramp_commands, recover_commands
+from retwin.errors import InputError
 
 ARM = YawPitchArm(base=0.028505 + 0.0361, links=(0.10048, 0.094714, 0.05071))
 DATA = os.environ.get("RETWIN_DATA")
@@ -166,14 +167,14 @@ def test_what_is_no_path_of_the_arm_is_not_explained() -> None:
 
 def test_wrong_paths_are_refused() -> None:
     path = Made(2, 9, real=True).path
-    with pytest.raises(ValueError, match=r"path must have shape \(n, T, 3\).*got \(1020, 3\)"):
+    with pytest.raises(InputError, match=r"path: expected shape \(n, T, 3\) .*got \(1020, 3\)"):
         recover_commands(path[0], arm=ARM)
-    with pytest.raises(ValueError, match=r"path must have shape .*got \(2, 1020, 2\)"):
+    with pytest.raises(InputError, match=r"path: expected shape .*got \(2, 1020, 2\)"):
         recover_commands(path[..., :2], arm=ARM)
     path[1, 5, 0] = np.nan
-    with pytest.raises(ValueError, match=r"path must be finite, .* at index 1; drop"):
+    with pytest.raises(InputError, match=r"path: expected finite numbers, .* at index 1; drop"):
         recover_commands(path, arm=ARM)
-    with pytest.raises(ValueError, match="arm must have 3 pitch joints, got 1"):
+    with pytest.raises(InputError, match="arm: expected 3 pitch joints, got 1"):
         recover_commands(path[:1], arm=YawPitchArm(0.1, (0.2,)))
 
 

@@ -185,7 +185,7 @@ def test_emulated_data_say_so(case: rt.Case, emulated: rt.Trajectories) -> None:
 @pytest.mark.slow
 def test_the_emulated_arm_errs_as_the_real_one(tmp_path: Path) -> None:
     """All figures of benchmarks/emulation.py lie inside the intervals of the real ones."""
-    benchmark = Path(__file__).parents[2] / "benchmarks" / "emulation.py"
+    benchmark = Path(__file__).parents[3] / "benchmarks" / "emulation.py"
     run = [sys.executable, "-W", "error::RuntimeWarning", str(benchmark)]
     results = tmp_path / "results.json"
     told = {**os.environ, "RETWIN_RESULTS": str(results)}
