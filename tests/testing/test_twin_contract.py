@@ -292,15 +292,17 @@ def test_all_that_is_broken_is_listed() -> None:
     check_twin(GOOD, ramps())
     with pytest.raises(AssertionError) as caught:
         check_twin(Bent(ignores_the_seed), ramps())
-    told = str(caught.value)
-    assert told.startswith("Bent breaks its contract:\n- check_seed: observed: the same seed must")
-    assert "- check_severities: " in told
+    listed = str(caught.value)
+    assert listed.startswith(
+        "Bent breaks its contract:\n- check_seed: observed: the same seed must"
+    )
+    assert "- check_severities: " in listed
     with pytest.raises(AssertionError, match="check_protocol: a twin must have inputs"):
         check_twin(SimpleNamespace(inputs=TANK, simulate=None), ramps())
 
 
 def test_a_twin_need_not_know_stuck_actuators(tmp_path: Path) -> None:
-    """One whose actuators pull at tendons refuses them; its subject brings other faults."""
+    """A twin whose actuators drive tendons refuses them; its subject has other faults."""
     crane = Path(__file__).with_name("crane.xml").read_text("utf-8")
     tendon = '<tendon><fixed name="cable"><joint joint="rail" coef="1"/></fixed></tendon>'
     model = crane.replace("<actuator>", tendon + "<actuator>").replace(
@@ -314,7 +316,7 @@ def test_a_twin_need_not_know_stuck_actuators(tmp_path: Path) -> None:
     check_twin(twin, pushes, [None, *[rt.ActuatorBias(0, size=(0.5, 1.0))] * 2])
 
 
-def test_a_subject_must_tell_something() -> None:
+def test_a_subject_must_be_informative() -> None:
     with pytest.raises(rt.InputError, match="n at least 2 and T at least 8"):
         TwinSubject(GOOD, ramps(1))
     with pytest.raises(rt.InputError, match="some None and some not"):

@@ -13,7 +13,8 @@ from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
-from retwin.twins.parametric import TRAJECTORIES_PER_CHUNK, Parameter, values_per_simulation
+from retwin.twins.parameter_values import values_per_simulation
+from retwin.twins.parametric import TRAJECTORIES_PER_CHUNK, Parameter
 from retwin.twins.twin import (
     Chunk,
     Twin,
@@ -66,7 +67,7 @@ class CommandSide(TwinWrapper):
         offsets = tuple(f"{OFFSET}.{name}" for name in self.inputs.names)
         given = dict(parameters or {})
         own = {name: given.pop(name) for name in (DELAY, *offsets) if name in given}
-        own_values = values_per_simulation(own, count, known=(DELAY, *offsets))
+        own_values = values_per_simulation(own, count, allowed=(DELAY, *offsets))
         inner_values = values_per_simulation(given, count)
         delay = own_values.get(DELAY, np.zeros(count))
         offset = np.stack([own_values.get(name, np.zeros(count)) for name in offsets], axis=-1)

@@ -293,6 +293,7 @@ class FMUTwin:
         return nominal, observed
 
     def _schedule(self, pool: ProcessPool, commands: NDArray, values: fmu_worker.Start) -> Future:
+        """The outcome of one run, in the future."""
         return pool.schedule(fmu_worker.run, args=(commands, values), timeout=self.timeout)
 
     def _outcome(

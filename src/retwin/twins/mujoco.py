@@ -26,7 +26,7 @@ from retwin.twins.mujoco_model import (
     output_channels,
 )
 from retwin.twins.mujoco_simulation import Simulation
-from retwin.twins.parametric import values_per_simulation
+from retwin.twins.parameter_values import values_per_simulation
 from retwin.twins.time_step import steps_per_sample
 from retwin.twins.twin import Chunk, checked_commands, nominal_outputs, simulate_in_chunks
 
@@ -250,13 +250,13 @@ class MuJoCoTwin:
                 chunk.failed.update({int(faulty[i]): why for i, why in healthy.failed.items()})
             return nominal, result.outputs
 
-        made = simulate_in_chunks(
+        simulated = simulate_in_chunks(
             self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
         )
         if hidden is not None:
             hidden["positions"] = np.concatenate([positions for positions, _ in states])
             hidden["velocities"] = np.concatenate([velocities for _, velocities in states])
-        return made
+        return simulated
 
     def respond(self, commands: NDArray, frozen: NDArray, failed: dict[int, str]) -> NDArray:
         """Integrate the response of the joints; for twins that wrap this one.
@@ -282,6 +282,7 @@ class MuJoCoTwin:
 
     @cached_property
     def _simulation(self) -> Simulation:
+        """The integration of the model."""
         return Simulation(
             self.model,
             self.inputs.names,

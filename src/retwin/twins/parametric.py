@@ -19,6 +19,7 @@ from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
+from retwin.twins.parameter_values import values_per_simulation
 from retwin.twins.twin import Chunk, Twin, checked_commands, simulate_in_chunks
 from retwin.twins.wrapper import TwinWrapper, simulate_chunk
 
@@ -27,7 +28,6 @@ __all__ = [
     "ParametricTwin",
     "RebuiltTwin",
     "TakesParameters",
-    "values_per_simulation",
 ]
 
 TRAJECTORIES_PER_CHUNK = 512
@@ -347,7 +347,7 @@ class RebuiltTwin(TwinWrapper):
         """See `TakesParameters.simulate`."""
         commands = checked_commands(commands, self.inputs)
         names = tuple(self.defaults)
-        values = values_per_simulation(parameters, len(commands), known=names)
+        values = values_per_simulation(parameters, len(commands), allowed=names)
         table = np.stack(
             [values.get(n, np.full(len(commands), self.defaults[n])) for n in names], 1
         )
@@ -365,46 +365,3 @@ class RebuiltTwin(TwinWrapper):
         return simulate_in_chunks(
             self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
         )
-
-
-def values_per_simulation(
-    parameters: Mapping[str, ArrayLike] | None, count: int, *, known: Sequence[str] | None = None
-) -> dict[str, NDArray]:
-    """Check the values of parameters and give each simulation its own.
-
-    Parameters
-    ----------
-    parameters : mapping of str to array_like, optional
-        Finite values by name, each () for all simulations or (count,).
-    count : int
-        The number of simulations.
-    known : sequence of str, optional
-        Names that exist; by default all do.
-
-    Returns
-    -------
-    dict of str to ndarray, shape (count,)
-        The values of each parameter.
-
-    Raises
-    ------
-    InputError
-        An unknown name, or anything but finite numbers of those shapes.
-
-    """
-    values = {}
-    names = "" if known is None else f" for {', '.join(known)}"
-    for name, given in (parameters or {}).items():
-        array = np.asarray(given)
-        numbers = array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
-        require(
-            (known is None or name in known) and numbers and array.shape in ((), (count,)),
-            "parameters",
-            expected=f"finite numbers{names}: one for all, or one per trajectory, {count}",
-            got=f"{name}: {array.dtype} of shape {array.shape}"
-            if array.ndim
-            else f"{name}: {given!r}",
-            remedy="check the spelling; give as many values as there are trajectories",
-        )
-        values[name] = np.broadcast_to(array.astype(float), count)
-    return values

@@ -78,6 +78,6 @@ def worker_processes(
     try:
         yield found.pool
     except BaseException as error:
-        kept.remove(found)
+        kept[:] = [each for each in kept if each is not found]
         found.stack.__exit__(type(error), error, error.__traceback__)
         raise

@@ -37,19 +37,19 @@ class Made:
         rng = np.random.default_rng(seed)
         self.ramps = rng.choice(RAMPS, size=(count, moves, 4))
         self.start = np.full((count, 4), 500.0)
-        gaps = np.full((count, moves - 1), 200.0)
+        spacings = np.full((count, moves - 1), 200.0)
         first = np.zeros((count, 1))
         if real:
             self.start += rng.integers(-5, 6, size=(count, 4))
             first = rng.uniform(0, 9, size=first.shape)
-            gaps = rng.uniform(200, 204, size=gaps.shape)
-        self.onsets = np.cumsum(np.concatenate([first, gaps], axis=1), axis=1)
+            spacings = rng.uniform(200, 204, size=spacings.shape)
+        self.onsets = np.cumsum(np.concatenate([first, spacings], axis=1), axis=1)
         goals = 500 + rng.uniform(-1, 1, self.ramps.shape) * np.array([80, 50, 50, 50]) / 0.24
         self.targets = np.empty_like(goals)
         now = self.start
         for move in range(moves):
-            reach = 2.72 / 0.24 * self.ramps[:, move]
-            now = now + np.clip(goals[:, move] - now, -reach, reach)
+            largest = 2.72 / 0.24 * self.ramps[:, move]
+            now = now + np.clip(goals[:, move] - now, -largest, largest)
             now = np.rint(now) if whole else now
             self.targets[:, move] = now
         length = 200 * moves + 20 * real

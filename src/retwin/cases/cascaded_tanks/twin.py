@@ -29,7 +29,8 @@ from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
-from retwin.twins.parametric import Parameter, ParametricTwin, values_per_simulation
+from retwin.twins.parameter_values import values_per_simulation
+from retwin.twins.parametric import Parameter, ParametricTwin
 from retwin.twins.twin import Chunk, simulate_in_chunks
 
 __all__ = ["TanksTwin", "tanks_parametric"]
@@ -120,7 +121,7 @@ class TanksTwin:
     ) -> Trajectories:
         """See `TakesParameters.simulate`; a stuck pump holds its voltage."""
         count = len(commands)
-        own = values_per_simulation(parameters, count, known=PHYSICS)
+        own = values_per_simulation(parameters, count, allowed=PHYSICS)
         numbers = {name: own.get(name, np.full(count, getattr(self, name))) for name in PHYSICS}
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
