@@ -121,6 +121,7 @@ def _of_function(
     outputs: Sequence[str],
     rate: float | None,
 ) -> Twin:
+    """The twin of a function, whose channels have the unit "1"."""
     if not inputs or not outputs or not rate:
         raise InputError(
             f"twin {name!r}",
@@ -144,6 +145,7 @@ def _needs_no_arguments(function: Callable[..., Any]) -> bool:
 
 
 def _unknown(name: str, got: str) -> InputError:
+    """The error for a name that stands for no twin."""
     return InputError(
         f"twin {name!r}",
         expected=f"{', '.join(TWINS)}, {FORMS}",

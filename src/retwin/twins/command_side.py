@@ -137,15 +137,19 @@ class _ResponseOnly:
 
     @property
     def label(self) -> str:
+        """Class name of the fault."""
         return self.fault.label
 
     def drawn(self, rng: np.random.Generator, *, steps: int, segments: int) -> _ResponseOnly:
+        """The fault itself: its severity is fixed already."""
         return self
 
     def command(self, commands: NDArray, segments: Segments) -> NDArray:
+        """The commands unchanged."""
         return commands
 
     def response(self, response: NDArray) -> NDArray:
+        """The response with the fault."""
         return self.fault.response(response)
 
 

@@ -132,18 +132,18 @@ class Stuck:
         object.__setattr__(self, "onset", (low, high) if pair else low)
 
     def drawn(self, rng: np.random.Generator, *, steps: int, segments: int) -> Stuck:
-        """The same fault with its onset drawn."""
+        """The same fault with its onset drawn; see `Fault.drawn`."""
         if isinstance(self.onset, int):
             return self
         low, high = (min(onset, steps - 1) for onset in self.onset)
         return replace(self, onset=int(rng.integers(low, high + 1)))
 
     def command(self, commands: NDArray, segments: Segments) -> NDArray:
-        """The clean commands: the fault acts on the response."""
+        """The clean commands: the fault acts on the response. See `Fault.command`."""
         return commands
 
     def response(self, response: NDArray) -> NDArray:
-        """The response (T, d_u), constant from the onset on."""
+        """The response, constant from the onset on; see `Fault.response`."""
         onset = self.onset
         if not isinstance(onset, int):
             raise _open(self)
@@ -193,7 +193,7 @@ class ActuatorBias:
         )
 
     def drawn(self, rng: np.random.Generator, *, steps: int, segments: int) -> ActuatorBias:
-        """The same fault with one bias per segment drawn."""
+        """The same fault with one bias per segment drawn; see `Fault.drawn`."""
         if self.bias:
             return self
         count = max(segments, 1)
@@ -201,7 +201,7 @@ class ActuatorBias:
         return replace(self, bias=tuple(drawn.tolist()))
 
     def command(self, commands: NDArray, segments: Segments) -> NDArray:
-        """The commands (T, d_u) with the biased reference of one actuator."""
+        """The commands with the biased reference of one actuator; see `Fault.command`."""
         if not self.bias:
             raise _open(self)
         valid = segments.valid[0]
@@ -216,7 +216,7 @@ class ActuatorBias:
         return biased
 
     def response(self, response: NDArray) -> NDArray:
-        """The response unchanged: it follows the biased reference."""
+        """The response unchanged: it follows the biased reference. See `Fault.response`."""
         return response
 
 

@@ -183,7 +183,11 @@ class FMUTwin:
     def substeps(self) -> int:
         """Communication steps per sample.
 
-        Raises InputError when the step does not divide the sample period.
+        Raises
+        ------
+        InputError
+            The step does not divide the sample period.
+
         """
         return 1 if self.step is None else steps_per_sample(self.rate, self.step)
 

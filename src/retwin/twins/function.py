@@ -240,17 +240,17 @@ class _Call:
         except (TypeError, ValueError, RuntimeError) as error:
             values = np.empty(0)
             got = " ".join(str(error).split())
-        if values.shape != shape or values.dtype.kind not in "fiub":
-            names = ", ".join(self.outputs.names)
-            other = "vectorised=False if it takes one trajectory, (T, d_u)"
-            if self.single:
-                other = "vectorised=True if it takes many trajectories, (n, T, d_u)"
-            raise InputError(
-                self.role,
-                expected=f"{_name(self.function)} to return numbers of shape {shape}",
-                got=f"{type(returned).__name__}, {got}",
-                remedy=f"return one column per output channel, {names}; give {other}",
-            )
+        names = ", ".join(self.outputs.names)
+        other = "vectorised=False if it takes one trajectory, (T, d_u)"
+        if self.single:
+            other = "vectorised=True if it takes many trajectories, (n, T, d_u)"
+        require(
+            values.shape == shape and values.dtype.kind in "fiub",
+            self.role,
+            expected=f"{_name(self.function)} to return numbers of shape {shape}",
+            got=f"{type(returned).__name__}, {got}",
+            remedy=f"return one column per output channel, {names}; give {other}",
+        )
         return values
 
     def _check_finite(self, outputs: NDArray) -> None:
@@ -302,6 +302,7 @@ def _in_worker(pickled: bytes, role: str) -> NDArray:
 
 
 def _check_importable(function: Function | None, role: str) -> None:
+    """Refuse a function that cannot be pickled."""
     try:
         pickle.dumps(function)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -309,6 +310,7 @@ def _check_importable(function: Function | None, role: str) -> None:
 
 
 def _not_importable(role: str, reason: str) -> InputError:
+    """The error for a function that worker processes cannot import."""
     return InputError(
         role,
         expected="a function that worker processes can import",
@@ -318,6 +320,7 @@ def _not_importable(role: str, reason: str) -> InputError:
 
 
 def _takes_rng(function: Function) -> bool:
+    """Whether the function is stochastic."""
     try:
         return "rng" in inspect.signature(function).parameters
     except (TypeError, ValueError):  # some compiled functions have no signature
@@ -325,4 +328,5 @@ def _takes_rng(function: Function) -> bool:
 
 
 def _name(function: Function) -> str:
+    """Name of the function, for messages."""
     return getattr(function, "__qualname__", type(function).__qualname__)

@@ -185,7 +185,11 @@ class MuJoCoTwin:
     def substeps(self) -> int:
         """Integration steps per sample.
 
-        Raises InputError when the step does not divide the sample period.
+        Raises
+        ------
+        InputError
+            The step does not divide the sample period.
+
         """
         return steps_per_sample(self.rate, self.model.opt.timestep)
 

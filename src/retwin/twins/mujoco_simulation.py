@@ -13,6 +13,7 @@ import numpy as np
 from mujoco import batch as mujoco_batch
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.errors import InputError
 from retwin.twins.mujoco_model import FILTERS, joint_of, resting
 from retwin.twins.mujoco_parameters import set_parameter
@@ -220,13 +221,13 @@ class Simulation:
                 got=f"{name}, which drives something else",
                 remedy="give the fault to another actuator, or model it as a command fault",
             )
-        if self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4):
-            raise InputError(
-                "faults",
-                expected="an implicit integrator, which alone can lock a joint",
-                got="RK4",
-                remedy='set <option integrator="implicitfast"/> in the model',
-            )
+        require(
+            self.model.opt.integrator != int(mujoco.mjtIntegrator.mjINT_RK4),
+            "faults",
+            expected="an implicit integrator, which alone can lock a joint",
+            got="RK4",
+            remedy='set <option integrator="implicitfast"/> in the model',
+        )
         return int(self.model.jnt_dofadr[joint])
 
     @cached_property

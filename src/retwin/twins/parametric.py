@@ -277,7 +277,11 @@ class ParametricTwin(TwinWrapper):
     ) -> Trajectories:
         """See `TakesParameters.simulate`; `parameters` replace present values.
 
-        Raises InputError also for parameters that are not free.
+        Raises
+        ------
+        InputError
+            As `TakesParameters.simulate`, and for parameters that are not free.
+
         """
         self._check_known(parameters or {})
         now: dict[str, ArrayLike] = dict(zip(self.names, self.values, strict=True))
@@ -293,6 +297,7 @@ class ParametricTwin(TwinWrapper):
         )
 
     def _check_known(self, names: Mapping[str, Any]) -> None:
+        """Refuse names of parameters that are not free."""
         unknown = sorted(set(names) - set(self.names))
         require(
             not unknown,
@@ -324,7 +329,14 @@ class RebuiltTwin(TwinWrapper):
 
     @cached_property
     def twin(self) -> Twin:
-        """The twin at the defaults. Raises InputError when `build` returns no twin."""
+        """The twin at the defaults.
+
+        Raises
+        ------
+        InputError
+            `build` returns no twin.
+
+        """
         made = self.build(dict(self.defaults))
         require(
             isinstance(made, Twin),

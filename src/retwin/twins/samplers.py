@@ -179,7 +179,7 @@ class HoldSampler:
     def sample(
         self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
     ) -> NDArray:
-        """Draw commands (count, steps, d_u), float32; `timing` is ignored."""
+        """Draw commands, float32, without use of `timing`; see `CommandSampler.sample`."""
         shortest, longest = self.hold
         shape = (count, len(self.low), 1 + self.steps // shortest)
         ends = rng.integers(shortest, longest, size=shape, endpoint=True).cumsum(axis=2)
@@ -256,7 +256,7 @@ class MultisineSampler:
     def sample(
         self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
     ) -> NDArray:
-        """Draw commands (count, steps, d_u), float32; `timing` is ignored."""
+        """Draw commands, float32, without use of `timing`; see `CommandSampler.sample`."""
         number = np.arange(1, self.fast + 1)
         amplitude = np.where(number <= self.slow, 1.0, self.weak)
         amplitude = amplitude * np.sqrt(2 / np.sum(amplitude**2))
@@ -320,7 +320,7 @@ class RecordedSampler:
     def sample(
         self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
     ) -> NDArray:
-        """Draw commands (count, steps, d_u), float32; `timing` is ignored."""
+        """Draw commands, float32, without use of `timing`; see `CommandSampler.sample`."""
         records, samples, _ = self.commands.shape
         row = rng.integers(records, size=(count, 1))
         begin = rng.integers(samples - self.steps, size=(count, 1), endpoint=True)
@@ -342,6 +342,7 @@ def _checked_limits(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[ND
 
 
 def _check_steps(steps: int) -> None:
+    """Refuse fewer than two samples."""
     require(
         steps >= 2, "steps", expected="at least two samples", got=repr(steps), remedy="give more"
     )

@@ -97,6 +97,7 @@ def animate(
 
 
 def _check(fps: float, size: tuple[int, int], renderer: str) -> None:
+    """Refuse settings out of range."""
     finite("fps", fps, least=1, most=100, unit="frames per second", remedy="25 is common")
     # Video codecs halve the resolution of colour.
     require(

@@ -68,6 +68,7 @@ def _write(draw: ImageDraw, size: tuple[int, int], shots: Shots, second: float) 
 
 
 def _font(size: float, *, bold: bool = False) -> FreeTypeFont:
+    """The font of the captions, which matplotlib brings along."""
     import matplotlib
     from PIL.ImageFont import truetype
 

@@ -81,6 +81,7 @@ def write_film(
 
 
 def _write_gif(pictures: Iterable[NDArray], path: Path, fps: float) -> None:
+    """Encode a GIF, for which all frames are in memory."""
     from PIL import Image
 
     frames = [Image.fromarray(picture) for picture in pictures]
@@ -97,6 +98,7 @@ def _write_gif(pictures: Iterable[NDArray], path: Path, fps: float) -> None:
 
 
 def _write_mp4(pictures: Iterable[NDArray], path: Path, fps: float, size: tuple[int, int]) -> None:
+    """Encode an MP4 by ffmpeg, frame by frame."""
     from imageio_ffmpeg import write_frames
 
     film = write_frames(

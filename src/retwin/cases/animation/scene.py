@@ -148,6 +148,7 @@ def _backends() -> tuple[str, ...]:
 
 
 def _nothing_draws(reasons: Sequence[str]) -> InputError:
+    """The error for a machine on which no backend works."""
     return InputError(
         "renderer",
         expected="OpenGL that draws without a screen",
@@ -170,6 +171,7 @@ def _model(body: Body) -> str:
 
 
 def _check_opengl() -> None:
+    """Refuse to draw without the package that draws."""
     require(
         importlib.util.find_spec("OpenGL") is not None,
         "renderer",

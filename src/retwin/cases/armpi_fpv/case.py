@@ -87,7 +87,21 @@ class ArmSampler:
 
 
 def recover(trajectories: Trajectories, progress: Progress | None = None) -> Trajectories:
-    """Recover commands from the desired path (`nominal`); warns of ambiguous movements."""
+    """Recover commands from the desired path; a warning names ambiguous trajectories.
+
+    Parameters
+    ----------
+    trajectories : Trajectories
+        Trajectories whose `nominal` is the desired end-effector path in m.
+    progress : callable, optional
+        Called with the finished fraction.
+
+    Returns
+    -------
+    Trajectories
+        The same with commands.
+
+    """
     found = recover_commands(trajectories.nominal, arm=ARM, progress=progress)
     ambiguous = np.any(found.ambiguous, axis=1)
     if ambiguous.any():
@@ -118,6 +132,21 @@ def encoder_noise(trajectories: Trajectories, units: float, seed: int) -> Trajec
 
     The encoder of a held motor varies by -1, 0 or 1 times `units` from sample to sample of the
     sensor. The outputs change by the arm's Jacobian at the commanded pose with the motor held.
+
+    Parameters
+    ----------
+    trajectories : Trajectories
+        Trajectories of the arm; those of other classes stay unchanged.
+    units : float
+        Amplitude of the noise in command units.
+    seed : int
+        Seed of the noise.
+
+    Returns
+    -------
+    Trajectories
+        The same with other outputs.
+
     """
     rng = np.random.default_rng(seed)
     observed = trajectories.observed.copy()
@@ -134,7 +163,14 @@ def encoder_noise(trajectories: Trajectories, units: float, seed: int) -> Trajec
 
 
 def armpi() -> Case:
-    """The case of the paper."""
+    """The case of the paper.
+
+    Returns
+    -------
+    Case
+        The case `armpi`.
+
+    """
     return Case(
         name="armpi",
         title="ArmPi FPV robot arm",

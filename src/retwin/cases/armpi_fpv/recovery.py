@@ -144,6 +144,7 @@ def recover_commands(
 
 
 def _check(path: NDArray, arm: YawPitchArm) -> None:
+    """Refuse other shapes, values that are not finite, and other arms."""
     require(
         path.ndim == 3 and path.shape[2] == 3 and path.shape[1] >= 2,
         "path",

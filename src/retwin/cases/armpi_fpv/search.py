@@ -104,6 +104,7 @@ def free_chain(plane: Plane, effort: int = 1) -> Solution:
 
 
 def _join(one: _Guesses, two: _Guesses) -> _Guesses:
+    """The explanations of both."""
     return _Guesses(np.concatenate([one.path, two.path]), one.found.join(two.found))
 
 
