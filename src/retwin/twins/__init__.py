@@ -61,7 +61,7 @@ def get(
     -----
     | name | twin |
     |---|---|
-    | `armpi`, `armpi-kinematic`, … | an entry of `retwin.catalog.TWINS` |
+    | a name without `:` or suffix | an entry of `retwin.catalog.TWINS` |
     | `package.module:object` | a twin, or a callable without arguments that returns a twin |
     | `package.module:function` | a function from commands (n, T, d_u) to outputs (n, T, d_y) |
     | `*.fmu` | an FMU for co-simulation |
