@@ -142,11 +142,12 @@ if TYPE_CHECKING:
     from retwin.twins.faults import ActuatorBias, Fault, Stuck
     from retwin.twins.fmu import FMUTwin
     from retwin.twins.function import FunctionTwin
+    from retwin.twins.limits import Limits
     from retwin.twins.mujoco import MuJoCoTwin
     from retwin.twins.noisy import NoisyTwin
     from retwin.twins.parametric import Parameter, ParametricTwin
     from retwin.twins.randomised import RandomisedTwin
-    from retwin.twins.twin import Limits, SimulationError, Twin
+    from retwin.twins.twin import SimulationError, Twin
     from retwin.update.corrected import CorrectedTwin, generate
     from retwin.update.corrections import (
         Additive,

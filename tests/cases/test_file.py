@@ -218,7 +218,7 @@ density = { kind = "SequenceMixture", members = 3, network = { kind = "LSTM", hi
     ("keys", "wanted"),
     [
         ('kind = "MultisineSampler"\nmean = [0.1, 1]', {"steps": 1000, "mean": (0.1, 1.0)}),
-        ("low = [0, 1]\nhigh = [1, 2]\nmovements = 3", {"low": (0.0, 1.0), "movements": 3}),
+        ("low = [0, 1]\nhigh = [1, 2]\nmovements = 3", {"low": (0.0, 1.0), "segments": 3}),
     ],
 )
 def test_commands_are_drawn_as_described(

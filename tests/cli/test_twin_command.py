@@ -166,7 +166,7 @@ def test_a_module_in_the_current_folder(mine: str, tmp_path: Path) -> None:
         ("has no attribute 'none'", "my_twins:none"),
         ("got a int", "my_twins:other"),
         ("got Empty module name", ":twin"),
-        ("inputs, outputs and rate, which a function does not tell", "my_twins:double"),
+        ("inputs, outputs and rate, which a function does not have", "my_twins:double"),
         ("no file of that name", "none.fmu"),
         ("no file of that name", "none.xml"),
     ],

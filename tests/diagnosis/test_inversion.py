@@ -26,7 +26,7 @@ from retwin.update.corrections.command_problem import Problem
 
 CHAIN = rt.Chain(rt.CommandSpace(), rt.SampledSensor())
 MAP = np.array([[1.0, 0.5], [-0.3, 0.8], [0.2, -1.0]])
-SAMPLER = RampSampler((-1.0, -1.0), (1.0, 1.0), movements=4, steps=400, ramps=(30, 40))
+SAMPLER = RampSampler((-1.0, -1.0), (1.0, 1.0), segments=4, steps=400, ramps=(30, 40))
 
 
 class Linear:

@@ -103,7 +103,7 @@ class Toy:
     def sampler(self) -> RampSampler:
         ramps = (self.steps // (4 * self.movements), self.steps // (3 * self.movements))
         limits = (-1.0,) * self.inputs, (1.0,) * self.inputs
-        return RampSampler(*limits, movements=self.movements, steps=self.steps, ramps=ramps)
+        return RampSampler(*limits, segments=self.movements, steps=self.steps, ramps=ramps)
 
     def commands(self, count: int, seed: int) -> NDArray:
         onset = np.linspace(0, self.steps, self.movements, endpoint=False)[None] + 2.0

@@ -24,6 +24,7 @@ from retwin.nets.networks import Network
 from retwin.nets.training import Training
 from retwin.serialisation.configs import at, checked, fits, from_config, from_settings, key
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
+from retwin.twins.limits import Limits
 from retwin.twins.parametric import Parameter
 from retwin.twins.samplers import (
     CommandSampler,
@@ -32,7 +33,7 @@ from retwin.twins.samplers import (
     RampSampler,
     RecordedSampler,
 )
-from retwin.twins.twin import Limits, Twin
+from retwin.twins.twin import Twin
 from retwin.update.corrections import OPERATORS, Correction, DelayOffset
 from retwin.update.residual import Density, Mixture, SequenceMixture
 

@@ -19,9 +19,10 @@ from retwin.errors import InputError
 from retwin.serialisation.configs import at, checked, from_settings, key
 from retwin.twins.fmu import FMUTwin
 from retwin.twins.function import FunctionTwin
+from retwin.twins.limits import Limits
 from retwin.twins.mujoco import MuJoCoTwin, Servo
 from retwin.twins.parametric import Parameter, ParametricTwin
-from retwin.twins.twin import Limits, Twin
+from retwin.twins.twin import Twin
 
 __all__ = ["imported", "parametric_twin", "read_twin"]
 

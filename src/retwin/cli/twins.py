@@ -24,7 +24,8 @@ from retwin.errors import InputError
 if TYPE_CHECKING:
     from retwin.cases.case import Case
     from retwin.data.trajectories import Channels
-    from retwin.twins.twin import Limits, Twin
+    from retwin.twins.limits import Limits
+    from retwin.twins.twin import Twin
 
 __all__ = ["app"]
 

@@ -28,6 +28,7 @@ T = TypeVar("T")
 RENAMED_KINDS = {"SteadyStateError": "ActuatorBias"}
 """Kinds in files of versions before 0.1.0, and their present names."""
 RENAMED_SETTINGS = {
+    "RampSampler": {"movements": "segments"},
     "Training": {"epochs": "max_epochs", "batch": "batch_size", "rate": "learning_rate"},
 }
 """Per kind, settings in files of versions before 0.1.0, and their present names."""

@@ -18,7 +18,8 @@ from __future__ import annotations
 
 from retwin.testing.corrections import CORRECTION_CHECKS, CorrectionSubject, check_correction
 from retwin.testing.diagnosers import DIAGNOSER_CHECKS, DiagnoserSubject, check_diagnoser
-from retwin.testing.twins import TWIN_CHECKS, TwinSubject, check_twin
+from retwin.testing.twin_subject import TwinSubject
+from retwin.testing.twins import TWIN_CHECKS, check_twin
 
 __all__ = [
     "CORRECTION_CHECKS",

@@ -130,7 +130,9 @@ def test_the_same_noise_gives_the_same_outputs(
     faults = [case.faults["Motor_2_Stuck"], None] * 50
     noise = noise_of_torch(exportable, 100, portable.facts.max_segments, commands.shape[1], seed=9)
     monkeypatch.setattr(Portable, "_noise", lambda *_: noise)
-    made, other = (twin.simulate(commands, faults=faults, seed=9) for twin in (portable, exportable))
+    made, other = (
+        twin.simulate(commands, faults=faults, seed=9) for twin in (portable, exportable)
+    )
     assert made.labels.tolist() == other.labels.tolist()
     assert made.emulated
     np.testing.assert_allclose(made.nominal, other.nominal, atol=1e-6)

@@ -46,7 +46,7 @@ CASE = rt.Case(
         level, rt.Channels.numbered("u", 4, "%"), rt.Channels.numbered("y", 1, "m"), RATE
     ),
     emulator=None,
-    sampler=RampSampler((0.0,) * 4, (100.0,) * 4, movements=3, steps=STEPS, ramps=(800, 1600)),
+    sampler=RampSampler((0.0,) * 4, (100.0,) * 4, segments=3, steps=STEPS, ramps=(800, 1600)),
     correction=Additive(),
     output_correction=Additive(),
     sensor_rate=10.0,

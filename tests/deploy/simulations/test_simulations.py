@@ -33,7 +33,7 @@ from retwin.twins.samplers import RampSampler
 from retwin.twins.twin import Chunk, SimulationError, simulate_in_chunks
 
 FAULTS = {"Healthy": None, "Stuck": rt.Stuck(0, 3), "Biased": rt.ActuatorBias(1)}
-SAMPLER = RampSampler((0.0, 0.0), (100.0, 100.0), movements=2, steps=30, ramps=(3, 5))
+SAMPLER = RampSampler((0.0, 0.0), (100.0, 100.0), segments=2, steps=30, ramps=(3, 5))
 
 
 VOLTAGES = rt.Channels(("a", "b"), ("V", "V"))
@@ -439,7 +439,7 @@ def test_a_newer_schema_is_refused(tmp_path: Path) -> None:
         ("another chunk", {"chunk": 9}),
         ("another n", {"n": 96}),
         ("another twin", {"twin": Toy(fails_above=1e3)}),
-        ("another commands", {"commands": replace(SAMPLER, movements=1)}),
+        ("another commands", {"commands": replace(SAMPLER, segments=1)}),
         ("another faults", {"faults": dict(reversed(FAULTS.items()))}),
         ("another clip, dtype", {"clip": True, "dtype": "float64"}),
     ],

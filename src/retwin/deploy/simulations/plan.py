@@ -21,7 +21,8 @@ from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError, place_of
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
-from retwin.twins.twin import Limits, SimulationError, Twin, checked_commands
+from retwin.twins.limits import Limits
+from retwin.twins.twin import SimulationError, Twin, checked_commands
 
 if TYPE_CHECKING:  # a worker that simulates without torch need not load it
     from retwin.twins.samplers import CommandSampler

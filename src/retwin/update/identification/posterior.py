@@ -15,12 +15,12 @@ from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
-from retwin.twins.around import Around, generator_of
 from retwin.twins.faults import Fault
-from retwin.twins.noisy import interpolate_samples, readings
+from retwin.twins.noisy import interpolate_samples, sensor_sample_count
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.randomised import simulate_with_parameters
 from retwin.twins.twin import Chunk, simulate_in_chunks
+from retwin.twins.wrapper import TwinWrapper, chunk_generator
 from retwin.update.identification.noise import Noise
 
 __all__ = ["Posterior", "PosteriorTwin"]
@@ -30,7 +30,7 @@ KIND = "posterior"
 
 
 @dataclass(frozen=True, eq=False)
-class PosteriorTwin(Around):
+class PosteriorTwin(TwinWrapper):
     """A twin with parameters, noise and discrepancy drawn from the posterior per trajectory.
 
     Parameters
@@ -72,7 +72,7 @@ class PosteriorTwin(Around):
         """See `Twin.simulate`; the output error is added last, to faulty trajectories too."""
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            rng = generator_of(seed, chunk, 2)
+            rng = chunk_generator(seed, chunk, 2)
             drawn = rng.integers(len(self.samples), size=len(chunk.commands))
             ideal, observed = simulate_with_parameters(
                 self.twin, chunk, self.samples[drawn], seed=seed
@@ -85,7 +85,7 @@ class PosteriorTwin(Around):
 
     def _error(self, rng: np.random.Generator, logs: NDArray, steps: int) -> NDArray:
         """Errors (n, steps, d_y) in output units, drawn at the sensor's rate and interpolated."""
-        count = readings(steps, self.stride)
+        count = sensor_sample_count(steps, self.stride)
         read = self.noise.draw(rng, logs, count, len(self.outputs), self.stride / self.rate)
         return self.unit * interpolate_samples(read, self.stride, steps)
 
