@@ -87,11 +87,12 @@ class NPE:
         seen = problem.misfit.seen
         for done in range(self.rounds):
             count = self.simulations if done else max(self.simulations - len(points), 0)
-            fresh = box[0] + (box[1] - box[0]) * rng.random((count, problem.size))
-            made = problem.paths(fresh)
-            good = np.isfinite(made).all(axis=(1, 2, 3))
-            points = np.concatenate([points, fresh[good]])
-            paths = np.concatenate([paths, made[good]])
+            if count:
+                fresh = box[0] + (box[1] - box[0]) * rng.random((count, problem.size))
+                made = problem.paths(fresh)
+                good = np.isfinite(made).all(axis=(1, 2, 3))
+                points = np.concatenate([points, fresh[good]])
+                paths = np.concatenate([paths, made[good]])
             inside = np.all((points >= box[0]) & (points <= box[1]), axis=1)
             points, paths = points[inside], paths[inside]
             summaries = Summaries.of(paths)
