@@ -54,11 +54,17 @@ Named = Mapping[str, Any] | Sequence[str]
 
 
 def imported(name: Any, folder: Path, place: str) -> Any:
-    """What `module:object` names.
+    """The object that `module:object` names.
 
-    Modules in `folder` can be imported from then on, here and in worker processes, after all that
-    is installed. Raises InputError where there is none, and where `folder` has a module of that
-    name but another one was found.
+    From then on, modules in `folder` can be imported here and in worker processes, after all that
+    is installed.
+
+    Raises
+    ------
+    InputError
+        There is none, or `folder` has a module of that name but another one was found. The message
+        names `place`.
+
     """
     module, _, attribute = str(name).partition(":")
     expected = "module:object, the module installed or beside the case"
@@ -102,6 +108,13 @@ def read_twin(
     | `module:function` | inputs and outputs as tables, with units and limits; rate |
     | `module:object`, or a built-in one | nothing, since it has its own |
     | `*.fmu`, `*.xml`, `*.urdf` | names of inputs and outputs, by default all; rate |
+
+    Raises
+    ------
+    InputError
+        There is no such twin, or it does not take these settings. The message names `place` and the
+        key.
+
     """
     own = key(place, "twin")
     options = dict(twin) if isinstance(twin, Mapping) else {"name": twin}
