@@ -1,23 +1,41 @@
-# make install | demo | test | lint | docs | bench
+# make install | demo | test | test-all | test-long | coverage | lint | docs | bench | package
 PYTHON ?= python3
 BIN := .venv/bin
+EXTRAS := bayes,docs,fetch,flows,fmu,onnx,render,rocket,scale,dev
+# One torch thread per test process: more threads than cores cost several times the time.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n 2
 
-.PHONY: install demo test lint docs bench clean
+.PHONY: install demo test test-all test-long coverage lint docs bench package clean
 
 install: .venv/installed
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[bayes,docs,flows,fmu,onnx,render,rocket,scale,dev]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[$(EXTRAS)]"
 	touch $@
 
 # The main job: on the real robot if RETWIN_DATA is set, else on an emulated one.
 demo: install
 	$(BIN)/retwin demo
 
-# A worker per core, one torch thread each: more threads than cores cost several times the time.
+# The fast tier: every room, in minutes.
 test: install
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2
+	$(PYTEST) -m "not slow and not long"
+
+# What `make test` leaves out: whole studies, fits, documentation, browser and long chains.
+test-all: install
+	$(PYTEST) -m "slow and not long"
+
+# Before a release: thousands of mutated files, hundreds of kills, the arithmetic of other
+# processors, and one and two threads.
+test-long: install
+	$(PYTEST) -m long
+	ATEN_CPU_CAPABILITY=default OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "numerical and not long"
+	ATEN_CPU_CAPABILITY=avx2 OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "numerical and not long"
+	OMP_NUM_THREADS=2 $(BIN)/pytest -n 1 -m "numerical and not long"
+
+coverage: install
+	$(PYTEST) -m "not slow and not long" --cov=retwin --cov-report=term:skip-covered --cov-report=html
 
 lint: install
 	$(BIN)/ruff check .
@@ -30,19 +48,19 @@ docs: install
 
 bench: install
 	$(BIN)/retwin bench
-	$(BIN)/python benchmarks/generation.py
-	$(BIN)/python benchmarks/training.py
-	$(BIN)/python benchmarks/fitting.py
-	$(BIN)/python benchmarks/command_space.py
-	$(BIN)/python benchmarks/bands.py
-	$(BIN)/python benchmarks/inversion.py
-	$(BIN)/python benchmarks/updating.py
-	$(BIN)/python benchmarks/residual.py
-	$(BIN)/python benchmarks/importing.py
-	$(BIN)/python benchmarks/twins.py
-	$(BIN)/python benchmarks/fmu.py
-	$(BIN)/python benchmarks/scale.py
-	$(BIN)/python benchmarks/bundle.py
+	for name in generation training fitting command_space bands inversion updating residual \
+		importing twins fmu scale bundle; do $(BIN)/python benchmarks/$$name.py || exit 1; done
+
+# Wheel and source distribution in dist/; the wheel is tried in an empty environment.
+package: install
+	rm -rf dist .package
+	$(BIN)/python -m build --outdir dist
+	$(PYTHON) -m venv .package
+	.package/bin/pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl
+	cd dist && ../.package/bin/retwin doctor && ../.package/bin/retwin twin list
+	.package/bin/pip install --quiet --disable-pip-version-check -c constraints.txt \
+		"$$(echo dist/*.whl)[$(EXTRAS)]"
+	OMP_NUM_THREADS=1 .package/bin/python -m pytest -n 2 -m "not slow and not long" -p no:cacheprovider
 
 clean:
-	rm -rf .venv demo
+	rm -rf .venv .package demo dist site

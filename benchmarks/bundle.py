@@ -70,8 +70,8 @@ def transposed(columns: dict[str, dict[str, float]]) -> dict[str, dict[str, floa
 
 def flags(ibg: rt.Surrogate, judged: list[tuple[Guard, rt.Trajectories]]) -> dict[str, float]:
     """False flags on test parts, and AUROC and flags of what they are spoilt to."""
-    good = [guard.judge(ibg, test) for guard, test in judged]
-    usual = np.concatenate([each.suspicion for each in good])
+    good = [guard.assess(ibg, test) for guard, test in judged]
+    usual = np.concatenate([each.max_score for each in good])
     rows = {
         "trajectories": float(len(usual)),
         "false flags": float((usual > 1).mean()),
@@ -80,10 +80,10 @@ def flags(ibg: rt.Surrogate, judged: list[tuple[Guard, rt.Trajectories]]) -> dic
     for name, spoil in KINDS.items():
         rng = np.random.default_rng(0)
         odd = [
-            guard.judge(ibg, test.replace(observed=spoil(test, rng).astype(np.float32)))
+            guard.assess(ibg, test.replace(observed=spoil(test, rng).astype(np.float32)))
             for guard, test in judged
         ]
-        scores = np.concatenate([each.suspicion for each in odd])
+        scores = np.concatenate([each.max_score for each in odd])
         truth = np.repeat([0, 1], [len(usual), len(scores)])
         rows[f"AUROC, {name}"] = float(roc_auc_score(truth, np.concatenate([usual, scores])))
         rows[f"flagged, {name}"] = float((scores > 1).mean())

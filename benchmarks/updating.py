@@ -81,8 +81,7 @@ def main(folds: int) -> None:
     if not folder:
         print("updating: set RETWIN_DATA to the folder of the public data")
         return
-    import lightning  # noqa: F401 - importing is no part of updating
-    import sbi.neural_nets  # noqa: F401
+    import sbi.neural_nets  # noqa: F401 - importing is no part of updating
 
     case = rt.cases.armpi()
     real = rt.load(Path(folder) / "armpi" / "real_a.mat", case=case).with_label("Healthy")

@@ -10,6 +10,7 @@ import torch
 
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC
+from retwin.nets.mixtures import FLOOR
 from retwin.nets.training import Training
 
 
@@ -58,12 +59,13 @@ def updated(ibg: rt.Surrogate, rg: rt.ResidualModel) -> rt.CorrectedTwin:
     return rt.CorrectedTwin(ibg, rg, case="armpi")
 
 
-class ExactArm:
+class ExactArm(torch.nn.Module):
     """The arm's kinematics as a differentiable twin: a surrogate without any error."""
 
     memoryless = True
+    inputs, outputs, rate = KINEMATIC.inputs, KINEMATIC.outputs, KINEMATIC.rate
 
-    def __call__(self, commands: torch.Tensor) -> torch.Tensor:
+    def forward(self, commands: torch.Tensor) -> torch.Tensor:
         angles = (commands - KINEMATIC.centre) * KINEMATIC.scale
         pitch = angles[..., 1:].cumsum(dim=-1)
         links = torch.tensor(KINEMATIC.arm.links, dtype=commands.dtype)
@@ -80,3 +82,24 @@ class ExactArm:
 @pytest.fixture(scope="session")
 def exact() -> ExactArm:
     return ExactArm()
+
+
+@pytest.fixture(scope="session")
+def exact_updated(exact: ExactArm) -> rt.CorrectedTwin:
+    """A corrected twin of which nothing is trained, so that it is the same on any machine.
+
+    One component: a delay of 5 ± 0.5 samples, and offsets of 2 ± 3 mm.
+    """
+    density = rt.Mixture(components=1, hidden=(4,))
+    rg = rt.ResidualModel(rt.DelayOffset(), density, inputs=exact.inputs, outputs=exact.outputs)
+    with torch.no_grad():
+        for head, part in rg.parts():
+            head.linear.weight.zero_()
+            head.linear.bias.zero_()
+            width = part.stop - part.start
+            diagonal = [1 + width + i * (i + 1) // 2 + i for i in range(width)]
+            head.linear.bias[diagonal] = float(np.log(np.expm1(1 - FLOOR)))
+        rg.shift.copy_(torch.tensor([5.0, 2e-3, 2e-3, 2e-3]))
+        rg.scale.copy_(torch.tensor([0.5, 3e-3, 3e-3, 3e-3]))
+        rg.bounds.copy_(10 * (rg.shift + rg.scale))
+    return rt.CorrectedTwin(exact, rg.eval())

@@ -95,7 +95,7 @@ fmi3Status fmi3DoStep(fmi3Instance p, fmi3Float64 t, fmi3Float64 h, fmi3Boolean 
     if (s->trouble == 1) for (;;) pause();
     if (s->trouble == 2) raise(SIGSEGV);
     if (s->trouble == 3) {
-        s->log(NULL, fmi3Error, "status", "trouble was asked for");
+        s->log(NULL, fmi3Error, "status", "trouble was requested");
         return fmi3Error;
     }
     if (s->trouble == 4) s->x = NAN;
@@ -148,16 +148,16 @@ class PyLag(Fmi2Slave):
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
         self.u, self.gain, self.x, self.level, self.on, self.sum = 0.0, 1.0, 0.0, 0, True, 0
-        read, told = Fmi2Causality.output, Fmi2Causality.input
+        output, command = Fmi2Causality.output, Fmi2Causality.input
         fixed = {"causality": Fmi2Causality.parameter, "variability": Fmi2Variability.tunable}
-        held = {"causality": told, "variability": Fmi2Variability.discrete}
-        self.register_variable(Real("u", causality=told, start=0.0))
+        held = {"causality": command, "variability": Fmi2Variability.discrete}
+        self.register_variable(Real("u", causality=command, start=0.0))
         self.register_variable(Real("gain", start=1.0, **fixed))
         self.register_variable(Integer("level", start=0, **held))
         self.register_variable(Boolean("on", start=True, **held))
-        self.register_variable(Real("x", causality=read))
+        self.register_variable(Real("x", causality=output))
         self.register_variable(
-            Integer("sum", causality=read, variability=Fmi2Variability.discrete)
+            Integer("sum", causality=output, variability=Fmi2Variability.discrete)
         )
 
     def do_step(self, current_time, step_size):
@@ -174,7 +174,7 @@ def c_fmu(folder: Path, *, reset: int = 0, load: int = 0, name: str = "Lag") -> 
     Parameters
     ----------
     folder: where to.
-    reset: 0 works, 1 gives an error, 2 says that it worked but leaves everything as it was.
+    reset: 0 works, 1 gives an error, 2 reports success but changes nothing.
     load: 0 works, 1 gives no instance, 2 crashes.
     name: of the file.
 
@@ -220,7 +220,7 @@ def changed(path: Path, name: str, edit: Callable[[str, bytes], tuple[str, bytes
 
 
 def described(path: Path, name: str, old: str, new: str) -> Path:
-    """A copy of an FMU whose description says `new` instead of `old`."""
+    """A copy of an FMU whose description has `new` instead of `old`."""
 
     def edit(member: str, content: bytes) -> tuple[str, bytes]:
         if member == "modelDescription.xml":

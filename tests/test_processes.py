@@ -1,4 +1,4 @@
-"""Worker processes: they come and go without a word."""
+"""Worker processes: they begin and end without output."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if __name__ == "__main__":
 
 
 def test_a_pool_may_end_while_its_workers_still_start(tmp_path: Path) -> None:
-    """The one that is deaf holds up the end, and the others look for locks that might be gone."""
+    """A worker that ignores SIGTERM delays the end while others open locks that might be gone."""
     (tmp_path / "main.py").write_text(SCRIPT)
-    told = subprocess.run([sys.executable, tmp_path / "main.py"], capture_output=True, text=True)
-    assert (told.stdout, told.stderr) == ("done\n", "")
+    result = subprocess.run([sys.executable, tmp_path / "main.py"], capture_output=True, text=True)
+    assert (result.stdout, result.stderr) == ("done\n", "")

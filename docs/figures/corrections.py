@@ -273,7 +273,7 @@ def severity(robot: Robot, healthy: rt.Discrepancy) -> Figure:
     """A motor with a bias, its label told: how severe it is; and what is left for the RG."""
     rng = np.random.default_rng(21)
     motors = np.repeat(np.arange(4), 8)
-    shape = (len(motors), robot.segments.most)
+    shape = (len(motors), robot.segments.max_count)
     bias = rng.uniform(10, 50, size=shape) * rng.choice([-1, 1], size=shape)
     commands = robot.case.sampler.sample(len(motors), rng=rng)
     faults = [rt.ActuatorBias(j, bias=tuple(b)) for j, b in zip(motors, bias, strict=True)]

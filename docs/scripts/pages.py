@@ -24,7 +24,7 @@ OUTSIDE = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
     "examples/two_tanks": "two_tanks.md",
-    "tests/contracts/crane.xml": "crane.xml",
+    "tests/testing/crane.xml": "crane.xml",
 }
 """Files and folders outside of docs/ that the site has too, and their names there."""
 ABOUT_COMMANDS = """
@@ -35,11 +35,13 @@ goes on. `retwin --install-completion` lets bash, zsh, fish or PowerShell comple
 and names: cases, twins, sources, faults, classifiers. Exit codes: 0 done, 1 failed, 2 bad input,
 130 interrupted.
 """
+IMPORT = re.compile(r"^from retwin\.([\w.]+) import (\([^)]*\)|[^\n(]*)", re.M)
+"""An import on a page: the module below `retwin`, and what is imported from it."""
 LANGUAGES = {".py": "python", ".toml": "toml"}
 
 
 def on_config(config: MkDocsConfig) -> None:
-    """A page per module joins the overview of the API."""
+    """A page per room joins the overview of the API."""
     (reference,) = (part["Reference"] for part in config.nav if "Reference" in part)
     (api,) = (part["API"] for part in reference if isinstance(part, dict))
     api += [{module: f"api/{module}.md"} for module in modules()]
@@ -98,71 +100,67 @@ def _say_whole_lines(command: Any) -> None:
 
 
 def modules() -> dict[str, list[str]]:
-    """What the reference tells of: module to public names, in the order of the floors.
+    """Room to the dotted names of its public objects, rooms in the order of the architecture page.
 
-    Modules are those that `retwin` takes its names from, and those that a page imports from.
+    An object is public if `retwin` has it, or if a page of the documentation imports it.
     """
-    used = {home.split(".")[0] for home in retwin._HOME.values()} | set(retwin._MODULES)
+    names = {f"{home}.{name}" for name, home in retwin._HOME.items()}
     for page in (ROOT / "docs").glob("*.md"):
-        used |= set(re.findall(r"^from retwin\.(\w+)", page.read_text("utf-8"), re.M))
+        for home, imported in IMPORT.findall(page.read_text("utf-8")):
+            names |= {f"{home}.{name.strip(' ()')}" for name in imported.split(",")}
+    for room in retwin._MODULES:
+        names |= {f"{room}.{name}" for name in getattr(_module(room), "__all__", ())}
     drawn = (ROOT / "docs" / "architecture.md").read_text("utf-8")
-    floors = re.findall(r"^  (\w+)(?:\.py|/) ", drawn, re.M)
-    found = {}
-    for module in sorted(used, key=floors.index):
-        top = {name for name, home in retwin._HOME.items() if home.split(".")[0] == module}
-        own = set(getattr(_module(module), "__all__", []))
-        found[module] = sorted(top) + sorted(own - top)
-    return found
+    rooms = re.findall(r"^  (\w+)(?:\.py|/) ", drawn, re.M)
+    objects: dict[str, dict[str, str]] = {room: {} for room in rooms}
+    for name in sorted(names):
+        room = name.split(".")[0]
+        objects[room].setdefault(_path(name), name)
+    return {room: list(found.values()) for room, found in objects.items() if found}
 
 
 def overview() -> str:
     """Every public name with its first line."""
     lines = ["# API reference", "", "Generated from the docstrings.", ""]
-    for module, names in modules().items():
-        lines += [f"## [retwin.{module}](api/{module}.md)", "", *_first(_module(module)), ""]
+    for room, names in modules().items():
+        lines += [f"## [retwin.{room}](api/{room}.md)", "", *_first(_module(room)), ""]
         lines += ["| name | is |", "|---|---|"]
         for name in names:
-            (text,) = _first(_found(module, name)) or ("",)
-            lines.append(
-                f"| [`{_shown(name, module)}`](api/{module}.md#{_path(module, name)}) | {text} |"
-            )
+            (text,) = _first(_found(name)) or ("",)
+            lines.append(f"| [`{_shown(name)}`](api/{room}.md#{_path(name)}) | {text} |")
         lines.append("")
     return "\n".join(lines)
 
 
-def reference(module: str) -> str:
-    """The page of one module."""
-    lines = [f"# retwin.{module}", "", *_first(_module(module)), ""]
-    for name in modules()[module]:
-        lines += [
-            f"::: {_path(module, name)}",
-            "    options:",
-            f"      heading: {_shown(name, module)}",
-            "",
-        ]
+def reference(room: str) -> str:
+    """The page of one room."""
+    lines = [f"# retwin.{room}", "", *_first(_module(room)), ""]
+    for name in modules()[room]:
+        lines += [f"::: {_path(name)}", "    options:", f"      heading: {_shown(name)}", ""]
     return "\n".join(lines)
 
 
-def _shown(name: str, module: str) -> str:
-    """How a user writes it."""
-    return f"retwin.{name}" if name in retwin._HOME else f"retwin.{module}.{name}"
+def _shown(name: str) -> str:
+    """How a user writes a dotted name."""
+    last = name.rpartition(".")[2]
+    return f"retwin.{last if last in retwin._HOME else name}"
 
 
-def _path(module: str, name: str) -> str:
-    """Where it is defined."""
-    found = _found(module, name)
+def _path(name: str) -> str:
+    """Where an object is defined."""
+    found = _found(name)
     if inspect.isclass(found) or inspect.isfunction(found):
         return f"{found.__module__}.{found.__qualname__}"
-    return f"retwin.{module}.{name}"
+    return f"retwin.{name}"
 
 
-def _found(module: str, name: str) -> Any:
-    home: Any = retwin if name in retwin._HOME else _module(module)
-    return getattr(home, name)
+def _found(name: str) -> Any:
+    home, _, last = name.rpartition(".")
+    return getattr(_module(home), last)
 
 
-def _module(module: str) -> Any:
-    return importlib.import_module(f"retwin.{module}")
+def _module(name: str) -> Any:
+    return importlib.import_module(f"retwin.{name}")
 
 
 def _first(documented: Any) -> list[str]:

@@ -24,12 +24,14 @@ _HOME = {
     "Context": "update.corrections",
     "CorrectedTwin": "update.corrected",
     "Correction": "update.corrections",
+    "DANN": "diagnosis",
     "DelayOffset": "update.corrections",
     "Diagnoser": "diagnosis",
     "Discrepancy": "update.corrections",
     "FMUTwin": "twins.fmu",
     "Fault": "twins.faults",
     "Fidelity": "evaluation.fidelity",
+    "FineTune": "diagnosis",
     "Flow": "update.residual",
     "FunctionTwin": "twins.function",
     "InputError": "errors",
@@ -49,6 +51,7 @@ _HOME = {
     "RandomisedTwin": "twins.randomised",
     "Refinement": "update.residual",
     "ResidualModel": "update.residual",
+    "Rocket": "diagnosis",
     "SampledSensor": "update.corrections",
     "Scores": "scores.classification",
     "Segments": "data.segments",
@@ -69,12 +72,9 @@ _HOME = {
     "animate": "cases.animation",
     "evaluate": "evaluation.evaluate",
     "fetch": "data.download",
-    "fine_tune": "diagnosis",
-    "fit_dann": "diagnosis",
     "fit_diagnoser": "diagnosis",
     "fit_inversion": "diagnosis",
     "fit_residual": "update.residual",
-    "fit_rocket": "diagnosis",
     "fit_surrogate": "update.surrogate",
     "generate": "update.corrected",
     "identify": "update.identification",
@@ -120,15 +120,15 @@ if TYPE_CHECKING:
     from retwin.data.trajectories import Channels, Trajectories
     from retwin.deploy.simulations import SimulationPlan, simulate_to
     from retwin.diagnosis import (
+        DANN,
         Diagnoser,
+        FineTune,
         InversionDiagnoser,
         NetworkDiagnoser,
         PooledDiagnoser,
-        fine_tune,
-        fit_dann,
+        Rocket,
         fit_diagnoser,
         fit_inversion,
-        fit_rocket,
         load_diagnoser,
     )
     from retwin.errors import InputError
@@ -142,11 +142,12 @@ if TYPE_CHECKING:
     from retwin.twins.faults import ActuatorBias, Fault, Stuck
     from retwin.twins.fmu import FMUTwin
     from retwin.twins.function import FunctionTwin
+    from retwin.twins.limits import Limits
     from retwin.twins.mujoco import MuJoCoTwin
     from retwin.twins.noisy import NoisyTwin
     from retwin.twins.parametric import Parameter, ParametricTwin
     from retwin.twins.randomised import RandomisedTwin
-    from retwin.twins.twin import Limits, SimulationError, Twin
+    from retwin.twins.twin import SimulationError, Twin
     from retwin.update.corrected import CorrectedTwin, generate
     from retwin.update.corrections import (
         Additive,

@@ -1,4 +1,4 @@
-"""Arrays: what those of trajectories must be, and how they are gone through without a copy."""
+"""Checks of the arrays of trajectories, block by block and without a copy."""
 
 from __future__ import annotations
 
@@ -7,67 +7,89 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from retwin.checks import require
 from retwin.errors import InputError
 
 __all__ = ["check_finite", "check_shapes", "floating", "measured", "named", "row_blocks"]
 
-BLOCK = 2**22
-"""Bytes of an array that are looked at together."""
+BYTES_PER_BLOCK = 2**22
+"""The size of a block of rows in bytes: it fits the cache of a processor."""
 
 
 def row_blocks(array: NDArray, count: int | None = None) -> Iterator[slice]:
     """Slices of rows, of at most 4 MB each: of all rows of `array`, or of `count` such rows.
 
-    Whoever goes through a set by them needs little memory for it, also where the set is a map of
-    a file that no memory holds.
+    Work in blocks needs little memory, also where the array is a map of a file larger than the
+    memory.
     """
-    rows = max(1, BLOCK * len(array) // max(1, array.nbytes))
+    rows = max(1, BYTES_PER_BLOCK * len(array) // max(1, array.nbytes))
     count = len(array) if count is None else count
     return (slice(begin, begin + rows) for begin in range(0, count, rows))
 
 
 def floating(name: str, array: ArrayLike) -> NDArray:
-    """`array` as floating-point numbers (n, T, d), or an InputError."""
+    """`array` as floating-point numbers (n, T, d).
+
+    Raises
+    ------
+    InputError
+        It holds no real numbers, or has another number of axes.
+
+    """
     array = np.asarray(array)
     if array.dtype.kind in "iub":
         array = array.astype(np.float64)
-    if array.dtype.kind != "f" or array.ndim != 3:
-        raise InputError(
-            name,
-            expected="numbers of shape (trajectories, samples, channels)",
-            got=f"{array.dtype} of shape {array.shape}",
-            remedy="stack the trajectories into one three-dimensional array",
-        )
+    require(
+        array.dtype.kind == "f" and array.ndim == 3,
+        name,
+        expected="numbers of shape (trajectories, samples, channels)",
+        got=f"{array.dtype} of shape {array.shape}",
+        remedy="stack the trajectories into one three-dimensional array",
+    )
     return array
 
 
 def check_shapes(commands: NDArray, nominal: NDArray, observed: NDArray) -> None:
-    """Raise InputError unless they are of as many trajectories, samples and outputs."""
-    if nominal.shape != observed.shape:
-        raise InputError(
-            "observed",
-            expected=f"the shape of nominal, {nominal.shape}",
-            got=str(observed.shape),
-            remedy="give observed and nominal the same channels and samples",
-        )
-    if commands.shape[:2] != nominal.shape[:2]:
-        raise InputError(
-            "commands",
-            expected=f"{nominal.shape[0]} trajectories of {nominal.shape[1]} samples, as nominal",
-            got=str(commands.shape),
-            remedy="sample commands and outputs on the same grid",
-        )
-    if nominal.shape[1] < 2 or nominal.shape[2] < 1:
-        raise InputError(
-            "nominal",
-            expected="at least two samples and one channel",
-            got=str(nominal.shape),
-            remedy="give the outputs over time",
-        )
+    """Check that numbers of trajectories, samples and outputs agree.
+
+    Raises
+    ------
+    InputError
+        They differ, there are fewer than two samples, or there is no output.
+
+    """
+    require(
+        nominal.shape == observed.shape,
+        "observed",
+        expected=f"the shape of nominal, {nominal.shape}",
+        got=observed.shape,
+        remedy="give observed and nominal the same channels and samples",
+    )
+    require(
+        commands.shape[:2] == nominal.shape[:2],
+        "commands",
+        expected=f"{nominal.shape[0]} trajectories of {nominal.shape[1]} samples, as nominal",
+        got=commands.shape,
+        remedy="sample commands and outputs on the same grid",
+    )
+    require(
+        nominal.shape[1] >= 2 and nominal.shape[2] >= 1,
+        "nominal",
+        expected="at least two samples and one channel",
+        got=nominal.shape,
+        remedy="give the outputs over time",
+    )
 
 
 def check_finite(name: str, array: NDArray) -> None:
-    """Raise InputError, which names the place, where a number is NaN or infinite."""
+    """Check that all numbers are finite.
+
+    Raises
+    ------
+    InputError
+        One is NaN or infinite; the message names the first one.
+
+    """
     for rows in row_blocks(array):
         if _is_finite(array[rows]):
             continue
@@ -82,23 +104,40 @@ def check_finite(name: str, array: NDArray) -> None:
 
 
 def measured(observed: NDArray, mask: ArrayLike | None) -> tuple[NDArray, NDArray]:
-    """`observed` with 0 where the mask is False, and the mask, which is False where that was NaN.
+    """Measurements and their mask; arrays that need no change are not copied.
 
-    Without a mask it is True elsewhere. What is so already is not copied.
-    Raises InputError for infinite values, or a mask of another shape.
+    Parameters
+    ----------
+    observed : (n, T, d_y) array
+        Measurements, NaN where one is missing.
+    mask : (n, T, d_y) array of bool, or None
+        False where a measurement is missing; None for True everywhere.
+
+    Returns
+    -------
+    observed : (n, T, d_y) array
+        0 where the mask is False.
+    mask : (n, T, d_y) array of bool
+        False also where `observed` was NaN.
+
+    Raises
+    ------
+    InputError
+        A measurement is infinite, or the mask has another shape.
+
     """
     flags = np.ones(observed.shape, bool) if mask is None else np.asarray(mask, bool)
-    if flags.shape != observed.shape:
-        raise InputError(
-            "mask",
-            expected=f"the shape of observed, {observed.shape}",
-            got=str(flags.shape),
-            remedy="give one flag per measurement",
-        )
-    told = zeroed = True
+    require(
+        flags.shape == observed.shape,
+        "mask",
+        expected=f"the shape of observed, {observed.shape}",
+        got=flags.shape,
+        remedy="give one flag per measurement",
+    )
+    masked = zeroed = True
     for rows in row_blocks(observed):
-        values, there = observed[rows], flags[rows]
-        if there.all() and _is_finite(values):
+        values, present = observed[rows], flags[rows]
+        if present.all() and _is_finite(values):
             continue
         infinite = np.isinf(values)
         if infinite.any():
@@ -109,11 +148,11 @@ def measured(observed: NDArray, mask: ArrayLike | None) -> tuple[NDArray, NDArra
                 remedy="replace infinite measurements by NaN",
             )
         missing = np.isnan(values)
-        told &= not (missing & there).any()
-        hidden = values[~there & ~missing]
-        # A minus zero is another byte.
+        masked &= not (missing & present).any()
+        hidden = values[~present & ~missing]
+        # Minus zero has other bytes than zero.
         zeroed &= not (missing.any() or np.any(hidden != 0) or np.signbit(hidden).any())
-    if not told:
+    if not masked:
         flags = flags & ~np.isnan(observed)
     if not zeroed:
         observed = np.where(flags, observed, observed.dtype.type(0))
@@ -121,25 +160,32 @@ def measured(observed: NDArray, mask: ArrayLike | None) -> tuple[NDArray, NDArra
 
 
 def named(name: str, given: ArrayLike | None, default: list[str]) -> NDArray:
-    """One text (n,) per trajectory, those of `default` where none are given, or an InputError."""
+    """One text (n,) per trajectory, those of `default` if none are given.
+
+    Raises
+    ------
+    InputError
+        There is not one text per trajectory.
+
+    """
     texts = np.asarray(default if given is None else given, dtype=np.str_)
-    if texts.shape != (len(default),):
-        raise InputError(
-            name,
-            expected=f"{len(default)} names, one per trajectory",
-            got=f"shape {texts.shape}",
-            remedy="give one name per trajectory",
-        )
+    require(
+        texts.shape == (len(default),),
+        name,
+        expected=f"{len(default)} names, one per trajectory",
+        got=f"shape {texts.shape}",
+        remedy="give one name per trajectory",
+    )
     return texts
 
 
 def _is_finite(values: NDArray) -> bool:
-    """Whether all are finite for certain: where their sum is, each is, and no flags are needed."""
+    """Whether the sum of all is finite, from which it follows that each is."""
     with np.errstate(over="ignore", invalid="ignore"):
         return bool(np.isfinite(values.sum()))
 
 
 def _first(bad: NDArray, rows: slice) -> str:
-    """The place of the first flag among those of some rows."""
+    """The indices of the first flag in a block of rows."""
     trajectory, sample, channel = np.argwhere(bad)[0]
     return f"trajectory {rows.start + trajectory}, sample {sample}, channel {channel}"

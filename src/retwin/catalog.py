@@ -86,7 +86,7 @@ class CaseEntry:
 
 @dataclass(frozen=True)
 class SourceEntry:
-    """A source of a study: an updated twin, or a rival of one.
+    """A source of training data in a study: an updated twin, or a method compared with it.
 
     Exactly one of `twin`, `diagnoser` and `pool` is given.
 
@@ -113,7 +113,7 @@ class SourceEntry:
     extra : str
         The extra of the package that it needs.
     simulates : bool
-        Whether it has a place only in studies of cases without classes.
+        Whether it occurs only in studies of cases without classes.
     role : str
         Its role in what a report states: "plain" (the twin as it is), "surrogate" (the surrogate
         without residual model), "updated" (the surrogate with its residual model) or "".
@@ -175,11 +175,13 @@ class FormatEntry:
     title : str
         What it holds.
     reader : str
-        The function that reads it.
+        The function that reads it, a `data.io.assembly.Reader`.
     writer : str
-        The function that writes it; "" if the format is only read.
+        The function of trajectories and a path that writes it; "" if the format is only read.
     extra : str
         The extra of the package that it needs.
+    folder : bool
+        Whether it is a folder and no file.
 
     """
 
@@ -187,6 +189,7 @@ class FormatEntry:
     reader: str
     writer: str = ""
     extra: str = ""
+    folder: bool = False
 
 
 @dataclass(frozen=True)
@@ -212,7 +215,11 @@ class PublicFile:
 def resolve(target: str) -> Any:
     """The object that "package.module:object" names.
 
-    Raises ImportError or AttributeError if there is none; each entry of this module has one.
+    Raises
+    ------
+    ImportError, AttributeError
+        There is no such module or object; for each entry of this module there is one.
+
     """
     module, _, attribute = target.partition(":")
     return getattr(importlib.import_module(module), attribute)
@@ -221,15 +228,23 @@ def resolve(target: str) -> Any:
 def lookup(entries: Mapping[str, T], name: str, argument: str) -> T:
     """The entry of that name.
 
-    Raises InputError, about `argument`, if there is none.
+    Raises
+    ------
+    InputError
+        There is none; the message names `argument`.
+
     """
     return entries[one_of(argument, name, entries)]
 
 
 def make(entries: Mapping[str, Entry], name: str, argument: str) -> Any:
-    """What the target of that entry makes when it is called without arguments.
+    """The result of the target of that entry, called without arguments.
 
-    Raises InputError, about `argument`, if there is no entry of that name.
+    Raises
+    ------
+    InputError
+        There is no entry of that name; the message names `argument`.
+
     """
     return resolve(lookup(entries, name, argument).target)()
 
@@ -298,7 +313,7 @@ NETWORKS: Mapping[str, Entry] = {
 CLASSIFIERS: Mapping[str, Entry] = {
     "cnn": Entry("retwin.nets.networks:CNN", "convolutional network"),
     "lstm": Entry("retwin.nets.networks:LSTMClassifier", "LSTM, last step (the paper's)"),
-    "rocket": Entry("retwin.diagnosis.rocket:fit_rocket", "MiniRocket and a ridge", "rocket"),
+    "rocket": Entry("retwin.diagnosis.rocket:Rocket", "MiniRocket and a ridge", "rocket"),
 }
 """Classifiers that are trained on generated trajectories."""
 
@@ -307,7 +322,7 @@ DIAGNOSERS: Mapping[str, Entry] = {
     "inversion": Entry("retwin.diagnosis.inversion:InversionDiagnoser", "fault inversion"),
     "rocket": Entry("retwin.diagnosis.rocket:RocketDiagnoser", "MiniRocket and a ridge", "rocket"),
 }
-"""The kind that a saved diagnoser's model.json states, and the class whose `load` reads it."""
+"""By the kind in the model.json of a saved diagnoser: the class whose `load` reads it."""
 
 FORMATS: Mapping[str, FormatEntry] = {
     ".mat": FormatEntry(
@@ -323,10 +338,16 @@ FORMATS: Mapping[str, FormatEntry] = {
         "a folder in chunks, as `save` or `simulate_to` wrote it",
         "retwin.data.io.zarr_folder:read_zarr",
         "retwin.data.io.zarr_folder:write_zarr",
-        "scale",
+        extra="scale",
+        folder=True,
+    ),
+    "": FormatEntry(
+        "a folder per class of *.csv or dataset_*.mat",
+        "retwin.data.io.class_folders:read_class_folders",
+        folder=True,
     ),
 }
-"""By the suffix of the name. A folder without a suffix holds one folder per class."""
+"""By the suffix of the name; "" is any other folder."""
 
 DOWNLOADS: Mapping[str, PublicFile] = {
     "armpi": PublicFile(
@@ -444,7 +465,7 @@ SOURCES: Mapping[str, SourceEntry] = {
 """In the order in which they are reported."""
 
 CALIBRATE_ON = ("healthy", "all")
-"""The real trajectories that a residual model may learn from."""
+"""Which real trajectories a residual model may learn from."""
 
 PRESETS: Mapping[str, Entry] = {
     "quick": Entry("retwin.study.plan:QUICK", "CNN at the sensor's rate, 5 runs"),

@@ -1,7 +1,7 @@
 """Checks of arguments: each returns the value, or raises an `InputError` in one line.
 
-A message has four parts: the argument, what was expected, what came, and the remedy. The checks
-here cover what most functions ask for; `require` states anything else.
+A message has four parts: the argument, what was expected, what came, and the remedy, for which each
+check has a default. `require` states what no other check covers.
 """
 
 from __future__ import annotations
@@ -21,13 +21,23 @@ T = TypeVar("T")
 
 
 def require(condition: object, argument: str, *, expected: str, got: object, remedy: str) -> None:
-    """Raise an `InputError` unless `condition` is true; `got` is shown by its `str`."""
+    """Raise an `InputError` unless `condition` is true; the message shows `got` by its `str`.
+
+    Write comparisons so that NaN makes the condition false: `x > 0`, not `not x <= 0`.
+    """
     if not condition:
         raise InputError(argument, expected=expected, got=str(got), remedy=remedy)
 
 
 def one_of(argument: str, value: T, choices: Iterable[T], *, remedy: str = "") -> T:
-    """`value`, if it is one of `choices`."""
+    """`value`, if it is one of `choices` and of the same type.
+
+    Raises
+    ------
+    InputError
+        It is not.
+
+    """
     known = list(choices)
     require(
         any(type(value) is type(each) and value == each for each in known),
@@ -48,9 +58,31 @@ def finite(
     unit: str = "",
     remedy: str = "",
 ) -> float:
-    """`value`, if it is a finite number from `least` to `most`, ends included; never a bool."""
-    bounds = [f"of at least {least:g}"] * (least > -inf) + [f"of at most {most:g}"] * (most < inf)
-    expected = ["a finite number", " and ".join(bounds), unit and f"in {unit}"]
+    """`value`, if it is a finite number from `least` to `most`, ends included.
+
+    Parameters
+    ----------
+    argument : str
+        The name of the argument in the message.
+    value : number
+        A Python or numpy number; a bool is none.
+    least, most : float
+        The bounds.
+    unit : str
+        The unit that the message states.
+    remedy : str
+        What to do; by default to give a number in that range.
+
+    Raises
+    ------
+    InputError
+        It is NaN, infinite, out of range or no number.
+
+    """
+    low = f"of at least {least:g}" if least > -inf else ""
+    high = f"of at most {most:g}" if most < inf else ""
+    bounds = f"from {least:g} to {most:g}" if low and high else low or high
+    expected = ["a finite number", bounds, unit and f"in {unit}"]
     require(
         _real(value) and least <= value <= most,
         argument,
@@ -62,7 +94,7 @@ def finite(
 
 
 def positive(argument: str, value: Any, *, unit: str = "", remedy: str = "") -> float:
-    """`value`, if it is a finite number above 0."""
+    """`value`, if it is a finite number above 0; see `finite`."""
     require(
         _real(value) and value > 0,
         argument,
@@ -76,7 +108,14 @@ def positive(argument: str, value: Any, *, unit: str = "", remedy: str = "") -> 
 def whole(
     argument: str, value: Any, *, least: int = 0, most: int | None = None, remedy: str = ""
 ) -> int:
-    """`value`, if it is a whole number from `least` to `most`; never a bool."""
+    """`value`, if it is a whole number from `least` to `most`, ends included.
+
+    Raises
+    ------
+    InputError
+        It is a bool, a float, out of range or no number.
+
+    """
     number = isinstance(value, Integral) and not isinstance(value, bool)
     span = f"of at least {least}" if most is None else f"from {least} to {most}"
     require(
@@ -118,7 +157,20 @@ def one_per(argument: str, values: Sized, count: int, what: str, *, remedy: str 
 def needs_extra(module: str, extra: str, purpose: str) -> ModuleType:
     """The imported module of an optional package.
 
-    Raises InputError, with the command that installs the extra, if the package is missing.
+    Parameters
+    ----------
+    module : str
+        Its dotted name.
+    extra : str
+        The extra of retwin that installs it.
+    purpose : str
+        A verb phrase that says what the package does, for the message.
+
+    Raises
+    ------
+    InputError
+        The package is missing; the message holds the command that installs it.
+
     """
     try:
         return importlib.import_module(module)

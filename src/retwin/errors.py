@@ -1,7 +1,4 @@
-"""The one way to say that an input is bad: what was expected, what came, and what to do.
-
-And where in a user's own code an exception comes from.
-"""
+"""`InputError`: bad input as one line of four parts; and where in a user's code an error arose."""
 
 from __future__ import annotations
 
@@ -13,9 +10,19 @@ __all__ = ["InputError", "brief", "place_of"]
 
 
 class InputError(ValueError):
-    """Bad input, told in one line: the argument, what was expected, what came, the remedy.
+    """Bad input: the argument, what was expected, what came, and the remedy, in one line.
 
     The command line turns it into exit code 2.
+
+    Parameters
+    ----------
+    argument : str
+        The name of the argument, the key or the file.
+    expected, got : str
+        What it should be, and what came.
+    remedy : str
+        What to do.
+
     """
 
     def __init__(self, argument: str, *, expected: str, got: str, remedy: str) -> None:
@@ -26,7 +33,7 @@ class InputError(ValueError):
         self.remedy = remedy
 
     def __reduce__(self) -> tuple:
-        """Keep the parts when the error crosses a process border."""
+        """Keep the parts when the error is sent to another process."""
         return _rebuild, (self.argument, self.expected, self.got, self.remedy)
 
 
@@ -35,9 +42,9 @@ def _rebuild(argument: str, expected: str, got: str, remedy: str) -> InputError:
 
 
 def place_of(error: BaseException) -> str:
-    """The user's own line that was at work, as "FILE:LINE"; "" where none was.
+    """The innermost line of the user's own code in a traceback, as "FILE:LINE"; "" if none is.
 
-    The user's is what belongs neither to retwin, nor to Python, nor to an installed package.
+    Own code is what belongs neither to retwin, nor to Python, nor to an installed package.
     """
     others = [sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")]
     others.append(str(Path(__file__).parent))

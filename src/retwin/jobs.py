@@ -1,6 +1,6 @@
-"""Where chunks are made: in this process, in worker processes, or on a Dask cluster.
+"""Tasks for numbered chunks: in this process, in worker processes, or on a Dask cluster.
 
-All three call the same function on the same numbers; both kinds of workers give standard futures.
+All three call the same function with the same numbers; both kinds of workers give futures.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 from pebble import ProcessExpired
 
+from retwin.checks import needs_extra
 from retwin.errors import InputError
 from retwin.processes import sendable_errors, worker_pool
 from retwin.progress import Progress
@@ -21,7 +22,7 @@ from retwin.progress import Progress
 __all__ = ["alone", "each"]
 
 ATTEMPTS = 3
-"""How often a chunk is begun when worker processes die of it, before that is an error."""
+"""How often a chunk is begun while worker processes die, before that is an error."""
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -36,16 +37,34 @@ def each(
     scheduler: str | None,
     progress: Progress,
 ) -> Iterator[Result]:
-    """The results of `task(job, number)` for all numbers, as they come.
+    """The results of `task(job, number)` for all numbers, in the order of completion.
 
-    `progress` is told the share of one chunk, where that is seen: in this process, which does the
-    work when there is one worker. A chunk whose worker process dies is done again by another.
+    A chunk whose worker process dies is done again by another one.
+
+    Parameters
+    ----------
+    task : callable
+        A function of the job, a number, and in this process also of `progress`.
+    job : object
+        What all tasks share; it is pickled for workers.
+    numbers : sequence of int
+        The chunks.
+    workers : int
+        The number of processes; with one, this process does the work.
+    scheduler : str or None
+        The address of a Dask scheduler, which replaces the worker processes.
+    progress : callable
+        Called with the share of one chunk that is done, in this process only.
 
     Raises
     ------
-    InputError: no scheduler at that address, no package distributed, or a job that cannot be sent.
-    RuntimeError: workers died again and again.
-    Exception: whatever the first task that fails raises; the other workers are then stopped.
+    InputError
+        There is no scheduler at that address, the package distributed is missing, or the job cannot
+        be pickled.
+    RuntimeError
+        Workers died `ATTEMPTS` times.
+    Exception
+        The first exception of a task; the other workers are then stopped.
 
     """
     if scheduler is None and workers == 1:
@@ -63,10 +82,10 @@ def each(
 
 
 def alone(twin: Any) -> Any:
-    """The twin, told to start no processes or threads of its own: the workers are enough.
+    """A copy of a twin that starts no processes or threads of its own.
 
-    Looks for fields `workers` and `threads` of dataclasses, also of those inside; what a twin says
-    does not depend on them.
+    Sets the fields `workers` and `threads` of dataclasses to 1, also of nested ones; the outputs of
+    a twin do not depend on them.
     """
     if not dataclasses.is_dataclass(twin) or isinstance(twin, type):
         return twin
@@ -106,31 +125,23 @@ def _on_cluster(
     address: str, task: Callable[..., Result], job: object
 ) -> Iterator[Callable[[int], Future[Result]]]:
     """Submit tasks to the Dask cluster whose scheduler is at `address`."""
+    distributed = needs_extra("distributed", "scale", "speaks to a Dask scheduler")
     try:
-        from distributed import Client, KilledWorker
-    except ImportError:
-        raise InputError(
-            "scheduler",
-            expected="the package distributed, which speaks to it",
-            got="an installation without it",
-            remedy='install it: pip install "retwin[scale]"',
-        ) from None
-    try:
-        client = Client(address, set_as_default=False, timeout=20)
+        client = distributed.Client(address, set_as_default=False, timeout=20)
     except (OSError, ValueError) as error:
         raise InputError(
             "scheduler",
             expected="the address of a Dask scheduler, such as tcp://10.0.0.1:8786",
             got=f"{address} ({' '.join(str(error).split()) or type(error).__name__})",
-            remedy="start it with `dask scheduler`, and see that it can be reached from here",
+            remedy="start it with `dask scheduler`, and check that this machine can reach it",
         ) from None
     with client:
         executor = client.get_executor(pure=False)
-        # The job travels once. As a task's result it is made again if its worker dies.
+        # The job is sent once. As the result of a task it is made again if its worker dies.
         sent = client.submit(_same, job, pure=False)
         try:
             yield lambda number: executor.submit(task, sent, number)
-        except KilledWorker as error:
+        except distributed.KilledWorker as error:
             raise RuntimeError(f"workers of the cluster died of a chunk: {error}") from None
         except AssertionError as error:
             if "daemonic" not in str(error):
@@ -142,7 +153,7 @@ def _on_cluster(
                 remedy="start them with DASK_DISTRIBUTED__WORKER__DAEMON=False",
             ) from None
         finally:
-            # Not waiting: after an error or Ctrl-C, what is not begun is not wanted.
+            # No waiting: after an error or Ctrl-C, tasks that have not begun are dropped.
             executor.shutdown(wait=False)
 
 

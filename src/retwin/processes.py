@@ -1,6 +1,6 @@
-"""Worker processes that end with their parent, and that may hang or crash without ending it.
+"""Worker processes that end with their parent and may hang or crash without ending it.
 
-And folders for as long as a process needs them.
+And temporary folders that are removed when their process ends.
 """
 
 from __future__ import annotations
@@ -35,14 +35,24 @@ def worker_pool(
     *,
     orphaned: Callable[..., None] | None = None,
 ) -> Iterator[ProcessPool]:
-    """A pool of spawned processes, each of which calls `start(*arguments)` first.
+    """A pool of spawned processes.
 
-    Each ends when this process does, however that ends, and calls `orphaned(*arguments)` then.
+    Each worker ends when this process ends, however that happens. `pool.schedule(function, args,
+    kwargs, timeout)` gives a future. A task that takes longer than `timeout` (s) ends in
+    `TimeoutError`, one whose process dies in `pebble.ProcessExpired`; the other tasks go on in a
+    new process. Leaving the block waits for all tasks; an exception or Ctrl-C ends the workers.
 
-    `pool.schedule(function, args, kwargs, timeout)` gives a future. A task that hangs beyond its
-    timeout (s) ends in `TimeoutError`, one whose process dies in `pebble.ProcessExpired`; the other
-    tasks go on, in a new process. Leaving the block waits for all tasks; an exception or Ctrl-C
-    ends the workers at once.
+    Parameters
+    ----------
+    workers : int
+        The number of processes.
+    start : callable
+        Called with `arguments` when a worker begins.
+    arguments : tuple
+        Arguments of `start` and `orphaned`, which are pickled.
+    orphaned : callable
+        Called with `arguments` in a worker whose parent has ended, before the worker ends.
+
     """
     pool = ProcessPool(
         max_workers=workers,
@@ -61,10 +71,10 @@ def worker_pool(
 
 
 class _Spawn(SpawnContext):
-    """Spawns, not forks: torch's threads do not survive a fork.
+    """Spawns instead of forking, since torch's threads do not survive a fork.
 
-    Keeps the locks it makes. A worker that is still starting when its pool ends looks for them by
-    name, and would complain at length if they were gone.
+    Keeps references to its locks: a worker that still starts when its pool ends opens them by name
+    and prints an error if they are gone.
     """
 
     def __init__(self) -> None:
@@ -87,7 +97,7 @@ def _begin(
 
 
 def _end_with_parent(orphaned: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
-    """A parent that was killed cannot end its workers: they must see for themselves."""
+    """Wait for the parent process to end, then end: a parent that was killed ends no workers."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -100,9 +110,9 @@ def _end_with_parent(orphaned: Callable[..., None] | None, arguments: tuple[Any,
 
 @contextmanager
 def sendable_errors() -> Iterator[None]:
-    """Replace an exception that cannot be built again in another process by one that tells of it.
+    """Replace an exception that cannot be pickled by a RuntimeError with its type and message.
 
-    It would break the pool. For what is done in a worker.
+    For code in a worker, whose pool such an exception would break.
     """
     try:
         yield
@@ -110,19 +120,18 @@ def sendable_errors() -> Iterator[None]:
         try:
             pickle.loads(pickle.dumps(error))
         except Exception:
-            told = RuntimeError(f"{type(error).__name__}: {error}")
+            described = RuntimeError(f"{type(error).__name__}: {error}")
             for note in getattr(error, "__notes__", ()):
-                told.add_note(note)
-            raise told from error
+                described.add_note(note)
+            raise described from error
         raise
 
 
 @contextmanager
 def scratch_folder() -> Iterator[str]:
-    """A folder among the temporary files, removed in the end.
+    """A temporary folder, removed when the block ends or the pool ends this worker process.
 
-    Also when this process is a worker that its pool ends. What a process that was killed has left
-    is removed by the next one that makes such a folder on the same machine.
+    The folders of processes that were killed are removed by the next call on the same machine.
     """
     owner = f"retwin-{platform.node()}-"
     _sweep(owner)
@@ -135,8 +144,8 @@ def scratch_folder() -> Iterator[str]:
 
 
 def _sweep(owner: str) -> None:
-    """Remove my own folders whose process is no more."""
-    if os.name != "posix":  # elsewhere one cannot ask for a process by signal 0
+    """Remove the user's own folders whose process has ended."""
+    if os.name != "posix":  # elsewhere signal 0 does not test whether a process exists
         return
     for folder in Path(tempfile.gettempdir()).glob(f"{glob.escape(owner)}*-*"):
         process = folder.name.removeprefix(owner).partition("-")[0]
@@ -147,4 +156,4 @@ def _sweep(owner: str) -> None:
             if mine:
                 shutil.rmtree(folder, ignore_errors=True)
         except (OSError, ValueError, OverflowError):
-            continue  # someone else's, gone by now, or not one of these folders
+            continue  # another user's, already removed, or not one of these folders

@@ -1,4 +1,4 @@
-"""`Progress`: how long work reports the share of it that is done."""
+"""`Progress`: the type of functions to which long work reports its progress."""
 
 from __future__ import annotations
 

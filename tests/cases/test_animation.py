@@ -36,7 +36,7 @@ TWO_LINKS = """<mujoco><worldbody>
 
 @dataclass(frozen=True)
 class TwoLinks:
-    """Two links that the first two commands of any trajectory turn."""
+    """Two links that follow the first two commands of any trajectory."""
 
     model: Path | None
     joints: tuple[str, ...] = ("shoulder", "elbow")
@@ -77,13 +77,15 @@ def pictures(path: Path) -> list[NDArray]:
 
 
 def test_stick_figure(short: rt.Trajectories, case: rt.Case, tmp_path: Path) -> None:
-    told: list[float] = []
+    reported: list[float] = []
     film = tmp_path / "arm.gif"
-    made = animate(short, case, film, fps=FPS, size=SIZE, renderer="stick", progress=told.append)
+    made = animate(
+        short, case, film, fps=FPS, size=SIZE, renderer="stick", progress=reported.append
+    )
     assert made == film
     found = pictures(film)
-    assert len(found) == FRAMES == len(told)
-    assert told[-1] == 1.0
+    assert len(found) == FRAMES == len(reported)
+    assert reported[-1] == 1.0
     assert all(each.shape == (SIZE[1], SIZE[0], 3) for each in found)
     middle = slice(60, 180)  # neither title nor legend
     moved = [(a[middle] != b[middle]).any() for a, b in pairwise(found)]
@@ -186,7 +188,7 @@ def test_ghost_and_solid_differ(two_links: rt.Case, tmp_path: Path) -> None:
             return np.stack(list(found))[0].astype(int)
 
     try:
-        together, apart = drawn(0.0), drawn(0.6)
+        together, separate = drawn(0.0), drawn(0.6)
     except InputError as error:
         assert "libegl1" in str(error)
         return
@@ -198,9 +200,9 @@ def test_ghost_and_solid_differ(two_links: rt.Case, tmp_path: Path) -> None:
         return (picture.max(axis=2) - picture.min(axis=2) < 40) & (picture.mean(axis=2) < 215)
 
     assert red(together).sum() > 300
-    assert red(apart).sum() == pytest.approx(red(together).sum(), rel=0.3), "one solid body"
-    assert grey(apart).sum() > grey(together).sum() + 200, "the ghost comes out from behind it"
-    assert (grey(apart) & red(together)).sum() > 100, "where the nominal pose is"
+    assert red(separate).sum() == pytest.approx(red(together).sum(), rel=0.3), "one solid body"
+    assert grey(separate).sum() > grey(together).sum() + 200, "the ghost comes out from behind it"
+    assert (grey(separate) & red(together)).sum() > 100, "where the nominal pose is"
 
 
 def test_model_without_the_joints(
@@ -215,21 +217,21 @@ def test_model_without_the_joints(
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"path": "arm.avi"}, r"\.mp4 or \.gif"),
-        ({"index": 2}, "a place from 0 to 1, got 2"),
+        ({"index": 2}, "a position from 0 to 1, got 2"),
         ({"index": "third"}, "one of 2 ids .first, second., got 'third'"),
         ({"fps": 0}, "fps"),
         ({"size": (321, 240)}, "even width and height"),
-        ({"renderer": "crayon"}, "auto or mujoco or stick"),
+        ({"renderer": "crayon"}, "one of auto, mujoco, stick"),
     ],
 )
 def test_bad_input_writes_nothing(
-    short: rt.Trajectories, case: rt.Case, tmp_path: Path, changes: dict, said: str
+    short: rt.Trajectories, case: rt.Case, tmp_path: Path, changes: dict, message: str
 ) -> None:
     path = tmp_path / changes.pop("path", "arm.gif")
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         animate(short, case, path, **changes)
     assert not list(tmp_path.iterdir())
 
@@ -247,14 +249,14 @@ def test_command_line(short: rt.Trajectories, tmp_path: Path) -> None:
     app.command()(command)
     save(short, tmp_path / "set.npz")
     words = [str(tmp_path / "set.npz"), "--out", str(tmp_path / "arm.gif"), "--renderer", "stick"]
-    told = CliRunner().invoke(app, [*words, "--id", "second", "--fps", "2", "--size", "320x240"])
-    assert told.exit_code == 0, told.output
-    assert str(tmp_path / "arm.gif") in told.output
+    result = CliRunner().invoke(app, [*words, "--id", "second", "--fps", "2", "--size", "320x240"])
+    assert result.exit_code == 0, result.output
+    assert str(tmp_path / "arm.gif") in result.output
     assert pictures(tmp_path / "arm.gif")[0].shape == (240, 320, 3)
     for wrong in (["--size", "big"], ["--id", "none"], ["--case", "none"]):
-        told = CliRunner().invoke(app, [*words, *wrong])
-        assert isinstance(told.exception, InputError)
-        assert told.stderr == "", "the error's own line is the only one"
+        result = CliRunner().invoke(app, [*words, *wrong])
+        assert isinstance(result.exception, InputError)
+        assert result.stderr == "", "the error's own line is the only one"
 
 
 def test_skeleton_ends_at_the_end_effector(case: rt.Case, short: rt.Trajectories) -> None:

@@ -1,4 +1,4 @@
-"""A case as a file: every key does what it says, and what is wrong is told by file and key."""
+"""A case as a file: every key has its effect, and a refusal names the file and the key."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def commands(case: rt.Case, count: int = 4) -> np.ndarray:
     return case.sampler.sample(count, rng=np.random.default_rng(0)).astype(float)
 
 
-def test_little_need_be_told(read: Callable[..., rt.Case]) -> None:
+def test_few_keys_are_needed(read: Callable[..., rt.Case]) -> None:
     case = read(BASE)
     assert (case.name, case.title, case.rate, case.sensor_rate) == ("toy", "toy", 10.0, 10.0)
     assert case.inputs == rt.Channels(("a", "b"), ("V", "V"))
@@ -152,14 +152,14 @@ def test_little_need_be_told(read: Callable[..., rt.Case]) -> None:
     assert case.correction == case.output_correction == rt.DelayOffset()
     assert (case.density, case.network, case.training) == (rt.Mixture(), rt.MLP(), None)
     assert case.parametric is case.records is None
-    told = commands(case)
-    made = case.twin.simulate(told, seed=0)
-    np.testing.assert_allclose(made.observed, 2 * told[..., :1] + told[..., 1:])
+    drawn = commands(case)
+    made = case.twin.simulate(drawn, seed=0)
+    np.testing.assert_allclose(made.observed, 2 * drawn[..., :1] + drawn[..., 1:])
     with pytest.raises(rt.InputError, match="b from 0 to 4 V"):
-        case.twin.simulate(told - 1, seed=0)
+        case.twin.simulate(drawn - 1, seed=0)
 
 
-def test_everything_can_be_told(read: Callable[..., rt.Case]) -> None:
+def test_every_key_has_its_effect(read: Callable[..., rt.Case]) -> None:
     case = read(EVERYTHING)
     assert (case.title, case.sensor_rate, case.network) == ("A toy", 5.0, rt.TCN())
     assert case.sampler == HoldSampler((-1.0, 0.0), (1.0, 4.0), 50, (5, 9))
@@ -191,13 +191,13 @@ def test_parameters_are_arguments_of_the_function(read: Callable[..., rt.Case]) 
         'offset = { unit = "m", low = -1, high = 1, start = 0.5 }\n'
         "[commands]\nsteps = 40\nmovements = 2\nramps = [5]\n"
     )
-    told = commands(case)
+    drawn = commands(case)
     np.testing.assert_allclose(
-        case.twin.simulate(told, seed=0).observed, 2 * told[..., :1] + told[..., 1:] + 0.5
+        case.twin.simulate(drawn, seed=0).observed, 2 * drawn[..., :1] + drawn[..., 1:] + 0.5
     )
-    check_twin(case.twin, told)
+    check_twin(case.twin, drawn)
     truth = case.parametric.with_values({"gain": 1.4, "offset": -0.3})
-    measured = truth.simulate(told, seed=0)
+    measured = truth.simulate(drawn, seed=0)
     found = identify(case.parametric, measured, seed=0, method=LeastSquares(starts=1))
     assert found.values == pytest.approx({"gain": 1.4, "offset": -0.3}, abs=1e-4)
 
@@ -206,25 +206,25 @@ def test_a_correction_per_sample_brings_its_density(read: Callable[..., rt.Case]
     case = read('correction = "additive"\n' + BASE)
     assert case.correction == case.output_correction == rt.Additive()
     assert case.density == SequenceMixture()
-    told = """
+    keys = """
 correction.kind = "Additive"
 density = { kind = "SequenceMixture", members = 3, network = { kind = "LSTM", hidden = 8 } }
 """
-    case = read(told + BASE)
+    case = read(keys + BASE)
     assert case.density == SequenceMixture(members=3, network=rt.LSTM(8))
 
 
 @pytest.mark.parametrize(
-    ("told", "wanted"),
+    ("keys", "wanted"),
     [
         ('kind = "MultisineSampler"\nmean = [0.1, 1]', {"steps": 1000, "mean": (0.1, 1.0)}),
-        ("low = [0, 1]\nhigh = [1, 2]\nmovements = 3", {"low": (0.0, 1.0), "movements": 3}),
+        ("low = [0, 1]\nhigh = [1, 2]\nmovements = 3", {"low": (0.0, 1.0), "segments": 3}),
     ],
 )
-def test_commands_are_drawn_as_told(
-    read: Callable[..., rt.Case], told: str, wanted: dict[str, Any]
+def test_commands_are_drawn_as_described(
+    read: Callable[..., rt.Case], keys: str, wanted: dict[str, Any]
 ) -> None:
-    sampler = read(BASE + "[commands]\n" + told).sampler
+    sampler = read(BASE + "[commands]\n" + keys).sampler
     assert isinstance(sampler, MultisineSampler | RampSampler)
     assert {name: getattr(sampler, name) for name in wanted} == wanted
 
@@ -234,8 +234,8 @@ def test_commands_may_be_recorded_or_of_ones_own(
 ) -> None:
     case = read(BASE)
     rt.save(case.twin.simulate(commands(case), seed=0), tmp_path / "recorded.npz")
-    told = 'commands = { kind = "RecordedSampler", file = "recorded.npz", length = 90 }\n'
-    sampler = read(told + BASE).sampler
+    keys = 'commands = { kind = "RecordedSampler", file = "recorded.npz", length = 90 }\n'
+    sampler = read(keys + BASE).sampler
     assert isinstance(sampler, RecordedSampler)
     np.testing.assert_array_equal(sampler.commands, commands(case))
     assert sampler.steps == 90
@@ -243,7 +243,7 @@ def test_commands_may_be_recorded_or_of_ones_own(
     assert own.sample(2, rng=np.random.default_rng(0)).shape == (2, 30, 2)
 
 
-def test_a_random_function_tells_its_nominal(read: Callable[..., rt.Case]) -> None:
+def test_a_random_function_names_its_nominal(read: Callable[..., rt.Case]) -> None:
     text = BASE.replace('"toy_module:turned"', '{ name = "toy_module:noisy", nominal = "NOMINAL" }')
     case = read(text.replace("NOMINAL", "toy_module:ideal"))
     made = case.twin.simulate(commands(case), seed=0)
@@ -266,8 +266,8 @@ def test_a_model_and_an_fmu_lie_beside_the_file(
     read: Callable[..., rt.Case], tmp_path: Path
 ) -> None:
     (tmp_path / "pendulum.xml").write_text(PENDULUM)
-    told = 'twin = { name = "pendulum.xml", settle = 0.5, interpolate = false }\n'
-    case = read('name = "p"\nrate = 50\noutputs = ["tip"]\n' + told)
+    keys = 'twin = { name = "pendulum.xml", settle = 0.5, interpolate = false }\n'
+    case = read('name = "p"\nrate = 50\noutputs = ["tip"]\n' + keys)
     assert case.outputs.names == ("tip_x", "tip_y", "tip_z")
     assert (case.twin.settle, case.twin.interpolate, case.rate) == (0.5, False, 50.0)
     assert case.sampler == RampSampler((-1.0,), (1.0,))
@@ -275,8 +275,8 @@ def test_a_model_and_an_fmu_lie_beside_the_file(
     case = read('name = "p"\noutputs = ["tip"]\ntwin = "pendulum.xml"\n' + heavy)
     assert case.parametric.simulate(np.ones((1, 5, 1)), seed=0).observed.shape == (1, 5, 3)
     python_fmu(tmp_path)
-    told = 'twin = { name = "PyLag.fmu", start = { gain = 3.0 }, step = 0.05 }\n'
-    case = read('name = "lag"\nrate = 10\ninputs = ["u"]\noutputs = ["x"]\n' + told +
+    keys = 'twin = { name = "PyLag.fmu", start = { gain = 3.0 }, step = 0.05 }\n'
+    case = read('name = "lag"\nrate = 10\ninputs = ["u"]\noutputs = ["x"]\n' + keys +
                 "commands = { low = [0], high = [1] }\n")  # fmt: skip
     assert (case.inputs.names, case.outputs.names) == (("u",), ("x",))
     assert (dict(case.twin.start), case.twin.substeps) == ({"gain": 3.0}, 2)
@@ -317,21 +317,21 @@ URDF = """
 
 def test_a_urdf_gets_servos(read: Callable[..., rt.Case], tmp_path: Path) -> None:
     (tmp_path / "one.urdf").write_text(URDF)
-    told = """
+    keys = """
 name = "one"
 rate = 50
 outputs = ["arm"]
 commands = { low = [-1], high = [1], steps = 50, movements = 1, ramps = [10] }
 twin = { name = "one.urdf", servos = { hip = { stiffness = 50, damping = 4 } }, step = 0.002 }
 """
-    case = read(told)
+    case = read(keys)
     ((joint, servo),) = case.twin.servos
     assert (joint, servo.stiffness, servo.damping) == ("hip", 50.0, 4.0)
     assert case.twin.simulate(commands(case, 1), seed=0).observed.shape == (1, 50, 3)
     with pytest.raises(
         rt.InputError, match=r"case\.toml: twin\.servos\.hip\.damp: expected one of"
     ):
-        read(told.replace("damping", "damp"))
+        read(keys.replace("damping", "damp"))
 
 
 def leaves(value: Any, path: tuple = ()) -> Iterator[tuple]:
@@ -350,10 +350,10 @@ def test_no_value_in_the_wrong_place_is_anything_but_an_input_error(
     rng = np.random.default_rng(0)
     odd = [0, -1, 2.5, float("nan"), "", "x", "a:b", "..", True, [], [1, "a"], [[1]], {}]
     odd += [{"kind": "x"}, {"kind": ["x"]}, {"kind": "LSTM"}, {"a": 1}]
-    told = tomllib.loads(EVERYTHING)
+    valid = tomllib.loads(EVERYTHING)
     refused = 0
     for _ in range(200):
-        tables = copy.deepcopy(told)
+        tables = copy.deepcopy(valid)
         paths = list(leaves(tables))
         *parents, last = paths[rng.integers(len(paths))]
         inside = reduce(lambda table, key: table[key], parents, tables)
@@ -462,7 +462,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("old", "new", "message"), WRONG)
-def test_what_is_wrong_is_told_by_file_and_key(
+def test_a_refusal_names_file_and_key(
     read: Callable[..., rt.Case], old: str, new: str, message: str
 ) -> None:
     with pytest.raises(rt.InputError, match=message) as caught:

@@ -63,8 +63,8 @@ def test_the_code_of_the_page_runs(
         exec(compile(shown("python")[1], "own_twin.md", "exec"), names)
     finally:
         sys.modules.pop("two_tanks", None)
-    print(told := capsys.readouterr().out)
-    assert "in the 90 % band" in told
+    print(printed := capsys.readouterr().out)
+    assert "in the 90 % band" in printed
     assert names["surrogate"].fitted.figures["nrmse_level"] < 0.05
     assert names["after"] < names["before"]
     assert 0.6 < names["inside"] <= 1

@@ -83,8 +83,8 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
         monkeypatch.setattr(sys, "argv", ["retwin", *map(str, words)])
         with pytest.raises(SystemExit) as ended:
             main()
-        said = capsys.readouterr()
-        return int(ended.value.code or 0), said.out, said.err
+        printed = capsys.readouterr()
+        return int(ended.value.code or 0), printed.out, printed.err
 
     return run
 
@@ -120,8 +120,8 @@ class Running:
         out, _ = self.process.communicate(timeout=60)
         assert (self.process.returncode, out) == (130, ""), self.stderr
         assert "Traceback" not in self.stderr
-        (told,) = (line for line in self.stderr.splitlines() if "interrupted" in line)
-        return told
+        (message,) = (line for line in self.stderr.splitlines() if "interrupted" in line)
+        return message
 
 
 @pytest.fixture
@@ -130,7 +130,7 @@ def start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Ru
     begun: list[Running] = []
 
     def run(*words: object) -> Running:
-        begun.append(Running(words, tmp_path_factory.mktemp("said") / "stderr"))
+        begun.append(Running(words, tmp_path_factory.mktemp("output") / "stderr"))
         return begun[-1]
 
     yield run
@@ -164,11 +164,13 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     Path("tank.toml").write_text(TANK)
     reach, tank = (rt.cases.get(f"{name}.toml") for name in ("reach", "tank"))
     made = rt.generate(reach.twin, reach, per_class=12, seed=5)
-    late = np.concatenate([made.observed[:, :1].repeat(2, axis=1), made.observed[:, :-2]], axis=1)
-    rt.save(made.replace(observed=late + 0.02, emulated=True), "real.npz")
-    told = tank.sampler.sample(2, rng=np.random.default_rng(6)).astype(float)
-    level = tank.parametric.with_values({"leak": 0.07}).simulate(told, seed=0).observed
-    columns = np.concatenate([*told, *level], axis=1)
+    delayed = np.concatenate(
+        [made.observed[:, :1].repeat(2, axis=1), made.observed[:, :-2]], axis=1
+    )
+    rt.save(made.replace(observed=delayed + 0.02, emulated=True), "real.npz")
+    commands = tank.sampler.sample(2, rng=np.random.default_rng(6)).astype(float)
+    level = tank.parametric.with_values({"leak": 0.07}).simulate(commands, seed=0).observed
+    columns = np.concatenate([*commands, *level], axis=1)
     np.savetxt("record.csv", columns, delimiter=",", header="u1,u2,y1,y2", comments="")
     yield tmp_path
     sys.modules.pop("own_module", None)

@@ -26,7 +26,7 @@ def test_the_steps_one_by_one(call, files: Path, tmp_path: Path) -> None:
     )
     assert code == 0, err
     assert "Surrogate on held-out twin trajectories" in out
-    assert "50 movements of 10 EMULATED trajectories" in out
+    assert "50 segments of 10 EMULATED trajectories" in out
     made = tmp_path / "made.npz"
     code, out, err = call(
         "generate", tmp_path / "model", "--per-class", 20, "--seed", 1, "--out", made
@@ -53,10 +53,14 @@ def test_the_steps_one_by_one(call, files: Path, tmp_path: Path) -> None:
     assert "macro_f1" not in out, "no labels, no scores"
     words = ("diagnose", "predict", tmp_path / "cnn", files / "real.npz")
     assert "macro_f1" in call(*words)[1]
-    told = json.loads(call(*words, "--json")[1])
-    assert told.keys() == {"emulated", "trajectories", "scores"}
-    assert (told["emulated"], len(told["trajectories"]), told["scores"]["n"]) == (True, 90, 90)
-    first = told["trajectories"][0]
+    printed = json.loads(call(*words, "--json")[1])
+    assert printed.keys() == {"emulated", "trajectories", "scores"}
+    assert (printed["emulated"], len(printed["trajectories"]), printed["scores"]["n"]) == (
+        True,
+        90,
+        90,
+    )
+    first = printed["trajectories"][0]
     assert first.keys() == {"id", "diagnosis", "probability", "probabilities", "label"}
     assert first["probability"] == max(first["probabilities"].values())
     assert list(first["probabilities"]) == list(rt.cases.armpi().classes)
@@ -99,7 +103,7 @@ def spoilt(value: float, column: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("cells", "labels", "key", "message"),
     [
-        ([GOOD], ["Healthy"], "X_strange", "X_array"),
+        ([GOOD], ["Healthy"], "X_other", "X_array"),
         ([np.zeros((1000, 5))], ["Healthy"], "X_test_array", "expected"),
         ([spoilt(np.nan, 0)], ["Healthy"], "X_test_array", "got nan in sample 5"),
         ([spoilt(np.inf, 4)], ["Healthy"], "X_test_array", "infinite"),
@@ -117,10 +121,10 @@ def test_bad_files_end_with_one_line_and_code_2(
     )
     assert code == 2
     assert message in err
-    told = [line for line in err.splitlines() if line.startswith("error:")]
-    assert len(told) == 1
-    assert "expected" in told[0]
-    assert "got" in told[0]
+    errors = [line for line in err.splitlines() if line.startswith("error:")]
+    assert len(errors) == 1
+    assert "expected" in errors[0]
+    assert "got" in errors[0]
     assert "Traceback" not in err
     assert list(tmp_path.iterdir()) == [bad], "nothing half-written"
 
@@ -138,7 +142,7 @@ def test_bad_files_end_with_one_line_and_code_2(
         (("report", "nowhere"), "results.json"),
     ],
 )
-def test_bad_words_end_with_one_line_and_code_2(
+def test_bad_arguments_end_with_one_line_and_code_2(
     call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, words: tuple, message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -185,7 +189,7 @@ def test_a_case_of_ones_own_with_classes(call, own: Path, monkeypatch: pytest.Mo
     words = ("fit", "reach.toml", "--real", "real.npz", "--simulations", 40, "--out", "model")
     code, out, err = call(*words)
     assert code == 0, err
-    assert "36 movements of 12 EMULATED trajectories" in out
+    assert "36 segments of 12 EMULATED trajectories" in out
     (own / "elsewhere").mkdir()
     monkeypatch.chdir(own / "elsewhere")
     code, out, err = call("generate", "../model", "--per-class", 10, "--out", "made.npz")
@@ -206,13 +210,13 @@ def test_a_case_of_ones_own_without_classes(call, own: Path) -> None:
     assert code == 0, err
     assert "Residual model: 100 samples" in out
     assert "residual_level" in out
-    assert "90 % band holds" in " ".join(out.split())
+    assert "90 % band covers" in " ".join(out.split())
     code, out, err = call("--quiet", *words, "--json")
-    told = json.loads(out)
+    printed = json.loads(out)
     assert (code, err) == (0, "")
-    assert told["saved"] == "model"
-    assert [each.keys() for each in told["surrogate"]] == [{"output", "unit", "rmse", "nrmse"}]
-    assert told["residual"].keys() == {"emulated", "reason", "figures"}
+    assert printed["saved"] == "model"
+    assert [each.keys() for each in printed["surrogate"]] == [{"output", "unit", "rmse", "nrmse"}]
+    assert printed["residual"].keys() == {"emulated", "reason", "figures"}
     assert call("generate", "model", "--per-class", 3, "--out", "made.npz")[0] == 0
     made = rt.load("made.npz")
     assert (made.steps, made.outputs.names, len(made)) == (100, ("level",), 3)
@@ -220,27 +224,27 @@ def test_a_case_of_ones_own_without_classes(call, own: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "printed"),
     [
         (("reach.toml", "--real", "real.npz", "--folds", "2", "--sources", "dt,ibg_rg"), "IBG"),
         (("tank.toml", "--data", "record.csv", "--sources", "twin,pi_ls,ibg_rg"), "IBG"),
     ],
 )
-def test_a_study_of_a_case_of_ones_own(call, own: Path, words: tuple, told: str) -> None:
+def test_a_study_of_a_case_of_ones_own(call, own: Path, words: tuple, printed: str) -> None:
     words = ("study", *words, "--runs", 1, "--per-class", 12, "--processes", 1, "--out", "study")
     code, out, err = call(*words)
     assert code == 0, err
-    assert told in out
-    told_again = json.loads(call(*words, "--json")[1])
-    assert told_again.keys() == {
+    assert printed in out
+    printed_again = json.loads(call(*words, "--json")[1])
+    assert printed_again.keys() == {
         *("title", "emulated", "classifier", "runs", "test_trajectories"),
         *("sources", "comparisons", "report"),
     }
-    for source in told_again["sources"].values():
+    for source in printed_again["sources"].values():
         assert source.keys() in ({"title", *SCORES}, {"title", *ERRORS})
     assert all(
         each.keys() == {"a", "b", "metric", "mean_diff", "bootstrap_ci95"}
-        for each in told_again["comparisons"]
+        for each in printed_again["comparisons"]
     )
     page = own / "study" / "report.html"
     assert page.stat().st_size > 1000
@@ -272,7 +276,7 @@ def test_what_a_fit_cannot_be_is_one_line(call, own: Path, words: tuple, message
 def test_data_need_a_case_that_splits_them(call, own: Path) -> None:
     code, _, err = call("fit", "reach.toml", "--data", "record.csv", "--out", "model")
     assert code == 2
-    assert "--data: expected a case that says how its file is split, got 'reach'" in err
+    assert "--data: expected a case that defines how its file is split, got 'reach'" in err
 
 
 def test_a_built_in_twin_has_its_own_case(call, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ CLASSES = ("Healthy", "Broken [red]")
 
 
 class Case:
-    """The least that a case must have."""
+    """The attributes that reading needs of a case."""
 
     inputs = Channels(("left", "right"), ("V", "V"))
     outputs = Channels(("x", "y", "z"), ("m", "m", "m"))
@@ -53,16 +53,16 @@ def cases(monkeypatch):
     """`retwin.cases.get` that knows one case."""
     import retwin
 
-    asked = []
+    requested = []
 
     def get(name):
-        asked.append(name)
+        requested.append(name)
         return Case()
 
     module = SimpleNamespace(get=get)
     monkeypatch.setitem(sys.modules, "retwin.cases", module)
     monkeypatch.setattr(retwin, "cases", module, raising=False)
-    return asked
+    return requested
 
 
 def run(*arguments, fails=None):
@@ -90,22 +90,22 @@ def test_info_prints_a_table(file):
 
 
 def test_info_as_json(file, cases):
-    (told,) = json.loads(run("info", file, "--case", "armpi", "--json").stdout)
+    (facts,) = json.loads(run("info", file, "--case", "armpi", "--json").stdout)
     assert cases == ["armpi"]
-    assert told["sha256"] == sha256(file)
-    assert told["trajectories"] == 10
-    assert told["per_class"] == {"Broken [red]": 5, "Healthy": 5}
-    assert (told["samples"], told["rate"]) == (20, 100)
-    assert told["inputs"] == [{"name": "left", "unit": "V"}, {"name": "right", "unit": "V"}]
-    assert told["missing"] == pytest.approx(18 / 600)
-    assert told["emulated"] is False
-    assert told["provenance"] == [{"name": "robot.mat", "sha256": "ab12"}]
+    assert facts["sha256"] == sha256(file)
+    assert facts["trajectories"] == 10
+    assert facts["per_class"] == {"Broken [red]": 5, "Healthy": 5}
+    assert (facts["samples"], facts["rate"]) == (20, 100)
+    assert facts["inputs"] == [{"name": "left", "unit": "V"}, {"name": "right", "unit": "V"}]
+    assert facts["missing"] == pytest.approx(18 / 600)
+    assert facts["emulated"] is False
+    assert facts["provenance"] == [{"name": "robot.mat", "sha256": "ab12"}]
 
 
 def test_info_of_several_files_and_unlabelled_ones(file, tmp_path):
     save(load(file).replace(labels=None), tmp_path / "bare.npz")
-    told = json.loads(run("info", file, tmp_path / "bare.npz", "--json").stdout)
-    assert [one["per_class"] for one in told] == [{"Broken [red]": 5, "Healthy": 5}, {"": 10}]
+    facts = json.loads(run("info", file, tmp_path / "bare.npz", "--json").stdout)
+    assert [one["per_class"] for one in facts] == [{"Broken [red]": 5, "Healthy": 5}, {"": 10}]
     assert "unlabelled" in run("info", tmp_path / "bare.npz").output
 
 
@@ -158,19 +158,19 @@ def test_split_writes_two_disjoint_parts(file, tmp_path):
 
 
 def test_fetch_prints_the_path(tmp_path, monkeypatch):
-    asked = {}
+    requested = {}
 
     def fetch(name, *, folder, progress):
-        asked.update(name=name, folder=folder)
+        requested.update(name=name, folder=folder)
         progress(1.0)
         return tmp_path / "armpi" / "x.mat"
 
     monkeypatch.setattr(download, "fetch", fetch)
     result = run("fetch", "armpi", "--folder", tmp_path)
     assert result.stdout.strip() == str(tmp_path / "armpi" / "x.mat")
-    assert asked == {"name": "armpi", "folder": tmp_path}
+    assert requested == {"name": "armpi", "folder": tmp_path}
     run("fetch", "armpi")
-    assert asked["folder"] is None
+    assert requested["folder"] is None
 
 
 def test_input_errors_pass_on_to_the_caller(tmp_path):
@@ -178,7 +178,7 @@ def test_input_errors_pass_on_to_the_caller(tmp_path):
     assert "existing file or folder" in str(result.exception)
 
 
-def test_nothing_but_the_answer_goes_to_stdout_and_stderr(file):
+def test_nothing_but_the_result_is_printed(file):
     result = run("info", file, "--json")
     assert json.loads(result.stdout)
     assert result.stderr == ""

@@ -1,20 +1,22 @@
-"""`retwin doctor`: what is there, what is missing and what to do; only the necessary can fail."""
+"""`retwin doctor`: what is found, what is missing and what to do; only requirements can fail."""
 
 from __future__ import annotations
 
 import json
+import os
 import re
 from importlib import metadata
 from pathlib import Path
 
 import pytest
 
-from retwin.cli import environment as doctor
-from retwin.cli.environment import EXTRAS, FOR_DEVELOPERS, Check, examine
+from retwin.cli import doctor
+from retwin.cli.doctor import EXTRAS, FOR_DEVELOPERS, Check, examine
 from retwin.errors import InputError
 from retwin.serialisation.files import sha256
 
 STATES = {"ok", "warning", "missing", "broken"}
+BACKEND = "retwin.cases.animation.scene.offscreen_backend"
 
 
 @pytest.fixture
@@ -22,31 +24,34 @@ def healthy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPat
     """A machine without data of its own, where drawing is not tried."""
     monkeypatch.setenv("RETWIN_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("RETWIN_DATA", raising=False)
-    monkeypatch.setattr(doctor, "offscreen_backend", lambda: "egl")
+    monkeypatch.setattr(BACKEND, lambda: "egl")
     return monkeypatch
 
 
-def found(name: str) -> Check:
-    (check,) = (each for each in examine() if each.name == name)
+def found(name: str, *, deep: bool = False) -> Check:
+    (check,) = (each for each in examine(deep=deep) if each.name == name)
     return check
 
 
-def test_this_very_machine(call) -> None:
+@pytest.mark.parametrize("options", [(), ("--deep",)], ids=["default", "deep"])
+def test_this_very_machine(call, options: tuple[str, ...]) -> None:
     """All of it, drawing too; the tests run, so nothing that is needed can be broken."""
-    code, out, err = call("--quiet", "doctor", "--json")
+    code, out, err = call("--quiet", "doctor", *options, "--json")
     assert (code, err) == (0, "")
-    told = json.loads(out)
-    assert told.keys() == {"ok", "checks"}
-    assert told["ok"] is True
-    for each in told["checks"]:
+    printed = json.loads(out)
+    assert printed.keys() == {"ok", "checks"}
+    assert printed["ok"] is True
+    for each in printed["checks"]:
         assert each.keys() == {"group", "name", "state", "found", "remedy"}
         assert each["state"] in STATES - {"broken"}
         assert (each["state"] == "ok") == (each["remedy"] == ""), each
-    names = [each["name"] for each in told["checks"]]
+    names = [each["name"] for each in printed["checks"]]
     assert len(names) == len(set(names))
     assert {"Python", "torch", "mujoco", "cores", "memory", "GPU", "rendering", *EXTRAS} < {*names}
-    versions = {each["name"]: each["found"] for each in told["checks"]}
-    assert versions["torch"].startswith(metadata.version("torch"))
+    found = {each["name"]: each["found"] for each in printed["checks"]}
+    assert found["torch"].startswith(metadata.version("torch"))
+    assert ("not loaded" in found["torch"]) == (not options)
+    assert ("--deep" in found["GPU"]) == (not options)
 
 
 def test_every_extra_is_explained() -> None:
@@ -90,22 +95,31 @@ def test_what_is_needed_and_missing_is_broken(call, healthy: pytest.MonkeyPatch)
     assert "1 broken: retwin cannot work like this" in whole
 
 
-def test_a_library_that_does_not_load(healthy: pytest.MonkeyPatch) -> None:
-    def cannot(name: str) -> object:
-        raise OSError(f"lib{name}.so.1: cannot open\nshared object file")
+def test_a_library_that_does_not_load(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    broken = "raise OSError('libmujoco.so.1: cannot open\\nshared object file')"
+    (tmp_path / "mujoco.py").write_text(broken)
+    healthy.syspath_prepend(tmp_path)
+    healthy.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    assert found("mujoco").state == "ok", "it is installed, and not loaded"
+    (check,) = (each for each in doctor._installation(deep=True) if each.name == "mujoco")
+    assert check.state == "broken"
+    assert check.found == "OSError: libmujoco.so.1: cannot open shared object file"
+    assert "install mujoco-core again" in check.remedy
 
-    healthy.setattr("importlib.import_module", cannot)
-    assert found("mujoco").state == "broken"
-    assert found("mujoco").found == "OSError: libmujoco.so.1: cannot open shared object file"
+
+def test_a_library_that_hangs(healthy: pytest.MonkeyPatch) -> None:
+    healthy.setattr(doctor, "IMPORT_TIMEOUT", 0.0)
+    check = doctor._loaded("numpy")
+    assert (check.state, check.found) == ("broken", "no end after 0 s")
 
 
 def test_a_machine_that_cannot_draw(healthy: pytest.MonkeyPatch) -> None:
     def cannot() -> str:
         raise InputError("renderer", expected="OpenGL", got="none", remedy="install EGL")
 
-    healthy.setattr(doctor, "offscreen_backend", cannot)
-    told = found("rendering")
-    assert (told.state, told.found, told.remedy) == (
+    healthy.setattr(BACKEND, cannot)
+    check = found("rendering")
+    assert (check.state, check.found, check.remedy) == (
         "missing", "films are stick figures: none", "install EGL",
     )  # fmt: skip
 
@@ -117,7 +131,7 @@ def test_a_container_is_not_the_whole_machine(healthy: pytest.MonkeyPatch, tmp_p
         "memory.current": str(2**28),
     }.items():
         (tmp_path / name).write_text(text)
-    healthy.setattr(doctor, "CONTROL", tmp_path)
+    healthy.setattr(doctor, "CGROUP", tmp_path)
     healthy.setenv("OMP_NUM_THREADS", "64")
     assert found("cores").state == "warning"
     assert "OMP_NUM_THREADS=1" in found("cores").remedy
@@ -139,8 +153,8 @@ def test_data_that_are_found(healthy: pytest.MonkeyPatch, tmp_path: Path) -> Non
 
 def test_public_data_that_were_fetched(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
     ((name, known),) = doctor.DOWNLOADS.items()
-    told = found(f"public {name}")
-    assert (told.state, told.remedy) == ("missing", f"retwin data fetch {name}")
+    check = found(f"public {name}")
+    assert (check.state, check.remedy) == ("missing", f"retwin data fetch {name}")
     file = tmp_path / "cache" / known.file
     file.parent.mkdir(parents=True)
     file.write_bytes(b"x")
@@ -153,5 +167,5 @@ def test_public_data_that_were_fetched(healthy: pytest.MonkeyPatch, tmp_path: Pa
 def test_a_cache_that_cannot_be_written(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     healthy.setenv("RETWIN_CACHE", str(tmp_path / "file" / "below"))
-    told = found("cache")
-    assert (told.state, "RETWIN_CACHE" in told.remedy) == ("warning", True)
+    check = found("cache")
+    assert (check.state, "RETWIN_CACHE" in check.remedy) == ("warning", True)

@@ -36,7 +36,7 @@ def test_a_study_goes_on(call, start, own: Path) -> None:
 
 @pytest.mark.slow
 def test_a_fit_leaves_nothing_half_written(start, own: Path) -> None:
-    """In the midst of training, where lightning would end the process itself."""
+    """In the midst of training, between two epochs or within one."""
     long = (own / "reach.toml").read_text().replace("epochs = 20,", "epochs = 400,")
     (own / "long.toml").write_text(long)
     before = {file.name for file in own.iterdir()}

@@ -1,4 +1,4 @@
-"""Help that fits the screen and shows examples that work; tables of which nothing is cut off."""
+"""Help that fits the screen and shows examples that work; tables without cut-off texts."""
 
 from __future__ import annotations
 
@@ -97,8 +97,13 @@ def test_nothing_in_a_table_is_cut_off(
 
 
 def test_json_has_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
-    told = {"a": float("nan"), "b": [float("inf"), 1.5], "c": "ö", "d": rt.Scores(*(8 * [0.5]), 2)}
-    answer(told, "for people", as_json=True)
+    printed = {
+        "a": float("nan"),
+        "b": [float("inf"), 1.5],
+        "c": "ö",
+        "d": rt.Scores(*(8 * [0.5]), 2),
+    }
+    answer(printed, "for people", as_json=True)
     read = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert (read["a"], read["b"], read["c"], read["d"]["n"]) == (None, [None, 1.5], "ö", 2)
 
@@ -106,17 +111,17 @@ def test_json_has_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
 def test_json_is_alone_on_stdout(narrow) -> None:
     code, out, err = narrow("twin", "list", "--json")
     assert (code, err) == (0, "")
-    told = json.loads(out)
-    assert told.keys() == {"built_in", "forms"}
-    assert all(each.keys() == {"name", "title"} for each in told["built_in"])
-    assert all(each.keys() == {"form", "title"} for each in told["forms"])
+    printed = json.loads(out)
+    assert printed.keys() == {"built_in", "forms"}
+    assert all(each.keys() == {"name", "title"} for each in printed["built_in"])
+    assert all(each.keys() == {"form", "title"} for each in printed["forms"])
     code, out, err = narrow("twin", "info", "armpi-kinematic", "--json")
     assert (code, err) == (0, "")
-    told = json.loads(out)
-    assert told.keys() == {"title", "rate", "inputs", "outputs"}
-    for each in (*told["inputs"], *told["outputs"]):
+    printed = json.loads(out)
+    assert printed.keys() == {"title", "rate", "inputs", "outputs"}
+    for each in (*printed["inputs"], *printed["outputs"]):
         assert each.keys() == {"name", "unit", "low", "high"}
-    assert (told["rate"], len(told["inputs"]), len(told["outputs"])) == (100, 4, 3)
+    assert (printed["rate"], len(printed["inputs"]), len(printed["outputs"])) == (100, 4, 3)
 
 
 def test_quiet_stands_before_the_command(narrow, monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
@@ -127,12 +132,12 @@ def test_quiet_stands_before_the_command(narrow, monkeypatch: pytest.MonkeyPatch
     assert narrow(*words) == (0, "", "")
     code, out, err = narrow("twin", "info", "nonsense")
     assert (code, out) == (2, "")
-    assert "no such twin" in err, "errors are told"
+    assert "no such twin" in err, "errors are printed"
     monkeypatch.delenv("RETWIN_QUIET")
     assert "before the command" in narrow(*words, "--quiet")[2]
 
 
-def test_a_bar_says_how_long_it_takes(on_screen, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bar_shows_the_time_left(on_screen, capsys: pytest.CaptureFixture[str]) -> None:
     with bar("study") as tell:
         for share in (0.0, 0.5, 0.9, 0.1):
             tell("diagnosis", share)
@@ -142,7 +147,7 @@ def test_a_bar_says_how_long_it_takes(on_screen, capsys: pytest.CaptureFixture[s
     assert max(len(line) for line in Console().render_str(time_left).plain.splitlines()) < 200
 
 
-def test_a_log_is_told_of_long_work_only(
+def test_a_log_shows_the_progress_of_long_work_only(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [0.0]
@@ -152,13 +157,13 @@ def test_a_log_is_told_of_long_work_only(
             now[0] = float(second)
             tell("net [1]", second / 10)
         now[0] = 20.0
-        tell("law", 0.0)
+        tell("distribution", 0.0)
         now[0] = 40.0
-        tell("law", 0.5)
-        tell("law", 0.51)
+        tell("distribution", 0.5)
+        tell("distribution", 0.51)
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "fit: net [1] 20%, 8 s left"
-    assert lines[-2:] == ["fit: law 0%", "fit: law 50%, 20 s left"]
+    assert lines[-2:] == ["fit: distribution 0%", "fit: distribution 50%, 20 s left"]
     assert len(lines) == 11
 
 

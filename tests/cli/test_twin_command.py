@@ -166,7 +166,7 @@ def test_a_module_in_the_current_folder(mine: str, tmp_path: Path) -> None:
         ("has no attribute 'none'", "my_twins:none"),
         ("got a int", "my_twins:other"),
         ("got Empty module name", ":twin"),
-        ("inputs, outputs and rate, which a function does not tell", "my_twins:double"),
+        ("inputs, outputs and rate, which a function does not have", "my_twins:double"),
         ("no file of that name", "none.fmu"),
         ("no file of that name", "none.xml"),
     ],
@@ -367,9 +367,9 @@ def test_what_a_function_raises_is_one_line(
     )
     code, _, err = call(*words)
     assert code == 1
-    (told,) = err.splitlines()
-    found = re.match(match, told)
-    assert found, told
+    (message,) = err.splitlines()
+    found = re.match(match, message)
+    assert found, message
     line = MODULE.replace("\\\\", "\\").splitlines()[int(found[1]) - 1]
     assert "linalg" in line or "KeyError" in line
     if workers < 2:
@@ -405,12 +405,12 @@ def test_ctrl_c_says_how_to_go_on(
     done = tmp_path / "a.zarr.part" / "done"
     running = start("twin", *words, "--out", tmp_path / "a.zarr")
     line = running.interrupt(lambda: done.exists() and any(done.glob("[0-9]*")), number)
-    told = re.search(r"interrupted; give the same command again to go on: retwin twin (.*)", line)
-    assert told, line
+    match = re.search(r"interrupted; give the same command again to go on: retwin twin (.*)", line)
+    assert match, line
     finished = len(list(done.glob("[0-9]*")))
     assert 0 < finished < 150
-    monkeypatch.setattr("retwin.cli.terminal.MOMENT", 0.0)
-    code, _, err = call(*shlex.split(told[1]))
+    monkeypatch.setattr("retwin.cli.terminal.LOG_DELAY", 0.0)
+    code, _, err = call(*shlex.split(match[1]))
     assert code == 0
     assert f"simulate: {4 * finished} of 600" in err, "begun anew"
     assert "Wrote 600 trajectories" in err

@@ -56,7 +56,7 @@ def test_trajectories_may_have_different_numbers_of_movements() -> None:
 
 def test_commands_that_never_change_have_no_movement() -> None:
     found = Segments.from_commands(np.ones((2, 50, 3)))
-    assert found.most == 0
+    assert found.max_count == 0
     assert len(found) == 2
 
 
@@ -73,7 +73,7 @@ def test_steady_parts_end_with_the_trajectory_and_not_with_its_padding() -> None
     found = Segments.given([[0, 100], [5, np.nan]], [[50, 150], [60, np.nan]], steps=200)
     assert found.until([200, 200]).stop.tolist() == found.stop.tolist()
     assert found.until([180, 150]).stop.tolist() == [[100, 180], [150, 200]]
-    assert found.until([120, 200]).stop[0, 1] == 150, "a movement that was commanded took place"
+    assert found.until([120, 200]).stop[0, 1] == 150, "a commanded segment stays"
 
 
 def test_given_segments_are_checked() -> None:

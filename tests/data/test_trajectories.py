@@ -258,5 +258,5 @@ def test_only_channels_of_one_real_unit_compare():
 
 
 def test_concatenate_needs_a_set():
-    with pytest.raises(InputError, match="at least one set"):
+    with pytest.raises(InputError, match="at least 1 set"):
         Trajectories.concatenate([])

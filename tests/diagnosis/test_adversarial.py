@@ -7,20 +7,21 @@ import pytest
 import torch
 
 import retwin as rt
-from retwin.diagnosis import fit_dann
-from retwin.diagnosis.adversarial import _Reversed
+from retwin.diagnosis.adversarial import _Pair, _Reversed
+from retwin.diagnosis.features import Features
 from retwin.nets.training import Training
 from retwin.testing import check_diagnoser
 
 SMALL = rt.CNN(channels=(8, 16), dropout=0.0)
 SHORT = Training(max_epochs=20, batch_size=16, learning_rate=3e-3)
+SLOW = Training(max_epochs=40, batch_size=32, learning_rate=1e-3)
 
 
 def toy(count: int, *, seed: int, real: bool) -> rt.Trajectories:
-    """Two classes told by the first output, in noise.
+    """Two classes that differ in the first output, in noise.
 
-    A twin's second output tells them too, without noise; a real one's is a constant that the twin
-    shows for the class "high". The first output alone is right in Φ(2) = 0.977.
+    In a twin they differ in the second output too, without noise; a real one's is a constant, that
+    of the twin's class "high". The first output alone gives an accuracy of Φ(2) = 0.977.
     """
     rng = np.random.default_rng(seed)
     side = np.resize([1.0, -1.0], count)
@@ -41,31 +42,51 @@ def source() -> rt.Trajectories:
 
 @pytest.fixture(scope="module")
 def target() -> rt.Trajectories:
-    return toy(24, seed=1, real=True)
+    return toy(200, seed=1, real=True)
 
 
-def test_gives_up_what_only_the_twin_shows(
+def test_ignores_a_difference_that_only_the_twin_has(
     source: rt.Trajectories, target: rt.Trajectories
 ) -> None:
-    test = toy(100, seed=2, real=True)
+    """Trained on the twin alone every trajectory is one class, 0.5; adapted, most are right.
+
+    Over 12 retrainings a single one is right on 0.948, standard deviation 0.053 and at worst 0.795.
+    The mean of four has its limit seven of its standard deviations away.
+    """
+    test = toy(200, seed=2, real=True)
     plain = rt.fit_diagnoser(source, SMALL, seed=0, training=SHORT)
-    adapted = fit_dann(source, target, SMALL, seed=0, training=SHORT)
     assert rt.evaluate(plain, test).accuracy < 0.7
-    assert rt.evaluate(adapted, test).accuracy > 0.9
-    assert adapted.fitted is not None
-    assert abs(adapted.fitted.figures["domain_accuracy"] - 0.5) < 0.2
-    assert adapted.features.hide_start
-    check_diagnoser(adapted, target[:5])
+    adapted = [
+        rt.fit_diagnoser(source, rt.DANN(SMALL), target=target, seed=seed, training=SLOW)
+        for seed in range(4)
+    ]
+    assert np.mean([rt.evaluate(each, test).accuracy for each in adapted]) > 0.75
+    assert adapted[0].features.hide_start
+    check_diagnoser(adapted[0], target[:5])
 
 
-def test_labels_of_the_target_are_not_read(
+def test_the_critic_s_accuracy_is_balanced() -> None:
+    """One that takes all for real is right about none of a twin's and all of the real ones."""
+    features = Features.at(toy(2, seed=0, real=True))
+    pair = _Pair(rt.NetworkDiagnoser(SMALL, features, classes=("a", "b")))
+    twin, real = torch.zeros(6, 15, 4), torch.ones(2, 15, 4)
+    pair.represent = lambda values: values[:, 0, :1]
+    pair.critic = torch.nn.Linear(1, 1)
+    for weight, bias, accuracy in ((0.0, 1.0, 0.5), (1.0, -0.5, 1.0), (-1.0, 0.5, 0.0)):
+        torch.nn.init.constant_(pair.critic.weight, weight)
+        torch.nn.init.constant_(pair.critic.bias, bias)
+        assert pair.domain_accuracy(twin, real) == accuracy
+
+
+def test_labels_of_the_target_have_no_effect(
     source: rt.Trajectories, target: rt.Trajectories, tmp_path: Path
 ) -> None:
     shuffled = np.random.default_rng(0).permutation(target.labels)
     how = Training(max_epochs=2)
     for name, labels in (("known", target.labels), ("shuffled", shuffled), ("none", None)):
         given = target.replace(labels=labels)
-        fit_dann(source, given, SMALL, seed=0, training=how).save(tmp_path / name)
+        adapted = rt.fit_diagnoser(source, rt.DANN(SMALL), target=given, seed=0, training=how)
+        adapted.save(tmp_path / name)
     for file in ("model.json", "weights.safetensors"):
         known = (tmp_path / "known" / file).read_bytes()
         assert (tmp_path / "shuffled" / file).read_bytes() == known
@@ -82,10 +103,17 @@ def test_a_reversed_gradient() -> None:
 
 def test_bad_input_is_refused(source: rt.Trajectories, target: rt.Trajectories) -> None:
     with pytest.raises(rt.InputError, match="label every trajectory"):
-        fit_dann(source.replace(labels=None), target, SMALL, seed=0)
+        rt.fit_diagnoser(source.replace(labels=None), rt.DANN(SMALL), target=target, seed=0)
     with pytest.raises(rt.InputError, match="target: expected at least one"):
-        fit_dann(source, target[:0], SMALL, seed=0)
+        rt.fit_diagnoser(source, rt.DANN(SMALL), target=target[:0], seed=0)
     with pytest.raises(rt.InputError, match="network: expected a classifier"):
-        fit_dann(source, target, rt.MLP((4,)), seed=0)
+        rt.fit_diagnoser(source, rt.DANN(rt.MLP((4,))), target=target, seed=0)
     with pytest.raises(rt.InputError, match=r"trajectories\.rate"):
-        fit_dann(source, target.replace(rate=50.0), SMALL, seed=0)
+        rt.fit_diagnoser(source, rt.DANN(SMALL), target=target.replace(rate=50.0), seed=0)
+    with pytest.raises(rt.InputError, match="target: expected real trajectories for DANN"):
+        rt.fit_diagnoser(source, rt.DANN(SMALL), seed=0)
+    with pytest.raises(rt.InputError, match="target: expected none for CNN"):
+        rt.fit_diagnoser(source, SMALL, target=target, seed=0)
+    for setting in ({"hidden": 0}, {"gamma": float("nan")}):
+        with pytest.raises(rt.InputError, match=next(iter(setting))):
+            rt.DANN(SMALL, **setting)

@@ -26,7 +26,7 @@ from retwin.update.corrections.command_problem import Problem
 
 CHAIN = rt.Chain(rt.CommandSpace(), rt.SampledSensor())
 MAP = np.array([[1.0, 0.5], [-0.3, 0.8], [0.2, -1.0]])
-SAMPLER = RampSampler((-1.0, -1.0), (1.0, 1.0), movements=4, steps=400, ramps=(30, 40))
+SAMPLER = RampSampler((-1.0, -1.0), (1.0, 1.0), segments=4, steps=400, ramps=(30, 40))
 
 
 class Linear:
@@ -52,7 +52,7 @@ def at_rest(commands: np.ndarray) -> tuple[Problem, np.ndarray]:
     observed = torch.tensor(context.nominal.numpy() + noise)
     problem = Problem(rt.CommandSpace(), context, observed, mask)
     problem.observed, problem.unit = problem.observed * problem.unit, torch.ones(())
-    return problem, np.repeat(np.arange(segments.most), 2)
+    return problem, np.repeat(np.arange(segments.max_count), 2)
 
 
 def test_evidence_is_that_of_a_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -210,10 +210,14 @@ def test_any_twin_with_actuators(toy_diagnoser: InversionDiagnoser) -> None:
 
 
 @pytest.fixture(scope="module")
-def inversion(ibg: rt.Surrogate, emulated: rt.Trajectories, case: rt.Case) -> InversionDiagnoser:
-    """Calibrated on eight healthy trajectories of the emulated arm."""
+def inversion(exact, emulated: rt.Trajectories, case: rt.Case) -> InversionDiagnoser:
+    """Calibrated on eight healthy trajectories of the emulated arm, with the twin itself.
+
+    A surrogate's error, which differs from machine to machine, would be part of what is found.
+    """
     healthy = emulated.with_label("Healthy")[:8]
-    return fit_inversion(ibg, rt.fit_residual(ibg, healthy, CHAIN, seed=0), healthy, case.faults)
+    residual = rt.fit_residual(exact, healthy, CHAIN, seed=0)
+    return fit_inversion(exact, residual, healthy, case.faults)
 
 
 @pytest.fixture(scope="module")
@@ -234,6 +238,7 @@ def diagnosis(inversion: InversionDiagnoser, arm: tuple) -> Diagnosis:
 
 @pytest.mark.slow
 def test_the_emulated_arm_is_diagnosed(diagnosis: Diagnosis, arm: tuple) -> None:
+    """Over 11 retrainings all are right each time, with a probability of 0.96 at least."""
     truth = np.array([diagnosis.classes.index(label) for label in arm[0].labels])
     scores = score(truth, diagnosis.probabilities, diagnosis.classes)
     assert scores.macro_f1 > 0.9
@@ -243,6 +248,11 @@ def test_the_emulated_arm_is_diagnosed(diagnosis: Diagnosis, arm: tuple) -> None
 
 @pytest.mark.slow
 def test_intervals_of_severities_cover(diagnosis: Diagnosis, arm: tuple) -> None:
+    """The limits are ten standard deviations and more away from what 11 retrainings give.
+
+    Biases err by 4.01 with a standard deviation of 0.04, and 0.932 of their intervals hold
+    them, with one of 0.007; levels err by 0.60 with one of 0.02, and all intervals hold.
+    """
     truth = np.array([diagnosis.classes.index(label) for label in arm[0].labels])
     each, (_, drawn, hidden) = np.arange(len(truth)), arm
     biased, stuck = np.flatnonzero(truth >= 5), np.flatnonzero((truth > 0) & (truth < 5))
@@ -297,13 +307,11 @@ def test_a_glitch_is_no_fault(inversion: InversionDiagnoser, case: rt.Case) -> N
 
 
 @pytest.fixture(scope="module")
-def few(inversion: InversionDiagnoser) -> InversionDiagnoser:
-    """The same about three classes: contracts are about form."""
+def few(inversion: InversionDiagnoser, ibg: rt.Surrogate) -> InversionDiagnoser:
+    """The same about three classes, with a surrogate: contracts are about form."""
     names = ("Healthy", "Motor_1_Stuck", "Motor_2_Steady_state_error")
     faults = {name: inversion.faults[name] for name in names}
-    return InversionDiagnoser(
-        inversion.surrogate, inversion.residual, faults, noise=inversion.noise
-    )
+    return InversionDiagnoser(ibg, inversion.residual, faults, noise=inversion.noise)
 
 
 @pytest.mark.parametrize("check", DIAGNOSER_CHECKS, ids=lambda check: check.__name__)

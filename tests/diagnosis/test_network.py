@@ -23,7 +23,7 @@ def cnn(training: rt.Trajectories) -> rt.NetworkDiagnoser:
     return rt.fit_diagnoser(training, SMALL, seed=0, training=SHORT)
 
 
-def test_learns_what_can_be_learnt(
+def test_learns_classes_that_differ(
     cnn: rt.NetworkDiagnoser, case: rt.Case, ibg: rt.Surrogate
 ) -> None:
     test = rt.generate(ibg, case, per_class=20, seed=1)
@@ -41,7 +41,9 @@ def test_is_a_diagnoser(cnn: rt.NetworkDiagnoser, training: rt.Trajectories) -> 
     np.testing.assert_allclose(probabilities.sum(axis=1), 1)
 
 
-def test_looks_at_the_true_sensor_rate(cnn: rt.NetworkDiagnoser, training: rt.Trajectories) -> None:
+def test_features_have_the_true_sensor_rate(
+    cnn: rt.NetworkDiagnoser, training: rt.Trajectories
+) -> None:
     assert cnn.features(training[:2]).shape == (2, 100, 6)
     np.testing.assert_allclose(
         cnn.features(training[:2])[:, :, 3:].numpy(), training.residual[:2, ::10], atol=1e-6
@@ -101,4 +103,15 @@ def test_bad_input_is_refused(cnn: rt.NetworkDiagnoser, training: rt.Trajectorie
         with pytest.raises(rt.InputError, match="rate: expected 100 Hz"):
             rt.fit_diagnoser(training, SMALL, seed=0, rate=rate)
     with pytest.raises(rt.InputError, match="labels among"):
-        rt.evaluate(cnn, training.replace(labels=np.array(["Strange"] * len(training))))
+        rt.evaluate(cnn, training.replace(labels=np.array(["Another"] * len(training))))
+
+
+def test_a_diagnoser_of_any_kind_is_loaded_by_its_kind(
+    cnn: rt.NetworkDiagnoser, ibg: rt.Surrogate, tmp_path: Path
+) -> None:
+    cnn.save(tmp_path / "cnn")
+    assert isinstance(rt.load_diagnoser(tmp_path / "cnn"), rt.NetworkDiagnoser)
+    ibg.save(tmp_path / "surrogate")
+    for folder in ("surrogate", "missing"):
+        with pytest.raises(rt.InputError, match="a diagnoser model"):
+            rt.load_diagnoser(tmp_path / folder)

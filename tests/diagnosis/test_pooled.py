@@ -1,4 +1,4 @@
-"""Several diagnosers as one: against the formula, and the contract of every diagnoser."""
+"""Pooled diagnosers: the formula, and the contract of every diagnoser."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from retwin.testing import DIAGNOSER_CHECKS, DiagnoserSubject
 
 @dataclass(frozen=True)
 class Always:
-    """Thinks the same of every trajectory."""
+    """Gives the same probabilities for every trajectory."""
 
     classes: tuple[str, ...]
-    chance: tuple[float, ...]
+    probabilities: tuple[float, ...]
 
     def predict_proba(self, trajectories: rt.Trajectories) -> np.ndarray:
-        return np.tile(self.chance, (len(trajectories), 1))
+        return np.tile(self.probabilities, (len(trajectories), 1))
 
 
 CLASSES = ("Healthy", "a", "b")
@@ -35,10 +35,10 @@ def test_the_pool_is_the_geometric_mean(emulated: rt.Trajectories) -> None:
     assert pool.classes == CLASSES
     np.testing.assert_allclose(pool.predict_proba(emulated[:2]), [root / root.sum()] * 2)
     agreed = PooledDiagnoser((one, one)).predict_proba(emulated[:1])
-    np.testing.assert_allclose(agreed, [one.chance])
+    np.testing.assert_allclose(agreed, [one.probabilities])
 
 
-def test_nobody_rules_a_class_out(emulated: rt.Trajectories) -> None:
+def test_no_member_excludes_a_class_alone(emulated: rt.Trajectories) -> None:
     sure, other = Always(CLASSES, (1.0, 0.0, 0.0)), Always(CLASSES, (0.0, 0.0, 1.0))
     (got,) = PooledDiagnoser((sure, other)).predict_proba(emulated[:1])
     assert (got > 0).all()
@@ -46,7 +46,7 @@ def test_nobody_rules_a_class_out(emulated: rt.Trajectories) -> None:
     assert got[1] < 0.05
 
 
-def test_members_must_know_the_same_classes() -> None:
+def test_members_must_have_the_same_classes() -> None:
     with pytest.raises(rt.InputError, match="of the same classes"):
         PooledDiagnoser(())
     with pytest.raises(rt.InputError, match="of the same classes"):

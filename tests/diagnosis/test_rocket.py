@@ -7,17 +7,17 @@ import pytest
 import torch
 
 import retwin as rt
-from retwin.diagnosis import RocketDiagnoser, fit_rocket
+from retwin.diagnosis import RocketDiagnoser
 from retwin.testing import check_diagnoser
 
 pytest.importorskip("numba")
 pytest.importorskip("sktime")
 
-KERNELS = 504
+SMALL = rt.Rocket(504)
 
 
 def toy(count: int, *, seed: int, noise: float = 0.3) -> rt.Trajectories:
-    """Three classes by what the residual does: nothing, a slow wave, a quick one; in noise."""
+    """Three classes of residuals in noise: none, a slow wave and a fast one."""
     rng = np.random.default_rng(seed)
     kind = np.resize([0, 1, 2], count)
     time = np.arange(500) / 100.0
@@ -32,22 +32,22 @@ def toy(count: int, *, seed: int, noise: float = 0.3) -> rt.Trajectories:
 
 @pytest.fixture(scope="module")
 def rocket() -> RocketDiagnoser:
-    return fit_rocket(toy(240, seed=0), seed=0, kernels=KERNELS)
+    return rt.fit_diagnoser(toy(240, seed=0), SMALL, seed=0)
 
 
-def test_learns_what_can_be_learnt(rocket: RocketDiagnoser) -> None:
+def test_learns_classes_that_differ(rocket: RocketDiagnoser) -> None:
     assert rt.evaluate(rocket, toy(90, seed=1)).macro_f1 > 0.95
 
 
-def test_is_as_sure_as_it_is_right() -> None:
-    """In noise that hides the waves often, so that there is something to be unsure of."""
-    unsure = fit_rocket(toy(600, seed=0, noise=1.5), seed=0, kernels=KERNELS)
+def test_probabilities_are_calibrated() -> None:
+    """Noise often hides the waves, so that the probabilities are well below 1."""
+    noisy = rt.fit_diagnoser(toy(600, seed=0, noise=1.5), SMALL, seed=0)
     test = toy(600, seed=1, noise=1.5)
-    probabilities = unsure.predict_proba(test)
-    right = np.array(unsure.classes)[probabilities.argmax(axis=1)] == test.labels
-    assert 0.5 < right.mean() < 0.95
+    probabilities = noisy.predict_proba(test)
+    correct = np.array(noisy.classes)[probabilities.argmax(axis=1)] == test.labels
+    assert 0.5 < correct.mean() < 0.95
     # Two standard errors: 0.04 each, most of it from the 120 that set the temperature.
-    assert abs(probabilities.max(axis=1).mean() - right.mean()) < 0.08
+    assert abs(probabilities.max(axis=1).mean() - correct.mean()) < 0.08
 
 
 def test_is_a_diagnoser(rocket: RocketDiagnoser) -> None:
@@ -69,7 +69,8 @@ def test_what_is_not_finite_has_no_probabilities(rocket: RocketDiagnoser) -> Non
 def test_saved_and_loaded_is_the_same(rocket: RocketDiagnoser, tmp_path: Path) -> None:
     test = toy(9, seed=3)
     rocket.save(tmp_path / "rocket")
-    back = RocketDiagnoser.load(tmp_path / "rocket")
+    back = rt.load_diagnoser(tmp_path / "rocket")
+    assert isinstance(back, RocketDiagnoser)
     assert (back.classes, back.features) == (rocket.classes, rocket.features)
     np.testing.assert_array_equal(back.predict_proba(test), rocket.predict_proba(test))
     with pytest.raises(rt.InputError, match="a diagnoser model"):
@@ -78,7 +79,7 @@ def test_saved_and_loaded_is_the_same(rocket: RocketDiagnoser, tmp_path: Path) -
 
 def test_same_seed_same_bytes(tmp_path: Path) -> None:
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        fit_rocket(toy(60, seed=0), seed=seed, kernels=84).save(tmp_path / name)
+        rt.fit_diagnoser(toy(60, seed=0), rt.Rocket(84), seed=seed).save(tmp_path / name)
     for file in ("model.json", "weights.safetensors"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
     a, c = (tmp_path / name / "weights.safetensors" for name in "ac")
@@ -90,7 +91,7 @@ def test_classes_keep_the_order_given() -> None:
     two = toy(120, seed=0)
     two = two[two.labels != "slow"]
     order = ("quick", "never", "none")
-    fitted = fit_rocket(two, seed=0, classes=order, kernels=KERNELS)
+    fitted = rt.fit_diagnoser(two, SMALL, seed=0, classes=order)
     assert fitted.classes == order
     probabilities = fitted.predict_proba(two)
     assert (np.array(order)[probabilities.argmax(axis=1)] == two.labels).mean() > 0.95
@@ -100,14 +101,18 @@ def test_classes_keep_the_order_given() -> None:
 def test_bad_input_is_refused(rocket: RocketDiagnoser) -> None:
     given = toy(12, seed=0)
     with pytest.raises(rt.InputError, match="label every trajectory"):
-        fit_rocket(given.replace(labels=None), seed=0)
-    with pytest.raises(rt.InputError, match="rate: expected at least 9 readings"):
-        fit_rocket(given, seed=0, rate=1.0)
+        rt.fit_diagnoser(given.replace(labels=None), SMALL, seed=0)
+    with pytest.raises(rt.InputError, match="rate: expected at least 9 samples"):
+        rt.fit_diagnoser(given, SMALL, seed=0, rate=1.0)
+    with pytest.raises(rt.InputError, match="training: expected none for Rocket"):
+        rt.fit_diagnoser(given, SMALL, seed=0, training=rt.Training())
+    with pytest.raises(rt.InputError, match="kernels: expected a multiple of 84"):
+        rt.Rocket(100)
     short = given.replace(
         **{
             name: getattr(given, name)[:, :300]
             for name in ("commands", "nominal", "observed", "mask")
         }
     )
-    with pytest.raises(rt.InputError, match=r"trajectories\.steps: .*50 readings"):
+    with pytest.raises(rt.InputError, match=r"trajectories\.steps: .*50 samples"):
         rocket.predict_proba(short)

@@ -62,6 +62,33 @@ def test_a_loss_that_is_not_finite_ends_training() -> None:
         train(nn.Linear(2, 1), squared, (x, y * torch.nan), None, Training(3), seed=0)
 
 
+def test_modules_in_evaluation_mode_stay_in_it() -> None:
+    """What is frozen by `eval` is so in every epoch, also after a validation."""
+    modes = []
+
+    class Watched(nn.Linear):
+        def forward(self, values: torch.Tensor) -> torch.Tensor:
+            modes.append((self.training, frozen.training))
+            return super().forward(values)
+
+    frozen, fresh = nn.Dropout(0.5).eval(), Watched(2, 1)
+    network = nn.Sequential(frozen, fresh)
+    train(network, squared, line(64), line(64), Training(2, 32), seed=0)
+    assert modes == 2 * [(True, False), (True, False), (False, False)]
+
+
+def test_an_interrupted_training_ends_at_once() -> None:
+    def interrupt(share: float) -> None:
+        raise KeyboardInterrupt
+
+    network = nn.Linear(2, 1)
+    before = torch.random.get_rng_state(), torch.get_num_threads()
+    with pytest.raises(KeyboardInterrupt):
+        train(network, squared, line(), None, Training(3), seed=0, progress=interrupt)
+    assert torch.equal(torch.random.get_rng_state(), before[0])
+    assert torch.get_num_threads() == before[1]
+
+
 @pytest.mark.parametrize("config", [MLP((8,)), LSTM(8), TCN(8, levels=3)], ids=repr)
 def test_sequence_networks_are_causal(config: MLP | LSTM | TCN) -> None:
     with isolated(0):
@@ -103,10 +130,12 @@ def test_standardise_and_back() -> None:
 def test_unknown_settings_are_refused() -> None:
     from retwin import InputError
 
-    with pytest.raises(InputError, match="decay 'linear'"):
+    with pytest.raises(InputError, match=r"decay: expected one of cosine, step, got 'linear'"):
         Training(decay="linear")
-    with pytest.raises(InputError, match="0 epochs"):
+    with pytest.raises(InputError, match=r"max_epochs: expected .* at least 1, got 0"):
         Training(max_epochs=0)
+    with pytest.raises(InputError, match=r"learning_rate: .*, got nan"):
+        Training(learning_rate=float("nan"))
 
 
 def test_a_network_that_could_not_be_loaded_is_not_saved() -> None:

@@ -55,7 +55,7 @@ class Lag:
 
 @dataclass(frozen=True)
 class Steps:
-    """Commands that are held for ten samples."""
+    """Commands that are constant for ten samples each."""
 
     steps: int = STEPS
 
@@ -64,7 +64,7 @@ class Steps:
 
 
 def plant() -> Case:
-    """A lag whose real gain is 1.3, where its twin says 1."""
+    """A lag whose real gain is 1.3 and whose twin has 1."""
     twin = Lag()
     return Case(
         name="plant",
@@ -134,7 +134,7 @@ def test_results_hold_simulations_instead_of_diagnoses(folder: Path) -> None:
         assert len(source["rmse"]) == 1
         low, high = source["intervals"]["rmse"]
         assert low <= np.mean(source["rmse"]) <= high
-    assert sources["twin"]["coverage90"] == [None], "no chance, no band"
+    assert sources["twin"]["coverage90"] == [None], "a deterministic twin has no bands"
     # The gain explains all but the noise; the residual model has to learn it.
     assert np.mean(sources["pi_ls"]["rmse"]) == pytest.approx(0.02, abs=0.004)
     assert np.mean(sources["ibg_rg"]["rmse"]) < 0.7 * np.mean(sources["ibg"]["rmse"])
@@ -158,9 +158,9 @@ def test_figures_agree_with_the_arrays(folder: Path) -> None:
         )
         assert "simulation/twin/bands" not in arrays
         assert arrays["simulation/ids"].tolist() == results["data"]["test"]["ids"]
-    told = results["sources"]["ibg_rg"]
-    assert told["rmse"][0] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-3)
-    assert told["coverage90"][0] == pytest.approx(inside.mean(), abs=0.01)
+    found = results["sources"]["ibg_rg"]
+    assert found["rmse"][0] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-3)
+    assert found["coverage90"][0] == pytest.approx(inside.mean(), abs=0.01)
 
 
 @pytest.mark.slow
@@ -186,7 +186,7 @@ def test_a_case_may_split_its_file_itself(tmp_path: Path) -> None:
     assert results.data.calibration.n == 4
     low, high = results.sources["twin"].interval("rmse")
     assert low < results.sources["twin"].runs("rmse")[0] < high, "blocks of the one record"
-    with pytest.raises(rt.InputError, match="a case that says how its file is split"):
+    with pytest.raises(rt.InputError, match="a case that declares how its file is split"):
         rt.run_study(plant(), plan, data, tmp_path / "other", processes=1)
 
 
@@ -203,5 +203,5 @@ def test_sources_of_the_other_kind_are_refused(tmp_path: Path, capsys, monkeypat
     command = f"retwin study tanks --sources dt --data {tmp_path}/data.csv --out {tmp_path}/out"
     monkeypatch.setattr("sys.argv", command.split())
     assert _run() == 2
-    assert "classes to tell apart" in capsys.readouterr().err
+    assert "a case with classes" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

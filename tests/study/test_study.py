@@ -1,4 +1,4 @@
-"""The study end to end on the emulated robot, small: what it writes, and that it resumes."""
+"""A small study of the emulated robot from end to end: its results, and that it resumes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def finished(case: rt.Case, tmp_path_factory: pytest.TempPathFactory) -> tuple[d
 
 
 def comparable(out: Path) -> dict[str, Any]:
-    """results.json without what depends on the clock and the machine."""
+    """The contents of results.json without what depends on time and machine."""
     results = json.loads((out / "results.json").read_text("utf-8"))
     for name in ("timing", "provenance"):
         del results[name]
@@ -48,7 +48,7 @@ def test_results_follow_the_schema(finished: tuple[dict, Path], case: rt.Case) -
     results = json.loads((out / "results.json").read_text("utf-8"))
     assert results["schema"] == 1
     assert results["emulated"] is True
-    assert results["published"] == {}, "the paper's figures do not stand beside emulated ones"
+    assert results["published"] == {}, "the paper's figures are compared with real data alone"
     assert results["classes"] == list(case.classes)
     assert list(results["sources"]) == ["dt", "ibg", "ibg_rg"]
     assert results["data"]["test"]["n"] == 90
@@ -108,15 +108,15 @@ def test_calling_again_does_nothing_new(finished: tuple[dict, Path], case: rt.Ca
     assert {p: p.stat().st_mtime_ns for p in (out / "work").rglob("*") if p.is_file()} == stamps
 
 
-@pytest.mark.parametrize("sign_of_life", ["work/run-0/surrogate", "work/run-0/fold-0/dt.npz"])
+@pytest.mark.parametrize("sign_of_progress", ["work/run-0/surrogate", "work/run-0/fold-0/dt.npz"])
 def test_killed_and_called_again_it_ends_the_same(
-    finished: tuple[dict, Path], tmp_path: Path, sign_of_life: str
+    finished: tuple[dict, Path], tmp_path: Path, sign_of_progress: str
 ) -> None:
     out = tmp_path / "killed"
     call = [sys.executable, "-m", "retwin", *COMMAND, str(out)]
     process = subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 240
-    while not (out / sign_of_life).exists() and time.monotonic() < deadline:
+    while not (out / sign_of_progress).exists() and time.monotonic() < deadline:
         assert process.poll() is None, "ended before it could be killed"
         time.sleep(0.02)
     process.kill()
@@ -124,10 +124,10 @@ def test_killed_and_called_again_it_ends_the_same(
     assert not (out / "results.json").exists()
     subprocess.run(call, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     assert comparable(out) == comparable(finished[1])
-    with np.load(out / "arrays.npz") as ours, np.load(finished[1] / "arrays.npz") as theirs:
-        assert set(ours) == set(theirs)
-        for name in ours:
-            np.testing.assert_array_equal(ours[name], theirs[name])
+    with np.load(out / "arrays.npz") as made, np.load(finished[1] / "arrays.npz") as expected:
+        assert set(made) == set(expected)
+        for name in made:
+            np.testing.assert_array_equal(made[name], expected[name])
     assert not list(out.rglob(".*")), "no temporary file is left"
 
 
@@ -190,20 +190,20 @@ REAL = {
 
 
 @pytest.mark.parametrize("sees", SEES)
-def test_a_source_gets_no_real_data_but_those_it_declares(
+def test_a_source_has_access_to_the_real_data_that_it_declares_alone(
     sees: str, finished: tuple[dict, Path], case: rt.Case
 ) -> None:
     files = Files(finished[1] / "work")
     real = files.real_data()
     fold = (tuple(range(0, 90, 2)), tuple(range(1, 90, 2)))
     trial = Trial(files, case, PLAN, fold, Job("diagnosis", 0, 0, "a source"), sees)
-    for what, ask in REAL.items():
+    for what, read in REAL.items():
         if what not in SEES[sees]:
             if what == "timing":
-                assert ask(trial) is None
+                assert read(trial) is None
             else:
                 with pytest.raises(PermissionError, match=f"declares '{sees}' and asks for {what}"):
-                    ask(trial)
+                    read(trial)
     if sees == "labelled":
         assert trial.labelled.ids.tolist() == real.ids[::2].tolist()
         assert set(trial.healthy.labels.tolist()) == {"Healthy"}
@@ -211,7 +211,7 @@ def test_a_source_gets_no_real_data_but_those_it_declares(
         found = trial.unlabelled if sees == "unlabelled" else trial.test_outputs
         assert found.ids.tolist() == real.ids[int(sees == "transductive") :: 2].tolist()
         assert set(found.labels.tolist()) == {""}
-    assert set(trial.tested().labels.tolist()) == {""}, "whoever predicts sees no labels"
+    assert set(trial.tested().labels.tolist()) == {""}, "predictions use no labels"
 
 
 def test_fewer_trajectories_are_a_part_of_the_more(
@@ -249,16 +249,19 @@ def test_a_study_grows(finished: tuple[dict, Path], case: rt.Case, tmp_path: Pat
 
 
 def test_a_study_that_cannot_be_is_refused_at_once(case: rt.Case, tmp_path: Path) -> None:
-    blind = replace(case, parametric=None)
+    fixed = replace(case, parametric=None)
     for sources, system, classifier, message in (
-        (("dt", "pi_ls"), blind, None, "says what is free in its twin"),
+        (("dt", "pi_ls"), fixed, None, "declares the free parameters of its twin"),
         (("dann",), case, "rocket", "a classifier that is a network"),
     ):
         plan = rt.StudyPlan(sources=sources, classifier=classifier)
         with pytest.raises(rt.InputError, match=message):
             rt.run_study(system, plan, rt.StudyData(), tmp_path / "out")
+    for processes in (0, -1, 1.5, float("nan")):
+        with pytest.raises(rt.InputError, match="processes: expected a whole number of at least 1"):
+            rt.run_study(case, PLAN, rt.StudyData(), tmp_path / "out", processes=processes)
     assert not (tmp_path / "out").exists()
-    assert "pi_ls" not in possible_sources(blind, rt.StudyPlan())
+    assert "pi_ls" not in possible_sources(fixed, rt.StudyPlan())
 
 
 @pytest.mark.parametrize(
@@ -268,10 +271,19 @@ def test_a_study_that_cannot_be_is_refused_at_once(case: rt.Case, tmp_path: Path
         ({"sources": ()}, "at least one source"),
         ({"preset": "slow"}, "preset: expected one of quick, paper"),
         ({"classifier": "svm"}, "classifier: expected one of cnn, lstm, rocket"),
-        ({"runs": 0}, "runs: expected at least 1"),
+        ({"runs": 0}, "runs: expected a whole number of at least 1, got 0"),
+        ({"runs": 1.5}, "runs: expected a whole number of at least 1, got 1.5"),
+        ({"runs": float("nan")}, "runs: expected a whole number of at least 1, got nan"),
+        ({"per_class": 0}, "per_class: expected a whole number of at least 1"),
+        ({"folds": 1}, "folds: expected a whole number of at least 2"),
+        ({"seed": -1}, "seed: expected a whole number of at least 0"),
         ({"calibrate_on": "some"}, "calibrate_on: expected one of healthy, all"),
-        ({"encoder_noise": -1.0}, "encoder_noise of at least 0"),
-        ({"rate": 0.0}, "a positive rate"),
+        ({"encoder_noise": -1.0}, "encoder_noise: expected a finite number of at least 0"),
+        ({"encoder_noise": float("nan")}, "encoder_noise: expected a finite number .* got nan"),
+        ({"encoder_noise": float("inf")}, "encoder_noise: expected a finite number .* got inf"),
+        ({"rate": 0.0}, "rate: expected a positive number of Hz, got 0.0"),
+        ({"rate": float("nan")}, "rate: expected a positive number of Hz, got nan"),
+        ({"rate": float("inf")}, "rate: expected a positive number of Hz, got inf"),
     ],
 )
 def test_bad_plans_are_refused(changes: dict, message: str) -> None:
@@ -294,13 +306,13 @@ def test_bad_data_leave_nothing_behind(
     data = rt.StudyData(real=tmp_path / "faulty.npz")
     with pytest.raises(rt.InputError, match="labelled 'Healthy' in every calibration part"):
         rt.run_study(case, PLAN, data, tmp_path / "out")
-    strange = emulated.replace(labels=np.array(["Strange"] * 90))
-    rt.save(strange, tmp_path / "strange.npz")
-    with pytest.raises(rt.InputError, match="Strange"):
-        rt.run_study(case, PLAN, rt.StudyData(real=tmp_path / "strange.npz"), tmp_path / "out")
+    other = emulated.replace(labels=np.array(["Other"] * 90))
+    rt.save(other, tmp_path / "other.npz")
+    with pytest.raises(rt.InputError, match="Other"):
+        rt.run_study(case, PLAN, rt.StudyData(real=tmp_path / "other.npz"), tmp_path / "out")
     with pytest.raises(rt.InputError, match="at least 10 trajectories of the twin"):
         rt.run_study(case, rt.StudyPlan(per_class=1), rt.StudyData(), tmp_path / "out")
     noisy = rt.StudyPlan(encoder_noise=1.0)
-    with pytest.raises(rt.InputError, match="cannot tell what a joint's reading"):
+    with pytest.raises(rt.InputError, match="does not state how encoder noise"):
         rt.run_study(case.with_random_onset(), noisy, rt.StudyData(), tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
-"""Whole studies, apart from the other tests of studies so that they run beside them."""
+"""Whole studies, in a file of their own so that they run in parallel with other tests."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from retwin.twins.parametric import ParametricTwin
 def test_every_source_is_made(
     emulated: rt.Trajectories, twin_set: rt.Trajectories, case: rt.Case, tmp_path: Path
 ) -> None:
-    """All fourteen, small: each predicts every trajectory and says what it cost."""
+    """All fourteen, small: each predicts every trajectory and reports its costs."""
     free = command_side_parameters(KINEMATIC.inputs, delay=(0.0, 20.0), offset=25.0)
     quick = ParametricTwin(CommandSide(KINEMATIC, nominal=KINEMATIC.position), free)
     case = replace(case, parametric=quick)

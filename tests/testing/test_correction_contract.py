@@ -1,4 +1,4 @@
-"""All corrections keep the same contract, and the checks of it can fail."""
+"""All corrections satisfy the same contract, and every check of it can fail."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ def delays_and_offsets(context: rt.Context) -> Tensor:
 def offsets_of_joints(context: rt.Context) -> Tensor:
     rng = np.random.default_rng(2)
     shape = context.segments.start.shape
-    late, off = rng.gamma(4, 1.2, (*shape, 1)), rng.normal(0, 4, (*shape, 4))
+    delay, offset = rng.gamma(4, 1.2, (*shape, 1)), rng.normal(0, 4, (*shape, 4))
     missed = np.zeros((*shape, 4))
     missed[[0, 3, 5, 8], [0, 0, 0, 1], [0, 1, 2, 3]] = 1.0
-    return torch.tensor(np.concatenate([late, off * (1 - missed), missed], axis=2)).float()
+    return torch.tensor(np.concatenate([delay, offset * (1 - missed), missed], axis=2)).float()
 
 
 CORRECTIONS: dict[str, tuple[rt.Correction, Callable[[rt.Context], Tensor], str]] = {
     "delay and offset": (rt.DelayOffset(), delays_and_offsets, "context"),
-    # It learns from all trajectories what to believe, so it needs more than a few.
+    # Its prior is learned from all trajectories, so it needs more than a few.
     "command space": (rt.CommandSpace(), offsets_of_joints, "several"),
     "chain": (rt.Chain(rt.CommandSpace(), rt.SampledSensor()), offsets_of_joints, "several"),
 }
@@ -72,7 +72,7 @@ def test_correction(subject: CorrectionSubject, check: Callable) -> None:
 
 
 @dataclass(frozen=True)
-class Bent:
+class Modified:
     """`DelayOffset` with parts replaced."""
 
     resolution: str = "segment"
@@ -105,7 +105,7 @@ def mixes_trajectories(context: rt.Context, z: Tensor) -> Tensor:
     return GOOD.apply(context, z + (z.mean(dim=0) - z.mean(dim=0).mean()) * (len(z) - 1))
 
 
-def believes_in_every_movement(context: rt.Context, observed: Tensor, mask: Tensor):
+def identifies_every_segment(context: rt.Context, observed: Tensor, mask: Tensor):
     found = GOOD.infer(context, observed, mask)
     return replace(found, identified=torch.ones_like(found.identified))
 
@@ -120,11 +120,11 @@ def finds_half(context: rt.Context, observed: Tensor, mask: Tensor):
     return replace(found, z=found.z / 2)
 
 
-def looks_everywhere(context: rt.Context, observed: Tensor, mask: Tensor):
+def ignores_the_mask(context: rt.Context, observed: Tensor, mask: Tensor):
     return GOOD.infer(context, observed, torch.ones_like(mask))
 
 
-def mends_in_place(context: rt.Context, observed: Tensor, mask: Tensor):
+def changes_its_argument(context: rt.Context, observed: Tensor, mask: Tensor):
     observed += 0.001
     return GOOD.infer(context, observed, mask)
 
@@ -136,18 +136,18 @@ def draws_from_the_global_generator(context: rt.Context, observed: Tensor, mask:
 
 BROKEN = [
     ("check_protocol", SimpleNamespace(resolution="segment", apply=GOOD.apply)),
-    ("check_protocol", Bent(resolution="sometimes")),
-    ("check_latent", Bent(heads=heads_that_overlap)),
-    ("check_zero", Bent(apply=adds_a_constant)),
-    ("check_apply", Bent(apply=forgets_the_last_output)),
-    ("check_gradient", Bent(apply=forgets_the_gradient)),
-    ("check_batch", Bent(apply=mixes_trajectories)),
-    ("check_no_movement", Bent(infer=believes_in_every_movement)),
-    ("check_discrepancy", Bent(infer=has_a_negative_variance)),
-    ("check_recovery", Bent(infer=finds_half)),
-    ("check_mask", Bent(infer=looks_everywhere)),
-    ("check_arguments_kept", Bent(infer=mends_in_place)),
-    ("check_arguments_kept", Bent(infer=draws_from_the_global_generator)),
+    ("check_protocol", Modified(resolution="sometimes")),
+    ("check_latent", Modified(heads=heads_that_overlap)),
+    ("check_zero", Modified(apply=adds_a_constant)),
+    ("check_apply", Modified(apply=forgets_the_last_output)),
+    ("check_gradient", Modified(apply=forgets_the_gradient)),
+    ("check_batch", Modified(apply=mixes_trajectories)),
+    ("check_no_segment", Modified(infer=identifies_every_segment)),
+    ("check_discrepancy", Modified(infer=has_a_negative_variance)),
+    ("check_recovery", Modified(infer=finds_half)),
+    ("check_mask", Modified(infer=ignores_the_mask)),
+    ("check_arguments_kept", Modified(infer=changes_its_argument)),
+    ("check_arguments_kept", Modified(infer=draws_from_the_global_generator)),
 ]
 
 
@@ -164,18 +164,18 @@ def test_every_check_can_fail() -> None:
 
 def test_all_that_is_broken_is_listed(context: rt.Context) -> None:
     z = delays_and_offsets(context)
-    check_correction(Bent(), context, z)
-    worse = Bent(heads=heads_that_overlap, infer=finds_half)
-    with pytest.raises(AssertionError, match=r"Bent breaks(.|\n)*check_latent(.|\n)*check_rec"):
+    check_correction(Modified(), context, z)
+    worse = Modified(heads=heads_that_overlap, infer=finds_half)
+    with pytest.raises(AssertionError, match=r"Modified breaks(.|\n)*check_latent(.|\n)*check_rec"):
         check_correction(worse, context, z)
     with pytest.raises(rt.InputError, match="z: expected shape"):
-        check_correction(Bent(), context, z[:1])
+        check_correction(Modified(), context, z[:1])
 
 
-def test_the_operator_that_the_docs_show_keeps_it(context: rt.Context) -> None:
+def test_the_operator_of_the_docs_satisfies_it(context: rt.Context) -> None:
     page = (Path(__file__).parents[2] / "docs" / "corrections.md").read_text("utf-8")
     (code,) = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
-    # A dataclass looks its module up, so the page gets one.
+    # A dataclass needs its module in sys.modules.
     module = ModuleType("shown")
     sys.modules["shown"] = module
     try:

@@ -1,4 +1,4 @@
-"""All diagnosers keep the same contract, and the checks of it can fail."""
+"""All diagnosers satisfy the contract, and each check of it can fail."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def test_diagnoser(subject: DiagnoserSubject, check: Callable) -> None:
 
 
 @dataclass(frozen=True)
-class Farthest:
-    """A small diagnoser that is sound: which of the first two outputs goes astray more."""
+class LargestResidual:
+    """A small diagnoser that is correct: which of the first two outputs has the larger residual."""
 
     outputs: rt.Channels
     rate: float
@@ -58,35 +58,35 @@ class Farthest:
                     got=f"{getattr(trajectories, name)}",
                     remedy="give others",
                 )
-        astray = 1e-9 + np.abs(trajectories.residual[..., :2].astype(float)).mean(axis=1)
-        return astray / astray.sum(axis=1, keepdims=True)
+        size = 1e-9 + np.abs(trajectories.residual[..., :2].astype(float)).mean(axis=1)
+        return size / size.sum(axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)
-class Bent:
-    """A sound diagnoser whose answer is bent."""
+class Modified:
+    """A correct diagnoser whose probabilities are modified."""
 
-    bend: Callable[[Callable, rt.Trajectories], np.ndarray]
-    sound: Farthest
+    modify: Callable[[Callable, rt.Trajectories], np.ndarray]
+    correct: LargestResidual
     classes: tuple[str, ...] = ("x", "y")
 
     def predict_proba(self, trajectories: rt.Trajectories) -> np.ndarray:
-        return self.bend(self.sound.predict_proba, trajectories)
+        return self.modify(self.correct.predict_proba, trajectories)
 
 
 def forgets_to_normalise(predict: Callable, trajectories: rt.Trajectories) -> np.ndarray:
     return 2 * predict(trajectories)
 
 
-def peeks_at_labels(predict: Callable, trajectories: rt.Trajectories) -> np.ndarray:
+def uses_labels(predict: Callable, trajectories: rt.Trajectories) -> np.ndarray:
     return np.where((trajectories.labels == "x")[:, None], [1.0, 0.0], predict(trajectories))
 
 
-def compares_with_the_others(predict: Callable, trajectories: rt.Trajectories) -> np.ndarray:
+def subtracts_the_mean_of_all(predict: Callable, trajectories: rt.Trajectories) -> np.ndarray:
     return 0.5 + (predict(trajectories) - predict(trajectories).mean(axis=0)) / 4
 
 
-def divides_by_what_is_seen(predict: Callable, trajectories: rt.Trajectories) -> np.ndarray:
+def needs_some_measurement(predict: Callable, trajectories: rt.Trajectories) -> np.ndarray:
     seen = trajectories.mask.any(axis=(1, 2))
     return np.where(seen[:, None], predict(trajectories), np.nan)
 
@@ -95,7 +95,7 @@ def takes_any_rate(predict: Callable, trajectories: rt.Trajectories) -> np.ndarr
     return predict(trajectories.replace(rate=100.0))
 
 
-def rolls_dice(predict: Callable, trajectories: rt.Trajectories) -> np.ndarray:
+def uses_a_global_generator(predict: Callable, trajectories: rt.Trajectories) -> np.ndarray:
     share = torch.rand(1).item()
     return np.tile([share, 1 - share], (len(trajectories), 1))
 
@@ -103,24 +103,24 @@ def rolls_dice(predict: Callable, trajectories: rt.Trajectories) -> np.ndarray:
 BROKEN = [
     ("check_protocol", None),
     ("check_probabilities", forgets_to_normalise),
-    ("check_blindness", peeks_at_labels),
-    ("check_batch", compares_with_the_others),
-    ("check_missing", divides_by_what_is_seen),
+    ("check_blindness", uses_labels),
+    ("check_batch", subtracts_the_mean_of_all),
+    ("check_missing", needs_some_measurement),
     ("check_other_data", takes_any_rate),
-    ("check_same_again", rolls_dice),
+    ("check_same_again", uses_a_global_generator),
 ]
 
 
 @pytest.fixture(scope="module")
-def sound(trajectories: rt.Trajectories) -> Farthest:
-    return Farthest(trajectories.outputs, trajectories.rate)
+def correct(trajectories: rt.Trajectories) -> LargestResidual:
+    return LargestResidual(trajectories.outputs, trajectories.rate)
 
 
-@pytest.mark.parametrize(("name", "bend"), BROKEN)
+@pytest.mark.parametrize(("name", "modify"), BROKEN)
 def test_a_broken_diagnoser_is_caught(
-    name: str, bend, sound: Farthest, trajectories: rt.Trajectories
+    name: str, modify, correct: LargestResidual, trajectories: rt.Trajectories
 ) -> None:
-    broken = Bent(bend, sound) if bend else SimpleNamespace(classes=("x", "y"))
+    broken = Modified(modify, correct) if modify else SimpleNamespace(classes=("x", "y"))
     check = {check.__name__: check for check in DIAGNOSER_CHECKS}[name]
     with pytest.raises(AssertionError):
         check(DiagnoserSubject(broken, trajectories))
@@ -130,11 +130,13 @@ def test_every_check_can_fail() -> None:
     assert {check.__name__ for check in DIAGNOSER_CHECKS} == {name for name, _ in BROKEN}
 
 
-def test_all_that_is_broken_is_listed(sound: Farthest, trajectories: rt.Trajectories) -> None:
-    check_diagnoser(sound, trajectories)
+def test_all_that_is_broken_is_listed(
+    correct: LargestResidual, trajectories: rt.Trajectories
+) -> None:
+    check_diagnoser(correct, trajectories)
     with pytest.raises(AssertionError, match="- check_probabilities: probabilities must sum to 1"):
-        check_diagnoser(Bent(forgets_to_normalise, sound), trajectories)
+        check_diagnoser(Modified(forgets_to_normalise, correct), trajectories)
     with pytest.raises(AssertionError, match=r"breaks(.|\n)*check_batch(.|\n)*check_same_again"):
-        check_diagnoser(Bent(rolls_dice, sound), trajectories)
+        check_diagnoser(Modified(uses_a_global_generator, correct), trajectories)
     with pytest.raises(rt.InputError, match="trajectories: expected at least two"):
-        check_diagnoser(sound, trajectories[:1])
+        check_diagnoser(correct, trajectories[:1])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +20,7 @@ from retwin.testing import TWIN_CHECKS, TwinSubject, check_twin
 from retwin.twins.fmu import FMUTwin
 from retwin.twins.function import FunctionTwin
 from retwin.twins.mujoco import MuJoCoTwin
+from retwin.twins.workers import keep_workers
 
 Subject = Callable[[pytest.FixtureRequest], TwinSubject]
 
@@ -68,6 +69,13 @@ def of_crane(**options: Any) -> Subject:
     pushes = ramps()[:, :, :1] - 0.4
     faults = (None, rt.ActuatorBias(0, size=(0.5, 1.0)), rt.Stuck(0, onset=30))
     return lambda request: TwinSubject(twin, pushes, faults)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def workers() -> Iterator[None]:
+    """All checks of a twin share its worker processes, as in `check_twin`."""
+    with keep_workers():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -284,15 +292,17 @@ def test_all_that_is_broken_is_listed() -> None:
     check_twin(GOOD, ramps())
     with pytest.raises(AssertionError) as caught:
         check_twin(Bent(ignores_the_seed), ramps())
-    told = str(caught.value)
-    assert told.startswith("Bent breaks its contract:\n- check_seed: observed: the same seed must")
-    assert "- check_severities: " in told
+    listed = str(caught.value)
+    assert listed.startswith(
+        "Bent breaks its contract:\n- check_seed: observed: the same seed must"
+    )
+    assert "- check_severities: " in listed
     with pytest.raises(AssertionError, match="check_protocol: a twin must have inputs"):
         check_twin(SimpleNamespace(inputs=TANK, simulate=None), ramps())
 
 
 def test_a_twin_need_not_know_stuck_actuators(tmp_path: Path) -> None:
-    """One whose actuators pull at tendons refuses them; its subject brings other faults."""
+    """A twin whose actuators drive tendons refuses them; its subject has other faults."""
     crane = Path(__file__).with_name("crane.xml").read_text("utf-8")
     tendon = '<tendon><fixed name="cable"><joint joint="rail" coef="1"/></fixed></tendon>'
     model = crane.replace("<actuator>", tendon + "<actuator>").replace(
@@ -306,7 +316,7 @@ def test_a_twin_need_not_know_stuck_actuators(tmp_path: Path) -> None:
     check_twin(twin, pushes, [None, *[rt.ActuatorBias(0, size=(0.5, 1.0))] * 2])
 
 
-def test_a_subject_must_tell_something() -> None:
+def test_a_subject_must_be_informative() -> None:
     with pytest.raises(rt.InputError, match="n at least 2 and T at least 8"):
         TwinSubject(GOOD, ramps(1))
     with pytest.raises(rt.InputError, match="some None and some not"):

@@ -2,7 +2,7 @@
 
 Surrogate, residual, corrected twin, generation, folders on disk, fidelity, study and report: with
 one output and with eight, from 0.01 Hz to 1 kHz, 30 to 5000 samples, a fifth of what was measured
-missing, and trajectories of unequal length. What the toys' gaps are is known.
+missing, and trajectories of unequal length. The discrepancies of the toys are known.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from retwin.update.corrections import Additive
 from retwin.update.residual import Density, SequenceMixture
 
 QUICK = Training(max_epochs=80, batch_size=512, learning_rate=2e-2, decay="cosine")
-LAW = rt.Mixture(
-    components=1, hidden=(8,), dropout=0.0, training=replace(rt.Mixture().training, epochs=60)
+DENSITY = rt.Mixture(
+    components=1, hidden=(8,), dropout=0.0, training=replace(rt.Mixture().training, max_epochs=60)
 )
 STEPWISE = SequenceMixture(
     network=rt.TCN(channels=8, levels=4),
@@ -45,7 +45,7 @@ STEPWISE = SequenceMixture(
     training=Training(max_epochs=20, batch_size=6, learning_rate=2e-2),
 )
 MEAN, SPREAD, NOISE = 0.15, 0.03, 0.004
-"""Of the gap of every output or command, and of measuring; in the toys' units."""
+"""Moments of the discrepancy of every output or command, and the noise, in the toys' units."""
 
 
 def weights(inputs: int, outputs: int) -> NDArray:
@@ -60,14 +60,14 @@ def ideal(commands: NDArray, outputs: int) -> NDArray:
 
 @dataclass(frozen=True)
 class Toy:
-    """A system with a known gap: its shape, and how the gap is told."""
+    """A system with a known discrepancy, and the correction that describes it."""
 
     inputs: int
     outputs: int
     rate: float
     steps: int
     correction: rt.Correction
-    density: Density | SequenceMixture = LAW
+    density: Density | SequenceMixture = DENSITY
     movements: int = 2
     count: int = 16
 
@@ -95,15 +95,15 @@ class Toy:
         )
 
     @property
-    def late(self) -> int:
-        """Samples by which movements come late, where there are movements."""
+    def delay(self) -> int:
+        """Delay of the segments in samples, 0 without segments."""
         return 2 if self.correction.resolution == "segment" else 0
 
     @property
     def sampler(self) -> RampSampler:
         ramps = (self.steps // (4 * self.movements), self.steps // (3 * self.movements))
         limits = (-1.0,) * self.inputs, (1.0,) * self.inputs
-        return RampSampler(*limits, movements=self.movements, steps=self.steps, ramps=ramps)
+        return RampSampler(*limits, segments=self.movements, steps=self.steps, ramps=ramps)
 
     def commands(self, count: int, seed: int) -> NDArray:
         onset = np.linspace(0, self.steps, self.movements, endpoint=False)[None] + 2.0
@@ -118,18 +118,21 @@ class Toy:
         return rt.fit_surrogate(made, rt.MLP((16,)), seed=0, training=brisk)
 
     def measured(self, seed: int, count: int | None = None) -> rt.Trajectories:
-        """What the real system gave: late, and off by a law that is known."""
+        """Measured trajectories, with a delay and offsets from a known distribution."""
         rng = np.random.default_rng(seed)
         commands = self.commands(count or self.count, seed + 1)
         made = self.case.twin.simulate(commands, seed=0)
         operator = self.correction
         polled = isinstance(operator, rt.Chain)
-        told = isinstance(operator.first if polled else operator, rt.CommandSpace)
-        width = self.inputs if told else self.outputs
-        off = rng.normal(MEAN, SPREAD, (len(commands), 1, width)) * self.begun(commands)
-        moment = np.maximum(np.arange(self.steps) - self.late, 0)
-        late = commands[:, moment]
-        outputs = ideal(late + off, self.outputs) if told else ideal(late, self.outputs) + off
+        in_commands = isinstance(operator.first if polled else operator, rt.CommandSpace)
+        width = self.inputs if in_commands else self.outputs
+        offset = rng.normal(MEAN, SPREAD, (len(commands), 1, width)) * self.begun(commands)
+        moment = np.maximum(np.arange(self.steps) - self.delay, 0)
+        delayed = commands[:, moment]
+        if in_commands:
+            outputs = ideal(delayed + offset, self.outputs)
+        else:
+            outputs = ideal(delayed, self.outputs) + offset
         noisy = outputs + rng.normal(0, NOISE, outputs.shape)
         if polled:
             generator = torch.Generator().manual_seed(seed)
@@ -137,23 +140,23 @@ class Toy:
         return made.replace(observed=noisy, labels=np.full(len(commands), HEALTHY))
 
     def begun(self, commands: NDArray) -> NDArray:
-        """Share of the first movement that is done, late as it is, (n, T, 1)."""
+        """Share (n, T, 1) of the first segment's motion that is done, its delay included."""
         first = rt.Segments.from_commands(commands)
-        start, settle = first.start[:, :1] + self.late, first.settle[:, :1] + self.late
+        start, settle = first.start[:, :1] + self.delay, first.settle[:, :1] + self.delay
         time = np.arange(self.steps)
         return np.clip((time - start) / (settle - start), 0, 1)[..., None]
 
 
 EVERY_FOURTH = rt.SampledSensor(every=4, phases=(0,))
-TOLD = rt.CommandSpace(delay_range=(-2.0, 8.0))
-POLLED = rt.Chain(TOLD, EVERY_FOURTH)
+IN_COMMANDS = rt.CommandSpace(delay_range=(-2.0, 8.0))
+POLLED = rt.Chain(IN_COMMANDS, EVERY_FOURTH)
 DELAYED = rt.DelayOffset(delay_range=(-2.0, 8.0))
 TOYS = {
     "one output, a sample every 100 s": Toy(1, 1, 0.01, 30, DELAYED),
     "eight outputs at 1 kHz": Toy(3, 8, 1000.0, 1500, DELAYED, count=10),
-    "what actuators were told, polled": Toy(2, 8, 50.0, 400, POLLED, movements=3),
-    "no movements, one output": Toy(1, 1, 1000.0, 5000, Additive(), STEPWISE, count=1),
-    "no movements, eight outputs": Toy(3, 8, 0.01, 30, Additive(), STEPWISE, count=24),
+    "command space, polled": Toy(2, 8, 50.0, 400, POLLED, movements=3),
+    "no segments, one output": Toy(1, 1, 1000.0, 5000, Additive(), STEPWISE, count=1),
+    "no segments, eight outputs": Toy(3, 8, 0.01, 30, Additive(), STEPWISE, count=24),
 }
 
 
@@ -230,25 +233,27 @@ def test_generated_trajectories_are_whole(
     assert same(made, rt.load(tmp_path / "made.npz"))
 
 
-def test_the_known_gap_is_recovered(toy: Toy, updated: rt.CorrectedTwin) -> None:
-    """What is drawn for commands never seen is off as the real system is, on average and in width.
+def test_the_known_discrepancy_is_recovered(toy: Toy, updated: rt.CorrectedTwin) -> None:
+    """Draws for new commands have the mean and the spread of the known discrepancy.
 
-    The average over a few calibrated gaps misses the law's mean by its spread over their root.
+    The mean over a few calibration discrepancies has the standard error of their number.
     """
     test = toy.measured(20, count=40)
     drawn = updated.simulate(test.commands.repeat(5, axis=0), seed=1).observed
     last = slice(-toy.steps // 10, None)
     nominal = toy.case.twin.simulate(test.commands, seed=0).nominal
     real = (test.observed - nominal)[:, last].mean(axis=1)
-    ours = (drawn - nominal.repeat(5, axis=0))[:, last].mean(axis=1)
-    unsure = (4 * real.std(axis=0) / np.sqrt(toy.count)).clip(0.05)
-    assert (np.abs(ours.mean(axis=0) - real.mean(axis=0)) < unsure).all()
-    assert (np.abs(real.mean(axis=0)) > unsure).all(), "the gap can be seen"
+    means = (drawn - nominal.repeat(5, axis=0))[:, last].mean(axis=1)
+    tolerance = (4 * real.std(axis=0) / np.sqrt(toy.count)).clip(0.05)
+    assert (np.abs(means.mean(axis=0) - real.mean(axis=0)) < tolerance).all()
+    assert (np.abs(real.mean(axis=0)) > tolerance).all(), (
+        "the discrepancy is larger than the uncertainty"
+    )
 
 
 PADDED = {
     "delay and offset": Toy(1, 2, 10.0, 60, DELAYED),
-    "what actuators were told": Toy(2, 3, 10.0, 60, TOLD, count=8),
+    "command space": Toy(2, 3, 10.0, 60, IN_COMMANDS, count=8),
     "polled": Toy(2, 3, 10.0, 80, POLLED, count=8),
     "polled, timing unknown": Toy(1, 2, 10.0, 100, rt.Chain(DELAYED, rt.SampledSensor())),
     "per sample": Toy(1, 2, 10.0, 60, Additive(), STEPWISE, count=3),
@@ -269,11 +274,11 @@ def test_padding_changes_no_discrepancy(short: Toy) -> None:
     _, padded = rt.infer_discrepancy(short.surrogate, longer, short.correction)
     per_sample = short.correction.resolution == "step"
     for name in ("z", "covariance", "identified", "noise"):
-        ours, theirs = getattr(padded, name), getattr(alone, name)
+        means, theirs = getattr(padded, name), getattr(alone, name)
         if per_sample and name != "noise":
-            assert not ours[:, short.steps :].any()
-            ours = ours[:, : short.steps]
-        torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-6, equal_nan=True)
+            assert not means[:, short.steps :].any()
+            means = means[:, : short.steps]
+        torch.testing.assert_close(means, theirs, atol=1e-6, rtol=1e-6, equal_nan=True)
 
 
 def test_padding_changes_no_likelihood(short: Toy) -> None:
@@ -284,8 +289,8 @@ def test_padding_changes_no_likelihood(short: Toy) -> None:
         rg = rt.fit_residual(short.surrogate, data, short.correction, short.density, seed=5)
         context, found = rt.infer_discrepancy(short.surrogate, record, rg.correction)
         with torch.no_grad():
-            told = rg(context).log_prob(found.z.float())
-        return rg, told[found.identified.all(dim=-1)]
+            log_density = rg(context).log_prob(found.z.float())
+        return rg, log_density[found.identified.all(dim=-1)]
 
     alone, likely = learned(record)
     padded, as_likely = learned(record.padded(short.steps + 37))
@@ -294,7 +299,7 @@ def test_padding_changes_no_likelihood(short: Toy) -> None:
         torch.testing.assert_close(padded.state_dict()[name], weight, atol=1e-6, rtol=1e-6)
 
 
-def test_a_record_says_the_same_beside_a_longer_one() -> None:
+def test_a_record_gives_the_same_beside_a_longer_one() -> None:
     """Unequal lengths: what is found of one does not depend on how long the others are."""
     toy = PADDED["delay and offset"]
     longer = Toy(1, 2, 10.0, 97, DELAYED).measured(8)
@@ -377,12 +382,12 @@ def test_lengths_tell_padding_from_what_is_missing(data: st.DataObject) -> None:
 def with_outputs(toy: Toy, scale: list[float], offset: float) -> list[rt.Trajectories]:
     """Twin and calibration data with every output in another unit, and no unit's name."""
     sets = toy.case.twin.simulate(toy.commands(60, 1), seed=0), toy.measured(3)
-    told_nothing = rt.Channels.numbered("y", toy.outputs)
+    unnamed = rt.Channels.numbered("y", toy.outputs)
     return [
         each.replace(
             nominal=each.nominal * scale + offset,
             observed=each.observed * scale + offset,
-            outputs=told_nothing,
+            outputs=unnamed,
         )
         for each in sets
     ]
@@ -397,11 +402,13 @@ ODD = {
 
 
 @cache
-def drawn_gap(scale: tuple[float, ...], offset: float, correction: rt.Correction) -> NDArray:
-    """What the corrected twin adds to the nominal output."""
+def drawn_discrepancy(
+    scale: tuple[float, ...], offset: float, correction: rt.Correction
+) -> NDArray:
+    """Residuals that the corrected twin generates."""
     twin, measured = with_outputs(PADDED["delay and offset"], list(scale), offset)
     surrogate = rt.fit_surrogate(twin, rt.MLP((16,)), seed=0, training=QUICK)
-    rg = rt.fit_residual(surrogate, measured, correction, LAW, seed=5)
+    rg = rt.fit_residual(surrogate, measured, correction, DENSITY, seed=5)
     made = rt.CorrectedTwin(surrogate, rg).simulate(measured.commands, seed=1)
     return made.observed - made.nominal
 
@@ -410,23 +417,23 @@ def drawn_gap(scale: tuple[float, ...], offset: float, correction: rt.Correction
     ("name", "correction"),
     [
         *((name, DELAYED) for name in ODD),
-        ("a millionth and a million", TOLD),
+        ("a millionth and a million", IN_COMMANDS),
     ],
 )
 def test_the_units_of_outputs_do_not_matter(name: str, correction: rt.Correction) -> None:
-    """The same gap is found, in other numbers."""
+    """The same discrepancy is found in other units."""
     scale, offset = ODD[name]
-    found = drawn_gap(scale, offset, correction)
+    found = drawn_discrepancy(scale, offset, correction)
     assert np.isfinite(found).all()
-    wanted = drawn_gap((1.0, 1.0), 0.0, correction) * scale
+    wanted = drawn_discrepancy((1.0, 1.0), 0.0, correction) * scale
     error = np.abs(found - wanted).mean(axis=(0, 1))
     size = np.abs(wanted).mean(axis=(0, 1))
     # Behind a large constant, single precision leaves fewer digits.
     assert (error <= 0.1 * size + 2e-3 * np.array(scale) + 2e-3 * offset).all()
 
 
-@pytest.mark.parametrize("density", [LAW, STEPWISE])
-def test_no_gap_at_all(density: Density | SequenceMixture) -> None:
+@pytest.mark.parametrize("density", [DENSITY, STEPWISE])
+def test_no_discrepancy_at_all(density: Density | SequenceMixture) -> None:
     """A real system that is the twin: nothing is added to it, and every figure is a number."""
     toy = PADDED["per sample" if isinstance(density, SequenceMixture) else "delay and offset"]
     measured = toy.measured(3, count=6)
@@ -443,7 +450,7 @@ def test_a_single_trajectory_is_warned_of() -> None:
     """It cannot be validated on; what it tells is used."""
     toy = PADDED["delay and offset"]
     with pytest.warns(UserWarning, match="1 trajectories to calibrate on"):
-        rg = rt.fit_residual(toy.surrogate, toy.measured(3, count=1), DELAYED, LAW, seed=5)
+        rg = rt.fit_residual(toy.surrogate, toy.measured(3, count=1), DELAYED, DENSITY, seed=5)
     made = rt.CorrectedTwin(toy.surrogate, rg).simulate(toy.commands(3, 9), seed=1)
     assert np.isfinite(made.observed).all()
 
@@ -458,7 +465,7 @@ def test_nothing_measured_is_refused(name: str) -> None:
 
 
 def test_an_output_that_is_never_measured_leaves_the_others() -> None:
-    """Its own gap is not known; delays and the others' offsets are, as if it were not there."""
+    """Its own offset is not identified; delays and the others' offsets are, as without it."""
     toy = PADDED["delay and offset"]
     measured = toy.measured(3)
     half = measured.replace(mask=np.broadcast_to([True, False], measured.mask.shape))

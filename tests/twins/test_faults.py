@@ -30,7 +30,7 @@ def test_stuck_onset_is_drawn_in_its_range(commands: np.ndarray) -> None:
     assert onsets == set(range(10, 31))
 
 
-def test_bias_is_reached_with_the_movement_and_kept(commands: np.ndarray) -> None:
+def test_the_bias_builds_up_along_the_ramp_and_is_kept(commands: np.ndarray) -> None:
     segments = Segments.from_commands(commands)
     fault = ActuatorBias(0, bias=(20.0, -10.0))
     bias = faulty_commands(commands, [fault], segments)[0, :, 0] - commands[0, :, 0]
@@ -41,7 +41,7 @@ def test_bias_is_reached_with_the_movement_and_kept(commands: np.ndarray) -> Non
     np.testing.assert_allclose(bias[301:], -10.0, atol=1e-6)
 
 
-def test_an_actuator_that_is_told_nothing_still_gets_its_bias(commands: np.ndarray) -> None:
+def test_an_actuator_without_a_new_command_is_biased_too(commands: np.ndarray) -> None:
     segments = Segments.from_commands(commands)
     biased = faulty_commands(commands, [ActuatorBias(1, bias=(20.0, -10.0))], segments)
     np.testing.assert_allclose(biased[0, 81:220, 1], 20.0)
@@ -52,7 +52,7 @@ def test_drawn_biases_follow_the_protocol(commands: np.ndarray) -> None:
     segments = Segments.from_commands(np.repeat(commands, 500, axis=0))
     drawn = draw_faults([ActuatorBias(0)] * 500, segments, seed=1)
     biases = np.array([fault.bias for fault in drawn])
-    assert biases.shape == (500, 2), "one bias per movement"
+    assert biases.shape == (500, 2), "one bias per segment"
     assert (np.abs(biases) >= 10).all()
     assert (np.abs(biases) <= 50).all()
     assert abs((biases > 0).mean() - 0.5) < 0.05

@@ -160,7 +160,7 @@ def test_nominal_may_be_given(lag: Path) -> None:
 TROUBLES = {
     1: "hung for more than 1.5 s",
     2: "its process died (signal 11)",
-    3: "FMI status error in fmi3DoStep (trouble was asked for)",
+    3: "FMI status error in fmi3DoStep (trouble was requested)",
     4: "x is nan from sample 6 on",
     5: "FMI status fatal in fmi3DoStep",
     6: "its process ended (exit code 3)",
@@ -174,20 +174,20 @@ def test_a_run_that_fails_ends_alone(lag: Path, workers: int) -> None:
     commands = np.zeros((16, 20, 2))
     commands[:, :, 0] = np.arange(16)[:, None] / 2
     commands[1::2, 5:, 1] = np.arange(1, 9)[:, None]  # number 8 is no trouble
-    told: list[float] = []
+    reported: list[float] = []
     with pytest.raises(rt.SimulationError, match=r"7 of 16 .* trajectory 1: hung") as caught:
-        twin.simulate(commands, seed=0, progress=told.append)
+        twin.simulate(commands, seed=0, progress=reported.append)
     assert caught.value.failed == {2 * kind - 1: why for kind, why in TROUBLES.items()}
     finished = caught.value.finished
     assert finished.ids.tolist() == [f"{i:05d}" for i in (0, 2, 4, 6, 8, 10, 12, 14, 15)]
     for made, which in zip(finished.observed, finished.ids, strict=True):
         truth = lagged(np.full(20, int(which) / 2), 1 / RATE)
         np.testing.assert_allclose(made[:, 0], truth, atol=1e-12)
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    assert reported == sorted(reported)
+    assert reported[-1] == 1.0
 
 
-def test_a_healthy_run_that_fails_is_told_apart(lag: Path) -> None:
+def test_the_failure_of_a_healthy_run_is_named_as_such(lag: Path) -> None:
     commands = np.zeros((1, 20, 2))
     commands[0, :, 0] = 1.0
     commands[0, 10:, 1] = 3
@@ -220,11 +220,11 @@ def test_same_bytes_whatever_the_workers(lag: Path) -> None:
     assert made[0].nominal.tobytes() == made[1].nominal.tobytes()
 
 
-def test_progress_is_told_per_trajectory(lag: Path) -> None:
+def test_progress_is_reported_per_trajectory(lag: Path) -> None:
     twin = FMUTwin.from_file(lag, RATE, ["u"], ["x"], workers=1)
-    told: list[float] = []
-    twin.simulate(np.ones((20, 4, 1)), seed=0, progress=told.append)
-    np.testing.assert_allclose(told, np.arange(1, 21) / 20)
+    reported: list[float] = []
+    twin.simulate(np.ones((20, 4, 1)), seed=0, progress=reported.append)
+    np.testing.assert_allclose(reported, np.arange(1, 21) / 20)
 
 
 def test_native_code_stays_out_of_this_process_and_off_the_disk(
@@ -266,7 +266,7 @@ def test_native_code_stays_out_of_this_process_and_off_the_disk(
         ({"start": {"gain": "high"}}, r"start: expected for gain \(Float64\) .* got 'high'"),
         ({"start": {"gain": float("inf")}}, "start: .* got inf"),
         ({"inputs": ["u"], "start": {"trouble": 0.5}}, r"start: .* trouble \(Int32\) .*got 0.5"),
-        ({"outside": "ignore"}, "outside: expected 'refuse' or 'clip'"),
+        ({"outside": "ignore"}, "outside: expected one of refuse, clip, got 'ignore'"),
     ],
 )
 def test_bad_options_are_refused(lag: Path, options: dict, message: str) -> None:

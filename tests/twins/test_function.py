@@ -13,7 +13,7 @@ import pytest
 
 import retwin as rt
 from retwin.twins.faults import faulty_commands, frozen_response
-from retwin.twins.function import CHUNK, FunctionTwin
+from retwin.twins.function import TRAJECTORIES_PER_CHUNK, FunctionTwin
 
 INPUTS = rt.Channels(("valve", "heater"), ("1", "W"))
 OUTPUTS = rt.Channels(("level",), ("m",))
@@ -75,8 +75,8 @@ def trajectories(count: int = 5, steps: int = 40) -> np.ndarray:
 def test_says_what_the_function_says() -> None:
     commands = trajectories()
     faults = [None, rt.Stuck(0, onset=12), None, None, rt.ActuatorBias(1, bias=(4.0,))]
-    told = faulty_commands(commands, faults, rt.Segments.from_commands(commands))
-    held = frozen_response(told, faults)
+    effective = faulty_commands(commands, faults, rt.Segments.from_commands(commands))
+    held = frozen_response(effective, faults)
     for each in (twin(), twin(vectorised=False)):
         made = each.simulate(commands, faults=faults, seed=0)
         np.testing.assert_array_equal(made.nominal, level(commands))
@@ -128,8 +128,8 @@ def test_noise_is_in_the_residual(settings: dict) -> None:
 
 
 def test_same_bytes_whatever_the_workers() -> None:
-    commands = trajectories(CHUNK + 3)
-    faults = [rt.Stuck(0, onset=(5, 20)), None, rt.ActuatorBias(1)] * CHUNK
+    commands = trajectories(TRAJECTORIES_PER_CHUNK + 3)
+    faults = [rt.Stuck(0, onset=(5, 20)), None, rt.ActuatorBias(1)] * TRAJECTORIES_PER_CHUNK
     made = [
         twin(noisy, nominal=level, vectorised=False, workers=workers).simulate(
             commands, faults=faults[: len(commands)], seed=8
@@ -145,23 +145,25 @@ def test_same_bytes_whatever_the_workers() -> None:
 
 
 def test_workers_are_other_processes_and_tell_how_far_they_are() -> None:
-    told: list[float] = []
+    reported: list[float] = []
     made = twin(process_id, vectorised=False, workers=2).simulate(
-        trajectories(16), seed=0, progress=told.append
+        trajectories(16), seed=0, progress=reported.append
     )
     seen = set(made.observed.ravel().tolist())
     assert len(seen) == 2
     assert os.getpid() not in seen
-    assert len(told) >= 16
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    assert len(reported) >= 16
+    assert reported == sorted(reported)
+    assert reported[-1] == 1.0
 
 
 def test_a_process_that_dies_ends_its_trajectory_only() -> None:
-    with pytest.raises(rt.SimulationError, match=r"trajectory 1: .*dies died, exit code 7") as told:
+    with pytest.raises(
+        rt.SimulationError, match=r"trajectory 1: .*dies died, exit code 7"
+    ) as caught:
         twin(dies, vectorised=False, workers=2).simulate(trajectories(), seed=0)
-    assert sorted(told.value.failed) == [1, 3]
-    np.testing.assert_array_equal(told.value.finished.nominal, level(trajectories()[[0, 2, 4]]))
+    assert sorted(caught.value.failed) == [1, 3]
+    np.testing.assert_array_equal(caught.value.finished.nominal, level(trajectories()[[0, 2, 4]]))
 
 
 @pytest.mark.parametrize(
@@ -175,7 +177,7 @@ def test_exceptions_come_through_as_they_are(settings: dict) -> None:
     assert "raises" in where
 
 
-def test_an_exception_that_cannot_be_sent_is_told() -> None:
+def test_an_exception_that_cannot_be_sent_is_replaced() -> None:
     with pytest.raises(RuntimeError, match="Particular: valve 3 leaks"):
         twin(raises_particular, vectorised=False, workers=2).simulate(trajectories(), seed=0)
     with pytest.raises(Particular):
@@ -230,12 +232,12 @@ def blows_up(commands: np.ndarray) -> np.ndarray:
         ),
     ],
 )
-def test_wrong_outputs_are_told_in_one_line(function, message: str) -> None:
+def test_wrong_outputs_are_named_in_one_line(function, message: str) -> None:
     ways: list[dict] = [{}, {"vectorised": False}, {"vectorised": False, "workers": 2}]
     for settings in ways[: 3 if function is blows_up else 2]:
-        with pytest.raises(rt.InputError, match=f"^function: expected {message}") as told:
+        with pytest.raises(rt.InputError, match=f"^function: expected {message}") as caught:
             twin(function, **settings).simulate(trajectories(), seed=0)
-        assert "\n" not in str(told.value)
+        assert "\n" not in str(caught.value)
     with pytest.raises(rt.InputError, match=f"^nominal: expected {message}"):
         twin(level, nominal=function).simulate(trajectories(), seed=0)
 
@@ -326,21 +328,22 @@ def test_control_c_ends_it_at_once(tmp_path: Path) -> None:
     with in_a_script(tmp_path, body) as process:
         assert process.stdout is not None
         assert float(process.stdout.readline()) > 0
-        begin = time.monotonic()
         process.send_signal(signal.SIGINT)
-        # 500 trajectories would take minutes; how fast it ends depends on what else is running.
-        _, told = process.communicate(timeout=60)
-    assert time.monotonic() - begin < 30
-    assert "KeyboardInterrupt" in told
+        shares, errors = process.communicate(timeout=60)
+    # It ends with trajectories left to do, however fast or slow the machine is.
+    assert all(float(share) < 1 for share in shares.split())
+    assert "KeyboardInterrupt" in errors
 
 
 def test_a_script_without_a_guard_is_advised(tmp_path: Path) -> None:
     with in_a_script(tmp_path, "twin.simulate(np.ones((3, 4, 1)), seed=0)\n") as process:
-        _, told = process.communicate(timeout=20)
-    assert re.search(r"InputError: workers: .*under `if __name__ == '__main__':`", told)
+        _, errors = process.communicate(timeout=120)
+    assert re.search(r"InputError: workers: .*under `if __name__ == '__main__':`", errors)
 
 
-def test_a_function_the_workers_cannot_find_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_function_that_the_workers_cannot_find_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """As one from a notebook cell: it has a name here, but not there."""
     main = sys.modules["__main__"]
     monkeypatch.setattr(gone, "__module__", "__main__")

@@ -93,7 +93,7 @@ def test_a_servo_starts_at_rest_at_its_first_command(make) -> None:
 
 
 def test_a_velocity_actuator_starts_where_the_model_does(make) -> None:
-    """What acts is the integral of its control: the command tells no place to start from."""
+    """The integral of the control acts, so the command determines no start position."""
     twin = make('<intvelocity name="speed" joint="hinge" kp="400" actrange="-3 3"/>')
     assert twin.inputs.units == ("1",)
     made = twin.simulate(np.full((1, 50, 1), 0.5), seed=0)
@@ -137,9 +137,9 @@ def test_native_delay_shifts_the_response(make) -> None:
     commands[0, 20:] = 0.3
     delayed = SERVO.replace("/>", ' nsample="60" interp="linear" delay="0.05"/>')
     now = make(SERVO, interpolate=False).simulate(commands, seed=0).observed[0, :, 0]
-    late = make(delayed, interpolate=False).simulate(commands, seed=0).observed[0, :, 0]
-    np.testing.assert_allclose(late[25:], now[20:-5], atol=2e-3)
-    # What it looks back at before sample 0 is the first command, not zero.
+    shifted = make(delayed, interpolate=False).simulate(commands, seed=0).observed[0, :, 0]
+    np.testing.assert_allclose(shifted[25:], now[20:-5], atol=2e-3)
+    # Its history before sample 0 is the first command, not zero.
     held = make(delayed).simulate(np.full((1, 30, 1), 0.5), seed=0).observed[0, :, 0]
     assert np.abs(held - 0.5).max() < 0.05
 
@@ -148,7 +148,7 @@ def test_interpolated_commands_are_ramps_and_held_ones_are_steps(make) -> None:
     ramp = np.linspace(0, 0.5, 60)[None, :, None]
     smooth = make(SERVO).simulate(ramp, seed=0).observed[0]
     steps = make(SERVO, interpolate=False).simulate(ramp, seed=0).observed[0]
-    # Held commands come 4.5 of 10 steps of a sample late on average.
+    # Held commands are delayed by 4.5 of 10 steps of a sample on average.
     lead = (smooth[50:, 0] - steps[50:, 0]).mean() / (0.5 / 59)
     assert lead == pytest.approx(0.45, abs=0.05)
 
@@ -286,14 +286,14 @@ def test_the_how_to_is_true(
 ) -> None:
     tests = Path(__file__).parents[1]
     page = (tests.parent / "docs" / "mujoco.md").read_text("utf-8")
-    (tmp_path / "crane.xml").write_text((tests / "contracts" / "crane.xml").read_text("utf-8"))
+    (tmp_path / "crane.xml").write_text((tests / "testing" / "crane.xml").read_text("utf-8"))
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
     names: dict[str, object] = {}
     for code in blocks:
         exec(compile(code, "mujoco.md", "exec"), names)
-    told = re.findall(r"  # prints (.*)", page)
-    assert told
-    assert capsys.readouterr().out.splitlines() == told
+    printed = re.findall(r"  # prints (.*)", page)
+    assert printed
+    assert capsys.readouterr().out.splitlines() == printed
     swing = np.ptp(names["made"].observed[:, 60:, 0], axis=1)
-    assert len(set(swing.round(4))) == 4, "the loads are told apart"
+    assert len(set(swing.round(4))) == 4, "the loads give different motions"

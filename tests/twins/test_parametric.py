@@ -60,7 +60,7 @@ def test_one_parameter_may_stand_behind_several_places() -> None:
 
 
 def test_a_mujoco_twin_takes_parameters_as_it_is() -> None:
-    path = Path(__file__).parents[1] / "contracts" / "crane.xml"
+    path = Path(__file__).parents[1] / "testing" / "crane.xml"
     crane = MuJoCoTwin.from_file(path, rate=50.0, inputs=["limited"], outputs=["hook"])
     twin = ParametricTwin(crane, (Parameter("body.load.mass", "kg", 0.1, 2.0),))
     pushes = np.zeros((2, 60, 1))
@@ -86,12 +86,12 @@ def test_command_side_delays_by_fractions_and_shifts() -> None:
 
 
 def test_command_side_at_rest_is_the_twin_itself(case: rt.Case) -> None:
-    told = arm_commands(case)
+    commands = arm_commands(case)
     faults = (None, rt.Stuck(1, onset=(20, 80)), rt.ActuatorBias(2))
     for plain, sided in ((KINEMATIC, CommandSide(KINEMATIC)), (case.twin, armpi_parametric())):
         for name in ("nominal", "observed"):
-            wanted = getattr(plain.simulate(told, faults=faults, seed=0), name)
-            got = getattr(sided.simulate(told, faults=faults, seed=0), name)
+            wanted = getattr(plain.simulate(commands, faults=faults, seed=0), name)
+            got = getattr(sided.simulate(commands, faults=faults, seed=0), name)
             assert got == pytest.approx(wanted, abs=1e-12)
 
 
@@ -103,14 +103,14 @@ def test_what_is_pushed_beyond_the_limits_saturates() -> None:
 
 
 def test_stiffness_and_damping_act_on_the_arm(case: rt.Case) -> None:
-    told = arm_commands(case, 1)
+    commands = arm_commands(case, 1)
     twin = armpi_parametric()
     now = dict(zip(twin.names, twin.values, strict=True))
-    plain = twin.simulate(told, seed=0).observed
-    # A ramp is followed late by damping / stiffness: twice as much of both is nearly the same.
+    plain = twin.simulate(commands, seed=0).observed
+    # The lag behind a ramp is damping / stiffness: doubling both hardly changes the response.
     both = {"stiffness": 2 * now["stiffness"], "damping": 2 * now["damping"]}
-    alike = twin.with_values(both).simulate(told, seed=0).observed
-    soft = twin.with_values({"damping": 4 * now["damping"]}).simulate(told, seed=0).observed
+    alike = twin.with_values(both).simulate(commands, seed=0).observed
+    soft = twin.with_values({"damping": 4 * now["damping"]}).simulate(commands, seed=0).observed
     assert np.abs(soft - plain).max() > 5 * np.abs(alike - plain).max() > 0
 
 
@@ -118,20 +118,20 @@ def test_holding_keeps_the_value() -> None:
     twin = armpi_parametric().with_values({"damping": 9.0, "delay": 3.0})
     held = twin.holding("stiffness", "damping")
     assert held.names == twin.names[2:]
-    told = np.full((1, 60, 4), 500.0)
-    told[:, 20:] = 600.0
-    assert held.simulate(told, seed=0).observed == pytest.approx(
-        twin.simulate(told, seed=0).observed
+    commands = np.full((1, 60, 4), 500.0)
+    commands[:, 20:] = 600.0
+    assert held.simulate(commands, seed=0).observed == pytest.approx(
+        twin.simulate(commands, seed=0).observed
     )
 
 
 def test_a_failed_simulation_is_named() -> None:
-    told = np.full((3, 40, 4), 500.0)
-    told[:, 10:] = 620.0
+    commands = np.full((3, 40, 4), 500.0)
+    commands[:, 10:] = 620.0
     twin = armpi_parametric(rt.ArmPiTwin(step=0.01))
     unstable = {"damping": [4.7, -1e6, 4.7]}
     with pytest.raises(rt.SimulationError) as caught:
-        twin.simulate(told, seed=0, parameters=unstable)
+        twin.simulate(commands, seed=0, parameters=unstable)
     assert set(caught.value.failed) == {1}
     assert caught.value.finished.ids.tolist() == ["00000", "00002"]
 
@@ -144,7 +144,9 @@ def test_bad_parameters_are_named() -> None:
         "no name twice": lambda: ParametricTwin(GAIN.twin, (one, one)),
         "at least one": lambda: GAIN.holding("gain"),
         "some of gain": lambda: GAIN.simulate(RAMP, seed=0, parameters={"mass": 1.0}),
-        "one for all, or 3": lambda: GAIN.simulate(RAMP, seed=0, parameters={"gain": [1.0, 2.0]}),
+        "one for all, or one per trajectory, 3": lambda: GAIN.simulate(
+            RAMP, seed=0, parameters={"gain": [1.0, 2.0]}
+        ),
         "finite numbers, one per parameter": lambda: GAIN.with_values([1.0, 2.0]),
         "returns a twin": lambda: ParametricTwin.built(dict, [one]).inputs,
     }.items():

@@ -1,4 +1,4 @@
-"""Twins that draw parameters or noise per trajectory draw what they say."""
+"""Twins that draw parameters or noise per trajectory draw from the right distribution."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def test_noise_has_its_scale_at_readings_and_is_linear_between() -> None:
 
 
 def test_the_scale_is_found_again_in_what_was_measured() -> None:
-    told = np.zeros((300, 20, 1))
-    made = NoisyTwin(PLAIN, np.array([0.5, 2.0])).simulate(told, seed=1)
+    commands = np.zeros((300, 20, 1))
+    made = NoisyTwin(PLAIN, np.array([0.5, 2.0])).simulate(commands, seed=1)
     assert residual_scale(made) == pytest.approx([0.5, 2.0], rel=0.05)
     spoilt = made.observed.copy()
     spoilt[:, 3] = 1e6
@@ -85,11 +85,11 @@ def test_bad_input_is_named() -> None:
 
 
 def test_a_simulation_that_fails_inside_is_named() -> None:
-    told = np.full((3, 40, 4), 500.0)
-    told[:, 10:] = 620.0
+    commands = np.full((3, 40, 4), 500.0)
+    commands[:, 10:] = 620.0
     unstable = armpi_parametric(rt.ArmPiTwin(step=0.01)).with_values({"damping": -1e6})
     with pytest.raises(rt.SimulationError) as caught:
-        NoisyTwin(unstable, np.ones(3)).simulate(told, seed=0)
+        NoisyTwin(unstable, np.ones(3)).simulate(commands, seed=0)
     assert set(caught.value.failed) == {0, 1, 2}
 
 
@@ -112,12 +112,12 @@ def test_contract(case: rt.Case, kind: str, check: Callable) -> None:
 
 
 def test_arms_at_all_corners_of_the_box_can_be_simulated(case: rt.Case) -> None:
-    """The brink of what the integrator can follow must not lie where a search looks."""
+    """The integrator must be stable in the whole range of the parameters."""
     twin = armpi_parametric()
     low, high = twin.bounds
     corners = np.array([[a, b] for a in (low[0], high[0]) for b in (low[1], high[1])])
-    told = np.repeat(arm_commands(case)[:1], 4, axis=0)
+    commands = np.repeat(arm_commands(case)[:1], 4, axis=0)
     values = {"stiffness": corners[:, 0], "damping": corners[:, 1]}
     fine = armpi_parametric(rt.ArmPiTwin(step=0.001))
-    coarse, wanted = (t.simulate(told, seed=0, parameters=values) for t in (twin, fine))
+    coarse, wanted = (t.simulate(commands, seed=0, parameters=values) for t in (twin, fine))
     assert np.abs(coarse.observed - wanted.observed).max() < 5e-4

@@ -1,4 +1,4 @@
-"""Samplers of commands: within their limits, with the law that they promise."""
+"""Samplers of commands: within their limits, from the documented distribution."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 import retwin as rt
+from retwin.twins.ramps import ramps_and_holds
 from retwin.twins.samplers import (
     HoldSampler,
     MultisineSampler,
     RampSampler,
     RecordedSampler,
-    ramps_and_holds,
 )
 
-SAMPLER = RampSampler(low=(0.0, -2.0), high=(10.0, -1.0), movements=4, steps=400, ramps=(10, 30))
+SAMPLER = RampSampler(low=(0.0, -2.0), high=(10.0, -1.0), segments=4, steps=400, ramps=(10, 30))
 
 
 def draw(count: int = 50, seed: int = 0, timing: np.ndarray | None = None) -> np.ndarray:
@@ -28,8 +28,8 @@ def test_commands_ramp_and_hold_within_the_limits() -> None:
     assert (commands >= SAMPLER.low).all()
     assert (commands <= SAMPLER.high).all()
     np.testing.assert_allclose(commands[:, 0], [[5.0, -1.5]] * 50)
-    for movement in range(4):
-        held = commands[:, 100 * movement + 31 : 100 * movement + 100]
+    for segment in range(4):
+        held = commands[:, 100 * segment + 31 : 100 * segment + 100]
         assert np.ptp(held, axis=1).max() < 1e-5
     levels = commands[:, 99::100].reshape(-1, 2)
     # Uniform: mean and standard deviation of 200 draws within four of their standard errors.
@@ -44,7 +44,7 @@ def test_ramps_have_the_lengths_asked_for() -> None:
 
 
 def test_ramps_are_those_of_a_loop_over_all_samples() -> None:
-    """To the last digit, wherever ramps lie: crowded, left out, beyond the end."""
+    """To the last digit, wherever ramps lie: overlapping, left out, beyond the end."""
     rng = np.random.default_rng(0)
     shape = (70, 5, 3)
     start, levels = rng.normal(size=(70, 3)), rng.normal(size=shape)
@@ -56,17 +56,17 @@ def test_ramps_are_those_of_a_loop_over_all_samples() -> None:
     onsets[:, 3] = np.nan
     plain = np.repeat(start[:, None], 300, axis=1)
     before = start
-    for movement in range(5):
-        since = np.arange(300) - onsets[:, movement, None]
-        share = np.clip(since[..., None] / spans[:, None, movement], 0, 1)
-        plain += (levels[:, movement] - before)[:, None] * np.nan_to_num(share)
-        before = levels[:, movement]
+    for segment in range(5):
+        elapsed = np.arange(300) - onsets[:, segment, None]
+        fraction = np.clip(elapsed[..., None] / spans[:, None, segment], 0, 1)
+        plain += (levels[:, segment] - before)[:, None] * np.nan_to_num(fraction)
+        before = levels[:, segment]
     np.testing.assert_array_equal(ramps_and_holds(start, levels, spans, onsets, 300), plain)
 
 
 def test_the_segments_are_those_that_were_drawn() -> None:
     segments = rt.Segments.from_commands(draw())
-    assert segments.most == 4
+    assert segments.max_count == 4
     np.testing.assert_allclose(segments.start, [[0, 100, 200, 300]] * 50, atol=1e-3)
 
 
@@ -75,9 +75,9 @@ def test_timing_is_drawn_from_what_was_seen_and_continued() -> None:
     segments = rt.Segments.from_commands(draw(timing=seen))
     np.testing.assert_allclose(segments.start, [[7, 120, 220, 320]] * 50, atol=1e-3)
     assert np.array_equal(draw(timing=np.empty((0, 4))), draw())
-    crowded = draw(timing=np.array([[0.0, 1.0, 2.0, 3.0]]))
-    assert (crowded >= SAMPLER.low).all()
-    assert (crowded <= SAMPLER.high).all()
+    overlapping = draw(timing=np.array([[0.0, 1.0, 2.0, 3.0]]))
+    assert (overlapping >= SAMPLER.low).all()
+    assert (overlapping <= SAMPLER.high).all()
 
 
 def test_same_seed_same_commands() -> None:
@@ -94,14 +94,14 @@ def test_same_seed_same_commands() -> None:
         ("limits", {"low": (), "high": ()}),
         ("start", {"start": (5.0, 0.0)}),
         ("start", {"start": (5.0,)}),
-        ("movements", {"movements": 0}),
-        ("ramps: expected lengths from 1 to 100", {"ramps": (10, 101)}),
+        ("segments", {"segments": 0}),
+        ("ramps: expected durations from 1 to 100", {"ramps": (10, 101)}),
         ("ramps", {"ramps": ()}),
         ("ramps", {"ramps": (0,)}),
     ],
 )
 def test_settings_that_cannot_be_are_refused(match: str, changes: dict) -> None:
-    settings = {"low": (0.0, -2.0), "high": (10.0, -1.0), "movements": 4, "steps": 400}
+    settings = {"low": (0.0, -2.0), "high": (10.0, -1.0), "segments": 4, "steps": 400}
     with pytest.raises(rt.InputError, match=match) as caught:
         RampSampler(**{**settings, "ramps": (10, 30), **changes})
     assert "\n" not in str(caught.value)
@@ -139,8 +139,8 @@ def test_levels_are_held_for_as_long_as_asked() -> None:
     # Uniform, up to the hold that the end cuts off and that was therefore not counted.
     assert np.mean(lengths) == pytest.approx(20, abs=0.3)
     assert np.mean(levels) == pytest.approx(5, abs=4 * 10 / np.sqrt(12 * len(levels)))
-    apart = (np.diff(made, axis=1) != 0).any(axis=0)
-    assert not (apart[:, 0] & apart[:, 1]).all(), "channels change for themselves"
+    changes = (np.diff(made, axis=1) != 0).any(axis=0)
+    assert not (changes[:, 0] & changes[:, 1]).all(), "channels change for themselves"
 
 
 def test_a_multisine_has_the_spectrum_asked_for() -> None:

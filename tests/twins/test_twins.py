@@ -1,4 +1,4 @@
-"""What sets the closed-form twin apart; what all have in common is in tests/contracts."""
+"""The closed-form twin; the contract of all twins is in tests/testing."""
 
 from __future__ import annotations
 

@@ -31,25 +31,25 @@ def test_sources_share_commands_and_faults(
     np.testing.assert_array_equal(alone.commands, both.commands)
     np.testing.assert_array_equal(alone.nominal, both.nominal)
     # The residual model is all that differs, and it is of the size of millimetres.
-    gap = np.linalg.norm(alone.observed - both.observed, axis=2)
-    assert 0 < np.median(gap[:, 150:190]) < 0.02
+    discrepancy = np.linalg.norm(alone.observed - both.observed, axis=2)
+    assert 0 < np.median(discrepancy[:, 150:190]) < 0.02
 
 
-def test_healthy_ones_look_like_the_robot(ibg: rt.Surrogate, case: rt.Case) -> None:
+def test_healthy_ones_are_distributed_like_the_robot_s(ibg: rt.Surrogate, case: rt.Case) -> None:
     """Median distance from nominal, in steady parts and in motion, within a factor of two.
 
-    With 60 trajectories to calibrate on: from ten, a mixture makes too much of missed movements.
+    Sixty trajectories calibrate: from ten, a mixture gives missed segments too much weight.
     """
     commands = case.sampler.sample(60, rng=np.random.default_rng(5))
     real = case.emulator.simulate(commands, seed=9)
     updated = rt.CorrectedTwin(ibg, rt.fit_residual(ibg, real, seed=0))
     made = rt.generate(updated, case, per_class=100, seed=6).with_label("Healthy")
-    movements = 200 * np.arange(5)[:, None]
-    for part in (movements + np.arange(150, 195), movements + np.arange(20, 60)):
-        ours, theirs = (
+    segments = 200 * np.arange(5)[:, None]
+    for part in (segments + np.arange(150, 195), segments + np.arange(20, 60)):
+        simulated, measured = (
             np.median(np.linalg.norm(t.residual[:, part.ravel()], axis=2)) for t in (made, real)
         )
-        assert 0.5 < ours / theirs < 2
+        assert 0.5 < simulated / measured < 2
 
 
 def test_onsets_come_from_the_calibration_set(
@@ -67,8 +67,8 @@ def test_saved_and_loaded_generates_the_same(
     updated.save(tmp_path / "twin")
     back = rt.CorrectedTwin.load(tmp_path / "twin")
     assert back.case == "armpi"
-    ours, theirs = (rt.generate(t, case, per_class=2, seed=1) for t in (updated, back))
-    assert ours.observed.tobytes() == theirs.observed.tobytes()
+    before, after = (rt.generate(t, case, per_class=2, seed=1) for t in (updated, back))
+    assert before.observed.tobytes() == after.observed.tobytes()
 
 
 def test_a_count_below_one_is_refused(updated: rt.CorrectedTwin, case: rt.Case) -> None:

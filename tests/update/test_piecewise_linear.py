@@ -1,4 +1,4 @@
-"""Answers along straight lines of commands: the same as sample by sample, for fewer questions."""
+"""Interpolation along linear pieces equals evaluation sample by sample, at less cost."""
 
 from __future__ import annotations
 
@@ -16,38 +16,40 @@ from retwin.update.piecewise_linear import evaluate_piecewise_linear
 
 LOW, HIGH = (100.0, -3.0), (900.0, 2.0)
 SMALL = 5e-6
-"""Of answers of size 1: some roundings of commands and of answers in single precision."""
+"""For outputs of size 1: a few roundings of commands and outputs in single precision."""
 
 
 def smooth(rows: Tensor) -> Tensor:
-    """An answer like that of an arm: two angles in, a place out."""
+    """A function like that of an arm: from two angles to a position."""
     a, b = rows[:, 0] / 250.0, rows[:, 1]
     return torch.stack([a.cos() + (a + b).cos(), a.sin() * b.sin(), torch.tanh(a - b)], dim=1)
 
 
 class Counted:
-    """Counts what is asked."""
+    """Counts evaluations."""
 
-    def __init__(self, answer: Callable[[Tensor], Tensor]) -> None:
-        self.answer, self.asked = answer, 0
+    def __init__(self, function: Callable[[Tensor], Tensor]) -> None:
+        self.function, self.evaluations = function, 0
 
     def __call__(self, rows: Tensor) -> Tensor:
-        self.asked += len(rows)
-        return self.answer(rows)
+        self.evaluations += len(rows)
+        return self.function(rows)
 
 
-def both(answer: Callable[[Tensor], Tensor], commands: np.ndarray | Tensor) -> tuple[float, float]:
-    """The largest difference from asking at each sample, and the share that was asked."""
+def both(
+    function: Callable[[Tensor], Tensor], commands: np.ndarray | Tensor
+) -> tuple[float, float]:
+    """Largest difference from evaluation at each sample, and evaluations per sample."""
     commands = torch.as_tensor(commands)
-    ask = Counted(answer)
-    found = evaluate_piecewise_linear(ask, commands)
-    one_by_one = answer(commands.flatten(0, 1)).view(*commands.shape[:2], -1)
+    counted = Counted(function)
+    found = evaluate_piecewise_linear(counted, commands)
+    one_by_one = function(commands.flatten(0, 1)).view(*commands.shape[:2], -1)
     assert found.shape == one_by_one.shape
-    return float((found - one_by_one).abs().max()), ask.asked / commands[..., 0].numel()
+    return float((found - one_by_one).abs().max()), counted.evaluations / commands[..., 0].numel()
 
 
 @pytest.mark.parametrize("jitter", [False, True])
-def test_ramps_take_a_part_of_the_questions(jitter: bool) -> None:
+def test_ramps_take_a_part_of_the_evaluations(jitter: bool) -> None:
     rng = np.random.default_rng(0)
     timing = np.sort(rng.uniform(0, 900, (20, 5)), axis=1) if jitter else None
     commands = RampSampler(LOW, HIGH).sample(50, rng=rng, timing=timing)
@@ -56,21 +58,21 @@ def test_ramps_take_a_part_of_the_questions(jitter: bool) -> None:
     assert share < 0.2
 
 
-def test_a_hold_takes_one_question() -> None:
+def test_a_hold_takes_one_evaluation() -> None:
     commands = HoldSampler(LOW, HIGH, hold=(50, 200)).sample(20, rng=np.random.default_rng(0))
     error, share = both(smooth, commands)
     assert error < SMALL
     assert share < 0.1
 
 
-def test_curves_are_asked_for_sample_by_sample() -> None:
+def test_curves_are_evaluated_sample_by_sample() -> None:
     commands = MultisineSampler(LOW, HIGH).sample(5, rng=np.random.default_rng(0))
     error, share = both(smooth, commands)
     assert error < SMALL
     assert share == pytest.approx(1, abs=0.1)
 
 
-def test_a_curve_so_slow_that_no_sample_tells() -> None:
+def test_a_curve_so_slow_that_no_single_sample_shows_it() -> None:
     time = torch.linspace(0, 1, 4000)[None, :, None]
     commands = (700 + 0.05 * time * (1 - time)).expand(-1, -1, 2).float()
     turn = commands.diff(dim=1).diff(dim=1).abs().max()
@@ -86,14 +88,14 @@ def test_a_curve_so_slow_that_no_sample_tells() -> None:
     assert share > 0.99
 
 
-def test_an_answer_with_a_corner_is_asked_for_sample_by_sample() -> None:
+def test_a_function_with_a_corner_is_evaluated_sample_by_sample() -> None:
     commands = RampSampler(LOW, HIGH).sample(20, rng=np.random.default_rng(0))
 
     def corner(rows: Tensor) -> Tensor:
         return (rows[:, :1] / 400 - 1.2).abs() + (rows[:, 1:] > 0)
 
     error, share = both(corner, commands)
-    assert error < 1e-5  # the last two coefficients tell of a corner if it is no tiny one
+    assert error < 1e-5  # the last two coefficients show a corner unless it is tiny
     assert 0.2 < share < 1
 
 

@@ -1,4 +1,4 @@
-"""`Case`: what one system binds together, so that the rest of retwin need not know the system."""
+"""`Case`: the twin, faults, commands and settings of one system."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ __all__ = ["Body", "Case"]
 
 
 class Body(Protocol):
-    """What can be drawn of a system: a chain of points in space, moved by joints.
+    """A chain of points in space, moved by joints, by which a system is drawn.
 
-    Only outputs are measured. The pose behind them is inferred, for pictures and for nothing else.
+    The poses are inferred from the outputs, for pictures only.
     """
 
     @property
@@ -36,13 +36,13 @@ class Body(Protocol):
 
     @property
     def model(self) -> Path | None:
-        """An MJCF file that has these joints, z upwards; None when the chain is all there is."""
+        """An MJCF file that has these joints, z upwards; None if only the chain is drawn."""
         ...
 
     def poses(self, trajectories: Trajectories) -> tuple[NDArray, NDArray]:
         """Joint positions (n, T, joints) in rad or m, nominal and observed.
 
-        The observed ones are the nearest to the nominal ones that explain the outputs.
+        The observed pose is the one nearest to the nominal pose that gives the observed outputs.
         """
         ...
 
@@ -53,30 +53,56 @@ class Body(Protocol):
 
 @dataclass(frozen=True)
 class Case:
-    """One system.
+    """One system: all that the rest of retwin must know of it.
+
+    Studies, the command line and reports take a case and hold nothing about a particular system.
+    Built-in cases are in `catalog.CASES`; `read_case` makes one from a case.toml.
 
     Attributes
     ----------
-    name, title: for the command line, and for people.
-    faults: class name to fault, `None` for healthy, in the fixed order of the classes.
-    twin: the simulator that is to be updated.
-    emulator: a stand-in for the real system, for trying things out; its data are "emulated".
-    sampler: draws commands.
-    correction: the shape that the gap may take, by default.
-    output_correction: the same told at the outputs alone, as in the paper, for comparison.
-    sensor_rate: samples per second that the measuring chain really takes.
-    recover: fills in commands that a file does not hold; None when files hold them.
-    parametric: the twin with what is not known of it as parameters, for updating those instead;
-        None when the case cannot say.
-    encoder_noise: puts reading noise of so many command units on frozen actuators (trajectories,
-        units, seed); None when the case cannot tell what that does to its outputs.
-    published: the figures of a paper to show beside ours: source to metric to text.
-    body: what can be drawn of the system; None when there is nothing to draw.
-    network, training: of the surrogate; None trains it as suits the network.
-    per_class: trajectories of each class that a surrogate or a diagnoser learns from, by default.
-    density: the law of the gap, of one value per sample where the correction has that resolution.
-    records: splits a file into what calibrates and what tests, where a benchmark says so; None
-        when files hold one set.
+    name : str
+        Its name on the command line.
+    title : str
+        Its name on pages.
+    faults : mapping of str to Fault or None
+        The fault of each class, None for the healthy one. The order is that of the classes in all
+        results.
+    twin : Twin
+        The simulator to be updated; its channels and sample rate are those of the case.
+    emulator : Twin or None
+        A stand-in for the real system, whose outputs count as emulated measurements.
+    sampler : CommandSampler
+        The distribution of commands, for training data of surrogates and diagnosers.
+    correction : Correction
+        The default form of the discrepancy.
+    output_correction : Correction
+        A form of the discrepancy in the outputs alone, as in the paper, for comparison.
+    sensor_rate : float
+        The rate in Hz at which the sensor delivers samples, at most that of the data.
+    recover : callable or None
+        Completes trajectories without commands (trajectories, progress); None if files hold the
+        commands.
+    parametric : ParametricTwin or None
+        The twin with its uncertain parameters free, for identification; None if there are none.
+    encoder_noise : callable or None
+        Adds the encoder noise of frozen actuators (trajectories, standard deviation in command
+        units, seed); None if its effect on the outputs is not known.
+    published : mapping of str to mapping of str to str
+        Figures of a paper, shown beside the results: source to metric to text.
+    body : Body or None
+        How the system is drawn; None if it is not.
+    network : Network
+        The network of the surrogate.
+    training : Training or None
+        How the surrogate is trained; None for the default of the network.
+    per_class : int
+        The default number of trajectories per class in training sets of surrogates and diagnosers.
+    density : Density or SequenceMixture
+        The conditional distribution of the discrepancy z: per segment, or per sample if the
+        correction has one z per sample.
+    records : callable or None
+        Splits a file into the calibration set and the test set of a benchmark; None if a file holds
+        one set.
 
     """
 
@@ -107,7 +133,7 @@ class Case:
 
     @property
     def diagnosed(self) -> bool:
-        """Whether there is more than one class to tell apart."""
+        """Whether there is more than one class, so that a diagnosis makes sense."""
         return len(self.faults) > 1
 
     @property
@@ -122,23 +148,23 @@ class Case:
 
     @property
     def rate(self) -> float:
-        """Samples per second of the data."""
+        """Sample rate of the data, in Hz."""
         return self.twin.rate
 
     def with_random_onset(self) -> Case:
-        """The same case with stuck actuators that freeze anywhere in the first four fifths."""
+        """The same case with stuck actuators whose onset is uniform in the first 4/5 of a run."""
         onset = (0, 4 * self.sampler.steps // 5)
         faults = {
             name: replace(fault, onset=onset) if isinstance(fault, Stuck) else fault
             for name, fault in self.faults.items()
         }
-        # What noise does to a frozen joint is known for the published onset only.
+        # The effect of encoder noise on a frozen joint is known for the published onset only.
         return replace(self, faults=faults, encoder_noise=None)
 
     def complete(
         self, trajectories: Trajectories, *, progress: Progress | None = None
     ) -> Trajectories:
-        """`trajectories` with commands, recovered if the file has none and the case knows how."""
+        """`trajectories` with commands, recovered if the file has none and the case can do so."""
         if trajectories.commands.shape[2] or self.recover is None:
             return trajectories
         return self.recover(trajectories, progress)

@@ -1,4 +1,4 @@
-"""Records in one table of text: a column for each channel, one set to calibrate, one to test."""
+"""Records in one CSV table: a column for each channel, one record per set of data."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.serialisation.files import sha256
@@ -20,20 +21,23 @@ __all__ = ["ColumnRecords"]
 
 @dataclass(frozen=True)
 class ColumnRecords:
-    """Call it on a CSV file with a header: out come the record to calibrate on, and that to test.
+    """A function of a CSV file with a header that gives a calibration record and a test record.
 
-    One trajectory each, healthy. It ends where its commands end; an output that is missing before
-    is masked. `nominal` is what the twin says.
+    Each is one healthy trajectory. It ends where its commands end; an output that is missing before
+    is masked. `nominal` is the output of the twin.
 
     Parameters
     ----------
-    twin: tells channels and rate.
-    calibration, test: the name of each channel's column.
+    twin : Twin
+        Its channels and sample rate are those of the records.
+    calibration, test : mapping of str to str
+        The column of each channel.
 
     Raises
     ------
-    InputError: not one column for each input and output; when called, a file that cannot be read
-        or lacks a column, a command that is no number.
+    InputError
+        There is not one column for each input and output. When called: the file cannot be read or
+        lacks a column, or a command is no number.
 
     """
 
@@ -45,16 +49,16 @@ class ColumnRecords:
         wanted = (*self.twin.inputs.names, *self.twin.outputs.names)
         for name in ("calibration", "test"):
             given = getattr(self, name)
-            if set(given) != set(wanted):
-                raise InputError(
-                    name,
-                    expected=f"a column for each of {', '.join(wanted)}",
-                    got=f"{', '.join(given) or 'none'}",
-                    remedy='write for each channel NAME = "COLUMN"',
-                )
+            require(
+                set(given) == set(wanted),
+                name,
+                expected=f"a column for each of {', '.join(wanted)}",
+                got=", ".join(given) or "none",
+                remedy='write for each channel NAME = "COLUMN"',
+            )
 
     def __call__(self, path: str | Path) -> tuple[Trajectories, Trajectories]:
-        """The record to calibrate on, and the one to test."""
+        """The calibration record and the test record in a CSV file."""
         path = Path(path)
         table = _read(path, [*self.calibration.values(), *self.test.values()])
         source = Provenance(path.name, sha256(path))
@@ -70,15 +74,15 @@ class ColumnRecords:
             return np.stack([table[columns[each]] for each in channels.names], axis=-1)[None]
 
         commands = values(self.twin.inputs)
-        told = np.isfinite(commands[0]).all(axis=1)
-        steps = int(np.flatnonzero(told).max(initial=-1)) + 1
-        if steps < 2 or not told[:steps].all():
-            raise InputError(
-                source.name,
-                expected="a number for every command until the record ends, two rows at least",
-                got=f"{int(told.sum())} of {steps} rows of the {name} record",
-                remedy="fill the gaps: what was commanded is known",
-            )
+        known = np.isfinite(commands[0]).all(axis=1)
+        steps = int(np.flatnonzero(known).max(initial=-1)) + 1
+        require(
+            steps >= 2 and known[:steps].all(),
+            source.name,
+            expected="a number for every command until the record ends, two rows at least",
+            got=f"{int(known.sum())} of {steps} rows of the {name} record",
+            remedy="fill in the missing commands, which are known inputs",
+        )
         commands = commands[:, :steps]
         return Trajectories(
             commands=commands,
@@ -94,7 +98,7 @@ class ColumnRecords:
 
 
 def _read(path: Path, names: list[str]) -> dict[str, NDArray]:
-    """Those columns; NaN where a cell is empty."""
+    """Columns of a CSV file; NaN where a cell is empty."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as lines:
             rows = list(csv.DictReader(lines, strict=True))

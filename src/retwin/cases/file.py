@@ -1,7 +1,7 @@
-"""A case as a file, `case.toml`: what a user's system is, without a change to retwin.
+"""A case as a file, `case.toml`: a user's own system, without a change to retwin.
 
-A table whose `kind` is a class of retwin holds that class's parameters, under their own names. Code
-is named as `module:object`; a module that lies beside the file is found. Nothing else is run.
+A table whose `kind` is a class of retwin holds the parameters of that class, under their own names.
+Code is named as `module:object`; a module beside the file is found. No other code is run.
 """
 
 from __future__ import annotations
@@ -16,23 +16,15 @@ from retwin import catalog
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords
 from retwin.cases.named_twin import imported, parametric_twin, read_twin
+from retwin.checks import one_of, positive, require
 from retwin.data.io import load
 from retwin.data.trajectories import HEALTHY, Channels, Trajectories
 from retwin.errors import InputError
-from retwin.nets.networks import NETWORKS, Network
+from retwin.nets.networks import Network
 from retwin.nets.training import Training
-from retwin.serialisation.configs import (
-    at,
-    checked,
-    fits,
-    from_config,
-    from_settings,
-    key,
-    named,
-    table,
-)
-from retwin.twins.checks import check_positive
+from retwin.serialisation.configs import at, checked, fits, from_config, from_settings, key
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
+from retwin.twins.limits import Limits
 from retwin.twins.parametric import Parameter
 from retwin.twins.samplers import (
     CommandSampler,
@@ -41,15 +33,9 @@ from retwin.twins.samplers import (
     RampSampler,
     RecordedSampler,
 )
-from retwin.twins.twin import Limits, Twin
+from retwin.twins.twin import Twin
 from retwin.update.corrections import OPERATORS, Correction, DelayOffset
-from retwin.update.residual import (
-    Density,
-    Flow,
-    Mixture,
-    Refinement,
-    SequenceMixture,
-)
+from retwin.update.residual import Density, Mixture, SequenceMixture
 
 __all__ = ["check_density", "read_case"]
 
@@ -57,31 +43,40 @@ SAMPLERS: tuple[type, ...] = (RampSampler, HoldSampler, MultisineSampler, Record
 FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
 MODELS: tuple[type, ...] = (
     *OPERATORS,
-    *(Mixture, Flow, Refinement, SequenceMixture, Training),
-    *NETWORKS,
+    *(catalog.resolve(each.target) for each in catalog.DENSITIES.values()),
+    *(catalog.resolve(each.target) for each in catalog.NETWORKS.values()),
 )
+"""The classes that a case.toml may name, beside the user's own code."""
 
 
 @dataclass(frozen=True)
-class _File:
-    """What a case.toml may hold; see docs/own_twin.md."""
+class _Columns:
+    """The column of each channel in a table, one record per set."""
+
+    calibration: Mapping[str, str] = field(default_factory=dict)
+    test: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class CaseFile:
+    """The keys of a case.toml; see docs/own_twin.md."""
 
     name: str
     twin: Any
     title: str = ""
     rate: float | None = None
     sensor_rate: float | None = None
-    inputs: Mapping[str, Any] | tuple[str, ...] = ()
-    outputs: Mapping[str, Any] | tuple[str, ...] = ()
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    commands: Any = None
-    faults: Mapping[str, Any] = field(default_factory=dict)
+    inputs: dict[str, Any] | tuple[str, ...] = ()
+    outputs: dict[str, Any] | tuple[str, ...] = ()
+    parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
+    commands: dict[str, Any] | str = field(default_factory=dict)
+    faults: dict[str, dict[str, Any] | str] = field(default_factory=dict)
     correction: Correction | str = "delay_offset"
     output_correction: Correction | str | None = None
     density: Density | SequenceMixture | str | None = None
     network: Network | str = "mlp"
     training: Training | None = None
-    records: Any = None
+    records: _Columns | str | None = None
 
 
 def read_case(path: str | Path) -> Case:
@@ -89,61 +84,67 @@ def read_case(path: str | Path) -> Case:
 
     Raises
     ------
-    InputError: no TOML, an unknown or missing key, a value of another type or that cannot be, a
-        file or a Python name that is not there. It names the file and the key.
+    InputError
+        The file is no TOML, a key is unknown or missing, a value is of another type or refused by
+        what it sets, or a file or Python name is not there. The message names the file and the key.
 
     """
     path, place = Path(path), f"{path}:"
-    told = from_settings(_File, _read(path), MODELS, place=place)
-    twin = read_twin(told.twin, told.inputs, told.outputs, told.rate, path.parent, place)
+    folder = path.parent
+    keys = from_settings(CaseFile, _read(path), MODELS, place=place)
+    twin = read_twin(keys.twin, keys.inputs, keys.outputs, keys.rate, folder, place)
     parametric = None
-    if told.parameters:
+    if keys.parameters:
         inside = key(place, "parameters")
-        free = [_parameter(name, value, inside) for name, value in told.parameters.items()]
+        free = [
+            from_settings(Parameter, {"name": name, **value}, place=key(inside, name))
+            for name, value in keys.parameters.items()
+        ]
         twin = parametric = parametric_twin(twin, free, inside)
-    correction = _chosen(told.correction, catalog.CORRECTIONS, key(place, "correction"))
+    correction = _chosen(keys.correction, catalog.CORRECTIONS, key(place, "correction"))
     stepwise = correction.resolution == "step"
-    density = told.density or (SequenceMixture() if stepwise else Mixture())
+    density = keys.density or (SequenceMixture() if stepwise else Mixture())
     density = _chosen(density, catalog.DENSITIES, key(place, "density"))
-    at_outputs = told.output_correction or (correction if stepwise else DelayOffset())
+    at_outputs = keys.output_correction or (correction if stepwise else DelayOffset())
     at_outputs = _chosen(at_outputs, catalog.CORRECTIONS, key(place, "output_correction"))
     for operator in (correction, at_outputs):
         check_density(operator, density, key(place, "density"))
-    sensor_rate = twin.rate if told.sensor_rate is None else told.sensor_rate
-    with at(place):
-        check_positive("sensor_rate", sensor_rate, "Hz")
+    sensor_rate = twin.rate if keys.sensor_rate is None else keys.sensor_rate
     return Case(
-        name=told.name,
-        title=told.title or told.name,
-        faults=_faults(told.faults, twin.inputs, path.parent, key(place, "faults")),
+        name=keys.name,
+        title=keys.title or keys.name,
+        faults=_faults(keys.faults, twin.inputs, folder, key(place, "faults")),
         twin=twin,
         emulator=None,
-        sampler=_sampler(told.commands, twin, path.parent, key(place, "commands")),
+        sampler=_sampler(keys.commands, twin, folder, key(place, "commands")),
         correction=correction,
         output_correction=at_outputs,
-        sensor_rate=sensor_rate,
+        sensor_rate=positive(key(place, "sensor_rate"), sensor_rate, unit="Hz"),
         parametric=parametric,
-        network=_chosen(told.network, catalog.NETWORKS, key(place, "network")),
-        training=told.training,
+        network=_chosen(keys.network, catalog.NETWORKS, key(place, "network")),
+        training=keys.training,
         density=density,
-        records=_records(told.records, twin, path.parent, key(place, "records")),
+        records=_records(keys.records, twin, folder, key(place, "records")),
     )
 
 
 def check_density(
     correction: Correction, density: Density | SequenceMixture, place: str = "density"
 ) -> None:
-    """InputError when a density cannot be that of the correction's z: per movement, or sample."""
+    """Check that a density has one z where the correction has one: per segment, or per sample.
+
+    Raises InputError, about `place`, if it has not.
+    """
     stepwise = correction.resolution == "step"
-    if stepwise != isinstance(density, SequenceMixture):
-        raise InputError(
-            place,
-            expected="SequenceMixture, for a correction with one z per sample"
-            if stepwise
-            else "Mixture or Flow, for a correction with one z per movement",
-            got=type(density).__name__,
-            remedy="leave it out, or choose another correction",
-        )
+    require(
+        stepwise == isinstance(density, SequenceMixture),
+        place,
+        expected="SequenceMixture, for a correction with one z per sample"
+        if stepwise
+        else "Mixture or Flow, for a correction with one z per segment",
+        got=type(density).__name__,
+        remedy="leave it out, or choose another correction",
+    )
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -159,7 +160,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _chosen(value: Any, entries: Mapping[str, catalog.Entry], place: str) -> Any:
-    """What the catalog has by that name; or what a table has described already."""
+    """The implementation of that name in the catalog; an object stays as it is."""
     return catalog.make(entries, value, place) if isinstance(value, str) else value
 
 
@@ -167,81 +168,76 @@ def _own(name: str, folder: Path, place: str, protocol: type) -> Any:
     """An object of the user's own; of a class, one made without arguments."""
     found = imported(name, folder, place)
     found = found() if isinstance(found, type) else found
-    if not fits(found, protocol):
-        raise InputError(
-            place,
-            expected=f"a {protocol.__name__}",
-            got=f"{name!r}, a {type(found).__name__}",
-            remedy=f"see {protocol.__module__}.{protocol.__name__} for what it must have",
-        )
+    require(
+        fits(found, protocol),
+        place,
+        expected=f"a {protocol.__name__}",
+        got=f"{name!r}, a {type(found).__name__}",
+        remedy=f"see {protocol.__module__}.{protocol.__name__} for what it must have",
+    )
     return found
-
-
-def _parameter(name: str, value: Any, place: str) -> Parameter:
-    inside = key(place, name)
-    return from_settings(Parameter, {"name": name, **table(value, inside)}, place=inside)
 
 
 def _faults(
     tables: Mapping[str, Any], inputs: Channels, folder: Path, place: str
 ) -> dict[str, Fault | None]:
-    """Class name to fault, healthy first; an actuator is named as its channel is."""
+    """Class name to fault, healthy first; an actuator may be named as its channel is."""
     made: dict[str, Fault | None] = {HEALTHY: None}
     for name, value in tables.items():
         inside = key(place, name)
         if isinstance(value, str):
             made[name] = _own(value, folder, inside, Fault)
             continue
-        settings = table(value, inside)
-        if isinstance(settings.get("actuator"), str):
-            numbers = {channel: i for i, channel in enumerate(inputs.names)}
-            settings["actuator"] = named(settings["actuator"], numbers, key(inside, "actuator"))
-        made[name] = from_config(settings, FAULTS, place=inside)
+        actuator = value.get("actuator")
+        if isinstance(actuator, str):
+            channel = one_of(key(inside, "actuator"), actuator, inputs.names)
+            value = {**value, "actuator": inputs.names.index(channel)}
+        made[name] = from_config(value, FAULTS, place=inside)
     return made
 
 
 def _sampler(value: Any, twin: Twin, folder: Path, place: str) -> CommandSampler:
-    """How commands are drawn: by one of our kinds, ramps if not told; or by the user's own."""
+    """The distribution of commands: of a kind of retwin, by default ramps, or of the user's own."""
     if isinstance(value, str):
         own: CommandSampler = _own(value, folder, place, CommandSampler)
         return own
-    settings = {"kind": RampSampler.__name__, **table({} if value is None else value, place)}
+    settings = {"kind": RampSampler.__name__, **value}
     if settings["kind"] == RecordedSampler.__name__:
         return _recorded(settings, twin, folder, place)
     limits: Limits | None = getattr(twin, "limits", None)
     if limits is not None:
-        settings = {"low": list(limits.low), "high": list(limits.high), **settings}
+        settings = {"low": limits.low, "high": limits.high, **settings}
     made: CommandSampler = from_config(settings, SAMPLERS, place=place)
     return made
 
 
 def _recorded(settings: dict[str, Any], twin: Twin, folder: Path, place: str) -> RecordedSampler:
     """The commands of trajectories in a `file`."""
-    file = settings.pop("file", None)
-    if not isinstance(file, str):
-        raise InputError(
-            key(place, "file"),
-            expected="the name of a file of trajectories",
-            got=repr(file),
-            remedy="write what `retwin data convert` wrote, *.npz or *.zarr",
-        )
+    options = {name: value for name, value in settings.items() if name not in ("kind", "file")}
+    file = settings.get("file")
+    require(
+        isinstance(file, str),
+        key(place, "file"),
+        expected="the name of a file of trajectories",
+        got=repr(file),
+        remedy="write what `retwin data convert` wrote, *.npz or *.zarr",
+    )
     with at(key(place, "file")):
-        found = load(folder / file)
-    if (found.inputs, found.rate) != (twin.inputs, twin.rate):
-        raise InputError(
-            key(place, "file"),
-            expected=f"commands of {', '.join(twin.inputs.names)} at {twin.rate:g} Hz",
-            got=f"{', '.join(found.inputs.names) or 'none'} at {found.rate:g} Hz",
-            remedy="take data of this system",
-        )
-    settings.pop("kind")
-    own = checked(RecordedSampler, settings, place=place, besides=("commands",))
+        found = load(folder / str(file))
+    require(
+        (found.inputs, found.rate) == (twin.inputs, twin.rate),
+        key(place, "file"),
+        expected=f"commands of {', '.join(twin.inputs.names)} at {twin.rate:g} Hz",
+        got=f"{', '.join(found.inputs.names) or 'none'} at {found.rate:g} Hz",
+        remedy="take data of this system",
+    )
+    own = checked(RecordedSampler, options, place=place, besides=("commands",))
     with at(place):
         return RecordedSampler(found.commands, **own)
 
 
 def _records(
-    value: Any, twin: Twin, folder: Path, place: str
+    value: _Columns | str | None, twin: Twin, folder: Path, place: str
 ) -> Callable[[Path], tuple[Trajectories, Trajectories]] | None:
     """How one file is split: by columns, or by the user's own function of its path."""
     if value is None:
@@ -249,6 +245,5 @@ def _records(
     if isinstance(value, str):
         split: Callable[[Path], tuple[Trajectories, Trajectories]] = imported(value, folder, place)
         return split
-    columns = checked(ColumnRecords, value, place=place, besides=("twin",))
     with at(place):
-        return ColumnRecords(twin, **{"calibration": {}, "test": {}, **columns})
+        return ColumnRecords(twin, value.calibration, value.test)

@@ -1,4 +1,4 @@
-"""What a case.toml names: Python objects beside it, and the twin, whichever kind it is."""
+"""What a case.toml names: Python objects beside it, and its twin, of whatever kind."""
 
 from __future__ import annotations
 
@@ -7,46 +7,64 @@ import inspect
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from retwin import twins
+from retwin.checks import require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
-from retwin.serialisation.configs import at, checked, from_settings, key, named, table
+from retwin.serialisation.configs import at, checked, from_settings, key
 from retwin.twins.fmu import FMUTwin
 from retwin.twins.function import FunctionTwin
+from retwin.twins.limits import Limits
 from retwin.twins.mujoco import MuJoCoTwin, Servo
 from retwin.twins.parametric import Parameter, ParametricTwin
-from retwin.twins.twin import Limits, Twin
+from retwin.twins.twin import Twin
 
 __all__ = ["imported", "parametric_twin", "read_twin"]
 
 FILES: dict[str, Any] = {".fmu": FMUTwin, ".xml": MuJoCoTwin, ".urdf": MuJoCoTwin}
-APART = ("path", "function", "inputs", "outputs", "sensors", "rate", "limits")
-"""Parameters of twins that a case.toml tells elsewhere."""
-
-Named = Mapping[str, Any] | Sequence[str]
-"""Channels: a table of each, or names alone."""
+"""The kind of twin that a file of each suffix holds."""
+ELSEWHERE = ("path", "function", "inputs", "outputs", "sensors", "rate", "limits")
+"""Parameters of twins that other keys of a case.toml set."""
 
 
 @dataclass(frozen=True)
 class _Channel:
-    """What a table tells of a channel of a function."""
+    """A channel of a twin that is a function: its unit, and the limits of a command in it."""
 
     unit: str = "1"
     low: float = float("-inf")
     high: float = float("inf")
 
 
-def imported(name: Any, folder: Path, place: str) -> Any:
-    """What `module:object` names.
+@dataclass(frozen=True)
+class _Making:
+    """How a twin is made, besides the parameters of its class."""
 
-    Modules in `folder` can be imported from then on, here and in worker processes, after all that
-    is installed. Raises InputError where there is none, and where `folder` has a module of that
-    name but another one was found.
+    outside: Literal["refuse", "clip"] = "refuse"
+    servos: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+Named = Mapping[str, Any] | Sequence[str]
+"""Channels: a table of each, or names alone."""
+
+
+def imported(name: Any, folder: Path, place: str) -> Any:
+    """The object that `module:object` names.
+
+    From then on, modules in `folder` can be imported here and in worker processes, after all that
+    is installed.
+
+    Raises
+    ------
+    InputError
+        There is none, or `folder` has a module of that name but another one was found. The message
+        names `place`.
+
     """
     module, _, attribute = str(name).partition(":")
     expected = "module:object, the module installed or beside the case"
@@ -76,24 +94,36 @@ def imported(name: Any, folder: Path, place: str) -> Any:
 
 
 def read_twin(
-    told: Any, inputs: Named, outputs: Named, rate: float | None, folder: Path, place: str
+    twin: Any,
+    inputs: Named,
+    outputs: Named,
+    rate: float | None,
+    folder: Path,
+    place: str,
 ) -> Twin:
     """The twin that a text names, or a table that holds its name and its settings.
 
     | name | takes |
     |---|---|
     | `module:function` | inputs and outputs as tables, with units and limits; rate |
-    | `module:object`, or a built-in one | nothing, for it has its own |
+    | `module:object`, or a built-in one | nothing, since it has its own |
     | `*.fmu`, `*.xml`, `*.urdf` | names of inputs and outputs, by default all; rate |
+
+    Raises
+    ------
+    InputError
+        There is no such twin, or it does not take these settings. The message names `place` and the
+        key.
+
     """
     own = key(place, "twin")
-    options = dict(told) if isinstance(told, Mapping) else {"name": told}
+    options = dict(twin) if isinstance(twin, Mapping) else {"name": twin}
     name = options.pop("name", None)
     if not isinstance(name, str):
         raise InputError(
             own,
             expected=f"the name of a twin: {twins.FORMS}",
-            got=repr(told),
+            got=repr(twin),
             remedy='write twin = "NAME", or a table with a name in it',
         )
     if "nominal" in options:
@@ -103,13 +133,13 @@ def read_twin(
     found = imported(name, folder, own) if ":" in name else None
     if callable(found) and (inputs or outputs):
         return _of_function(found, inputs, outputs, rate, options, place)
-    if options:
-        raise InputError(
-            own,
-            expected="a name alone, for such a twin has its own settings",
-            got=", ".join(options),
-            remedy="make the object with these settings",
-        )
+    require(
+        not options,
+        own,
+        expected="a name alone, for such a twin has its own settings",
+        got=", ".join(options),
+        remedy="make the object with these settings",
+    )
     with at(place):
         return twins.get(name, inputs=tuple(inputs), outputs=tuple(outputs), rate=rate)
 
@@ -122,23 +152,20 @@ def _of_function(
     options: dict[str, Any],
     place: str,
 ) -> FunctionTwin:
-    told = _channels(inputs, key(place, "inputs"))
-    made = _channels(outputs, key(place, "outputs"))
+    commands = _channels(inputs, key(place, "inputs"))
+    results = _channels(outputs, key(place, "outputs"))
     own = key(place, "twin")
-    outside = _outside(options, own)
-    settings = checked(FunctionTwin, options, place=own, besides=APART)
+    making = _making(options, own, "outside")
+    settings = checked(FunctionTwin, options, place=own, besides=ELSEWHERE)
     with at(key(place, "inputs")):
-        limits = Limits(
-            tuple(each.low for each in told.values()),
-            tuple(each.high for each in told.values()),
-            outside,
-        )
+        low, high = (tuple(getattr(c, end) for c in commands.values()) for end in ("low", "high"))
+        limits = Limits(low, high, making.outside)
     with at(place):
         return FunctionTwin(
             function,
-            Channels(tuple(told), tuple(each.unit for each in told.values())),
-            Channels(tuple(made), tuple(each.unit for each in made.values())),
-            rate,  # type: ignore[arg-type]  # it says so itself where there is none
+            Channels(tuple(commands), tuple(each.unit for each in commands.values())),
+            Channels(tuple(results), tuple(each.unit for each in results.values())),
+            rate,  # type: ignore[arg-type]  # None is refused there
             limits=limits,
             **settings,
         )
@@ -153,43 +180,45 @@ def _of_file(
     place: str,
 ) -> Twin:
     own, kind = key(place, "twin"), FILES[file.suffix.lower()]
-    if not file.is_file():
-        raise InputError(
-            own, expected="a file", got=f"{file}, where there is none", remedy="check the name"
+    require(
+        file.is_file(),
+        own,
+        expected="a file",
+        got=f"{file}, where there is none",
+        remedy="check the name",
+    )
+    for name, channels in (("inputs", inputs), ("outputs", outputs)):
+        require(
+            not (isinstance(channels, Mapping) and any(channels.values())),
+            key(place, name),
+            expected=f"names alone, since units and limits are those of {file.name}",
+            got=repr(channels),
+            remedy=f"write {name} = [{', '.join(map(repr, channels))}]",
         )
-    for name, given in (("inputs", inputs), ("outputs", outputs)):
-        if isinstance(given, Mapping) and any(given.values()):
-            raise InputError(
-                key(place, name),
-                expected=f"names alone, since units and limits are those of {file.name}",
-                got=repr(given),
-                remedy=f"write {name} = [{', '.join(repr(each) for each in given)}]",
-            )
-    servos, outside = options.pop("servos", {}), _outside(options, own)
-    settings = checked(kind, options, place=own, besides=(*APART, "servos", "outside"))
-    if servos:
+    making = _making(options, own, "outside", *(["servos"] if kind is MuJoCoTwin else []))
+    settings = checked(kind, options, place=own, besides=(*ELSEWHERE, "outside"))
+    if making.servos:
         inside = key(own, "servos")
         settings["servos"] = [
             (joint, from_settings(Servo, value, place=key(inside, joint)))
-            for joint, value in table(servos, inside).items()
+            for joint, value in making.servos.items()
         ]
     if rate is not None:
         settings["rate"] = rate
     with at(own):
         made: Twin = kind.from_file(
-            file, inputs=tuple(inputs), outputs=tuple(outputs), outside=outside, **settings
+            file, inputs=tuple(inputs), outputs=tuple(outputs), outside=making.outside, **settings
         )
         return made
 
 
-def _outside(options: dict[str, Any], place: str) -> Any:
-    """What to do with commands beyond the limits."""
-    known = {name: name for name in ("refuse", "clip")}
-    return named(options.pop("outside", "refuse"), known, key(place, "outside"))
+def _making(options: dict[str, Any], place: str, *names: str) -> _Making:
+    """The settings of those names, taken out of `options`."""
+    return from_settings(_Making, {n: options.pop(n) for n in names if n in options}, place=place)
 
 
 def _channels(given: Named, place: str) -> dict[str, _Channel]:
-    """A table of each channel, which its name alone stands for too."""
+    """A table of each channel, for which its name alone may stand."""
     tables = given if isinstance(given, Mapping) else {name: {} for name in given}
     return {
         name: from_settings(_Channel, value, place=key(place, name))

@@ -18,9 +18,7 @@ import typer
 from typer.core import TyperGroup
 
 from retwin._version import __version__
-from retwin.cli import bundle, data, diagnose, models, studies, twins
-from retwin.cli.bench import bench
-from retwin.cli.doctor import doctor
+from retwin.cli import bench, bundle, data, diagnose, doctor, models, studies, twins
 from retwin.cli.terminal import (
     BAD_INPUT,
     FAILED,
@@ -45,7 +43,7 @@ class FirstScreen(TyperGroup):
     """All commands; its help fits into 24 lines of 80."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """The options; of Typer's own for completion the one that most need is told, in brief."""
+        """The options; of the two that Typer adds for completion only one is shown."""
         params: list[Any] = [*super().get_params(ctx)]
         for each in params:
             if each.name == "install_completion":
@@ -61,8 +59,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command(epilog=example("retwin demo"))(studies.demo)
-app.command(epilog=example("retwin doctor"))(doctor)
-app.command(epilog=example("retwin bench"))(bench)
+app.command(epilog=example("retwin doctor"))(doctor.doctor)
+app.command(epilog=example("retwin bench"))(bench.bench)
 app.command(epilog=example("retwin fit armpi --twin-data sim.mat --real real.mat --out model"))(
     models.fit
 )
@@ -104,8 +102,8 @@ def options(
 def main() -> None:
     """Run the command line and exit with its code.
 
-    SIGTERM is taken as Ctrl-C, so that nothing is left lying about. Modules in the current folder
-    can be imported, after all that is installed: a file there must not stand in for a package.
+    SIGTERM acts as Ctrl-C, so that temporary files are removed. Modules in the current folder can
+    be imported, after installed packages, which a file there therefore cannot replace.
     """
     if "" not in sys.path:
         sys.path.append("")
@@ -114,10 +112,10 @@ def main() -> None:
 
 
 def _run() -> int:
-    """The exit code; what went wrong is told in one line."""
+    """Run the command; print an error as one line, and return the exit code."""
     try:
-        # Typer ends Ctrl-C without a word: with this code, or by Abort where it is older.
-        code: int = app(standalone_mode=False) or 0
+        # Typer ends Ctrl-C with this code and no message; older versions raise Abort.
+        code: int = app(prog_name="retwin", standalone_mode=False) or 0
         if code != INTERRUPTED:
             return code
         complain_of_interruption(kept=False)

@@ -1,4 +1,4 @@
-"""`retwin twin animate`: one trajectory as a film."""
+"""`retwin twin animate`: a film of one trajectory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["animate"]
 
 
 class Renderer(StrEnum):
-    """What draws the pictures."""
+    """Renderers of the pictures."""
 
     auto = "auto"
     mujoco = "mujoco"
@@ -52,7 +52,7 @@ def animate(
     shape = _size(size)
     found = cases.get(case or "armpi")
     trajectories = read(file, found)
-    with bar("animate") as tell:
+    with bar("animate") as show:
         path = film(
             trajectories,
             found,
@@ -61,7 +61,7 @@ def animate(
             fps=fps,
             size=shape,
             renderer=renderer.value,
-            progress=lambda share: tell("draw", share),
+            progress=lambda share: show("draw", share),
         )
     answer(path, str(path))
 
@@ -73,6 +73,6 @@ def _size(text: str) -> tuple[int, int]:
             "--size",
             expected="WIDTHxHEIGHT in pixels",
             got=repr(text),
-            remedy="640x480 is usual",
+            remedy="give it like 640x480",
         )
     return int(found[1]), int(found[2])

@@ -1,4 +1,4 @@
-"""`retwin bench`: what this machine takes, beside what the paper says."""
+"""`retwin bench`: times on this machine, beside those of the paper."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def bench(
         Path | None, typer.Option(metavar="FILE", help="JSON file for the figures, too.")
     ] = None,
     n: Annotated[
-        int, typer.Option("--n", metavar="N", help="Trajectories that times are told for.", min=9)
+        int, typer.Option("--n", metavar="N", help="Trajectories that times are given for.", min=9)
     ] = 3600,
     repeats: Annotated[
         int, typer.Option(metavar="N", help="Times that generation is timed.", min=1)
@@ -34,12 +34,12 @@ def bench(
     """Time twins of the arm and what learns from them, beside the paper."""
     from retwin.cli.benchmark import run_bench
 
-    with bar("bench") as tell:
-        found = run_bench(count=n, repeats=repeats, report=tell)
-    told = found.told()
+    with bar("bench") as show:
+        found = run_bench(count=n, repeats=repeats, report=show)
+    figures = found.about()
     if out is not None:
         with write_atomically(out) as part:
-            part.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+            part.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     made = [
         (
             way.what,
@@ -53,20 +53,20 @@ def bench(
     learned = [(each.what, f"{each.seconds:.3g}") for each in found.learning.values()]
     numbers = ("s", "per s", "ratio", "paper, s")
     answer(
-        told,
+        figures,
         table((f"{n} trajectories of 10 s, labelled", *numbers), made, numbers=numbers),
         "",
         table(("learned", "s"), learned, numbers=("s",)),
         "",
-        *_read(found),
+        *_sentences(found),
         as_json=as_json,
     )
     if out is not None:
         note(f"Wrote {out}")
 
 
-def _read(found: Benchmark) -> Iterator[str]:
-    """What the figures say, in sentences."""
+def _sentences(found: Benchmark) -> Iterator[str]:
+    """The main results in sentences."""
     yield (
         f"The twin takes {found.ratio('twin'):.0f} times as long as the corrected twin; the "
         f"paper's, {found.paper_ratio:.0f} times."
@@ -75,9 +75,8 @@ def _read(found: Benchmark) -> Iterator[str]:
     faster = "which needs no surrogate for speed" if closed < 1 else "which is no faster here"
     yield f"This arm has a closed form, {faster}: {closed:.2g} times the corrected twin."
     yield (
-        f"With what is learned before, the corrected twin is ahead from {found.pays_from:.0f} "
-        "trajectories on."
+        f"Learning included, the corrected twin is faster from {found.pays_from:.0f} trajectories."
         if found.pays_from < float("inf")
         else "The corrected twin is not faster than the twin here."
     )
-    yield "Times alone: how well diagnosis does is measured by `retwin study`."
+    yield "These are times alone: `retwin study` measures the accuracy of diagnosis."

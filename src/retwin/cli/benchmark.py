@@ -1,9 +1,9 @@
-"""How long things take on this machine, beside what the paper says: `retwin bench`.
+"""Times on this machine, beside those of the paper: what `retwin bench` measures.
 
-The paper's claim is of time: its twin takes about 8.5 hours for 3600 trajectories on an Apple M1
-Pro, IBG and RG together 4 to 5 minutes. It leaves training out, and that the same arm can be
-simulated otherwise. All that stands beside it here: the arm by MuJoCo, corrected twins, the
-surrogate alone, the arm in closed form, and how long the memory takes to be written at all.
+The paper's twin takes about 8.5 hours for 3600 trajectories on an Apple M1 Pro, its IBG and RG
+together 4 to 5 minutes. These figures exclude training, and the same arm can be simulated in other
+ways. Timed here are the arm by MuJoCo, corrected twins, the surrogate alone, the arm in closed
+form, what is learned, and, as a lower bound, writing the results to memory.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ import numpy as np
 from retwin import cases, twins
 from retwin._version import __version__
 from retwin.cases.case import Case
+from retwin.checks import whole
 from retwin.data.trajectories import HEALTHY
 from retwin.diagnosis import fit_diagnoser
 from retwin.diagnosis.network import training_for
-from retwin.errors import InputError
 from retwin.nets.networks import CNN
 from retwin.nets.training import Training
 from retwin.twins.twin import Twin
@@ -48,27 +48,32 @@ __all__ = [
 ]
 
 COUNT = 3600
-"""Trajectories of 10 s that times are told for, as in the paper."""
+"""Trajectories of 10 s that times are given for, as in the paper."""
 REPEATS = 3
+"""Runs of a generation, of which the median time is taken."""
 PAPER = {"twin": 8.5 * 3600.0, "corrected": 4.5 * 60.0}
-"""The paper's seconds for as many, on an Apple M1 Pro; the latter is told as 4 to 5 minutes."""
+"""The paper's times for as many, in s, on an Apple M1 Pro; it states the latter as 4 to 5 min."""
 
 Model = TypeVar("Model")
 Result = TypeVar("Result")
 Report = Callable[[str, float], None]
-"""Called with what is being timed and the share that is done."""
+"""Callback that gets the name of what is timed and the share that is done."""
 
 
 @dataclass(frozen=True)
 class Timed:
-    """How long something takes.
+    """The time that something takes.
 
     Attributes
     ----------
-    what: in words.
-    seconds: for all of it.
-    share: of it that was really done, 0 … 1; the time is scaled up.
-    paper: the paper's seconds for the same; None where it does not say.
+    what : str
+        What is timed, in words.
+    seconds : float
+        Time of all of it, in s.
+    share : float
+        Share of it that was run, 0 to 1; the time is scaled up.
+    paper : float or None
+        Time of the same in the paper, in s; None if the paper has none.
 
     """
 
@@ -80,14 +85,18 @@ class Timed:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What was timed.
+    """The times of `run_bench`.
 
     Attributes
     ----------
-    count: trajectories that `generation` is told for.
-    generation: making them, labelled, by name; "corrected" is what the others are held against.
-    learning: what must be learned once before, and a classifier from what is made.
-    machine: where, with what, and when.
+    count : int
+        Trajectories that `generation` is given for.
+    generation : mapping of str to Timed
+        Times to generate labelled trajectories, by twin; ratios are to that of "corrected".
+    learning : mapping of str to Timed
+        Times to learn, once, what the corrected twin needs, and a classifier.
+    machine : mapping
+        Machine, versions and date.
 
     """
 
@@ -97,26 +106,26 @@ class Benchmark:
     machine: Mapping[str, Any]
 
     def ratio(self, name: str) -> float:
-        """How many times as long a way of generating takes as the corrected twin does."""
+        """Time of a way of generating, in multiples of the corrected twin's."""
         return self.generation[name].seconds / self.generation["corrected"].seconds
 
     @property
     def paper_ratio(self) -> float:
-        """The same of the paper's twin and the paper's corrected twin."""
+        """Time of the paper's twin, in multiples of the paper's corrected twin's."""
         return PAPER["twin"] / PAPER["corrected"]
 
     @property
     def pays_from(self) -> float:
-        """Trajectories from which learning and generating take less than the twin at 1 ms does.
+        """Number of trajectories from which learning and generating are faster than the 1 ms twin.
 
-        Infinite where the corrected twin is the slower one.
+        It is infinite if the corrected twin is slower.
         """
         once = sum(self.learning[name].seconds for name in ("twin_data", "surrogate", "residual"))
         gain = self.generation["twin"].seconds - self.generation["corrected"].seconds
         return self.count * once / gain if gain > 0 else float("inf")
 
-    def told(self) -> dict[str, Any]:
-        """As plain values, for JSON."""
+    def about(self) -> dict[str, Any]:
+        """The times as JSON values."""
         ways = {name: asdict(each) for name, each in self.generation.items()}
         return {
             "schema": 1,
@@ -132,45 +141,57 @@ class Benchmark:
 def run_bench(
     *, count: int = COUNT, repeats: int = REPEATS, report: Report | None = None
 ) -> Benchmark:
-    """Time the twins of the arm, and what is learned from them; a minute or two on two cores.
+    """Time the twins of the arm and the training of networks; a minute or two on two cores.
 
-    Slow twins make a part of the trajectories, and networks learn for a few epochs, since times
-    do not depend on how good they are: the rest is reckoned. Generation is the median of
-    `repeats`, learning is timed once. `report` is told what is going on.
+    Slow twins generate a share of the trajectories, and networks are trained for a few epochs,
+    since times do not depend on their quality. Times are scaled up from there.
+
+    Parameters
+    ----------
+    count : int
+        Trajectories that times are given for, at least 1.
+    repeats : int
+        Runs of each generation, of which the median time is taken, at least 1; learning runs once.
+    report : callable, optional
+        Called with the name of what is timed and the share that is done.
+
+    Returns
+    -------
+    Benchmark
+        All times.
 
     Raises
     ------
-    InputError: `count` or `repeats` below 1.
+    InputError
+        If `count` or `repeats` is below 1.
 
     """
-    for name, number in (("count", count), ("repeats", repeats)):
-        if number < 1:
-            raise InputError(
-                name, expected="at least 1", got=repr(number), remedy="give a positive number"
-            )
-    tell = report or (lambda _text, _share: None)
+    whole("count", count, least=1)
+    whole("repeats", repeats, least=1)
+    show = report or (lambda _text, _share: None)
     case = cases.get("armpi")
-    tell("learning", 0.0)
+    show("learning", 0.0)
     learning, corrected, in_commands = _learned(case)
-    tell("classifier", 0.3)
+    show("classifier", 0.3)
     learning["classifier"] = _classifier(corrected, case, count)
     generation = {}
     for done, way in enumerate(_ways(case, corrected, in_commands)):
-        tell(way.what, 0.4 + 0.1 * done)
+        show(way.what, 0.4 + 0.1 * done)
         seconds, share = generating(way.twin, case, count, share=way.share, repeats=repeats)
         generation[way.name] = Timed(way.what, seconds, share, PAPER.get(way.name))
     size = count * _bytes_of_one(case)
     generation["memory"] = Timed("writing as many bytes to memory", size / memory_bandwidth())
-    tell("done", 1.0)
+    show("done", 1.0)
     return Benchmark(count, generation, learning, machine())
 
 
 def generating(
     twin: Twin, case: Case, count: int, *, share: float = 1.0, repeats: int = REPEATS
 ) -> tuple[float, float]:
-    """Median seconds for `count` balanced labelled trajectories, and the share really made.
+    """Median time in s for `count` balanced labelled trajectories, and the share that was run.
 
-    With a `share` below 1 fewer are made, at least one of each class, and the time is scaled up.
+    With a `share` below 1 fewer are generated, at least one of each class, and the time is scaled
+    up.
     """
     per_class = max(1, round(share * count / len(case.classes)))
     seconds = median_seconds(lambda: generate(twin, case, per_class=per_class, seed=2), repeats)
@@ -179,27 +200,27 @@ def generating(
 
 
 def median_seconds(make: Callable[[], object], repeats: int = REPEATS) -> float:
-    """The median time that `make` takes, by the wall clock."""
+    """Median time of `make` in s, by the wall clock."""
     return statistics.median(timed(make)[0] for _ in range(repeats))
 
 
 def timed(
     make: Callable[[], Result], clock: Callable[[], float] = time.perf_counter
 ) -> tuple[float, Result]:
-    """Seconds, by the wall clock unless another is given, and what was made."""
+    """Time of `make` in s, by the wall clock unless another is given, and its result."""
     started = clock()
     result = make()
     return clock() - started, result
 
 
 def memory_bandwidth() -> float:
-    """Bytes per second that one core writes to memory: the best of five copies of 256 MB."""
+    """Bytes per second that one core writes to memory, the best of five copies of 256 MB."""
     source, target = np.ones(2**25), np.zeros(2**25)
     return target.nbytes / min(timed(lambda: np.copyto(target, source))[0] for _ in range(5))
 
 
 def machine() -> dict[str, Any]:
-    """Where something was measured, with what, and when."""
+    """The machine, versions and the date, for what is measured."""
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "retwin": __version__,
@@ -214,7 +235,7 @@ def machine() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Way:
-    """A way of generating, and the share of all trajectories that is enough to time it."""
+    """A way of generating, and the share of trajectories that is enough to time it."""
 
     name: str
     what: str
@@ -235,14 +256,14 @@ def _ways(case: Case, corrected: CorrectedTwin, in_commands: CorrectedTwin) -> l
 
 
 def _learned(case: Case) -> tuple[dict[str, Timed], CorrectedTwin, CorrectedTwin]:
-    """Times, and the twin corrected at its outputs and in command space."""
+    """Times to learn, and the twin corrected at its outputs and in command space."""
     assert case.emulator is not None
     n = case.per_class
     healthy = replace(case, faults={HEALTHY: None})
-    took, said = timed(lambda: generate(case.twin, healthy, per_class=n, seed=0))
-    found = {"twin_data": Timed(f"simulating {n} trajectories to learn from", took)}
+    seconds, simulated = timed(lambda: generate(case.twin, healthy, per_class=n, seed=0))
+    found = {"twin_data": Timed(f"simulating {n} trajectories to learn from", seconds)}
     surrogate, found["surrogate"] = _trained(
-        lambda how: fit_surrogate(said, case.network, seed=0, training=how),
+        lambda how: fit_surrogate(simulated, case.network, seed=0, training=how),
         case.training or surrogate_training(case.network),
         "surrogate",
     )
@@ -252,15 +273,15 @@ def _learned(case: Case) -> tuple[dict[str, Timed], CorrectedTwin, CorrectedTwin
         ("residual", case.output_correction),
         ("residual_command", case.correction),
     ):
-        took, residual = timed(partial(fit_residual, surrogate, measured, correction, seed=0))
+        seconds, residual = timed(partial(fit_residual, surrogate, measured, correction, seed=0))
         corrected.append(CorrectedTwin(surrogate, residual))
         where = "in command space" if name == "residual_command" else "at outputs"
-        found[name] = Timed(f"residual model {where}, of {len(measured)} trajectories", took)
+        found[name] = Timed(f"residual model {where}, of {len(measured)} trajectories", seconds)
     return found, corrected[0], corrected[1]
 
 
 def _classifier(twin: Twin, case: Case, count: int) -> Timed:
-    """How long the CNN takes to learn from `count` generated trajectories."""
+    """Time to train the CNN on `count` generated trajectories."""
     made = generate(twin, case, per_class=max(5, count // len(case.classes)), seed=2)
     return _trained(
         lambda how: fit_diagnoser(made, CNN(), seed=0, training=how),
@@ -272,9 +293,9 @@ def _classifier(twin: Twin, case: Case, count: int) -> Timed:
 def _trained(
     fit: Callable[[Training], Model], training: Training, what: str
 ) -> tuple[Model, Timed]:
-    """What is fitted in three epochs, and how long all of them would take.
+    """A model fitted in three epochs, and the time that all epochs would take.
 
-    One epoch and three: what is left is what every fit takes once.
+    The difference between one epoch and three is the time of an epoch; the rest occurs once.
     """
     brief = (1, 3)
     (first, _), (second, model) = (
@@ -286,15 +307,15 @@ def _trained(
 
 
 def _bytes_of_one(case: Case) -> int:
-    """What a trajectory in memory takes, in single precision: commands, both outputs, mask."""
+    """Size of a trajectory in single precision: commands, both outputs, mask."""
     return case.sampler.steps * (4 * len(case.inputs) + 9 * len(case.outputs))
 
 
 def _processor() -> str:
-    """The processor's name, where the system tells it."""
+    """Name of the processor, if the system states it."""
     try:
-        told = Path("/proc/cpuinfo").read_text("utf-8")
+        text = Path("/proc/cpuinfo").read_text("utf-8")
     except OSError:
         return platform.processor()
-    names = [line.partition(":")[2] for line in told.splitlines() if line.startswith("model name")]
+    names = [line.partition(":")[2] for line in text.splitlines() if line.startswith("model name")]
     return names[0].strip() if names else platform.processor()

@@ -1,4 +1,4 @@
-"""`retwin bundle`: what was fitted as one folder, and its use on any machine."""
+"""`retwin bundle`: make, verify, use and export bundles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["app"]
 
 app = typer.Typer(
-    help="Everything that was fitted in one sealed folder.",
+    help="Everything that was fitted, in one sealed folder.",
     epilog=example("retwin bundle predict bundle real.mat --case armpi"),
     no_args_is_help=True,
 )
@@ -48,24 +48,24 @@ def save(
 
     twin = rt.CorrectedTwin.load(model)
     system = rt.cases.get(case or twin.case)
-    judge = None if diagnoser is None else rt.load_diagnoser(diagnoser)
+    classifier = None if diagnoser is None else rt.load_diagnoser(diagnoser)
     calibration = read(real, system)
-    with bar("bundle") as tell:
-        guard = fit_guard(twin, system, calibration, seed=seed, progress=lambda s: tell("guard", s))
+    with bar("bundle") as show:
+        guard = fit_guard(twin, system, calibration, seed=seed, progress=lambda s: show("guard", s))
     notes = {"seed": seed, "command": command_given()}
-    Bundle.of(system, twin, guard, judge, data=[calibration], notes=notes).save(out)
+    Bundle.of(system, twin, guard, classifier, data=[calibration], notes=notes).save(out)
     note(f"Saved {out}")
 
 
 @app.command(epilog=example("retwin bundle verify bundle"))
 def verify(folder: Folder, as_json: Json = False) -> None:
-    """Hold every file against its SHA-256, and show what the bundle is; nothing is loaded."""
+    """Compare every file with its SHA-256, and describe the bundle; nothing is loaded."""
     from retwin.deploy.bundle.seal import read_sealed
 
     about = read_sealed(folder, "bundle", "portable")
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    told = {name: about.get(name) for name in ("case", "schema", "steps", "movements")}
-    told["sensor_rate"] = about.get("sensor_rate")
+    properties = ("case", "schema", "steps", "movements", "sensor_rate")
+    values = {name: about.get(name) for name in properties}
     provenance = about.get("provenance")
     notes = provenance if isinstance(provenance, dict) else {}
     answer(
@@ -73,11 +73,11 @@ def verify(folder: Folder, as_json: Json = False) -> None:
             "folder": str(folder),
             "kind": about["kind"],
             "bytes": size,
-            **told,
+            **values,
             "provenance": notes,
         },
         f"{about['kind']}, {size / 1e6:.2f} MB",
-        table(("property", "value"), [*told.items(), *notes.items()]),
+        table(("property", "value"), [*values.items(), *notes.items()]),
         "",
         f"{folder} is whole",
         as_json=as_json,
@@ -99,16 +99,16 @@ def predict(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Diagnose trajectories, and say which of them the bundle was not made for.
+    """Diagnose trajectories, and flag those that the bundle was not made for.
 
     A trajectory that is outside has no diagnosis and no probabilities.
     """
     bundle = _opened(folder)
     trajectories = read(file, case_named(case))
     found = bundle.predict(trajectories)
-    told = diagnoses(trajectories, found.classes, found.probabilities)
+    diagnosed = diagnoses(trajectories, found.classes, found.probabilities)
     verdicts = zip(found.verdicts.verdict.tolist(), found.verdicts.reason.tolist(), strict=True)
-    for each, (verdict, reason) in zip(told, verdicts, strict=True):
+    for each, (verdict, reason) in zip(diagnosed, verdicts, strict=True):
         each |= {"guard": verdict, "because_of": reason}
     rows = [
         (
@@ -118,16 +118,16 @@ def predict(
             e["guard"],
             e["because_of"],
         )
-        for e in told
+        for e in diagnosed
     ]
     answer(
-        {"emulated": trajectories.emulated, "trajectories": told},
+        {"emulated": trajectories.emulated, "trajectories": diagnosed},
         table(("trajectory", "diagnosis", "probability", "guard", "because of"), rows),
         *([EMULATED] if trajectories.emulated else []),
         as_json=as_json,
     )
     if out is not None:
-        write_probabilities(out, found.classes, told, ("guard", "because_of"))
+        write_probabilities(out, found.classes, diagnosed, ("guard", "because_of"))
 
 
 @app.command(epilog=example("retwin bundle generate bundle --out made.npz"))
@@ -145,12 +145,12 @@ def generate(
     check_target(out)
     bundle = Bundle.load(folder)
     system = case_named(case)
-    # A built-in name only: code that a file names is not run, a case of one's own is given by hand.
+    # Only built-in names: code that a file names is not run, so other cases are given by --case.
     if system is None and bundle.facts.sampler is None and bundle.facts.case.isidentifier():
         system = rt.cases.get(bundle.facts.case)
-    with bar("generate") as tell:
+    with bar("generate") as show:
         made = bundle.generate(
-            system, per_class=per_class, seed=seed, progress=lambda s: tell("", s)
+            system, per_class=per_class, seed=seed, progress=lambda s: show("", s)
         )
     rt.save(made, out)
     note(f"Wrote {len(made)} trajectories to {out}")
@@ -166,8 +166,8 @@ def export(
     from retwin.deploy.bundle.bundle import Bundle
     from retwin.deploy.onnx.export import export_onnx
 
-    with bar("export") as tell:
-        parity = export_onnx(Bundle.load(folder), onnx, progress=lambda s: tell("", s))
+    with bar("export") as show:
+        parity = export_onnx(Bundle.load(folder), onnx, progress=lambda s: show("", s))
     rows = [(name, f"{difference:.1e}") for name, difference in parity.items()]
     answer(
         {"saved": str(onnx), "differences": parity},
@@ -178,7 +178,7 @@ def export(
 
 
 def _opened(folder: Path) -> Bundle | Portable:
-    """A bundle, or its export, for which torch is not loaded."""
+    """The bundle, or its export, for which torch is not imported."""
     from retwin.deploy.bundle.seal import read_sealed
 
     if read_sealed(folder, "bundle", "portable")["kind"] == "portable":

@@ -1,4 +1,4 @@
-"""Completion in a shell: of names from the catalog, and of the classes of a case."""
+"""Shell completion of names from the catalog and of the classes of a case."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Complete = Callable[[str], list[str]]
 
 
 def one_of(names: Iterable[str]) -> Complete:
-    """Completes to one of these names."""
+    """A function that completes to one of these names."""
 
     def complete(incomplete: str) -> list[str]:
         return [name for name in names if name.startswith(incomplete)]
@@ -31,29 +31,29 @@ def one_of(names: Iterable[str]) -> Complete:
 
 
 def complete_sources(incomplete: str) -> list[str]:
-    """Completes the last of several names that are joined by commas, none of them twice."""
+    """Complete the last of several names joined by commas; none is offered twice."""
     *chosen, last = incomplete.split(",")
     before = "".join(f"{name}," for name in chosen)
-    left = [
+    remaining = [
         name for name in (*catalog.SOURCES, *(() if chosen else ("all",))) if name not in chosen
     ]
-    return [before + name for name in left if name.startswith(last)]
+    return [before + name for name in remaining if name.startswith(last)]
 
 
 def complete_twins(incomplete: str) -> list[tuple[str, str]]:
-    """Completes to a built-in twin, and says what it is."""
-    known = ((name, entry.title) for name, entry in catalog.TWINS.items())
-    return [(name, title) for name, title in known if name.startswith(incomplete)]
+    """Complete to a built-in twin, with its title."""
+    titles = ((name, entry.title) for name, entry in catalog.TWINS.items())
+    return [(name, title) for name, title in titles if name.startswith(incomplete)]
 
 
 def complete_files(incomplete: str) -> list[str]:
-    """Completes to a public data file that can be fetched."""
+    """Complete to a public data file."""
     return one_of(sorted(catalog.DOWNLOADS))(incomplete)
 
 
 def complete_faults(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Completes to a class of the case, or of the twin's own case, that stands on the line."""
-    # An option that still lacks its value leaves arguments where they are.
+    """Complete to a class of the case, or of the twin's own case, that the command names."""
+    # While an option lacks its value, click leaves the arguments in `args`.
     named = ctx.params.get("case") or ctx.params.get("twin") or next(iter(ctx.args), "")
     return one_of(("none", "all", *_faults(named)))(incomplete)
 

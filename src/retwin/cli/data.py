@@ -1,4 +1,4 @@
-"""`retwin data`: look at, convert, split and fetch trajectories."""
+"""`retwin data`: describe, convert, split and fetch trajectories."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from retwin.checks import require
 from retwin.cli.completion import complete_files
 from retwin.cli.options import CaseOption, Json, Rate, Seed
 from retwin.cli.reading import case_named, read
@@ -16,13 +17,12 @@ from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data import download
 from retwin.data.io import check_target, save
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.errors import InputError
 from retwin.serialisation.files import sha256
 
 __all__ = ["app"]
 
 app = typer.Typer(
-    help="Look at, convert, split and fetch trajectories.",
+    help="Describe, convert, split and fetch trajectories.",
     epilog=example("retwin data info real.mat --case armpi"),
     no_args_is_help=True,
 )
@@ -41,9 +41,9 @@ def info(
     rate: Rate = None,
     as_json: Json = False,
 ) -> None:
-    """Say what files hold: classes, samples, channels, missing values, SHA-256."""
-    told = [_facts(read(file, case_named(case), rate), file) for file in files]
-    answer(told, *map(_table, told), as_json=as_json)
+    """Describe files: classes, samples, channels, missing values, SHA-256."""
+    facts = [_facts(read(file, case_named(case), rate), file) for file in files]
+    answer(facts, *map(_table, facts), as_json=as_json)
 
 
 @app.command(epilog=example("retwin data convert sim.mat sim.npz --case armpi"))
@@ -77,13 +77,13 @@ def split(
     """Split trajectories in two, at random, with the same shares of every class."""
     for target in (first, second):
         check_target(target)
-    if first.resolve() == second.resolve():
-        raise InputError(
-            "--out-second",
-            expected="another name than --out-first",
-            got=str(second),
-            remedy="give each part its own file",
-        )
+    require(
+        first.resolve() != second.resolve(),
+        "--out-second",
+        expected="another name than --out-first",
+        got=second,
+        remedy="give each part its own file",
+    )
     parts = read(file, case_named(case), rate).split(fraction, seed=seed)
     for part, target in zip(parts, (first, second), strict=True):
         save(part, target)
@@ -108,9 +108,9 @@ def fetch(
         ),
     ] = None,
 ) -> None:
-    """Download a public data file, check its SHA-256 and print where it lies."""
-    with bar("fetch") as tell:
-        path = download.fetch(name, folder=folder, progress=lambda share: tell(name, share))
+    """Download a public data file, check its SHA-256 and print its path."""
+    with bar("fetch") as show:
+        path = download.fetch(name, folder=folder, progress=lambda share: show(name, share))
     answer(path, str(path))
 
 

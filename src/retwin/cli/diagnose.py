@@ -1,10 +1,9 @@
-"""`retwin diagnose`: train a diagnoser or make one by physics, and use it."""
+"""`retwin diagnose`: train a diagnoser or derive one from a corrected twin, and use it."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,12 +12,12 @@ import typer
 from numpy.typing import NDArray
 
 from retwin import catalog
+from retwin.checks import require
 from retwin.cli.completion import one_of
 from retwin.cli.options import CaseOption, Json, Seed
 from retwin.cli.reading import case_named, read
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data.trajectories import Trajectories
-from retwin.errors import InputError
 from retwin.serialisation.files import write_atomically
 
 __all__ = ["EMULATED", "app", "diagnoses", "write_probabilities"]
@@ -46,7 +45,7 @@ def fit(
     ] = "cnn",
     case: CaseOption = None,
     rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="What the classifier looks at.")
+        float | None, typer.Option(metavar="HZ", help="Sample rate of the features.")
     ] = None,
     seed: Seed = 0,
 ) -> None:
@@ -54,19 +53,16 @@ def fit(
     import retwin as rt
 
     system = case_named(case)
-    entry = catalog.lookup(catalog.CLASSIFIERS, classifier, "classifier")
-    target = catalog.resolve(entry.target)
-    chosen = (
-        rt.fit_rocket if classifier == "rocket" else partial(rt.fit_diagnoser, network=target())
-    )
+    chosen = catalog.make(catalog.CLASSIFIERS, classifier, "classifier")
     training = read(file, system)
-    with bar("train") as tell:
-        diagnoser = chosen(
+    with bar("train") as show:
+        diagnoser = rt.fit_diagnoser(
             training,
+            chosen,
             seed=seed,
             classes=None if system is None else system.classes,
             rate=rate,
-            progress=lambda share: tell(classifier, share),
+            progress=lambda share: show(classifier, share),
         )
     diagnoser.save(out)
     assert diagnoser.fitted is not None
@@ -86,10 +82,10 @@ def invert(
     out: Out,
     random_onset: Annotated[
         bool,
-        typer.Option("--random-onset", metavar="", help="Leave the onset of stuck motors open."),
+        typer.Option("--random-onset", metavar="", help="Infer the onset of stuck motors."),
     ] = False,
 ) -> None:
-    """Make a diagnoser by physics: no training, only healthy trajectories are used."""
+    """Derive a diagnoser from a corrected twin; only healthy trajectories are used."""
     import retwin as rt
 
     updated = rt.CorrectedTwin.load(model)
@@ -114,7 +110,7 @@ def predict(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Say which class each trajectory belongs to, and score it where labels are known."""
+    """Diagnose trajectories, and score the diagnoses if the labels are known."""
     import retwin as rt
 
     diagnoser = rt.load_diagnoser(model)
@@ -124,37 +120,39 @@ def predict(
     labels = trajectories.labels.tolist()
     labelled = bool(trajectories.known_labels) and "" not in labels
     scores = rt.evaluate(diagnoser, trajectories) if labelled else None
-    told = diagnoses(trajectories, diagnoser.classes, probabilities)
-    for each, label in zip(told, labels, strict=True):
+    diagnosed = diagnoses(trajectories, diagnoser.classes, probabilities)
+    for each, label in zip(diagnosed, labels, strict=True):
         each["label"] = label or None
-    rows = [(e["id"], e["diagnosis"], f"{e['probability']:.2f}", e["label"] or "") for e in told]
+    rows = [
+        (e["id"], e["diagnosis"], f"{e['probability']:.2f}", e["label"] or "") for e in diagnosed
+    ]
     answer(
-        {"emulated": trajectories.emulated, "trajectories": told, "scores": scores},
+        {"emulated": trajectories.emulated, "trajectories": diagnosed, "scores": scores},
         table(("trajectory", "diagnosis", "probability", "label"), rows, numbers=("probability",)),
         *([EMULATED] if trajectories.emulated else []),
         *([str(scores)] if scores is not None else []),
         as_json=as_json,
     )
     if out is not None:
-        write_probabilities(out, diagnoser.classes, told)
+        write_probabilities(out, diagnoser.classes, diagnosed)
 
 
 def diagnoses(
     trajectories: Trajectories, classes: Sequence[str], probabilities: NDArray
 ) -> list[dict[str, Any]]:
-    """For each trajectory the best class, and the probability of every class.
+    """The most probable class of each trajectory, and the probability of every class.
 
-    Without a class, and with None for each probability, where one of them is not finite.
+    A trajectory with a probability that is not finite has no class, and None for each probability.
     """
     made = []
-    for name, shares in zip(trajectories.ids.tolist(), probabilities, strict=True):
-        finite = bool(np.isfinite(shares).all())
-        values = shares.tolist() if finite else [None] * len(classes)
+    for name, row in zip(trajectories.ids.tolist(), probabilities, strict=True):
+        finite = bool(np.isfinite(row).all())
+        values = row.tolist() if finite else [None] * len(classes)
         made.append(
             {
                 "id": name,
-                "diagnosis": classes[shares.argmax()] if finite else "",
-                "probability": float(shares.max()) if finite else None,
+                "diagnosis": classes[row.argmax()] if finite else "",
+                "probability": float(row.max()) if finite else None,
                 "probabilities": dict(zip(classes, values, strict=True)),
             }
         )
@@ -162,30 +160,30 @@ def diagnoses(
 
 
 def _check_finite(trajectories: Trajectories, probabilities: NDArray) -> None:
-    """Raise InputError, which names the trajectories, where a probability is not finite."""
+    """Raise InputError with the trajectories that have a probability that is not finite."""
     bad = trajectories.ids[~np.isfinite(probabilities).all(axis=1)].tolist()
-    if bad:
-        more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
-        raise InputError(
-            "probabilities",
-            expected="finite probabilities from the diagnoser",
-            got=f"NaN for {', '.join(bad[:5])}{more}",
-            remedy="replace sentinel values in these trajectories by NaN, or train the diagnoser "
-            "anew if it gives NaN for others too",
-        )
+    more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+    require(
+        not bad,
+        "probabilities",
+        expected="finite probabilities from the diagnoser",
+        got=f"NaN for {', '.join(bad[:5])}{more}",
+        remedy="replace sentinel values in these trajectories by NaN, or train the diagnoser anew "
+        "if it gives NaN for others too",
+    )
 
 
 def write_probabilities(
     out: Path,
     classes: Sequence[str],
-    told: Iterable[Mapping[str, Any]],
-    besides: Sequence[str] = (),
+    diagnosed: Iterable[Mapping[str, Any]],
+    columns: Sequence[str] = (),
 ) -> None:
-    """Write a CSV file: the trajectory, what stands `besides`, and every class's probability."""
+    """Write a CSV file: the trajectory, more `columns`, and the probability of every class."""
     with write_atomically(out) as part, part.open("w", newline="", encoding="utf-8") as sheet:
         writer = csv.writer(sheet)
-        writer.writerow(["trajectory", *besides, *classes])
-        for each in told:
-            beside = [each[name] for name in besides]
-            writer.writerow([each["id"], *beside, *each["probabilities"].values()])
+        writer.writerow(["trajectory", *columns, *classes])
+        for each in diagnosed:
+            values = [each[name] for name in columns]
+            writer.writerow([each["id"], *values, *each["probabilities"].values()])
     note(f"Wrote {out}")

@@ -1,4 +1,4 @@
-"""`retwin fit` and `generate`: from files to a corrected twin, and from it to more files."""
+"""`retwin fit` and `generate`: a corrected twin from files, and trajectories from it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from retwin import catalog
+from retwin.checks import require
 from retwin.cli.completion import one_of
 from retwin.cli.options import CaseArgument, Json, OtherCase, Seed
 from retwin.cli.plans import Workers, carry_out
@@ -27,7 +28,7 @@ __all__ = ["fit", "generate"]
 
 data_option, model_option = (
     partial(typer.Option, rich_help_panel=panel)
-    for panel in ("Data", "Model; what is not given is the case's")
+    for panel in ("Data", "Model; by default the case's")
 )
 
 
@@ -72,7 +73,7 @@ def fit(
         str | None,
         model_option(
             metavar="NAME",
-            help="Law of the gap: mixture, flow or sequence_mixture.",
+            help="Distribution: mixture, flow or sequence_mixture.",
             autocompletion=one_of(catalog.DENSITIES),
         ),
     ] = None,
@@ -88,14 +89,14 @@ def fit(
     system = _system(case, network, correction, density, refine)
     measured = _measured(system, real, data)
     size = system.per_class if simulations is None else simulations
-    twin = _of_twin(system, twin_data, size, seed)
-    with bar("fit") as tell:
+    nominal = _nominal(system, twin_data, size, seed)
+    with bar("fit") as show:
         ibg = rt.fit_surrogate(
-            twin,
+            nominal,
             system.network,
             seed=seed,
             training=system.training,
-            progress=lambda s: tell("surrogate, 1 of 2", s),
+            progress=lambda s: show("surrogate, 1 of 2", s),
         )
         rg = rt.fit_residual(
             ibg,
@@ -104,18 +105,18 @@ def fit(
             system.density,
             seed=seed,
             calibrate_on=system.faults if calibrate_on == "all" else calibrate_on,
-            progress=lambda s: tell("residual model, 2 of 2", s),
+            progress=lambda s: show("residual model, 2 of 2", s),
         )
-    # A model is used from other folders, too.
+    # The path is absolute, since a model is also used from other folders.
     name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
     rt.CorrectedTwin(ibg, rg, case=name).save(out)
-    _tell(ibg, rg, out, as_json=as_json)
+    _print_fit(ibg, rg, out, as_json=as_json)
 
 
 def _system(
     case: str, network: str | None, correction: str | None, density: str | None, refine: bool
 ) -> Case:
-    """The case, with what the command line says otherwise."""
+    """The case, with the options of the command in place of its own."""
     import retwin as rt
     from retwin.cases.file import check_density
     from retwin.update.residual import Density
@@ -137,7 +138,7 @@ def _system(
     if not isinstance(system.density, Density):
         raise rt.InputError(
             "--refine",
-            expected="a density of one z per movement, mixture or flow",
+            expected="a density of one z per segment, mixture or flow",
             got=type(system.density).__name__,
             remedy="leave it out",
         )
@@ -148,43 +149,43 @@ def _measured(system: Case, real: Path | None, data: Path | None) -> Trajectorie
     """The real trajectories to calibrate on."""
     import retwin as rt
 
-    if (real is None) == (data is None):
-        raise rt.InputError(
-            "real data",
-            expected="either --real or --data",
-            got="none" if real is None else "both",
-            remedy="give --real FILE; or --data FILE, for a case that says how it is split",
-        )
+    require(
+        (real is None) != (data is None),
+        "real data",
+        expected="either --real or --data",
+        got="none" if real is None else "both",
+        remedy="give --real FILE; or --data FILE, for a case that defines how it is split",
+    )
     if real is not None:
         return read(real, system)
     assert data is not None
     if system.records is None:
         raise rt.InputError(
             "--data",
-            expected="a case that says how its file is split",
+            expected="a case that defines how its file is split",
             got=f"{system.name!r}, which does not",
             remedy="give --real FILE",
         )
     return system.records(data)[0]
 
 
-def _of_twin(system: Case, file: Path | None, simulations: int, seed: int) -> Trajectories:
-    """What the twin says: from a file, or healthy simulations of the case's own."""
+def _nominal(system: Case, file: Path | None, simulations: int, seed: int) -> Trajectories:
+    """Trajectories of the twin: from a file, or healthy simulations of the case's twin."""
     import retwin as rt
 
     if file is not None:
         return read(file, system)
     healthy = replace(system, faults={HEALTHY: None})
-    with bar("simulate") as tell:
+    with bar("simulate") as show:
         return rt.generate(
-            system.twin, healthy, per_class=simulations, seed=seed, progress=lambda s: tell("", s)
+            system.twin, healthy, per_class=simulations, seed=seed, progress=lambda s: show("", s)
         )
 
 
-def _tell(
+def _print_fit(
     ibg: Surrogate, rg: ResidualModel | SequenceResidual, out: Path, *, as_json: bool
 ) -> None:
-    """How well both were fitted, and where they are."""
+    """Print the errors of both models, and where they were saved."""
     assert ibg.fitted is not None
     assert rg.fitted is not None
     figures, channels = ibg.fitted.figures, ibg.outputs
@@ -199,27 +200,27 @@ def _tell(
         "Surrogate on held-out twin trajectories:",
         table(("output", "RMSE", "NRMSE"), rows, numbers=("RMSE", "NRMSE")),
         "",
-        _of_residual(rg),
+        _residual_line(rg),
         as_json=as_json,
     )
     note(f"Saved {out}")
 
 
-def _of_residual(rg: ResidualModel | SequenceResidual) -> str:
-    """What a residual model learned from, and how it fared on what it did not."""
+def _residual_line(rg: ResidualModel | SequenceResidual) -> str:
+    """The training data of a residual model, and its errors on held-out parts."""
     from retwin.update.residual import ResidualModel
 
     assert rg.fitted is not None
     figures, reason = rg.fitted.figures, rg.fitted.reason
     emulated = "EMULATED " if rg.emulated else ""
     if isinstance(rg, ResidualModel):
-        counted = f"{figures['movements']:.0f} movements of {figures['trajectories']:.0f} "
+        counted = f"{figures['movements']:.0f} segments of {figures['trajectories']:.0f} "
         return f"Residual model: {counted}{emulated}trajectories; {reason}."
     latent = zip(rg.latent.names, rg.latent.units, strict=True)
     errors = ", ".join(f"{name} {figures[f'rmse_{name}']:.3g} {unit}" for name, unit in latent)
     return (
         f"Residual model: {figures['samples']:.0f} {emulated}samples; {reason}. "
-        f"On parts held out its mean errs by {errors} (RMSE), and its 90 % band holds "
+        f"On held-out parts the RMSE of its mean is {errors}, and its 90 % band covers "
         f"{figures['coverage90']:.0%}."
     )
 
@@ -234,29 +235,29 @@ def generate(
 ) -> None:
     """Generate a balanced labelled set from a corrected twin.
 
-    A *.npz holds the classes one after the other, a *.zarr in turn, and other draws. Interrupted
-    on the way to a *.zarr, it can go on.
+    A *.npz holds one class after the other; a *.zarr holds the classes in turn, with other draws,
+    and is resumed after an interruption.
     """
     import retwin as rt
 
     kind = check_target(out)
     updated = rt.CorrectedTwin.load(model)
-    if not (case or updated.case):
-        raise rt.InputError(
-            "case",
-            expected="the name of a case",
-            got=f"none, and {model} was saved without one",
-            remedy="give --case",
-        )
+    require(
+        case or updated.case,
+        "case",
+        expected="the name of a case",
+        got=f"none, and {model} was saved without one",
+        remedy="give --case",
+    )
     system = rt.cases.get(case or updated.case)
     if kind == ".zarr" or workers is not None:
         n = per_class * len(system.faults)
         plan = rt.SimulationPlan(updated, system.sampler, seed, n, system.faults)
         carry_out(plan, out, "generate", workers=workers)
         return
-    with bar("generate") as tell:
+    with bar("generate") as show:
         made = rt.generate(
-            updated, system, per_class=per_class, seed=seed, progress=lambda s: tell("", s)
+            updated, system, per_class=per_class, seed=seed, progress=lambda s: show("", s)
         )
     rt.save(made, out)
     note(f"Wrote {len(made)} trajectories to {out}")

@@ -1,4 +1,4 @@
-"""Arguments and options that several commands have."""
+"""Arguments and options that several commands share."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ OtherCase = Annotated[
 ]
 Rate = Annotated[
     float | None,
-    typer.Option("--rate", metavar="HZ", help="Samples per second, when the file does not say."),
+    typer.Option("--rate", metavar="HZ", help="Samples per second, if the file has none."),
 ]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", help="Same seed, same result.", min=0)]
 Json = Annotated[

@@ -1,4 +1,4 @@
-"""A plan of simulations carried out by a command: `retwin twin simulate`, `retwin generate`."""
+"""Simulation plans of commands: `retwin twin simulate` and `retwin generate`."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ def carry_out(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> None:
-    """Write the trajectories of a plan; those that fail are told, and make the exit code 1."""
+    """Write the trajectories of a plan; list those that fail, and exit with code 1 if any did."""
     from retwin.deploy.simulations import simulate_to
 
-    with resumable() if out.suffix.lower() == ".zarr" else nullcontext(), bar(what) as tell:
+    with resumable() if out.suffix.lower() == ".zarr" else nullcontext(), bar(what) as show:
         done = simulate_to(
             out,
             plan,
             workers=workers,
             scheduler=scheduler,
-            progress=lambda share: tell(f"{share * plan.count:.0f} of {plan.count}", share),
+            progress=lambda share: show(f"{share * plan.count:.0f} of {plan.count}", share),
         )
     note(f"Wrote {done.count - len(done.failed)} trajectories to {out}")
     if done.failed:

@@ -1,4 +1,4 @@
-"""What names and files on the command line stand for."""
+"""Cases and trajectories from the names and files of a command."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def case_named(name: str | None) -> Case | None:
     """The case of that name, if one is given."""
     if name is None:
         return None
-    # Here and not above: it loads torch, and many commands do without.
+    # Imported here, since cases need torch and many commands do not.
     from retwin import cases
 
     return cases.get(name)
@@ -27,5 +27,5 @@ def case_named(name: str | None) -> Case | None:
 
 def read(file: Path, case: DataCase | None = None, rate: float | None = None) -> Trajectories:
     """The trajectories of a file, with a bar while they are read."""
-    with bar("read") as tell:
-        return load(file, case=case, rate=rate, progress=lambda share: tell(file.name, share))
+    with bar("read") as show:
+        return load(file, case=case, rate=rate, progress=lambda share: show(file.name, share))

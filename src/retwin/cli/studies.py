@@ -92,7 +92,7 @@ def study(
     ] = None,
     rate: Annotated[
         float | None,
-        compared_option(metavar="HZ", help="Seen by the classifier; else the sensor's."),
+        compared_option(metavar="HZ", help="Rate of the features; else the sensor's."),
     ] = None,
     per_class: Annotated[
         int | None, compared_option(metavar="N", help="Generated trajectories; else the case's.")
@@ -121,7 +121,7 @@ def study(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Compare updated twins and their rivals on real trajectories."""
+    """Compare updated twins with other sources on real trajectories."""
     import retwin as rt
     from retwin.study import StudyData, StudyPlan, possible_sources
 
@@ -129,9 +129,9 @@ def study(
     if random_onset:
         system = system.with_random_onset()
     plain = "dt" if system.diagnosed else "twin"
-    usual = (plain, "ibg", "ibg_rg")
+    default = (plain, "ibg", "ibg_rg")
     plan = StudyPlan(
-        sources=usual if sources in (None, "all") else tuple(sources.split(",")),
+        sources=default if sources in (None, "all") else tuple(sources.split(",")),
         preset=preset,
         classifier=classifier,
         runs=runs,
@@ -168,7 +168,7 @@ def demo(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """The whole job of the paper, on an emulated robot or on real data.
+    """Run the method of the paper on an emulated robot or on real data.
 
     Real data are those in the folder that `RETWIN_DATA` names.
     """

@@ -1,6 +1,6 @@
-"""What every command shares: the answer on stdout, everything else on stderr, exit codes.
+"""Output of all commands: results on stdout, everything else on stderr, exit codes.
 
-On stderr go bars and notes, which `--quiet` leaves out, and warnings and errors, which it does not.
+Bars and notes go to stderr unless `--quiet` is given; warnings and errors always do.
 """
 
 from __future__ import annotations
@@ -47,16 +47,15 @@ __all__ = [
 ]
 
 USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
-"""Click's UsageError, by a way that leads to it in any Typer: newer ones bring a Click along."""
+"""Click's UsageError, as a base class of Typer's, since newer Typers vendor their own Click."""
 
-FAILED = 1
-BAD_INPUT = 2
-INTERRUPTED = 130
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+"""Exit codes."""
 
-MOMENT = 2.0
-"""Seconds that a command may take before a log is told how far it is."""
-HOUR = 3600.0
-"""Over which the time left is reckoned: jobs of a study differ much, their mean does not."""
+LOG_DELAY = 2.0
+"""Seconds before the first line of progress in a log; shorter work leaves none."""
+SPEED_WINDOW = 3600.0
+"""Seconds over which the speed is averaged, since the jobs of a study differ much in length."""
 
 _quiet = False
 
@@ -68,30 +67,35 @@ def be_quiet(quiet: bool) -> None:
 
 
 def example(command: str) -> str:
-    """The last line of a command's help: a command that works.
-
-    Of 69 characters at most: then it fits into one line of 80, and can be copied.
-    """
+    """The last line of a command's help: a command that works, in one line of 80 characters."""
     return f"Example: {command}"
 
 
 def command_given() -> str:
-    """The command as it was given, to be given again."""
+    """The command line of this process, quoted for a shell."""
     return shlex.join(["retwin", *sys.argv[1:]])
 
 
-# The answer.
+# Results.
 
 
-def answer(told: object, *shown: RenderableType, as_json: bool = False) -> None:
-    """The result on stdout: `told` as JSON and nothing else, or what is `shown` to people.
+def answer(result: object, *shown: RenderableType, as_json: bool = False) -> None:
+    """Print a result on stdout.
 
-    JSON has no NaN: figures that are not defined are null.
+    Parameters
+    ----------
+    result : object
+        The result as plain values or dataclasses, printed as JSON with null for NaN.
+    *shown : renderables
+        The result for people, printed instead of JSON.
+    as_json : bool
+        Whether JSON is printed.
+
     """
     if as_json:
         from pydantic_core import to_json
 
-        typer.echo(to_json(told, indent=2, inf_nan_mode="null").decode())
+        typer.echo(to_json(result, indent=2, inf_nan_mode="null").decode())
         return
     console = Console()
     for each in shown:
@@ -107,12 +111,20 @@ def table(
     *,
     numbers: Sequence[str] = (),
 ) -> Table:
-    """A table of plain texts, of which nothing is cut off however narrow the screen.
+    """A table of plain texts, which are folded on a narrow screen and never cut off.
 
-    `numbers` names the columns that stand to the right.
+    Parameters
+    ----------
+    columns : sequence of str
+        Titles of the columns.
+    rows : iterable of sequence
+        Cells of each row.
+    numbers : sequence of str
+        Titles of the columns that are aligned to the right.
+
     """
     made = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    # What comes from files is no markup: a class named [red] must not colour the table.
+    # Texts are escaped, since a class named [red] must not colour the table.
     for name in columns:
         justify: JustifyMethod = "right" if name in numbers else "left"
         made.add_column(escape(name), overflow="fold", justify=justify)
@@ -121,21 +133,31 @@ def table(
     return made
 
 
-# How far it is.
+# Progress.
 
 
 def note(text: str) -> None:
-    """A line on stderr about what was done."""
+    """Print a line on stderr about what was done."""
     _stderr().print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager
 def bar(what: str) -> Iterator[Callable[[str, float], None]]:
-    """A bar on stderr, told what is going on and the share done; gone when the work is done.
+    """Show progress on stderr while the block runs.
 
-    A share that is less than the one before begins a new part of the work, with a time left of its
-    own. Without a terminal a line is printed at every tenth, so that the log of a long work shows
-    life.
+    On a terminal it is a bar; elsewhere a line for every tenth of the work.
+
+    Parameters
+    ----------
+    what : str
+        Name of the work.
+
+    Yields
+    ------
+    callable
+        Function of the current step's name and the share that is done. A share smaller than the
+        one before starts a new part of the work, with its own remaining time.
+
     """
     console = _stderr()
     if not console.is_terminal:
@@ -149,70 +171,74 @@ def bar(what: str) -> Iterator[Callable[[str, float], None]]:
         TextColumn("left"),
     )
     with Progress(
-        *columns, console=console, transient=True, speed_estimate_period=HOUR, disable=_quiet
+        *columns,
+        console=console,
+        transient=True,
+        speed_estimate_period=SPEED_WINDOW,
+        disable=_quiet,
     ) as bars:
         task = bars.add_task(what, total=1.0)
 
-        def tell(text: str, share: float) -> None:
+        def show(text: str, share: float) -> None:
             if share < bars.tasks[task].completed:
                 bars.reset(task, total=1.0)
             bars.update(task, completed=share, description=f"{what}: {text}" if text else what)
 
-        yield tell
+        yield show
 
 
 def _lines(console: Console, what: str) -> Callable[[str, float], None]:
     begun = since = time.monotonic()
     first, tenth = 0.0, -1
 
-    def tell(text: str, share: float) -> None:
+    def show(text: str, share: float) -> None:
         nonlocal since, first, tenth
         now, before, tenth = time.monotonic(), tenth, int(10 * share)
         if before < 0 or tenth < before:
             since, first = now, share
-        if tenth == before or now - begun < MOMENT:
+        if tenth == before or now - begun < LOG_DELAY:
             return
         left = (now - since) * (1 - share) / (share - first) if share > first else 0.0
         after = f", {left:.0f} s left" if left else ""
         line = f"{what}: {text} {share:.0%}{after}"
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
-    return tell
+    return show
 
 
 def _stderr() -> Console:
     return Console(stderr=True, quiet=_quiet)
 
 
-# What went wrong.
+# Errors.
 
 
 def complain(text: str) -> None:
-    """One line on stderr, never wrapped."""
+    """Print an error in one line on stderr, never wrapped."""
     line = escape(" ".join(text.split()))
     Console(stderr=True, soft_wrap=True).print(f"[red]error:[/] {line}", highlight=False)
 
 
 def complain_of_usage(error: Any) -> None:
-    """One line on words that are no command, and where to read on."""
-    told = error.format_message().rstrip(".")
+    """Print a usage error in one line, with the command whose help explains it."""
+    text = error.format_message().rstrip(".")
     if getattr(error, "option_name", "") in ("--quiet", "-q"):
-        told = "--quiet stands before the command: retwin --quiet …"
-    if told:  # without any words the help was shown, and that is all
+        text = "--quiet stands before the command: retwin --quiet …"
+    if text:  # there is none when typer has printed the help
         where = f"; see `{error.ctx.command_path} --help`" if error.ctx is not None else ""
-        complain(f"{told}{where}")
+        complain(f"{text}{where}")
 
 
 def complain_of_interruption(*, kept: bool) -> None:
-    """One line on Ctrl-C; `kept`: the same command goes on where this one stopped."""
-    # Zarr's event loop would tell at length, as the process ends, what it was cut off in.
+    """Print a line after Ctrl-C; `kept` if the same command resumes the work."""
+    # Zarr's event loop would log what was interrupted when the process ends.
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
     how = "to go on" if kept else "to begin anew, nothing is left half-written"
     complain(f"interrupted; give the same command again {how}: {command_given()}")
 
 
 def described(error: Exception) -> str:
-    """Kind and message of an exception, and where in the user's own code it comes from."""
+    """Type and message of an exception, and the line of the user's code that raised it."""
     at = "; ".join(getattr(error, "__notes__", ())) or place_of(error)
     if not (at or isinstance(error, OSError | RuntimeError)):
         at = "RETWIN_TRACEBACK=1 in the environment shows where"
@@ -220,12 +246,12 @@ def described(error: Exception) -> str:
 
 
 class Interrupted(Exception):
-    """Ctrl-C in a work of which the same command makes the rest."""
+    """Ctrl-C in work that the same command resumes."""
 
 
 @contextmanager
 def resumable() -> Iterator[None]:
-    """For work that leaves what is finished, and goes on when it is called again."""
+    """Raise Interrupted for Ctrl-C in work that the same command resumes."""
     try:
         yield
     except KeyboardInterrupt:
@@ -234,7 +260,7 @@ def resumable() -> Iterator[None]:
 
 @contextmanager
 def interrupted_by_term() -> Iterator[None]:
-    """SIGTERM does what Ctrl-C does."""
+    """Let SIGTERM act as Ctrl-C in the block."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
@@ -244,7 +270,7 @@ def interrupted_by_term() -> Iterator[None]:
 
 @contextmanager
 def show_warnings() -> Iterator[None]:
-    """Our warnings as one line on stderr each, without the source line Python would add."""
+    """Print each warning as one line on stderr, without its source line."""
     console = Console(stderr=True, soft_wrap=True)
 
     def show(message: Warning | str, *_: object, **__: object) -> None:

@@ -1,4 +1,4 @@
-"""`retwin twin`: which twins there are, what they are, and what they say."""
+"""`retwin twin`: list, describe, simulate and film twins."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import typer
 
 from retwin import twins
 from retwin.catalog import CASES, TWINS
+from retwin.checks import require
 from retwin.cli.animate import animate
 from retwin.cli.completion import complete_faults, complete_twins, one_of
 from retwin.cli.options import Json, Seed
@@ -23,7 +24,8 @@ from retwin.errors import InputError
 if TYPE_CHECKING:
     from retwin.cases.case import Case
     from retwin.data.trajectories import Channels
-    from retwin.twins.twin import Limits, Twin
+    from retwin.twins.limits import Limits
+    from retwin.twins.twin import Twin
 
 __all__ = ["app"]
 
@@ -56,7 +58,7 @@ OTHERS = {
 
 @app.command("list", epilog=example("retwin twin list"))
 def list_twins(as_json: Json = False) -> None:
-    """Say which twins are built in, and what else can be named."""
+    """List the built-in twins, and the forms of other names."""
     built_in = {name: entry.title for name, entry in TWINS.items()}
     answer(
         {
@@ -78,9 +80,9 @@ def info(
     rate: Rate = None,
     as_json: Json = False,
 ) -> None:
-    """Say what a twin is: its inputs with their limits, its outputs, its rate."""
+    """Describe a twin: its inputs with their limits, its outputs, its rate."""
     found = _twin(twin, inputs, outputs, rate)
-    told: dict[str, Any] = {
+    facts: dict[str, Any] = {
         "title": _title(twin, found),
         "rate": found.rate,
         "inputs": _channels(found.inputs, getattr(found, "limits", None)),
@@ -89,12 +91,12 @@ def info(
     rows = [
         (kind.removesuffix("s"), each["name"], each["unit"], *_ends(each))
         for kind in ("inputs", "outputs")
-        for each in told[kind]
+        for each in facts[kind]
     ]
     answer(
-        told,
-        told["title"],
-        table(("", "name", "unit", "least", "greatest"), rows, numbers=("least", "greatest")),
+        facts,
+        facts["title"],
+        table(("", "name", "unit", "low", "high"), rows, numbers=("low", "high")),
         f"{found.rate:g} samples per second",
         as_json=as_json,
     )
@@ -127,13 +129,13 @@ def simulate(
         str | None,
         typer.Option(
             metavar="CASE",
-            help="Draws commands, knows faults; else its own.",
+            help="Source of commands and faults; else its own.",
             autocompletion=one_of(CASES),
         ),
     ] = None,
     commands: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Trajectories whose commands are taken."),
+        typer.Option(metavar="FILE", help="Trajectories with the commands."),
     ] = None,
     fault: Annotated[
         str,
@@ -152,11 +154,9 @@ def simulate(
     ] = False,
     workers: Workers = None,
     scheduler: Scheduler = None,
-    chunk: Annotated[
-        int, typer.Option(metavar="N", help="Trajectories done together.", min=1)
-    ] = 256,
+    chunk: Annotated[int, typer.Option(metavar="N", help="Trajectories per chunk.", min=1)] = 256,
 ) -> None:
-    """Simulate trajectories to a file; interrupted on the way to a *.zarr, it can go on."""
+    """Simulate trajectories to a file; an interrupted *.zarr is resumed."""
     from retwin.deploy.simulations import SimulationPlan
 
     check_target(out)
@@ -177,7 +177,7 @@ app.command(
 
 
 def _twin(name: str, inputs: str, outputs: str, rate: float | None) -> Twin:
-    """The twin of that name, or the model that was saved in that folder."""
+    """The twin of that name, or the model in that folder."""
     if (Path(name) / "model.json").is_file() and not (inputs or outputs or rate):
         return _model(Path(name))
     if _is_case(name) and not (inputs or outputs or rate):
@@ -202,7 +202,7 @@ def _model(folder: Path) -> Twin:
         return Surrogate.load(folder)
     from retwin.update.corrected import CorrectedTwin
 
-    return CorrectedTwin.load(folder)  # and says so of any other kind
+    return CorrectedTwin.load(folder)  # raises InputError for any other kind
 
 
 def _names(given: str) -> tuple[str, ...]:
@@ -216,12 +216,12 @@ def _title(name: str, found: Twin) -> str:
         from retwin import cases
 
         return f"{name}: {cases.get(name).title}"
-    told = (type(found).__doc__ or "").strip().partition("\n")[0]
-    return f"{Path(name).name} ({type(found).__name__}): {told}"
+    summary = (type(found).__doc__ or "").strip().partition("\n")[0]
+    return f"{Path(name).name} ({type(found).__name__}): {summary}"
 
 
 def _case(given: str | None, name: str, found: Twin) -> Case | None:
-    """The case that is named, that of the twin's name, or that a corrected twin was fitted for."""
+    """The given case, that of the twin's name, or that a corrected twin was fitted for."""
     from retwin import cases
 
     own = getattr(found, "case", "")
@@ -232,14 +232,14 @@ def _case(given: str | None, name: str, found: Twin) -> Case | None:
     if not (given or own):
         return None
     system = cases.get(given or own)
-    if (system.inputs, system.rate) != (found.inputs, found.rate):
-        raise InputError(
-            "--case",
-            expected=f"a case with the twin's inputs, {', '.join(found.inputs.names)}, at "
-            f"{found.rate:g} Hz",
-            got=f"{system.name} with {', '.join(system.inputs.names)} at {system.rate:g} Hz",
-            remedy="name the case that this twin belongs to",
-        )
+    require(
+        (system.inputs, system.rate) == (found.inputs, found.rate),
+        "--case",
+        expected=f"a case with the twin's inputs, {', '.join(found.inputs.names)}, at "
+        f"{found.rate:g} Hz",
+        got=f"{system.name} with {', '.join(system.inputs.names)} at {system.rate:g} Hz",
+        remedy="name the case that this twin belongs to",
+    )
     return system
 
 
@@ -248,16 +248,16 @@ def _faults(system: Case | None, fault: str) -> dict[str, Any]:
 
     if fault == "none":
         return {HEALTHY: None}
-    known = {} if system is None else dict(system.faults)
-    if known and fault == "all":
-        return known
-    if fault in known:
-        return {fault: known[fault]}
+    classes = {} if system is None else dict(system.faults)
+    if classes and fault == "all":
+        return classes
+    if fault in classes:
+        return {fault: classes[fault]}
     raise InputError(
         "--fault",
-        expected=", ".join(["none", *(["all", *known] if known else [])]),
+        expected=", ".join(["none", *(["all", *classes] if classes else [])]),
         got=fault,
-        remedy="check the spelling" if known else "give --case, which knows what can go wrong",
+        remedy="check the spelling" if classes else "give --case, which defines faults",
     )
 
 

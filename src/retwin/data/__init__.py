@@ -1,5 +1,5 @@
 """Trajectories of commands and outputs, their segments, and the files they come from.
 
-Belongs here: the data type, file formats, downloads. Not here: anything that simulates, learns or
+Belongs here: the data types, file formats, downloads. Not here: anything that simulates, learns or
 scores.
 """

@@ -1,4 +1,4 @@
-"""Public data files: fetched once, checked against their SHA-256, kept in a cache."""
+"""Public data files: downloaded once, checked against their SHA-256, kept in a cache."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from retwin.catalog import DOWNLOADS, PublicFile
+from retwin.checks import needs_extra, require
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.files import sha256 as sha256_of
@@ -17,9 +18,11 @@ from retwin.serialisation.files import sha256 as sha256_of
 __all__ = ["cache_folder", "fetch"]
 
 CACHE_VARIABLE = "RETWIN_CACHE"
-# Seconds without an answer until a download is given up.
+"""The environment variable that names the cache folder."""
 TIMEOUT = 30.0
-CHUNK = 64 * 1024
+"""Seconds without an answer after which a download fails."""
+BYTES_PER_BLOCK = 64 * 1024
+"""Bytes that are received between two reports of progress."""
 
 
 def fetch(
@@ -30,35 +33,48 @@ def fetch(
     sha256: str | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """The path of a public file, downloaded when it is not in the cache yet.
+    """The path of a public file, downloaded if it is not in the cache.
 
-    The cache is `folder`, else the environment variable RETWIN_CACHE, else the user's cache folder.
-    The file lies there under the name that the catalog states, so that the cache can serve as
-    RETWIN_DATA. `url` names another address; the SHA-256 stays the known one. A name that is not
-    in `catalog.DOWNLOADS` needs both `url` and `sha256`. A cached file whose SHA-256 is wrong is
-    fetched again. `progress` is called with the share that is done.
+    The file is in the cache under the name that the catalog states, so that the cache can serve as
+    RETWIN_DATA. A cached file whose SHA-256 is wrong is downloaded again.
+
+    Parameters
+    ----------
+    name : str
+        A name of `catalog.DOWNLOADS`, or any file name if `url` and `sha256` are given.
+    folder : path
+        The cache; by default the environment variable RETWIN_CACHE, else the user's cache folder.
+    url : str
+        Another address of the file; its SHA-256 stays that of the catalog.
+    sha256 : str
+        Another SHA-256, in hexadecimal.
+    progress : callable
+        Called with the share that is done, from 0 to 1.
 
     Raises
     ------
-    InputError: an unknown name without `url` and `sha256`, or an address that is not http(s).
-    OSError: no network, no such file there, or a folder that cannot be written.
-    RuntimeError: what came has another SHA-256; nothing of it is kept.
+    InputError
+        The name is unknown and has no `url` and `sha256`, the address is not http(s), or the extra
+        `fetch` is missing.
+    OSError
+        There is no network or no such file, or the folder cannot be written.
+    RuntimeError
+        The downloaded file has another SHA-256; nothing of it is kept.
 
     """
     known = _known(name, url, sha256)
-    if not known.url.startswith(("http://", "https://")):
-        raise InputError(
-            "url",
-            expected="an address that begins with https:// or http://",
-            got=known.url,
-            remedy="give the address of the file",
-        )
+    require(
+        known.url.startswith(("http://", "https://")),
+        "url",
+        expected="an address that begins with https:// or http://",
+        got=known.url,
+        remedy="give the address of the file",
+    )
     place = Path(folder) if folder else cache_folder()
     target = place / known.file
     if target.is_file() and sha256_of(target) == known.sha256:
         return target
-    import pooch
-
+    pooch = needs_extra("pooch", "fetch", "downloads public files")
     try:
         with _quiet(pooch.get_logger()):
             pooch.retrieve(
@@ -85,18 +101,17 @@ def fetch(
 
 
 def cache_folder() -> Path:
-    """Where fetched files are kept: RETWIN_CACHE, else the user's cache folder."""
+    """The folder of downloaded files: RETWIN_CACHE, else the user's cache folder."""
     given = os.environ.get(CACHE_VARIABLE)
     if given:
         return Path(given)
-    # It takes half a second to import, and only downloads need it.
-    import pooch
-
+    # Imported late: it takes half a second, and only downloads need it.
+    pooch = needs_extra("pooch", "fetch", "downloads public files")
     return Path(pooch.os_cache("retwin"))
 
 
 def _known(name: str, url: str | None, sha256: str | None) -> PublicFile:
-    """The registered file with what the caller overrides, or a file that only the caller knows."""
+    """The entry of the catalog with the caller's changes, or an entry of the caller's own."""
     known = DOWNLOADS.get(name)
     if known is not None:
         return PublicFile(url or known.url, sha256 or known.sha256, known.file)
@@ -112,33 +127,33 @@ def _known(name: str, url: str | None, sha256: str | None) -> PublicFile:
 
 
 def _tidy(folder: Path, place: Path) -> None:
-    """Remove the folder below the cache that was made for a file which did not come."""
+    """Remove the empty folder below the cache of a file that could not be downloaded."""
     if folder != place:
-        with suppress(OSError):  # it holds something, or was never made
+        with suppress(OSError):  # it is not empty, or does not exist
             folder.rmdir()
 
 
 def _downloader(progress: Progress | None) -> Callable[[str, str, Any], None]:
-    """What pooch calls to bring `url` to a file. Its own leaves the connection open on errors."""
+    """A downloader for pooch, whose own one leaves the connection open on errors."""
 
-    def bring(url: str, output: str, _: Any) -> None:
+    def download(url: str, output: str, _: Any) -> None:
         import requests
 
         with requests.get(url, stream=True, timeout=TIMEOUT) as answer, open(output, "wb") as file:
             answer.raise_for_status()
-            # A server may not say how much will come.
+            # A server need not state the size.
             size = int(answer.headers.get("content-length", 0))
-            for chunk in answer.iter_content(CHUNK):
+            for chunk in answer.iter_content(BYTES_PER_BLOCK):
                 file.write(chunk)
                 if progress is not None and size:
                     progress(min(1.0, file.tell() / size))
 
-    return bring
+    return download
 
 
 @contextmanager
 def _quiet(logger: logging.Logger) -> Iterator[None]:
-    """Keep pooch's own lines off the screen, for this download only."""
+    """Silence pooch's log during this download."""
     level = logger.level
     logger.setLevel(logging.ERROR)
     try:

@@ -1,7 +1,8 @@
-"""`Segments`: the movements of each trajectory, a motion part and then a steady part.
+"""`Segments`: the segments of each trajectory, a motion part and then a steady part.
 
-Found from command events; for twins without events, from the speed of the nominal path; or given
-by the user. Onsets jitter and may fall between samples: nothing here assumes a fixed period.
+They are found from changes of the commands, from the speed of the nominal outputs if commands do
+not change by steps, or given by the user. Onsets are in samples and may be fractions; no period is
+assumed.
 """
 
 from __future__ import annotations
@@ -13,25 +14,36 @@ from functools import reduce
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from retwin.checks import require
 from retwin.errors import InputError
 
 __all__ = ["Segments"]
 
-BLOCK = 32
-"""Trajectories that are looked at together: their samples stay in the processor's cache."""
+TRAJECTORIES_PER_BLOCK = 32
+"""Trajectories per pass over the commands, few enough that their samples fit the cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Movements of n trajectories, at most M each, in samples (fractions allowed).
+    """Segments of n trajectories, at most M each.
 
     Attributes
     ----------
-    start: (n, M), onset of the motion part.
-    settle: (n, M), end of the motion part and begin of the steady part.
-    stop: (n, M), end of the steady part: the next onset, or the end of the trajectory.
-    valid: (n, M) bool; where False, start = settle = stop = steps and nothing moves.
-    steps: samples per trajectory.
+    start : (n, M) array
+        The onset of the motion part, in samples.
+    settle : (n, M) array
+        The end of the motion part and the beginning of the steady part, in samples.
+    stop : (n, M) array
+        The end of the steady part: the next onset, or the end of the trajectory.
+    valid : (n, M) array of bool
+        False where a trajectory has fewer than M segments; there start = settle = stop = steps.
+    steps : int
+        Samples per trajectory, T.
+
+    Raises
+    ------
+    InputError
+        Segments overlap or are out of order.
 
     """
 
@@ -45,10 +57,11 @@ class Segments:
         ordered = (self.start <= self.settle) & (self.settle <= self.stop)
         following = self.stop[:, :-1] <= self.start[:, 1:]
         if not (ordered.all() and following.all()):
+            wrong = ~(ordered.all(axis=1) & following.all(axis=1))
             raise InputError(
                 "segments",
                 expected="start <= settle <= stop <= next start in every trajectory",
-                got=f"trajectory {int(np.argmin(ordered.all(1)))} out of order",
+                got=f"trajectory {int(np.argmax(wrong))} out of order",
                 remedy="sort the segments by time and let none overlap",
             )
 
@@ -58,39 +71,49 @@ class Segments:
     def __getitem__(self, index: slice | ArrayLike) -> Segments:
         """The segments of the trajectories at `index`."""
         index = index if isinstance(index, slice) else np.atleast_1d(np.asarray(index))
-        part = object.__new__(Segments)  # of what is in order, a part need not be checked again
+        part = object.__new__(Segments)  # a subset of checked segments needs no check
         for name in ("start", "settle", "stop", "valid"):
             part.__dict__[name] = getattr(self, name)[index]
         part.__dict__["steps"] = self.steps
         return part
 
     @property
-    def most(self) -> int:
-        """The largest number of movements in one trajectory, M."""
+    def max_count(self) -> int:
+        """The largest number of segments in one trajectory, M."""
         return self.start.shape[1]
 
     def until(self, ends: ArrayLike) -> Segments:
-        """The same in trajectories that end after `ends` (n,) samples; what follows is padding."""
+        """The same for trajectories whose padding begins after `ends` (n,) samples."""
         ends = np.asarray(ends, dtype=float)[:, None]
         stop = np.minimum(self.stop, np.maximum(self.settle, ends))
         return replace(self, stop=stop)
 
     @classmethod
     def given(cls, start: ArrayLike, settle: ArrayLike, *, steps: int) -> Segments:
-        """Segments the user names: `start` and `settle` (n, M) in samples, NaN where there is none.
+        """Segments that the user gives; each steady part lasts until the next start.
 
-        The steady part lasts until the next start. Raises InputError when they are out of order or
-        beyond `steps`.
+        Parameters
+        ----------
+        start, settle : (n, M) array
+            Onsets and settle times in samples, NaN where there is no segment.
+        steps : int
+            Samples per trajectory.
+
+        Raises
+        ------
+        InputError
+            Shapes differ, or times are out of order or not between 0 and `steps`.
+
         """
         start = np.atleast_2d(np.asarray(start, dtype=float))
         settle = np.atleast_2d(np.asarray(settle, dtype=float))
-        if start.shape != settle.shape:
-            raise InputError(
-                "segments",
-                expected=f"as many settle times as starts, {start.shape}",
-                got=str(settle.shape),
-                remedy="give both for every movement",
-            )
+        require(
+            start.shape == settle.shape,
+            "segments",
+            expected=f"as many settle times as starts, {start.shape}",
+            got=settle.shape,
+            remedy="give both for every segment",
+        )
         valid = np.isfinite(start) & np.isfinite(settle)
         outside = valid & ((start < 0) | (settle > steps))
         if outside.any():
@@ -107,33 +130,51 @@ class Segments:
 
     @classmethod
     def from_commands(cls, commands: NDArray, *, tolerance: float = 1e-6) -> Segments:
-        """Movements where any command changes: (n, T, d_u) in, sub-sample onsets out.
+        """Segments whose motion part is where any command changes.
 
-        A change below `tolerance` times the range of that command is none. On a ramp, the first
-        step that is a part of the following one tells the fraction of a sample at which it began.
+        If the first change of a ramp is smaller than the next one, their ratio gives the onset as a
+        fraction of a sample.
+
+        Parameters
+        ----------
+        commands : (n, T, d_u) array
+            Commands in any unit.
+        tolerance : float
+            The largest difference of two samples that counts as constant, as a share of the range
+            of that command.
+
         """
-        # One axis after the other: so numpy's inner loop is over a whole trajectory.
+        # One axis after the other, so that numpy's inner loop is over a whole trajectory.
         highest, lowest = commands.max(axis=0).max(axis=0), commands.min(axis=0).min(axis=0)
         extent = highest - lowest
-        least = (tolerance * np.where(extent > 0, extent, 1)).astype(commands.dtype)
+        smallest = (tolerance * np.where(extent > 0, extent, 1)).astype(commands.dtype)
         moving = np.empty((len(commands), commands.shape[1] - 1), dtype=bool)
-        for begin in range(0, len(commands), BLOCK):
-            some = commands[begin : begin + BLOCK]
-            change = np.abs(some[:, 1:] - some[:, :-1]) > least
-            none = np.zeros(change.shape[:2], dtype=bool)  # a twin may have no inputs
-            moving[begin : begin + BLOCK] = reduce(np.logical_or, np.moveaxis(change, 2, 0), none)
+        for begin in range(0, len(commands), TRAJECTORIES_PER_BLOCK):
+            some = commands[begin : begin + TRAJECTORIES_PER_BLOCK]
+            change = np.abs(some[:, 1:] - some[:, :-1]) > smallest
+            still = np.zeros(change.shape[:2], dtype=bool)  # a twin may have no inputs
+            channels = np.moveaxis(change, 2, 0)
+            moving[begin : begin + TRAJECTORIES_PER_BLOCK] = reduce(np.logical_or, channels, still)
 
         def speed(row: NDArray, step: NDArray) -> NDArray:
-            after, before = (commands[row, step + late].astype(np.float64) for late in (1, 0))
+            after, before = (commands[row, step + i].astype(np.float64) for i in (1, 0))
             return np.abs(after - before).sum(axis=1)
 
         return cls._from_moving(moving, speed)
 
     @classmethod
     def from_path(cls, nominal: NDArray, *, threshold: float = 0.01) -> Segments:
-        """Movements where the nominal path (n, T, d_y) is faster than `threshold` × its top speed.
+        """Segments whose motion part is where the nominal outputs change fast.
 
-        For twins whose commands have no events. Channels are scaled by their ranges first.
+        For systems whose commands change all the time.
+
+        Parameters
+        ----------
+        nominal : (n, T, d_y) array
+            Nominal outputs; each channel is divided by its range.
+        threshold : float
+            The smallest speed of a motion part, as a share of the highest speed.
+
         """
         extent = np.ptp(nominal, axis=(0, 1)).astype(np.float64)
         step = np.diff(nominal.astype(np.float64), axis=1) / np.where(extent > 0, extent, 1)
@@ -145,33 +186,36 @@ class Segments:
     def _from_moving(
         cls, moving: NDArray, speed: Callable[[NDArray, NDArray], NDArray]
     ) -> Segments:
-        """Movements where `moving` (n, T - 1); `speed` tells how fast a row is in a step."""
+        """Segments whose motion part is where `moving` (n, T - 1) is True.
+
+        `speed` gives the speeds of trajectories in steps, for arrays of their indices.
+        """
         n, steps = moving.shape[0], moving.shape[1] + 1
         padded = np.pad(moving, ((0, 0), (1, 1)))
-        # padded[:, i] tells whether step i - 1 -> i moves: edges are first and last such steps.
+        # padded[:, i] is True if step i - 1 -> i moves: edges are the first and last such steps.
         row, first = np.nonzero(padded[:, 1:] & ~padded[:, :-1])
         _, last = np.nonzero(padded[:, :-1] & ~padded[:, 1:])
         order = np.arange(len(row)) - np.searchsorted(row, row)
-        most = int(order.max(initial=-1)) + 1
-        start = np.full((n, most), float(steps))
-        settle = np.full((n, most), float(steps))
-        valid = np.zeros((n, most), dtype=bool)
-        start[row, order] = first + _late(speed, row, steps - 1, first, first + 1)
-        settle[row, order] = last - _late(speed, row, steps - 1, last - 1, last - 2)
+        count = int(order.max(initial=-1)) + 1
+        start = np.full((n, count), float(steps))
+        settle = np.full((n, count), float(steps))
+        valid = np.zeros((n, count), dtype=bool)
+        start[row, order] = first + _rest(speed, row, steps - 1, first, first + 1)
+        settle[row, order] = last - _rest(speed, row, steps - 1, last - 1, last - 2)
         settle = np.maximum(settle, start)
         valid[row, order] = True
-        stop = np.concatenate([start[:, 1:], np.full((n, 1), float(steps))], axis=1)[:, :most]
+        stop = np.concatenate([start[:, 1:], np.full((n, 1), float(steps))], axis=1)[:, :count]
         return cls(start, np.minimum(settle, stop), stop, valid, steps)
 
 
-def _late(
+def _rest(
     speed: Callable[[NDArray, NDArray], NDArray],
     row: NDArray,
     steps: int,
     edge: NDArray,
     inner: NDArray,
 ) -> NDArray:
-    """Fraction of the step `edge` that was still at rest, if `inner` is a full step (0 … 1)."""
+    """The fraction (0 … 1) of the step `edge` at rest, given that `inner` moves all the time."""
     inside = (inner >= 0) & (inner < steps)
     full = speed(row, np.clip(inner, 0, steps - 1))
     with np.errstate(divide="ignore", invalid="ignore"):

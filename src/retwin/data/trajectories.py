@@ -1,17 +1,16 @@
-"""`Trajectories`: commands, nominal and observed outputs of n runs; frozen, checked when made."""
+"""`Trajectories`: commands, nominal and observed outputs of n runs on one time grid."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.arrays import check_finite, check_shapes, floating, measured, named, row_blocks
-from retwin.errors import InputError
+from retwin.checks import at_least, positive, require, whole
 
 __all__ = ["HEALTHY", "UNLABELLED", "Channels", "Provenance", "Trajectories"]
 
@@ -25,34 +24,45 @@ HEALTHY = "Healthy"
 
 @dataclass(frozen=True)
 class Channels:
-    """Names and units of the columns of an array."""
+    """Names and units of the columns of an array.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Unique names.
+    units : tuple of str
+        A unit for each, "1" if it has none.
+
+    Raises
+    ------
+    InputError
+        A name repeats, or there is not one unit per name.
+
+    """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        if len(self.names) != len(self.units) or len(set(self.names)) != len(self.names):
-            raise InputError(
-                "channels",
-                expected="one unit per name and no name twice",
-                got=f"names {list(self.names)}, units {list(self.units)}",
-                remedy="name every channel once and give each a unit ('1' when it has none)",
-            )
+        require(
+            len(self.names) == len(self.units) and len(set(self.names)) == len(self.names),
+            "channels",
+            expected="one unit per name and no name twice",
+            got=f"names {list(self.names)}, units {list(self.units)}",
+            remedy="name every channel once and give each a unit ('1' when it has none)",
+        )
 
     def __len__(self) -> int:
         return len(self.names)
 
     @property
     def comparable(self) -> bool:
-        """Whether numbers of different channels compare: all have one unit, which "1" is not.
-
-        A single channel compares with itself.
-        """
+        """Whether all channels have the same unit, other than "1", or there is only one channel."""
         return len(self) == 1 or (len(set(self.units)) == 1 and self.units[0] != "1")
 
     @classmethod
     def of(cls, values: Mapping[str, Sequence[str]]) -> Channels:
-        """The channels that `vars` of one gave, JSON lists or tuples alike."""
+        """The channels of a mapping with `names` and `units`, as `vars` or JSON gives it."""
         return cls(tuple(values["names"]), tuple(values["units"]))
 
     @classmethod
@@ -63,7 +73,16 @@ class Channels:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where data came from: a file name and its SHA-256, or the maker's name with a seed."""
+    """Where data came from.
+
+    Parameters
+    ----------
+    name : str
+        The name of a file, or of the class that simulated them, with its seed.
+    sha256 : str
+        The SHA-256 of the file, in hexadecimal; "" without a file.
+
+    """
 
     name: str
     sha256: str = ""
@@ -73,26 +92,37 @@ class Provenance:
 class Trajectories:
     """A set of trajectories on one time grid.
 
+    Arrays are read-only. NaN in `observed` means a missing measurement and becomes a False in the
+    mask. Shorter trajectories are padded (`padded`): commands held, mask False.
+
     Attributes
     ----------
-    commands: (n, T, d_u), what the actuators were told; d_u = 0 when a file does not say.
-    nominal: (n, T, d_y), the ideal output for the clean commands.
-    observed: (n, T, d_y), the measured or simulated output; 0 where it is missing.
-    mask: (n, T, d_y) bool, True where `observed` is a measurement.
-    labels: (n,) class names, "" where unlabelled.
-    ids: (n,) unique names.
-    rate: samples per second.
-    inputs, outputs: names and units of the command and output channels.
-    provenance: the files or makers the data came from.
-    emulated: True when `observed` stands for a real system's measurements but a model made it.
-
-    Arrays are read-only. Shorter trajectories are padded (`padded`): mask False, commands held.
-    NaN in `observed` means missing and goes to the mask.
+    commands : (n, T, d_u) array
+        The inputs that the actuators were given; d_u = 0 if a file does not hold them.
+    nominal : (n, T, d_y) array
+        The ideal outputs for fault-free commands.
+    observed : (n, T, d_y) array
+        The measured or simulated outputs, 0 where a measurement is missing.
+    rate : float
+        The sample rate in Hz.
+    mask : (n, T, d_y) array of bool
+        True where `observed` is a measurement.
+    labels : (n,) array of str
+        Class names, "" where unlabelled.
+    ids : (n,) array of str
+        Unique names.
+    inputs, outputs : Channels
+        Names and units of the commands and of the outputs.
+    provenance : tuple of Provenance
+        The files or simulators that the data came from.
+    emulated : bool
+        True if `observed` stands for measurements of a real system but a model simulated it.
 
     Raises
     ------
-    InputError: shapes that disagree, NaN or infinite commands or nominal outputs, infinite
-        observations, a rate that is not positive, ids that repeat.
+    InputError
+        Shapes disagree, a command or nominal output is NaN or infinite, a measurement is infinite,
+        the rate is not positive, or an id repeats.
 
     """
 
@@ -100,7 +130,7 @@ class Trajectories:
     nominal: NDArray
     observed: NDArray
     rate: float
-    # None asks for the default; after the checks these are never None, so their types say so.
+    # None stands for the default, which the checks put in its place.
     mask: NDArray = None  # type: ignore[assignment]
     labels: NDArray = None  # type: ignore[assignment]
     ids: NDArray = None  # type: ignore[assignment]
@@ -117,42 +147,36 @@ class Trajectories:
         check_finite("commands", commands)
         check_finite("nominal", nominal)
         observed, mask = measured(observed, self.mask)
-        if not (isinstance(self.rate, Real) and np.isfinite(self.rate) and self.rate > 0):
-            raise InputError(
-                "rate",
-                expected="a positive number of samples per second",
-                got=repr(self.rate),
-                remedy="give the sample rate in Hz",
-            )
+        rate = positive("rate", self.rate, unit="Hz")
         n = len(commands)
         labels = named("labels", self.labels, [UNLABELLED] * n)
         ids = named("ids", self.ids, [f"{i:05d}" for i in range(n)])
-        if len(set(ids.tolist())) != n:
-            raise InputError(
-                "ids",
-                expected="one unique name per trajectory",
-                got="a name that repeats",
-                remedy="leave ids out to have them numbered",
-            )
+        require(
+            len(set(ids.tolist())) == n,
+            "ids",
+            expected="one unique name per trajectory",
+            got="a name that repeats",
+            remedy="leave ids out to have them numbered",
+        )
         inputs = self.inputs or Channels.numbered("u", commands.shape[2])
         outputs = self.outputs or Channels.numbered("y", nominal.shape[2])
         for name, channels, width in (
             ("inputs", inputs, commands.shape[2]),
             ("outputs", outputs, nominal.shape[2]),
         ):
-            if len(channels) != width:
-                raise InputError(
-                    name,
-                    expected=f"{width} channels, as the array has columns",
-                    got=f"{len(channels)}: {list(channels.names)}",
-                    remedy="name every column",
-                )
+            require(
+                len(channels) == width,
+                name,
+                expected=f"{width} channels, as the array has columns",
+                got=f"{len(channels)}: {list(channels.names)}",
+                remedy="name every column",
+            )
         checked = (commands, nominal, observed, mask, labels, ids)
         for name, array in zip(PER_TRAJECTORY, checked, strict=True):
             array = array.view()
             array.flags.writeable = False
             object.__setattr__(self, name, array)
-        object.__setattr__(self, "rate", float(self.rate))
+        object.__setattr__(self, "rate", rate)
         object.__setattr__(self, "inputs", inputs)
         object.__setattr__(self, "outputs", outputs)
         object.__setattr__(self, "provenance", tuple(self.provenance))
@@ -174,21 +198,22 @@ class Trajectories:
 
     @property
     def lengths(self) -> NDArray:
-        """(n,) samples of each, after which nothing is measured nor commanded anew: padding.
+        """Samples (n,) of each trajectory without its padding: up to the last one that is measured
+        or at which a command changes.
 
-        All T where nothing was measured at all, as with a twin that was asked for `nominal` only.
+        T for a trajectory without any measurement, of which a twin computed `nominal` only.
         """
         found = np.empty(len(self), dtype=int)
         for rows in row_blocks(max(self.commands, self.nominal, key=lambda each: each.nbytes)):
-            commands, eventful = self.commands[rows], np.any(self.mask[rows], axis=2)
-            nothing = ~np.any(eventful, axis=1)
-            eventful[:, 1:] |= (commands[:, 1:] != commands[:, :-1]).any(axis=2)
-            found[rows] = self.steps - (eventful | nothing[:, None])[:, ::-1].argmax(axis=1)
+            commands, used = self.commands[rows], np.any(self.mask[rows], axis=2)
+            unmeasured = ~np.any(used, axis=1)
+            used[:, 1:] |= (commands[:, 1:] != commands[:, :-1]).any(axis=2)
+            found[rows] = self.steps - (used | unmeasured[:, None])[:, ::-1].argmax(axis=1)
         return found
 
     @property
     def residual(self) -> NDArray:
-        """(n, T, d_y) observed minus nominal (Eq. 11), 0 where nothing was measured."""
+        """Observed minus nominal outputs (n, T, d_y), Eq. 11; 0 where nothing was measured."""
         return np.where(self.mask, self.observed - self.nominal, 0).astype(self.nominal.dtype)
 
     @property
@@ -209,19 +234,16 @@ class Trajectories:
         return replace(self, **changes)
 
     def padded(self, steps: int) -> Trajectories:
-        """The same with `steps` samples each: the last values held, and nothing measured there.
+        """The same with `steps` samples each: the last values held, and the mask False.
 
-        Raises InputError for fewer samples than there are.
+        Raises
+        ------
+        InputError
+            `steps` is smaller than T.
+
         """
-        more = steps - self.steps
-        if more < 0:
-            raise InputError(
-                "steps",
-                expected=f"at least {self.steps}, the samples that there are",
-                got=repr(steps),
-                remedy="padding only makes trajectories longer",
-            )
-        longer = ((0, 0), (0, more), (0, 0))
+        steps = whole("steps", steps, least=self.steps, remedy="padding makes them longer")
+        longer = ((0, 0), (0, steps - self.steps), (0, 0))
         return self.replace(
             commands=np.pad(self.commands, longer, mode="edge"),
             nominal=np.pad(self.nominal, longer, mode="edge"),
@@ -230,32 +252,43 @@ class Trajectories:
         )
 
     def with_label(self, label: str) -> Trajectories:
-        """Those of class `label`."""
+        """The trajectories of class `label`."""
         return self[self.labels == label]
 
     def split(self, fraction: float, *, seed: int) -> tuple[Trajectories, Trajectories]:
-        """Two disjoint parts by trajectory, stratified by class, `fraction` in the first.
+        """Two disjoint sets of trajectories, stratified by class.
 
-        Raises InputError when `fraction` is not strictly between 0 and 1.
+        Parameters
+        ----------
+        fraction : float
+            The share of the first set, strictly between 0 and 1.
+        seed : int
+            The seed of the random permutation.
+
+        Raises
+        ------
+        InputError
+            `fraction` is out of range.
+
         """
         first, second = self.split_index(fraction, seed=seed)
         return self[first], self[second]
 
     def split_index(self, fraction: float, *, seed: int) -> tuple[NDArray, NDArray]:
-        """The sorted indices of the two parts that `split` gives."""
-        if not 0 < fraction < 1:
-            raise InputError(
-                "fraction",
-                expected="a number strictly between 0 and 1",
-                got=repr(fraction),
-                remedy="give the share of the first part",
-            )
+        """The sorted indices of the two sets that `split` gives."""
+        require(
+            0 < fraction < 1,
+            "fraction",
+            expected="a number strictly between 0 and 1",
+            got=repr(fraction),
+            remedy="give the share of the first part",
+        )
         rng = np.random.default_rng(seed)
         first = np.zeros(len(self), dtype=bool)
         taken = 0.0
         for label in np.unique(self.labels):
             members = rng.permutation(np.flatnonzero(self.labels == label))
-            # Carry the rounding over, so that the whole share is right and not only each class's.
+            # The remainder of a class counts for the next, so that the total share is exact.
             taken += fraction * len(members)
             count = int(np.clip(round(taken), 0, len(members)))
             taken -= count
@@ -263,51 +296,60 @@ class Trajectories:
         return np.flatnonzero(first), np.flatnonzero(~first)
 
     def folds(self, count: int, *, seed: int) -> list[tuple[NDArray, NDArray]]:
-        """`count` pairs (calibration, test) of sorted indices, stratified by class.
+        """The folds of a cross-validation, stratified by class.
 
-        Every trajectory is in exactly one test part. Raises InputError when `count` is below 2 or
-        above the number of trajectories.
+        Parameters
+        ----------
+        count : int
+            The number of folds, from 2 to the number of trajectories.
+        seed : int
+            The seed of the random permutation.
+
+        Returns
+        -------
+        list of (array, array)
+            For each fold, the sorted indices of its calibration set and of its test set. Every
+            trajectory is in exactly one test set.
+
+        Raises
+        ------
+        InputError
+            `count` is out of range.
+
         """
-        if not (isinstance(count, Integral) and 2 <= count <= len(self)):
-            raise InputError(
-                "folds",
-                expected=f"a whole number from 2 to {len(self)}, the number of trajectories",
-                got=repr(count),
-                remedy="give fewer folds or more data",
-            )
+        count = whole(
+            "folds", count, least=2, most=len(self), remedy="give fewer folds or more data"
+        )
         rng = np.random.default_rng(seed)
         fold = np.empty(len(self), dtype=int)
-        dealt = 0
+        assigned = 0
         for label in np.unique(self.labels):
             members = rng.permutation(np.flatnonzero(self.labels == label))
-            fold[members] = (dealt + np.arange(len(members))) % count
-            dealt += len(members)
+            fold[members] = (assigned + np.arange(len(members))) % count
+            assigned += len(members)
         return [(np.flatnonzero(fold != k), np.flatnonzero(fold == k)) for k in range(count)]
 
     @staticmethod
     def concatenate(sets: Sequence[Trajectories]) -> Trajectories:
-        """All trajectories of several sets, padded to the longest, renumbered when ids repeat.
+        """All trajectories of several sets, padded to the longest, renumbered if ids repeat.
 
-        Raises InputError when rates or channels differ, or there is no set.
+        Raises
+        ------
+        InputError
+            Sample rates or channels differ, or there is no set.
+
         """
-        if not sets:
-            raise InputError(
-                "sets",
-                expected="at least one set of trajectories",
-                got="none",
-                remedy="give the sets to join",
-            )
+        at_least("sets", sets, 1, "set of trajectories", remedy="give the sets to join")
         first = sets[0]
         for other in sets[1:]:
             for name in ("rate", "inputs", "outputs"):
-                if getattr(other, name) != getattr(first, name):
-                    raise InputError(
-                        name,
-                        expected=f"the same in every set, {getattr(first, name)}",
-                        got=f"{getattr(other, name)}",
-                        remedy="resample or rename before joining",
-                    )
-
+                require(
+                    getattr(other, name) == getattr(first, name),
+                    name,
+                    expected=f"the same in every set, {getattr(first, name)}",
+                    got=getattr(other, name),
+                    remedy="resample or rename before joining",
+                )
         longest = max(each.steps for each in sets)
         sets = [each.padded(longest) for each in sets]
         joined: dict[str, Any] = {

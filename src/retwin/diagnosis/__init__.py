@@ -6,27 +6,29 @@ Belongs here: one file per kind of diagnoser, and what they share. Not here: the
 
 from __future__ import annotations
 
-from retwin.diagnosis.adversarial import fit_dann
-from retwin.diagnosis.diagnoser import Diagnoser
-from retwin.diagnosis.fine_tuning import fine_tune
+from retwin.diagnosis.adversarial import DANN
+from retwin.diagnosis.diagnoser import Diagnoser, FittedDiagnoser, load_diagnoser
+from retwin.diagnosis.fine_tuning import FineTune
+from retwin.diagnosis.fitting import Classifier, fit_diagnoser
 from retwin.diagnosis.inversion import Diagnosis, Estimate, InversionDiagnoser, fit_inversion
-from retwin.diagnosis.network import NetworkDiagnoser, fit_diagnoser
+from retwin.diagnosis.network import NetworkDiagnoser
 from retwin.diagnosis.pooled import PooledDiagnoser
-from retwin.diagnosis.rocket import RocketDiagnoser, fit_rocket
-from retwin.diagnosis.saved import load_diagnoser
+from retwin.diagnosis.rocket import Rocket, RocketDiagnoser
 
 __all__ = [
+    "DANN",
+    "Classifier",
     "Diagnoser",
     "Diagnosis",
     "Estimate",
+    "FineTune",
+    "FittedDiagnoser",
     "InversionDiagnoser",
     "NetworkDiagnoser",
     "PooledDiagnoser",
+    "Rocket",
     "RocketDiagnoser",
-    "fine_tune",
-    "fit_dann",
     "fit_diagnoser",
     "fit_inversion",
-    "fit_rocket",
     "load_diagnoser",
 ]

@@ -1,8 +1,9 @@
-"""Domain-adversarial training: labelled twin data, and real outputs without labels.
+"""Domain-adversarial training on labelled trajectories of a twin and unlabelled real ones.
 
-Ganin et al., "Domain-adversarial training of neural networks", JMLR 17 (2016). A critic tells from
-the network's representation whether an example is the twin's or real. The network learns the
-classes on the twin's, and at the same time a representation in which the critic cannot tell.
+A critic classifies the network's representation of a trajectory as the twin's or as real. The
+network learns the classes on the twin's trajectories, and at the same time a representation on
+which the critic fails (Ganin et al., "Domain-adversarial training of neural networks", JMLR 17,
+2016).
 """
 
 from __future__ import annotations
@@ -16,26 +17,51 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from retwin.checks import positive, require, whole
 from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.features import Features, class_index, class_order, one_view
+from retwin.diagnosis.features import Features, class_index, class_order, random_phase
 from retwin.diagnosis.network import NetworkDiagnoser, training_for
-from retwin.errors import InputError
 from retwin.nets.networks import CNN, Network
 from retwin.nets.training import Training, isolated, train
 from retwin.progress import Progress
 
-__all__ = ["fit_dann"]
+__all__ = ["DANN", "fit_dann"]
 
-HIDDEN = 100
-"""Units of the critic, as in the paper's small architectures."""
-GAMMA = 10.0
-"""How fast the critic's say grows; the paper's."""
+
+@dataclass(frozen=True)
+class DANN:
+    """A domain-adversarial network, which learns from unlabelled real trajectories too.
+
+    Parameters
+    ----------
+    network : Network
+        `CNN` or `LSTMClassifier`.
+    hidden : int
+        Hidden units of the critic, at least 1; 100 as in the small architectures of Ganin et al.
+    gamma : float
+        Growth of the critic's weight 2 / (1 + exp(-gamma p)) - 1 over the progress p from 0 to 1
+        of the training, positive; 10 as in Ganin et al., section 5.2.2.
+
+    Raises
+    ------
+    InputError
+        If `hidden` or `gamma` is out of range.
+
+    """
+
+    network: Network = CNN()  # noqa: RUF009 - a frozen config
+    hidden: int = 100
+    gamma: float = 10.0
+
+    def __post_init__(self) -> None:
+        whole("hidden", self.hidden, least=1)
+        positive("gamma", self.gamma)
 
 
 def fit_dann(
     source: Trajectories,
+    classifier: DANN,
     target: Trajectories,
-    network: Network = CNN(),  # noqa: B008 - a frozen config
     *,
     seed: int,
     classes: Sequence[str] | None = None,
@@ -43,73 +69,58 @@ def fit_dann(
     training: Training | None = None,
     progress: Progress | None = None,
 ) -> NetworkDiagnoser:
-    """Train a classifier on labelled trajectories so that it does not tell them from real ones.
+    """Train the network and its critic; see `fit_diagnoser`.
 
-    Parameters
-    ----------
-    source: labelled, of a twin; a stratified fifth is held out, for figures only.
-    target: real; their labels are not looked at. As many as of the source are in each batch, drawn
-        with replacement.
-    network: `CNN` or `LSTMClassifier`.
-    seed: same seed, same weights on the same machine.
-    classes: their order; by default sorted by name.
-    rate: samples per second the network looks at; by default 10 Hz or the data's, if lower.
-    training: epochs, batch, rate; by default what suits the network.
-
-    The start of every trajectory is hidden (`Features.hide_start`). Each is seen at a phase of the
-    sensor drawn anew each time (`Features.views`), which tells the critic less of single ones.
-    The last epoch is kept: what would choose a better one for real data is their labels.
-    `fitted.figures` hold the `accuracy` on the held-out fifth, and the critic's `domain_accuracy`
-    on it and the target, balanced: 0.5 where it cannot tell.
-
-    Raises
-    ------
-    InputError: a source that is not labelled with at least two of the classes, target trajectories
-        of other channels, rate or length, or none, a network without a representation.
-
+    Each batch holds as many real trajectories as of the source, drawn with replacement. The start
+    of every trajectory is hidden (`Features.hide_start`), and each is sampled at a new random
+    phase each time (`Features.phases`), so that the critic learns less of single ones. The last
+    epoch is kept: choosing a better one for real data would need their labels. The figures hold
+    the critic's `domain_accuracy` too, the mean of its accuracies on the held-out fifth and the
+    target: 0.5 where the critic fails.
     """
     order = class_order(source, classes)
     features = Features.at(source, rate, hide_start=True)
-    if len(target) == 0 or target.steps != source.steps:
-        raise InputError(
-            "target",
-            expected=f"at least one real trajectory of {source.steps} samples, as in the source",
-            got=f"{len(target)} of {target.steps} samples",
-            remedy="give the unlabelled real trajectories, cut to the source's length",
-        )
+    require(
+        len(target) > 0 and target.steps == source.steps,
+        "target",
+        expected=f"at least one real trajectory of {source.steps} samples, as in the source",
+        got=f"{len(target)} of {target.steps} samples",
+        remedy="give the unlabelled real trajectories, cut to the source's length",
+    )
     fitted_on, held_out = source.split(0.8, seed=seed)
     with isolated(seed):
-        pair = _Pair(NetworkDiagnoser(network, features, classes=order))
-    views, unlabelled = features.views(fitted_on), features.views(target)
-    pair.diagnoser.before.fit(views)
-    how = training or training_for(network)
-    steps = how.max_epochs * math.ceil(len(views) / how.batch_size)
-    loss = _Loss(unlabelled, torch.Generator().manual_seed(seed), steps)
-    labelled = (views, class_index(fitted_on, order))
+        diagnoser = NetworkDiagnoser(classifier.network, features, classes=order)
+        pair = _Pair(diagnoser, classifier.hidden)
+    phases, unlabelled = features.phases(fitted_on), features.phases(target)
+    diagnoser.before.fit(phases)
+    how = training or training_for(classifier.network)
+    steps = how.max_epochs * math.ceil(len(phases) / how.batch_size)
+    loss = _Loss(unlabelled, torch.Generator().manual_seed(seed), classifier.gamma, steps)
+    labelled = (phases, class_index(fitted_on, order))
     result = train(pair, loss, labelled, None, how, seed=seed, progress=progress)
     figures = {
-        "accuracy": _accuracy(pair.diagnoser, held_out),
+        "accuracy": _accuracy(diagnoser, held_out),
         "domain_accuracy": pair.domain_accuracy(features(held_out), unlabelled[:, 0]),
     }
-    pair.diagnoser.fitted = replace(result, figures=figures)
-    return pair.diagnoser
+    diagnoser.fitted = replace(result, figures=figures)
+    return diagnoser
 
 
 class _Pair(nn.Module):
     """A diagnoser, and the critic of its representation."""
 
-    def __init__(self, diagnoser: NetworkDiagnoser) -> None:
+    def __init__(self, diagnoser: NetworkDiagnoser, hidden: int) -> None:
         super().__init__()
-        if not hasattr(diagnoser.network, "represent"):
-            raise InputError(
-                "network",
-                expected="a classifier that represents a trajectory: CNN or LSTMClassifier",
-                got=type(diagnoser.config).__name__,
-                remedy="choose one of these",
-            )
+        require(
+            hasattr(diagnoser.network, "represent"),
+            "network",
+            expected="a classifier that represents a trajectory: CNN or LSTMClassifier",
+            got=type(diagnoser.config).__name__,
+            remedy="choose one of these",
+        )
         self.diagnoser = diagnoser
         width = self._network.readout.in_features
-        self.critic = nn.Sequential(nn.Linear(width, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 1))
+        self.critic = nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, 1))
 
     @property
     def _network(self) -> Any:
@@ -123,52 +134,53 @@ class _Pair(nn.Module):
 
     @torch.no_grad()
     def domain_accuracy(self, source: Tensor, target: Tensor) -> float:
-        """Of the critic, the mean of its accuracies on the two domains."""
-        right = (self.critic(self.represent(source)) < 0, self.critic(self.represent(target)) >= 0)
-        return float(sum(each.float().mean() for each in right) / 2)
+        """Mean of the critic's accuracies on the two domains."""
+        hits = (self.critic(self.represent(source)) < 0, self.critic(self.represent(target)) >= 0)
+        return float(sum(each.float().mean() for each in hits) / 2)
 
 
 class _Reversed(torch.autograd.Function):
-    """The identity, whose gradient is turned around and scaled (the paper's section 4.2)."""
+    """The identity, whose gradient is negated and scaled (Ganin et al., section 4.2)."""
 
     @staticmethod
-    def forward(ctx: Any, values: Tensor, strength: float) -> Tensor:
-        ctx.strength = strength
+    def forward(ctx: Any, values: Tensor, weight: float) -> Tensor:
+        ctx.weight = weight
         return values.view_as(values)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        return -ctx.strength * gradients[0], None
+        return -ctx.weight * gradients[0], None
 
 
 @dataclass
 class _Loss:
-    """Classes of the source, and domains of both; counts its steps, for the critic's strength."""
+    """Cross-entropy of the source's classes and of both domains; counts the training steps."""
 
     target: Tensor
     generator: torch.Generator
+    gamma: float
     steps: int
     done: int = 0
 
     @property
-    def strength(self) -> float:
-        """From 0 to 1 over the training: at first a critic has nothing sound to say."""
-        return 2 / (1 + math.exp(-GAMMA * self.done / self.steps)) - 1
+    def weight(self) -> float:
+        """The critic's weight, from 0 to 1 over the training: an untrained critic is wrong."""
+        return 2 / (1 + math.exp(-self.gamma * self.done / self.steps)) - 1
 
     def __call__(self, pair: _Pair, batch: tuple[Tensor, ...]) -> Tensor:
-        views, classes = batch
-        source = one_view(views, self.generator)
+        phases, classes = batch
+        source = random_phase(phases, self.generator)
         drawn = torch.randint(len(self.target), (len(source),), generator=self.generator)
-        target = one_view(self.target[drawn], self.generator).to(source.device)
+        target = random_phase(self.target[drawn], self.generator).to(source.device)
         # In one pass: batch normalisation must not give either domain a scale of its own.
         representation = pair.represent(torch.cat([source, target]))
         logits = pair.classify(representation[: len(source)])
-        suspicion = pair.critic(_Reversed.apply(representation, self.strength))[:, 0]
+        domain_logits = pair.critic(_Reversed.apply(representation, self.weight))[:, 0]
         domains = torch.cat([torch.zeros(len(source)), torch.ones(len(target))]).to(source.device)
         self.done += 1
         return functional.cross_entropy(
             logits, classes
-        ) + functional.binary_cross_entropy_with_logits(suspicion, domains)
+        ) + functional.binary_cross_entropy_with_logits(domain_logits, domains)
 
 
 def _accuracy(diagnoser: NetworkDiagnoser, held_out: Trajectories) -> float:

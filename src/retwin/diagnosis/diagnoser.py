@@ -1,19 +1,22 @@
-"""What every diagnoser offers: trajectories in, class probabilities out."""
+"""`Diagnoser`: the interface of all diagnosers, and `load_diagnoser` for those that were saved."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from numpy.typing import NDArray
 
+from retwin.catalog import DIAGNOSERS, resolve
 from retwin.data.trajectories import Trajectories
+from retwin.serialisation.models import kind_of
 
-__all__ = ["Diagnoser"]
+__all__ = ["Diagnoser", "FittedDiagnoser", "load_diagnoser"]
 
 
 @runtime_checkable
 class Diagnoser(Protocol):
-    """Tells which class a trajectory belongs to."""
+    """Classifies trajectories: it gives the probability of each class."""
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -21,11 +24,55 @@ class Diagnoser(Protocol):
         ...
 
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
-        """Probabilities (n, classes) that sum to one; labels are not looked at.
+        """Class probabilities; labels of the trajectories have no effect.
+
+        Parameters
+        ----------
+        trajectories : Trajectories
+            n trajectories with the output channels and the sample rate of the training set.
+
+        Returns
+        -------
+        NDArray
+            Probabilities (n, classes) that sum to 1 in each row.
 
         Raises
         ------
-        InputError: other output channels or another sample rate than it was trained on.
+        InputError
+            If the output channels or the sample rate differ from those of the training set.
 
         """
         ...
+
+
+class FittedDiagnoser(Diagnoser, Protocol):
+    """A diagnoser that can be saved."""
+
+    def save(self, folder: str | Path) -> None:
+        """Write a folder that `load_diagnoser` reads."""
+        ...
+
+
+def load_diagnoser(folder: str | Path) -> FittedDiagnoser:
+    """Read a diagnoser of any kind that the catalog lists.
+
+    Parameters
+    ----------
+    folder : str or Path
+        What the diagnoser's `save` wrote.
+
+    Returns
+    -------
+    FittedDiagnoser
+        An object of the class that `retwin.catalog.DIAGNOSERS` names for the folder's kind.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no diagnoser, or a damaged one.
+
+    """
+    # A folder of no known kind is refused by this class, with a message that states what it lacks.
+    entry = DIAGNOSERS.get(kind_of(folder), DIAGNOSERS["diagnoser"])
+    found: FittedDiagnoser = resolve(entry.target).load(folder)
+    return found

@@ -1,4 +1,4 @@
-"""`Features`: what a diagnoser that learns looks at, x = concat(ŷ, r) (Eq. 11)."""
+"""`Features`: the input of a diagnoser that is trained, x = concat(ŷ, r) (Eq. 11)."""
 
 from __future__ import annotations
 
@@ -12,31 +12,41 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retwin.arrays import row_blocks
+from retwin.checks import require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.errors import InputError
 
-__all__ = ["Features", "class_index", "class_order", "one_view"]
+__all__ = ["SETTLED", "Features", "class_index", "class_order", "random_phase"]
 
 SETTLED = 2
-"""Readings of the sensor from the end of the first motion until it is hidden no more: one for the
-response's delay, one because a value between two readings still holds some of the earlier."""
+"""Samples of the features, from the end of the first motion on, that are still hidden: one for the
+delay of the response, and one because a value interpolated between two sensor samples depends on
+the earlier one."""
 
 
 @dataclass(frozen=True)
 class Features:
     """concat(ŷ, r) at every `stride`-th sample; r = observed − ŷ is 0 where missing.
 
-    Parameters
+    Attributes
     ----------
-    outputs: channels of the trajectories it takes.
-    rate: samples per second of the trajectories it takes.
-    stride: every how many samples it looks; the sensor's true rate is often lower than the file's.
-    hide_start: whether everything before the first movement has come to rest is hidden: ŷ is then
-        what it is at that moment, r is 0. Where a recording began may tell its label (the motors
-        of a rig rest where the fault of the run before left them), so whatever learns from real
-        trajectories must not see it. The desired path shows it as well as the measured one, and
-        shows it until the first motion ends: hence not r alone, and not the time at rest alone.
+    outputs : Channels
+        The d_y output channels of the trajectories.
+    rate : float
+        Sample rate of the trajectories in Hz.
+    stride : int
+        Samples of the trajectories per sample of the features: the true rate of a sensor is often
+        lower than that of the file.
+    hide_start : bool
+        Whether all samples before the end of the first motion are hidden: ŷ is then constant at
+        its value at that end, and r is 0.
+
+    Notes
+    -----
+    The initial pose of a recording may reveal its label, because the motors of a rig rest where
+    the previous experiment left them. A diagnoser that learns from real trajectories must not use
+    that. The pose appears in the nominal as well as in the measured path, and until the first
+    motion ends: so `hide_start` hides both, until then.
 
     """
 
@@ -49,16 +59,30 @@ class Features:
     def at(
         cls, trajectories: Trajectories, rate: float | None = None, *, hide_start: bool = False
     ) -> Features:
-        """Features of trajectories like these, at `rate` Hz: by default 10, or theirs if lower.
+        """The features of trajectories like these at a given rate.
 
-        Raises InputError when the rate is no whole part of the trajectories'.
+        Parameters
+        ----------
+        trajectories : Trajectories
+            Their output channels and sample rate are taken.
+        rate : float, optional
+            Sample rate of the features in Hz; by default 10 Hz, or that of the trajectories if it
+            is lower.
+        hide_start : bool
+            See the class.
+
+        Raises
+        ------
+        InputError
+            If the rate of the trajectories is no whole multiple of `rate`.
+
         """
         stride = _stride(trajectories.rate, min(10.0, trajectories.rate) if rate is None else rate)
         return cls(trajectories.outputs, trajectories.rate, stride, hide_start)
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Features:
-        """From the values that `asdict` gave; other ones beside them are left alone."""
+        """From the plain values that `about` returned; other keys have no effect."""
         return cls(
             Channels.of(values["outputs"]),
             values["rate"],
@@ -67,36 +91,53 @@ class Features:
         )
 
     def about(self) -> dict[str, Any]:
-        """As plain values, for JSON."""
+        """The fields as plain values, for JSON."""
         return asdict(self)
 
     @property
     def width(self) -> int:
-        """Channels of the features, 2 d_y."""
+        """Number of channels of the features, 2 d_y."""
         return 2 * len(self.outputs)
 
     def __call__(self, trajectories: Trajectories) -> Tensor:
-        """Features (n, T', 2 d_y), float32.
+        """The features of n trajectories.
+
+        Returns
+        -------
+        Tensor
+            (n, T', 2 d_y), float32.
 
         Raises
         ------
-        InputError: other output channels or another rate; no commands, where the start is hidden.
+        InputError
+            If the output channels or the rate differ, or if the start is to be hidden and there
+            are no commands.
 
         """
-        return self._read(trajectories, np.arange(0, trajectories.steps, self.stride))
+        return self._sampled(trajectories, np.arange(0, trajectories.steps, self.stride))
 
-    def views(self, trajectories: Trajectories) -> Tensor:
-        """The features (n, stride, T', 2 d_y) from every sample on at which a sensor may begin.
+    def phases(self, trajectories: Trajectories) -> Tensor:
+        """The features at each of the `stride` phases at which a sensor may sample.
 
-        They are the same movements, read otherwise: more to learn from, and of the same class.
-        Raises as the call does.
+        They show the same segments at other samples, which augments a training set.
+
+        Returns
+        -------
+        Tensor
+            (n, stride, T', 2 d_y), float32.
+
+        Raises
+        ------
+        InputError
+            As the call does.
+
         """
         first = np.arange(0, trajectories.steps, self.stride)
         time = np.minimum(np.arange(self.stride)[:, None] + first, trajectories.steps - 1)
-        return self._read(trajectories, time.ravel()).unflatten(1, time.shape)
+        return self._sampled(trajectories, time.ravel()).unflatten(1, time.shape)
 
-    def _read(self, trajectories: Trajectories, time: NDArray) -> Tensor:
-        """Features at these samples, (n, len(time), 2 d_y); made block by block."""
+    def _sampled(self, trajectories: Trajectories, time: NDArray) -> Tensor:
+        """Features at the samples `time`, (n, len(time), 2 d_y), computed block by block."""
         self._check(trajectories)
         settled = self._settled(trajectories) if self.hide_start else None
         found = np.empty((len(trajectories), len(time), self.width), np.float32)
@@ -115,78 +156,78 @@ class Features:
         return torch.from_numpy(found)
 
     def _settled(self, trajectories: Trajectories) -> NDArray:
-        """The sample (n,) at which the first movement has come to rest; the last where none is."""
-        if trajectories.commands.shape[2] == 0:
-            raise InputError(
-                "trajectories.commands",
-                expected="commands, which tell when the first movement ends",
-                got="none",
-                remedy="recover them, or take a diagnoser that does not hide the start",
-            )
+        """The sample (n,) up to which the start is hidden; the last one if nothing moves."""
+        require(
+            trajectories.commands.shape[2] > 0,
+            "trajectories.commands",
+            expected="commands, which show when the first motion ends",
+            got="none",
+            remedy="recover them, or take a diagnoser that does not hide the start",
+        )
         segments = Segments.from_commands(trajectories.commands)
-        if segments.most == 0:
+        if segments.max_count == 0:
             return np.full(len(trajectories), trajectories.steps - 1)
         end = np.ceil(segments.settle[:, 0]).astype(int) + SETTLED * self.stride
         return np.minimum(end, trajectories.steps - 1)
 
     def _check(self, trajectories: Trajectories) -> None:
-        for name, ours, theirs in (
-            ("outputs", self.outputs, trajectories.outputs),
-            ("rate", self.rate, trajectories.rate),
-        ):
-            if ours != theirs:
-                raise InputError(
-                    f"trajectories.{name}",
-                    expected=f"what the diagnoser was trained on, {ours}",
-                    got=f"{theirs}",
-                    remedy="resample or rename, or train on data like these",
-                )
+        for name in ("outputs", "rate"):
+            expected, given = getattr(self, name), getattr(trajectories, name)
+            require(
+                given == expected,
+                f"trajectories.{name}",
+                expected=f"what the diagnoser was trained on, {expected}",
+                got=given,
+                remedy="resample or rename, or train on data like these",
+            )
 
 
-def one_view(views: Tensor, generator: torch.Generator) -> Tensor:
-    """One phase of each example, drawn at random: (b, stride, T', d) in, (b, T', d) out."""
-    phase = torch.randint(views.shape[1], (len(views),), generator=generator)
-    return views[torch.arange(len(views)), phase]
+def random_phase(phases: Tensor, generator: torch.Generator) -> Tensor:
+    """One random phase of each example: (b, stride, T', d) in, (b, T', d) out."""
+    phase = torch.randint(phases.shape[1], (len(phases),), generator=generator)
+    return phases[torch.arange(len(phases)), phase]
 
 
 def class_order(
     trajectories: Trajectories, classes: Sequence[str] | None = None
 ) -> tuple[str, ...]:
-    """The classes to learn, in their order; by default sorted by name.
+    """The class names in the order of the probabilities; by default sorted.
 
     Raises
     ------
-    InputError: unlabelled trajectories, fewer than two classes, a label not among `classes`.
+    InputError
+        If a trajectory has no label or one that is not among `classes`, or if there are fewer
+        than two classes.
 
     """
-    named = trajectories.known_labels
-    order = tuple(classes) if classes is not None else tuple(sorted(named))
-    unknown = named - set(order)
-    if len(named) < 2 or unknown or "" in trajectories.labels:
-        raise InputError(
-            "trajectories",
-            expected=f"labelled trajectories of at least two of the classes {', '.join(order)}",
-            got=f"unknown {sorted(unknown)}"
-            if unknown
-            else f"labels {sorted(set(trajectories.labels))}",
-            remedy="label every trajectory with a known class",
-        )
+    labels = trajectories.known_labels
+    order = tuple(classes) if classes is not None else tuple(sorted(labels))
+    unknown = labels - set(order)
+    require(
+        len(labels) >= 2 and not unknown and "" not in trajectories.labels,
+        "trajectories",
+        expected=f"labelled trajectories of at least two of the classes {', '.join(order)}",
+        got=f"unknown {sorted(unknown)}"
+        if unknown
+        else f"labels {sorted(set(trajectories.labels))}",
+        remedy="label every trajectory with a known class",
+    )
     return order
 
 
 def class_index(trajectories: Trajectories, order: Sequence[str]) -> Tensor:
-    """The labels (n,) as places in `order`."""
+    """The labels (n,) as indices into `order`."""
     return torch.tensor([list(order).index(label) for label in trajectories.labels])
 
 
 def _stride(given: float, wanted: float) -> int:
-    """Every how many samples at `given` Hz make `wanted` Hz."""
+    """The stride that reduces `given` Hz to `wanted` Hz."""
     stride = given / wanted if wanted > 0 else 0.0
-    if stride < 1 or abs(stride - round(stride)) > 1e-6:
-        raise InputError(
-            "rate",
-            expected=f"{given:g} Hz, the data's rate, or a whole part of it",
-            got=f"{wanted:g} Hz",
-            remedy="choose a rate that takes every sample, every second, every third …",
-        )
+    require(
+        stride >= 1 and abs(stride - round(stride)) <= 1e-6,
+        "rate",
+        expected=f"{given:g} Hz, the data's rate, or a whole part of it",
+        got=f"{wanted:g} Hz",
+        remedy="choose the rate of the data divided by a whole number",
+    )
     return round(stride)

@@ -1,73 +1,95 @@
-"""Fine-tuning: a network that learnt on generated trajectories goes on with a few real ones."""
+"""Fine-tuning: training a network on generated trajectories is continued with a few real ones."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
+from retwin.checks import require, whole
 from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.features import class_index, class_order, one_view
+from retwin.diagnosis.features import class_index, class_order, random_phase
 from retwin.diagnosis.network import NetworkDiagnoser
 from retwin.nets.training import Training, isolated, train
 from retwin.progress import Progress
 
-__all__ = ["FINE_TUNING", "fine_tune"]
+__all__ = ["FineTune", "fine_tune"]
 
 FINE_TUNING = Training(max_epochs=10, batch_size=48, learning_rate=1e-3, weight_decay=1e-2)
-"""A third of the first training's rate; fixed beforehand, as labelled trajectories are too few to
-choose it on."""
-
-GENERATED_PER_LABELLED = 3
-"""In a batch: with the default 48, there are 16 labelled beside them."""
+"""The default training. Its learning rate is a third of the first training's; it was fixed in
+advance, because labelled trajectories are too few to choose it."""
 
 
-def fine_tune(
-    diagnoser: NetworkDiagnoser,
-    generated: Trajectories,
-    labelled: Trajectories,
-    *,
-    seed: int,
-    training: Training = FINE_TUNING,
-    progress: Progress | None = None,
-) -> NetworkDiagnoser:
-    """Go on training a copy of `diagnoser`, with labelled real trajectories mixed in.
+@dataclass(frozen=True)
+class FineTune:
+    """Continue the training of a network with labelled real trajectories.
 
     Parameters
     ----------
-    diagnoser: trained on `generated`; stays as it is.
-    generated: labelled; they keep what was learnt from being forgotten.
-    labelled: real, a few per class; drawn with replacement, one for three generated ones.
-    seed: same seed, same weights on the same machine.
-    training: `batch` counts the generated ones only. All epochs are done, and the last is kept.
-
-    The start of every trajectory is hidden, in training and from then on (`Features.hide_start`):
-    it may tell the labels of real ones. Each is seen at a phase of the sensor drawn anew each time.
+    base : NetworkDiagnoser
+        The network, trained on generated trajectories; a copy of it is trained.
+    generated_per_labelled : int
+        Generated trajectories per labelled one in a batch, at least 1. They keep the network from
+        forgetting. With a batch of 48 generated trajectories, the default of 3 adds 16 labelled
+        ones. `batch_size` of the training counts the generated ones alone.
 
     Raises
     ------
-    InputError: unlabelled trajectories, fewer than two classes, a label that the diagnoser does not
-        know, other channels or another rate than it was trained on.
+    InputError
+        If `base` is no network, or if there is no generated trajectory per labelled one.
 
     """
-    for part in (generated, labelled):
-        class_order(part, diagnoser.classes)
-    features = replace(diagnoser.features, hide_start=True)
+
+    base: NetworkDiagnoser
+    generated_per_labelled: int = 3
+
+    def __post_init__(self) -> None:
+        require(
+            isinstance(self.base, NetworkDiagnoser),
+            "base",
+            expected="a NetworkDiagnoser",
+            got=type(self.base).__name__,
+            remedy="train one with fit_diagnoser on generated trajectories",
+        )
+        whole("generated_per_labelled", self.generated_per_labelled, least=1)
+
+
+def fine_tune(
+    generated: Trajectories,
+    classifier: FineTune,
+    target: Trajectories,
+    *,
+    seed: int,
+    training: Training | None = None,
+    progress: Progress | None = None,
+) -> NetworkDiagnoser:
+    """Train a copy of the base on both sets; see `fit_diagnoser`.
+
+    Trajectories of the target are drawn with replacement. All epochs are run and the last is kept.
+    The start of every trajectory is hidden, in training and in later use (`Features.hide_start`),
+    and each is sampled at a new random phase each time (`Features.phases`).
+    """
+    base = classifier.base
+    for part in (generated, target):
+        class_order(part, base.classes)
+    features = replace(base.features, hide_start=True)
     with isolated(seed):
-        tuned = NetworkDiagnoser(diagnoser.config, features, classes=diagnoser.classes)
-    tuned.load_state_dict(diagnoser.state_dict())
-    real, real_class = features.views(labelled), class_index(labelled, diagnoser.classes)
+        tuned = NetworkDiagnoser(base.config, features, classes=base.classes)
+    tuned.load_state_dict(base.state_dict())
+    real, real_class = features.phases(target), class_index(target, base.classes)
     generator = torch.Generator().manual_seed(seed)
 
     def loss(module: nn.Module, batch: tuple[Tensor, ...]) -> Tensor:
-        views, classes = batch
-        count = max(1, len(views) // GENERATED_PER_LABELLED)
+        phases, classes = batch
+        count = max(1, len(phases) // classifier.generated_per_labelled)
         drawn = torch.randint(len(real), (count,), generator=generator)
-        mixed = torch.cat([views, real[drawn].to(views.device)])
-        truth = torch.cat([classes, real_class[drawn].to(views.device)])
-        return nn.functional.cross_entropy(module(one_view(mixed, generator)), truth)
+        mixed = torch.cat([phases, real[drawn].to(phases.device)])
+        truth = torch.cat([classes, real_class[drawn].to(phases.device)])
+        return nn.functional.cross_entropy(module(random_phase(mixed, generator)), truth)
 
-    examples = (features.views(generated), class_index(generated, diagnoser.classes))
-    tuned.fitted = train(tuned, loss, examples, None, training, seed=seed, progress=progress)
+    examples = (features.phases(generated), class_index(generated, base.classes))
+    tuned.fitted = train(
+        tuned, loss, examples, None, training or FINE_TUNING, seed=seed, progress=progress
+    )
     return tuned

@@ -219,7 +219,7 @@ def fit_inversion(
     context, observed, mask = _Readings.of(surrogate, residual, healthy)[:]
     problem = posed(residual, context, observed, mask)
     belief = healthy_belief(residual, context)
-    x = belief.mean.unflatten(1, (context.segments.most, -1))
+    x = belief.mean.unflatten(1, (context.segments.max_count, -1))
     noise = Noise.first(problem.residual(x, torch.zeros_like(x[..., 1:])), problem)
     each = torch.arange(len(healthy))
     for _ in range(ROUNDS):

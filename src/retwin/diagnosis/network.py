@@ -12,25 +12,42 @@ from torch import Tensor, nn
 
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.features import Features, class_index, class_order
-from retwin.nets.networks import CNN, NETWORKS, Network, Standardise
+from retwin.nets.networks import NETWORKS, Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 
-__all__ = ["NetworkDiagnoser", "fit_diagnoser", "training_for"]
+__all__ = ["NetworkDiagnoser", "fit_network", "training_for"]
 
-CHUNK = 256
+TRAJECTORIES_PER_BATCH = 256
+"""Trajectories that are classified together: activations of more would leave the cache."""
+
+DEFAULTS = {
+    "CNN": Training(max_epochs=25, batch_size=64, learning_rate=3e-3, weight_decay=1e-2),
+    "LSTMClassifier": Training(max_epochs=30, batch_size=32, learning_rate=1e-3, decay="step"),
+}
+"""The training of each network by the name of its config; that of the LSTM is the paper's."""
 
 
 class NetworkDiagnoser(nn.Module):
-    """A trained classifier of trajectories.
+    """A neural network that classifies trajectories.
 
     Parameters
     ----------
-    network: the config its module was built from.
-    features: what it looks at.
-    classes: in the order of the probabilities.
+    network : Network
+        The config from which the network is built.
+    features : Features
+        The input of the network.
+    classes : tuple of str
+        Class names, in the order of the probabilities.
+
+    Attributes
+    ----------
+    config : Network
+        As given.
+    fitted : Fit or None
+        History and figures of the training; None before it.
 
     """
 
@@ -44,7 +61,7 @@ class NetworkDiagnoser(nn.Module):
         self.fitted: Fit | None = None
 
     def forward(self, features: Tensor) -> Tensor:
-        """Logits (n, classes)."""
+        """Logits (n, classes) of features (n, T', 2 d_y)."""
         return self.network(self.before(features))
 
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
@@ -53,9 +70,9 @@ class NetworkDiagnoser(nn.Module):
 
     @torch.no_grad()
     def of_features(self, features: Tensor) -> NDArray:
-        """Probabilities (n, classes) for features (n, T', d), in chunks."""
-        parts = [self(part).double().softmax(dim=1) for part in features.split(CHUNK)]
-        return torch.cat(parts).numpy()
+        """Probabilities (n, classes) of features (n, T', 2 d_y), computed in batches."""
+        batches = features.split(TRAJECTORIES_PER_BATCH)
+        return torch.cat([self(each).double().softmax(dim=1) for each in batches]).numpy()
 
     def save(self, folder: str | Path) -> None:
         """Write weights and description, see `retwin.serialisation.models`."""
@@ -70,7 +87,14 @@ class NetworkDiagnoser(nn.Module):
 
     @classmethod
     def load(cls, folder: str | Path) -> NetworkDiagnoser:
-        """Read what `save` wrote; InputError when it is not a diagnoser or damaged."""
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        InputError
+            If the folder holds no network diagnoser, or a damaged one.
+
+        """
         about, weights = read_model(folder, "diagnoser")
         model = cls(
             from_config(about["network"], NETWORKS),
@@ -82,20 +106,14 @@ class NetworkDiagnoser(nn.Module):
         return model.eval()
 
 
-DEFAULTS = {
-    "CNN": Training(max_epochs=25, batch_size=64, learning_rate=3e-3, weight_decay=1e-2),
-    "LSTMClassifier": Training(max_epochs=30, batch_size=32, learning_rate=1e-3, decay="step"),
-}
-
-
 def training_for(network: Network) -> Training:
-    """What suits the network."""
+    """The training that suits a network, see `DEFAULTS`."""
     return DEFAULTS.get(type(network).__name__, Training())
 
 
-def fit_diagnoser(
+def fit_network(
     trajectories: Trajectories,
-    network: Network = CNN(),  # noqa: B008 - a frozen config
+    network: Network,
     *,
     seed: int,
     classes: Sequence[str] | None = None,
@@ -103,33 +121,15 @@ def fit_diagnoser(
     training: Training | None = None,
     progress: Progress | None = None,
 ) -> NetworkDiagnoser:
-    """Train a classifier on labelled trajectories.
-
-    Parameters
-    ----------
-    trajectories: labelled; a stratified fifth is held out to choose the best epoch.
-    network: `CNN` or `LSTMClassifier`.
-    seed: same seed, same weights on the same machine.
-    classes: their order; by default sorted by name.
-    rate: samples per second the network looks at; by default 10 Hz or the data's, if lower.
-    training: epochs, batch, rate; by default what suits the network.
-
-    `fitted.figures` hold the `accuracy` on the held-out fifth.
-
-    Raises
-    ------
-    InputError: unlabelled trajectories, fewer than two classes, a label not among `classes`, a
-        rate that is no whole part of the data's.
-
-    """
+    """Train a network by cross-entropy; see `fit_diagnoser`."""
     order = class_order(trajectories, classes)
     features = Features.at(trajectories, rate)
     with isolated(seed):
         model = NetworkDiagnoser(network, features, classes=order)
-    # Features are split and not trajectories, which no memory may hold.
-    every, truth = features(trajectories), class_index(trajectories, order)
-    sets = [(every[part], truth[part]) for part in trajectories.split_index(0.8, seed=seed)]
-    del every
+    # Features are split and not trajectories, which may not fit into memory.
+    inputs, truth = features(trajectories), class_index(trajectories, order)
+    sets = [(inputs[part], truth[part]) for part in trajectories.split_index(0.8, seed=seed)]
+    del inputs
     model.before.fit(sets[0][0])
 
     def loss(module: nn.Module, batch: tuple[Tensor, ...]) -> Tensor:
@@ -144,6 +144,6 @@ def fit_diagnoser(
         seed=seed,
         progress=progress,
     )
-    right = model.of_features(sets[1][0]).argmax(axis=1) == sets[1][1].numpy()
-    model.fitted = replace(result, figures={"accuracy": float(right.mean())})
+    correct = model.of_features(sets[1][0]).argmax(axis=1) == sets[1][1].numpy()
+    model.fitted = replace(result, figures={"accuracy": float(correct.mean())})
     return model

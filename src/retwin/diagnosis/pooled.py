@@ -1,4 +1,4 @@
-"""`PooledDiagnoser`: the opinions of several diagnosers as one."""
+"""`PooledDiagnoser`: several diagnosers whose probabilities are combined into one distribution."""
 
 from __future__ import annotations
 
@@ -7,48 +7,56 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.diagnoser import Diagnoser
-from retwin.errors import InputError
 
 __all__ = ["PooledDiagnoser", "pool_probabilities"]
 
 FLOOR = 1e-3
-"""Least probability that a member's opinion is taken for: none may rule a class out alone.
+"""Lower bound of a member's probability, so that no member excludes a class alone.
 
-Set before any pool was scored: no member has seen thousands of real trajectories to be so sure.
+It was set before any pool was scored: no member was tested on the thousands of real trajectories
+that would justify a smaller probability.
 """
 
 
 class PooledDiagnoser:
     """The logarithmic pool of diagnosers: the normalised geometric mean of their probabilities.
 
-    p(c) ~ prod_i max(p_i(c), FLOOR)^(1/k) for k members (Genest and Zidek, Stat. Sci. 1, 114,
-    1986, section 3). Weights are equal: to choose others, labelled faults of the real machine would
-    be needed, and there are none. They sum to 1: members that look at the same outputs are no
-    independent witnesses, and where all agree the pool says what they say.
-
     Parameters
     ----------
-    members: fitted diagnosers of the same classes, each in an order of its own; the pool takes the
-        first one's.
+    members : sequence of Diagnoser
+        Fitted diagnosers of the same classes, each in an order of its own; the pool takes the
+        order of the first one.
 
     Raises
     ------
-    InputError: no member, or members of different classes.
+    InputError
+        If there is no member, or if the members have different classes.
+
+    Notes
+    -----
+    For k members, p(c) is proportional to prod_i max(p_i(c), FLOOR)^(1/k). The weights are equal:
+    choosing others would need labelled faults of the real machine. They sum to 1, because members
+    that use the same outputs are not independent: where all agree, the pool agrees with them.
+
+    References
+    ----------
+    Genest and Zidek, "Combining probability distributions", Statistical Science 1, 114 (1986),
+    section 3.
 
     """
 
     def __init__(self, members: Sequence[Diagnoser]) -> None:
         self.members = tuple(members)
-        known = [sorted(member.classes) for member in self.members]
-        if not known or any(each != known[0] for each in known):
-            raise InputError(
-                "members",
-                expected="one diagnoser or more, all of the same classes",
-                got=f"{[member.classes for member in self.members]}",
-                remedy="fit all of them with the classes of one case",
-            )
+        require(
+            len({tuple(sorted(member.classes)) for member in self.members}) == 1,
+            "members",
+            expected="one diagnoser or more, all of the same classes",
+            got=[member.classes for member in self.members],
+            remedy="fit all of them with the classes of one case",
+        )
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -57,15 +65,15 @@ class PooledDiagnoser:
 
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
         """Probabilities (n, classes), see `Diagnoser`."""
-        opinions = []
+        probabilities = []
         for member in self.members:
             order = [member.classes.index(name) for name in self.classes]
-            opinions.append(member.predict_proba(trajectories)[:, order])
-        return pool_probabilities(opinions)
+            probabilities.append(member.predict_proba(trajectories)[:, order])
+        return pool_probabilities(probabilities)
 
 
-def pool_probabilities(opinions: Sequence[NDArray]) -> NDArray:
+def pool_probabilities(probabilities: Sequence[NDArray]) -> NDArray:
     """The logarithmic pool of probabilities (..., classes), see `PooledDiagnoser`."""
-    logs = np.mean([np.log(np.maximum(each, FLOOR)) for each in opinions], axis=0)
+    logs = np.mean([np.log(np.maximum(each, FLOOR)) for each in probabilities], axis=0)
     pooled: NDArray = np.exp(logs)
     return pooled / pooled.sum(axis=-1, keepdims=True)

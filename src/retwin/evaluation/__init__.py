@@ -1,5 +1,5 @@
 """Evaluations that need a model: diagnosers on test trajectories, twins on measured ones.
 
-Belongs here: what runs a model and hands its outputs to `scores`. Not here: formulas of scores,
+Belongs here: what runs a model and passes its outputs to `scores`. Not here: formulas of scores,
 and the choice of what is compared (see `study`).
 """

@@ -3,24 +3,78 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis import Diagnoser
-from retwin.errors import InputError
 from retwin.scores.classification import Scores, score
 
-__all__ = ["evaluate"]
+__all__ = ["evaluate", "finite_probabilities"]
 
 
 def evaluate(diagnoser: Diagnoser, test: Trajectories) -> Scores:
-    """Score a diagnoser on labelled trajectories. Raises InputError for labels it does not know."""
+    """Score a diagnoser on labelled trajectories.
+
+    Parameters
+    ----------
+    diagnoser : Diagnoser
+        It predicts without the labels.
+    test : Trajectories
+        Labelled with classes of the diagnoser.
+
+    Returns
+    -------
+    Scores
+        A score that is not defined is NaN.
+
+    Raises
+    ------
+    InputError
+        If a label is not among the classes, a probability is not finite, or `predict_proba`
+        raises it.
+
+    """
     unknown = set(test.labels.tolist()) - set(diagnoser.classes)
-    if unknown:
-        raise InputError(
-            "test",
-            expected=f"labels among {', '.join(diagnoser.classes)}",
-            got=f"{sorted(unknown)}",
-            remedy="label every trajectory with a class the diagnoser was trained on",
-        )
+    require(
+        not unknown,
+        "test",
+        expected=f"labels among {', '.join(diagnoser.classes)}",
+        got=sorted(unknown),
+        remedy="label every trajectory with a class the diagnoser was trained on",
+    )
     truth = np.array([diagnoser.classes.index(label) for label in test.labels])
-    return score(truth, diagnoser.predict_proba(test), diagnoser.classes)
+    return score(truth, finite_probabilities(diagnoser, test), diagnoser.classes)
+
+
+def finite_probabilities(diagnoser: Diagnoser, trajectories: Trajectories) -> NDArray:
+    """Class probabilities that can be scored.
+
+    Parameters
+    ----------
+    diagnoser : Diagnoser
+        It predicts without the labels.
+    trajectories : Trajectories
+        n trajectories.
+
+    Returns
+    -------
+    NDArray
+        Probabilities (n, classes), all finite.
+
+    Raises
+    ------
+    InputError
+        If a probability is not finite, because its largest would be taken for a class.
+
+    """
+    probabilities = diagnoser.predict_proba(trajectories)
+    failed = trajectories.ids[~np.isfinite(probabilities).all(axis=1)].tolist()
+    require(
+        not failed,
+        "probabilities",
+        expected="finite probabilities from the diagnoser",
+        got=f"{len(failed)} trajectories with others, such as {', '.join(failed[:5])}",
+        remedy="replace sentinel values in these trajectories by NaN, or train the diagnoser anew",
+    )
+    return probabilities

@@ -1,4 +1,4 @@
-"""Conditional Gaussian mixtures (Eq. 6): context in, torch `Distribution` out."""
+"""Conditional Gaussian mixtures (Eq. 6) and events, as torch distributions, and their heads."""
 
 from __future__ import annotations
 
@@ -20,9 +20,11 @@ from torch.distributions import (
 __all__ = ["BernoulliHead", "Bernoullis", "Blocks", "GaussianMixture", "MixtureHead"]
 
 FLOOR = 0.05
-"""Least standard deviation of a component, in standard units: no component shrinks onto a point."""
-SURE = (1e-4, 1 - 1e-4)
-"""Shares beyond which a normal score goes no further."""
+"""Smallest standard deviation of a component, in standard units. It keeps a component from
+collapsing onto a single example, where its likelihood has no bound."""
+PIT_RANGE = (1e-4, 1 - 1e-4)
+"""Range to which a PIT is clipped before it becomes a normal score, which is then finite, within
+3.7 standard deviations."""
 
 
 class GaussianMixture(MixtureSameFamily):
@@ -30,9 +32,12 @@ class GaussianMixture(MixtureSameFamily):
 
     Parameters
     ----------
-    logits: (..., K), unnormalised log weights π.
-    mean: (..., K, D), μ.
-    factor: (..., K, D, D), Cholesky factor of Σ.
+    logits : Tensor
+        (..., K), unnormalised logarithms of the weights π.
+    mean : Tensor
+        (..., K, D), the means μ of the components.
+    factor : Tensor
+        (..., K, D, D), the Cholesky factors of the covariances Σ.
 
     """
 
@@ -48,7 +53,7 @@ class GaussianMixture(MixtureSameFamily):
     def expand(
         self, batch_shape: Sequence[int], _instance: Distribution | None = None
     ) -> GaussianMixture:
-        """The same mixture, repeated to a larger batch."""
+        """The same mixture for a larger batch."""
         shape = torch.Size(batch_shape)
         return GaussianMixture(
             self.mixture_distribution.logits.expand(*shape, -1),
@@ -57,13 +62,19 @@ class GaussianMixture(MixtureSameFamily):
         )
 
     def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
-        """The draw (..., D) that this noise stands for: uniform (...) in [0, 1), normal (..., D).
+        """A draw (..., D) as a function of noise, which gives the same draw on every device.
 
-        Noise is an input, so that the same noise gives the same draw anywhere.
+        Parameters
+        ----------
+        uniform : Tensor
+            (...), in [0, 1), selects the component.
+        normal : Tensor
+            (..., D), standard normal, selects the value within the component.
+
         """
         weights = self.mixture_distribution.probs
-        steps = weights.cumsum(dim=-1)
-        chosen = (uniform[..., None] >= steps).sum(dim=-1).clamp_max(weights.shape[-1] - 1)
+        cumulative = weights.cumsum(dim=-1)
+        chosen = (uniform[..., None] >= cumulative).sum(dim=-1).clamp_max(weights.shape[-1] - 1)
         size = normal.shape[-1]
         mean = self.means.gather(-2, chosen[..., None, None].expand(*chosen.shape, 1, size))[
             ..., 0, :
@@ -74,22 +85,23 @@ class GaussianMixture(MixtureSameFamily):
         return mean + (factor @ normal[..., None])[..., 0]
 
     def marginal_cdf(self, value: Tensor) -> Tensor:
-        """P(z_d <= value_d) of each component of z on its own, (..., D): the PIT of a value."""
+        """The marginal probabilities P(z_d <= value_d), (..., D): the PIT of `value`."""
         deviation = self.factor.square().sum(dim=-1).sqrt()
         distance = (value[..., None, :] - self.means) / deviation
         return (self.mixture_distribution.probs[..., None] * torch.special.ndtr(distance)).sum(-2)
 
     def normal_scores(self, value: Tensor) -> Tensor:
-        """The PIT of `value` (..., D) in standard deviations of a normal law."""
-        return torch.special.ndtri(self.marginal_cdf(value).clamp(*SURE))
+        """The quantiles (..., D) of the standard normal at the PIT of `value` (..., D)."""
+        return torch.special.ndtri(self.marginal_cdf(value).clamp(*PIT_RANGE))
 
 
 class Bernoullis(Distribution):
-    """D independent events, each 0 or 1, beside the mixtures of `Blocks`.
+    """The distribution of D independent events, each 0 or 1.
 
     Parameters
     ----------
-    logits: (..., D), log odds.
+    logits : Tensor
+        (..., D), the logarithms of the odds.
 
     """
 
@@ -107,32 +119,33 @@ class Bernoullis(Distribution):
 
     @property
     def variance(self) -> Tensor:
-        """Of each event, (..., D)."""
+        """The variance of each event, (..., D)."""
         return self.mean * (1 - self.mean)
 
     def expand(
         self, batch_shape: Sequence[int], _instance: Distribution | None = None
     ) -> Bernoullis:
-        """The same events, repeated to a larger batch."""
+        """The same events for a larger batch."""
         return Bernoullis(self.logits.expand(*batch_shape, -1))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log probability of all events together; a value between 0 and 1 counts for both."""
-        odds = nn.functional.logsigmoid
-        return (value * odds(self.logits) + (1 - value) * odds(-self.logits)).sum(dim=-1)
+        """Log probability (...) of `value` (..., D); within 0 to 1, minus its cross entropy."""
+        log_probability = nn.functional.logsigmoid
+        one, zero = log_probability(self.logits), log_probability(-self.logits)
+        return (value * one + (1 - value) * zero).sum(dim=-1)
 
     def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
-        """The draw (..., D) that this normal noise (..., D) stands for; `uniform` is not needed."""
+        """A draw (..., D) as a function of normal noise (..., D); `uniform` is not used."""
         return (torch.special.ndtr(normal) > 1 - self.mean).to(self.logits.dtype)
 
     def normal_scores(self, value: Tensor) -> Tensor:
-        """P(z_d <= value_d) of each event (..., D), in standard deviations of a normal law."""
-        share = torch.where(value < 1, 1 - self.mean, torch.ones_like(value))
-        return torch.special.ndtri(share.clamp(*SURE))
+        """The quantiles (..., D) of the standard normal at P(z_d <= value_d)."""
+        probability = torch.where(value < 1, 1 - self.mean, torch.ones_like(value))
+        return torch.special.ndtri(probability.clamp(*PIT_RANGE))
 
 
-class Law(Protocol):
-    """What `Blocks` needs of each block, beside what torch's `Distribution` has."""
+class Block(Protocol):
+    """A distribution that `Blocks` can join: torch's interface, `from_noise`, `normal_scores`."""
 
     @property
     def batch_shape(self) -> torch.Size: ...
@@ -146,7 +159,7 @@ class Law(Protocol):
     @property
     def variance(self) -> Tensor: ...
 
-    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Law: ...
+    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Block: ...
 
     def log_prob(self, value: Tensor) -> Tensor: ...
 
@@ -156,12 +169,19 @@ class Law(Protocol):
 
 
 class Blocks(Distribution):
-    """Independent distributions side by side: the distribution of their joined values (..., D)."""
+    """The joint distribution of independent blocks of z, (..., D).
+
+    Parameters
+    ----------
+    blocks : sequence of Block
+        One distribution for each block of components, with the same batch shape.
+
+    """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     support = constraints.real_vector
 
-    def __init__(self, blocks: Sequence[Law]) -> None:
+    def __init__(self, blocks: Sequence[Block]) -> None:
         self.blocks = list(blocks)
         self.widths = [block.event_shape[0] for block in self.blocks]
         super().__init__(
@@ -170,42 +190,42 @@ class Blocks(Distribution):
 
     @property
     def mean(self) -> Tensor:
-        """The mixture mean z̄ (Eq. 8), (..., D)."""
+        """The mean z̄ (Eq. 8), (..., D)."""
         return torch.cat([block.mean for block in self.blocks], dim=-1)
 
     @property
     def variance(self) -> Tensor:
-        """Variance of each component of z, (..., D)."""
+        """The variance of each component of z, (..., D)."""
         return torch.cat([block.variance for block in self.blocks], dim=-1)
 
     def block_log_prob(self, value: Tensor) -> Tensor:
-        """Log density of each block at its part of `value`, (..., blocks)."""
+        """Log density of each block at its part of `value` (..., D), (..., blocks)."""
         parts = value.split(self.widths, dim=-1)
         return torch.stack(
             [block.log_prob(part) for block, part in zip(self.blocks, parts, strict=True)], dim=-1
         )
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log density at `value` (..., D)."""
+        """Log density (...) at `value` (..., D)."""
         return self.block_log_prob(value).sum(dim=-1)
 
     def sample(
         self, sample_shape: Sequence[int] = (), *, generator: torch.Generator | None = None
     ) -> Tensor:
-        """Draws (*sample_shape, ..., D) from `generator`, or from torch's global one."""
+        """Draws (*sample_shape, ..., D) with `generator`, or with torch's global one."""
         shape = torch.Size(sample_shape) + self.batch_shape
         uniform = torch.rand(*shape, len(self.blocks), generator=generator)
         normal = torch.randn(*shape, self.event_shape[0], generator=generator)
         return self.from_noise(uniform, normal)
 
     def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
-        """The draw (..., D) that this noise stands for: uniform (..., blocks), normal (..., D)."""
+        """A draw (..., D) as a function of uniform (..., blocks) and normal (..., D) noise."""
         shape = normal.shape[:-1]
         parts = zip(self.blocks, uniform.unbind(-1), normal.split(self.widths, -1), strict=True)
         return torch.cat([block.expand(shape).from_noise(u, e) for block, u, e in parts], dim=-1)
 
     def normal_scores(self, value: Tensor) -> Tensor:
-        """The normal noise (..., D) that draws `value`, each block on its own."""
+        """The quantiles (..., D) of the standard normal at the PIT of `value` (..., D)."""
         parts = value.split(self.widths, dim=-1)
         return torch.cat(
             [block.normal_scores(part) for block, part in zip(self.blocks, parts, strict=True)], -1
@@ -213,7 +233,18 @@ class Blocks(Distribution):
 
 
 class MixtureHead(nn.Module):
-    """Encoded context (..., H) in, `GaussianMixture` over `width` components of z out."""
+    """The last layer of a mixture density network (Eq. 6).
+
+    Parameters
+    ----------
+    features : int
+        Width H of the encoded context.
+    width : int
+        Number D of components of z.
+    components : int
+        Number K of components of the mixture.
+
+    """
 
     def __init__(self, features: int, width: int, components: int) -> None:
         super().__init__()
@@ -223,7 +254,7 @@ class MixtureHead(nn.Module):
         self.linear = nn.Linear(features, components * (1 + width + self.lower))
 
     def forward(self, encoded: Tensor, shift: Tensor, scale: Tensor) -> GaussianMixture:
-        """The mixture in physical units: standard units times `scale` plus `shift`, both (D,)."""
+        """The mixture of z for contexts (..., H); `shift` and `scale` (D,) are its units."""
         raw = self.linear(encoded).unflatten(-1, (self.components, -1))
         logits, mean, lower = raw.split([1, self.width, self.lower], dim=-1)
         factor = raw.new_zeros(*raw.shape[:-1], self.width, self.width)
@@ -235,43 +266,56 @@ class MixtureHead(nn.Module):
 
     @torch.no_grad()
     def initialise(self, values: NDArray, seed: int) -> None:
-        """Start at the clusters (k-means++) of standard z (n, D), the same for every context.
+        """Start at the clusters (k-means) of z (n, D) in standard units, nearly without context.
 
-        A cluster of few points takes most of its spread from the whole: it is no law yet.
+        The variance of a cluster is shrunk towards that of all examples, which counts as two
+        examples: that of a few is no estimate.
         """
         from sklearn.cluster import KMeans
 
         count = min(self.components, len(np.unique(values, axis=0)))
-        found = KMeans(count, n_init=5, random_state=seed).fit(values)
-        whole = values.var(axis=0)
+        clusters = KMeans(count, n_init=5, random_state=seed).fit(values)
+        variance = values.var(axis=0)
         bias = torch.zeros(self.components, 1 + self.width + self.lower)
         diagonal = [i * (i + 1) // 2 + i for i in range(self.width)]
         for k in range(self.components):
-            members = values[found.labels_ == k % count]
-            spread = (len(members) * members.var(axis=0) + 2 * whole) / (len(members) + 2)
-            deviation = torch.as_tensor(np.sqrt(spread).clip(2 * FLOOR) - FLOOR)
+            members = values[clusters.labels_ == k % count]
+            shrunk = (len(members) * members.var(axis=0) + 2 * variance) / (len(members) + 2)
+            deviation = torch.as_tensor(np.sqrt(shrunk).clip(2 * FLOOR) - FLOOR)
             bias[k, 0] = np.log(len(members) / len(values))
-            bias[k, 1 : 1 + self.width] = torch.as_tensor(found.cluster_centers_[k % count])
+            bias[k, 1 : 1 + self.width] = torch.as_tensor(clusters.cluster_centers_[k % count])
             bias[k, 1 + self.width :][diagonal] = torch.log(torch.expm1(deviation)).float()
         self.linear.bias.copy_(bias.flatten())
         self.linear.weight.mul_(0.1)
 
 
 class BernoulliHead(nn.Module):
-    """Encoded context (..., H) in, `Bernoullis` of `width` events out."""
+    """The last layer of a network that predicts the probabilities of events.
+
+    Parameters
+    ----------
+    features : int
+        Width H of the encoded context.
+    width : int
+        Number D of events.
+
+    """
 
     def __init__(self, features: int, width: int) -> None:
         super().__init__()
         self.linear = nn.Linear(features, width)
 
     def forward(self, encoded: Tensor, shift: Tensor, scale: Tensor) -> Bernoullis:
-        """The events; they have no unit to shift or scale."""
+        """The events for contexts (..., H); they have no unit, `shift` and `scale` are not used."""
         return Bernoullis(self.linear(encoded))
 
     @torch.no_grad()
     def initialise(self, values: NDArray, seed: int) -> None:
-        """Start at how often each event was seen (n, D), in any context; rare ones as if shared."""
+        """Start at the frequency of each event (n, D), nearly without context.
+
+        Frequencies are shrunk towards that of all events, which counts as ten examples.
+        """
         common = (values.sum() + 0.5) / (values.size + 1)
-        share = (values.sum(axis=0) + 10 * common) / (len(values) + 10)
-        self.linear.bias.copy_(torch.as_tensor(np.log(share / (1 - share))))
+        frequency = (values.sum(axis=0) + 10 * common) / (len(values) + 10)
+        self.linear.bias.copy_(torch.as_tensor(np.log(frequency / (1 - frequency))))
         self.linear.weight.mul_(0.1)

@@ -1,8 +1,8 @@
-"""Small networks and standardisation, chosen by frozen config objects; nothing else.
+"""Small networks, each described by a frozen config object, and standardisation.
 
-A config object says what to build; `build(inputs, outputs)` makes the torch module. Sequence
-networks map (n, T, inputs) to (n, T, outputs); classifiers map (n, T, inputs) to (n, outputs), by
-a `readout` of what they `represent` of a sequence.
+`config.build(inputs, outputs)` makes the torch module. Sequence networks map (n, T, inputs) to
+(n, T, outputs). Classifiers map (n, T, inputs) to logits (n, outputs): `represent` gives the
+features of a sequence, `readout` the logits of the features.
 """
 
 from __future__ import annotations
@@ -29,23 +29,29 @@ __all__ = [
     "StateSpace",
 ]
 
-
-BLOCK = 2**22
-"""Rows that are summed up together, in double precision."""
+ROWS_PER_BLOCK = 2**22
+"""Rows whose moments are computed together: their copy in double precision takes 32 MB a
+channel."""
 
 
 class Network(Protocol):
-    """A config object that builds a network."""
+    """The interface of a network's config object."""
 
     def build(self, inputs: int, outputs: int) -> nn.Module:
-        """A module with fresh weights."""
+        """A module with random initial weights, for so many input and output channels."""
         ...
 
 
 class Standardise(nn.Module):
-    """Subtract the mean and divide by the scale of each channel; saved with the weights.
+    """Subtracts the mean of each channel and divides by its standard deviation.
 
-    A channel that never varies has scale 1.
+    The scale of a constant channel is 1. Both are buffers, saved with the weights.
+
+    Parameters
+    ----------
+    channels : int
+        Size of the last axis.
+
     """
 
     mean: Tensor
@@ -57,50 +63,66 @@ class Standardise(nn.Module):
         self.register_buffer("scale", torch.ones(channels))
 
     def fit(self, values: Tensor) -> Standardise:
-        """Take mean and standard deviation over all but the last axis, block by block."""
-        blocks = values.reshape(-1, values.shape[-1]).split(BLOCK)
-        told = [
+        """Take mean and standard deviation of `values` (..., channels), in double precision."""
+        blocks = values.reshape(-1, values.shape[-1]).split(ROWS_PER_BLOCK)
+        moments = [
             (each.mean(0), each.var(0, correction=0), each.abs().amax(0))
             for each in map(torch.Tensor.double, blocks)
         ]
-        means, variances, largest = map(torch.stack, zip(*told, strict=True))
-        share = torch.tensor([len(each) for each in blocks], dtype=torch.float64)
-        share /= share.sum()
-        mean = share @ means
-        # What varies within blocks, and from one to another.
-        scale = (share @ (variances + (means - mean).square())).sqrt()
+        means, variances, largest = map(torch.stack, zip(*moments, strict=True))
+        weight = torch.tensor([len(each) for each in blocks], dtype=torch.float64)
+        weight /= weight.sum()
+        mean = weight @ means
+        # The variance within blocks, and that between their means.
+        scale = (weight @ (variances + (means - mean).square())).sqrt()
         tiny = 1e-6 * largest.amax(dim=0).clamp_min(1e-30)
         self.mean.copy_(mean)
         self.scale.copy_(torch.where(scale > tiny, scale, torch.ones_like(scale)))
         return self
 
     def forward(self, values: Tensor) -> Tensor:
-        """Physical units in, standard units out."""
+        """`values` (..., channels) in standard units."""
         return (values - self.mean) / self.scale
 
     def inverse(self, values: Tensor) -> Tensor:
-        """Standard units in, physical units out."""
+        """`values` (..., channels) in standard units, in physical units again."""
         return values * self.scale + self.mean
 
 
 @dataclass(frozen=True)
 class MLP:
-    """The same dense network at every sample: for twins whose nominal output has no memory."""
+    """A multilayer perceptron, applied to every sample: for twins without memory.
+
+    Parameters
+    ----------
+    hidden : tuple of int
+        Widths of the hidden layers.
+
+    """
 
     hidden: tuple[int, ...] = (128, 128)
 
     def build(self, inputs: int, outputs: int) -> nn.Module:
-        """Dense layers with SiLU between."""
+        """Dense layers with SiLU activations."""
         layers: list[nn.Module] = []
         for width, following in pairwise((inputs, *self.hidden)):
-            # In place: at these sizes a processor spends as long on fresh memory as on numbers.
+            # In place: at these sizes the allocation of memory takes as long as the arithmetic.
             layers += [nn.Linear(width, following), nn.SiLU(inplace=True)]
         return nn.Sequential(*layers, nn.Linear((inputs, *self.hidden)[-1], outputs))
 
 
 @dataclass(frozen=True)
 class LSTM:
-    """Long short-term memory over time, with a dense read-out at every sample."""
+    """A long short-term memory network over time, with a dense read-out at every sample.
+
+    Parameters
+    ----------
+    hidden : int
+        Units of each layer.
+    layers : int
+        Layers in series.
+
+    """
 
     hidden: int = 64
     layers: int = 1
@@ -120,14 +142,25 @@ class _Recurrent(nn.Module):
         )
 
     def forward(self, values: Tensor) -> Tensor:
-        # The read-out sees the present input too: memory need not carry what is known anyway.
+        # The read-out has the present input too, so the memory need not represent it.
         remembered, _ = self.memory(values)
         return self.readout(torch.cat([remembered, self.direct(values)], dim=-1))
 
 
 @dataclass(frozen=True)
 class TCN:
-    """Causal dilated convolutions over time; sees 1 + (kernel - 1) (2^levels - 1) samples."""
+    """Causal dilated convolutions over 1 + (kernel - 1) (2^levels - 1) past samples.
+
+    Parameters
+    ----------
+    channels : int
+        Width of every level.
+    kernel : int
+        Samples that a convolution combines.
+    levels : int
+        Convolutions in series; the dilation doubles from each to the next.
+
+    """
 
     channels: int = 32
     kernel: int = 3
@@ -141,7 +174,7 @@ class TCN:
 class _Convolutional(nn.Module):
     def __init__(self, inputs: int, outputs: int, config: TCN) -> None:
         super().__init__()
-        self.reach = [(config.kernel - 1) * 2**i for i in range(config.levels)]
+        self.padding = [(config.kernel - 1) * 2**i for i in range(config.levels)]
         self.enter = nn.Conv1d(inputs, config.channels, 1)
         self.convolutions = nn.ModuleList(
             nn.Conv1d(config.channels, config.channels, config.kernel, dilation=2**i)
@@ -154,22 +187,35 @@ class _Convolutional(nn.Module):
 
     def forward(self, values: Tensor) -> Tensor:
         state = self.enter(values.transpose(1, 2))
-        for reach, convolution, mix in zip(self.reach, self.convolutions, self.mixers, strict=True):
-            past = functional.pad(state, (reach, 0), mode="replicate")
+        for padding, convolution, mix in zip(
+            self.padding, self.convolutions, self.mixers, strict=True
+        ):
+            past = functional.pad(state, (padding, 0), mode="replicate")
             state = state + mix(functional.silu(convolution(past)))
         return self.leave(functional.silu(state)).transpose(1, 2)
 
 
 @dataclass(frozen=True)
 class LSTMClassifier:
-    """The paper's classifier (section 4.3.2): stacked LSTM, the last step decides."""
+    """The paper's classifier (section 4.3.2): a stacked LSTM whose last state is classified.
+
+    Parameters
+    ----------
+    hidden : int
+        Units of each layer.
+    layers : int
+        Layers in series.
+    dropout : float
+        Dropout between the layers and before the read-out, from 0 to below 1.
+
+    """
 
     hidden: int = 100
     layers: int = 2
     dropout: float = 0.1
 
     def build(self, inputs: int, outputs: int) -> nn.Module:
-        """Sequence in, logits out."""
+        """A classifier with `outputs` classes."""
         return _LastStep(inputs, outputs, self)
 
 
@@ -193,14 +239,25 @@ class _LastStep(nn.Module):
 
 @dataclass(frozen=True)
 class CNN:
-    """Convolutions with pooling between, then mean and maximum over time, then a dense layer."""
+    """A classifier of convolutions with pooling, mean and maximum over time, and a dense layer.
+
+    Parameters
+    ----------
+    channels : tuple of int
+        Width of each convolution.
+    kernel : int
+        Samples that a convolution combines.
+    dropout : float
+        Dropout before the dense layer, from 0 to below 1.
+
+    """
 
     channels: tuple[int, ...] = (32, 64, 128)
     kernel: int = 5
     dropout: float = 0.2
 
     def build(self, inputs: int, outputs: int) -> nn.Module:
-        """Sequence in, logits out."""
+        """A classifier with `outputs` classes."""
         return _Pooled(inputs, outputs, self)
 
 
@@ -215,9 +272,9 @@ class _Pooled(nn.Module):
                 nn.ReLU(),
                 nn.MaxPool2d((1, 2), ceil_mode=True),
             ]
-        # No pooling behind the last one: mean and maximum over time follow.
-        # In two dimensions, one of them of length 1, channels may come last in memory, as they do
-        # in what is given: that takes two thirds of the time on a processor.
+        # No pooling after the last convolution: mean and maximum over time follow.
+        # Two-dimensional convolutions, with one axis of length 1, allow channels last in memory, as
+        # in the input: that takes two thirds of the time on a CPU.
         features = nn.Sequential(*layers[:-1])
         self.features = features.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.dropout = nn.Dropout(config.dropout)
@@ -232,4 +289,4 @@ class _Pooled(nn.Module):
 
 
 NETWORKS: tuple[type, ...] = (MLP, LSTM, TCN, StateSpace, LSTMClassifier, CNN)
-"""The kinds that a saved model may name."""
+"""The kinds of network that a saved model may name."""

@@ -1,4 +1,4 @@
-"""A neural state-space network: a small state that a dense network moves on, sample by sample."""
+"""A neural state-space network: a small state with a learned transition from sample to sample."""
 
 from __future__ import annotations
 
@@ -13,17 +13,20 @@ __all__ = ["StateSpace"]
 
 @dataclass(frozen=True)
 class StateSpace:
-    """x_{t+1} = x_t + r (A x_t + B u_t + f(x_t, u_t)), y_t = C x_t + h(x_t): for hidden states.
+    """x_{t+1} = x_t + r (A x_t + B u_t + f(x_t, u_t)), y_t = C x_t + h(x_t).
 
-    f and h have one hidden layer: what is linear need not be learned by them. The state of the
-    first sample is learned, the same for every record, as the twin's is. Unlike an `LSTM` it has no
-    more memory than it has states, each with a rate r of its own.
+    f and h have one hidden layer; A, B and C are the linear part. Each state has an inverse time
+    constant r of its own. The initial state is learned and the same for every record, as the
+    twin's is.
 
     Parameters
     ----------
-    states: more than the twin has do no harm.
-    hidden: width of f and of h.
-    slowest: time of the slowest state at first, in samples; the others' are spread down to two.
+    states : int
+        Number of states; it may exceed that of the twin.
+    hidden : int
+        Width of the hidden layers of f and h.
+    slowest : float
+        Largest initial time constant, in samples; the others are spread geometrically down to 2.
 
     """
 
@@ -41,8 +44,8 @@ class _States(nn.Module):
         super().__init__()
         states, hidden = config.states, config.hidden
         self.start = nn.Parameter(torch.zeros(states))
-        rates = torch.logspace(-math.log10(config.slowest), math.log10(0.5), states)
-        self.log_rate = nn.Parameter(rates.log())
+        inverse_times = torch.logspace(-math.log10(config.slowest), math.log10(0.5), states)
+        self.log_rate = nn.Parameter(inverse_times.log())
         self.enter = nn.Linear(inputs, states + hidden)
         self.now = nn.Linear(states, states + hidden, bias=False)
         self.move = nn.Linear(hidden, states, bias=False)
@@ -54,12 +57,13 @@ class _States(nn.Module):
             self.now.weight[:states] = -torch.eye(states)
 
     def forward(self, values: Tensor) -> Tensor:
-        rate, size = self.log_rate.exp(), len(self.start)
+        # The parameter is named `log_rate` in saved weights.
+        inverse_times, size = self.log_rate.exp(), len(self.start)
         state = self.start.expand(len(values), -1)
         states = []
         for entered in self.enter(values).unbind(dim=1):
             states.append(state)
             linear, inside = (entered + self.now(state)).split([size, entered.shape[1] - size], 1)
-            state = state + rate * (linear + self.move(torch.tanh(inside)))
-        seen = torch.stack(states, dim=1)
-        return self.skip(seen) + self.readout(seen)
+            state = state + inverse_times * (linear + self.move(torch.tanh(inside)))
+        trajectory = torch.stack(states, dim=1)
+        return self.skip(trajectory) + self.readout(trajectory)

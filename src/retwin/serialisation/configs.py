@@ -1,6 +1,8 @@
-"""Frozen config objects as plain values and back, for a closed list of kinds: files run no code.
+"""Config objects as plain values and back: frozen dataclasses, validated by pydantic.
 
-The values are those of JSON or TOML: tables, lists, texts and numbers.
+Plain values are those of JSON and TOML: tables, lists, texts and numbers. A config object inside
+another one is a table whose `kind` is one class of a closed list, so that reading runs no code that
+a file names.
 """
 
 from __future__ import annotations
@@ -9,42 +11,42 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, fields, is_dataclass
-from types import NoneType
-from typing import Any, TypeVar, get_args, get_type_hints
+from functools import cache, partial
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from pydantic import BaseModel, ConfigDict, PlainValidator, ValidationError, create_model
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from retwin.checks import one_of, require
 from retwin.errors import InputError
 
-__all__ = [
-    "at",
-    "checked",
-    "fits",
-    "from_config",
-    "from_settings",
-    "key",
-    "named",
-    "table",
-    "to_config",
-]
+__all__ = ["at", "checked", "fits", "from_config", "from_settings", "key", "to_config"]
 
 T = TypeVar("T")
 
 RENAMED_KINDS = {"SteadyStateError": "ActuatorBias"}
 """Kinds in files of versions before 0.1.0, and their present names."""
 RENAMED_SETTINGS = {
+    "RampSampler": {"movements": "segments"},
     "Training": {"epochs": "max_epochs", "batch": "batch_size", "rate": "learning_rate"},
 }
 """Per kind, settings in files of versions before 0.1.0, and their present names."""
 
 
 def to_config(value: Any, kinds: Sequence[type]) -> dict[str, Any]:
-    """The settings of a frozen dataclass and of those inside it.
+    """The settings of a frozen dataclass and of the config objects inside it, as plain values.
 
-    Raises InputError for a kind that could not be loaded again.
+    Raises
+    ------
+    InputError
+        The object, or one inside it, is of no class of `kinds` and could not be read again.
+
     """
     if type(value) not in kinds:
         raise InputError(
             "config",
-            expected=f"one of {_names(kinds)}, to be saved",
+            expected=f"one of {', '.join(kind.__name__ for kind in kinds)}, to be saved",
             got=type(value).__name__,
             remedy="use the model without saving it: loading runs no code that a file names",
         )
@@ -54,94 +56,68 @@ def to_config(value: Any, kinds: Sequence[type]) -> dict[str, Any]:
 
 
 def from_config(values: Mapping[str, Any], kinds: Sequence[type], *, place: str = "config") -> Any:
-    """The object that `to_config` told of: its `kind` is a class, the rest are its parameters.
+    """The object that `to_config` described.
 
-    Raises InputError, about `place`, for an unknown kind and for what `from_settings` refuses.
+    Parameters
+    ----------
+    values : mapping of str to plain values
+        A `kind`, which names a class of `kinds`, and parameters of that class.
+    kinds : sequence of type
+        The dataclasses that may be made.
+    place : str
+        What messages name before the key, such as "case.toml:".
+
+    Raises
+    ------
+    InputError
+        The kind is unknown, a parameter is unknown, missing or of another type, or the class
+        refuses its parameters. The message names `place` and the key.
+
     """
     known = {kind.__name__: kind for kind in kinds}
-    kind = values.get("kind")
-    kind = RENAMED_KINDS.get(kind, kind) if isinstance(kind, str) else kind
-    if not isinstance(kind, str) or kind not in known:
-        raise InputError(
-            key(place, "kind"),
-            expected=f"one of {_names(kinds)}",
-            got=repr(kind),
-            remedy="check the spelling; a model loads with the version of retwin that wrote it",
-        )
-    settings = {name: value for name, value in values.items() if name != "kind"}
-    return from_settings(known[kind], settings, kinds, place=place)
+    name: Any = values.get("kind")
+    name = one_of(
+        key(place, "kind"),
+        RENAMED_KINDS.get(name, name) if isinstance(name, str) else name,
+        known,
+        remedy="check the spelling; a model loads with the version of retwin that wrote it",
+    )
+    settings = {each: value for each, value in values.items() if each != "kind"}
+    return from_settings(known[name], settings, kinds, place=place)
 
 
 def from_settings(
     kind: type[T], settings: Mapping[str, Any], kinds: Sequence[type] = (), *, place: str
 ) -> T:
-    """A dataclass from its parameters by name, each checked against its type.
+    """An object of the dataclass `kind` from its parameters by name.
 
-    Raises InputError, about `place` and the parameter, for a missing one, for what `checked`
-    refuses, and for what the class itself refuses.
+    Config objects among the parameters are of `kinds`, or of the one class that the type of the
+    parameter names. Raises as `from_config` does.
     """
-    made = checked(kind, settings, kinds, place=place)
-    for each in fields(kind):  # type: ignore[arg-type]
-        optional = each.default is not MISSING or each.default_factory is not MISSING
-        if not optional and each.name not in made:
-            raise InputError(
-                key(place, each.name),
-                expected="a value",
-                got="none",
-                remedy=f"give it: {_name(kind)} cannot be without",
-            )
+    made = _validated(_model(kind, tuple(kinds)), settings, place)  # type: ignore[arg-type]
     with at(place):
         return kind(**made)
 
 
 def checked(
-    kind: type,
-    settings: Mapping[str, Any],
-    kinds: Sequence[type] = (),
-    *,
-    place: str,
-    besides: Sequence[str] = (),
+    kind: type, settings: Mapping[str, Any], *, place: str, besides: Sequence[str]
 ) -> dict[str, Any]:
-    """Parameters of a dataclass by name, lists as tuples, each of the type it should have.
+    """Some parameters of the dataclass `kind`, lists as tuples, each of the type it should have.
 
-    A parameter that is a config object itself is a table, with a `kind` of `kinds` where the type
-    leaves it open. Raises InputError, about `place` and the parameter, for unknown ones and those
-    named in `besides`, and for values of another type.
+    Raises InputError for unknown parameters, for those named in `besides`, and for values of
+    another type. The message names `place` and the key.
     """
-    hints = get_type_hints(kind)
-    known = [each.name for each in fields(kind) if each.name not in besides]
-    made = {}
-    renamed = RENAMED_SETTINGS.get(kind.__name__, {})
-    for given, value in table(settings, place).items():
-        name = renamed.get(given, given)
-        if name not in known:
-            raise InputError(
-                key(place, name),
-                expected=f"one of {', '.join(known)}",
-                got="an unknown key",
-                remedy="check the spelling, or leave it out",
-            )
-        made[name] = _setting(value, hints[name], kinds, key(place, name))
-    return made
-
-
-def table(value: Any, place: str) -> dict[str, Any]:
-    """`value`, which must be a table; InputError, about `place`, when it is not."""
-    if not isinstance(value, Mapping):
-        raise InputError(
-            place, expected="a table", got=repr(value), remedy="write { key = value, … }"
-        )
-    return dict(value)
+    return _validated(_model(kind, (), tuple(besides)), settings, place)
 
 
 def key(place: str, name: str) -> str:
     """The name of a key in messages: "case.toml: density", then "case.toml: density.members"."""
-    return f"{place} {name}" if place.endswith(":") else f"{place}.{name}"
+    return f"{place} {name}" if place.endswith(":") else f"{place}.{name}".removeprefix(".")
 
 
 @contextmanager
 def at(place: str) -> Iterator[None]:
-    """What is wrong with an argument inside is wrong with that key of `place`."""
+    """Raise the InputErrors of the block about that key of `place` which their argument names."""
     try:
         yield
     except InputError as error:
@@ -152,74 +128,98 @@ def at(place: str) -> Iterator[None]:
         ) from None
 
 
-def _setting(value: Any, hint: Any, kinds: Sequence[type], place: str) -> Any:
-    """A setting as it was before JSON or TOML, which know neither tuples nor our kinds."""
-    arms = get_args(hint) or (hint,)
-    configs = [arm for arm in arms if is_dataclass(arm) or _is_protocol(arm)]
-    if not configs:
-        return _plain(value, hint, place)
-    if type(value) in (arm for arm in arms if arm in (str, NoneType)):
-        return value
-    if isinstance(value, Mapping):
-        if "kind" not in value and len(configs) == 1 and is_dataclass(configs[0]):
-            return from_settings(configs[0], value, kinds, place=place)  # type: ignore[arg-type]
-        made = from_config(value, kinds, place=place)
-        if any(fits(made, arm) for arm in configs):
-            return made
-    names = " or ".join(map(_name, configs))
-    raise _wrong(place, f"a table whose kind is a {names}", repr(value))
-
-
-def _plain(value: Any, hint: Any, place: str) -> Any:
-    """A number, a text, a list or table of them."""
-    # Here and not above: many commands do without it.
-    from pydantic import ConfigDict, TypeAdapter, ValidationError
-
-    exactly = ConfigDict(strict=True, arbitrary_types_allowed=True)  # a text is no number
-    try:
-        return TypeAdapter(hint, config=exactly).validate_python(_tuples(value))
-    except ValidationError as error:
-        told = {each["msg"].removeprefix("Input should be "): None for each in error.errors()}
-        raise _wrong(place, " or ".join(told), repr(value)) from None
+def fits(value: Any, hint: Any) -> bool:
+    """Whether `value` is of that class, or has the public members of that protocol."""
+    if _is_protocol(hint):
+        return all(hasattr(value, name) for name in vars(hint) if not name.startswith("_"))
+    return isinstance(value, hint)
 
 
 def _is_protocol(hint: Any) -> bool:
     return getattr(hint, "_is_protocol", False)
 
 
-def fits(value: Any, hint: Any) -> bool:
-    """Whether `value` is of that class, or has what that protocol asks for."""
-    if _is_protocol(hint):
-        return all(hasattr(value, name) for name in vars(hint) if not name.startswith("_"))
-    return isinstance(value, hint)
+def _validated(model: type[BaseModel], settings: Any, place: str) -> dict[str, Any]:
+    """The parameters of `model` that `settings` hold; InputError about the first bad key."""
+    require(
+        isinstance(settings, Mapping),
+        place,
+        expected="a table",
+        got=repr(settings),
+        remedy="write { key = value, … }",
+    )
+    renamed = RENAMED_SETTINGS.get(model.__name__, {})
+    given = {renamed.get(name, name): value for name, value in settings.items()}
+    for name in given:
+        one_of(key(place, name), name, model.model_fields, remedy="check the spelling")
+    try:
+        made = model.model_validate(_tuples(given))
+        return {name: getattr(made, name) for name in made.model_fields_set}
+    except ValidationError as error:
+        errors = error.errors(include_url=False)
+    name = str(errors[0]["loc"][0])
+    where = key(place, name)
+    require(name in given, where, expected="a value", got="none", remedy="give it: it is needed")
+    errors = [each for each in errors if each["loc"][0] == name]
+    for each in errors:
+        if "error" in each.get("ctx", {}):  # an InputError from inside a config object
+            with at(where):
+                raise each["ctx"]["error"]
+    raise InputError(
+        where,
+        expected=" or ".join(dict.fromkeys(map(_expected, errors))),
+        got=repr(given[name]),
+        remedy="see what this key may hold",
+    )
+
+
+def _expected(error: ErrorDetails) -> str:
+    """What pydantic expected, in the words of TOML."""
+    text = {"missing": "more items", "too_long": "fewer items"}.get(error["type"], error["msg"])
+    return re.sub("dictionary|mapping", "table", text.removeprefix("Input should be "))
+
+
+@cache
+def _model(
+    kind: type, kinds: tuple[type, ...], besides: tuple[str, ...] | None = None
+) -> type[BaseModel]:
+    """What validates all parameters of `kind`, or any of them besides some."""
+    hints = get_type_hints(kind)
+    settings: dict[str, Any] = {}
+    for each in fields(kind):
+        if each.name not in (besides or ()):
+            needed = besides is None and each.default is each.default_factory is MISSING
+            settings[each.name] = (_setting(hints[each.name], kinds), ... if needed else None)
+    exactly = ConfigDict(strict=True, arbitrary_types_allowed=True)  # a text is no number
+    return create_model(kind.__name__, __config__=exactly, **settings)
+
+
+def _setting(hint: Any, kinds: tuple[type, ...]) -> Any:
+    """The type of a parameter, in which config objects are read from tables."""
+    union = isinstance(hint, UnionType) or get_origin(hint) is Union
+    arms = get_args(hint) if union else (hint,)
+    configs = tuple(arm for arm in arms if is_dataclass(arm) or _is_protocol(arm))
+    if not configs:
+        return hint
+    table = Annotated[Any, PlainValidator(partial(_config, configs, kinds))]
+    return Union[(table, *(arm for arm in arms if arm not in configs))]
+
+
+def _config(hints: tuple[Any, ...], kinds: tuple[type, ...], value: Any) -> Any:
+    """The config object of one of `hints` that a table describes; messages begin with its keys."""
+    if isinstance(value, Mapping):
+        classes = tuple(hint for hint in hints if not _is_protocol(hint))
+        if "kind" not in value and len(hints) == len(classes) == 1:
+            return from_settings(classes[0], value, kinds, place="")
+        made = from_config(value, (*classes, *kinds), place="")
+        if any(fits(made, hint) for hint in hints):
+            return made
+    names = " or ".join(hint.__name__ for hint in hints)
+    raise PydanticCustomError("config", f"a table whose kind is a {names}")
 
 
 def _tuples(value: Any) -> Any:
     """Lists as tuples, also those in tables and in lists."""
     if isinstance(value, Mapping):
         return {name: _tuples(each) for name, each in value.items()}
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
-
-
-def _wrong(place: str, expected: str, got: str) -> InputError:
-    return InputError(place, expected=expected, got=got, remedy="see what this key may hold")
-
-
-def named(name: str, known: Mapping[str, T], argument: str) -> T:
-    """What goes by that name; InputError, about `argument`, when nothing does."""
-    if not isinstance(name, str) or name not in known:
-        raise InputError(
-            argument,
-            expected=f"one of {', '.join(known)}",
-            got=repr(name),
-            remedy="check the spelling",
-        )
-    return known[name]
-
-
-def _names(kinds: Sequence[type]) -> str:
-    return ", ".join(map(_name, kinds))
-
-
-def _name(kind: Any) -> str:
-    return getattr(kind, "__name__", str(kind))
+    return tuple(map(_tuples, value)) if isinstance(value, list | tuple) else value

@@ -1,4 +1,4 @@
-"""What an object is, as a SHA-256 that is the same in another process: is this the same plan?"""
+"""Digests of objects that are equal in all processes, to recognise the same plan or data."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from retwin.serialisation.files import sha256
 
 __all__ = ["identity"]
 
-DEEPEST = 12
-"""Levels of objects within objects; deeper ones are told by their kind alone."""
+MAX_DEPTH = 12
+"""Levels of nested objects; of deeper ones only the class counts, which ends cycles."""
 
 
 def identity(value: object) -> str:
-    """The SHA-256 of what `value` is: kind, settings, arrays, weights, contents of its files.
+    """The SHA-256 of an object: its class, settings, arrays, weights and the contents of its files.
 
-    An object whose files name other files tells in `fingerprint`, a text, what it is with those.
-    A function or class is known by its name. Not by pickle, which depends on what happens to be
-    the same object, and is silent on files.
+    An object whose files name other files has a text `fingerprint` that depends on those. Functions
+    and classes count by their names. Pickle is not used, since its bytes depend on which parts are
+    the same object, and not on the contents of files.
     """
-    text = json.dumps(_told(value, DEEPEST), sort_keys=True)
+    text = json.dumps(_described(value, MAX_DEPTH), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _told(value: Any, deep: int) -> Any:
+def _described(value: Any, depth: int) -> Any:
     """`value` as JSON."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -41,20 +41,20 @@ def _told(value: Any, deep: int) -> Any:
         value = value.tolist()
     if isinstance(value, np.generic | np.ndarray):
         array = np.ascontiguousarray(value)
-        numbers = array.reshape(-1).view(np.uint8).data  # as they lie there: they may be a map
+        numbers = array.reshape(-1).view(np.uint8).data  # without a copy: it may be a memory map
         return [array.dtype.str, list(array.shape), hashlib.sha256(numbers).hexdigest()]
     if isinstance(value, Path):
         return sha256(value) if value.exists() else str(value)
-    if deep == 0:
+    if depth == 0:
         return _kind(value)
     if isinstance(value, Mapping):
-        return [[str(key), _told(each, deep - 1)] for key, each in value.items()]
+        return [[str(key), _described(each, depth - 1)] for key, each in value.items()]
     if isinstance(value, list | tuple):
-        return [_told(each, deep - 1) for each in value]
+        return [_described(each, depth - 1) for each in value]
     if hasattr(value, "__qualname__") and not isinstance(value, MethodType):  # function or class
         return f"{value.__module__}:{value.__qualname__}"
-    fingerprint = _told(getattr(value, "fingerprint", ""), 0)
-    return [_kind(value), _told(_contents(value), deep - 1), fingerprint]
+    fingerprint = _described(getattr(value, "fingerprint", ""), 0)
+    return [_kind(value), _described(_contents(value), depth - 1), fingerprint]
 
 
 def _contents(value: Any) -> Any:
@@ -64,7 +64,7 @@ def _contents(value: Any) -> Any:
         return [value.func, value.args, value.keywords]
     if dataclasses.is_dataclass(value):
         return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    if hasattr(value, "state_dict"):  # a network: what is private there is torch's bookkeeping
+    if hasattr(value, "state_dict"):  # a network, whose private attributes belong to torch
         public = {name: each for name, each in vars(value).items() if name[0] != "_"}
         weights = {name: np.asarray(each) for name, each in value.state_dict().items()}
         return [public, repr(value), weights]

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from retwin.checks import require
 from retwin.errors import InputError
 from retwin.serialisation.files import write_atomically
 
@@ -17,15 +18,33 @@ if TYPE_CHECKING:
 __all__ = ["kind_of", "read_about", "read_model", "write_model"]
 
 SCHEMA = 1
+"""The version of the layout of model folders."""
 
 
 @contextmanager
 def write_model(
     folder: str | Path, kind: str, about: dict[str, Any], weights: dict[str, Tensor]
 ) -> Iterator[Path]:
-    """Write `folder`/model.json and `folder`/weights.safetensors, moved into place when whole.
+    """Write `folder`/model.json and `folder`/weights.safetensors, whole or not at all.
 
-    Inside the `with` block more can be put into the folder that is given.
+    Yields the temporary folder, to which more files can be written.
+
+    Parameters
+    ----------
+    folder : path
+        The folder to make or replace.
+    kind : str
+        The kind of the model, which `read_model` checks.
+    about : dict
+        Its description, as JSON values.
+    weights : dict of str to torch.Tensor
+        Its parameters; no file is written for none.
+
+    Raises
+    ------
+    InputError
+        See `write_atomically`.
+
     """
     from safetensors.torch import save_file
 
@@ -42,7 +61,11 @@ def write_model(
 def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Description and weights of a model folder.
 
-    Raises InputError when the folder is missing, damaged, newer, or holds another kind of model.
+    Raises
+    ------
+    InputError
+        The folder is missing, damaged, of another schema, or holds another kind of model.
+
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
@@ -61,13 +84,13 @@ def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str,
             remedy=remedy,
         ) from None
     found = (about.get("schema"), about.get("kind")) if isinstance(about, dict) else (None, None)
-    if found != (SCHEMA, kind):
-        raise InputError(
-            str(folder),
-            expected=f"a {kind} model of schema {SCHEMA}",
-            got=f"kind {found[1]!r}, schema {found[0]!r}",
-            remedy=remedy,
-        )
+    require(
+        found == (SCHEMA, kind),
+        str(folder),
+        expected=f"a {kind} model of schema {SCHEMA}",
+        got=f"kind {found[1]!r}, schema {found[0]!r}",
+        remedy=remedy,
+    )
     return about, weights
 
 
@@ -77,7 +100,7 @@ def read_about(folder: str | Path, kind: str) -> dict[str, Any]:
 
 
 def kind_of(folder: str | Path) -> str:
-    """What kind of model a folder says it holds; empty where it says nothing."""
+    """The kind in the model.json of a folder; "" if there is none."""
     try:
         about = json.loads((Path(folder) / "model.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -1,7 +1,7 @@
 """Studies: sources compared over runs and folds, resumable, with one results.json.
 
-Belongs here: the plan, the graph of jobs, what a source may see, and how answers are collected.
-Not here: formulas of scores, and sources' names, which stand in `retwin.catalog`.
+Belongs here: the plan, the graph of jobs, access of sources to real data, and the collection of
+answers. Not here: formulas of scores, and the names of sources, which `retwin.catalog` declares.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from retwin.cases.case import Case
-from retwin.catalog import SOURCES
+from retwin.catalog import CLASSIFIERS, SOURCES
+from retwin.checks import at_least, require, whole
 from retwin.data.io import load, save
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
@@ -27,30 +28,40 @@ from retwin.study.files import Files, Roles
 from retwin.study.plan import StudyPlan
 from retwin.study.pool import run_jobs
 from retwin.study.results import write_results
-from retwin.study.sources import lacking
+from retwin.study.sources import lacking, not_installed
 from retwin.study.work import Work
 from retwin.update.corrected import generate
-from retwin.update.surrogate import ENOUGH
+from retwin.update.surrogate import MIN_TRAJECTORIES
 
 __all__ = ["StudyData", "StudyPlan", "possible_sources", "run_study"]
 
 Report = Callable[[str, float], None]
-"""Called with what is going on and the share that is done."""
+"""Called with the name of the present stage and the share that is done."""
 
 EMULATED_PER_CLASS = 10
+"""Emulated trajectories per class where there are no real ones: 90 for the arm, as measured."""
 
 
 @dataclass(frozen=True)
 class StudyData:
-    """Where a study's data are; see docs/theory.md, How a study scores.
+    """The files of a study; see docs/theory.md, How a study scores.
 
     Parameters
     ----------
-    twin: recorded or simulated trajectories; None simulates them with the case's twin.
-    calibration, test: two real sets.
-    real: one real set, split into folds; every trajectory is tested once. Without any real set the
-        case's emulator makes one, which is labelled "emulated" everywhere.
-    records: one file that the case itself splits into what calibrates and what tests.
+    twin : Path, optional
+        Recorded or simulated trajectories; by default the case's twin simulates them.
+    calibration, test : Path, optional
+        Two real sets.
+    real : Path, optional
+        One real set, which is split into folds; every trajectory is tested once. Without any real
+        set the case's emulator makes one, which is labelled "emulated" everywhere.
+    records : Path, optional
+        One file that the case itself splits into calibration and test set.
+
+    Raises
+    ------
+    InputError
+        If the real data are given in two ways, or a calibration set without a test set.
 
     """
 
@@ -62,14 +73,13 @@ class StudyData:
 
     def __post_init__(self) -> None:
         given = {name for name, file in vars(self).items() if file is not None} - {"twin"}
-        if given not in ({"calibration", "test"}, {"real"}, {"records"}, set()):
-            raise InputError(
-                "real data",
-                expected="either calibration and test, or real alone, or records alone",
-                got=", ".join(sorted(given)),
-                remedy="give --calibration FILE --test FILE, or --real FILE --folds K, "
-                "or --data FILE",
-            )
+        require(
+            given in ({"calibration", "test"}, {"real"}, {"records"}, set()),
+            "real data",
+            expected="either calibration and test, or real alone, or records alone",
+            got=", ".join(sorted(given)),
+            remedy="give --calibration FILE --test FILE, or --real FILE --folds K, or --data FILE",
+        )
 
 
 def run_study(
@@ -82,41 +92,55 @@ def run_study(
     report: Report | None = None,
     command: str = "",
 ) -> Results:
-    """Run or resume a study; writes `results.json` and `arrays.npz` in `out`, returns the former.
+    """Run or resume a study; write `results.json` and `arrays.npz` in `out`.
 
     Parameters
     ----------
-    case: the system.
-    plan: what is compared, and the seed.
-    data: where the data are.
-    out: folder; a second call with the same plan and data goes on where the first one stopped. It
-        may ask for other sources, more runs, or a learning curve: what is there is kept.
-    processes: jobs at a time, one thread each; by default one per core.
-    report: told what is going on.
-    command: how the study was called, for the record.
+    case : Case
+        The system.
+    plan : StudyPlan
+        What is compared, and the seed.
+    data : StudyData
+        The files.
+    out : str or Path
+        A folder. A second call with the same plan and data continues where the first one stopped.
+        Its plan may name other sources, more runs, or a learning curve; finished results are kept.
+    processes : int, optional
+        Jobs at a time, one thread each, at least 1; by default one per core.
+    report : callable, optional
+        Called with the name of the present stage and the share that is done.
+    command : str
+        The call of the study, for the provenance.
+
+    Returns
+    -------
+    Results
+        The contents of `results.json`.
 
     Raises
     ------
-    InputError: bad data; or `out` holds another study.
+    InputError
+        If data or plan do not suit the case, if `out` holds another study, or if `processes` is
+        below 1.
 
     """
+    workers = (os.cpu_count() or 1) if processes is None else whole("processes", processes, least=1)
     out = Path(out)
-    tell = report or (lambda _text, _share: None)
-    ours = _identity(case, plan, _digests(data))
-    _check_free(out, ours)
+    report = report or (lambda _stage, _share: None)
+    digests = _digests(data)
+    found = _identity(case, plan, digests)
+    _check_free(out, found)
     _check_possible(case, plan)
     work_folder = out / "work"
     if not (work_folder / "roles.json").exists():
-        _prepare(case, plan, data, out, ours, tell)
+        _prepare(case, plan, data, out, found, report)
     roles = Roles.of(json.loads((work_folder / "roles.json").read_text("utf-8")))
     _check_healthy(plan, Files(work_folder).real_data(), roles)
     work = Work(work_folder, case, plan, roles)
-    run_jobs(work, processes or os.cpu_count() or 1, tell)
-    tell("scores", 1.0)
+    run_jobs(work, workers, report)
+    report("scores", 1.0)
     provenance = {"command": command, "seed": plan.seed}
-    return write_results(
-        work, out, about=_about(case, plan, data, ours["data"]), provenance=provenance
-    )
+    return write_results(work, out, about=_about(case, plan, data, digests), provenance=provenance)
 
 
 def _digests(data: StudyData) -> dict[str, dict[str, str]]:
@@ -129,29 +153,28 @@ def _digests(data: StudyData) -> dict[str, dict[str, str]]:
 
 
 def _identity(case: Case, plan: StudyPlan, digests: Mapping[str, Any]) -> dict[str, Any]:
-    """What decides the result of every job, as plain JSON values.
+    """All that determines the result of every job, as plain JSON values.
 
-    Two studies are the same if it is. The case counts with all it holds, functions by their names.
-    Which sources and how many runs there are decides none of
-    them, so a study may grow.
+    Two studies are the same if these are equal. The case contributes all its fields, functions by
+    their names. Sources, runs and learning curve add jobs but change none, so a study may grow.
     """
-    grows = ("sources", "runs", "learning_curve")
-    fixed = {key: value for key, value in asdict(plan).items() if key not in grows}
-    known = {"name": case.name, "sha256": identity(case)}
-    told = {"case": known, "plan": fixed, "data": digests}
-    plain: dict[str, Any] = json.loads(json.dumps(told))
+    additive = ("sources", "runs", "learning_curve")
+    fixed = {key: value for key, value in asdict(plan).items() if key not in additive}
+    system = {"name": case.name, "sha256": identity(case)}
+    values = {"case": system, "plan": fixed, "data": digests}
+    plain: dict[str, Any] = json.loads(json.dumps(values))
     return plain
 
 
-def _check_free(out: Path, ours: Mapping[str, Any]) -> None:
-    """Make sure that `out` is new or holds this very study."""
+def _check_free(out: Path, expected: Mapping[str, Any]) -> None:
+    """Require that `out` is new or holds the study of this identity."""
     file = out / "study.json"
     if file.exists():
         try:
-            theirs = json.loads(file.read_text("utf-8"))
+            present = json.loads(file.read_text("utf-8"))
         except ValueError:
-            theirs = None
-        if theirs == ours:
+            present = None
+        if present == expected:
             return
         got = f"{out}, which holds a study with another plan or other data"
     elif out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -160,59 +183,81 @@ def _check_free(out: Path, ours: Mapping[str, Any]) -> None:
         return
     raise InputError(
         "out",
-        expected="a new folder, or the folder of this very study",
+        expected="a new folder, or the folder of the same study",
         got=got,
         remedy="give another folder, or remove this one",
     )
 
 
 def _check_possible(case: Case, plan: StudyPlan) -> None:
-    """Find out before hours of work what cannot be done."""
-    if plan.encoder_noise and case.encoder_noise is None:
-        raise InputError(
-            "encoder_noise",
-            expected="0 for a case that cannot tell what a joint's reading does to its outputs",
-            got=repr(plan.encoder_noise),
-            remedy=f"leave it out for the case {case.name!r}",
-        )
+    """Refuse, before hours of work, what the case or the classifier does not permit."""
+    require(
+        plan.encoder_noise == 0 or case.encoder_noise is not None,
+        "encoder_noise",
+        expected="0 for a case that does not state how encoder noise changes its outputs",
+        got=plan.encoder_noise,
+        remedy=f"leave it out for the case {case.name!r}",
+    )
+    package = not_installed(CLASSIFIERS[plan.classifier_name].extra) if case.diagnosed else ""
+    require(
+        not package,
+        "classifier",
+        expected=f"for {plan.classifier_name!r} {package}",
+        got="no such package",
+        remedy="install it, or take another classifier",
+    )
     for name in plan.sources:
         missing = lacking(name, case, plan)
-        if missing:
-            raise InputError(
-                "sources",
-                expected=f"for {name!r} {missing}",
-                got=f"{name!r}",
-                remedy="leave it out, or say 'all' for those that are possible",
-            )
+        require(
+            not missing,
+            "sources",
+            expected=f"for {name!r} {missing}",
+            got=repr(name),
+            remedy="leave it out, or give 'all' for those that are possible",
+        )
 
 
 def possible_sources(case: Case, plan: StudyPlan) -> tuple[str, ...]:
-    """Every source that a study of this case and with this classifier can have, in order."""
+    """The sources that a study of a case can have.
+
+    Parameters
+    ----------
+    case : Case
+        The system.
+    plan : StudyPlan
+        Its classifier must suit the sources.
+
+    Returns
+    -------
+    tuple of str
+        Keys of `retwin.catalog.SOURCES` in its order.
+
+    """
     return tuple(name for name in SOURCES if not lacking(name, case, plan))
 
 
 def _prepare(
-    case: Case, plan: StudyPlan, data: StudyData, out: Path, ours: Mapping[str, Any], tell: Report
+    case: Case,
+    plan: StudyPlan,
+    data: StudyData,
+    out: Path,
+    found: Mapping[str, Any],
+    report: Report,
 ) -> None:
-    """Read all data, then put them, with commands, where the jobs find them; decide the roles.
+    """Read and check all data, then write them with commands for the jobs, and the roles.
 
-    Nothing is written before everything is read and found good. The roles come last: where they
-    are, all is.
+    Nothing is written before everything is checked. The roles are written last, so that their
+    file marks the folder as complete.
     """
-    real, roles = _real(case, plan, data, tell)
+    real, roles = _real(case, plan, data, report)
     _check_healthy(plan, real, roles)
-    twin = _twin(case, plan, data, tell)
-    if len(twin) < ENOUGH:
-        raise InputError(
-            "twin-data",
-            expected=f"at least {ENOUGH} trajectories of the twin",
-            got=f"{len(twin)}",
-            remedy="give more of them, or a larger per_class",
-        )
+    twin = _twin(case, plan, data, report)
+    remedy = "give more of them, or a larger per_class"
+    at_least("twin-data", twin, MIN_TRAJECTORIES, "trajectories of the twin", remedy=remedy)
     with write_atomically(out / "study.json") as part:
-        part.write_text(json.dumps(ours, indent=1), encoding="utf-8")
+        part.write_text(json.dumps(found, indent=1), encoding="utf-8")
     save(real, out / "work" / "real.npz")
-    # What may not fit into memory stays in the format that is read without.
+    # A set that may not fit into memory stays in Zarr, which is read in chunks.
     large = data.twin is not None and (data.twin / "zarr.json").exists()
     save(twin, out / "work" / ("twin.zarr" if large else "twin.npz"))
     with write_atomically(out / "work" / "roles.json") as part:
@@ -222,7 +267,7 @@ def _prepare(
 def _about(
     case: Case, plan: StudyPlan, data: StudyData, digests: Mapping[str, dict[str, str]]
 ) -> dict[str, Any]:
-    """The data in words, for the results."""
+    """Names and digests of the data, and how they are split, for the results."""
     simulated = {"name": f"simulated by {type(case.twin).__name__}", "sha256": ""}
     emulated = {"name": f"emulated by {type(case.emulator).__name__}", "sha256": ""}
     one = digests.get("records", digests.get("real", emulated))
@@ -239,23 +284,25 @@ def _about(
 
 
 def _check_healthy(plan: StudyPlan, real: Trajectories, roles: Roles) -> None:
-    """Every calibration part must have what the residual model is calibrated on."""
+    """Require healthy trajectories in every calibration part, if a source learns from these."""
     needed = any(SOURCES[name].real_data in ("healthy", "labelled") for name in plan.sources)
     if not needed or plan.calibrate_on == "all":
         return
     for calibration, _ in roles.folds:
-        if not (real.labels[list(calibration)] == HEALTHY).any():
-            raise InputError(
-                "calibration",
-                expected=f"at least one trajectory labelled {HEALTHY!r} in every calibration part",
-                got="none",
-                remedy="label healthy trajectories, give more of them, or calibrate on 'all'",
-            )
+        require(
+            (real.labels[list(calibration)] == HEALTHY).any(),
+            "calibration",
+            expected=f"at least one trajectory labelled {HEALTHY!r} in every calibration part",
+            got="none",
+            remedy="label healthy trajectories, give more of them, or calibrate on 'all'",
+        )
 
 
-def _twin(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> Trajectories:
+def _twin(case: Case, plan: StudyPlan, data: StudyData, report: Report) -> Trajectories:
+    """The trajectories of the twin, read or simulated."""
+
     def progress(share: float) -> None:
-        tell("twin data", share)
+        report("twin data", share)
 
     if data.twin is not None:
         return _labelled(load(data.twin, case=case, progress=progress), case, "twin-data")
@@ -263,9 +310,13 @@ def _twin(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> Traject
     return generate(case.twin, case, per_class=plan.generated(case), seed=seed, progress=progress)
 
 
-def _real(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> tuple[Trajectories, Roles]:
+def _real(
+    case: Case, plan: StudyPlan, data: StudyData, report: Report
+) -> tuple[Trajectories, Roles]:
+    """The real trajectories and their roles."""
+
     def read(path: Path) -> Trajectories:
-        found = load(path, case=case, progress=lambda share: tell(path.name, share))
+        found = load(path, case=case, progress=lambda share: report(path.name, share))
         return _labelled(found, case, path.name)
 
     if data.records is not None:
@@ -290,10 +341,11 @@ def _real(case: Case, plan: StudyPlan, data: StudyData, tell: Report) -> tuple[T
 
 
 def _records(case: Case, path: Path) -> tuple[Trajectories, Trajectories]:
+    """Calibration and test set of a file that the case splits."""
     if case.records is None:
         raise InputError(
             "records",
-            expected="a case that says how its file is split",
+            expected="a case that declares how its file is split",
             got=f"the case {case.name!r}, which does not",
             remedy="give --calibration FILE --test FILE, or --real FILE --folds K",
         )
@@ -301,20 +353,21 @@ def _records(case: Case, path: Path) -> tuple[Trajectories, Trajectories]:
 
 
 def _in_two(calibration: Trajectories, test: Trajectories) -> tuple[Trajectories, Roles]:
-    """Both as one set, with their roles."""
+    """Both sets as one, with their roles."""
     both = Trajectories.concatenate([calibration, test])
     return both, Roles.of([(range(len(calibration)), range(len(calibration), len(both)))])
 
 
 def _labelled(trajectories: Trajectories, case: Case, name: str) -> Trajectories:
+    """The trajectories with labels of the case, where it has classes."""
     if not case.diagnosed:
         return trajectories.replace(labels=np.full(len(trajectories), case.classes[0]))
     unknown = set(trajectories.labels.tolist()) - set(case.classes)
-    if unknown:
-        raise InputError(
-            name,
-            expected=f"trajectories labelled with the classes {', '.join(case.classes)}",
-            got=f"{sorted(unknown)}",
-            remedy="label every trajectory; a study scores against labels",
-        )
+    require(
+        not unknown,
+        name,
+        expected=f"trajectories labelled with the classes {', '.join(case.classes)}",
+        got=sorted(unknown),
+        remedy="label every trajectory: labels are needed to score a study",
+    )
     return trajectories

@@ -1,4 +1,4 @@
-"""What sources answered: diagnoses of test trajectories, or simulations of test records."""
+"""The answers of sources: diagnoses of test trajectories, or simulations of test records."""
 
 from __future__ import annotations
 
@@ -13,24 +13,28 @@ from numpy.typing import NDArray
 from retwin.catalog import SOURCES
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.pooled import pool_probabilities
-from retwin.evaluation.fidelity import Simulation
+from retwin.evaluation.fidelity import Simulation, record_means, simulation_scores
 from retwin.scores.bootstrap import bootstrap, bootstrap_means, bootstrap_weights
 from retwin.scores.classification import METRICS, confusion, score
 from retwin.study.work import Work
 
 __all__ = ["Answers", "Diagnoses", "Simulations", "answers"]
 
-DRAWS = 10_000
+RESAMPLINGS = 10_000
+"""Bootstrap resamplings of the test set, as docs/theory.md states."""
 
 
 class Answers(Protocol):
-    """Scores of every source, over runs and over test trajectories drawn again.
+    """Scores of every source, for each run and for each bootstrap resampling of the test set.
 
     Attributes
     ----------
-    compared: scores by which sources are compared, those of Holm's family first.
-    family: scores of which one claim is corrected for the others.
-    curved: scores that a learning curve shows.
+    compared : tuple of str
+        Scores by which sources are compared, those of the family first.
+    family : tuple of str
+        Scores whose p-values are adjusted together (Holm).
+    curved : tuple of str
+        Scores of a learning curve.
 
     """
 
@@ -39,30 +43,33 @@ class Answers(Protocol):
     curved: ClassVar[tuple[str, ...]]
 
     def scores(self, source: str, healthy: int = 0) -> dict[str, list[float]]:
-        """One value per run; see `Job.healthy`."""
+        """Each score of a source, with one value per run; `healthy` as in `Job`."""
         ...
 
     def drawn(self, source: str, healthy: int = 0) -> dict[str, NDArray]:
-        """What is compared, averaged over runs, of every draw; draws of all sources are paired."""
+        """Each compared score (resamplings,), averaged over runs; paired between sources."""
         ...
 
-    def told(self, source: str) -> dict[str, Any]:
-        """What else the results hold of a source."""
+    def details(self, source: str) -> dict[str, Any]:
+        """Other entries of a source in `results.json`."""
         ...
 
     def arrays(self) -> dict[str, NDArray]:
-        """What is too large for `results.json`."""
+        """Arrays for `arrays.npz`."""
         ...
 
 
 def answers(work: Work) -> Answers:
-    """Those of a study, of the kind that its case has."""
+    """The answers of a study: diagnoses, or simulations where the case has no classes."""
     return Diagnoses(work) if work.case.diagnosed else Simulations(work)
 
 
 @dataclass(frozen=True)
 class Diagnoses:
-    """Class probabilities of test trajectories. `probabilities/SOURCE` (runs, n, classes)."""
+    """Class probabilities of the test trajectories.
+
+    In `arrays.npz` they are `probabilities/SOURCE` (runs, n, classes).
+    """
 
     work: Work
     family: ClassVar[tuple[str, ...]] = ("macro_f1", "balanced_accuracy", "auroc")
@@ -81,7 +88,7 @@ class Diagnoses:
     @cached_property
     def _weights(self) -> NDArray:
         seed = self.work.plan.seed_of("bootstrap", 0)
-        return bootstrap_weights(self._truth, draws=DRAWS, seed=seed)
+        return bootstrap_weights(self._truth, draws=RESAMPLINGS, seed=seed)
 
     def _probabilities(self, source: str, healthy: int = 0) -> NDArray:
         members = SOURCES[source].pool
@@ -103,11 +110,11 @@ class Diagnoses:
 
     def drawn(self, source: str, healthy: int = 0) -> dict[str, NDArray]:
         """See `Answers.drawn`."""
-        told, classes = self._probabilities(source, healthy), self.work.case.classes
-        return {m: bootstrap(m, self._truth, told, self._weights, classes) for m in self.compared}
+        runs, classes = self._probabilities(source, healthy), self.work.case.classes
+        return {m: bootstrap(m, self._truth, runs, self._weights, classes) for m in self.compared}
 
-    def told(self, source: str) -> dict[str, Any]:
-        """Confusions, rows true, summed over runs; and every prediction."""
+    def details(self, source: str) -> dict[str, Any]:
+        """Confusion counts, rows true, summed over runs; and the predicted class indices."""
         predicted = self._probabilities(source).argmax(axis=2)
         classes = len(self.work.case.classes)
         counts = np.sum([confusion(self._truth, run, classes) for run in predicted], axis=0)
@@ -127,9 +134,9 @@ class Diagnoses:
 class Simulations:
     """Test records simulated from their commands.
 
-    `simulation/SOURCE/mean` (n, T, d) and `/bands` (n, 5, T, d), of the first run; the same of what
-    was measured: `simulation/commands`, `/nominal`, `/observed` (n, T, d), NaN where not measured,
-    `/ids` (n,) and `/rate` in Hz.
+    `arrays.npz` holds, of the first run, `simulation/SOURCE/mean` (n, T, d) and `/bands`
+    (n, 5, T, d), and of the records `simulation/commands`, `/nominal`, `/observed` (n, T, d), NaN
+    where not measured, `/ids` (n,) and `/rate` in Hz.
     """
 
     work: Work
@@ -142,17 +149,18 @@ class Simulations:
         return self.work.files.real_data()[sorted(self.work.roles.tested)]
 
     def _runs(self, source: str, healthy: int = 0) -> list[Simulation]:
-        """One of all test records for each run."""
+        """A simulation of all test records for each run."""
         jobs = self.work.answers(source, healthy)
         found = []
         for run in range(self.work.plan.number_of_runs):
-            paths = [self.work.files.path(job) for job in jobs if job.run == run]
-            found.append(_joined([Simulation.load(path) for path in paths], self._records.ids))
+            parts = [Simulation.load(self.work.files.path(job)) for job in jobs if job.run == run]
+            found.append(Simulation.joined(parts, self._records.ids))
         return found
 
     def scores(self, source: str, healthy: int = 0) -> dict[str, list[float]]:
         """See `Answers.scores`."""
-        runs = [self._figures(_means(_per_sample(each))) for each in self._runs(source, healthy)]
+        means = [record_means(each.per_sample()) for each in self._runs(source, healthy)]
+        runs = [simulation_scores(each, self._records) for each in means]
         return {name: [float(run[name]) for run in runs] for name in runs[0]}
 
     def drawn(self, source: str, healthy: int = 0) -> dict[str, NDArray]:
@@ -160,32 +168,15 @@ class Simulations:
         seed = self.work.plan.seed_of("bootstrap", 0)
         runs = []
         for each in self._runs(source, healthy):
-            values = _per_sample(each)
+            values = each.per_sample()
             flat = values.reshape(*values.shape[:2], -1)
-            drawn = bootstrap_means(flat, draws=DRAWS, seed=seed)
-            runs.append(self._figures(drawn.reshape(DRAWS, *values.shape[2:])))
+            means = bootstrap_means(flat, draws=RESAMPLINGS, seed=seed)
+            means = means.reshape(RESAMPLINGS, *values.shape[2:])
+            runs.append(simulation_scores(means, self._records))
         return {name: np.mean([run[name] for run in runs], axis=0) for name in runs[0]}
 
-    def _figures(self, means: NDArray) -> dict[str, NDArray]:
-        """Scores of mean (..., d, 4) squared error, CRPS, and shares inside of both bands.
-
-        Outputs are averaged, RMSE and CRPS only where they have one unit; NRMSE is over each
-        output's standard deviation.
-        """
-        observed = np.where(self._records.mask, self._records.observed, np.nan)
-        spread = np.nanstd(observed.astype(float), axis=(0, 1))
-        alike = 1.0 if self._records.outputs.comparable else np.nan
-        square, crps, half, most = np.moveaxis(means, -1, 0)
-        return {
-            "rmse": alike * np.sqrt(square.mean(axis=-1)),
-            "nrmse": (np.sqrt(square) / spread).mean(axis=-1),
-            "crps": alike * crps.mean(axis=-1),
-            "coverage50": half.mean(axis=-1),
-            "coverage90": most.mean(axis=-1),
-        }
-
-    def told(self, source: str) -> dict[str, Any]:
-        """Nothing."""
+    def details(self, source: str) -> dict[str, Any]:
+        """Simulations have no other entries."""
         return {}
 
     def arrays(self) -> dict[str, NDArray]:
@@ -200,35 +191,8 @@ class Simulations:
             found |= {f"{name}/mean": first.mean}
             if first.random:
                 found |= {f"{name}/bands": first.bands}
-        made: Mapping[str, NDArray] = {key: each.astype(np.float32) for key, each in found.items()}
+        single: Mapping[str, NDArray] = {
+            key: each.astype(np.float32) for key, each in found.items()
+        }
         about = {"ids": self._records.ids, "rate": np.array(self._records.rate)}
-        return {f"simulation/{name}": each for name, each in {**made, **about}.items()}
-
-
-def _joined(parts: list[Simulation], ids: NDArray) -> Simulation:
-    """Simulations of several folds as one, in the order of `ids`."""
-    names = np.concatenate([part.ids for part in parts]).tolist()
-    order = [names.index(name) for name in ids.tolist()]
-    arrays = {
-        name: np.concatenate([getattr(part, name) for part in parts])[order]
-        for name in vars(parts[0])
-    }
-    return Simulation(**arrays)
-
-
-def _per_sample(simulation: Simulation) -> NDArray:
-    """Squared error, CRPS, and whether inside of both bands, (n, T, d, 4); no bands, no share."""
-    error = np.square(simulation.mean - simulation.observed)
-    inside = [simulation.inside(level) for level in (50, 90)]
-    if not simulation.random:
-        inside = [np.full_like(error, np.nan)] * 2
-    return np.stack([error, simulation.crps, *inside], axis=-1)
-
-
-def _means(values: NDArray) -> NDArray:
-    """Of (n, T, ...) over samples, then over records; NaN where there is nothing."""
-    seen = np.isfinite(values)
-    with np.errstate(invalid="ignore"):
-        each = np.where(seen, values, 0.0).sum(axis=1) / seen.sum(axis=1)
-    mean: NDArray = each.mean(axis=0)
-    return mean
+        return {f"simulation/{name}": each for name, each in {**single, **about}.items()}

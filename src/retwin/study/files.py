@@ -1,4 +1,4 @@
-"""A study's folder: which job leaves its result where, and what roles the real data play."""
+"""The folder of a study: which file each job writes, and the roles of the real data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ __all__ = ["Files", "Job", "Roles"]
 
 @dataclass(frozen=True)
 class Roles:
-    """Which real trajectories calibrate and which test, by index into the study's real set."""
+    """Which real trajectories calibrate and which test, by index into the study's real set.
+
+    Attributes
+    ----------
+    folds : tuple of (tuple of int, tuple of int)
+        Indices of the calibration and of the test trajectories of each fold.
+
+    """
 
     folds: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
@@ -28,7 +35,7 @@ class Roles:
 
     @property
     def tested(self) -> list[int]:
-        """Every tested trajectory, in the order of the folds."""
+        """Indices of all test trajectories, in the order of the folds."""
         return [i for _, test in self.folds for i in test]
 
 
@@ -38,16 +45,20 @@ def _indices(values: Iterable[int]) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Job:
-    """One piece of work.
+    """One unit of work of a study.
 
     Attributes
     ----------
-    kind: "surrogate", "residual", "update", "diagnosis", "simulation", "fidelity" or
-        "portrait".
-    run, fold: from 0.
-    name: of the correction of a residual model, of the update that a surrogate stands for (none
-        for the twin as it is), or of the source.
-    healthy: calibration trajectories of each class that are used, 0 for all there are.
+    kind : str
+        "surrogate", "residual", "update", "diagnosis", "simulation", "fidelity" or "portrait" (a
+        predictive overlay).
+    run, fold : int
+        Counted from 0.
+    name : str
+        Of a residual model, its correction; of a surrogate, the update of its twin ("" for the
+        twin as it is); else the source.
+    healthy : int
+        Calibration trajectories of each class that are used; 0 for all.
 
     """
 
@@ -58,12 +69,12 @@ class Job:
     healthy: int = 0
 
     def __str__(self) -> str:
-        few = f"from {self.healthy}" if self.healthy else ""
-        parts = [f"run {self.run + 1}", self.kind, self.name, few]
+        count = f"from {self.healthy}" if self.healthy else ""
+        parts = [f"run {self.run + 1}", self.kind, self.name, count]
         return " ".join(part for part in parts if part)
 
     def before(self, kind: str, name: str) -> Job:
-        """The job that leaves the result of that kind and name for this one."""
+        """The job of that kind and name whose result this one needs."""
         if kind == "surrogate" and not name:
             return Job(kind, self.run)
         return replace(self, kind=kind, name=name)
@@ -71,19 +82,19 @@ class Job:
 
 @dataclass(frozen=True)
 class Files:
-    """Where everything of a study lies."""
+    """The paths of all intermediate results below one folder."""
 
     folder: Path
 
     def path(self, job: Job) -> Path:
-        """A job's result: a model's folder, or an NPZ file of answers, fidelity or portraits."""
+        """The result of a job: a model's folder, or an NPZ file."""
         if job.kind in ("diagnosis", "simulation"):
             return self._of(job, ".npz")
         arrays = ".npz" if job.kind in ("fidelity", "portrait") else ""
         return self._of(job, f".{job.kind}{arrays}")
 
     def diagnoser(self, job: Job) -> Path:
-        """The diagnoser's folder."""
+        """The folder of the diagnoser that a job trains."""
         return self._of(job, ".diagnoser")
 
     def _of(self, job: Job, suffix: str) -> Path:
@@ -93,14 +104,14 @@ class Files:
         fold = run / f"fold-{job.fold}"
         return (fold / f"healthy-{job.healthy}" if job.healthy else fold) / f"{job.name}{suffix}"
 
-    def costs(self, job: Job) -> dict[str, float]:
-        """Seconds a job took, whole and in parts; empty if it was cut off before it could say."""
+    def costs(self, job: Job) -> dict[str, Any]:
+        """What a job cost, see `Work.do`; empty if it was interrupted before it was recorded."""
         file = self._costs(job)
-        found: dict[str, float] = json.loads(file.read_text("utf-8")) if file.exists() else {}
+        found: dict[str, Any] = json.loads(file.read_text("utf-8")) if file.exists() else {}
         return found
 
     def keep_costs(self, job: Job, costs: Mapping[str, Any]) -> None:
-        """Write them beside the result."""
+        """Write the costs of a job beside its result."""
         with write_atomically(self._costs(job)) as part:
             part.write_text(json.dumps(costs), encoding="utf-8")
 
@@ -109,10 +120,10 @@ class Files:
         return path.with_name(f"{path.name}.costs.json")
 
     def twin_data(self) -> Trajectories:
-        """What the twin says, with commands; in Zarr if it was given so, else in NPZ."""
+        """The trajectories of the twin with commands, from a Zarr folder or an NPZ file."""
         (file,) = self.folder.glob("twin.*")
         return load(file)
 
     def real_data(self) -> Trajectories:
-        """All real trajectories, with commands."""
+        """All real trajectories with commands."""
         return load(self.folder / "real.npz")

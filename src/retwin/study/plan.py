@@ -1,4 +1,4 @@
-"""What a study compares, and the seeds of every stage."""
+"""`StudyPlan`: what a study compares, and the seeds of its stages."""
 
 from __future__ import annotations
 
@@ -8,21 +8,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from retwin.cases.case import Case
-from retwin.catalog import CALIBRATE_ON, CLASSIFIERS, PRESETS, SOURCES, resolve
-from retwin.checks import one_of
-from retwin.errors import InputError
+from retwin.catalog import CALIBRATE_ON, CLASSIFIERS, PRESETS, SOURCES, make, resolve
+from retwin.checks import finite, one_of, positive, require, whole
+from retwin.diagnosis import Rocket
 from retwin.nets.networks import Network
 from retwin.nets.training import Training
 
-__all__ = ["ROCKET", "Preset", "StudyPlan"]
-
-ROCKET = "rocket"
-"""The classifier that is not a network."""
+__all__ = ["PAPER", "QUICK", "Preset", "StudyPlan"]
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Classifier and training of a preset."""
+    """The classifier, the number of runs and the training of a preset.
+
+    Attributes
+    ----------
+    classifier : str
+        A key of `retwin.catalog.CLASSIFIERS`.
+    runs : int
+        Number of runs.
+    training : Training
+        The training of the classifier.
+
+    """
 
     classifier: str
     runs: int
@@ -37,26 +45,39 @@ PAPER = Preset("lstm", 10, Training(max_epochs=30, batch_size=32, learning_rate=
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """Everything that decides the result of a study, data apart.
+    """All settings that determine the result of a study, apart from its data.
 
     Parameters
     ----------
-    sources: names from SOURCES, in the order they are reported.
-    preset: "quick" or "paper": classifier, its training and the number of runs.
-    classifier: "cnn", "lstm" or "rocket"; None takes the preset's.
-    runs: None takes the preset's.
-    seed: of everything.
-    folds: of the real set, when there is one set only.
-    rate: samples per second the classifier looks at; None takes the case's true sensor rate.
-    per_class: generated trajectories per class; None takes the case's.
-    calibrate_on: "healthy" or "all".
-    encoder_noise: command units of reading noise put on frozen joints, in training and test sets
-        alike. Real stuck joints are frozen in software; their exact stillness is an artefact that
-        a diagnoser could live on. 0 leaves the data as they are.
-    learning_curve: whether sources that are calibrated on healthy trajectories are tried with
-        fewer of them too.
+    sources : tuple of str
+        Keys of `retwin.catalog.SOURCES`, in the order in which they are reported.
+    preset : str
+        "quick" or "paper": the classifier, its training and the number of runs.
+    classifier : str, optional
+        "cnn", "lstm" or "rocket"; by default the preset's.
+    runs : int, optional
+        Number of runs, at least 1; by default the preset's.
+    seed : int
+        Root of all seeds, at least 0.
+    folds : int
+        Folds of the real set if there is one set only, at least 2.
+    rate : float, optional
+        Sample rate of the classifier's features in Hz; by default the case's true sensor rate.
+    per_class : int, optional
+        Generated trajectories per class, at least 1; by default the case's.
+    calibrate_on : str
+        "healthy" or "all": the real trajectories from which residual models learn.
+    encoder_noise : float
+        Standard deviation of measurement noise added to frozen joints in training and test sets,
+        in command units; 0 leaves the data as they are. Real stuck joints are frozen in software,
+        and a diagnoser could exploit that they do not move at all.
+    learning_curve : bool
+        Whether sources that are calibrated on healthy trajectories are also calibrated on fewer.
 
-    Raises InputError for a name that is not known or a number below one.
+    Raises
+    ------
+    InputError
+        If a name is unknown or a number is out of its range or not finite.
 
     """
 
@@ -78,28 +99,24 @@ class StudyPlan:
         one_of("calibrate_on", self.calibrate_on, CALIBRATE_ON)
         for source in self.sources:
             one_of("sources", source, SOURCES)
-        for name, number in (("runs", self.number_of_runs), ("per_class", self.per_class)):
-            if number is not None and number < 1:
-                raise InputError(
-                    name, expected="at least 1", got=repr(number), remedy="give a positive number"
-                )
-        if self.encoder_noise < 0 or (self.rate is not None and self.rate <= 0):
-            raise InputError(
-                "encoder_noise and rate",
-                expected="encoder_noise of at least 0 and a positive rate",
-                got=f"{self.encoder_noise} and {self.rate}",
-                remedy="leave them out for the defaults",
-            )
-        if not self.sources or len(set(self.sources)) != len(self.sources):
-            raise InputError(
-                "sources",
-                expected="at least one source, none twice",
-                got=repr(self.sources),
-                remedy=f"choose from {', '.join(SOURCES)}",
-            )
+        require(
+            0 < len(self.sources) == len(set(self.sources)),
+            "sources",
+            expected="at least one source, none twice",
+            got=self.sources,
+            remedy=f"choose from {', '.join(SOURCES)}",
+        )
+        whole("runs", self.number_of_runs, least=1)
+        whole("seed", self.seed)
+        whole("folds", self.folds, least=2)
+        if self.per_class is not None:
+            whole("per_class", self.per_class, least=1)
+        if self.rate is not None:
+            positive("rate", self.rate, unit="Hz")
+        finite("encoder_noise", self.encoder_noise, least=0.0, unit="command units")
 
     def generated(self, case: Case) -> int:
-        """Trajectories per class, the case's unless given."""
+        """Generated trajectories per class; the case's by default."""
         return case.per_class if self.per_class is None else self.per_class
 
     @property
@@ -109,31 +126,37 @@ class StudyPlan:
 
     @property
     def number_of_runs(self) -> int:
-        """Runs, the preset's unless given."""
+        """Number of runs; the preset's by default."""
         return self._preset.runs if self.runs is None else self.runs
 
     @property
     def classifier_name(self) -> str:
-        """Classifier, the preset's unless given."""
+        """Key of the classifier in the catalog; the preset's by default."""
         return self.classifier or self._preset.classifier
 
     @property
-    def network(self) -> Network | None:
-        """The classifier's config; None for one that is no network."""
-        if self.classifier_name == ROCKET:
-            return None
-        network: Network = resolve(CLASSIFIERS[self.classifier_name].target)()
-        return network
+    def classifier_config(self) -> Network | Rocket:
+        """The config of the classifier."""
+        config: Network | Rocket = make(CLASSIFIERS, self.classifier_name, "classifier")
+        return config
 
     @property
-    def training(self) -> Training:
-        """The classifier's training."""
-        return self._preset.training
+    def training(self) -> Training | None:
+        """The preset's training; None for a classifier whose weights have a closed form."""
+        return None if isinstance(self.classifier_config, Rocket) else self._preset.training
 
     def seed_of(self, stage: str, run: int, fold: int = 0) -> int:
-        """The seed of one stage of one run, all from one SeedSequence.
+        """The seed of one stage of one run, all spawned from one SeedSequence.
 
-        The stage's name is hashed, so that adding a source changes no other's seed.
+        The key of a stage is the CRC-32 of its name, so a new stage changes no other's seed.
+
+        Parameters
+        ----------
+        stage : str
+            Any name, such as "generate".
+        run, fold : int
+            Counted from 0.
+
         """
         key = (run, fold, zlib.crc32(stage.encode()))
         sequence = np.random.SeedSequence(self.seed, spawn_key=key)

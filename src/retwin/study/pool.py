@@ -1,4 +1,7 @@
-"""Jobs over processes, one torch thread each: threads beyond the cores cost several times."""
+"""`run_jobs`: jobs in worker processes with one torch thread each.
+
+More threads than cores take several times as long.
+"""
 
 from __future__ import annotations
 
@@ -16,27 +19,41 @@ from retwin.study.work import Work
 
 __all__ = ["run_jobs"]
 
-_progress: Any = None
+_messages: Any = None
+"""Queue to the parent process, set in each worker when it starts."""
 
 
-def run_jobs(work: Work, processes: int, tell: Callable[[str, float], None]) -> None:
-    """Do all jobs of `work` that are not done; an exception or Ctrl-C leaves what is finished."""
+def run_jobs(work: Work, processes: int, report: Callable[[str, float], None]) -> None:
+    """Run all jobs that have no result yet, each when the jobs that it needs are done.
+
+    An exception or Ctrl-C ends the workers; results that are finished remain.
+
+    Parameters
+    ----------
+    work : Work
+        The jobs.
+    processes : int
+        Number of worker processes, at least 1.
+    report : callable
+        Called with the name of a job and the share of all work that is done.
+
+    """
     graph = work.graph()
     shares = {job: float(work.files.path(job).exists()) for job in graph}
     missing = [job for job, share in shares.items() if not share]
     if not missing:
         return
     # Spawned, as the workers are.
-    news = multiprocessing.get_context("spawn").Queue()
+    messages = multiprocessing.get_context("spawn").Queue()
     stop = threading.Event()
-    listener = threading.Thread(target=_listen, args=(news, shares, tell, stop), daemon=True)
+    listener = threading.Thread(target=_listen, args=(messages, shares, report, stop), daemon=True)
     listener.start()
     try:
-        with worker_pool(min(processes, len(missing)), _start_worker, (news,)) as pool:
+        with worker_pool(min(processes, len(missing)), _start_worker, (messages,)) as pool:
             _finish(graph, set(missing), lambda job: pool.schedule(_do, args=(work, job)))
     finally:
         stop.set()
-        # A worker ended in the middle of a message could keep the listener waiting.
+        # A worker that was ended in the middle of a message could keep the listener waiting.
         listener.join(timeout=1.0)
 
 
@@ -45,7 +62,7 @@ def _finish(
     missing: set[Job],
     start: Callable[[Job], Future[None]],
 ) -> None:
-    """Start each job when those before it are done; the first failure is raised at once."""
+    """Start each job when those that it needs are done; the first failure is raised at once."""
     order = TopologicalSorter(graph)
     order.prepare()
     running: dict[Future[None], Job] = {}
@@ -62,31 +79,32 @@ def _finish(
 
 
 def _listen(
-    news: Any,
+    messages: Any,
     shares: dict[Job, float],
-    tell: Callable[[str, float], None],
+    report: Callable[[str, float], None],
     stop: threading.Event,
 ) -> None:
     while not stop.is_set():
         try:
-            job, share = news.get(timeout=0.2)
+            job, share = messages.get(timeout=0.2)
         except queue.Empty:
             continue
         shares[job] = max(shares[job], share)
-        tell(str(job), sum(shares.values()) / len(shares))
+        report(str(job), sum(shares.values()) / len(shares))
 
 
-def _start_worker(news: Any) -> None:
+def _start_worker(messages: Any) -> None:
     import torch
 
-    global _progress
-    _progress = news
+    global _messages
+    _messages = messages
     torch.set_num_threads(1)
-    # Recurrent nets run into denormal numbers, which are several times slower; must be first.
+    # Recurrent networks produce denormal numbers, which are several times slower. This must come
+    # before any computation.
     torch.set_flush_denormal(True)
 
 
 def _do(work: Work, job: Job) -> None:
-    _progress.put((job, 0.0))
-    work.do(job, lambda share: _progress.put((job, 0.99 * share)))
-    _progress.put((job, 1.0))
+    _messages.put((job, 0.0))
+    work.do(job, lambda share: _messages.put((job, 0.99 * share)))
+    _messages.put((job, 1.0))

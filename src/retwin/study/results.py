@@ -64,7 +64,7 @@ def write_results(
     if overlay is not None:
         arrays |= _overlay_arrays(work, test, overlay) | _poses(work, test)
         shown["portrait"] = {
-            "source": work.portraits()[0].name,
+            "source": work.overlay_jobs()[0].name,
             "movement": overlay.latent.names,
             "movement_units": overlay.latent.units,
         }
@@ -104,7 +104,7 @@ def _source(work: Work, found: Answers, name: str, drawn: Mapping[str, NDArray])
     return SourceResults(
         scores=found.scores(name),
         intervals={metric: _interval(each) for metric, each in drawn.items()},
-        **found.told(name),
+        **found.details(name),
         title=SOURCES[name].title,
         real_data=work.sees(name),
         **_costs(work, name),
@@ -265,7 +265,7 @@ def _judged(work: Work, source: str, healthy: int = 0) -> Fidelity | None:
     labels = work.files.real_data().labels
     parts = [
         Fidelity.load(work.files.path(job))
-        for job in work.judgements(source, healthy)
+        for job in work.fidelity_jobs(source, healthy)
         if (labels[list(work.roles.folds[job.fold][1])] == HEALTHY).any()
     ]
     return Fidelity.concatenate(parts) if parts else None
@@ -279,12 +279,12 @@ def _fidelity_arrays(source: str, found: Fidelity) -> dict[str, NDArray]:
     (2, P, d), `seen` (2, P), `quantiles` (2, 5, P, d), `ids` (2,), of the trajectory with the
     median energy score and of the one with the worst; `rate` in Hz.
     """
-    identified = np.isfinite(found.movements).any(axis=-1)
+    identified = np.isfinite(found.segment_values).any(axis=-1)
     order = np.argsort(found.energy, kind="stable").tolist()
     index = list(dict.fromkeys([order[(len(order) - 1) // 2], order[-1]]))
     return {
-        f"z/{source}/observed": found.movements[:, 0][identified[:, 0]].astype(np.float32),
-        f"z/{source}/predicted": found.movements[:, 1:][identified[:, 1:]].astype(np.float32),
+        f"z/{source}/observed": found.segment_values[:, 0][identified[:, 0]].astype(np.float32),
+        f"z/{source}/predicted": found.segment_values[:, 1:][identified[:, 1:]].astype(np.float32),
         f"pit/{source}": found.pit_shares(),
         f"bands/{source}/nominal": found.nominal[index].astype(np.float32),
         f"bands/{source}/observed": found.observed[index].astype(np.float32),
@@ -297,7 +297,7 @@ def _fidelity_arrays(source: str, found: Fidelity) -> dict[str, NDArray]:
 
 def _overlay(work: Work) -> Overlay | None:
     """The predictions beside all test trajectories; None if no twin was corrected."""
-    made = [Overlay.load(work.files.path(job)) for job in work.portraits()]
+    made = [Overlay.load(work.files.path(job)) for job in work.overlay_jobs()]
     return Overlay.concatenate(made) if made else None
 
 

@@ -1,8 +1,8 @@
-"""How each source of the catalog makes its twin or its diagnoser from a `Trial`.
+"""Functions of a `Trial` that make the twin or the diagnoser of each source of the catalog.
 
 A source is a row of the table in docs/theory.md, "How a study scores". `retwin.catalog.SOURCES`
-declares it: which real data it may see, and which jobs must be done first. Where the case has
-classes its answers are diagnoses, else simulations of the test records.
+declares which real data it may use, and which jobs it needs. Its answers are diagnoses where the
+case has classes, else simulations of the test records.
 """
 
 from __future__ import annotations
@@ -12,19 +12,20 @@ from importlib.util import find_spec
 
 from retwin.cases.case import Case
 from retwin.catalog import SOURCES, SourceEntry
-from retwin.diagnosis import fine_tune, fit_dann, fit_inversion
-from retwin.study.plan import ROCKET, StudyPlan
-from retwin.study.trial import Trained, Trial
+from retwin.data.trajectories import Trajectories
+from retwin.diagnosis import DANN, FineTune, FittedDiagnoser, Rocket, fit_diagnoser, fit_inversion
+from retwin.study.plan import StudyPlan
+from retwin.study.trial import Trial
 from retwin.twins.noisy import NoisyTwin, residual_scale
 from retwin.twins.randomised import RandomisedTwin
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.residual import ResidualModel, SequenceMixture
 
-__all__ = ["NEEDS", "Need", "lacking"]
+__all__ = ["NEEDS", "Need", "lacking", "not_installed"]
 
 Need = tuple[str, str]
-"""A result that must be there first: kind of job, and name."""
+"""Kind and name of a job whose result is needed."""
 
 SURROGATE: Need = ("surrogate", "")
 COMMAND: Need = ("residual", "command")
@@ -35,12 +36,13 @@ NEEDS: Mapping[Need, tuple[Need, ...]] = {
     ("surrogate", "pi_ls"): (("update", "pi_ls"),),
     ("residual", "pi_ls"): (("surrogate", "pi_ls"),),
 }
-"""The results that must be there before those that sources need."""
-EXTRAS = {"bayes": "sbi"}
-"""An extra, and the package that shows whether it is installed."""
+"""The results that are needed to make those that sources need."""
+
+EXTRAS = {"bayes": "sbi", "rocket": "sktime"}
+"""Extras of the package, and for each a module by which its installation is recognised."""
 
 
-def recorded_twin(trial: Trial) -> Trained:
+def recorded_twin(trial: Trial) -> FittedDiagnoser:
     """The classifier, trained on the recorded trajectories of the twin."""
     return trial.train(trial.twin_data)
 
@@ -61,7 +63,7 @@ def surrogate_alone(trial: Trial) -> Twin:
 
 
 def noisy_surrogate(trial: Trial) -> Twin:
-    """The IBG with output noise of the residual's size."""
+    """The IBG with white output noise of the residual's standard deviation."""
     healthy = trial.healthy
     scale = residual_scale(healthy)
     return NoisyTwin(trial.surrogate(), scale, stride=trial.stride, emulated=healthy.emulated)
@@ -77,18 +79,24 @@ def posterior_twin(trial: Trial) -> Twin:
     return trial.updated("pi_bayes")
 
 
-def adversarial(trial: Trial) -> Trained:
-    """A domain-adversarial network on unlabelled calibration outputs."""
-    return fit_dann(trial.twin_data, trial.unlabelled, trial.network, **trial.fitting)
+def adversarial(trial: Trial) -> FittedDiagnoser:
+    """A domain-adversarial network on the unlabelled calibration set."""
+    return _adversarial(trial, trial.unlabelled)
 
 
-def adversarial_transductive(trial: Trial) -> Trained:
-    """The same on the outputs of the test set, without labels."""
-    return fit_dann(trial.twin_data, trial.test_outputs, trial.network, **trial.fitting)
+def adversarial_transductive(trial: Trial) -> FittedDiagnoser:
+    """A domain-adversarial network on the unlabelled test set."""
+    return _adversarial(trial, trial.test_outputs)
+
+
+def _adversarial(trial: Trial, target: Trajectories) -> FittedDiagnoser:
+    classifier = trial.plan.classifier_config
+    assert not isinstance(classifier, Rocket), "checked before the study begins"
+    return fit_diagnoser(trial.twin_data, DANN(classifier), target=target, **trial.fitting)
 
 
 def mean_corrected(trial: Trial) -> Twin:
-    """The corrected twin with the RG's mean in place of samples (Eq. 8)."""
+    """The corrected twin with the mean of the RG instead of samples (Eq. 8)."""
     return CorrectedTwin(trial.surrogate(), trial.residual("output"), random=False)
 
 
@@ -107,14 +115,15 @@ def identified_corrected(trial: Trial) -> Twin:
     return CorrectedTwin(trial.surrogate("pi_ls"), trial.residual("pi_ls"))
 
 
-def fine_tuned(trial: Trial) -> Trained:
+def fine_tuned(trial: Trial) -> FittedDiagnoser:
     """The network of `ibg_rg_command`, fine-tuned on labelled calibration trajectories."""
     base = trial.diagnoser("ibg_rg_command")
     made = trial.generate(command_corrected(trial))
-    return fine_tune(base, made, trial.labelled, seed=trial.seed("fine-tuning"))
+    seed = trial.seed("fine-tuning")
+    return fit_diagnoser(made, FineTune(base), target=trial.labelled, seed=seed)
 
 
-def inversion(trial: Trial) -> Trained:
+def inversion(trial: Trial) -> FittedDiagnoser:
     """The Bayesian inversion of faults, without training of a classifier."""
     residual = trial.residual("command")
     assert isinstance(residual, ResidualModel), "checked before the study begins"
@@ -122,21 +131,42 @@ def inversion(trial: Trial) -> Trained:
 
 
 def lacking(name: str, case: Case, plan: StudyPlan) -> str:
-    """What a study of that case lacks to have a source; empty where it lacks nothing."""
+    """What a study lacks for a source.
+
+    Parameters
+    ----------
+    name : str
+        A key of `retwin.catalog.SOURCES`.
+    case : Case
+        The system.
+    plan : StudyPlan
+        Its classifier must suit the source.
+
+    Returns
+    -------
+    str
+        The missing requirement; "" if there is none.
+
+    """
     source: SourceEntry = SOURCES[name]
     if case.diagnosed and source.simulates:
         return "a case without classes, where twins simulate"
     if not case.diagnosed and not source.twin:
-        return f"a case with classes to tell apart; {case.name!r} has none"
+        return f"a case with classes; {case.name!r} has none"
     if COMMAND in source.needs and case.correction == case.output_correction:
         return f"a case with a correction besides the one at its outputs; {case.name!r} has none"
     if name == "inversion" and isinstance(case.density, SequenceMixture):
         return "a correction per segment"
     if source.parametric and case.parametric is None:
         return f"a case that declares the free parameters of its twin; {case.name!r} does not"
-    if source.network and plan.classifier_name == ROCKET:
+    if source.network and isinstance(plan.classifier_config, Rocket):
         return "a classifier that is a network"
-    package = EXTRAS.get(source.extra)
+    return not_installed(source.extra)
+
+
+def not_installed(extra: str) -> str:
+    """The package that an extra lacks, with the command that installs it; "" if none."""
+    package = EXTRAS.get(extra)
     if package and find_spec(package) is None:
-        return f"the package {package}; install it: pip install 'retwin[{source.extra}]'"
+        return f"the package {package}; install it: pip install 'retwin[{extra}]'"
     return ""

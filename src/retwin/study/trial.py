@@ -1,10 +1,10 @@
-"""`Trial`: what one source holds in its hands in one run and fold, and nothing else."""
+"""`Trial`: the models and the real data that one source may use in one run and fold."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from retwin.cases.case import Case
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
-from retwin.diagnosis import Diagnoser, NetworkDiagnoser, RocketDiagnoser, fit_diagnoser, fit_rocket
-from retwin.nets.networks import Network
+from retwin.diagnosis import FittedDiagnoser, NetworkDiagnoser, fit_diagnoser
 from retwin.progress import Progress
 from retwin.serialisation.models import read_about
 from retwin.study.files import Files, Job
@@ -26,16 +25,7 @@ from retwin.update.identification import PosteriorTwin
 from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["Trained", "Trial"]
-
-
-class Trained(Diagnoser, Protocol):
-    """A diagnoser that can be saved."""
-
-    def save(self, folder: str | Path) -> None:
-        """Write one folder."""
-        ...
-
+__all__ = ["SEES", "Trial"]
 
 SEES = {
     "none": (),
@@ -45,24 +35,32 @@ SEES = {
     "transductive": ("timing", "test outputs"),
     "labelled": ("timing", "healthy", "labelled"),
 }
-"""What a source's `real_data` lets it see."""
+"""The real data to which each value of a source's `real_data` gives access."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
     """One run and fold of a study, as the source of a job may see it.
 
-    Real data that `sees` does not name cannot be reached from here, so a source cannot use more
-    than it declares.
+    Real data that `sees` does not name cannot be accessed here, so a source cannot use more than
+    it declares.
 
     Attributes
     ----------
-    files: where results lie.
-    case, plan: the system, and what is compared.
-    fold: indices of calibration and test trajectories.
-    job: run, fold, and how many healthy calibration trajectories are used.
-    sees: a key of `SEES`.
-    progress: told the share that is done.
+    files : Files
+        Paths of intermediate results.
+    case : Case
+        The system.
+    plan : StudyPlan
+        What is compared.
+    fold : (tuple of int, tuple of int)
+        Indices of the calibration and of the test trajectories.
+    job : Job
+        Run, fold, and the number of healthy calibration trajectories.
+    sees : str
+        A key of `SEES`.
+    progress : Progress or None
+        Called with the share that is done.
 
     """
 
@@ -78,10 +76,10 @@ class Trial:
         """The seed of one stage of this run and fold."""
         return self.plan.seed_of(stage, self.job.run, self.job.fold)
 
-    # What was made before.
+    # Results of other jobs.
 
     def surrogate(self, name: str = "") -> Surrogate:
-        """The IBG, of the twin as it is or after the update of that name."""
+        """The IBG of the twin as it is, or after the update of that name."""
         return Surrogate.load(self._made("surrogate", name))
 
     def residual(self, name: str) -> Residual:
@@ -89,11 +87,11 @@ class Trial:
         return load_residual(self._made("residual", name))
 
     def diagnoser(self, source: str) -> NetworkDiagnoser:
-        """The network that another source trained."""
+        """The network that was trained for another source."""
         return NetworkDiagnoser.load(self.files.diagnoser(self.job.before("diagnosis", source)))
 
     def updated(self, method: str) -> Twin:
-        """The twin whose own parameters were updated: to one value each, or to a posterior."""
+        """The twin whose parameters were updated to one value each, or to a posterior."""
         folder = self._made("update", method)
         if method == "pi_bayes":
             return PosteriorTwin.load(folder, self.parametric)
@@ -102,34 +100,34 @@ class Trial:
     def _made(self, kind: str, name: str) -> Path:
         return self.files.path(self.job.before(kind, name))
 
-    # What the case knows.
+    # Properties of the case.
 
     @property
     def parametric(self) -> ParametricTwin:
-        """The twin with what is not known of it as parameters."""
+        """The twin with its free parameters."""
         assert self.case.parametric is not None, "checked before the study begins"
         return self.case.parametric
 
     def correction(self, name: str) -> Correction:
-        """The case's own ("command"), else the paper's, at the outputs."""
+        """The case's own correction for "command", else the one at the outputs (the paper's)."""
         return self.case.correction if name == "command" else self.case.output_correction
 
     @property
     def stride(self) -> int:
-        """Samples of the data per reading of the sensor."""
+        """Samples of the data per sample of the sensor."""
         return max(1, round(self.case.rate / self.case.sensor_rate))
 
-    # What may be seen of real data.
+    # Data.
 
     @property
     def twin_data(self) -> Trajectories:
-        """What the twin says, labelled: no real data."""
+        """The labelled trajectories of the twin; they are no real data."""
         seed = self.seed("encoder noise in training")
         return self._noisy(self.files.twin_data(), seed)
 
     @property
     def timing(self) -> NDArray | None:
-        """Onsets of movements (k, M) in the calibration set, NaN where there is none."""
+        """Onsets (k, M) of segments in the calibration set, in samples; NaN for none."""
         if "timing" not in SEES[self.sees]:
             return None
         seen = self.files.real_data()[list(self.fold[0])]
@@ -154,8 +152,12 @@ class Trial:
 
     @property
     def test_outputs(self) -> Trajectories:
-        """The test set without labels; whoever trains on it is flagged."""
+        """The test set without labels; a source that trains on it is flagged."""
         self._allow("test outputs")
+        return self.tested()
+
+    def tested(self) -> Trajectories:
+        """The test set without labels, for prediction alone."""
         found = self._real()[list(self.fold[1])]
         return found.replace(labels=np.full(len(found), UNLABELLED))
 
@@ -164,7 +166,7 @@ class Trial:
         found = self._real()[list(self.fold[0])]
         if self.job.healthy == 0:
             return found
-        # Nested: what few trajectories hold is in more of them as well.
+        # Nested: the subsets of a learning curve contain each other.
         order = np.random.default_rng(self.seed("learning curve")).permutation(len(found))
         kept = [
             index
@@ -178,7 +180,7 @@ class Trial:
             raise PermissionError(f"{self.job} declares {self.sees!r} and asks for {what}")
 
     def _real(self) -> Trajectories:
-        # The same noise in every run and for every source.
+        # The noise is the same in every run and for every source.
         return self._noisy(self.files.real_data(), self.plan.seed_of("encoder noise in test", 0))
 
     def _noisy(self, trajectories: Trajectories, seed: int) -> Trajectories:
@@ -186,10 +188,10 @@ class Trial:
             return trajectories
         return self.case.encoder_noise(trajectories, self.plan.encoder_noise, seed)
 
-    # What sources do with it.
+    # Steps that sources share.
 
     def generate(self, twin: Twin) -> Trajectories:
-        """A labelled training set: the same commands and faults for all sources of a run."""
+        """A labelled training set, with the same commands and faults for all sources of a run."""
         made = generate(
             twin,
             self.case,
@@ -200,19 +202,10 @@ class Trial:
         return self._noisy(made, self.seed("encoder noise in training"))
 
     @property
-    def network(self) -> Network:
-        """The study's classifier, where it is one."""
-        assert self.plan.network is not None, "checked before the study begins"
-        return self.plan.network
-
-    @property
     def fitting(self) -> dict[str, Any]:
-        """How every network is trained."""
-        return {**self._fitting, "training": self.plan.training}
-
-    @property
-    def _fitting(self) -> dict[str, Any]:
+        """Arguments of `fit_diagnoser` that all sources share."""
         return {
+            "training": self.plan.training,
             "seed": self.seed("diagnoser"),
             "classes": self.case.classes,
             "rate": self.plan.rate or self.case.sensor_rate,
@@ -221,20 +214,13 @@ class Trial:
 
     @property
     def updating(self) -> dict[str, Any]:
-        """How the twin's own parameters are updated."""
+        """Arguments of `identify` and `identify_bayes` that all sources share."""
         return {
             "seed": self.seed("update"),
             "rate": self.case.sensor_rate,
             "progress": self.progress,
         }
 
-    def train(self, made: Trajectories) -> NetworkDiagnoser | RocketDiagnoser:
+    def train(self, made: Trajectories) -> FittedDiagnoser:
         """The study's classifier, trained on labelled trajectories."""
-        if self.plan.network is None:
-            return fit_rocket(made, **self._fitting)
-        return fit_diagnoser(made, self.network, **self.fitting)
-
-    def tested(self) -> Trajectories:
-        """The test set, to predict and for nothing else."""
-        found = self._real()[list(self.fold[1])]
-        return found.replace(labels=np.full(len(found), UNLABELLED))
+        return fit_diagnoser(made, self.plan.classifier_config, **self.fitting)

@@ -1,7 +1,8 @@
-"""The work of a study as jobs; each leaves one result on disk, and is done when that is there.
+"""`Work`: the jobs of a study, their dependencies, and how each result is made.
 
-Killed at any moment and called again, a study goes on with the jobs that are missing. Results are
-moved into place whole, and every job draws from a seed of its own, so the order does not matter.
+Each job writes one result, and is done when that exists. A study that was killed continues with
+the jobs whose results are missing. Results are moved into place when they are complete, and each
+job has a seed of its own, so the order of the jobs has no effect.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from numpy.typing import NDArray
 from retwin.cases.case import Case
 from retwin.catalog import SOURCES, resolve
 from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.diagnosis import FittedDiagnoser
+from retwin.evaluation.evaluate import finite_probabilities
 from retwin.evaluation.fidelity import (
     measure_fidelity,
     measure_widening,
@@ -32,7 +35,7 @@ from retwin.serialisation.models import write_model
 from retwin.study.files import Files, Job, Roles
 from retwin.study.plan import StudyPlan
 from retwin.study.sources import NEEDS
-from retwin.study.trial import Trained, Trial
+from retwin.study.trial import Trial
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin, generate
@@ -42,22 +45,36 @@ from retwin.update.surrogate import Surrogate, fit_surrogate
 
 __all__ = ["Work"]
 
-ENOUGH = 5
-"""Healthy calibration trajectories from which some can be kept back to widen bands."""
+MIN_HEALTHY = 5
+"""Least number of healthy calibration trajectories of which two can be held out to widen bands."""
 CURVE = (1, 2, 4, 6, 8, 12, 16, 24, 32)
-"""Healthy calibration trajectories of a learning curve, as far as there are more."""
+"""Healthy calibration trajectories of the points of a learning curve, if there are more."""
 
-PORTRAYED = ("ibg_rg_command", "ibg_rg")
-"""Sources whose twin stands beside every test trajectory; the first that is there."""
+OVERLAID = ("ibg_rg_command", "ibg_rg")
+"""Sources whose twin may give the predictive overlay; the first that the plan holds does."""
 DRAWS = 500
-"""Simulations of a test record."""
+"""Simulations of a test record: quantiles of 5 and 95 % vary by 0.01 in their level."""
 
 Costs = dict[str, Any]
+"""What a job cost: `seconds` in all, and parts of it by name."""
 
 
 @dataclass(frozen=True)
 class Work:
-    """A study's folder of intermediate results, and how each is made."""
+    """The jobs of a study.
+
+    Attributes
+    ----------
+    folder : Path
+        Where intermediate results are written.
+    case : Case
+        The system.
+    plan : StudyPlan
+        What is compared.
+    roles : Roles
+        Calibration and test trajectories of each fold.
+
+    """
 
     folder: Path
     case: Case
@@ -66,19 +83,19 @@ class Work:
 
     @property
     def files(self) -> Files:
-        """Where results lie."""
+        """Paths of intermediate results."""
         return Files(self.folder)
 
-    # Which jobs there are.
+    # The graph of jobs.
 
     def graph(self) -> dict[Job, tuple[Job, ...]]:
-        """Every job, and those that must be done before it."""
+        """Every job, and those whose results it needs."""
         found: dict[Job, tuple[Job, ...]] = {}
         waiting = [
             job for source in self.plan.sources for count in (0, *self.counts(source))
-            for job in (*self.answers(source, count), *self.judgements(source, count))
+            for job in (*self.answers(source, count), *self.fidelity_jobs(source, count))
         ]  # fmt: skip
-        waiting += self.portraits()
+        waiting += self.overlay_jobs()
         while waiting:
             job = waiting.pop()
             if job not in found:
@@ -87,9 +104,17 @@ class Work:
         return found
 
     def answers(self, source: str, healthy: int = 0) -> list[Job]:
-        """The jobs whose answers are a source's; a pooled source has those of its members.
+        """The jobs that give the answers of a source; those of its members for a pooled source.
 
-        Diagnoses of test trajectories; where there are no classes, simulations of them.
+        Their kind is "diagnosis", or "simulation" where the case has no classes.
+
+        Parameters
+        ----------
+        source : str
+            A key of `retwin.catalog.SOURCES`.
+        healthy : int
+            See `Job`.
+
         """
         made = SOURCES[source]
         if made.pool:
@@ -102,49 +127,49 @@ class Work:
             for fold in folds
         ]
 
-    def judgements(self, source: str, healthy: int = 0) -> list[Job]:
-        """The jobs that tell how real a source's trajectories are, if there are some to compare.
+    def fidelity_jobs(self, source: str, healthy: int = 0) -> list[Job]:
+        """The jobs that compare a source's twin with healthy test trajectories, if there are two.
 
-        Of the first run: the chance in training is seen in the scores, at less cost.
+        They belong to the first run: the scores show the variance between runs at less cost.
         """
         if not SOURCES[source].fidelity or (self._labels[self.roles.tested] == HEALTHY).sum() < 2:
             return []
         folds = range(len(self.roles.folds))
         return [Job("fidelity", 0, fold, source, healthy) for fold in folds]
 
-    def portraits(self) -> list[Job]:
-        """Jobs that draw every test trajectory over the predictions of the most corrected twin."""
-        corrected = [name for name in PORTRAYED if name in self.plan.sources]
+    def overlay_jobs(self) -> list[Job]:
+        """The jobs of the predictive overlay of the test trajectories, for a corrected twin."""
+        corrected = [name for name in OVERLAID if name in self.plan.sources]
         if not corrected or not self.case.diagnosed:
             return []
         return [Job("portrait", 0, fold, corrected[0]) for fold in range(len(self.roles.folds))]
 
     def needed(self, job: Job) -> tuple[Job, ...]:
-        """What must be done before a job."""
+        """The jobs whose results a job needs."""
         own = job.kind in ("diagnosis", "simulation", "fidelity", "portrait")
         needs = SOURCES[job.name].needs if own else NEEDS.get((job.kind, job.name), ())
         return tuple(job.before(*need) for need in needs)
 
     def counts(self, source: str) -> tuple[int, ...]:
-        """Numbers of healthy calibration trajectories of a source's learning curve, but all."""
+        """Numbers of healthy trajectories at which a learning curve is evaluated, but for all."""
         if not self.plan.learning_curve or SOURCES[source].real_data != "healthy":
             return ()
         return tuple(count for count in CURVE if count < self.healthy)
 
     @property
     def healthy(self) -> int:
-        """Healthy calibration trajectories in the fold that has the fewest."""
+        """Least number of healthy calibration trajectories of a fold."""
         return min(int((self._labels[list(part)] == HEALTHY).sum()) for part, _ in self.roles.folds)
 
     @cached_property
     def _labels(self) -> NDArray:
-        """Of all real trajectories."""
+        """Labels of all real trajectories."""
         return self.files.real_data().labels
 
-    # How each is done.
+    # The work of each job.
 
     def do(self, job: Job, progress: Progress | None = None) -> None:
-        """Make a job's result, unless it is there."""
+        """Make the result of a job and record its costs, unless the result exists."""
         path = self.files.path(job)
         if path.exists():
             return
@@ -155,25 +180,25 @@ class Work:
             "diagnosis": self._diagnosis,
             "simulation": self._simulation,
             "fidelity": self._fidelity,
-            "portrait": self._portrait,
+            "portrait": self._overlay,
         }[job.kind]
         started = time.perf_counter()
         costs = make(self._trial(job, progress), path)
         self.files.keep_costs(job, {"seconds": time.perf_counter() - started, **costs})
 
     def sees(self, source: str) -> str:
-        """Which real data a source may see, in this study."""
+        """The real data that a source may use in this study, a key of `SEES`."""
         declared = SOURCES[source].real_data
-        return "labelled" if declared == "healthy" and self._labels_serve else declared
+        return "labelled" if declared == "healthy" and self._uses_labels else declared
 
     @property
-    def _labels_serve(self) -> bool:
+    def _uses_labels(self) -> bool:
         return self.plan.calibrate_on == "all"
 
     def _trial(self, job: Job, progress: Progress | None) -> Trial:
         fold = self.roles.folds[job.fold]
         if job.kind in ("residual", "update"):
-            sees = "labelled" if self._labels_serve else "healthy"
+            sees = "labelled" if self._uses_labels else "healthy"
         elif job.kind == "surrogate":
             sees = "none"
         else:
@@ -183,12 +208,12 @@ class Work:
         return Trial(self.files, self.case, self.plan, fold, job, sees, progress)
 
     def _surrogate(self, trial: Trial, path: Path) -> Costs:
-        """The IBG of the twin as it is, or of the one whose parameters were updated."""
+        """The IBG of the twin as it is, or after the update that the job names."""
         data = self.files.twin_data()
         if trial.job.name:
             twin, seed = trial.updated(trial.job.name), trial.seed("updated twin")
-            size = self.plan.generated(self.case)
-            data = generate(twin, self.case, per_class=size, seed=seed)
+            count = self.plan.generated(self.case)
+            data = generate(twin, self.case, per_class=count, seed=seed)
         fit_surrogate(
             data,
             self.case.network,
@@ -204,14 +229,15 @@ class Work:
         return {}
 
     def _update(self, trial: Trial, path: Path) -> Costs:
-        """Eq. 2 or Eq. 3; what they warn of is kept with the costs."""
+        """The update by Eq. 2 or Eq. 3; its warnings are recorded with the costs."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            least = trial.job.name == "pi_ls"
-            found = _least_squares(trial, path) if least else _bayes(trial, path)
+            bayes = trial.job.name == "pi_bayes"
+            found = _bayes(trial, path) if bayes else _least_squares(trial, path)
         return {"twin_runs": found.twin_runs, "notes": found.reason}
 
     def _diagnosis(self, trial: Trial, path: Path) -> Costs:
+        """Train or make the diagnoser of a source, and predict the test trajectories."""
         source, costs = SOURCES[trial.job.name], {}
         started = time.perf_counter()
         if source.twin:
@@ -219,14 +245,14 @@ class Work:
             costs = {"generate": time.perf_counter() - started, "trajectories": len(made)}
             if not source.needs or source.parametric:
                 costs["twin_runs"] = len(made)
-            diagnoser: Trained = trial.train(made)
+            diagnoser: FittedDiagnoser = trial.train(made)
         else:
             diagnoser = resolve(source.diagnoser)(trial)
             if not source.needs:
                 costs["twin_runs"] = len(trial.twin_data)
         trained = time.perf_counter()
         test = trial.tested()
-        probabilities = diagnoser.predict_proba(test)
+        probabilities = finite_probabilities(diagnoser, test)
         costs["predict"] = (time.perf_counter() - trained) / len(test)
         diagnoser.save(self.files.diagnoser(trial.job))
         with write_atomically(path) as part:
@@ -234,7 +260,7 @@ class Work:
         return {"train": trained - started - costs.get("generate", 0.0), **costs}
 
     def _simulation(self, trial: Trial, path: Path) -> Costs:
-        """Simulate the test records from their commands alone, and score that sample by sample."""
+        """Simulate the test records from their commands alone, with scores of each sample."""
         make = resolve(SOURCES[trial.job.name].twin)
         twin, records = make(trial), self.files.real_data()[list(trial.fold[1])]
         started = time.perf_counter()
@@ -244,11 +270,11 @@ class Work:
         return {"generate": seconds, "trajectories": DRAWS * len(records)}
 
     def _fidelity(self, trial: Trial, path: Path) -> Costs:
-        """Hold a source's twin against the fold's healthy test trajectories."""
-        held_out = self.files.real_data()[list(trial.fold[1])].with_label(HEALTHY)
-        if len(held_out) == 0:
+        """Compare the twin of a source with the healthy test trajectories of the fold."""
+        healthy = self.files.real_data()[list(trial.fold[1])].with_label(HEALTHY)
+        if len(healthy) == 0:
             with write_atomically(path) as part:
-                np.savez(part)  # done, and nothing found
+                np.savez(part)  # an empty file marks the job as done
             return {}
         make = resolve(SOURCES[trial.job.name].twin)
         twin = make(trial)
@@ -258,7 +284,7 @@ class Work:
             rivals, widening = self._rivals(trial, twin), self._widening(trial)
         found = measure_fidelity(
             twin,
-            held_out,
+            healthy,
             seed=trial.seed("fidelity"),
             rate=self.case.sensor_rate,
             against=rivals,
@@ -268,40 +294,40 @@ class Work:
         found.save(path)
         return {}
 
-    def _portrait(self, trial: Trial, path: Path) -> Costs:
-        """For the eye, and for no score: the fold's test trajectories beside a healthy twin."""
+    def _overlay(self, trial: Trial, path: Path) -> Costs:
+        """The predictive overlay of the fold's test trajectories, for display and no score."""
         make = resolve(SOURCES[trial.job.name].twin)
         twin, test = make(trial), self.files.real_data()[list(trial.fold[1])]
-        assert isinstance(twin, CorrectedTwin), "as all in PORTRAYED"
+        assert isinstance(twin, CorrectedTwin), "as all in OVERLAID"
         seed, rate = trial.seed("portrait"), self.case.sensor_rate
         predictive_overlay(twin, test, seed=seed, rate=rate, progress=trial.progress).save(path)
         return {}
 
     def _rivals(self, trial: Trial, twin: CorrectedTwin) -> dict[str, Twin]:
-        """What the residual model's shape is worth: its mean alone, and a single Gaussian."""
-        one: Density | SequenceMixture = Mixture(components=1)
+        """Ablations of the residual model: its mean alone, and a single Gaussian."""
+        density: Density | SequenceMixture = Mixture(components=1)
         if isinstance(self.case.density, SequenceMixture):
-            one = replace(self.case.density, components=1)
-        single = self._refitted(trial, self._calibration(trial), one)
+            density = replace(self.case.density, components=1)
+        single = self._refitted(trial, self._calibration(trial), density)
         return {"mean_only": replace(twin, random=False), "single_gaussian": single}
 
     def _widening(self, trial: Trial) -> float | None:
-        """By how much to widen bands, from healthy calibration trajectories kept back from the RG.
+        """Factor by which bands are widened, from healthy calibration trajectories held out.
 
-        The RG is fitted to the others for this; test trajectories play no part.
+        The RG is fitted to the others for this; no test trajectory is used.
         """
         healthy = trial.healthy
-        if len(healthy) < ENOUGH:
+        if len(healthy) < MIN_HEALTHY:
             return None
         seed = trial.seed("widening")
-        fitted, kept = healthy.split(0.6, seed=seed)
-        twin = self._refitted(trial, fitted, self.case.density)
-        return measure_widening(twin, kept, seed=seed, rate=self.case.sensor_rate)
+        fitted_on, held_out = healthy.split(0.6, seed=seed)
+        twin = self._refitted(trial, fitted_on, self.case.density)
+        return measure_widening(twin, held_out, seed=seed, rate=self.case.sensor_rate)
 
     def _refitted(
         self, trial: Trial, calibration: Trajectories, density: Density | SequenceMixture
     ) -> CorrectedTwin:
-        """The corrected twin of a source, its RG fitted to other data or another shape."""
+        """The corrected twin of a source, its RG fitted to other data or with another density."""
         (name,) = (name for kind, name in SOURCES[trial.job.name].needs if kind == "residual")
         residual = self._fitted(trial, calibration, name, density)
         return CorrectedTwin(self._base(trial, name), residual)
@@ -325,12 +351,12 @@ class Work:
             trial.correction(name),
             density,
             seed=trial.seed("residual"),
-            calibrate_on=faults if self._labels_serve else "healthy",
+            calibrate_on=faults if self._uses_labels else "healthy",
             progress=trial.progress,
         )
 
     def _calibration(self, trial: Trial) -> Trajectories:
-        return trial.labelled if self._labels_serve else trial.healthy
+        return trial.labelled if self._uses_labels else trial.healthy
 
 
 def _least_squares(trial: Trial, path: Path) -> Updated:

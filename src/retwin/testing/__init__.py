@@ -1,9 +1,9 @@
-"""Contract suites: checks that every twin, correction and diagnoser passes, for users too.
+"""Contract suites: checks that every twin, correction and diagnoser must pass, for users too.
 
 Belongs here: checks that take an implementation and its subject. Not here: tests of this package.
 
-A suite is a tuple of checks. A check takes a subject and raises AssertionError with what is wrong.
-With pytest, which is not needed:
+A suite is a tuple of checks. A check takes a subject and raises AssertionError with the violation.
+With pytest, which is optional:
 
     SUBJECT = TwinSubject(MyTwin(), commands)
 
@@ -18,7 +18,8 @@ from __future__ import annotations
 
 from retwin.testing.corrections import CORRECTION_CHECKS, CorrectionSubject, check_correction
 from retwin.testing.diagnosers import DIAGNOSER_CHECKS, DiagnoserSubject, check_diagnoser
-from retwin.testing.twins import TWIN_CHECKS, TwinSubject, check_twin
+from retwin.testing.twin_subject import TwinSubject
+from retwin.testing.twins import TWIN_CHECKS, check_twin
 
 __all__ = [
     "CORRECTION_CHECKS",

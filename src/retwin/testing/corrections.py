@@ -1,4 +1,4 @@
-"""The contract of `Correction`: what every operator g must do, as checks to run on any."""
+"""The contract of `Correction`: checks that every operator g must pass."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from retwin import checks
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
-from retwin.errors import InputError
 from retwin.testing.suite import (
     quiet_randomness,
     require,
@@ -19,7 +19,7 @@ from retwin.testing.suite import (
     run_checks,
 )
 
-if TYPE_CHECKING:  # torch takes seconds to load, and twins can be checked without it
+if TYPE_CHECKING:  # the contract of twins needs no torch, which takes seconds to import
     from torch import Tensor
 
     from retwin.update.corrections import Context, Correction, Discrepancy
@@ -29,17 +29,22 @@ __all__ = ["CORRECTION_CHECKS", "CorrectionSubject", "check_correction"]
 
 @dataclass(frozen=True, eq=False)
 class CorrectionSubject:
-    """A correction, and what it is to be tried on.
+    """A correction with the trajectories and discrepancies that it is checked on.
 
     Parameters
     ----------
-    correction: the operator.
-    context: at least two trajectories, with movements that it can tell from each other.
-    z: (n, M, d_z), values that it should be able to find again; 0 where a movement does not exist.
+    correction : Correction
+        The operator.
+    context : Context
+        At least two trajectories, in whose outputs the segments can be identified.
+    z : Tensor, shape (n, M, d_z)
+        Discrepancies that the operator should be able to infer, 0 for a segment that does not
+        exist.
 
     Raises
     ------
-    InputError: fewer than two trajectories, or not one z for each.
+    InputError
+        If there are fewer than two trajectories, or not one z for each.
 
     """
 
@@ -48,39 +53,51 @@ class CorrectionSubject:
     z: Tensor
 
     def __post_init__(self) -> None:
-        if len(self.context) < 2 or self.z.ndim != 3 or len(self.z) != len(self.context):
-            raise InputError(
-                "z",
-                expected="shape (n, M, d_z) for n trajectories of the context, n at least 2",
-                got=f"{tuple(self.z.shape)} for {len(self.context)}",
-                remedy="give a few short trajectories and one z for each",
-            )
+        checks.require(
+            len(self.context) >= 2 and self.z.ndim == 3 and len(self.z) == len(self.context),
+            "z",
+            expected="shape (n, M, d_z) for n trajectories of the context, n at least 2",
+            got=f"{tuple(self.z.shape)} for {len(self.context)}",
+            remedy="give a few short trajectories and one z for each",
+        )
 
     @property
     def inputs(self) -> Channels:
-        """Channels for the commands; a context does not name them."""
+        """Numbered channels of the commands, since a context has no names."""
         return Channels.numbered("u", self.context.commands.shape[2])
 
     @property
     def outputs(self) -> Channels:
-        """Channels for the outputs; a context does not name them."""
+        """Numbered channels of the outputs, since a context has no names."""
         return Channels.numbered("y", self.context.path.shape[2])
 
     def apply(self, z: Tensor, context: Context | None = None) -> Tensor:
-        """The corrected path, by default of the subject's context."""
+        """Corrected outputs (n, T, d_y), by default of the subject's context."""
         return self.correction.apply(context or self.context, z)
 
     def infer(self, *, noise: float = 0.0) -> Discrepancy:
-        """What is found for z, the outputs being noisy by that share of what z does."""
+        """Discrepancies inferred from corrected outputs with white noise.
+
+        Parameters
+        ----------
+        noise : float
+            Standard deviation of the noise, in units of the root mean square effect of z.
+
+        Returns
+        -------
+        Discrepancy
+            What `infer` of the correction gives.
+
+        """
         observed = self.apply(self.z).detach()
         effect = (observed - self.context.path).square().mean().sqrt()
-        drawn = np.random.default_rng(0).normal(size=tuple(observed.shape))
-        observed = observed + noise * effect * observed.new_tensor(drawn)
+        white = np.random.default_rng(0).normal(size=tuple(observed.shape))
+        observed = observed + noise * effect * observed.new_tensor(white)
         return self.correction.infer(self.context, observed, observed == observed)
 
 
 def check_protocol(subject: CorrectionSubject) -> None:
-    """It has resolution, latent, heads, apply and infer."""
+    """The correction has resolution, latent, heads, apply and infer."""
     from retwin.update.corrections import Correction
 
     require(
@@ -88,8 +105,8 @@ def check_protocol(subject: CorrectionSubject) -> None:
         "a correction must have resolution, latent, heads, apply, infer; see retwin.Correction",
     )
     resolution = subject.correction.resolution
-    known = resolution in ("segment", "step")
-    require(known, f"resolution must be 'segment' or 'step', got {resolution!r}")
+    valid = resolution in ("segment", "step")
+    require(valid, f"resolution must be 'segment' or 'step', got {resolution!r}")
 
 
 def check_latent(subject: CorrectionSubject) -> None:
@@ -106,13 +123,13 @@ def check_latent(subject: CorrectionSubject) -> None:
 
 
 def check_zero(subject: CorrectionSubject) -> None:
-    """With z = 0 nothing changes."""
+    """With z = 0 the outputs do not change."""
     same = subject.apply(subject.z * 0)
-    require_alike(same, subject.context.path, "apply with z = 0 must give the path back")
+    require_alike(same, subject.context.path, "apply with z = 0 must return the path")
 
 
 def check_apply(subject: CorrectionSubject) -> None:
-    """What comes out is a finite path of the same shape, and every component of z acts."""
+    """`apply` gives finite outputs of the same shape, and every component of z has an effect."""
     path = subject.context.path
     corrected = subject.apply(subject.z)
     require(
@@ -125,28 +142,29 @@ def check_apply(subject: CorrectionSubject) -> None:
         alone[..., component] = subject.z[..., component]
         acts = not subject.apply(alone).equal(subject.apply(alone * 0))
         require(alone.any(), f"component {component} of the subject's z is 0; give another z")
-        require(acts, f"component {component} of z must do something")
+        require(acts, f"component {component} of z must have an effect")
 
 
 def check_gradient(subject: CorrectionSubject) -> None:
-    """`apply` can be differentiated by z."""
+    """`apply` is differentiable with respect to z."""
     z = subject.z.clone().requires_grad_()
     corrected = subject.apply(z)
     require(corrected.requires_grad, "apply must keep the gradient of z")
     corrected.square().sum().backward()
     require(
-        z.grad is not None and z.grad.isfinite().all(), "the gradient by z must be finite numbers"
+        z.grad is not None and z.grad.isfinite().all(),
+        "the gradient with respect to z must be finite",
     )
     if z.grad is not None:
-        reached = z.grad.flatten(0, 1).any(dim=0).tolist()
-        require(all(reached), f"every component of z must have a gradient, got {reached}")
+        nonzero = z.grad.flatten(0, 1).any(dim=0).tolist()
+        require(all(nonzero), f"every component of z must have a gradient, got {nonzero}")
 
 
 def check_batch(subject: CorrectionSubject) -> None:
-    """What a trajectory gives does not depend on those beside it.
+    """The results of a trajectory do not depend on the others of the batch.
 
-    An operator with a true `pools` may learn from all of them what to believe beforehand; then
-    this holds for `apply` only.
+    An operator with a true `pools` may learn a prior from all trajectories; then this holds for
+    `apply` only.
     """
     pools = getattr(subject.correction, "pools", False)
     whole = subject.apply(subject.z).detach()
@@ -163,30 +181,30 @@ def check_batch(subject: CorrectionSubject) -> None:
         require_alike(alone.z, found.z[one], f"infer: {message}", tolerance=1e-3)
 
 
-def check_no_movement(subject: CorrectionSubject) -> None:
-    """Where a movement does not exist, nothing is corrected and nothing found."""
+def check_no_segment(subject: CorrectionSubject) -> None:
+    """A segment that does not exist is not corrected, and nothing is inferred for it."""
     if subject.correction.resolution != "segment":
         return
     corrected = subject.apply(subject.z).detach()
     mask = corrected == corrected
     more = replace(subject.context, segments=_with_another(subject.context.segments))
-    z = subject.z.new_zeros(len(more), more.segments.most, subject.z.shape[2])
+    z = subject.z.new_zeros(len(more), more.segments.max_count, subject.z.shape[2])
     z[:, :-1] = subject.z
-    message = "a movement that does not exist, z = 0, must change nothing"
+    message = "a segment that does not exist, z = 0, must change nothing"
     require_alike(subject.apply(z, more), corrected, message)
     found = subject.correction.infer(more, corrected, mask)
     quiet = not found.z[:, -1].any() and not found.identified[:, -1].any()
-    require(quiet, "infer must give z = 0, not identified, where a movement does not exist")
+    require(quiet, "infer must give z = 0, not identified, for a segment that does not exist")
     still = replace(subject.context, segments=_without_any(subject.context.segments))
     none = subject.z[:, :0]
-    message = "without any movement apply must give the path back"
+    message = "without any segment apply must return the path"
     require_alike(subject.apply(none, still), subject.context.path, message)
     got, wanted = subject.correction.infer(still, corrected, mask).z.shape, none.shape
-    require(got == wanted, f"without movements z must have shape {tuple(wanted)}, got {got}")
+    require(got == wanted, f"without segments z must have shape {tuple(wanted)}, got {got}")
 
 
 def _with_another(segments: Segments) -> Segments:
-    """The same movements and one more that does not exist."""
+    """The same segments and one more that does not exist."""
     end = np.full((len(segments), 1), float(segments.steps))
     start, settle, stop = (
         np.hstack([times, end]) for times in (segments.start, segments.settle, segments.stop)
@@ -201,13 +219,13 @@ def _without_any(segments: Segments) -> Segments:
 
 
 def check_discrepancy(subject: CorrectionSubject) -> None:
-    """What is found has the shapes of z, a covariance that is one, and no gradient."""
-    n, most, width = subject.z.shape
+    """An inferred discrepancy has the shapes of z, a valid covariance, and no gradient."""
+    n, count, width = subject.z.shape
     found = subject.infer(noise=0.01)
     wanted = {
-        "z": (n, most, width),
-        "covariance": (n, most, width, width),
-        "identified": (n, most, width),
+        "z": (n, count, width),
+        "covariance": (n, count, width, width),
+        "identified": (n, count, width),
         "noise": (n,),
     }
     for name, shape in wanted.items():
@@ -221,35 +239,34 @@ def check_discrepancy(subject: CorrectionSubject) -> None:
     scale = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
     scaled = (scale[..., None] * covariance * scale[..., None, :]).numpy()
     require_alike(scaled, scaled.swapaxes(-1, -2), "covariance must be symmetric")
-    least = np.linalg.eigvalsh(scaled).min(initial=0.0)
-    require(least > -1e-6, f"covariance must have no negative eigenvalue, got {least:.3g}")
+    smallest = np.linalg.eigvalsh(scaled).min(initial=0.0)
+    require(smallest > -1e-6, f"covariance must have no negative eigenvalue, got {smallest:.3g}")
 
 
 def check_recovery(subject: CorrectionSubject) -> None:
-    """`infer` finds the z that `apply` was given: exactly without noise, roughly with some."""
+    """`infer` recovers the z that `apply` was given, with and without noise."""
     corrected = subject.apply(subject.z).detach()
     found = subject.infer()
     error = (subject.apply(found.z.to(subject.z)) - corrected).square().mean().sqrt()
     effect = (corrected - subject.context.path).square().mean().sqrt()
     require(
         error <= 0.05 * effect,
-        f"apply with what infer finds must come within 5 % of the path, got {error / effect:.1%}",
+        f"apply with the inferred z must reproduce the path to 5 %, got {error / effect:.1%}",
     )
     for noise in (0.0, 0.02):
         found = subject.infer(noise=noise)
         size = subject.z.abs().flatten(0, 1).amax(dim=0)
         near = (found.z - subject.z).abs() <= 0.2 * size
-        known = found.identified
-        share = known.double().mean()
-        require(share >= 0.5, f"infer must identify what is plain to see, got {share:.0%} of z")
-        right = near[known].double().mean()
+        share = found.identified.double().mean()
+        require(share >= 0.5, f"infer must identify at least half of z, got {share:.0%}")
+        right = near[found.identified].double().mean()
         require(
-            right >= 0.9, f"infer must find z again where identified, it found {right:.0%} of it"
+            right >= 0.9, f"infer must recover z where identified, it recovered {right:.0%} of it"
         )
 
 
 def check_mask(subject: CorrectionSubject) -> None:
-    """What was not measured does not count, and from nothing nothing is identified."""
+    """Outputs that were not measured have no effect; without any, nothing is identified."""
     observed = subject.apply(subject.z).detach()
     mask = observed == observed
     mask[:, : mask.shape[1] // 8] = False
@@ -259,7 +276,7 @@ def check_mask(subject: CorrectionSubject) -> None:
         )
         for value in (0.0, 1e3)
     ]
-    message = "infer must not look at samples where the mask is False"
+    message = "infer must not use samples where the mask is False"
     require_alike(results[1].z, results[0].z, message)
     blind = subject.correction.infer(subject.context, observed * 0, mask & False)
     require(blind.z.isfinite().all(), "z must be finite even if nothing was measured")
@@ -267,7 +284,7 @@ def check_mask(subject: CorrectionSubject) -> None:
 
 
 def check_arguments_kept(subject: CorrectionSubject) -> None:
-    """Arguments stay as they are, the same call gives the same bytes, no generator is touched."""
+    """Arguments do not change, results repeat exactly, and global generators are not used."""
     observed = subject.apply(subject.z).detach()
     mask = observed == observed
     given = {"path": subject.context.path, "z": subject.z, "observed": observed, "mask": mask}
@@ -288,7 +305,7 @@ CORRECTION_CHECKS: tuple[Callable[[CorrectionSubject], None], ...] = (
     check_apply,
     check_gradient,
     check_batch,
-    check_no_movement,
+    check_no_segment,
     check_discrepancy,
     check_recovery,
     check_mask,
@@ -297,11 +314,17 @@ CORRECTION_CHECKS: tuple[Callable[[CorrectionSubject], None], ...] = (
 
 
 def check_correction(correction: Correction, context: Context, z: Tensor) -> None:
-    """Run all `CORRECTION_CHECKS`, see `CorrectionSubject` for the arguments.
+    """Run all `CORRECTION_CHECKS`.
+
+    Parameters
+    ----------
+    correction, context, z : Correction, Context, Tensor
+        See `CorrectionSubject`.
 
     Raises
     ------
-    AssertionError: one that lists everything the correction breaks.
+    AssertionError
+        If the correction violates its contract; the message lists every violation.
 
     """
     subject = CorrectionSubject(correction, context, z)

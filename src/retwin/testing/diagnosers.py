@@ -1,4 +1,4 @@
-"""The contract of `Diagnoser`: what every classifier of trajectories must do, as checks."""
+"""The contract of `Diagnoser`: requirements of every classifier of trajectories, as checks."""
 
 from __future__ import annotations
 
@@ -28,16 +28,19 @@ __all__ = ["DIAGNOSER_CHECKS", "DiagnoserSubject", "check_diagnoser"]
 
 @dataclass(frozen=True, eq=False)
 class DiagnoserSubject:
-    """A diagnoser, and what it is to be tried on.
+    """A diagnoser, and the trajectories on which it is checked.
 
     Parameters
     ----------
-    diagnoser: fitted.
-    trajectories: at least two of the kind that it was fitted on.
+    diagnoser : Diagnoser
+        A fitted one.
+    trajectories : Trajectories
+        At least two, of the kind on which it was fitted.
 
     Raises
     ------
-    InputError: fewer than two trajectories.
+    InputError
+        If there are fewer than two trajectories.
 
     """
 
@@ -50,18 +53,18 @@ class DiagnoserSubject:
                 "trajectories",
                 expected="at least two",
                 got=f"{len(self.trajectories)}",
-                remedy="give a few of the kind that the diagnoser was fitted on",
+                remedy="give a few of the kind on which the diagnoser was fitted",
             )
 
     def predict(self, trajectories: Trajectories | None = None) -> NDArray:
-        """Probabilities, by default of the subject's trajectories."""
+        """Probabilities (n, classes), by default of the subject's trajectories."""
         return self.diagnoser.predict_proba(
             self.trajectories if trajectories is None else trajectories
         )
 
 
 def check_protocol(subject: DiagnoserSubject) -> None:
-    """It has classes, each named once, and predict_proba."""
+    """The diagnoser has `classes`, each named once, and `predict_proba`."""
     from retwin.diagnosis import Diagnoser
 
     require(
@@ -75,7 +78,7 @@ def check_protocol(subject: DiagnoserSubject) -> None:
 
 
 def check_probabilities(subject: DiagnoserSubject) -> None:
-    """One probability per class, none below 0, that sum to 1."""
+    """There is one probability per class, none is below 0, and they sum to 1."""
     shape = (len(subject.trajectories), len(subject.diagnoser.classes))
     got = subject.predict()
     sound = isinstance(got, np.ndarray) and got.shape == shape and got.dtype.kind == "f"
@@ -85,9 +88,9 @@ def check_probabilities(subject: DiagnoserSubject) -> None:
 
 
 def check_blindness(subject: DiagnoserSubject) -> None:
-    """Labels, names and provenance are not looked at."""
+    """Labels, names and provenance of trajectories do not change the probabilities."""
     n = len(subject.trajectories)
-    wanted = subject.predict()
+    expected = subject.predict()
     wrong = np.resize(subject.diagnoser.classes, n)
     for what, given in {
         "the labels": subject.trajectories.replace(labels=wrong),
@@ -98,21 +101,21 @@ def check_blindness(subject: DiagnoserSubject) -> None:
             emulated=not subject.trajectories.emulated
         ),
     }.items():
-        require_same(subject.predict(given), wanted, f"predict_proba must not depend on {what}")
+        require_same(subject.predict(given), expected, f"predict_proba must not depend on {what}")
 
 
 def check_batch(subject: DiagnoserSubject) -> None:
-    """What a trajectory gives does not depend on those beside it, or on their order."""
+    """Probabilities of a trajectory do not depend on the others, or on their order."""
     whole = subject.predict()
-    turned = subject.predict(subject.trajectories[::-1])
-    require_alike(turned, whole[::-1], "order must not matter")
+    reversed_ = subject.predict(subject.trajectories[::-1])
+    require_alike(reversed_, whole[::-1], "order must not matter")
     for i in range(len(whole)):
         alone = subject.predict(subject.trajectories[i : i + 1])
         require_alike(alone, whole[i : i + 1], f"trajectory {i} must give the same alone")
 
 
 def check_missing(subject: DiagnoserSubject) -> None:
-    """Missing measurements do not make probabilities NaN, were they all missing."""
+    """Probabilities are finite where measurements are missing, even if all are."""
     for share in (2, 1):
         mask = subject.trajectories.mask.copy()
         mask[:, : mask.shape[1] // share] = False
@@ -122,7 +125,7 @@ def check_missing(subject: DiagnoserSubject) -> None:
 
 
 def check_other_data(subject: DiagnoserSubject) -> None:
-    """Other channels or another rate than it was trained on are refused."""
+    """Channels or a rate other than those of the training set are refused."""
     given = subject.trajectories
     units = given.outputs.units
     other = Channels(tuple(f"not {name}" for name in given.outputs.names), units)
@@ -133,20 +136,20 @@ def check_other_data(subject: DiagnoserSubject) -> None:
         mask=np.concatenate([given.mask, given.mask[..., :1]], axis=2),
         outputs=more,
     )
-    for what, argument, strange in (
+    for what, argument, unsuitable in (
         ("twice the rate", "rate", given.replace(rate=2 * given.rate)),
         ("outputs of other names", "outputs", given.replace(outputs=other)),
         ("an output too many", "outputs", wide),
     ):
         require_refused(
-            lambda t=strange: subject.predict(t),  # type: ignore[misc]
+            lambda t=unsuitable: subject.predict(t),  # type: ignore[misc]
             f"trajectories.{argument}",
             what,
         )
 
 
 def check_same_again(subject: DiagnoserSubject) -> None:
-    """The same trajectories give the same bytes, and no generator is touched."""
+    """The same trajectories give the same bytes, and no global generator is used."""
     with quiet_randomness():
         first, second = subject.predict(), subject.predict()
     require_same(second, first, "predict_proba must give the same bytes again")
@@ -164,11 +167,17 @@ DIAGNOSER_CHECKS: tuple[Callable[[DiagnoserSubject], None], ...] = (
 
 
 def check_diagnoser(diagnoser: Diagnoser, trajectories: Trajectories) -> None:
-    """Run all `DIAGNOSER_CHECKS`, see `DiagnoserSubject` for the arguments.
+    """Run all `DIAGNOSER_CHECKS`.
+
+    Parameters
+    ----------
+    diagnoser, trajectories
+        See `DiagnoserSubject`.
 
     Raises
     ------
-    AssertionError: one that lists everything the diagnoser breaks.
+    AssertionError
+        A single one that lists every requirement that is violated.
 
     """
     subject = DiagnoserSubject(diagnoser, trajectories)

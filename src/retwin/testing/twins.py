@@ -1,17 +1,15 @@
-"""The contract of `Twin`: what every twin must do, as checks that can be run on any."""
+"""The contract of `Twin`, as checks that can be run on any implementation."""
 
 from __future__ import annotations
 
 import pickle
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
-from retwin.errors import InputError
 from retwin.testing.suite import (
     quiet_randomness,
     require,
@@ -20,86 +18,13 @@ from retwin.testing.suite import (
     require_same,
     run_checks,
 )
-from retwin.twins.faults import Fault, Stuck, draw_faults, faulty_commands, frozen_response
-from retwin.twins.twin import Limits, Twin
+from retwin.testing.twin_subject import TwinSubject
+from retwin.twins.faults import Fault, Stuck
+from retwin.twins.limits import Limits
+from retwin.twins.twin import Twin
+from retwin.twins.workers import keep_workers
 
-__all__ = ["TWIN_CHECKS", "TwinSubject", "check_twin"]
-
-
-@dataclass(frozen=True, eq=False)
-class TwinSubject:
-    """A twin, and what it is to be tried on.
-
-    Parameters
-    ----------
-    twin: the twin.
-    commands: (n, T, d_u) that it can follow, at least two trajectories that move; a few short ones
-        do.
-    faults: one per trajectory, None for a healthy one, some of each; those that are there must
-        change what the twin does. By default the first is healthy, and in each of the others one
-        actuator sticks somewhere before its last movement.
-
-    Raises
-    ------
-    InputError: commands or faults that the checks cannot work with.
-
-    """
-
-    twin: Twin
-    commands: NDArray
-    faults: Sequence[Fault | None] = ()
-
-    def __post_init__(self) -> None:
-        shape = np.shape(self.commands)
-        if len(shape) != 3 or shape[0] < 2 or shape[1] < 8:
-            raise InputError(
-                "commands",
-                expected="numbers of shape (n, T, d_u), n at least 2 and T at least 8",
-                got=f"shape {shape}",
-                remedy="give a few short trajectories that the twin can follow",
-            )
-        if not self.faults:
-            stuck = [_stuck(each, turn) for turn, each in enumerate(self.commands[1:])]
-            object.__setattr__(self, "faults", (None, *stuck))
-        healthy = sum(fault is None for fault in self.faults)
-        if len(self.faults) != shape[0] or healthy in (0, shape[0]):
-            raise InputError(
-                "faults",
-                expected=f"{shape[0]}, one per trajectory, some None and some not",
-                got=f"{len(self.faults)}, {healthy} of them None",
-                remedy="give None for a healthy trajectory, or leave faults out",
-            )
-
-    def simulate(
-        self,
-        commands: NDArray | None = None,
-        *,
-        faults: Sequence[Fault | None] | None = None,
-        seed: int = 0,
-    ) -> Trajectories:
-        """What the twin says to those commands, by default the subject's."""
-        commands = self.commands.copy() if commands is None else commands
-        return self.twin.simulate(commands, faults=faults, seed=seed)
-
-    def drawn(self, seed: int) -> list[Fault | None]:
-        """The subject's faults with the severities that this seed gives."""
-        return draw_faults(self.faults, Segments.from_commands(self.commands), seed)
-
-    def moved(self, seed: int) -> NDArray:
-        """(n,) bool: whether the fault changes what the actuators are told or do."""
-        drawn = self.drawn(seed)
-        told = faulty_commands(self.commands, drawn, Segments.from_commands(self.commands))
-        return (frozen_response(told, drawn) != self.commands).any(axis=(1, 2))
-
-
-def _stuck(commands: NDArray, turn: int) -> Stuck:
-    """A fault that acts on (T, d_u): one actuator that moves, another each turn."""
-    moving = np.diff(commands, axis=0) != 0
-    actuators = np.flatnonzero(moving.any(axis=0))
-    if len(actuators) == 0:
-        return Stuck(0, onset=0)
-    actuator = int(actuators[turn % len(actuators)])
-    return Stuck(actuator, onset=(0, int(np.flatnonzero(moving[:, actuator])[-1])))
+__all__ = ["TWIN_CHECKS", "check_twin"]
 
 
 def check_protocol(subject: TwinSubject) -> None:
@@ -111,7 +36,7 @@ def check_protocol(subject: TwinSubject) -> None:
 
 
 def check_result(subject: TwinSubject) -> None:
-    """The result has the twin's channels and rate, one finite output per command, the commands."""
+    """The result has the twin's channels and rate, the commands, and finite outputs for them."""
     twin, made = subject.twin, subject.simulate()
     require(isinstance(made, Trajectories), f"simulate must return Trajectories, got {type(made)}")
     require(made.inputs == twin.inputs, f"inputs must be the twin's, got {made.inputs}")
@@ -122,12 +47,12 @@ def check_result(subject: TwinSubject) -> None:
         got = getattr(made, name).shape
         require(got == shape, f"{name} must have shape {shape}, got {got}")
     require(made.mask.all(), "a simulated output must not be missing: observed has NaN")
-    told = subject.commands.astype(made.commands.dtype)
-    require_same(made.commands, told, "commands must come back as they were given")
+    given = subject.commands.astype(made.commands.dtype)
+    require_same(made.commands, given, "commands must come back as they were given")
 
 
 def check_labels(subject: TwinSubject) -> None:
-    """Labels are the faults' own, and "Healthy" where there is none."""
+    """Labels are those of the faults, and "Healthy" where there is none."""
     for faults in (None, [_renamed(fault) for fault in subject.faults]):
         made = subject.simulate(faults=faults)
         given = [None] * len(subject.commands) if faults is None else faults
@@ -137,10 +62,10 @@ def check_labels(subject: TwinSubject) -> None:
 
 
 def _renamed(fault: Fault | None) -> Fault | None:
-    """The fault with a label that is not its kind's, where it can have one."""
+    """The fault with a label that is not the default of its class, where it can have one."""
     try:
         return replace(fault, label="A name of its own")  # type: ignore[type-var]
-    except TypeError:  # None, or a fault of the user's that is made in another way
+    except TypeError:  # None, or a user's fault that is no dataclass with a label
         return fault
 
 
@@ -153,15 +78,15 @@ def check_seed(subject: TwinSubject) -> None:
 
 
 def check_severities(subject: TwinSubject) -> None:
-    """Open severities are drawn first, from the seed alone: twins can be compared on them."""
+    """Open severities depend on the seed alone, so that twins can be compared."""
     for seed in (1, 2):
         left_open = subject.simulate(faults=subject.faults, seed=seed)
         fixed = subject.simulate(faults=subject.drawn(seed), seed=seed)
         require_same(
             left_open.observed,
             fixed.observed,
-            f"with seed {seed}, faults must get the severities that draw_faults gives; "
-            "simulate_in_chunks sees to it",
+            f"with seed {seed}, faults must get the severities of draw_faults, as they do in "
+            "simulate_in_chunks",
         )
 
 
@@ -174,24 +99,24 @@ def check_nominal(subject: TwinSubject) -> None:
 
 
 def check_faults_act(subject: TwinSubject) -> None:
-    """A fault that moves an actuator changes the observed output, and no other trajectory's."""
-    moved = subject.moved(3)
-    require(moved.any(), "no fault of the subject changes its commands; give others")
+    """A fault that affects an actuator changes the observed output of its trajectory alone."""
+    affected = subject.affected(3)
+    require(affected.any(), "no fault of the subject changes its commands; give others")
     healthy = subject.simulate(seed=3).observed
     faulty = subject.simulate(faults=subject.faults, seed=3).observed
     for i, fault in enumerate(subject.faults):
         if fault is None:
             message = f"observed of healthy trajectory {i} must not depend on the others' faults"
             require_alike(faulty[i], healthy[i], message)
-        elif moved[i]:
+        elif affected[i]:
             changed = faulty[i].tobytes() != healthy[i].tobytes()
             require(changed, f"observed of trajectory {i} must change with the fault {fault}")
 
 
 def check_batch(subject: TwinSubject) -> None:
-    """What a trajectory gives does not depend on those beside it.
+    """The outputs of a trajectory do not depend on the other trajectories.
 
-    Of a twin whose healthy output depends on the seed, this is asked of the nominal output only.
+    Where the healthy output depends on the seed, only the nominal output is compared.
     """
     whole = subject.simulate(seed=1)
     names = ["nominal"]
@@ -238,6 +163,7 @@ def _whole_numbers(subject: TwinSubject) -> NDArray | None:
 
 
 def _limits(subject: TwinSubject) -> tuple[NDArray, NDArray]:
+    """The twin's limits (d_u,), infinite where it has none."""
     limits: Limits | None = getattr(subject.twin, "limits", None)
     if limits is None:
         wide = np.full(len(subject.twin.inputs), np.inf)
@@ -246,7 +172,7 @@ def _limits(subject: TwinSubject) -> tuple[NDArray, NDArray]:
 
 
 def check_lengths(subject: TwinSubject) -> None:
-    """Trajectories may have two samples, or many more than usual."""
+    """Trajectories may have two samples, or many more than the subject's."""
     held = np.repeat(subject.commands[:, -1:], 3 * subject.commands.shape[1], axis=1)
     long = np.concatenate([subject.commands, held], axis=1)
     for commands in (subject.commands[:, :2], long):
@@ -256,33 +182,34 @@ def check_lengths(subject: TwinSubject) -> None:
 
 
 def check_too_short(subject: TwinSubject) -> None:
-    """Commands without time, one sample or none, are refused."""
+    """Commands of one sample or none are refused."""
     for steps in (0, 1):
         commands = subject.commands[:, :steps]
         require_refused(lambda c=commands: subject.simulate(c), "commands", f"{steps} samples")  # type: ignore[misc]
 
 
 def check_progress(subject: TwinSubject) -> None:
-    """Progress is told as a share that never falls and ends at 1."""
-    told: list[float] = []
-    subject.twin.simulate(subject.commands.copy(), seed=0, progress=told.append)
-    require(told and told[-1] == 1.0, f"progress must end at 1.0, got {told[-3:]}")
-    require(min(told) >= 0 and told == sorted(told), f"progress must rise from 0 to 1, got {told}")
+    """Progress is reported as a fraction that never decreases and ends at 1."""
+    reported: list[float] = []
+    subject.twin.simulate(subject.commands.copy(), seed=0, progress=reported.append)
+    require(reported and reported[-1] == 1.0, f"progress must end at 1.0, got {reported[-3:]}")
+    rising = min(reported) >= 0 and reported == sorted(reported)
+    require(rising, f"progress must rise from 0 to 1, got {reported}")
 
 
 def check_bad_commands(subject: TwinSubject) -> None:
-    """Commands that cannot be meant are refused in one line that names them."""
+    """Commands of another shape or with values that are not finite are refused."""
     good = subject.commands
-    holed, endless = (good.astype(float) for _ in range(2))
-    holed[0, 1, 0], endless[0, 1, 0] = np.nan, np.inf
+    with_nan, with_inf = (good.astype(float) for _ in range(2))
+    with_nan[0, 1, 0], with_inf[0, 1, 0] = np.nan, np.inf
     bad = {
         "a channel too many": np.concatenate([good, good[..., :1]], axis=2),
         "a channel too few": good[..., 1:],
         "one trajectory without its axis": good[0],
         "an axis too many": good[None],
         "no trajectory": good[:0],
-        "NaN": holed,
-        "an infinite command": endless,
+        "NaN": with_nan,
+        "an infinite command": with_inf,
         "text": good.astype(str),
     }
     for what, commands in bad.items():
@@ -311,7 +238,7 @@ def check_bad_seed(subject: TwinSubject) -> None:
 
 
 def check_limits(subject: TwinSubject) -> None:
-    """Commands beyond the twin's limits are refused, or clipped if it says so."""
+    """Commands beyond the twin's limits are refused, or clipped where `outside` is "clip"."""
     limits: Limits | None = getattr(subject.twin, "limits", None)
     for side, bounds in zip((-1.0, 1.0), _limits(subject), strict=True):
         for channel in np.flatnonzero(np.isfinite(bounds)):
@@ -328,13 +255,13 @@ def check_limits(subject: TwinSubject) -> None:
 
 
 def check_global_randomness(subject: TwinSubject) -> None:
-    """Nothing is drawn from, or done to, a generator that others share."""
+    """The global random generators are neither used nor seeded."""
     with quiet_randomness():
         subject.simulate(faults=subject.faults)
 
 
 def check_pickle(subject: TwinSubject) -> None:
-    """It can be sent to another process, and says the same there: studies do so."""
+    """It can be sent to another process, as in studies, and simulates the same there."""
     try:
         copy: Twin = pickle.loads(pickle.dumps(subject.twin))
     except Exception as error:
@@ -343,7 +270,7 @@ def check_pickle(subject: TwinSubject) -> None:
         ) from error
     wanted = subject.simulate(faults=subject.faults, seed=4).observed
     got = copy.simulate(subject.commands.copy(), faults=subject.faults, seed=4).observed
-    require_same(got, wanted, "a copy from pickle must say the same")
+    require_same(got, wanted, "a copy from pickle must simulate the same")
 
 
 TWIN_CHECKS: tuple[Callable[[TwinSubject], None], ...] = (
@@ -370,11 +297,18 @@ TWIN_CHECKS: tuple[Callable[[TwinSubject], None], ...] = (
 
 
 def check_twin(twin: Twin, commands: NDArray, faults: Sequence[Fault | None] = ()) -> None:
-    """Run all `TWIN_CHECKS`, see `TwinSubject` for the arguments.
+    """Run all `TWIN_CHECKS` on a twin, whose worker processes are kept for all of them.
+
+    Parameters
+    ----------
+    twin, commands, faults
+        See `TwinSubject`.
 
     Raises
     ------
-    AssertionError: one that lists everything the twin breaks.
+    AssertionError
+        It lists all checks that fail.
 
     """
-    run_checks(TWIN_CHECKS, TwinSubject(twin, commands, faults), type(twin).__name__)
+    with keep_workers():
+        run_checks(TWIN_CHECKS, TwinSubject(twin, commands, faults), type(twin).__name__)

@@ -12,15 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from retwin.catalog import TWINS, resolve
+from retwin.checks import require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 
-if TYPE_CHECKING:  # whoever needs one twin need not load what another one needs
+if TYPE_CHECKING:  # one kind of twin does not load what another kind needs
     from retwin.twins.twin import Twin
 
 __all__ = ["get"]
 
 FORMS = "package.module:object, *.fmu, *.xml or *.urdf"
+FILES = (".fmu", ".xml", ".urdf")
 
 
 def get(
@@ -31,71 +33,84 @@ def get(
     rate: float | None = None,
     outside: Literal["refuse", "clip"] = "refuse",
 ) -> Twin:
-    """The twin of that name.
+    """Find a twin by its name.
 
-    | name | is |
+    Parameters
+    ----------
+    name : str
+        One of the forms below.
+    inputs, outputs : sequence of str, optional
+        Names of the channels. A function needs both; a file has all its channels by default.
+    rate : float, optional
+        Sample rate in Hz, above 0. A function needs it; for a file the default is 100 Hz.
+    outside : {"refuse", "clip"}
+        What the twin of a file does with commands outside its limits.
+
+    Returns
+    -------
+    Twin
+        The twin.
+
+    Raises
+    ------
+    InputError
+        There is no such twin, it cannot be made, a package is missing, or channels or a rate are
+        given for a twin that has its own.
+
+    Notes
+    -----
+    | name | twin |
     |---|---|
-    | `armpi`, `armpi-kinematic`, … | one of `retwin.catalog.TWINS` |
-    | `package.module:object` | a twin, or what makes one when called without arguments |
+    | a name without `:` or suffix | an entry of `retwin.catalog.TWINS` |
+    | `package.module:object` | a twin, or a callable without arguments that returns a twin |
     | `package.module:function` | a function from commands (n, T, d_u) to outputs (n, T, d_y) |
     | `*.fmu` | an FMU for co-simulation |
     | `*.xml`, `*.urdf` | a MuJoCo model |
 
-    Parameters
-    ----------
-    name: see above.
-    inputs, outputs: names of the channels. Of a file, by default all; a function needs both.
-    rate: samples per second. Of a file, by default 100; a function needs it.
-    outside: what files do with commands outside their limits, "refuse" or "clip".
-
-    Raises
-    ------
-    InputError: there is no such twin, it cannot be made, a package is missing, or channels or a
-        rate are given for a twin that has its own.
-
     """
-    suffix = Path(name).suffix.lower()
     if name in TWINS or ":" in name:
         return _from_module(name, inputs, outputs, rate)
+    suffix = Path(name).suffix.lower()
+    if suffix not in FILES:
+        raise _unknown(name, "no such twin")
+    if not Path(name).is_file():
+        raise _unknown(name, "no file of that name")
     options: dict[str, Any] = {"inputs": tuple(inputs), "outputs": tuple(outputs)}
     if rate is not None:
         options["rate"] = rate
-    if suffix in (".fmu", ".xml", ".urdf"):
-        if not Path(name).is_file():
-            raise _unknown(name, "no file of that name")
-        if suffix == ".fmu":
-            from retwin.twins.fmu import FMUTwin
+    if suffix == ".fmu":
+        from retwin.twins.fmu import FMUTwin
 
-            return FMUTwin.from_file(name, outside=outside, **options)
-        from retwin.twins.mujoco import MuJoCoTwin
+        return FMUTwin.from_file(name, outside=outside, **options)
+    from retwin.twins.mujoco import MuJoCoTwin
 
-        return MuJoCoTwin.from_file(name, outside=outside, **options)
-    raise _unknown(name, "no such twin")
+    return MuJoCoTwin.from_file(name, outside=outside, **options)
 
 
 def _from_module(
     name: str, inputs: Sequence[str], outputs: Sequence[str], rate: float | None
 ) -> Twin:
+    """The twin that an entry of the catalog, or an object of a module, is or makes."""
     from retwin.twins.twin import Twin
 
     try:
         found = resolve(TWINS[name].target if name in TWINS else name)
     except (ImportError, AttributeError, ValueError) as error:
         raise _unknown(name, str(error)) from None
-    # A class satisfies the protocol too, but it makes a twin and is none.
+    # A class of twins satisfies the protocol too, although it is not a twin itself.
     if isinstance(found, type) or not isinstance(found, Twin):
-        if callable(found) and not _takes_none(found):
+        if callable(found) and not _needs_no_arguments(found):
             return _of_function(name, found, inputs, outputs, rate)
         found = found() if callable(found) else found
     if not isinstance(found, Twin):
         raise _unknown(name, f"a {type(found).__name__}")
-    if inputs or outputs or rate is not None:
-        raise InputError(
-            f"twin {name!r}",
-            expected="neither channels nor a rate, since it has its own",
-            got=f"inputs {list(inputs)}, outputs {list(outputs)}, rate {rate}",
-            remedy="leave them out",
-        )
+    require(
+        not inputs and not outputs and rate is None,
+        f"twin {name!r}",
+        expected="neither channels nor a rate, since it has its own",
+        got=f"inputs {list(inputs)}, outputs {list(outputs)}, rate {rate}",
+        remedy="leave them out",
+    )
     return found
 
 
@@ -106,29 +121,31 @@ def _of_function(
     outputs: Sequence[str],
     rate: float | None,
 ) -> Twin:
-    if not (inputs and outputs and rate):
+    """The twin of a function, whose channels have the unit "1"."""
+    if not inputs or not outputs or not rate:
         raise InputError(
             f"twin {name!r}",
-            expected="inputs, outputs and rate, which a function does not tell",
+            expected="inputs, outputs and rate, which a function does not have",
             got=f"inputs {list(inputs)}, outputs {list(outputs)}, rate {rate}",
             remedy="name the channels and the rate, or name an object that is a FunctionTwin",
         )
     from retwin.twins.function import FunctionTwin
 
-    told, made = (Channels(tuple(each), ("1",) * len(each)) for each in (inputs, outputs))
-    return FunctionTwin(function, told, made, rate)
+    commands, results = (Channels(tuple(n), ("1",) * len(n)) for n in (inputs, outputs))
+    return FunctionTwin(function, commands, results, rate)
 
 
-def _takes_none(function: Callable[..., Any]) -> bool:
-    """Whether it can be called without arguments: then it makes a twin, and is none itself."""
+def _needs_no_arguments(function: Callable[..., Any]) -> bool:
+    """Whether it can be called without arguments: then it makes a twin."""
     try:
         inspect.signature(function).bind()
-    except (TypeError, ValueError):  # arguments are missing, or it does not tell
+    except (TypeError, ValueError):  # arguments are missing, or it has no signature
         return False
     return True
 
 
 def _unknown(name: str, got: str) -> InputError:
+    """The error for a name that stands for no twin."""
     return InputError(
         f"twin {name!r}",
         expected=f"{', '.join(TWINS)}, {FORMS}",

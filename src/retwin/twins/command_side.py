@@ -1,4 +1,4 @@
-"""`CommandSide`: any twin whose commands arrive late and shifted."""
+"""`CommandSide`: any twin with a delay and offsets of its commands as parameters."""
 
 from __future__ import annotations
 
@@ -12,11 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
-from retwin.twins.around import Around, simulate_chunk
-from retwin.twins.checks import ideal_outputs
 from retwin.twins.faults import Fault
-from retwin.twins.parametric import TOGETHER, Parameter, values_per_simulation
-from retwin.twins.twin import Chunk, Twin, checked_commands, simulate_in_chunks
+from retwin.twins.parameter_values import values_per_simulation
+from retwin.twins.parametric import TRAJECTORIES_PER_CHUNK, Parameter
+from retwin.twins.twin import (
+    Chunk,
+    Twin,
+    checked_commands,
+    nominal_outputs,
+    simulate_in_chunks,
+)
+from retwin.twins.wrapper import TwinWrapper, simulate_chunk
 
 __all__ = ["CommandSide", "command_side_parameters"]
 
@@ -25,19 +31,21 @@ OFFSET = "offset"
 
 
 @dataclass(frozen=True)
-class CommandSide(Around):
-    """Any twin whose commands arrive late and shifted: parameters `delay` and `offset.CHANNEL`.
+class CommandSide(TwinWrapper):
+    """Any twin whose commands are delayed and offset: parameters `delay` and `offset.CHANNEL`.
 
-    A transport delay in samples (fractions allowed, all actuators alike) and for every actuator an
-    offset in its command unit, constant from the first sample on. They act after faults on the
-    command and before a stuck actuator is held. What then lies beyond the twin's limits saturates.
-    Other parameters go to the twin inside.
+    The transport delay, in samples with fractions allowed, is the same for all actuators. Each
+    actuator has an offset in its command unit, constant from the first sample on. Both act after
+    the faults of the reference and before a stuck actuator is held; the result is clipped to the
+    twin's limits. Other parameters are passed to the wrapped twin.
 
     Parameters
     ----------
-    twin: the twin inside.
-    nominal: the ideal output (n, T, d_y) for clean commands (n, T, d_u); by default what the twin
-        inside says, which costs a second simulation.
+    twin : Twin
+        The wrapped twin.
+    nominal : callable, optional
+        From clean commands (n, T, d_u) to the ideal output (n, T, d_y); by default the wrapped
+        twin's nominal output, which costs a second simulation.
 
     """
 
@@ -59,34 +67,35 @@ class CommandSide(Around):
         offsets = tuple(f"{OFFSET}.{name}" for name in self.inputs.names)
         given = dict(parameters or {})
         own = {name: given.pop(name) for name in (DELAY, *offsets) if name in given}
-        mine = values_per_simulation(own, (DELAY, *offsets), count)
-        theirs = values_per_simulation(given, tuple(given), count)
-        delay = mine.get(DELAY, np.zeros(count))
-        offset = np.stack([mine.get(name, np.zeros(count)) for name in offsets], axis=-1)
+        own_values = values_per_simulation(own, count, allowed=(DELAY, *offsets))
+        inner_values = values_per_simulation(given, count)
+        delay = own_values.get(DELAY, np.zeros(count))
+        offset = np.stack([own_values.get(name, np.zeros(count)) for name in offsets], axis=-1)
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             rows = np.arange(len(chunk.commands))
-            options = {name: each[chunk.index] for name, each in theirs.items()}
-            late = (
-                _delayed(chunk.faulty_commands, delay[chunk.index]) + offset[chunk.index][:, None]
-            )
-            held: list[Fault | None] = [
+            options = {name: each[chunk.index] for name, each in inner_values.items()}
+            delayed = _delayed(chunk.faulty_commands, delay[chunk.index])
+            effective = self._clipped(delayed + offset[chunk.index][:, None])
+            responses: list[Fault | None] = [
                 None if fault is None else _ResponseOnly(fault) for fault in chunk.faults
             ]
-            ask = partial(simulate_chunk, self.twin, chunk, rows, seed=seed, parameters=options)
-            _, observed = ask(self._kept(late), held)
+            simulate = partial(
+                simulate_chunk, self.twin, chunk, rows, seed=seed, parameters=options
+            )
+            _, observed = simulate(effective, responses)
             if self.nominal is not None:
-                return ideal_outputs(self.nominal, chunk.commands, len(self.outputs)), observed
+                return nominal_outputs(self.nominal, chunk.commands, len(self.outputs)), observed
             healthy: list[Fault | None] = [None] * len(rows)
-            nominal, _ = ask(chunk.commands, healthy)
+            nominal, _ = simulate(chunk.commands, healthy)
             return nominal, observed
 
         return simulate_in_chunks(
-            self, run, commands, faults, seed=seed, progress=progress, size=TOGETHER
+            self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
         )
 
-    def _kept(self, commands: NDArray) -> NDArray:
-        """An actuator goes no further than its limits."""
+    def _clipped(self, commands: NDArray) -> NDArray:
+        """Commands (n, T, d_u) within the twin's limits: an actuator goes no further."""
         if self.limits is None:
             return commands
         return np.clip(commands, self.limits.low, self.limits.high)
@@ -95,7 +104,23 @@ class CommandSide(Around):
 def command_side_parameters(
     inputs: Channels, *, delay: tuple[float, float], offset: float
 ) -> tuple[Parameter, ...]:
-    """The parameters of `CommandSide`: `delay` (low, high) in samples, offsets within ±`offset`."""
+    """Declare the parameters of `CommandSide`.
+
+    Parameters
+    ----------
+    inputs : Channels
+        The d_u command channels.
+    delay : (float, float)
+        Lowest and highest delay in samples; the start is the value nearest to 0.
+    offset : float
+        Highest magnitude of an offset in command units; the start is 0.
+
+    Returns
+    -------
+    tuple of Parameter
+        1 + d_u parameters, the delay first.
+
+    """
     offsets = (
         Parameter(f"{OFFSET}.{name}", unit, -offset, offset, 0.0)
         for name, unit in zip(inputs.names, inputs.units, strict=True)
@@ -106,29 +131,33 @@ def command_side_parameters(
 
 @dataclass(frozen=True)
 class _ResponseOnly:
-    """A fault whose effect on the command is already there."""
+    """A fault without its effect on the reference, which has been applied already."""
 
     fault: Fault
 
     @property
     def label(self) -> str:
+        """Class name of the fault."""
         return self.fault.label
 
-    def drawn(self, rng: np.random.Generator, *, steps: int, movements: int) -> _ResponseOnly:
+    def drawn(self, rng: np.random.Generator, *, steps: int, segments: int) -> _ResponseOnly:
+        """The fault itself: its severity is fixed already."""
         return self
 
     def command(self, commands: NDArray, segments: Segments) -> NDArray:
+        """The commands unchanged."""
         return commands
 
     def response(self, response: NDArray) -> NDArray:
+        """The response with the fault."""
         return self.fault.response(response)
 
 
 def _delayed(commands: NDArray, delay: NDArray) -> NDArray:
-    """Commands (n, T, d_u) late by `delay` (n,) samples, linear between samples."""
+    """Commands (n, T, d_u) delayed by `delay` (n,) samples, linear between samples."""
     last = commands.shape[1] - 1
-    when = np.clip(np.arange(last + 1) - delay[:, None], 0, last)
-    below = np.minimum(when.astype(int), last - 1)
-    share = (when - below)[..., None]
+    times = np.clip(np.arange(last + 1) - delay[:, None], 0, last)
+    below = np.minimum(times.astype(int), last - 1)
+    fraction = (times - below)[..., None]
     row = np.arange(len(commands))[:, None]
-    return (1 - share) * commands[row, below] + share * commands[row, below + 1]
+    return (1 - fraction) * commands[row, below] + fraction * commands[row, below + 1]

@@ -1,6 +1,6 @@
-"""Faults: each turns commands, or the actuators' response, into what a faulty actuator does.
+"""Faults of actuators: their effect on the reference, and on the response.
 
-A fault with an open severity is a class of faults; `drawn` fixes the severity from a seed.
+A fault whose severity is open stands for a class of faults; `drawn` draws the severity.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import one_per, require
 from retwin.data.segments import Segments
 from retwin.errors import InputError
 
@@ -29,40 +30,86 @@ __all__ = [
 
 @runtime_checkable
 class Fault(Protocol):
-    """What goes wrong in one trajectory."""
+    """A fault that acts during one trajectory."""
 
     @property
     def label(self) -> str:
-        """The class name of this fault."""
+        """Class name of the fault."""
         ...
 
-    def drawn(self, rng: np.random.Generator, *, steps: int, movements: int) -> Fault:
-        """The same fault with every open severity fixed."""
+    def drawn(self, rng: np.random.Generator, *, steps: int, segments: int) -> Fault:
+        """Draw every open severity.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+            Source of the severities.
+        steps : int
+            Samples of the trajectory.
+        segments : int
+            Segments of the trajectory.
+
+        Returns
+        -------
+        Fault
+            The same fault with fixed severities.
+
+        """
         ...
 
     def command(self, commands: NDArray, segments: Segments) -> NDArray:
-        """What the actuators are effectively told: (T, d_u) in and out; `segments` of one."""
+        """Reference that the actuators follow under the fault.
+
+        Parameters
+        ----------
+        commands : ndarray, shape (T, d_u)
+            Clean commands of one trajectory.
+        segments : Segments
+            Its segments.
+
+        Returns
+        -------
+        ndarray, shape (T, d_u)
+            Effective commands.
+
+        """
         ...
 
     def response(self, response: NDArray) -> NDArray:
-        """What the actuators effectively do: (T, d_u) in and out."""
+        """Response of the actuators under the fault.
+
+        Parameters
+        ----------
+        response : ndarray, shape (T, d_u)
+            Response to the effective commands, in command units.
+
+        Returns
+        -------
+        ndarray, shape (T, d_u)
+            The response with the fault.
+
+        """
         ...
 
 
 @dataclass(frozen=True)
 class Stuck:
-    """The actuator's response is held from sample `onset` on.
+    """The actuator's response is held from an onset on.
 
     Parameters
     ----------
-    actuator: which, counted from 0.
-    onset: 0-based sample from which the response stays as it is; a pair (low, high) is drawn
-        uniformly. The published protocol freezes at sample 49.
-    label: class name.
+    actuator : int
+        The actuator, counted from 0.
+    onset : int or (int, int), default 49
+        Sample, counted from 0, from which the response is held, at least 0. A pair (low, high) is
+        the range of a uniform draw. The published protocol holds from sample 49 on.
+    label : str
+        Class name.
 
     Raises
     ------
-    InputError: an onset below 0 or no whole number, a pair out of order.
+    InputError
+        An onset that is negative or not a whole number, or a pair out of order.
 
     """
 
@@ -74,29 +121,29 @@ class Stuck:
         pair = isinstance(self.onset, Sequence)
         ends: Sequence = self.onset if isinstance(self.onset, Sequence) else (self.onset,) * 2
         whole = all(isinstance(end, int | np.integer) for end in ends)
-        if not (whole and len(ends) == 2 and 0 <= ends[0] <= ends[1]):
-            raise InputError(
-                "onset",
-                expected="a sample from 0 on, or a pair (low, high) of them, in order",
-                got=repr(self.onset),
-                remedy="count the samples from 0",
-            )
+        require(
+            whole and len(ends) == 2 and 0 <= ends[0] <= ends[1],
+            "onset",
+            expected="a sample from 0 on, or a pair (low, high) of them, in order",
+            got=repr(self.onset),
+            remedy="count the samples from 0",
+        )
         low, high = map(int, ends)
         object.__setattr__(self, "onset", (low, high) if pair else low)
 
-    def drawn(self, rng: np.random.Generator, *, steps: int, movements: int) -> Stuck:
-        """The same fault with its onset fixed."""
+    def drawn(self, rng: np.random.Generator, *, steps: int, segments: int) -> Stuck:
+        """The same fault with its onset drawn; see `Fault.drawn`."""
         if isinstance(self.onset, int):
             return self
         low, high = (min(onset, steps - 1) for onset in self.onset)
         return replace(self, onset=int(rng.integers(low, high + 1)))
 
     def command(self, commands: NDArray, segments: Segments) -> NDArray:
-        """Commands are not touched: the actuator does not follow them."""
+        """The clean commands: the fault acts on the response. See `Fault.command`."""
         return commands
 
     def response(self, response: NDArray) -> NDArray:
-        """The response with the actuator held from the onset on."""
+        """The response, constant from the onset on; see `Fault.response`."""
         onset = self.onset
         if not isinstance(onset, int):
             raise _open(self)
@@ -107,21 +154,27 @@ class Stuck:
 
 @dataclass(frozen=True)
 class ActuatorBias:
-    """A bias on the actuator's reference, one per movement.
+    """A bias of the actuator's reference, one per segment: the paper's steady-state error (SSE).
 
-    The bias is reached along the movement's ramp: the reference goes from the biased old target to
-    the biased new one, as in the published data. The actuator starts at rest, without bias.
+    The bias builds up along the ramp of each segment: the reference goes from the old biased
+    target to the new biased target, as in the published data. The actuator starts without bias.
 
     Parameters
     ----------
-    actuator: which, counted from 0.
-    size: least and greatest size of a drawn bias, in units of the command; its sign is random.
-    bias: one per movement; empty leaves it open.
-    label: class name.
+    actuator : int
+        The actuator, counted from 0.
+    size : (float, float), default (10.0, 50.0)
+        Lowest and highest magnitude of a drawn bias, in command units, at least 0. The sign is
+        positive or negative with equal probability.
+    bias : tuple of float, optional
+        One per segment, in command units; empty leaves the severity open.
+    label : str
+        Class name.
 
     Raises
     ------
-    InputError: sizes that are negative, infinite or out of order.
+    InputError
+        Sizes that are negative, infinite or out of order.
 
     """
 
@@ -131,24 +184,24 @@ class ActuatorBias:
     label: str = "Steady_state_error"
 
     def __post_init__(self) -> None:
-        if not (len(self.size) == 2 and 0 <= self.size[0] <= self.size[1] < np.inf):
-            raise InputError(
-                "size",
-                expected="a pair (least, greatest) of sizes, at least 0 and in order",
-                got=repr(self.size),
-                remedy="leave the sign out, it is drawn",
-            )
+        require(
+            len(self.size) == 2 and 0 <= self.size[0] <= self.size[1] < np.inf,
+            "size",
+            expected="a pair (low, high) of magnitudes, at least 0 and in order",
+            got=repr(self.size),
+            remedy="leave the sign out, it is drawn",
+        )
 
-    def drawn(self, rng: np.random.Generator, *, steps: int, movements: int) -> ActuatorBias:
-        """The same fault with one bias per movement."""
+    def drawn(self, rng: np.random.Generator, *, steps: int, segments: int) -> ActuatorBias:
+        """The same fault with one bias per segment drawn; see `Fault.drawn`."""
         if self.bias:
             return self
-        count = max(movements, 1)
+        count = max(segments, 1)
         drawn = rng.uniform(*self.size, size=count) * (2.0 * rng.integers(2, size=count) - 1.0)
         return replace(self, bias=tuple(drawn.tolist()))
 
     def command(self, commands: NDArray, segments: Segments) -> NDArray:
-        """The commands with the biased reference of one actuator."""
+        """The commands with the biased reference of one actuator; see `Fault.command`."""
         if not self.bias:
             raise _open(self)
         valid = segments.valid[0]
@@ -163,39 +216,40 @@ class ActuatorBias:
         return biased
 
     def response(self, response: NDArray) -> NDArray:
-        """The actuator follows its (biased) reference."""
+        """The response unchanged: it follows the biased reference. See `Fault.response`."""
         return response
 
 
 def _along(clean: NDArray, start: NDArray, settle: NDArray, levels: NDArray) -> NDArray:
-    """The bias over time: it moves from level to level as the command moves to its target."""
+    """The bias (T,): it goes from level to level as the command (T,) goes to its target."""
     clean = clean.astype(np.float64)
     bias = np.zeros(len(clean))
     before = 0.0
-    movements = (start, settle, _between(clean, start), _between(clean, settle), levels)
-    # Plain numbers: numpy's own cost more than what is done with them.
-    for begin, end, first, last, level in zip(*(each.tolist() for each in movements), strict=True):
+    segments = (start, settle, _interpolated(clean, start), _interpolated(clean, settle), levels)
+    # Python numbers: for single values they are faster than numpy's.
+    for begin, end, first, last, level in zip(*(each.tolist() for each in segments), strict=True):
         if first != last:
-            moves = slice(math.ceil(begin), math.ceil(end))
-            share = (clean[moves] - first) / (last - first)
+            moving = slice(math.ceil(begin), math.ceil(end))
+            fraction = (clean[moving] - first) / (last - first)
         else:
             length = max(end - begin, 1.0)
-            moves = slice(math.ceil(begin), math.ceil(begin + length))
-            share = (np.arange(len(bias), dtype=float)[moves] - begin) / length
-        bias[moves] = before + (level - before) * np.minimum(np.maximum(share, 0.0), 1.0)
-        bias[moves.stop :] = before + (level - before)
+            moving = slice(math.ceil(begin), math.ceil(begin + length))
+            fraction = (np.arange(len(bias), dtype=float)[moving] - begin) / length
+        bias[moving] = before + (level - before) * np.minimum(np.maximum(fraction, 0.0), 1.0)
+        bias[moving.stop :] = before + (level - before)
         before = level
     return bias
 
 
-def _between(values: NDArray, when: NDArray) -> NDArray:
-    """Values (T,) at times in samples, fractions allowed."""
-    left = np.minimum(when.astype(int), len(values) - 2)
-    share = np.minimum(when - left, 1.0)
-    return values[left] + share * (values[left + 1] - values[left])
+def _interpolated(values: NDArray, times: NDArray) -> NDArray:
+    """Values (T,) at times in samples, linear between samples."""
+    left = np.minimum(times.astype(int), len(values) - 2)
+    fraction = np.minimum(times - left, 1.0)
+    return values[left] + fraction * (values[left + 1] - values[left])
 
 
 def _open(fault: Fault) -> InputError:
+    """The error for a fault that must have a fixed severity and has none."""
     return InputError(
         "faults",
         expected="a severity that is fixed",
@@ -207,21 +261,34 @@ def _open(fault: Fault) -> InputError:
 def draw_faults(
     faults: Sequence[Fault | None], segments: Segments, seed: int
 ) -> list[Fault | None]:
-    """Fix the severity of every fault, one per trajectory (None: healthy).
+    """Draw the severity of every fault.
 
-    The same seed gives the same severities whatever the twin, so twins can be compared on them.
+    Parameters
+    ----------
+    faults : sequence of Fault or None
+        One per trajectory, None for a healthy one.
+    segments : Segments
+        Segments of the n trajectories.
+    seed : int
+        The same seed gives the same severities with every twin, so that twins can be compared.
+
+    Returns
+    -------
+    list of Fault or None
+        The faults with fixed severities.
+
+    Raises
+    ------
+    InputError
+        Not one fault per trajectory.
+
     """
-    if len(faults) != len(segments):
-        raise InputError(
-            "faults",
-            expected=f"one per trajectory, {len(segments)}",
-            got=f"{len(faults)}",
-            remedy="give None for a healthy trajectory",
-        )
+    remedy = "give None for a healthy trajectory"
+    one_per("faults", faults, len(segments), "trajectory", remedy=remedy)
     rng = np.random.default_rng(seed)
     counts = segments.valid.sum(axis=1)
     return [
-        None if fault is None else fault.drawn(rng, steps=segments.steps, movements=int(count))
+        None if fault is None else fault.drawn(rng, steps=segments.steps, segments=int(count))
         for fault, count in zip(faults, counts, strict=True)
     ]
 
@@ -229,7 +296,23 @@ def draw_faults(
 def faulty_commands(
     commands: NDArray, faults: Sequence[Fault | None], segments: Segments
 ) -> NDArray:
-    """Commands (n, T, d_u) with every fault's effect on the reference."""
+    """Commands with the effect of every fault on the reference.
+
+    Parameters
+    ----------
+    commands : ndarray, shape (n, T, d_u)
+        Clean commands.
+    faults : sequence of Fault or None
+        One per trajectory, with fixed severities.
+    segments : Segments
+        Segments of the commands.
+
+    Returns
+    -------
+    ndarray, shape (n, T, d_u)
+        Effective commands.
+
+    """
     out = commands.copy()
     for i, fault in enumerate(faults):
         if fault is not None:
@@ -238,9 +321,22 @@ def faulty_commands(
 
 
 def frozen_response(response: NDArray, faults: Sequence[Fault | None]) -> NDArray:
-    """Response (n, T, d_u) of the actuators with every fault's effect on it.
+    """Response of the actuators with the effect of every fault on it.
 
-    A twin whose actuators are not visible applies this to its commands: the command is then held.
+    A twin whose actuators cannot be accessed applies this to its commands, which are then held.
+
+    Parameters
+    ----------
+    response : ndarray, shape (n, T, d_u)
+        Response without faults, in command units.
+    faults : sequence of Fault or None
+        One per trajectory, with fixed severities.
+
+    Returns
+    -------
+    ndarray, shape (n, T, d_u)
+        The response with faults.
+
     """
     out = response.copy()
     for i, fault in enumerate(faults):
@@ -250,12 +346,30 @@ def frozen_response(response: NDArray, faults: Sequence[Fault | None]) -> NDArra
 
 
 def frozen_from(faults: Sequence[Fault | None], steps: int, actuators: int) -> NDArray:
-    """The sample (n, d_u) from which every actuator is held; `steps` where it never is.
+    """Sample from which every actuator is held.
 
-    For twins that integrate their dynamics and must hold an actuator while they do. Asked of the
-    faults themselves: what they do to a response that rises by one per sample.
+    For twins that integrate their dynamics and must hold an actuator meanwhile. The sample is
+    found from the effect of the fault on a response that rises by one per sample.
 
-    Raises InputError for a fault that does something else to the response than hold it.
+    Parameters
+    ----------
+    faults : sequence of Fault or None
+        One per trajectory, with fixed severities.
+    steps : int
+        Samples per trajectory, T.
+    actuators : int
+        The number of actuators, d_u.
+
+    Returns
+    -------
+    ndarray of int, shape (n, d_u)
+        Samples counted from 0; `steps` where an actuator is never held.
+
+    Raises
+    ------
+    InputError
+        A fault that neither holds the response nor leaves it unchanged.
+
     """
     rising = np.tile(np.arange(steps, dtype=float)[:, None], (1, actuators))
     onsets = np.full((len(faults), actuators), steps)
@@ -266,12 +380,12 @@ def frozen_from(faults: Sequence[Fault | None], steps: int, actuators: int) -> N
         if response is rising:
             continue
         onset = response[-1].astype(int)
-        if not np.array_equal(response, np.minimum(rising, onset)):
-            raise InputError(
-                "faults",
-                expected="faults that hold an actuator's response or leave it as it is",
-                got=repr(fault),
-                remedy="use a twin whose actuators' response is visible, such as KinematicTwin",
-            )
+        require(
+            np.array_equal(response, np.minimum(rising, onset)),
+            "faults",
+            expected="faults that hold an actuator's response or leave it as it is",
+            got=fault,
+            remedy="use a twin whose actuators' response can be accessed, such as KinematicTwin",
+        )
         onsets[i] = np.where(onset < steps - 1, onset, steps)
     return onsets

@@ -1,14 +1,17 @@
 """`FMUTwin`: a simulator exported as an FMU (FMI 2.0 or 3.0, co-simulation), run by FMPy.
 
-Needs the extra `fmu`. An FMU runs native code with your rights: run only FMUs that you trust.
+It needs the extra `fmu`. An FMU is native code that runs with the user's rights: run only FMUs
+from sources that you trust.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,12 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pebble import ProcessExpired, ProcessPool
 
+from retwin.checks import positive, require
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.errors import InputError
 from retwin.processes import scratch_folder, worker_pool
 from retwin.progress import Progress
 from retwin.twins import fmu_worker
-from retwin.twins.checks import check_positive, ideal_outputs, substeps
 from retwin.twins.faults import Fault
 from retwin.twins.fmu_model import (
     channels_of,
@@ -31,42 +33,58 @@ from retwin.twins.fmu_model import (
     read_description,
     start_column,
 )
-from retwin.twins.twin import Chunk, Limits, checked_commands, simulate_in_chunks
+from retwin.twins.limits import Limits
+from retwin.twins.time_step import steps_per_sample
+from retwin.twins.twin import Chunk, checked_commands, nominal_outputs, simulate_in_chunks
+from retwin.twins.workers import worker_processes
 
 __all__ = ["FMUTwin"]
 
-TOGETHER = 256
-"""Trajectories per chunk."""
+TRAJECTORIES_PER_CHUNK = 256
+"""Number of trajectories per chunk: it bounds the tasks that wait for a process."""
 
 
 @dataclass(frozen=True)
 class FMUTwin:
-    """A functional mock-up unit, run in worker processes, which it may hang or crash.
+    """A functional mock-up unit, run in worker processes, since it may hang or crash.
 
-    Make it with `FMUTwin.from_file`, which takes names, units and limits from the FMU. Each worker
-    loads the FMU once and resets it between runs. A script that simulates must do so under
-    `if __name__ == "__main__":`.
+    `FMUTwin.from_file` makes one with names, units and limits from the FMU. Each process loads the
+    FMU once and resets it between runs; see also `keep_workers`. A script that simulates must do
+    so under `if __name__ == "__main__":`.
 
     Parameters
     ----------
-    path: the .fmu file.
-    inputs, outputs: variables that are commands and outputs. Continuous inputs are linear between
-        samples, others rounded and held. The FMU sees inputs from the begin of each step.
-    rate: samples per second of commands and outputs.
-    start: start values by name, in the variables' units.
-    rates: inputs that are sampled and held at a rate of their own, in Hz, at most `rate`.
-    step: communication step in s, which divides the sample period; None takes one per sample.
-    limits: that the commands must keep.
-    nominal: the ideal output (n, T, d_y) for clean commands (n, T, d_u); None takes the FMU's own
-        healthy output.
-    reuse: whether an instance is reset between runs. False makes another for every run: for FMUs
-        whose reset leaves something behind.
-    timeout: s that a run may take before it counts as hung, loading included.
-    workers: processes; 0 takes one per core. The result does not depend on it.
+    path : Path
+        The .fmu file.
+    inputs, outputs : Channels
+        Variables that are commands and outputs. Continuous inputs are linear between samples,
+        other inputs are rounded and held. In each step the FMU has the inputs of its begin.
+    rate : float, default 100.0
+        Sample rate in Hz, above 0.
+    start : mapping of str to float or str, optional
+        Start values by name, in the variables' units.
+    rates : mapping of str to float, optional
+        Rates in Hz, at most `rate`, of inputs that are sampled and held at a rate of their own.
+    step : float, optional
+        Communication step in s, which divides the sample period; by default the sample period.
+    limits : Limits, optional
+        Range of the commands.
+    nominal : callable, optional
+        From clean commands (n, T, d_u) to the ideal output (n, T, d_y); by default the FMU's own
+        output without faults.
+    reuse : bool, default True
+        Whether an instance is reset between runs. False makes a new instance for every run, for
+        FMUs whose reset is incomplete.
+    timeout : float, default 60.0
+        Duration of a run in s, loading included, after which it is ended as hung.
+    workers : int, default 0
+        Processes; 0 takes one per core. The result does not depend on it.
 
     Raises
     ------
-    InputError: a rate, step or timeout that is not positive or does not fit.
+    InputError
+        A rate, step or timeout that is not positive, a rate of an input above `rate`, or a step
+        that does not divide the sample period.
 
     """
 
@@ -84,17 +102,16 @@ class FMUTwin:
     workers: int = 0
 
     def __post_init__(self) -> None:
-        check_positive("rate", self.rate, "Hz")
-        check_positive("timeout", self.timeout, "s")
+        positive("rate", self.rate, unit="Hz")
+        positive("timeout", self.timeout, unit="s")
         for name, rate in self.rates.items():
-            if name not in self.inputs.names or not 0 < rate <= self.rate:
-                raise InputError(
-                    "rates",
-                    expected=f"inputs of the twin, each with a rate above 0 and up to {self.rate:g}"
-                    " Hz",
-                    got=f"{name!r} with {rate:g} Hz",
-                    remedy=f"the inputs are {', '.join(self.inputs.names)}",
-                )
+            require(
+                name in self.inputs.names and 0 < rate <= self.rate,
+                "rates",
+                expected=f"inputs of the twin, each with a rate above 0 and up to {self.rate:g} Hz",
+                got=f"{name!r} with {rate:g} Hz",
+                remedy=f"the inputs are {', '.join(self.inputs.names)}",
+            )
         _ = self.substeps
 
     @classmethod
@@ -109,42 +126,54 @@ class FMUTwin:
         outside: Literal["refuse", "clip"] = "refuse",
         **options: Any,
     ) -> FMUTwin:
-        """The twin of a file, whose description is read here; its native code is not loaded.
+        """Make the twin of a file from its description; its native code is not loaded yet.
 
         Parameters
         ----------
-        path: the .fmu file.
-        rate: samples per second.
-        inputs, outputs: names of variables, in order; by default all scalar numbers among the
-            FMU's inputs and outputs.
-        start: start values by name.
-        outside: what to do with commands beyond the limits that the FMU declares.
-        options: other attributes of the class, by name.
+        path : str or Path
+            The .fmu file.
+        rate : float, default 100.0
+            Sample rate in Hz.
+        inputs, outputs : sequence of str, optional
+            Names of variables, in order; by default all scalar numbers among the FMU's inputs and
+            outputs.
+        start : mapping of str to float or str, optional
+            Start values by name.
+        outside : {"refuse", "clip"}
+            What is done with commands outside the ranges that the FMU declares.
+        **options
+            Other parameters of the class.
+
+        Returns
+        -------
+        FMUTwin
+            The twin.
 
         Raises
         ------
-        InputError: no FMU, or one without co-simulation, without native code for this machine or
-            without the named variables; FMPy is not installed.
+        InputError
+            The file is no FMU, or one without co-simulation, without native code for this machine
+            or without the named variables; FMPy is not installed.
 
         """
         path = Path(path)
         description = read_description(path)
-        taken = find_variables(description, "inputs", inputs)
-        given = find_variables(description, "outputs", outputs)
-        if not given:
-            raise InputError(
-                "outputs",
-                expected="at least one variable that is an output and a number",
-                got=f"{path.name}, which has none",
-                remedy="export the FMU with outputs",
-            )
+        inputs_found = find_variables(description, "inputs", inputs)
+        outputs_found = find_variables(description, "outputs", outputs)
+        require(
+            outputs_found,
+            "outputs",
+            expected="at least one variable that is an output and a number",
+            got=f"{path.name}, which has none",
+            remedy="export the FMU with outputs",
+        )
         twin = cls(
             path.resolve(),
-            channels_of(taken),
-            channels_of(given),
+            channels_of(inputs_found),
+            channels_of(outputs_found),
             rate,
             start=dict(start or {}),
-            limits=limits_of(taken, outside),
+            limits=limits_of(inputs_found, outside),
             **options,
         )
         twin._start_values(description, {}, 1)
@@ -154,9 +183,13 @@ class FMUTwin:
     def substeps(self) -> int:
         """Communication steps per sample.
 
-        Raises InputError when the step does not divide the sample period.
+        Raises
+        ------
+        InputError
+            The step does not divide the sample period.
+
         """
-        return 1 if self.step is None else substeps(self.rate, self.step)
+        return 1 if self.step is None else steps_per_sample(self.rate, self.step)
 
     def simulate(
         self,
@@ -167,119 +200,140 @@ class FMUTwin:
         progress: Progress | None = None,
         parameters: Mapping[str, ArrayLike] | None = None,
     ) -> Trajectories:
-        """See `Twin.simulate`; the actuators are inside, so a stuck one is a held command.
+        """See `TakesParameters.simulate`; a stuck actuator is a held command.
 
         Parameters
         ----------
-        commands, faults, seed, progress: as in `Twin.simulate`.
-        parameters: start values per trajectory, (n,) or one for all; they go before `start`.
+        commands, faults, seed, progress
+            See `Twin.simulate`.
+        parameters : mapping of str to array_like, optional
+            Start values by name, each () or (n,); they take precedence over `start`.
 
-        A run that hangs, crashes or ends in an error ends alone: see `SimulationError`.
+        Returns
+        -------
+        Trajectories
+            See `Twin.simulate`.
 
         Raises
         ------
-        InputError: as in `Twin.simulate`; start values that cannot be set; an FMU that is gone or
-            does not load.
+        InputError
+            As `Twin.simulate`; start values that cannot be set; an FMU that does not load.
+        SimulationError
+            Runs that hung, crashed or ended in an error.
 
         """
         commands = checked_commands(commands, self.inputs)
         count = len(commands)
         values = self._start_values(read_description(self.path), parameters or {}, count)
+
+        def report(finished: float) -> None:
+            if progress is not None:
+                progress(min(1.0, finished / count))
+
+        with ExitStack() as stack:
+            # No process is started before commands and faults are found good.
+            pool = cache(lambda: stack.enter_context(self._workers(count)))
+
+            def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+                return self._run(pool(), chunk, values[chunk.index], report)
+
+            return simulate_in_chunks(
+                self, run, commands, faults, seed=seed, progress=None, size=TRAJECTORIES_PER_CHUNK
+            )
+
+    def _workers(self, count: int) -> AbstractContextManager[ProcessPool]:
+        """Processes that have loaded the FMU, for `count` trajectories."""
+        job = fmu_worker.Job(
+            inputs=self.inputs.names,
+            outputs=self.outputs.names,
+            rate=self.rate,
+            substeps=self.substeps,
+            rates=dict(self.rates),
+            reuse=self.reuse,
+        )
+        workers = min(self.workers or os.cpu_count() or 1, count)
+        state = self.path.stat()
+        version = (self.path, state.st_mtime_ns, state.st_size)
+        return worker_processes((version, job, workers), lambda: self._start(job, workers))
+
+    @contextmanager
+    def _start(self, job: fmu_worker.Job, workers: int) -> Iterator[ProcessPool]:
+        """Start the processes on an unpacked FMU, which is removed when they end."""
+        begin, orphaned = fmu_worker.start, fmu_worker.orphaned
         with scratch_folder() as folder:
             extract(self.path, folder)
-            job = fmu_worker.Job(
-                folder,
-                self.inputs.names,
-                self.outputs.names,
-                self.rate,
-                self.substeps,
-                dict(self.rates),
-                self.reuse,
-            )
-            workers = min(self.workers or os.cpu_count() or 1, count)
-            begin, orphaned = fmu_worker.start, fmu_worker.orphaned
-            with worker_pool(workers, begin, (job,), orphaned=orphaned) as pool:
-
-                def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-                    if chunk.index.start == 0:
-                        self._try_to_load(pool)
-                    return self._run(pool, chunk, values[chunk.index], tell)
-
-                def tell(finished: float) -> None:
-                    if progress is not None:
-                        progress(min(1.0, finished / count))
-
-                return simulate_in_chunks(
-                    self, run, commands, faults, seed=seed, progress=None, size=TOGETHER
-                )
+            with worker_pool(workers, begin, (folder, job), orphaned=orphaned) as pool:
+                self._check_loads(pool)
+                yield pool
 
     def _run(
         self,
         pool: ProcessPool,
         chunk: Chunk,
         values: Sequence[fmu_worker.Start],
-        tell: Callable[[float], None],
+        report: Callable[[float], None],
     ) -> tuple[NDArray, NDArray]:
-        """Nominal and observed outputs of a chunk, which tells how many trajectories are done."""
+        """Nominal and observed outputs of a chunk; reports the number of finished trajectories."""
         clean, held = chunk.commands, chunk.held_commands
         observed = np.zeros((*clean.shape[:2], len(self.outputs)))
         nominal = np.zeros_like(observed)
         runs = [(observed, i, held[i]) for i in range(len(clean))]
-        # A trajectory whose commands no fault has bent is its own healthy run.
-        bent = (held != clean).any(axis=(1, 2))
+        # Where no fault changes the commands, the run is the nominal run as well.
+        changed = (held != clean).any(axis=(1, 2))
         if self.nominal is None:
-            runs += [(nominal, i, clean[i]) for i in np.flatnonzero(bent).tolist()]
-        asked = [self._ask(pool, commands, values[i]) for _, i, commands in runs]
-        for done, ((outputs, i, commands), future) in enumerate(zip(runs, asked, strict=True), 1):
+            runs += [(nominal, i, clean[i]) for i in np.flatnonzero(changed).tolist()]
+        futures = [self._schedule(pool, commands, values[i]) for _, i, commands in runs]
+        for done, ((outputs, i, commands), future) in enumerate(zip(runs, futures, strict=True), 1):
             outcome = self._outcome(pool, future, commands, values[i])
             if isinstance(outcome, str):
                 healthy = "" if outputs is observed else "without its fault: "
                 chunk.failed.setdefault(i, healthy + outcome)
             else:
                 outputs[i] = outcome
-            tell(chunk.index.start + len(clean) * done / len(runs))
+            report(chunk.index.start + len(clean) * done / len(runs))
         if self.nominal is not None:
-            return ideal_outputs(self.nominal, clean, len(self.outputs)), observed
-        nominal[~bent] = observed[~bent]
+            return nominal_outputs(self.nominal, clean, len(self.outputs)), observed
+        nominal[~changed] = observed[~changed]
         return nominal, observed
 
-    def _ask(self, pool: ProcessPool, commands: NDArray, values: fmu_worker.Start) -> Future:
+    def _schedule(self, pool: ProcessPool, commands: NDArray, values: fmu_worker.Start) -> Future:
+        """The outcome of one run, in the future."""
         return pool.schedule(fmu_worker.run, args=(commands, values), timeout=self.timeout)
 
     def _outcome(
         self, pool: ProcessPool, future: Future, commands: NDArray, values: fmu_worker.Start
     ) -> NDArray | str:
-        """Outputs (T, d_y), or why there are none."""
+        """Outputs (T, d_y), or the reason of the failure."""
         while True:
             try:
                 return future.result()
             except TimeoutError:
                 return f"hung for more than {self.timeout:g} s"
             except ProcessExpired as error:
-                if error.exitcode != fmu_worker.AGAIN:
+                if error.exitcode != fmu_worker.RETRY:
                     return _death(error.exitcode)
-                future = self._ask(pool, commands, values)
+                future = self._schedule(pool, commands, values)
 
-    def _try_to_load(self, pool: ProcessPool) -> None:
-        """Refuse an FMU that no run could load, before every run says so."""
+    def _check_loads(self, pool: ProcessPool) -> None:
+        """Refuse an FMU that cannot be loaded, once instead of in every run."""
         try:
             reason = pool.schedule(fmu_worker.load, timeout=self.timeout).result()
         except TimeoutError:
             reason = f"it hung for more than {self.timeout:g} s"
         except ProcessExpired as error:
             reason = _death(error.exitcode)
-        if reason:
-            raise InputError(
-                "path",
-                expected="an FMU that loads on this machine",
-                got=f"{self.path.name}: {reason}",
-                remedy="export it for this system; see that what it needs is installed",
-            )
+        require(
+            not reason,
+            "path",
+            expected="an FMU that loads on this machine",
+            got=f"{self.path.name}: {reason}",
+            remedy="export it for this system; see that what it needs is installed",
+        )
 
     def _start_values(
         self, description: Any, parameters: Mapping[str, ArrayLike], count: int
     ) -> list[dict[str, Any]]:
-        """Start values of every trajectory, checked."""
+        """Checked start values of every trajectory."""
         values = [dict(self.start) for _ in range(count)]
         for name, value in {**self.start, **parameters}.items():
             column = start_column(description, name, value, count, self.inputs.names)
@@ -289,7 +343,7 @@ class FMUTwin:
 
 
 def _death(code: int | None) -> str:
-    """How a process ended."""
+    """The reason of a failure: how a process ended."""
     if code is not None and code < 0:
         return f"its process died (signal {-code})"
     return f"its process ended (exit code {code})"

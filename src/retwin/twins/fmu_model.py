@@ -1,4 +1,4 @@
-"""What an FMU says of itself: read and checked, without loading its native code."""
+"""The model description of an FMU, read and checked without loading its native code."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from retwin.checks import needs_extra, require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError, brief
-from retwin.twins.twin import Limits
+from retwin.twins.limits import Limits
 
 __all__ = [
     "channels_of",
@@ -31,24 +32,34 @@ WHOLE = (
 )
 SCALARS = (*NUMBERS, *WHOLE, "Boolean")
 UNLIMITED = 1e30
-"""Tools write the largest float where they mean no limit."""
+"""Magnitude above which a declared limit counts as none: tools write the largest float for it."""
 
 
 def _fmpy() -> Any:
-    try:
-        import fmpy
-    except ImportError:
-        raise InputError(
-            "path",
-            expected="the package fmpy, which runs FMUs",
-            got="an installation without it",
-            remedy='install it: pip install "retwin[fmu]"',
-        ) from None
-    return fmpy
+    """The package FMPy."""
+    return needs_extra("fmpy", "fmu", "runs FMUs")
 
 
 def read_description(path: Path) -> Any:
-    """FMPy's model description of an FMU that can run here; loads no native code."""
+    """Read the model description of an FMU and check that it can run here.
+
+    Parameters
+    ----------
+    path : Path
+        The .fmu file.
+
+    Returns
+    -------
+    fmpy.model_description.ModelDescription
+        FMPy's object.
+
+    Raises
+    ------
+    InputError
+        The file is no FMU, has no readable description, no co-simulation or no native code for
+        this machine; FMPy is not installed.
+
+    """
     fmpy = _fmpy()
 
     def refuse(expected: str, got: str, remedy: str) -> InputError:
@@ -88,7 +99,21 @@ def read_description(path: Path) -> Any:
 
 
 def extract(path: Path, folder: str) -> None:
-    """Unpack an FMU. Members cannot leave the folder: FMPy and zipfile see to that."""
+    """Unpack an FMU; FMPy and zipfile refuse or confine members that point outside the folder.
+
+    Parameters
+    ----------
+    path : Path
+        The .fmu file.
+    folder : str
+        Where its members go.
+
+    Raises
+    ------
+    InputError
+        It cannot be unpacked.
+
+    """
     try:
         _fmpy().extract(path, folder)
     except Exception as error:  # FMPy raises nothing more special
@@ -101,7 +126,28 @@ def extract(path: Path, folder: str) -> None:
 
 
 def find_variables(description: Any, argument: str, names: Sequence[str]) -> list[Any]:
-    """The variables called `names`, or all that can be a channel."""
+    """Find the variables that are channels.
+
+    Parameters
+    ----------
+    description : fmpy.model_description.ModelDescription
+        The FMU's description.
+    argument : {"inputs", "outputs"}
+        The causality of the variables, and the argument that errors name.
+    names : sequence of str
+        Names of variables; empty takes all that can be a channel.
+
+    Returns
+    -------
+    list of fmpy.model_description.ScalarVariable
+        The variables in the order of the names.
+
+    Raises
+    ------
+    InputError
+        A variable that is missing, of another causality or no scalar number.
+
+    """
     causality = argument.removesuffix("s")
     every = {variable.name: variable for variable in description.modelVariables}
     able = {
@@ -113,17 +159,18 @@ def find_variables(description: Any, argument: str, names: Sequence[str]) -> lis
         and not variable.clocks
     }
     for name in names:
-        if name not in able:
-            raise InputError(
-                argument,
-                expected=f"variables that are an {causality} and a scalar number",
-                got=f"{name!r}, {_what(every.get(name))}",
-                remedy=_close(name, able),
-            )
+        require(
+            name in able,
+            argument,
+            expected=f"variables that are an {causality} and a scalar number",
+            got=f"{name!r}, {_description(every.get(name))}",
+            remedy=_close_matches(name, able),
+        )
     return [able[name] for name in names] if names else list(able.values())
 
 
-def _what(variable: Any) -> str:
+def _description(variable: Any) -> str:
+    """Why a variable cannot be a channel."""
     if variable is None:
         return "which the FMU does not have"
     shape = f" of shape {variable.shape}" if variable.shape else ""
@@ -131,8 +178,8 @@ def _what(variable: Any) -> str:
     return f"whose causality is {variable.causality}, type {variable.type}{shape}{clocked}"
 
 
-def _close(name: str, names: Sequence[str] | Mapping[str, Any]) -> str:
-    """What may have been meant, and what there is."""
+def _close_matches(name: str, names: Sequence[str] | Mapping[str, Any]) -> str:
+    """Names that are similar, and the names that exist."""
     near = difflib.get_close_matches(name, names, n=3)
     meant = f"did you mean {' or '.join(near)}? " if near else ""
     more = f", … ({len(names)} in all)" if len(names) > 10 else ""
@@ -146,7 +193,19 @@ def _declared(variable: Any, attribute: str) -> Any:
 
 
 def channels_of(variables: Sequence[Any]) -> Channels:
-    """Names and units; "1" where a variable has no unit."""
+    """Channels of variables.
+
+    Parameters
+    ----------
+    variables : sequence of fmpy.model_description.ScalarVariable
+        See `find_variables`.
+
+    Returns
+    -------
+    Channels
+        Their names and units; "1" where a variable has no unit.
+
+    """
     return Channels(
         tuple(variable.name for variable in variables),
         tuple(_declared(variable, "unit") or "1" for variable in variables),
@@ -154,7 +213,21 @@ def channels_of(variables: Sequence[Any]) -> Channels:
 
 
 def limits_of(variables: Sequence[Any], outside: Literal["refuse", "clip"]) -> Limits | None:
-    """The ranges the FMU declares for its inputs; None where it declares none."""
+    """Limits of inputs.
+
+    Parameters
+    ----------
+    variables : sequence of fmpy.model_description.ScalarVariable
+        The inputs.
+    outside : {"refuse", "clip"}
+        See `Limits`.
+
+    Returns
+    -------
+    Limits or None
+        The ranges that the FMU declares; None where it declares none.
+
+    """
 
     def bound(variable: Any, attribute: str, open_end: float) -> float:
         if variable.type == "Boolean":
@@ -171,7 +244,32 @@ def limits_of(variables: Sequence[Any], outside: Literal["refuse", "clip"]) -> L
 def start_column(
     description: Any, name: str, value: Any, count: int, inputs: Sequence[str]
 ) -> list[Any]:
-    """One checked start value per trajectory."""
+    """Check a start value and give each trajectory its own.
+
+    Parameters
+    ----------
+    description : fmpy.model_description.ModelDescription
+        The FMU's description.
+    name : str
+        Name of a variable.
+    value : float, str or array_like, shape (count,)
+        One value for all trajectories or one each.
+    count : int
+        The number of trajectories.
+    inputs : sequence of str
+        The command channels, which have no start value.
+
+    Returns
+    -------
+    list
+        One value per trajectory, of the variable's type.
+
+    Raises
+    ------
+    InputError
+        A variable that cannot be set before a run, or a value that does not fit its type.
+
+    """
     from fmpy.simulation import settable_in_initialization_mode, settable_in_instantiated
 
     able = {
@@ -183,13 +281,13 @@ def start_column(
         and not variable.shape
         and variable.name not in inputs
     }
-    if name not in able:
-        raise InputError(
-            "start",
-            expected="scalar variables that can be set before a run, and are no commands",
-            got=repr(name),
-            remedy=_close(name, able),
-        )
+    require(
+        name in able,
+        "start",
+        expected="scalar variables that can be set before a run, and are no commands",
+        got=repr(name),
+        remedy=_close_matches(name, able),
+    )
     kind = able[name].type
     array = np.asarray(value)
     fits = array.shape in ((), (count,)) and array.dtype.kind in (
@@ -199,11 +297,11 @@ def start_column(
         fits = bool(np.isfinite(array).all())
         if kind not in NUMBERS:
             fits = fits and not np.any(array % 1)
-    if not fits:
-        raise InputError(
-            "start",
-            expected=f"for {name} ({kind}) one fitting value, or one per trajectory, {count}",
-            got=f"{array.dtype} of shape {array.shape}" if array.ndim else repr(value),
-            remedy="give finite numbers, whole ones for whole types",
-        )
+    require(
+        fits,
+        "start",
+        expected=f"for {name} ({kind}) one fitting value, or one per trajectory, {count}",
+        got=f"{array.dtype} of shape {array.shape}" if array.ndim else repr(value),
+        remedy="give finite numbers, whole ones for whole types",
+    )
     return np.broadcast_to(array, (count,)).tolist()

@@ -1,6 +1,7 @@
-"""What a worker process does with an FMU: load it once, then run it again and again.
+"""The worker process of an FMU: it loads the FMU once and runs it again and again.
 
-An FMU is native code. This module is the only one that loads it, and no parent process calls it.
+An FMU is native code. This module is the only one that loads it, and parent processes do not call
+it.
 """
 
 from __future__ import annotations
@@ -16,35 +17,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["AGAIN", "Job", "load", "orphaned", "run", "start"]
+__all__ = ["RETRY", "Job", "load", "orphaned", "run", "start"]
 
-AGAIN = 75
-"""Exit code of a process that was spent before it began a run: the run is to be asked for again."""
-INSTANCES = 500
-"""Instances one process makes at most. Some FMUs crash at about the thousandth."""
+RETRY = 75
+"""Exit code of a process that ends before it begins a run, which another process has to do. The
+code is that of sysexits.h for a temporary failure."""
+MAX_INSTANCES = 500
+"""Largest number of instances that one process makes. Some FMUs crash at about the thousandth."""
 STATUS = ("ok", "warning", "discard", "error", "fatal", "pending")
 FATAL = STATUS.index("fatal")
 ROUNDING = 1e-9
+"""Times in samples that are this close below a whole number count as that number: they round."""
 
 Start = Mapping[str, float | str]
 
 
 @dataclass(frozen=True)
 class Job:
-    """What all runs have in common.
+    """Settings that all runs share.
 
     Parameters
     ----------
-    folder: the extracted FMU.
-    inputs, outputs: names of variables, in order.
-    rate: samples per second.
-    substeps: communication steps per sample.
-    rates: samples per second of the inputs that are held at a rate of their own.
-    reuse: whether an instance is reset between runs, or made anew.
+    inputs, outputs : tuple of str
+        Names of variables, in order.
+    rate : float
+        Sample rate in Hz.
+    substeps : int
+        Communication steps per sample.
+    rates : mapping of str to float
+        Rates in Hz of inputs that are sampled and held at a rate of their own.
+    reuse : bool
+        Whether an instance is reset between runs, or made anew.
 
     """
 
-    folder: str
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     rate: float
@@ -53,44 +59,82 @@ class Job:
     reuse: bool
 
 
+_folder: str
 _job: Job
 _instance: Instance | None = None
 
 
-def start(job: Job) -> None:
-    """Make this process ready for runs of `job`."""
-    import fmpy  # noqa: F401  loaded here, so that no run's time limit pays for it
+def start(folder: str, job: Job) -> None:
+    """Prepare this process for runs.
 
-    global _job
-    _job = job
-    # Python's handlers wait for the native code to return, which a hung FMU never does.
+    Parameters
+    ----------
+    folder : str
+        Where the FMU is unpacked.
+    job : Job
+        Settings of the runs.
+
+    """
+    import fmpy  # noqa: F401  before the time limit of the first run begins
+
+    global _folder, _job
+    _folder, _job = folder, job
+    # Python's handlers wait for native code to return, which a hung FMU never does.
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    # What an FMU prints must not mix with what the program prints.
+    # The output of an FMU must not mix with that of the program.
     os.dup2(2, 1)
 
 
-def orphaned(job: Job) -> None:
-    """Remove the extracted FMU, when the process that would have done it is no more."""
-    shutil.rmtree(job.folder, ignore_errors=True)
+def orphaned(folder: str, job: Job) -> None:
+    """Remove the unpacked FMU when the parent process, which would have done it, has died.
+
+    Parameters
+    ----------
+    folder, job
+        See `start`.
+
+    """
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def load() -> str:
-    """Why the FMU cannot be loaded here; "" when it is."""
+    """Load the FMU, unless it is loaded.
+
+    Returns
+    -------
+    str
+        The reason why it cannot be loaded; "" when it is loaded.
+
+    """
     global _instance
     if _instance is None:
         try:
-            _instance = Instance(_job)
+            _instance = Instance(_folder, _job)
         except Exception as error:  # FMPy raises nothing more special
             return " ".join(str(error).split())
     return ""
 
 
 def run(commands: NDArray, values: Start) -> NDArray | str:
-    """Outputs (T, d_y) for `commands` (T, d_u) and start values, or why there are none."""
+    """Run the FMU once.
+
+    Parameters
+    ----------
+    commands : ndarray, shape (T, d_u)
+        Commands of one trajectory.
+    values : mapping of str to float or str
+        Start values.
+
+    Returns
+    -------
+    ndarray, shape (T, d_y), or str
+        Outputs, or the reason of the failure.
+
+    """
     if _instance is not None and _instance.spent:
-        # Time for the parent to hear that this process took the task, or it would be lost.
+        # Until the parent has noted that this process took the task; otherwise it would be lost.
         time.sleep(0.2)
-        os._exit(AGAIN)
+        os._exit(RETRY)
     reason = load()
     if _instance is None:
         return reason
@@ -100,28 +144,26 @@ def run(commands: NDArray, values: Start) -> NDArray | str:
 class Instance:
     """An instance of the FMU, reset or made anew between runs; its library is loaded once.
 
-    Raises what FMPy raises when it cannot be loaded.
+    The constructor passes on FMPy's exceptions when the FMU cannot be loaded.
     """
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, folder: str, job: Job) -> None:
         from fmpy import read_model_description
         from fmpy.simulation import instantiate_fmu
 
         self.job = job
-        self.description = read_model_description(job.folder, validate=False)
+        self.description = read_model_description(folder, validate=False)
         self.version = self.description.fmiMajorVersion
         named = {variable.name: variable for variable in self.description.modelVariables}
         self.inputs = [named[name] for name in job.inputs]
         self.outputs = [named[name] for name in job.outputs]
-        self.said = ""
+        self.message = ""
         self.made = 1
         self.fresh, self.sound, self.spent = True, True, False
-        self.slave = instantiate_fmu(
-            job.folder, self.description, "CoSimulation", logger=self._listen
-        )
+        self.slave = instantiate_fmu(folder, self.description, "CoSimulation", logger=self._log)
 
     def run(self, commands: NDArray, values: Start) -> NDArray | str:
-        """See `run` of this module."""
+        """See the function `run`."""
         from fmpy.fmi1 import FMICallException
 
         try:
@@ -133,17 +175,17 @@ class Instance:
         except FMICallException as error:
             self.sound, self.spent = False, self.spent or error.status == FATAL
             label = STATUS[error.status] if error.status < len(STATUS) else str(error.status)
-            said = f" ({self.said})" if self.said else ""
-            return f"FMI status {label} in {error.function}{said}"
+            message = f" ({self.message})" if self.message else ""
+            return f"FMI status {label} in {error.function}{message}"
         except Exception as error:  # FMPy raises nothing more special
             self.sound = False
             return " ".join(str(error).split())
 
     def _renew(self) -> None:
-        """Back to where an instance begins: by a reset, or by another instance."""
+        """Restore the initial state: by a reset, or by another instance."""
         from fmpy.fmi1 import FMICallException
 
-        self.said = ""
+        self.message = ""
         if self.fresh:
             return
         if self.job.reuse and self.sound:
@@ -157,42 +199,42 @@ class Instance:
         if self.version == 2:
             self.slave.instantiate(callbacks=self.slave.callbacks)
         else:
-            self.slave.instantiate(logMessage=self._listen)
+            self.slave.instantiate(logMessage=self._log)
         self.made += 1
-        self.sound, self.spent = True, self.made >= INSTANCES
+        self.sound, self.spent = True, self.made >= MAX_INSTANCES
 
-    def _listen(self, *message: Any) -> None:
-        """Keep what the FMU says last: (…, status, category, text)."""
-        self.said = " ".join(message[-1].decode("utf-8", "replace").split())
+    def _log(self, *message: Any) -> None:
+        """Keep the last log message of the FMU: (…, status, category, text)."""
+        self.message = " ".join(message[-1].decode("utf-8", "replace").split())
 
     def _simulate(self, commands: NDArray, values: Start) -> NDArray:
-        """Outputs after every sample's last step, in which the FMU saw inputs from its begin."""
+        """Outputs (T, d_y) at the samples; in each step the FMU has the inputs of its begin."""
         step = 1.0 / (self.job.rate * self.job.substeps)
         steps = (len(commands) - 1) * self.job.substeps
         table = self._table(commands)
         outputs = np.zeros((len(commands), len(self.outputs)))
         setters = [self._setter(columns, table) for columns in _by_type(self.inputs)]
-        taken = [(columns, *self._getter(columns, outputs)) for columns in _by_type(self.outputs)]
+        getters = [(columns, *self._getter(columns, outputs)) for columns in _by_type(self.outputs)]
         begin = self._initialise(values, setters, steps * step)
-        for _, _, get in taken:
+        for _, _, get in getters:
             get(0)
         for k in range(steps):
             for put in setters:
                 put(k)
-            said = self.slave.doStep(begin + k * step, step)
-            if said is not None and said[1]:
-                raise RuntimeError(f"the FMU ended its simulation at {begin + said[3]:g} s")
+            outcome = self.slave.doStep(begin + k * step, step)
+            if outcome is not None and outcome[1]:
+                raise RuntimeError(f"the FMU ended its simulation at {begin + outcome[3]:g} s")
             if (k + 1) % self.job.substeps == 0:
-                for _, _, get in taken:
+                for _, _, get in getters:
                     get((k + 1) // self.job.substeps)
-        for columns, rows, _ in taken:
+        for columns, rows, _ in getters:
             outputs[:, columns] = rows
         return outputs
 
     def _initialise(
         self, values: Start, setters: list[Callable[[int], None]], duration: float
     ) -> float:
-        """Start values and first inputs, in FMI's order; gives the time of the begin in s."""
+        """Set start values and first inputs, in FMI's order; returns the start time in s."""
         from fmpy.simulation import (
             apply_start_values,
             settable_in_initialization_mode,
@@ -220,8 +262,8 @@ class Instance:
     def _table(self, commands: NDArray) -> NDArray:
         """Inputs (K, d_u) at all communication points.
 
-        Continuous inputs are linear between samples, others held; one with a rate of its own is
-        sampled at that rate and held.
+        Continuous inputs are linear between samples, others are held; an input with a rate of its
+        own is sampled at that rate and held.
         """
         samples = np.arange(len(commands))
         points = np.arange((len(commands) - 1) * self.job.substeps + 1) / self.job.substeps
@@ -237,7 +279,7 @@ class Instance:
         return table
 
     def _setter(self, columns: list[int], table: NDArray) -> Callable[[int], None]:
-        """A call that sets the inputs in `columns`, all of one type, to row k of `table`."""
+        """A function that sets the inputs in `columns`, all of one type, to row k of `table`."""
         variables = [self.inputs[column] for column in columns]
         kind, element = self._type(variables[0])
         return self._call(f"Set{kind}", variables, _as_type(table[:, columns], kind, element))
@@ -245,14 +287,14 @@ class Instance:
     def _getter(
         self, columns: list[int], outputs: NDArray
     ) -> tuple[NDArray, Callable[[int], None]]:
-        """An array for the outputs in `columns`, all of one type, and a call that fills row k."""
+        """An array for the outputs in `columns`, of one type, and a function that fills row k."""
         variables = [self.outputs[column] for column in columns]
         kind, element = self._type(variables[0])
         rows = np.zeros((len(outputs), len(columns)), element)
         return rows, self._call(f"Get{kind}", variables, rows)
 
     def _type(self, variable: Any) -> tuple[str, Any]:
-        """What FMI's calls call the type of a variable, and its C type."""
+        """The name of a variable's type in FMI's functions, and its C type."""
         from fmpy import fmi2, fmi3
 
         kind = variable.type
@@ -261,7 +303,7 @@ class Instance:
         return kind, getattr(fmi2 if self.version == 2 else fmi3, f"fmi{self.version}{kind}")
 
     def _call(self, name: str, variables: list[Any], rows: NDArray) -> Callable[[int], None]:
-        """FMI's call `name` on row k of `rows`, without a copy: FMPy's own takes twice as long."""
+        """FMI's function `name` for row k of `rows`; twice as fast as FMPy's."""
         from ctypes import c_uint32
 
         count = len(variables)
@@ -275,18 +317,30 @@ class Instance:
 
 
 def is_continuous(variable: Any) -> bool:
-    """Whether a variable may take values between its samples."""
+    """Whether a variable is interpolated between its samples.
+
+    Parameters
+    ----------
+    variable : fmpy.model_description.ScalarVariable
+        An input.
+
+    Returns
+    -------
+    bool
+        True for continuous floating-point variables.
+
+    """
     return variable.type in ("Real", "Float32", "Float64") and variable.variability == "continuous"
 
 
 def _by_type(variables: list[Any]) -> list[list[int]]:
-    """Which variables are of one type: FMI has one call per type."""
+    """Indices of the variables of each type: FMI has one function per type."""
     kinds = [variable.type for variable in variables]
     return [[i for i, k in enumerate(kinds) if k == kind] for kind in dict.fromkeys(kinds)]
 
 
 def _as_type(values: NDArray, kind: str, element: Any) -> NDArray:
-    """`values` as C type; whole numbers are rounded and kept within the type's range."""
+    """`values` as C type; whole numbers are rounded and clipped to the range of the type."""
     dtype = np.dtype(element)
     if dtype.kind != "f":
         low, high = (0, 1) if kind == "Boolean" else (np.iinfo(dtype).min, np.iinfo(dtype).max)

@@ -1,4 +1,4 @@
-"""`FunctionTwin`: any Python function from commands to outputs, over processes if asked for."""
+"""`FunctionTwin`: any Python function from commands to outputs, in worker processes on request."""
 
 from __future__ import annotations
 
@@ -6,26 +6,28 @@ import inspect
 import pickle
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import KW_ONLY, dataclass
-from functools import partial
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pebble import ProcessExpired, ProcessPool
 
+from retwin.checks import positive, require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
 from retwin.processes import sendable_errors, worker_pool
 from retwin.progress import Progress
-from retwin.twins.checks import check_positive
 from retwin.twins.faults import Fault
-from retwin.twins.twin import Chunk, Limits, simulate_in_chunks
+from retwin.twins.limits import Limits
+from retwin.twins.twin import Chunk, simulate_in_chunks
+from retwin.twins.workers import worker_processes
 
 __all__ = ["FunctionTwin"]
 
-CHUNK = 128
-"""Trajectories that a vectorised function gets at once."""
+TRAJECTORIES_PER_CHUNK = 128
+"""Number of trajectories that a vectorised function gets at once."""
 
 Function = Callable[..., ArrayLike]
 
@@ -36,26 +38,37 @@ class FunctionTwin:
 
     Parameters
     ----------
-    function: commands in, outputs out, both in physical units. Vectorised: (n, T, d_u) to
-        (n, T, d_y), for at most 128 trajectories at a time. Else (T, d_u) to (T, d_y). With a
-        parameter `rng` it is stochastic, and gets a `numpy.random.Generator` by that name.
-    inputs, outputs: channels of commands and outputs.
-    rate: samples per second.
-    vectorised: whether `function` takes many trajectories at once.
-    nominal: the ideal output for clean commands, called as `function` is; by default what
-        `function` itself says. A stochastic function needs one: what is ideal has no noise.
-    limits: what commands must keep.
-    workers: processes that a function of one trajectory is spread over; 1 runs it in this one.
-
-    The actuators are inside the function, out of sight: a frozen response is a held command. The
-    generator is drawn from the seed and the index of the (first) trajectory, so the same seed gives
-    the same bytes whatever `workers`.
+    function : callable
+        From commands to outputs in physical units. Vectorised: (n, T, d_u) to (n, T, d_y), for at
+        most 128 trajectories at a time; otherwise (T, d_u) to (T, d_y). A function with a
+        parameter `rng` is stochastic; it gets a `numpy.random.Generator` by that name.
+    inputs, outputs : Channels
+        Channels of the commands and the outputs.
+    rate : float
+        Sample rate in Hz, above 0.
+    vectorised : bool, default True
+        Whether `function` takes many trajectories at once.
+    nominal : callable, optional
+        The ideal output for clean commands, with the arguments of `function`; by default
+        `function` itself. A stochastic function requires it, since the ideal output has no noise.
+    limits : Limits, optional
+        Range of the commands.
+    workers : int, default 1
+        Processes over which the calls of a function of one trajectory are distributed; 1 calls it
+        in this process.
 
     Raises
     ------
-    InputError: something that cannot be called, a stochastic function without `nominal`, a rate
-        that is not positive, `workers` below 1 or for a vectorised function, or more than one for a
+    InputError
+        An object that cannot be called, a stochastic function without `nominal`, a rate that is
+        not positive, `workers` below 1, or more than one for a vectorised function or for a
         function that other processes cannot import.
+
+    Notes
+    -----
+    The actuators inside the function cannot be accessed, so a frozen response is a held command.
+    Random numbers depend on the seed and on the index of the (first) trajectory: the same seed
+    gives the same bytes for any number of workers.
 
     """
 
@@ -71,28 +84,28 @@ class FunctionTwin:
 
     def __post_init__(self) -> None:
         for role, given in (("function", self.function), ("nominal", self.nominal)):
-            if not (callable(given) or (role == "nominal" and given is None)):
-                raise InputError(
-                    role,
-                    expected="something that can be called with commands",
-                    got=repr(given),
-                    remedy="give a function of the commands that returns the outputs",
-                )
-        if _takes_rng(self.function) and self.nominal is None:
-            raise InputError(
-                "nominal",
-                expected=f"a function for the ideal output, since {_name(self.function)} is random",
-                got="None",
-                remedy="give nominal=, the same without noise",
+            require(
+                callable(given) or (role == "nominal" and given is None),
+                role,
+                expected="something that can be called with commands",
+                got=repr(given),
+                remedy="give a function of the commands that returns the outputs",
             )
-        check_positive("rate", self.rate, "Hz")
-        if self.workers < 1 or (self.vectorised and self.workers > 1):
-            raise InputError(
-                "workers",
-                expected="1, or more for a function of one trajectory",
-                got=f"{self.workers} with vectorised={self.vectorised}",
-                remedy="leave workers out, or give vectorised=False",
-            )
+        require(
+            self.nominal is not None or not _takes_rng(self.function),
+            "nominal",
+            expected=f"a function for the ideal output, since {_name(self.function)} is random",
+            got="None",
+            remedy="give nominal=, the same without noise",
+        )
+        positive("rate", self.rate, unit="Hz")
+        require(
+            self.workers >= 1 and (self.workers == 1 or not self.vectorised),
+            "workers",
+            expected="1, or more for a function of one trajectory",
+            got=f"{self.workers} with vectorised={self.vectorised}",
+            remedy="leave workers out, or give vectorised=False",
+        )
         if self.workers > 1:
             _check_importable(self.function, "function")
             _check_importable(self.nominal, "nominal")
@@ -105,44 +118,66 @@ class FunctionTwin:
         seed: int,
         progress: Progress | None = None,
     ) -> Trajectories:
-        """See `Twin.simulate`. What the function raises comes through as it is.
+        """See `Twin.simulate`; exceptions of the function are passed on unchanged.
 
-        Raises InputError too when the function returns another shape, no numbers, NaN or infinite
-        ones; `SimulationError` names trajectories whose worker process died.
+        Raises
+        ------
+        InputError
+            As `Twin.simulate`, and when the function returns another shape, no numbers, NaN or
+            infinite values.
+        SimulationError
+            The worker processes of some trajectories died.
+
         """
 
-        def tell(chunk: Chunk, share: float) -> None:
+        def report(chunk: Chunk, fraction: float) -> None:
             if progress is not None:
-                done = chunk.index.start + share * len(chunk.commands)
+                done = chunk.index.start + fraction * len(chunk.commands)
                 progress(done / len(commands))
 
-        # No process is started before commands and faults are found good.
-        with nullcontext() if self.workers == 1 else worker_pool(self.workers) as pool:
-            run = partial(self._run, seed=seed, pool=pool, tell=tell)
+        with ExitStack() as stack:
+            # No process is started before commands and faults are found good.
+            pool = cache(lambda: stack.enter_context(self._workers()) if self.workers > 1 else None)
+
+            def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+                return self._run(pool(), chunk, seed, report)
+
             return simulate_in_chunks(
-                self, run, commands, faults, seed=seed, progress=progress, size=CHUNK
+                self,
+                run,
+                commands,
+                faults,
+                seed=seed,
+                progress=progress,
+                size=TRAJECTORIES_PER_CHUNK,
             )
 
+    def _workers(self) -> AbstractContextManager[ProcessPool]:
+        """Processes that can serve every function."""
+        key = (FunctionTwin, self.workers)
+        return worker_processes(key, lambda: worker_pool(self.workers))
+
     def _run(
-        self, chunk: Chunk, *, seed: int, pool: ProcessPool | None, tell: Callable
+        self, pool: ProcessPool | None, chunk: Chunk, seed: int, report: Callable
     ) -> tuple[NDArray, NDArray]:
+        """Nominal and observed outputs of a chunk."""
         held = chunk.held_commands
         every = np.arange(len(held))
-        # Without a nominal of its own, the function need not say twice what a healthy one does.
-        fresh = every
+        # Without a nominal function, the healthy output of a trajectory is its nominal output.
+        faulty = every
         if self.nominal is None:
-            fresh = np.flatnonzero((held != chunk.commands).any(axis=(1, 2)))
+            faulty = np.flatnonzero((held != chunk.commands).any(axis=(1, 2)))
         ideal = "function" if self.nominal is None else "nominal"
         clean = self._calls(ideal, chunk, chunk.commands, every, seed)
-        calls = [*clean, *self._calls("function", chunk, held, fresh, seed)]
-        answers = []
-        for answer in _answers(calls, pool, chunk):
-            answers.append(answer)
-            tell(chunk, len(answers) / len(calls))
-        nominal = np.concatenate(answers[: len(clean)]).astype(chunk.commands.dtype)
+        calls = [*clean, *self._calls("function", chunk, held, faulty, seed)]
+        outputs = []
+        for output in _outputs(calls, pool, chunk):
+            outputs.append(output)
+            report(chunk, len(outputs) / len(calls))
+        nominal = np.concatenate(outputs[: len(clean)]).astype(chunk.commands.dtype)
         observed = nominal.copy()
-        if len(fresh):
-            observed[fresh] = np.concatenate(answers[len(clean) :])
+        if len(faulty):
+            observed[faulty] = np.concatenate(outputs[len(clean) :])
         return nominal, observed
 
     def _calls(
@@ -158,11 +193,11 @@ class FunctionTwin:
             _Call(
                 function=function,
                 role=role,
-                # A copy: what the function does to its argument stays there.
+                # A copy, which the function may change.
                 commands=commands[part],
                 outputs=self.outputs,
                 ids=part + chunk.index.start,
-                alone=not self.vectorised,
+                single=not self.vectorised,
                 seed=seed if random else None,
             )
             for part in parts
@@ -171,53 +206,55 @@ class FunctionTwin:
 
 @dataclass(frozen=True, eq=False)
 class _Call:
-    """One call of a user's function: what it gets, and what it must give."""
+    """One call of a user's function, for one trajectory or for many."""
 
     function: Function
     role: str
     commands: NDArray
     outputs: Channels
     ids: NDArray
-    alone: bool
+    single: bool
     seed: int | None
 
-    def answer(self) -> NDArray:
-        """The outputs (n, T, d_y), checked."""
-        given = self.commands[0] if self.alone else self.commands
+    def outputs_of(self) -> NDArray:
+        """Call the function and check its outputs (n, T, d_y)."""
+        given = self.commands[0] if self.single else self.commands
         if self.seed is None:
             returned = self.function(given)
         else:
-            # A key of its own: the faults' severities are drawn from the bare seed.
+            # With a spawn key, since the severities of faults are drawn from the seed itself.
             sequence = np.random.SeedSequence(self.seed, spawn_key=(int(self.ids[0]),))
             returned = self.function(given, rng=np.random.default_rng(sequence))
         outputs = self._numbers(returned)
-        outputs = outputs[None] if self.alone else outputs
+        outputs = outputs[None] if self.single else outputs
         self._check_finite(outputs)
         return outputs
 
     def _numbers(self, returned: ArrayLike) -> NDArray:
-        shape = (*self.commands.shape[:2], len(self.outputs))[int(self.alone) :]
+        """What the function returned, as numbers of the right shape."""
+        shape = (*self.commands.shape[:2], len(self.outputs))[int(self.single) :]
         try:
-            # A copy: the function may use its own array again.
+            # A copy: the function may reuse its own array.
             values = np.array(returned)
             got = f"{values.dtype} of shape {values.shape}"
         except (TypeError, ValueError, RuntimeError) as error:
             values = np.empty(0)
             got = " ".join(str(error).split())
-        if values.shape != shape or values.dtype.kind not in "fiub":
-            names = ", ".join(self.outputs.names)
-            other = "vectorised=False if it takes one trajectory, (T, d_u)"
-            if self.alone:
-                other = "vectorised=True if it takes many trajectories, (n, T, d_u)"
-            raise InputError(
-                self.role,
-                expected=f"{_name(self.function)} to return numbers of shape {shape}",
-                got=f"{type(returned).__name__}, {got}",
-                remedy=f"return one column per output channel, {names}; give {other}",
-            )
+        names = ", ".join(self.outputs.names)
+        other = "vectorised=False if it takes one trajectory, (T, d_u)"
+        if self.single:
+            other = "vectorised=True if it takes many trajectories, (n, T, d_u)"
+        require(
+            values.shape == shape and values.dtype.kind in "fiub",
+            self.role,
+            expected=f"{_name(self.function)} to return numbers of shape {shape}",
+            got=f"{type(returned).__name__}, {got}",
+            remedy=f"return one column per output channel, {names}; give {other}",
+        )
         return values
 
     def _check_finite(self, outputs: NDArray) -> None:
+        """Refuse NaN and infinite values."""
         bad = ~np.isfinite(outputs)
         if bad.any():
             row, sample, channel = np.argwhere(bad)[0]
@@ -226,16 +263,16 @@ class _Call:
                 expected=f"{_name(self.function)} to return finite numbers",
                 got=f"{outputs[row, sample, channel]} for {self.outputs.names[channel]} in "
                 f"trajectory {self.ids[row]}, sample {sample}",
-                remedy="mend the function, or give limits that keep commands where it holds",
+                remedy="repair the function, or give limits that exclude such commands",
             )
 
 
-def _answers(calls: Sequence[_Call], pool: ProcessPool | None, chunk: Chunk) -> Iterator[NDArray]:
-    """What each call gives, in order; a trajectory whose process died is noted as failed."""
+def _outputs(calls: Sequence[_Call], pool: ProcessPool | None, chunk: Chunk) -> Iterator[NDArray]:
+    """Outputs of each call, in order; a trajectory whose process died is entered as failed."""
     if pool is None:
-        yield from (call.answer() for call in calls)
+        yield from (call.outputs_of() for call in calls)
         return
-    # Packed here, so that a function the worker cannot import ends its call, and not the pool.
+    # Pickled here, so that a function that the worker cannot import ends its call, not the pool.
     futures = [pool.schedule(_in_worker, args=(pickle.dumps(call), call.role)) for call in calls]
     for call, future in zip(calls, futures, strict=True):
         try:
@@ -254,16 +291,18 @@ def _answers(calls: Sequence[_Call], pool: ProcessPool | None, chunk: Chunk) -> 
             yield np.zeros((*call.commands.shape[:2], len(call.outputs)))
 
 
-def _in_worker(packed: bytes, role: str) -> NDArray:
+def _in_worker(pickled: bytes, role: str) -> NDArray:
+    """Outputs of a pickled call."""
     try:
-        call = pickle.loads(packed)
+        call = pickle.loads(pickled)
     except (AttributeError, ImportError) as error:
         raise _not_importable(role, str(error)) from error
     with sendable_errors():
-        return call.answer()
+        return call.outputs_of()
 
 
 def _check_importable(function: Function | None, role: str) -> None:
+    """Refuse a function that cannot be pickled."""
     try:
         pickle.dumps(function)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -271,6 +310,7 @@ def _check_importable(function: Function | None, role: str) -> None:
 
 
 def _not_importable(role: str, reason: str) -> InputError:
+    """The error for a function that worker processes cannot import."""
     return InputError(
         role,
         expected="a function that worker processes can import",
@@ -280,11 +320,13 @@ def _not_importable(role: str, reason: str) -> InputError:
 
 
 def _takes_rng(function: Function) -> bool:
+    """Whether the function is stochastic."""
     try:
         return "rng" in inspect.signature(function).parameters
-    except (TypeError, ValueError):  # some compiled functions do not tell
+    except (TypeError, ValueError):  # some compiled functions have no signature
         return False
 
 
 def _name(function: Function) -> str:
+    """Name of the function, for messages."""
     return getattr(function, "__qualname__", type(function).__qualname__)

@@ -1,4 +1,4 @@
-"""From a file to a MuJoCo model with the actuators and sensors asked for, and their channels."""
+"""A MuJoCo model from a file, with added actuators and sensors, and its channels."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 
@@ -28,15 +29,19 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Servo:
-    """A position servo for a joint that has no actuator; its command is the joint's angle in rad
-    (or its place in m).
+    """A position servo for a joint that has no actuator.
+
+    Its command is the joint's angle in rad (or its position in m).
 
     Parameters
     ----------
-    stiffness: N m/rad (or N/m).
-    damping: N m s/rad (or N s/m).
-    armature: the rotor's inertia behind the gear, in kg m^2 (or kg). Most of what a geared servo
-        moves is its own rotor; without it, a stiff loop needs far smaller steps.
+    stiffness : float
+        Position gain in N m/rad (or N/m).
+    damping : float
+        Velocity gain in N m s/rad (or N s/m).
+    armature : float, default 0.005
+        Inertia of the rotor, reflected through the gear, in kg m^2 (or kg). It is most of the
+        inertia that a geared servo moves; without it, a stiff loop needs far smaller steps.
 
     """
 
@@ -50,9 +55,9 @@ HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE
 DIRECT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 FIXED, AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
 FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
-"""Actuators that follow their control with a lag."""
+"""Dynamics of actuators that follow their control with a lag."""
 FOLLOWING = (int(mujoco.mjtDyn.mjDYN_NONE), *FILTERS)
-"""Actuators whose gain acts on their control, and not, say, on its integral."""
+"""Dynamics of actuators whose gain acts on their control, and not for instance on its integral."""
 
 
 def compiled(
@@ -63,17 +68,39 @@ def compiled(
     step: float | None = None,
     meshes: bool = True,
 ) -> mujoco.MjModel:
-    """The model in `path`, with servos on joints and sensors for the places of sites or bodies.
+    """Compile a model, with servos added to joints and sensors added to sites or bodies.
 
-    Raises InputError when the file is missing, broken, or lacks one of the joints.
+    Parameters
+    ----------
+    path : Path
+        MJCF or URDF file.
+    servos : sequence of (str, Servo)
+        Position servos, by the joint that they drive.
+    places : sequence of str
+        Sites or bodies that get a position sensor; other names are ignored.
+    step : float, optional
+        Integration step in s; by default the model's.
+    meshes : bool, default True
+        Whether to load meshes.
+
+    Returns
+    -------
+    mujoco.MjModel
+        The compiled model.
+
+    Raises
+    ------
+    InputError
+        The file is missing or broken, or lacks one of the joints.
+
     """
-    if not path.is_file():
-        raise InputError(
-            "model",
-            expected="an MJCF or URDF file",
-            got=f"{path}, where there is none",
-            remedy="check the name",
-        )
+    require(
+        path.is_file(),
+        "model",
+        expected="an MJCF or URDF file",
+        got=f"{path}, where there is none",
+        remedy="check the name",
+    )
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         if not meshes:
@@ -100,7 +127,7 @@ def compiled(
             spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         if step is not None:
             spec.option.timestep = step
-        # Instability is told as such, and not hidden by starting again in the middle.
+        # An unstable simulation must raise a warning instead of being reset.
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         return spec.compile()
     except ValueError as error:
@@ -116,46 +143,87 @@ def compiled(
 
 
 def input_channels(model: mujoco.MjModel, names: Sequence[str]) -> Channels:
-    """Those actuators, by default all with a name; units of controls where these are plain."""
-    there = [name for i in range(model.nactuator) if (name := model.actuator(i).name)]
-    chosen = [_name("inputs", name, there) for name in names] or there
-    if not chosen:
-        raise InputError(
-            "inputs",
-            expected="a model with actuators that have names",
-            got="one without, as a URDF file always is",
-            remedy="name them, or add servos=((joint, Servo(stiffness, damping)), …)",
-        )
+    """Channels of actuators.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+        The model.
+    names : sequence of str
+        Actuators, in order; empty takes all that have a name.
+
+    Returns
+    -------
+    Channels
+        Names, and units of the controls where the model determines them, else "1".
+
+    Raises
+    ------
+    InputError
+        No actuator of that name, none at all, or one with several controls.
+
+    """
+    existing = [name for i in range(model.nactuator) if (name := model.actuator(i).name)]
+    chosen = [_name("inputs", name, existing) for name in names] or existing
+    require(
+        chosen,
+        "inputs",
+        expected="a model with actuators that have names",
+        got="one without, as a URDF file always is",
+        remedy="name them, or add servos=((joint, Servo(stiffness, damping)), …)",
+    )
     for name in chosen:
-        if model.actuator_ctrlnum[model.actuator(name).id] != 1:
-            raise InputError(
-                "inputs",
-                expected="actuators with one control",
-                got=f"{name} with {model.actuator_ctrlnum[model.actuator(name).id]}",
-                remedy="use an actuator for each of its controls",
-            )
+        controls = model.actuator_ctrlnum[model.actuator(name).id]
+        require(
+            controls == 1,
+            "inputs",
+            expected="actuators with one control",
+            got=f"{name} with {controls}",
+            remedy="use an actuator for each of its controls",
+        )
     return Channels(tuple(chosen), tuple(_control_unit(model, name) for name in chosen))
 
 
 def output_channels(
     model: mujoco.MjModel, names: Sequence[str]
 ) -> tuple[tuple[str, ...], Channels]:
-    """Those sensors, by default all that have a name, and a channel for each component."""
-    there = [name for i in range(model.nsensor) if (name := model.sensor(i).name)]
+    """Channels of sensors.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+        The model, compiled with the sensors' places.
+    names : sequence of str
+        Sensors, sites and bodies, in order; empty takes all sensors that have a name.
+
+    Returns
+    -------
+    sensors : tuple of str
+        Names of the sensors.
+    channels : Channels
+        One channel per component of the sensors.
+
+    Raises
+    ------
+    InputError
+        No sensor, site or body of that name, or none at all.
+
+    """
+    existing = [name for i in range(model.nsensor) if (name := model.sensor(i).name)]
     places = [name for i in range(model.nsite) if (name := model.site(i).name)]
     places += [name for i in range(1, model.nbody) if (name := model.body(i).name)]
-    # Places that were asked for have become sensors when the model was compiled.
+    # The chosen places became sensors when the model was compiled.
     for name in names:
-        _name("outputs", name, list(dict.fromkeys(there + places)))
-    chosen = list(names) or there
-    if not chosen:
-        raise InputError(
-            "outputs",
-            expected="sensors, sites or bodies of the model",
-            got="none asked for, and no sensors with names in the model",
-            remedy="name places whose position is the output"
-            + (f", such as {', '.join(places[-3:])}" if places else ""),
-        )
+        _name("outputs", name, list(dict.fromkeys(existing + places)))
+    chosen = list(names) or existing
+    example = f", such as {', '.join(places[-3:])}" if places else ""
+    require(
+        chosen,
+        "outputs",
+        expected="sensors, sites or bodies of the model",
+        got="no names, and no sensors with names in the model",
+        remedy=f"name places whose position is the output{example}",
+    )
     channels: list[str] = []
     units: list[str] = []
     for name in chosen:
@@ -168,7 +236,21 @@ def output_channels(
 
 
 def limits_of(model: mujoco.MjModel, names: Sequence[str]) -> tuple[NDArray, NDArray] | None:
-    """The least and the greatest control of those actuators; None when none is limited."""
+    """Control ranges of actuators.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+        The model.
+    names : sequence of str
+        Actuators, d_u of them.
+
+    Returns
+    -------
+    (low, high) or None
+        Arrays (d_u,), infinite where an actuator is not limited; None when none is.
+
+    """
     controls = np.array([model.actuator_ctrladr[model.actuator(name).id] for name in names])
     limited = model.actuator_ctrllimited[controls].astype(bool)
     if not limited.any():
@@ -178,9 +260,21 @@ def limits_of(model: mujoco.MjModel, names: Sequence[str]) -> tuple[NDArray, NDA
 
 
 def resting(model: mujoco.MjModel, name: str) -> tuple[int, Callable[[NDArray], NDArray]] | None:
-    """For a position servo on a joint: where its place is in qpos, and that place by command.
+    """Rest position of a position servo on a joint, as a function of its command.
 
-    None for actuators of another kind: a command does not tell where they rest.
+    Parameters
+    ----------
+    model : mujoco.MjModel
+        The model.
+    name : str
+        The actuator.
+
+    Returns
+    -------
+    (address, position) or None
+        The joint's address in qpos, and a function from commands to positions in rad or m. None
+        for other actuators, whose rest position does not follow from the command alone.
+
     """
     actuator = model.actuator(name)
     joint = joint_of(model, name)
@@ -191,37 +285,51 @@ def resting(model: mujoco.MjModel, name: str) -> tuple[int, Callable[[NDArray], 
     gear = actuator.gear[0]
     low, high = limits_of(model, [name]) or (np.array([-np.inf]), np.array([np.inf]))
 
-    def place(commands: NDArray) -> NDArray:
-        told = np.clip(commands, low[0], high[0])
-        return -(actuator.gainprm[0] * told + actuator.biasprm[0]) / (slope * gear)
+    def position(commands: NDArray) -> NDArray:
+        controls = np.clip(commands, low[0], high[0])
+        return -(actuator.gainprm[0] * controls + actuator.biasprm[0]) / (slope * gear)
 
-    return int(model.jnt_qposadr[joint]), place
+    return int(model.jnt_qposadr[joint]), position
 
 
 def joint_of(model: mujoco.MjModel, name: str) -> int | None:
-    """The hinge or slide joint that an actuator drives, or None when it drives something else."""
+    """The joint that an actuator drives.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+        The model.
+    name : str
+        The actuator.
+
+    Returns
+    -------
+    int or None
+        Index of the hinge or slide joint; None when the actuator drives something else.
+
+    """
     actuator = model.actuator(name)
     joint = int(actuator.trnid[0])
     direct = actuator.trntype[0] in DIRECT and model.jnt_type[joint] in (HINGE, SLIDE)
     return joint if direct else None
 
 
-def _name(argument: str, name: str, there: Sequence[str]) -> str:
+def _name(argument: str, name: str, existing: Sequence[str]) -> str:
     """`name`, if the model has it."""
-    if name not in there:
-        close = get_close_matches(name, there, n=1)
-        shown = ", ".join(there[:12]) + (", …" if len(there) > 12 else "")
-        raise InputError(
-            argument,
-            expected=f"names in the model: {shown or 'it has none'}",
-            got=repr(name),
-            remedy=f"did you mean {close[0]!r}?" if close else "check the spelling",
-        )
+    close = get_close_matches(name, existing, n=1)
+    shown = ", ".join(existing[:12]) + (", …" if len(existing) > 12 else "")
+    require(
+        name in existing,
+        argument,
+        expected=f"names in the model: {shown or 'it has none'}",
+        got=repr(name),
+        remedy=f"did you mean {close[0]!r}?" if close else "check the spelling",
+    )
     return name
 
 
 def _control_unit(model: mujoco.MjModel, name: str) -> str:
-    """Unit of a plain position servo or motor of gear 1; "1" where only the model knows."""
+    """Unit of the control of a position servo or motor of gear 1; "1" for other actuators."""
     joint = joint_of(model, name)
     actuator = model.actuator(name)
     if joint is None or actuator.gear[0] != 1 or actuator.dyntype[0] not in FOLLOWING:
@@ -256,6 +364,7 @@ BY_JOINT = {
 
 
 def _sensor_unit(model: mujoco.MjModel, name: str) -> str:
+    """Unit of a sensor; "1" where the model does not determine it."""
     sensor = model.sensor(name)
     kind = mujoco.mjtSensor(int(sensor.type[0])).name.removeprefix("mjSENS_")
     if kind in BY_JOINT:
@@ -267,6 +376,6 @@ def _sensor_unit(model: mujoco.MjModel, name: str) -> str:
 
 
 def _is_spatial(model: mujoco.MjModel, tendon: int) -> bool:
-    """Whether a tendon has a length in m; a fixed one adds up joints, in units of their own."""
+    """Whether a tendon has a length in m; a fixed one is a sum of joints in their own units."""
     first = int(model.tendon_adr[tendon])
     return bool(model.wrap_type[first] != int(mujoco.mjtWrap.mjWRAP_JOINT))

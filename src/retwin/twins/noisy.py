@@ -1,4 +1,4 @@
-"""`NoisyTwin`: a twin with independent noise on its outputs, at the rate of its sensor."""
+"""`NoisyTwin`: a twin with independent Gaussian noise on its outputs, at its sensor's rate."""
 
 from __future__ import annotations
 
@@ -8,32 +8,41 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require, whole
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
-from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.twins.around import Around, generator_of, simulate_chunk
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, Twin, simulate_in_chunks
+from retwin.twins.wrapper import TwinWrapper, chunk_generator, simulate_chunk
 
-__all__ = ["NoisyTwin", "interpolate_samples", "readings", "residual_scale"]
+__all__ = ["NoisyTwin", "interpolate_samples", "residual_scale", "sensor_sample_count"]
+
+OUTPUT_NOISE = 4
+"""The purpose of the random numbers that are the noise, see `chunk_generator`."""
 
 
 @dataclass(frozen=True, eq=False)
-class NoisyTwin(Around):
-    """Any twin, and independent Gaussian noise on what its sensor reads.
+class NoisyTwin(TwinWrapper):
+    """Any twin with independent Gaussian noise on every sample of its sensor.
 
-    The rival that takes the gap for noise: right in size, without any shape.
+    The baseline that models the discrepancy as white noise: of the right variance, without
+    temporal structure.
 
     Parameters
     ----------
-    twin: the twin inside.
-    scale: (d_y,) standard deviation of a reading, in output units; see `residual_scale`.
-    stride: samples per reading of the sensor; between them noise is linear.
-    emulated: whether the data that gave the scale were emulated.
+    twin : Twin
+        The wrapped twin.
+    scale : ndarray, shape (d_y,)
+        Standard deviation of a sensor sample, in output units, at least 0; see `residual_scale`.
+    stride : int, default 1
+        Data samples per sensor sample, at least 1; in between the noise is interpolated linearly.
+    emulated : bool, default False
+        Whether the data from which the scale was estimated are emulated.
 
     Raises
     ------
-    InputError: not one finite scale of at least 0 per output, a stride below 1.
+    InputError
+        Not one finite scale of at least 0 per output, or a stride below 1.
 
     """
 
@@ -44,20 +53,14 @@ class NoisyTwin(Around):
 
     def __post_init__(self) -> None:
         scale, width = np.asarray(self.scale, dtype=float), len(self.twin.outputs)
-        if scale.shape != (width,) or not (np.isfinite(scale) & (scale >= 0)).all():
-            raise InputError(
-                "scale",
-                expected=f"{width} finite numbers of at least 0, one per output",
-                got=f"{scale.tolist()}",
-                remedy="residual_scale gives them for calibration trajectories",
-            )
-        if not (isinstance(self.stride, int | np.integer) and self.stride >= 1):
-            raise InputError(
-                "stride",
-                expected="a whole number of at least 1",
-                got=repr(self.stride),
-                remedy="divide the data's rate by the sensor's",
-            )
+        require(
+            scale.shape == (width,) and bool((np.isfinite(scale) & (scale >= 0)).all()),
+            "scale",
+            expected=f"{width} finite numbers of at least 0, one per output",
+            got=scale.tolist(),
+            remedy="estimate it by residual_scale(calibration trajectories)",
+        )
+        whole("stride", self.stride, least=1, remedy="divide the data's rate by the sensor's")
         object.__setattr__(self, "scale", scale)
 
     def simulate(
@@ -68,15 +71,15 @@ class NoisyTwin(Around):
         seed: int,
         progress: Progress | None = None,
     ) -> Trajectories:
-        """See `Twin.simulate`; noise comes last, on faulty trajectories too."""
+        """See `Twin.simulate`; noise is added last, to faulty trajectories too."""
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             rows = np.arange(len(chunk.commands))
             nominal, observed = simulate_chunk(self.twin, chunk, rows, seed=seed)
             count, steps, width = observed.shape
-            shape = (count, readings(steps, self.stride), width)
-            read = self.scale * generator_of(seed, chunk, 4).normal(size=shape)
-            return nominal, observed + interpolate_samples(read, self.stride, steps)
+            shape = (count, sensor_sample_count(steps, self.stride), width)
+            noise = self.scale * chunk_generator(seed, chunk, OUTPUT_NOISE).normal(size=shape)
+            return nominal, observed + interpolate_samples(noise, self.stride, steps)
 
         return simulate_in_chunks(
             self, run, commands, faults, seed=seed, progress=progress, emulated=self.emulated
@@ -84,37 +87,80 @@ class NoisyTwin(Around):
 
 
 def residual_scale(calibration: Trajectories) -> NDArray:
-    """How large the residual of healthy trajectories is: its standard deviation (d_y,) per output.
+    """Standard deviation of the residual of healthy trajectories (Eq. 11).
 
-    In output units, over all that was measured (Eq. 11). Raises InputError for no trajectory, one
-    with a fault, or an output that was never measured.
+    Parameters
+    ----------
+    calibration : Trajectories
+        Healthy or unlabelled trajectories, one at least.
+
+    Returns
+    -------
+    ndarray, shape (d_y,)
+        One per output, in its unit, over all measured samples.
+
+    Raises
+    ------
+    InputError
+        No trajectory, a trajectory with a fault, or an output that was never measured.
+
     """
     healthy = np.isin(calibration.labels, (HEALTHY, UNLABELLED))
-    if len(calibration) == 0 or not healthy.all():
-        raise InputError(
-            "calibration",
-            expected="healthy trajectories, one at least",
-            got=f"{len(calibration)}, {int((~healthy).sum())} of them with a fault",
-            remedy=f"take calibration.with_label({HEALTHY!r})",
-        )
-    if not calibration.mask.any(axis=(0, 1)).all():
-        raise InputError(
-            "calibration",
-            expected="every output measured somewhere",
-            got="one that never was",
-            remedy="give trajectories in which it is, or leave the output out",
-        )
+    require(
+        len(calibration) > 0 and bool(healthy.all()),
+        "calibration",
+        expected="healthy trajectories, one at least",
+        got=f"{len(calibration)}, {int((~healthy).sum())} of them with a fault",
+        remedy=f"take calibration.with_label({HEALTHY!r})",
+    )
+    require(
+        calibration.mask.any(axis=(0, 1)).all(),
+        "calibration",
+        expected="every output measured somewhere",
+        got="one that never was",
+        remedy="give trajectories in which it is, or leave the output out",
+    )
     residual = calibration.residual.astype(np.float64)
     return residual.std(axis=(0, 1), where=calibration.mask)
 
 
-def readings(steps: int, stride: int) -> int:
-    """How many readings, one per `stride` samples, have `steps` samples between them."""
+def sensor_sample_count(steps: int, stride: int) -> int:
+    """Number of sensor samples between which `steps` data samples are interpolated.
+
+    Parameters
+    ----------
+    steps : int
+        Data samples.
+    stride : int
+        Data samples per sensor sample.
+
+    Returns
+    -------
+    int
+        One sensor sample per `stride` data samples, and one beyond the last data sample.
+
+    """
     return (steps - 1) // stride + 2
 
 
-def interpolate_samples(read: NDArray, stride: int, steps: int) -> NDArray:
-    """Samples (n, steps, d) on straight lines between readings (n, r, d), r of `readings`."""
+def interpolate_samples(samples: NDArray, stride: int, steps: int) -> NDArray:
+    """Interpolate sensor samples linearly.
+
+    Parameters
+    ----------
+    samples : ndarray, shape (n, r, d)
+        Sensor samples, r of `sensor_sample_count`.
+    stride : int
+        Data samples per sensor sample.
+    steps : int
+        Data samples to compute.
+
+    Returns
+    -------
+    ndarray, shape (n, steps, d)
+        Values at the data samples, the first at the first sensor sample.
+
+    """
     time = np.arange(steps)
-    before, share = time // stride, (time % stride / stride)[:, None]
-    return (1 - share) * read[:, before] + share * read[:, before + 1]
+    before, fraction = time // stride, (time % stride / stride)[:, None]
+    return (1 - fraction) * samples[:, before] + fraction * samples[:, before + 1]

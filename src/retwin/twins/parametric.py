@@ -1,9 +1,8 @@
-"""Twins with parameters: names, units and bounds, and one value per simulation.
+"""Twins with parameters: names, units and bounds, and one value per simulation (Eq. 2, 3).
 
-What can be updated (Eq. 2 and 3) is declared here. A `TakesParameters` is a twin whose `simulate`
-takes `parameters`, one value for all trajectories or one each: `MuJoCoTwin` and `FMUTwin` are, and
-`RebuiltTwin` and `CommandSide` make one of any other. `ParametricTwin` says which of its parameters
-are free, and holds their present values.
+A `TakesParameters` is a twin whose `simulate` takes values of its parameters: `MuJoCoTwin` and
+`FMUTwin` do, and `RebuiltTwin` and `CommandSide` add them to any other twin. `ParametricTwin`
+declares which parameters are free to be updated, and holds their present values.
 """
 
 from __future__ import annotations
@@ -16,27 +15,27 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
-from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.twins.around import Around, simulate_chunk
 from retwin.twins.faults import Fault
+from retwin.twins.parameter_values import values_per_simulation
 from retwin.twins.twin import Chunk, Twin, checked_commands, simulate_in_chunks
+from retwin.twins.wrapper import TwinWrapper, simulate_chunk
 
 __all__ = [
     "Parameter",
     "ParametricTwin",
     "RebuiltTwin",
     "TakesParameters",
-    "values_per_simulation",
 ]
 
-TOGETHER = 512
-"""Trajectories that are handed on at once."""
+TRAJECTORIES_PER_CHUNK = 512
+"""Number of trajectories that are passed to the wrapped twin together."""
 
 
 class TakesParameters(Twin, Protocol):
-    """A twin that can be given values of its parameters, one for all trajectories or one each."""
+    """A twin whose parameters can differ between simulations."""
 
     def simulate(
         self,
@@ -47,26 +46,53 @@ class TakesParameters(Twin, Protocol):
         progress: Progress | None = None,
         parameters: Mapping[str, ArrayLike] | None = None,
     ) -> Trajectories:
-        """See `Twin.simulate`; `parameters` by name, each () or (n,)."""
+        """Simulate with given values of the parameters.
+
+        Parameters
+        ----------
+        commands, faults, seed, progress
+            See `Twin.simulate`.
+        parameters : mapping of str to array_like, optional
+            Values by name, each () for all trajectories or (n,); other parameters keep their
+            default.
+
+        Returns
+        -------
+        Trajectories
+            See `Twin.simulate`.
+
+        Raises
+        ------
+        InputError
+            As `Twin.simulate`, and for unknown parameters and values that are not finite.
+
+        """
         ...
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of a twin that is not known exactly.
+    """A number of a twin that is not known exactly.
 
     Parameters
     ----------
-    name: of the parameter.
-    unit: of its values.
-    low, high: least and greatest value that is plausible; the prior is uniform between them.
-    start: the value before any updating; by default the middle.
-    places: what of the twin is set, with the factor that each is times the value; by default the
-        twin's own parameter of that name. So one stiffness can stand behind several numbers.
+    name : str
+        Name of the parameter.
+    unit : str
+        Unit of its values.
+    low, high : float
+        Lowest and highest plausible value; the prior is uniform between them.
+    start : float, optional
+        Value before any update, within the bounds; by default their middle.
+    places : mapping of str to float, optional
+        Parameters of the wrapped twin that are set, each to its factor times the value. So one
+        stiffness can determine several numbers. By default the wrapped twin's parameter of the
+        same name, with factor 1.
 
     Raises
     ------
-    InputError: bounds that are not finite or out of order, a start outside them.
+    InputError
+        Bounds that are not finite or out of order, or a start outside them.
 
     """
 
@@ -79,39 +105,44 @@ class Parameter:
 
     def __post_init__(self) -> None:
         start = (self.low + self.high) / 2 if self.start is None else self.start
-        if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
-            raise InputError(
-                f"parameter {self.name!r}",
-                expected="finite bounds, low below high",
-                got=f"low {self.low}, high {self.high}",
-                remedy=f"give the plausible range in {self.unit}",
-            )
-        if not self.low <= start <= self.high:
-            raise InputError(
-                f"parameter {self.name!r}",
-                expected=f"a start from {self.low:g} to {self.high:g} {self.unit}",
-                got=f"{start:g}",
-                remedy="widen the bounds or leave start out",
-            )
+        require(
+            np.isfinite([self.low, self.high]).all() and self.low < self.high,
+            f"parameter {self.name!r}",
+            expected="finite bounds, low below high",
+            got=f"low {self.low}, high {self.high}",
+            remedy=f"give the plausible range in {self.unit}",
+        )
+        require(
+            self.low <= start <= self.high,
+            f"parameter {self.name!r}",
+            expected=f"a start from {self.low:g} to {self.high:g} {self.unit}",
+            got=f"{start:g}",
+            remedy="widen the bounds or leave start out",
+        )
         object.__setattr__(self, "start", float(start))
         object.__setattr__(self, "places", dict(self.places or {self.name: 1.0}))
 
 
 @dataclass(frozen=True)
-class ParametricTwin(Around):
-    """A twin at certain values of its free parameters; satisfies `Twin` as it is.
+class ParametricTwin(TwinWrapper):
+    """A twin at certain values of its free parameters; it satisfies `Twin`.
 
     Parameters
     ----------
-    twin: takes `parameters`.
-    parameters: which are free.
-    values: one per parameter; by default their starts. Values outside the bounds are allowed here:
-        bounds are for updating.
-    held: other parameters of the twin inside, and their values.
+    twin : TakesParameters
+        The wrapped twin.
+    parameters : tuple of Parameter
+        The k free parameters, one at least.
+    values : tuple of float, optional
+        One finite value per parameter; by default their starts. The bounds constrain updates, not
+        these values.
+    held : mapping of str to float, optional
+        Values of other parameters of the wrapped twin.
 
     Raises
     ------
-    InputError: no parameter, a name that repeats, not one finite value per parameter.
+    InputError
+        No parameter, a repeated name, or not one finite value per parameter.
 
     """
 
@@ -122,22 +153,22 @@ class ParametricTwin(Around):
 
     def __post_init__(self) -> None:
         names = [each.name for each in self.parameters]
-        if not names or len(set(names)) != len(names):
-            raise InputError(
-                "parameters",
-                expected="at least one, no name twice",
-                got=str(names),
-                remedy="give each parameter a name of its own",
-            )
+        require(
+            names and len(set(names)) == len(names),
+            "parameters",
+            expected="at least one, no name twice",
+            got=names,
+            remedy="give each parameter a name of its own",
+        )
         starts = tuple(float(each.start or 0.0) for each in self.parameters)
         values = tuple(map(float, self.values)) or starts
-        if len(values) != len(names) or not np.isfinite(values).all():
-            raise InputError(
-                "values",
-                expected=f"{len(names)} finite numbers, one per parameter",
-                got=str(values),
-                remedy=f"the parameters are {', '.join(names)}",
-            )
+        require(
+            len(values) == len(names) and np.isfinite(values).all(),
+            "values",
+            expected=f"{len(names)} finite numbers, one per parameter",
+            got=values,
+            remedy=f"the parameters are {', '.join(names)}",
+        )
         object.__setattr__(self, "parameters", tuple(self.parameters))
         object.__setattr__(self, "values", values)
 
@@ -145,13 +176,27 @@ class ParametricTwin(Around):
     def built(
         cls, build: Callable[[Mapping[str, float]], Twin], parameters: Sequence[Parameter]
     ) -> ParametricTwin:
-        """Of a function from values by name to a twin; see `RebuiltTwin`."""
+        """Declare the parameters of a function that builds a twin.
+
+        Parameters
+        ----------
+        build : callable
+            From values by name to a twin, see `RebuiltTwin`.
+        parameters : sequence of Parameter
+            The free parameters.
+
+        Returns
+        -------
+        ParametricTwin
+            The twin at the parameters' starts.
+
+        """
         starts = {each.name: float(each.start or 0.0) for each in parameters}
         return cls(RebuiltTwin(build, starts), tuple(parameters))
 
     @property
     def nominal(self) -> Callable[[NDArray], NDArray] | None:
-        """The ideal output for clean commands, where it does not depend on the parameters."""
+        """Ideal output for clean commands; None where it depends on the parameters."""
         return getattr(self.twin, "nominal", None)
 
     @property
@@ -161,14 +206,28 @@ class ParametricTwin(Around):
 
     @property
     def bounds(self) -> tuple[NDArray, NDArray]:
-        """Low and high of every parameter, each (k,)."""
+        """Lowest and highest value of the free parameters, each (k,)."""
         low, high = zip(*((each.low, each.high) for each in self.parameters), strict=True)
         return np.array(low, dtype=float), np.array(high, dtype=float)
 
     def with_values(self, values: ArrayLike | Mapping[str, float]) -> ParametricTwin:
-        """The same twin at other values: one per parameter (k,), or some of them by name.
+        """The same twin at other values.
 
-        Raises InputError for unknown names and for anything but finite numbers.
+        Parameters
+        ----------
+        values : array_like, shape (k,), or mapping of str to float
+            One per free parameter, or some of them by name.
+
+        Returns
+        -------
+        ParametricTwin
+            The twin at these values.
+
+        Raises
+        ------
+        InputError
+            An unknown name, or anything but finite numbers.
+
         """
         if isinstance(values, Mapping):
             self._check_known(values)
@@ -177,9 +236,23 @@ class ParametricTwin(Around):
         return replace(self, values=tuple(np.asarray(values, dtype=float).tolist()))
 
     def holding(self, *names: str) -> ParametricTwin:
-        """The same twin with those parameters held at their present values, no longer free.
+        """The same twin with some parameters held at their present values.
 
-        Raises InputError for unknown names, and when none is left free.
+        Parameters
+        ----------
+        *names : str
+            Free parameters.
+
+        Returns
+        -------
+        ParametricTwin
+            The twin whose free parameters are the others.
+
+        Raises
+        ------
+        InputError
+            An unknown name, or no parameter is left free.
+
         """
         self._check_known(dict.fromkeys(names))
         pairs = list(zip(self.parameters, self.values, strict=True))
@@ -202,43 +275,52 @@ class ParametricTwin(Around):
         progress: Progress | None = None,
         parameters: Mapping[str, ArrayLike] | None = None,
     ) -> Trajectories:
-        """See `Twin.simulate`; `parameters` replace present values, for all (), or each (n,).
+        """See `TakesParameters.simulate`; `parameters` replace present values.
 
-        Raises InputError too for parameters that are not free.
+        Raises
+        ------
+        InputError
+            As `TakesParameters.simulate`, and for parameters that are not free.
+
         """
         self._check_known(parameters or {})
         now: dict[str, ArrayLike] = dict(zip(self.names, self.values, strict=True))
         now |= parameters or {}
-        told: dict[str, ArrayLike] = dict(self.held)
-        told |= {
+        inner_values: dict[str, ArrayLike] = dict(self.held)
+        inner_values |= {
             place: factor * np.asarray(now[each.name], dtype=float)
             for each in self.parameters
             for place, factor in each.places.items()
         }
         return self.twin.simulate(
-            commands, faults=faults, seed=seed, progress=progress, parameters=told
+            commands, faults=faults, seed=seed, progress=progress, parameters=inner_values
         )
 
     def _check_known(self, names: Mapping[str, Any]) -> None:
+        """Refuse names of parameters that are not free."""
         unknown = sorted(set(names) - set(self.names))
-        if unknown:
-            raise InputError(
-                "parameters",
-                expected=f"some of {', '.join(self.names)}",
-                got=", ".join(map(repr, unknown)),
-                remedy="check the spelling, or declare it with a Parameter",
-            )
+        require(
+            not unknown,
+            "parameters",
+            expected=f"some of {', '.join(self.names)}",
+            got=", ".join(map(repr, unknown)),
+            remedy="check the spelling, or declare it with a Parameter",
+        )
 
 
 @dataclass(frozen=True)
-class RebuiltTwin(Around):
-    """Takes parameters by being built anew for every value; those that share one go together.
+class RebuiltTwin(TwinWrapper):
+    """A twin that is built anew for each combination of parameter values.
+
+    Trajectories with equal values are simulated together.
 
     Parameters
     ----------
-    build: from values by name to a twin; channels, rate and limits must not depend on them. Define
-        it in a module, so that other processes can import it.
-    defaults: values of all parameters.
+    build : callable
+        From values by name to a twin, whose channels, rate and limits do not depend on them.
+        Other processes must be able to import it.
+    defaults : mapping of str to float
+        Values of all parameters.
 
     """
 
@@ -247,15 +329,22 @@ class RebuiltTwin(Around):
 
     @cached_property
     def twin(self) -> Twin:
-        """The twin at the defaults. Raises InputError when `build` makes no twin."""
+        """The twin at the defaults.
+
+        Raises
+        ------
+        InputError
+            `build` returns no twin.
+
+        """
         made = self.build(dict(self.defaults))
-        if not isinstance(made, Twin):
-            raise InputError(
-                "build",
-                expected="a function that returns a twin",
-                got=type(made).__name__,
-                remedy="return a FunctionTwin, or any object that satisfies Twin",
-            )
+        require(
+            isinstance(made, Twin),
+            "build",
+            expected="a function that returns a twin",
+            got=type(made).__name__,
+            remedy="return a FunctionTwin, or any object that satisfies Twin",
+        )
         return made
 
     def simulate(
@@ -270,7 +359,7 @@ class RebuiltTwin(Around):
         """See `TakesParameters.simulate`."""
         commands = checked_commands(commands, self.inputs)
         names = tuple(self.defaults)
-        values = values_per_simulation(parameters, names, len(commands))
+        values = values_per_simulation(parameters, len(commands), allowed=names)
         table = np.stack(
             [values.get(n, np.full(len(commands), self.defaults[n])) for n in names], 1
         )
@@ -286,27 +375,5 @@ class RebuiltTwin(Around):
             return nominal, observed
 
         return simulate_in_chunks(
-            self, run, commands, faults, seed=seed, progress=progress, size=TOGETHER
+            self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
         )
-
-
-def values_per_simulation(
-    parameters: Mapping[str, ArrayLike] | None, known: Sequence[str], count: int
-) -> dict[str, NDArray]:
-    """The values of each parameter, (count,).
-
-    Raises InputError for unknown names, and for anything but finite numbers, one for all or each.
-    """
-    own = {}
-    for name, given in (parameters or {}).items():
-        array = np.asarray(given)
-        numbers = array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
-        if name not in known or not numbers or array.shape not in ((), (count,)):
-            raise InputError(
-                "parameters",
-                expected=f"finite numbers for {', '.join(known)}: one for all, or {count}",
-                got=f"{name}: {array.dtype} of shape {array.shape}",
-                remedy="check the spelling; give as many values as there are trajectories",
-            )
-        own[name] = np.broadcast_to(array.astype(float), count)
-    return own

@@ -1,4 +1,4 @@
-"""`RandomisedTwin`: domain randomisation, parameters anew for every trajectory."""
+"""`RandomisedTwin`: domain randomisation, with parameters drawn anew for every trajectory."""
 
 from __future__ import annotations
 
@@ -10,26 +10,35 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.twins.around import Around, generator_of, simulate_chunk
-from retwin.twins.checks import ideal_outputs
 from retwin.twins.faults import Fault
 from retwin.twins.parametric import ParametricTwin
-from retwin.twins.twin import Chunk, simulate_in_chunks
+from retwin.twins.twin import Chunk, nominal_outputs, simulate_in_chunks
+from retwin.twins.wrapper import TwinWrapper, chunk_generator, simulate_chunk
 
 __all__ = ["RandomisedTwin", "simulate_with_parameters"]
 
 
-@dataclass(frozen=True)
-class RandomisedTwin(Around):
-    """A twin whose every parameter is drawn uniformly within its bounds, per trajectory.
+PARAMETERS = 3
+"""The purpose of the random numbers that are the parameters, see `chunk_generator`."""
 
-    Domain randomisation (Tobin et al. 2017): the rival that asks for no real data. It is as good as
-    its bounds, which somebody who has not seen the data has to set by hand.
+
+@dataclass(frozen=True)
+class RandomisedTwin(TwinWrapper):
+    """A twin whose parameters are drawn uniformly within their bounds, per trajectory.
+
+    The baseline that needs no real data. It is as good as its bounds, which have to be set without
+    data of the real system.
 
     Parameters
     ----------
-    twin: says which parameters there are, and their bounds. Its values give the nominal output
-        where the twin has none that is free of parameters.
+    twin : ParametricTwin
+        Declares the parameters and their bounds. Its present values give the nominal output
+        where the twin has no nominal output that is free of parameters.
+
+    References
+    ----------
+    J. Tobin et al., "Domain randomization for transferring deep neural networks from simulation
+    to the real world", IROS (2017).
 
     """
 
@@ -47,7 +56,7 @@ class RandomisedTwin(Around):
         low, high = self.twin.bounds
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            rng = generator_of(seed, chunk, 3)
+            rng = chunk_generator(seed, chunk, PARAMETERS)
             drawn = rng.uniform(low, high, size=(len(chunk.commands), len(low)))
             return simulate_with_parameters(self.twin, chunk, drawn, seed=seed)
 
@@ -57,15 +66,30 @@ class RandomisedTwin(Around):
 def simulate_with_parameters(
     twin: ParametricTwin, chunk: Chunk, values: NDArray, *, seed: int
 ) -> tuple[NDArray, NDArray]:
-    """Nominal and observed outputs of a chunk, every trajectory with parameters (n, k) of its own.
+    """Outputs of a chunk whose trajectories have different parameters.
 
-    The nominal output does not depend on them: it is the twin's own, or else what the twin says at
-    its present values.
+    Parameters
+    ----------
+    twin : ParametricTwin
+        The twin.
+    chunk : Chunk
+        n trajectories; those that fail are entered in its `failed`.
+    values : ndarray, shape (n, k)
+        One row of values per trajectory, one column per free parameter.
+    seed : int
+        Seed of the whole simulation.
+
+    Returns
+    -------
+    nominal, observed : ndarray, shape (n, T, d_y)
+        Outputs. The nominal ones do not depend on `values`: they are the twin's own, or else what
+        it predicts at its present values.
+
     """
     rows = np.arange(len(chunk.commands))
     named = dict(zip(twin.names, values.T, strict=True))
     _, observed = simulate_chunk(twin, chunk, rows, seed=seed, parameters=named)
     if twin.nominal is not None:
-        return ideal_outputs(twin.nominal, chunk.commands, len(twin.outputs)), observed
+        return nominal_outputs(twin.nominal, chunk.commands, len(twin.outputs)), observed
     ideal, _ = simulate_chunk(twin, chunk, rows, faults=[None] * len(rows), seed=seed)
     return ideal, observed

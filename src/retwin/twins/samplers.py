@@ -1,4 +1,4 @@
-"""Commands for any twin: ramps, random holds, multisines within limits; or what was recorded."""
+"""Samplers of commands: ramps, random holds, multisines, and pieces of recorded commands."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.errors import InputError
+from retwin.checks import require
+from retwin.twins.ramps import draw_onsets, ramps_and_holds
 
 __all__ = [
     "CommandSampler",
@@ -16,16 +17,11 @@ __all__ = [
     "MultisineSampler",
     "RampSampler",
     "RecordedSampler",
-    "draw_onsets",
-    "ramps_and_holds",
 ]
-
-BLOCK = 32
-"""Trajectories that are made together: their samples stay in the processor's cache."""
 
 
 class CommandSampler(Protocol):
-    """Draws commands as an operator would give them."""
+    """A distribution of commands such as an operator gives."""
 
     @property
     def steps(self) -> int:
@@ -35,36 +31,56 @@ class CommandSampler(Protocol):
     def sample(
         self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
     ) -> NDArray:
-        """Commands (count, T, d_u).
+        """Draw commands.
 
-        `timing` (k, M): onsets in samples seen in real trajectories, to draw from; NaN where a
-        trajectory has fewer movements.
+        Parameters
+        ----------
+        count : int
+            Trajectories to draw, n.
+        rng : numpy.random.Generator
+            Source of the draw.
+        timing : ndarray, shape (k, M), optional
+            Onsets of k real trajectories in samples, NaN where one has fewer segments; onsets of
+            the commands are drawn from them. A sampler without segments ignores it.
+
+        Returns
+        -------
+        ndarray, shape (n, T, d_u)
+            Commands in the units of the input channels.
+
         """
         ...
 
 
 @dataclass(frozen=True)
 class RampSampler:
-    """Commands that ramp to a random level, hold it, and ramp to the next; a command sampler.
+    """Commands that ramp to a random level, hold it, and ramp to the next.
 
     Parameters
     ----------
-    low, high: the levels' limits, one per input channel, in its unit.
-    movements: per trajectory, evenly spaced from sample 0 on.
-    steps: samples per trajectory.
-    ramps: lengths of a ramp in samples; each channel draws one for each movement.
-    start: level before the first movement, per channel; empty takes the middle of the limits.
+    low, high : tuple of float
+        Range of the levels of each input channel, in its unit.
+    segments : int, default 5
+        Segments per trajectory, at least 1; onsets are evenly spaced from sample 0 on.
+    steps : int, default 1000
+        Samples per trajectory, at least 2.
+    ramps : tuple of int
+        Possible durations of a ramp in samples, from 1 to the spacing of the onsets. Each channel
+        draws one in each segment.
+    start : tuple of float, optional
+        Level of each channel before the first segment, within its range; by default the middle.
 
     Raises
     ------
-    InputError: limits that are not finite or not in order, a start outside them, fewer than one
-        movement or two samples, ramps that are not whole or that a movement has no time for.
+    InputError
+        Limits that are not finite or not in order, a start outside them, fewer than one segment
+        or two samples, ramps that are longer than a segment.
 
     """
 
     low: tuple[float, ...]
     high: tuple[float, ...]
-    movements: int = 5
+    segments: int = 5
     steps: int = 1000
     ramps: tuple[int, ...] = (60, 80, 100)
     start: tuple[float, ...] = ()
@@ -72,71 +88,75 @@ class RampSampler:
     def __post_init__(self) -> None:
         low, high = _checked_limits(self.low, self.high)
         rest = np.array(self.rest)
-        if rest.shape != low.shape or not ((low <= rest) & (rest <= high)).all():
-            raise InputError(
-                "start",
-                expected=f"one level within the limits per input channel, {len(low)}",
-                got=str(self.start),
-                remedy="leave start out to begin in the middle of the limits",
-            )
-        if self.movements < 1 or self.steps < 2:
-            raise InputError(
-                "movements",
-                expected="at least one movement and two samples",
-                got=f"{self.movements} movements in {self.steps} samples",
-                remedy="give more",
-            )
-        longest = self.steps // self.movements
-        if not self.ramps or not all(1 <= ramp <= longest for ramp in self.ramps):
-            raise InputError(
-                "ramps",
-                expected=f"lengths from 1 to {longest} samples, the time of a movement",
-                got=str(self.ramps),
-                remedy="give shorter ramps, fewer movements or more samples",
-            )
+        require(
+            rest.shape == low.shape and bool(((low <= rest) & (rest <= high)).all()),
+            "start",
+            expected=f"one level within the limits per input channel, {len(low)}",
+            got=self.start,
+            remedy="leave start out to begin in the middle of the limits",
+        )
+        require(
+            self.segments >= 1 and self.steps >= 2,
+            "segments",
+            expected="at least one segment and two samples",
+            got=f"{self.segments} segments in {self.steps} samples",
+            remedy="give more",
+        )
+        longest = self.steps // self.segments
+        require(
+            self.ramps and all(1 <= ramp <= longest for ramp in self.ramps),
+            "ramps",
+            expected=f"durations from 1 to {longest} samples, the duration of a segment",
+            got=self.ramps,
+            remedy="give shorter ramps, fewer segments or more samples",
+        )
 
     @property
     def rest(self) -> tuple[float, ...]:
-        """The level per channel before the first movement."""
+        """Level of each channel before the first segment."""
         middle = (0.5 * (a + b) for a, b in zip(self.low, self.high, strict=True))
         return self.start or tuple(middle)
 
     def sample(
         self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
     ) -> NDArray:
-        """Commands (count, steps, d_u), float32.
+        """Draw commands (count, steps, d_u), float32; see `CommandSampler.sample`.
 
-        `timing` (k, M): onsets in samples to draw from, a row per trajectory; where a row has no
-        onset (NaN, or fewer than `movements`), the movement comes a period after the one before.
+        Where a row of `timing` has no onset, the segment begins one mean spacing after the
+        segment before.
         """
-        shape = (count, self.movements, len(self.low))
+        shape = (count, self.segments, len(self.low))
         levels = rng.uniform(self.low, self.high, size=shape)
         ramps = rng.choice(self.ramps, size=shape)
-        period = self.steps / self.movements
-        onsets = draw_onsets(count, self.movements, period, rng=rng, timing=timing)
+        period = self.steps / self.segments
+        onsets = draw_onsets(count, self.segments, period, rng=rng, timing=timing)
         rest = np.broadcast_to(np.array(self.rest), (count, len(self.low)))
         commands = ramps_and_holds(rest, levels, ramps, onsets, self.steps)
-        # Sums round; and movements that are timed more closely than their ramps overshoot.
+        # Sums round, and segments that are shorter than their ramps overshoot.
         return np.clip(commands, self.low, self.high).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class HoldSampler:
-    """Random levels, each held for a random time, every channel for itself; a command sampler.
+    """Random levels, each held for a random time, independently in every channel.
 
-    The field's name is amplitude-modulated pseudo-random binary signal (APRBS): steps of all sizes
-    and of many lengths, which excite what is slow and what is nonlinear.
+    This is an amplitude-modulated pseudo-random binary signal (APRBS): steps of all sizes and of
+    many durations, which excite slow and nonlinear dynamics.
 
     Parameters
     ----------
-    low, high: the levels' limits, one per input channel, in its unit.
-    steps: samples per trajectory.
-    hold: least and greatest number of samples that a level is held for.
+    low, high : tuple of float
+        Range of the levels of each input channel, in its unit.
+    steps : int, default 1000
+        Samples per trajectory, at least 2.
+    hold : (int, int), default (20, 200)
+        Shortest and longest hold in samples, at least 1.
 
     Raises
     ------
-    InputError: limits that are not finite or not in order, fewer than two samples, holds below one
-        sample or out of order.
+    InputError
+        Limits that are not finite or not in order, fewer than two samples, holds below one sample
+        or out of order.
 
     """
 
@@ -148,21 +168,21 @@ class HoldSampler:
     def __post_init__(self) -> None:
         _checked_limits(self.low, self.high)
         _check_steps(self.steps)
-        if not (len(self.hold) == 2 and 1 <= self.hold[0] <= self.hold[1]):
-            raise InputError(
-                "hold",
-                expected="a pair (least, greatest) of samples, at least 1 and in order",
-                got=str(self.hold),
-                remedy="hold for longer than the slowest state takes, at times",
-            )
+        require(
+            len(self.hold) == 2 and 1 <= self.hold[0] <= self.hold[1],
+            "hold",
+            expected="a pair (shortest, longest) of samples, at least 1 and in order",
+            got=self.hold,
+            remedy="make the longest hold longer than the slowest state takes to settle",
+        )
 
     def sample(
         self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
     ) -> NDArray:
-        """Commands (count, steps, d_u), float32; there are no movements, `timing` is not used."""
-        least, greatest = self.hold
-        shape = (count, len(self.low), 1 + self.steps // least)
-        ends = rng.integers(least, greatest, size=shape, endpoint=True).cumsum(axis=2)
+        """Draw commands, float32, without use of `timing`; see `CommandSampler.sample`."""
+        shortest, longest = self.hold
+        shape = (count, len(self.low), 1 + self.steps // shortest)
+        ends = rng.integers(shortest, longest, size=shape, endpoint=True).cumsum(axis=2)
         levels = rng.uniform(self.low, self.high, size=(count, shape[2], len(self.low)))
         changes = np.zeros((count, self.steps, len(self.low)), dtype=int)
         row, channel, hold = np.nonzero(ends < self.steps)
@@ -172,22 +192,32 @@ class HoldSampler:
 
 @dataclass(frozen=True)
 class MultisineSampler:
-    """Sines of random phases about a mean, every channel for itself; a command sampler.
+    """Multisines of random phases about a mean, independently in every channel.
 
     Parameters
     ----------
-    low, high: limits of each input channel, in its unit; what goes beyond is cut off.
-    steps: samples per trajectory.
-    period: samples of one period of the slowest sine.
-    mean, deviation: of each channel; by default the middle of its limits and a sixth of the way
-        between them.
-    slow, fast: number of sines at full strength, and of all; frequencies are evenly spaced.
-    weak: amplitude of the faster ones against the slow ones'.
+    low, high : tuple of float
+        Range of each input channel, in its unit; the signal is clipped to it.
+    steps : int, default 1000
+        Samples per trajectory, at least 2.
+    period : int, default 1000
+        Period of the slowest sine in samples, at least 2.
+    mean : tuple of float, optional
+        Mean of each channel; by default the middle of its range.
+    deviation : tuple of float, optional
+        Standard deviation of each channel, at least 0; by default a sixth of its range.
+    slow : int, default 20
+        Number of sines of full amplitude, at least 1; they are the slowest.
+    fast : int, default 60
+        Number of all sines, at least `slow`; their frequencies are evenly spaced.
+    weak : float, default 0.1
+        Ratio of the amplitude of the other sines to the full amplitude, at least 0.
 
     Raises
     ------
-    InputError: limits that are not finite or not in order, fewer than two samples, a mean outside
-        the limits, a negative deviation, numbers of sines out of order.
+    InputError
+        Limits that are not finite or not in order, fewer than two samples, a mean outside the
+        limits, a negative deviation, numbers of sines out of order.
 
     """
 
@@ -206,54 +236,58 @@ class MultisineSampler:
         _check_steps(self.steps)
         mean, deviation = self.mean or (low + high) / 2, self.deviation or (high - low) / 6
         fits = np.shape(mean) == np.shape(deviation) == low.shape
-        if not (fits and ((low <= mean) & (mean <= high) & (np.array(deviation) >= 0)).all()):
-            raise InputError(
-                "mean",
-                expected=f"{len(low)} means within the limits, and as many deviations from 0",
-                got=f"mean {self.mean}, deviation {self.deviation}",
-                remedy="leave them out for the middle of the limits and a sixth of their distance",
-            )
-        if not (self.period >= 2 and 1 <= self.slow <= self.fast and self.weak >= 0):
-            raise InputError(
-                "slow",
-                expected="slow from 1, fast from slow on, weak from 0, a period from 2 samples on",
-                got=f"slow {self.slow}, fast {self.fast}, weak {self.weak}, period {self.period}",
-                remedy="leave them out for the default",
-            )
+        require(
+            fits and ((low <= mean) & (mean <= high) & (np.array(deviation) >= 0)).all(),
+            "mean",
+            expected=f"{len(low)} means within the limits, and as many deviations from 0",
+            got=f"mean {self.mean}, deviation {self.deviation}",
+            remedy="leave them out for the middle of the limits and a sixth of their distance",
+        )
+        require(
+            self.period >= 2 and 1 <= self.slow <= self.fast and self.weak >= 0,
+            "slow",
+            expected="slow from 1, fast from slow on, weak from 0, a period from 2 samples on",
+            got=f"slow {self.slow}, fast {self.fast}, weak {self.weak}, period {self.period}",
+            remedy="leave them out for the default",
+        )
         object.__setattr__(self, "mean", tuple(map(float, mean)))
         object.__setattr__(self, "deviation", tuple(map(float, deviation)))
 
     def sample(
         self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
     ) -> NDArray:
-        """Commands (count, steps, d_u), float32; there are no movements, `timing` is not used."""
+        """Draw commands, float32, without use of `timing`; see `CommandSampler.sample`."""
         number = np.arange(1, self.fast + 1)
-        share = np.where(number <= self.slow, 1.0, self.weak)
-        share = share * np.sqrt(2 / np.sum(share**2))
+        amplitude = np.where(number <= self.slow, 1.0, self.weak)
+        amplitude = amplitude * np.sqrt(2 / np.sum(amplitude**2))
         phases = rng.uniform(0, 2 * np.pi, size=(count, self.fast, len(self.low)))
-        turns = 2 * np.pi * number[:, None] * np.arange(self.steps) / self.period
+        angle = 2 * np.pi * number[:, None] * np.arange(self.steps) / self.period
         commands = np.empty((count, self.steps, len(self.low)), np.float32)
-        for made, phase in zip(commands, phases, strict=True):  # one by one: waves take memory
+        # One trajectory at a time: all sines of all trajectories would take much memory.
+        for trajectory, phase in zip(commands, phases, strict=True):
             for channel, (mean, deviation) in enumerate(
                 zip(self.mean, self.deviation, strict=True)
             ):
-                waves = np.cos(turns + phase[:, channel, None])
-                made[:, channel] = mean + deviation * (share @ waves)
+                sines = np.cos(angle + phase[:, channel, None])
+                trajectory[:, channel] = mean + deviation * (amplitude @ sines)
         return commands.clip(*np.array([self.low, self.high], np.float32))
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedSampler:
-    """Recorded commands, or pieces of them, drawn with replacement; a command sampler.
+    """Recorded commands, or pieces of them, drawn with replacement.
 
     Parameters
     ----------
-    commands: (k, T, d_u), recorded.
-    length: samples of a piece, which begins anywhere; 0 takes whole records.
+    commands : ndarray, shape (k, T, d_u)
+        Recorded commands, finite.
+    length : int, default 0
+        Samples of a piece, which begins at a random sample, at most T; 0 takes whole records.
 
     Raises
     ------
-    InputError: commands of another shape, none, or not finite; a length beyond the records'.
+    InputError
+        Commands of another shape, none, or not finite; a length beyond that of the records.
 
     """
 
@@ -262,20 +296,21 @@ class RecordedSampler:
 
     def __post_init__(self) -> None:
         shape = np.shape(self.commands)
-        if len(shape) != 3 or 0 in shape or not np.isfinite(self.commands).all():
-            raise InputError(
-                "commands",
-                expected="finite numbers of shape (records, samples, channels), none of them 0",
-                got=f"shape {shape}" if len(shape) != 3 or 0 in shape else "NaN or infinite ones",
-                remedy="give Trajectories.commands of a set that has some",
-            )
-        if not 0 <= self.length <= shape[1]:
-            raise InputError(
-                "length",
-                expected=f"from 1 to {shape[1]} samples, as the records have, or 0 for all",
-                got=repr(self.length),
-                remedy="give shorter pieces",
-            )
+        shaped = len(shape) == 3 and 0 not in shape
+        require(
+            shaped and np.isfinite(self.commands).all(),
+            "commands",
+            expected="finite numbers of shape (records, samples, channels), none of them 0",
+            got="NaN or infinite ones" if shaped else f"shape {shape}",
+            remedy="give Trajectories.commands of a set that has some",
+        )
+        require(
+            0 <= self.length <= shape[1],
+            "length",
+            expected=f"from 1 to {shape[1]} samples, as the records have, or 0 for all",
+            got=repr(self.length),
+            remedy="give shorter pieces",
+        )
 
     @property
     def steps(self) -> int:
@@ -285,107 +320,29 @@ class RecordedSampler:
     def sample(
         self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
     ) -> NDArray:
-        """Commands (count, steps, d_u), float32; their timing is the records' own."""
+        """Draw commands, float32, without use of `timing`; see `CommandSampler.sample`."""
         records, samples, _ = self.commands.shape
         row = rng.integers(records, size=(count, 1))
         begin = rng.integers(samples - self.steps, size=(count, 1), endpoint=True)
         return self.commands[row, begin + np.arange(self.steps)].astype(np.float32)
 
 
-def ramps_and_holds(
-    start: NDArray,
-    levels: NDArray,
-    spans: NDArray,
-    onsets: NDArray,
-    steps: int,
-    *,
-    dtype: type[np.floating] = np.float64,
-) -> NDArray:
-    """Commands (n, steps, d_u) that ramp linearly from level to level and hold.
-
-    Parameters
-    ----------
-    start: (n, d_u) before the first movement.
-    levels, spans: (n, M, d_u) level that each movement reaches, and length of its ramp in samples.
-    onsets: (n, M) sample at which a movement starts, fractions allowed; NaN leaves it out.
-    steps: samples per trajectory.
-    dtype: of the commands; they are computed in double precision.
-
-    """
-    commands = np.empty((len(start), steps, start.shape[1]), dtype)
-    for begin in range(0, len(start), BLOCK):
-        part = slice(begin, begin + BLOCK)
-        commands[part] = _ramped(start[part], levels[part], spans[part], onsets[part], steps)
-    return commands
-
-
-def _ramped(
-    start: NDArray, levels: NDArray, spans: NDArray, onsets: NDArray, steps: int
-) -> NDArray:
-    """The same of a few trajectories; shares are only computed where one of them is on a ramp."""
-    there = ~np.isnan(onsets)
-    onsets = np.where(there, onsets, np.inf)
-    ways = np.diff(levels, axis=1, prepend=start[:, None]) * there[..., None]
-    first = onsets.min(axis=0)
-    last = np.where(there[..., None], onsets[..., None] + spans, 0).max(axis=(0, 2)) + 1
-    windows = np.clip([np.floor(first), np.ceil(last)], 0, steps).astype(int).T.tolist()
-    commands = np.empty((len(start), steps, start.shape[1]))
-    time, level, done = np.arange(steps), start[:, None], 0
-    for movement, (begin, end) in enumerate(windows):
-        end = max(end, done)
-        commands[:, done:end] = level
-        since = time[begin:end] - onsets[:, movement, None]
-        share = np.clip(since[..., None] / spans[:, None, movement], 0.0, 1.0)
-        commands[:, begin:end] += ways[:, None, movement] * share
-        level, done = level + ways[:, None, movement], end
-    commands[:, done:] = level
-    return commands
-
-
-def draw_onsets(
-    count: int,
-    movements: int,
-    period: float,
-    *,
-    rng: np.random.Generator,
-    timing: NDArray | None = None,
-) -> NDArray:
-    """Onsets (count, movements) in samples, one every `period` samples from sample 0 on.
-
-    With `timing` (k, M), in samples, every row of onsets is one of its rows, drawn at random; where
-    that has none (NaN, or fewer than `movements`), the movement comes a period after the one
-    before.
-    """
-    if timing is None or len(timing) == 0:
-        return np.tile(period * np.arange(movements, dtype=float), (count, 1))
-    drawn = timing[rng.integers(len(timing), size=count), :movements]
-    onsets = np.full((count, movements), np.nan)
-    onsets[:, : drawn.shape[1]] = drawn
-    for movement in range(movements):
-        before = onsets[:, movement - 1] + period if movement else np.zeros(count)
-        gap = np.isnan(onsets[:, movement])
-        onsets[gap, movement] = before[gap]
-    return onsets
-
-
 def _checked_limits(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[NDArray, NDArray]:
     """Both as arrays (d_u,), finite and in order."""
-    least, greatest = np.array(low, float), np.array(high, float)
-    alike = least.ndim == 1 and least.shape == greatest.shape
-    if not (
-        alike and len(least) and np.isfinite([least, greatest]).all() and (least < greatest).all()
-    ):
-        raise InputError(
-            "limits",
-            expected="a finite low and a greater finite high per input channel",
-            got=f"low {low}, high {high}",
-            remedy="say between which levels commands may be drawn",
-        )
-    return least, greatest
+    lower, upper = np.array(low, float), np.array(high, float)
+    paired = lower.ndim == 1 and lower.shape == upper.shape and len(lower) > 0
+    require(
+        paired and np.isfinite([lower, upper]).all() and (lower < upper).all(),
+        "limits",
+        expected="a finite low and a greater finite high per input channel",
+        got=f"low {low}, high {high}",
+        remedy="give the range from which levels are drawn",
+    )
+    return lower, upper
 
 
 def _check_steps(steps: int) -> None:
-    if steps < 2:
-        raise InputError(
-            "steps", expected="at least two samples", got=repr(steps), remedy="give more"
-        )
+    """Refuse fewer than two samples."""
+    require(
+        steps >= 2, "steps", expected="at least two samples", got=repr(steps), remedy="give more"
+    )

@@ -12,11 +12,11 @@ __all__ = ["System"]
 
 
 class System(Protocol):
-    """What `generate` needs of a system; a `Case` satisfies it."""
+    """What `generate` requires of a system; a `Case` satisfies it."""
 
     @property
     def faults(self) -> Mapping[str, Fault | None]:
-        """Class name to fault, `None` for healthy, in the fixed order of the classes."""
+        """Fault of each class, None for the healthy class, in the fixed order of the classes."""
         ...
 
     @property
@@ -26,5 +26,5 @@ class System(Protocol):
 
     @property
     def sampler(self) -> CommandSampler:
-        """Draws the commands."""
+        """Distribution of the commands."""
         ...

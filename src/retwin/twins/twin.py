@@ -1,39 +1,42 @@
-"""What every twin offers: commands in, trajectories out."""
+"""`Twin`: a simulator from commands to outputs, and the steps that every `simulate` shares."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.arrays import check_finite, row_blocks
+from retwin.arrays import check_finite
+from retwin.checks import require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
-from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.twins.faults import Fault, draw_faults, faulty_commands, frozen_from, frozen_response
+from retwin.twins.limits import Limits
 
 __all__ = [
     "Chunk",
-    "Limits",
     "SimulationError",
     "Twin",
     "checked_commands",
     "checked_seed",
+    "nominal_outputs",
     "simulate_in_chunks",
 ]
 
 
 class SimulationError(RuntimeError):
-    """Some trajectories could not be simulated; the others are at hand.
+    """Some trajectories could not be simulated; the others are attached.
 
     Attributes
     ----------
-    failed: index of the trajectory to the reason.
-    finished: the trajectories that were simulated; their ids are their indices.
+    failed : dict of int to str
+        The reason of each failure, by the index of the trajectory.
+    finished : Trajectories
+        The trajectories that were simulated; their ids are their indices.
 
     """
 
@@ -46,13 +49,17 @@ class SimulationError(RuntimeError):
         super().__init__(f"{len(self.failed)} of {count} simulations failed: {named}{more}")
 
     def __reduce__(self) -> tuple:
-        """Keep the parts when the error crosses a process border."""
+        """Keep both attributes when the error is sent to another process."""
         return SimulationError, (self.failed, self.finished)
 
 
 @runtime_checkable
 class Twin(Protocol):
-    """A simulator: plain, learned or corrected, all look the same."""
+    """A simulator from commands to outputs: plain, learned or corrected.
+
+    A twin may also have `limits`, the `Limits` of its commands, and `fingerprint`, a text that
+    identifies it where its fields, and the files that they name, do not.
+    """
 
     @property
     def inputs(self) -> Channels:
@@ -66,7 +73,7 @@ class Twin(Protocol):
 
     @property
     def rate(self) -> float:
-        """Samples per second."""
+        """Sample rate in Hz."""
         ...
 
     def simulate(
@@ -77,135 +84,143 @@ class Twin(Protocol):
         seed: int,
         progress: Progress | None = None,
     ) -> Trajectories:
-        """Simulate `commands` (n, T, d_u), each with its fault, if any.
+        """Simulate commands, each trajectory with its fault, if any.
 
-        `nominal` of the result is the ideal output for the clean commands, `observed` what the
-        twin says happens, `labels` the label of each fault. The same seed gives the same bytes.
+        Parameters
+        ----------
+        commands : ndarray, shape (n, T, d_u)
+            Commands in the units of `inputs`, T at least 2.
+        faults : sequence of Fault or None, optional
+            One per trajectory, None for a healthy one; by default all are healthy.
+        seed : int
+            At least 0. The same seed gives the same bytes.
+        progress : callable, optional
+            Called with the finished fraction, from 0 to 1.
 
-        A twin may also have `limits`, the `Limits` its commands must keep, and `fingerprint`, a
-        text that tells it from others where its fields, and the files they name, do not.
+        Returns
+        -------
+        Trajectories
+            `nominal` is the ideal output for the clean commands, `observed` the output that the
+            twin predicts with the faults, `labels` the label of each fault.
 
         Raises
         ------
-        InputError: commands of another width, NaN or infinite, or outside the twin's limits; not
-            one fault per trajectory; a seed that is no whole number or below 0.
-        SimulationError: some trajectories could not be simulated; it names them and holds the
-            others.
+        InputError
+            Commands of another width, not finite or outside the twin's limits; not one fault per
+            trajectory; a seed that is not a whole number of at least 0.
+        SimulationError
+            Some trajectories could not be simulated; it holds the others.
 
         """
         ...
 
 
-@dataclass(frozen=True)
-class Limits:
-    """The least and the greatest command of every input channel.
+def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
+    """Check the shape and the values of commands.
 
     Parameters
     ----------
-    low, high: one per channel, in its unit; infinite where there is no limit.
-    outside: what to do with commands beyond: "refuse" them, or "clip" them to the limit.
+    commands : array_like, shape (n, T, d_u)
+        Finite numbers, n at least 1 and T at least 2.
+    inputs : Channels
+        The d_u command channels.
 
-    Limits are for what an operator commands. A fault that pushes an effective command beyond them
-    is none of the operator's: what then happens is up to the twin.
+    Returns
+    -------
+    ndarray, shape (n, T, d_u)
+        The commands as floating-point numbers.
+
+    Raises
+    ------
+    InputError
+        Another shape, no numbers, NaN or an infinite value.
 
     """
-
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    outside: Literal["refuse", "clip"] = "refuse"
-
-    def __post_init__(self) -> None:
-        paired = len(self.low) == len(self.high)
-        if not (paired and all(a < b for a, b in zip(self.low, self.high, strict=True))):
-            raise InputError(
-                "limits",
-                expected="one low and one greater high per input channel",
-                got=f"low {self.low}, high {self.high}",
-                remedy="give -inf and inf where a channel has no limit",
-            )
-        if self.outside not in ("refuse", "clip"):
-            raise InputError(
-                "outside",
-                expected="'refuse' or 'clip'",
-                got=repr(self.outside),
-                remedy="say what to do with commands beyond the limits",
-            )
-
-    def keep(self, commands: NDArray, inputs: Channels) -> NDArray:
-        """`commands` (n, T, d_u) within the limits, clipped if that is asked for.
-
-        Raises InputError when a command is outside and `outside` is "refuse", or when there are
-        not as many limits as channels.
-        """
-        if len(self.low) != len(inputs):
-            raise InputError(
-                "limits",
-                expected=f"{len(inputs)}, one per input channel",
-                got=f"{len(self.low)}",
-                remedy="give -inf and inf where a channel has no limit",
-            )
-        low = np.asarray(self.low, commands.dtype)
-        high = np.asarray(self.high, commands.dtype)
-        if self.outside == "clip":
-            return np.clip(commands, low, high)
-        for rows in row_blocks(commands):
-            beyond = (commands[rows] < low) | (commands[rows] > high)
-            if beyond.any():
-                trajectory, sample, channel = np.argwhere(beyond)[0] + (rows.start, 0, 0)
-                raise InputError(
-                    "commands",
-                    expected=f"{inputs.names[channel]} from {low[channel]:g} to {high[channel]:g} "
-                    f"{inputs.units[channel]}",
-                    got=f"{commands[trajectory, sample, channel]:g} in trajectory {trajectory}, "
-                    f"sample {sample}",
-                    remedy="keep the limits, or have commands clipped (outside='clip')",
-                )
-        return commands
-
-
-def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
-    """`commands` as a finite float array (n, T, d_u), or an InputError."""
     array = np.asarray(commands)
-    if (
-        array.ndim != 3
-        or len(array) == 0
-        or array.shape[1] < 2
-        or array.shape[2] != len(inputs)
-        or array.dtype.kind not in "fiu"
-    ):
-        raise InputError(
-            "commands",
-            expected=f"numbers of shape (n, T, {len(inputs)}), T at least 2",
-            got=f"{array.dtype} of shape {array.shape}",
-            remedy=f"give one column per input channel, {', '.join(inputs.names)}",
-        )
+    shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] >= 2
+    require(
+        shaped and array.shape[2] == len(inputs) and array.dtype.kind in "fiu",
+        "commands",
+        expected=f"numbers of shape (n, T, {len(inputs)}), T at least 2",
+        got=f"{array.dtype} of shape {array.shape}",
+        remedy=f"give one column per input channel, {', '.join(inputs.names)}",
+    )
     check_finite("commands", array)
     return array if array.dtype.kind == "f" else array.astype(np.float64)
 
 
 def checked_seed(seed: int) -> int:
-    """`seed` as a plain number, or an InputError."""
-    if not (isinstance(seed, int | np.integer) and seed >= 0):
-        raise InputError(
-            "seed",
-            expected="a whole number of at least 0",
-            got=repr(seed),
-            remedy="give one: the same seed gives the same result",
-        )
-    return int(seed)
+    """Check that a seed is a whole number of at least 0.
+
+    Parameters
+    ----------
+    seed : int
+        The seed.
+
+    Returns
+    -------
+    int
+        The seed as a Python integer.
+
+    Raises
+    ------
+    InputError
+        Anything else.
+
+    """
+    return whole("seed", seed, remedy="give one: the same seed gives the same result")
+
+
+def nominal_outputs(
+    nominal: Callable[[NDArray], NDArray], commands: NDArray, width: int
+) -> NDArray:
+    """Evaluate and check a user's function for the ideal output.
+
+    Parameters
+    ----------
+    nominal : callable
+        From commands (n, T, d_u) to outputs (n, T, d_y).
+    commands : ndarray, shape (n, T, d_u)
+        Clean commands.
+    width : int
+        The number of outputs, d_y.
+
+    Returns
+    -------
+    ndarray, shape (n, T, d_y)
+        The ideal outputs.
+
+    Raises
+    ------
+    InputError
+        The function returns another shape, NaN or an infinite value.
+
+    """
+    outputs = np.asarray(nominal(commands))
+    shape = (*commands.shape[:2], width)
+    fits = outputs.shape == shape and outputs.dtype.kind in "fiub"
+    require(
+        fits and bool(np.isfinite(outputs).all()),
+        "nominal",
+        expected=f"a function that gives finite outputs of shape {shape}",
+        got="NaN or an infinite number" if fits else f"{outputs.dtype}, {outputs.shape}",
+        remedy="give the ideal outputs (n, T, d_y) for commands (n, T, d_u)",
+    )
+    return outputs
 
 
 def _check_actuators(faults: Sequence[Fault | None], inputs: Channels) -> None:
-    """A fault on one actuator must name one that there is."""
-    for fault in faults:
-        actuator = getattr(fault, "actuator", 0)
-        if not 0 <= actuator < len(inputs):
-            raise InputError(
-                "faults",
-                expected=f"an actuator from 0 to {len(inputs) - 1}",
-                got=repr(fault),
-                remedy=f"count the command channels from 0: {', '.join(inputs.names)}",
-            )
+    """A fault of one actuator must name one that exists."""
+    count = len(inputs)
+    wrong = (fault for fault in faults if not 0 <= getattr(fault, "actuator", 0) < count)
+    first = next(wrong, None)
+    require(
+        first is None,
+        "faults",
+        expected=f"an actuator from 0 to {count - 1}",
+        got=first,
+        remedy=f"count the command channels from 0: {', '.join(inputs.names)}",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,13 +229,19 @@ class Chunk:
 
     Attributes
     ----------
-    index: which of all they are.
-    commands: (n, T, d_u), clean.
-    faulty_commands: (n, T, d_u), the commands with the effect of the faults on the reference.
-    faults: drawn, one per trajectory.
-    segments: movements of the clean commands.
-    failed: for `run` to fill in: which trajectories of this chunk, counted from 0, could not be
-        simulated, and why. Their outputs do not matter.
+    index : slice
+        Their place among all trajectories.
+    commands : ndarray, shape (n, T, d_u)
+        Clean commands.
+    faulty_commands : ndarray, shape (n, T, d_u)
+        Commands with the faults' effect on the reference.
+    faults : sequence of Fault or None
+        One per trajectory, their severities drawn.
+    segments : Segments
+        Segments of the clean commands.
+    failed : dict of int to str
+        Filled in by the simulation: the trajectories of this chunk, counted from 0, that could
+        not be simulated, and the reasons. Their outputs are ignored.
 
     """
 
@@ -233,14 +254,15 @@ class Chunk:
 
     @property
     def frozen(self) -> NDArray:
-        """The sample (n, d_u) from which an actuator is held; T where it never is."""
+        """Sample (n, d_u) from which an actuator is held; T where it never is."""
         return frozen_from(self.faults, *self.commands.shape[1:])
 
     @property
     def held_commands(self) -> NDArray:
-        """`faulty_commands`, held from the sample at which an actuator freezes.
+        """Faulty commands (n, T, d_u), held from the sample at which an actuator freezes.
 
-        For twins whose actuators are not visible: a frozen response is a held command.
+        For twins whose actuators cannot be accessed: a held command stands in for a frozen
+        response.
         """
         return frozen_response(self.faulty_commands, self.faults)
 
@@ -256,11 +278,35 @@ def simulate_in_chunks(
     size: int = 128,
     emulated: bool = False,
 ) -> Trajectories:
-    """What every twin's `simulate` does around its own simulation `run`.
+    """Simulate by a function of chunks: the steps that the `simulate` of all twins shares.
 
-    Checks all arguments, draws the severities of faults, tells progress, collects what `run` says
-    of each chunk of at most `size` trajectories: nominal and observed outputs (n, T, d_y). One
-    trajectory that fails, or gives outputs that are not finite, does not end the others.
+    Arguments are checked, severities of faults are drawn, progress is reported, and the results
+    are collected. A trajectory that fails or gives outputs that are not finite does not end the
+    others.
+
+    Parameters
+    ----------
+    twin : Twin
+        The twin whose channels, rate and limits count.
+    run : callable
+        From a `Chunk` to its nominal and observed outputs, each (n, T, d_y).
+    commands, faults, seed, progress
+        See `Twin.simulate`.
+    size : int, default 128
+        Trajectories per chunk, at most.
+    emulated : bool, default False
+        Whether the result stands in for measurements.
+
+    Returns
+    -------
+    Trajectories
+        See `Twin.simulate`.
+
+    Raises
+    ------
+    InputError, SimulationError
+        See `Twin.simulate`.
+
     """
     commands = checked_commands(commands, twin.inputs)
     limits: Limits | None = getattr(twin, "limits", None)
@@ -275,18 +321,18 @@ def simulate_in_chunks(
     failed: dict[int, str] = {}
     for begin in range(0, len(commands), size):
         index = slice(begin, begin + size)
-        part, some, these = commands[index], drawn[index], segments[index]
-        told = faulty_commands(part, some, these)
-        chunk = Chunk(index, part, told, some, these)
+        own_commands, own_faults, own_segments = commands[index], drawn[index], segments[index]
+        effective = faulty_commands(own_commands, own_faults, own_segments)
+        chunk = Chunk(index, own_commands, effective, own_faults, own_segments)
         nominal[index], observed[index] = run(chunk)
-        wrong = _not_finite(twin, nominal[index], observed[index]) | chunk.failed
-        failed |= {begin + i: reason for i, reason in sorted(wrong.items())}
+        reasons = _not_finite(twin, nominal[index], observed[index]) | chunk.failed
+        failed |= {begin + i: reason for i, reason in sorted(reasons.items())}
         if progress is not None:
             progress(min(1.0, (begin + size) / len(commands)))
     labels = np.array([HEALTHY if fault is None else fault.label for fault in drawn])
     good = np.setdiff1d(np.arange(len(commands)), list(failed)) if failed else slice(None)
-    made = Trajectories(
-        commands=commands[good].copy(),  # the caller's own are the caller's to change
+    simulated = Trajectories(
+        commands=commands[good].copy(),  # the caller may change its own array afterwards
         nominal=nominal[good],
         observed=observed[good],
         ids=np.array([f"{i:05d}" for i in range(len(commands))], dtype=np.str_)[good],
@@ -298,19 +344,19 @@ def simulate_in_chunks(
         emulated=emulated,
     )
     if failed:
-        raise SimulationError(failed, made)
-    return made
+        raise SimulationError(failed, simulated)
+    return simulated
 
 
 def _not_finite(twin: Twin, nominal: NDArray, observed: NDArray) -> dict[int, str]:
-    """Which trajectories have outputs that are not finite, and where first."""
-    wrong = {}
+    """Trajectories with outputs that are not finite, and the first such output of each."""
+    reasons = {}
     for outputs in (observed, nominal):
         bad = ~np.isfinite(outputs)
         for i in np.flatnonzero(bad.any(axis=(1, 2))):
             sample, channel = np.argwhere(bad[i])[0]
-            wrong[int(i)] = (
+            reasons[int(i)] = (
                 f"{twin.outputs.names[channel]} is {outputs[i, sample, channel]} from sample "
                 f"{sample} on"
             )
-    return wrong
+    return reasons

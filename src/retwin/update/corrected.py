@@ -1,4 +1,4 @@
-"""`CorrectedTwin`: surrogate, residual model and correction in series (Eq. 4); and `generate`."""
+"""`CorrectedTwin`, surrogate, residual model and correction in series (Eq. 4), and `generate`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from retwin.checks import whole
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.models import read_about, write_model
 from retwin.twins.faults import Fault
@@ -34,12 +34,16 @@ __all__ = ["CorrectedTwin", "generate"]
 class CorrectedTwin:
     """The updated twin, ỹ = g(ŷ, z) with z from the residual model; satisfies `Twin` again.
 
-    Attributes
+    Parameters
     ----------
-    surrogate: the IBG.
-    residual: the RG; it holds the correction g.
-    case: name of the case it was fitted for, for the command line.
-    random: whether z is drawn; else it is the RG's mean z̄ (Eq. 8), the same in every simulation.
+    surrogate : Surrogate
+        The IBG, which gives the nominal output ŷ.
+    residual : Residual
+        The RG, which gives the distribution of z and holds the correction g.
+    case : str
+        Name of the case that it was fitted for; the command line reads it.
+    random : bool
+        Whether z is drawn; otherwise it is the mean z̄ (Eq. 8), the same in every simulation.
 
     """
 
@@ -60,12 +64,12 @@ class CorrectedTwin:
 
     @property
     def rate(self) -> float:
-        """Samples per second."""
+        """Sample rate in Hz."""
         return self.surrogate.rate
 
     @property
     def timing(self) -> NDArray:
-        """(k, M) onsets in samples of the trajectories it was calibrated on."""
+        """(k, M) onsets, in samples, of the segments of the calibration trajectories."""
         return self.residual.timing
 
     def simulate(
@@ -76,9 +80,9 @@ class CorrectedTwin:
         seed: int,
         progress: Progress | None = None,
     ) -> Trajectories:
-        """See `Twin.simulate`. Faults act on the commands, then z is drawn, g applied, and read.
+        """See `Twin.simulate`. Faults act on the commands; z is drawn, g and the sensor applied.
 
-        z is drawn for the clean commands: the RG is not told of faults.
+        z is conditioned on the commands without faults, as in calibration.
         """
         generator = torch.Generator().manual_seed(checked_seed(seed))
         correction = self.residual.correction
@@ -110,7 +114,7 @@ class CorrectedTwin:
         )
 
     def save(self, folder: str | Path) -> None:
-        """Write one folder with `surrogate` and `residual` inside, or nothing."""
+        """Write one folder with `surrogate` and `residual` inside; a failure leaves no folder."""
         about = {"case": self.case, "random": self.random}
         with write_model(folder, "corrected", about, {}) as inside:
             self.surrogate.save(inside / "surrogate")
@@ -118,7 +122,10 @@ class CorrectedTwin:
 
     @classmethod
     def load(cls, folder: str | Path) -> CorrectedTwin:
-        """Read what `save` wrote; InputError when it is not a corrected twin or damaged."""
+        """Read what `save` wrote.
+
+        Raises InputError if the folder holds no corrected twin or is damaged.
+        """
         about = read_about(folder, "corrected")
         folder = Path(folder)
         surrogate = Surrogate.load(folder / "surrogate")
@@ -135,29 +142,36 @@ def generate(
     timing: NDArray | None = None,
     progress: Progress | None = None,
 ) -> Trajectories:
-    """A balanced labelled set of any size from any twin.
+    """A labelled set of any size with as many trajectories of each class, from any twin.
 
     Parameters
     ----------
-    twin: plain, learned or corrected.
-    case: a `Case`, or anything else with `faults`, `classes` and a command `sampler`.
-    per_class: trajectories per class.
-    seed: same seed, same bytes on the same machine.
-    timing: (k, M) onsets in samples to draw the command timing from; by default what a corrected
-        twin saw when it was calibrated, else the sampler's own.
+    twin : Twin
+        Plain, surrogate or corrected.
+    case : System
+        A `Case`, or another object with `faults`, `classes` and a command `sampler`.
+    per_class : int
+        Trajectories per class, at least 1.
+    seed : int
+        The same seed gives the same bytes on the same machine.
+    timing : NDArray, optional
+        (k, M) onsets in samples, from which those of the commands are drawn. The default is the
+        onsets of the calibration trajectories for a corrected twin, and otherwise the sampler's.
+    progress : callable, optional
+        Called with the share of the simulations that are done.
+
+    Returns
+    -------
+    Trajectories
+        Sorted by class, with labels.
 
     Raises
     ------
-    InputError: `per_class` below 1.
+    InputError
+        `per_class` is below 1.
 
     """
-    if per_class < 1:
-        raise InputError(
-            "per_class",
-            expected="a whole number of at least 1",
-            got=repr(per_class),
-            remedy="say how many trajectories each class gets",
-        )
+    whole("per_class", per_class, least=1)
     if timing is None and isinstance(twin, CorrectedTwin):
         timing = twin.timing
     for_commands, for_twin = np.random.SeedSequence(seed).spawn(2)
@@ -168,5 +182,5 @@ def generate(
     made = twin.simulate(
         commands, faults=faults, seed=int(for_twin.generate_state(1)[0]), progress=progress
     )
-    # The case names its classes; a fault only says what it is.
+    # The names of the classes are the case's; a fault has none.
     return made.replace(labels=np.repeat(case.classes, per_class))

@@ -1,4 +1,4 @@
-"""Ideal Behavior Generator (IBG), Eq. 5: a fast neural twin, G_φ(u) ≈ ŷ."""
+"""The surrogate, Ideal Behavior Generator (IBG), Eq. 5: a fast neural twin, G_φ(u) ≈ ŷ."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retwin.arrays import row_blocks
+from retwin.checks import require
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.errors import InputError
 from retwin.nets.networks import MLP, NETWORKS, Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress
@@ -26,22 +26,47 @@ from retwin.update.piecewise_linear import evaluate_piecewise_linear
 
 __all__ = ["Surrogate", "fit_surrogate", "surrogate_training"]
 
-CHUNK = 8
-"""Trajectories that a network with memory is asked at a time: more leave the cache."""
-SPAN = 2**17
-"""Samples, in whole trajectories, that are gone through for lines together."""
-ROWS = 2048
-"""Samples that a network without memory is asked at a time, for the same reason."""
+TRAJECTORIES_PER_BATCH = 8
+"""Trajectories per evaluation of a network with memory: more do not fit the cache."""
+SAMPLES_PER_BLOCK = 2**17
+"""Samples, in whole trajectories, that are searched for linear pieces together."""
+SAMPLES_PER_BATCH = 2048
+"""Samples per evaluation of a network without memory: more do not fit the cache."""
+MIN_TRAJECTORIES = 10
+"""Smallest number of trajectories to fit on: a tenth each is held out for validation and test."""
+MAX_HELD_OUT = 1000
+"""Largest number of trajectories that are held out for validation, and for test: the relative
+standard error of an RMSE from a thousand is about 2 %."""
+MAX_SAMPLES = 200_000
+"""Largest number of distinct samples that a network without memory is trained on; more do not lower
+the error."""
+MAX_SEQUENCE_SAMPLES = 10_000_000
+"""Largest number of samples, in whole trajectories, that a network with memory is trained on."""
+TRAINING = {
+    "MLP": Training(max_epochs=20, batch_size=256, learning_rate=5e-3),
+    "LSTM": Training(max_epochs=10, batch_size=32, learning_rate=5e-3),
+    "TCN": Training(max_epochs=10, batch_size=32, learning_rate=5e-3),
+    "StateSpace": Training(max_epochs=40, batch_size=16, learning_rate=1e-2),
+}
+"""Default settings of the training by kind of network."""
 
 
 class Surrogate(nn.Module):
-    """A trained neural twin: call it on a tensor, or `simulate` as any `Twin`.
+    """A neural twin: a differentiable function of commands, and a `Twin`.
 
     Parameters
     ----------
-    network: the config its module was built from.
-    inputs, outputs: channels of commands and outputs.
-    rate: samples per second it was trained at.
+    network : Network
+        Config object of the network.
+    inputs, outputs : Channels
+        Channels of the commands and of the outputs.
+    rate : float
+        Sample rate of the data that it is trained on, in Hz.
+
+    Attributes
+    ----------
+    fitted : Fit or None
+        Record of the training; None before it.
 
     """
 
@@ -60,47 +85,49 @@ class Surrogate(nn.Module):
 
     @property
     def memoryless(self) -> bool:
-        """Whether an output depends on the command of its own sample only."""
+        """Whether an output depends on the command at the same sample only."""
         return isinstance(self.config, MLP)
 
     @property
     def unit(self) -> Tensor:
-        """(d_y,) what outputs are divided by to be compared with each other: their spread.
+        """(d_y,) the divisors that make outputs comparable: their standard deviations.
 
-        One for all where they have the same unit.
+        Where all outputs have the same physical unit it is the mean of these.
         """
         spread = self.after.scale
         return spread.mean().expand_as(spread) if self.outputs.comparable else spread
 
     def forward(self, commands: Tensor) -> Tensor:
-        """Outputs (n, T, d_y) for commands (n, T, d_u), both in physical units."""
+        """The outputs (n, T, d_y) for commands (n, T, d_u), both in physical units."""
         return self.after.inverse(self.network(self.before(commands)))
 
     @torch.no_grad()
     def predict(self, commands: NDArray, *, progress: Progress | None = None) -> NDArray:
-        """Outputs (n, T, d_y), float32, for commands (n, T, d_u), without gradient.
+        """The outputs (n, T, d_y), float32, for commands (n, T, d_u), without gradient.
 
-        In chunks that fit the cache; a network without memory is asked once for a held command, and
-        at few points of a ramp.
+        A network without memory is evaluated once for a constant command, and at a few points of a
+        ramp (`evaluate_piecewise_linear`), which agrees with `forward` up to rounding.
         """
         values = np.ascontiguousarray(commands, dtype=np.float32)
         out = np.empty((*values.shape[:2], len(self.outputs)), dtype=np.float32)
-        few = 1 + SPAN // (1 + values.shape[1])
-        ask, size = (self._by_lines, few) if self.memoryless else (self, CHUNK)
+        if self.memoryless:
+            evaluate, size = self._piecewise_linear, 1 + SAMPLES_PER_BLOCK // (1 + values.shape[1])
+        else:
+            evaluate, size = self, TRAJECTORIES_PER_BATCH
         for begin in range(0, len(values), size):
             part = slice(begin, begin + size)
-            out[part] = ask(torch.tensor(values[part])).numpy()
+            out[part] = evaluate(torch.tensor(values[part])).numpy()
             if progress is not None:
                 progress(min(1.0, (begin + size) / len(values)))
         return out
 
-    def _by_lines(self, commands: Tensor) -> Tensor:
-        """As `forward`, up to rounding; asked once for a hold and at few points of a ramp."""
+    def _piecewise_linear(self, commands: Tensor) -> Tensor:
+        """As `forward`, up to rounding, by interpolation along linear pieces of the commands."""
 
-        def ask(rows: Tensor) -> Tensor:
-            return torch.cat([self(some) for some in rows.split(ROWS)])
+        def function(rows: Tensor) -> Tensor:
+            return torch.cat([self(some) for some in rows.split(SAMPLES_PER_BATCH)])
 
-        return evaluate_piecewise_linear(ask, commands, self.after.scale)
+        return evaluate_piecewise_linear(function, commands, self.after.scale)
 
     def simulate(
         self,
@@ -110,7 +137,7 @@ class Surrogate(nn.Module):
         seed: int,
         progress: Progress | None = None,
     ) -> Trajectories:
-        """What the surrogate says, see `Twin.simulate`; frozen responses are held commands."""
+        """See `Twin.simulate`; a frozen response is the output of constant commands."""
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             nominal = self.predict(chunk.commands)
@@ -120,7 +147,7 @@ class Surrogate(nn.Module):
         return simulate_in_chunks(self, run, checked, faults, seed=seed, progress=progress)
 
     def save(self, folder: str | Path) -> None:
-        """Write weights and description; see `read_model` for the layout."""
+        """Write the weights and the description; see `read_model` for the layout."""
         about = {
             "network": to_config(self.config, NETWORKS),
             "inputs": vars(self.inputs),
@@ -133,7 +160,10 @@ class Surrogate(nn.Module):
 
     @classmethod
     def load(cls, folder: str | Path) -> Surrogate:
-        """Read what `save` wrote; InputError when it is not a surrogate or damaged."""
+        """Read what `save` wrote.
+
+        Raises InputError if the folder holds no surrogate or is damaged.
+        """
         about, weights = read_model(folder, "surrogate")
         surrogate = cls(
             from_config(about["network"], NETWORKS),
@@ -146,29 +176,9 @@ class Surrogate(nn.Module):
         return surrogate.eval()
 
 
-ENOUGH = 10
-"""Fewest trajectories to fit on: a tenth each is held out for validation and for the error."""
-
-HELD_OUT = 1000
-"""Trajectories that tell an error well enough, however many there are."""
-
-SAMPLES = 200_000
-"""Distinct samples that are enough for a network without memory."""
-
-WINDOWED = 10_000_000
-"""Samples, in whole trajectories, that are enough for a network with memory."""
-
-DEFAULTS = {
-    "MLP": Training(max_epochs=20, batch_size=256, learning_rate=5e-3),
-    "LSTM": Training(max_epochs=10, batch_size=32, learning_rate=5e-3),
-    "TCN": Training(max_epochs=10, batch_size=32, learning_rate=5e-3),
-    "StateSpace": Training(max_epochs=40, batch_size=16, learning_rate=1e-2),
-}
-
-
 def surrogate_training(network: Network) -> Training:
-    """What suits the network."""
-    return DEFAULTS.get(type(network).__name__, Training())
+    """Default settings of the training of a surrogate with this network."""
+    return TRAINING.get(type(network).__name__, Training())
 
 
 def fit_surrogate(
@@ -179,98 +189,116 @@ def fit_surrogate(
     training: Training | None = None,
     progress: Progress | None = None,
 ) -> Surrogate:
-    """Train an IBG on what a twin says its nominal output is (Eq. 5).
+    """Train a surrogate on the nominal outputs of a twin (Eq. 5).
 
     Parameters
     ----------
-    twin: commands and nominal outputs; faults in `observed` do not matter. A tenth of the
-        trajectories is held out for validation and another tenth for the reported error, a
-        thousand each at most. Of a set larger than that needs, a random part is learned from.
-    network: `MLP` (no memory, the default), `LSTM`, `TCN` or `StateSpace`.
-    seed: same seed, same weights on the same machine.
-    training: epochs, batch, rate; by default what suits the network.
+    twin : Trajectories
+        Commands and nominal outputs of at least ten trajectories; `observed` is not used. A tenth
+        of them is held out for validation and another tenth for the reported error, at most a
+        thousand each. A network without memory is trained on at most 200,000 distinct samples,
+        drawn at random, one with memory on at most ten million.
+    network : Network
+        `MLP` (no memory, the default), `LSTM`, `TCN` or `StateSpace`.
+    seed : int
+        The same seed gives the same weights on the same machine.
+    training : Training, optional
+        Settings of the training; by default `surrogate_training(network)`.
+    progress : callable, optional
+        Called with the share of the epochs that are done.
 
-    The result's `fitted.figures` hold, for every output, `rmse_NAME` in its unit and `nrmse_NAME`
-    (over its standard deviation) on held-out trajectories.
+    Returns
+    -------
+    Surrogate
+        Its `fitted.figures` hold, for each output, `rmse_NAME` in its unit and `nrmse_NAME`, which
+        is divided by the output's standard deviation, on held-out trajectories.
 
     Raises
     ------
-    InputError: fewer than ten trajectories, or a set without commands.
+    InputError
+        Fewer than ten trajectories, or trajectories without commands.
 
     """
-    if len(twin) < ENOUGH or twin.commands.shape[2] == 0:
-        raise InputError(
-            "twin",
-            expected=f"at least {ENOUGH} trajectories with commands",
-            got=f"{len(twin)} trajectories with {twin.commands.shape[2]} command channels",
-            remedy="load the file with its case, which recovers commands, or simulate more",
-        )
+    channels = twin.commands.shape[2]
+    require(
+        len(twin) >= MIN_TRAJECTORIES and channels,
+        "twin",
+        expected=f"at least {MIN_TRAJECTORIES} trajectories with commands",
+        got=f"{len(twin)} trajectories with {channels} command channels",
+        remedy="load the file with its case, which recovers commands, or simulate more",
+    )
     order = np.random.default_rng(seed).permutation(len(twin))
-    tenth = min(max(1, len(twin) // 10), HELD_OUT)
-    test, valid, train_part = order[:tenth], order[tenth : 2 * tenth], order[2 * tenth :]
+    tenth = min(max(1, len(twin) // 10), MAX_HELD_OUT)
+    test, valid, fitted = order[:tenth], order[tenth : 2 * tenth], order[2 * tenth :]
     with isolated(seed):
         surrogate = Surrogate(network, inputs=twin.inputs, outputs=twin.outputs, rate=twin.rate)
-    rows = _samples if isinstance(network, MLP) else _windows
-    fitted = rows(twin, train_part, seed)
-    commands, nominal, there = fitted
-    surrogate.before.fit(commands[there])
-    surrogate.after.fit(nominal[there])
+    examples = _samples if surrogate.memoryless else _sequences
+    training_set = examples(twin, fitted, seed)
+    commands, nominal, valid_samples = training_set
+    surrogate.before.fit(commands[valid_samples])
+    surrogate.after.fit(nominal[valid_samples])
 
     def loss(module: Any, batch: tuple[Tensor, ...]) -> Tensor:
-        commands, nominal, there = batch
+        commands, nominal, valid_samples = batch
         error = module.network(module.before(commands)) - module.after(nominal)
-        return error[there].square().mean()
+        return error[valid_samples].square().mean()
 
     result = train(
         surrogate,
         loss,
-        fitted,
-        rows(twin, valid, seed + 1),
+        training_set,
+        examples(twin, valid, seed + 1),
         training or surrogate_training(network),
         seed=seed,
         progress=progress,
     )
-    whole = _there(twin, test)
-    error = (surrogate.predict(twin.commands[test]) - twin.nominal[test])[whole]
-    rmse = np.sqrt(np.square(error, dtype=np.float64).mean(axis=0))
-    spread = twin.nominal[test][whole].std(axis=0, dtype=np.float64)
-    figures = {"held_out": float(tenth)}
-    for name, error_of, spread_of in zip(twin.outputs.names, rmse, spread, strict=True):
-        figures[f"rmse_{name}"] = float(error_of)
-        figures[f"nrmse_{name}"] = float(error_of / spread_of) if spread_of > 0 else 0.0
-    surrogate.fitted = replace(result, figures=figures)
+    surrogate.fitted = replace(result, figures=_errors(surrogate, twin, test))
     return surrogate
 
 
-def _there(twin: Trajectories, part: NDArray) -> NDArray:
-    """(len(part), T) bool, what is no padding: there a nominal output is held, not the twin's."""
+def _errors(surrogate: Surrogate, twin: Trajectories, test: NDArray) -> dict[str, float]:
+    """RMSE and normalised RMSE of each output on the trajectories `test`."""
+    valid = _not_padding(twin, test)
+    error = (surrogate.predict(twin.commands[test]) - twin.nominal[test])[valid]
+    rmse = np.sqrt(np.square(error, dtype=np.float64).mean(axis=0))
+    deviation = twin.nominal[test][valid].std(axis=0, dtype=np.float64)
+    nrmse = np.divide(rmse, deviation, out=np.zeros_like(rmse), where=deviation > 0)
+    figures = {"held_out": float(len(test))}
+    for name, absolute, normalised in zip(twin.outputs.names, rmse, nrmse, strict=True):
+        figures[f"rmse_{name}"] = float(absolute)
+        figures[f"nrmse_{name}"] = float(normalised)
+    return figures
+
+
+def _not_padding(twin: Trajectories, part: NDArray) -> NDArray:
+    """(len(part), T) bool, the samples within each trajectory's length."""
     return np.arange(twin.steps) < twin.lengths[part][:, None]
 
 
 def _samples(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, ...]:
-    """Distinct samples of those trajectories, at most SAMPLES: a hold says the same all over."""
-    count = sum(len(fresh) for _, fresh in _fresh(twin, part))
+    """Distinct commands of the trajectories `part` and their outputs, at most MAX_SAMPLES."""
+    count = sum(len(changes) for _, changes in _changes(twin, part))
     chosen = np.arange(count)
-    if count > SAMPLES:
+    if count > MAX_SAMPLES:
         rng = np.random.default_rng(seed)
-        chosen = rng.choice(count, SAMPLES, replace=False, shuffle=False)
-    kinds = (twin.commands, twin.nominal)
-    found = [np.empty((len(chosen), kind.shape[2]), np.float32) for kind in kinds]
-    seen = 0
-    for some, fresh in _fresh(twin, part):
-        here = np.flatnonzero((chosen >= seen) & (chosen < seen + len(fresh)))
-        for values, kind in zip(found, kinds, strict=True):
-            values[here] = kind[some].reshape(-1, kind.shape[2])[fresh[chosen[here] - seen]]
-        seen += len(fresh)
-    commands, nominal = map(torch.from_numpy, found)
+        chosen = rng.choice(count, MAX_SAMPLES, replace=False, shuffle=False)
+    sources = (twin.commands, twin.nominal)
+    copies = [np.empty((len(chosen), source.shape[2]), np.float32) for source in sources]
+    before = 0
+    for some, changes in _changes(twin, part):
+        here = np.flatnonzero((chosen >= before) & (chosen < before + len(changes)))
+        rows = changes[chosen[here] - before]
+        for values, source in zip(copies, sources, strict=True):
+            values[here] = source[some].reshape(-1, source.shape[2])[rows]
+        before += len(changes)
+    commands, nominal = map(torch.from_numpy, copies)
     return commands, nominal, torch.ones(len(chosen), dtype=torch.bool)
 
 
-def _fresh(twin: Trajectories, part: NDArray) -> Iterator[tuple[NDArray, NDArray]]:
-    """Block by block, which trajectories, and at which of their samples the command is a new one.
+def _changes(twin: Trajectories, part: NDArray) -> Iterator[tuple[NDArray, NDArray]]:
+    """Per block of trajectories, their indices and the samples at which the command changes.
 
-    The samples of a block are counted through; the first of a trajectory is new if it is not the
-    last of the one before.
+    Samples are indexed over all trajectories of the block, in series.
     """
     last = np.full(twin.commands.shape[2], np.nan)
     for rows in row_blocks(twin.commands, len(part)):
@@ -281,11 +309,11 @@ def _fresh(twin: Trajectories, part: NDArray) -> Iterator[tuple[NDArray, NDArray
         last = commands[-1]
 
 
-def _windows(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, ...]:
-    """Whole trajectories, WINDOWED samples at most, and what of them is no padding."""
-    part = part[: max(1, WINDOWED // twin.steps)]
+def _sequences(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, ...]:
+    """Whole trajectories, at most MAX_SEQUENCE_SAMPLES, and which samples are no padding."""
+    part = part[: max(1, MAX_SEQUENCE_SAMPLES // twin.steps)]
     return (
         torch.tensor(twin.commands[part], dtype=torch.float32),
         torch.tensor(twin.nominal[part], dtype=torch.float32),
-        torch.as_tensor(_there(twin, part)),
+        torch.as_tensor(_not_padding(twin, part)),
     )

@@ -42,10 +42,10 @@ def test_commands_are_drawn_as_published() -> None:
     assert {round(x) for x in longest} <= {60, 80, 100}
 
 
-def test_the_case_crosses_process_borders(case: rt.Case) -> None:
+def test_the_case_can_be_sent_to_another_process(case: rt.Case) -> None:
     again = pickle.loads(pickle.dumps(case))
-    ours, theirs = (rt.generate(c.twin, c, per_class=1, seed=0) for c in (case, again))
-    assert ours.observed.tobytes() == theirs.observed.tobytes()
+    own, sent = (rt.generate(c.twin, c, per_class=1, seed=0) for c in (case, again))
+    assert own.observed.tobytes() == sent.observed.tobytes()
 
 
 def test_random_onset_is_an_option(case: rt.Case) -> None:
@@ -85,7 +85,7 @@ def real_set() -> rt.Trajectories:
 @needs_data
 @pytest.mark.real_data
 def test_the_real_robot_is_as_described() -> None:
-    """The discrepancies that REFERENCE tells of, found through the whole chain."""
+    """The discrepancies of REFERENCE, found through the whole chain."""
     real = real_set()
     assert not real.emulated
     assert real.known_labels == set(rt.cases.armpi().classes)
@@ -135,7 +135,7 @@ def test_encoder_noise_moves_stuck_joints_only(case: rt.Case) -> None:
     assert (moved[~stuck] == 0).all()
     assert (moved[stuck, :50] == 0).all()
     assert (moved[stuck, 50:].max(axis=1) > 1e-4).all()
-    # One unit at the arm's full reach, as the twin itself answers it.
+    # One unit at the arm's full reach, as the twin itself responds.
     assert moved.max() <= 0.26 * np.deg2rad(0.24) * 1.1
     i = int(np.flatnonzero(made.labels == "Motor_2_Stuck")[0])
     held = made.commands[i].astype(float)

@@ -13,13 +13,13 @@ def chain(angles: np.ndarray) -> np.ndarray:
     end = np.eye(4)
     for joint, (angle, length) in enumerate(zip(angles, lengths, strict=True)):
         c, s = np.cos(angle), np.sin(angle)
-        turn = np.eye(4)
-        turn[:3, :3] = (
+        rotation = np.eye(4)
+        rotation[:3, :3] = (
             [[c, -s, 0], [s, c, 0], [0, 0, 1]] if joint == 0 else [[1, 0, 0], [0, c, -s], [0, s, c]]
         )
         move = np.eye(4)
         move[2, 3] = length
-        end = end @ move @ turn
+        end = end @ move @ rotation
     return (end @ [0, 0, 0.05071, 1])[:3]
 
 

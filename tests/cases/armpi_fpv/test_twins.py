@@ -34,8 +34,8 @@ def test_the_model_has_the_arms_kinematics(commands: np.ndarray) -> None:
     hidden: dict[str, np.ndarray] = {}
     made = ArmPiTwin().simulate(commands, seed=0, hidden=hidden)
     assert hidden["positions"].shape == (8, 1000, 5)
-    reached = ARM.position(hidden["positions"][..., :4])
-    np.testing.assert_allclose(made.observed, reached, atol=1e-6)
+    expected = ARM.position(hidden["positions"][..., :4])
+    np.testing.assert_allclose(made.observed, expected, atol=1e-6)
     # Joint 5 rolls about the last link: it is held, and would not move the end-effector.
     assert np.abs(hidden["positions"][..., 4]).max() < 1e-3
     np.testing.assert_array_equal(made.nominal, KINEMATIC.position(commands))
@@ -73,7 +73,7 @@ def test_the_model_has_the_masses_of_the_urdf() -> None:
         holding.append(data.qfrc_bias.copy())
     base = model.body("link_1").id
     assert robot.body_subtreemass[1] == pytest.approx(model.body_subtreemass[base], rel=1e-9)
-    # The torque that holds the arm against gravity tells masses and their places.
+    # The torque that holds the arm against gravity depends on the masses and their positions.
     np.testing.assert_allclose(holding[0], holding[1], atol=1e-6)
 
 
@@ -98,8 +98,8 @@ def test_the_emulated_arm_tells_what_went_wrong(commands: np.ndarray) -> None:
     assert hidden["angles"].shape == (8, 1000, 4)
     assert (hidden["delay"] > 0).all()
     # Readings are rounded and joined linearly: away from glitches within a unit of the joints.
-    gap = np.linalg.norm(made.observed - KINEMATIC.position(hidden["angles"]), axis=2)
-    assert np.median(gap[:, ::10]) < 1e-3
+    error = np.linalg.norm(made.observed - KINEMATIC.position(hidden["angles"]), axis=2)
+    assert np.median(error[:, ::10]) < 1e-3
 
 
 PERFECT = EmulatedArmPi(
@@ -133,8 +133,8 @@ def test_every_effect_does_what_it_says(commands: np.ndarray) -> None:
         replace(PERFECT, **effect).simulate(commands, seed=0, hidden=found)
         return found["angles"]
 
-    late = angles(delay=4.0, jitter=1e-6)
-    np.testing.assert_allclose(late[:, 4:], plain[:, :-4], atol=0.5)
+    delayed = angles(delay=4.0, jitter=1e-6)
+    np.testing.assert_allclose(delayed[:, 4:], plain[:, :-4], atol=0.5)
     steady = np.abs(angles(dead_zone=2.0) - plain)[:, 190]
     assert steady.max() == pytest.approx(2.0, abs=0.05)
     play = np.abs(angles(backlash=3.0) - plain)
@@ -185,11 +185,11 @@ def test_emulated_data_say_so(case: rt.Case, emulated: rt.Trajectories) -> None:
 @pytest.mark.slow
 def test_the_emulated_arm_errs_as_the_real_one(tmp_path: Path) -> None:
     """All figures of benchmarks/emulation.py lie inside the intervals of the real ones."""
-    benchmark = Path(__file__).parents[2] / "benchmarks" / "emulation.py"
+    benchmark = Path(__file__).parents[3] / "benchmarks" / "emulation.py"
     run = [sys.executable, "-W", "error::RuntimeWarning", str(benchmark)]
     results = tmp_path / "results.json"
-    told = {**os.environ, "RETWIN_RESULTS": str(results)}
-    done = subprocess.run(run, env=told, capture_output=True, text=True, check=False)
+    environment = {**os.environ, "RETWIN_RESULTS": str(results)}
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     rows = json.loads(results.read_text("utf-8"))["emulation"]["rows"]
     assert len(rows) == 11

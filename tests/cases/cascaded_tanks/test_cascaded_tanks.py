@@ -45,13 +45,13 @@ def test_steps_of_a_sample_are_fine_enough(overflow: bool) -> None:
             + 0.5 * over - 0.5 * max(y - 10.0, 0.0) * overflow,
         ]  # fmt: skip
 
-    levels, told = np.array([6.0, 5.1309]), []
+    levels, lower = np.array([6.0, 5.1309]), []
     for voltage in commands[0, :, 0]:
-        told.append(levels[1])
+        lower.append(levels[1])
         levels = solve_ivp(rates, (0, 1 / RATE), levels, args=(voltage,), rtol=1e-9, atol=1e-9).y[
             :, -1
         ]
-    exact = np.minimum(told, 10.0) if overflow else np.array(told)
+    exact = np.minimum(lower, 10.0) if overflow else np.array(lower)
     assert exact.max() >= 10.0
     np.testing.assert_allclose(
         twin.simulate(commands, seed=0).observed[0, :, 0], exact, atol=5e-2 if overflow else 1e-4
@@ -133,10 +133,10 @@ def test_a_state_space_network_is_saved_and_starts_where_the_twin_does(tmp_path:
     surrogate = rt.fit_surrogate(made, StateSpace(states=3), seed=0, training=quick)
     surrogate.save(tmp_path / "ibg")
     commands = voltages(2, 40, seed=1)
-    said = rt.Surrogate.load(tmp_path / "ibg").predict(commands)
-    np.testing.assert_array_equal(said, surrogate.predict(commands))
-    # The first output is read from the learned state: no input has reached it.
-    assert said[0, 0, 0] == said[1, 0, 0]
+    predicted = rt.Surrogate.load(tmp_path / "ibg").predict(commands)
+    np.testing.assert_array_equal(predicted, surrogate.predict(commands))
+    # The first output is read from the learned state: no input affects it yet.
+    assert predicted[0, 0, 0] == predicted[1, 0, 0]
 
 
 @pytest.mark.real_data
@@ -153,9 +153,9 @@ def test_the_twin_is_what_least_squares_gives_on_the_estimation_record() -> None
             seed=0,
             method=LeastSquares(starts=1, loss="linear"),
         )
-    ours = np.sqrt(np.square(estimation.residual).mean())
-    assert found.figures["rms_after"] == pytest.approx(ours, abs=1e-3)
-    assert ours == pytest.approx(0.603, abs=2e-3)
+    rms = np.sqrt(np.square(estimation.residual).mean())
+    assert found.figures["rms_after"] == pytest.approx(rms, abs=1e-3)
+    assert rms == pytest.approx(0.603, abs=2e-3)
     # The other twin's numbers are found likewise, with all free; see docs/tanks.md.
-    told, _ = benchmark(tanks_overflow().twin)(file)
-    assert np.sqrt(np.square(told.residual).mean()) == pytest.approx(0.207, abs=1e-3)
+    complete, _ = benchmark(tanks_overflow().twin)(file)
+    assert np.sqrt(np.square(complete.residual).mean()) == pytest.approx(0.207, abs=1e-3)

@@ -218,7 +218,7 @@ def test_a_bundle_generates_without_its_case_where_it_can(bundle: Bundle) -> Non
         faults=bundle.facts.faults,
         sensor_rate=10.0,
         steps=200,
-        movements=2,
+        max_segments=2,
         sampler=RampSampler((400.0,) * 4, (600.0,) * 4, 2, 200),
     )
     alone = Bundle(bundle.twin, bundle.guard, Facts.of(json.loads(json.dumps(facts.about()))))
@@ -249,8 +249,8 @@ def test_the_commands(call: Call, bundle: Bundle, saved: Path, tmp_path: Path) -
     assert (code, err) == (0, "")
     assert "is whole" in out
     assert "armpi" in out
-    told = json.loads(call("bundle", "verify", saved, "--json")[1])
-    assert told.keys() == {
+    printed = json.loads(call("bundle", "verify", saved, "--json")[1])
+    assert printed.keys() == {
         *("folder", "kind", "bytes", "case", "schema", "steps", "movements", "sensor_rate"),
         "provenance",
     }
@@ -266,10 +266,10 @@ def test_the_commands(call: Call, bundle: Bundle, saved: Path, tmp_path: Path) -
     assert code == 0, err
     assert "outside" in out
     code, out, _ = call("bundle", "predict", saved, tmp_path / "scaled.npz", "--json")
-    told = json.loads(out)
-    assert told.keys() == {"emulated", "trajectories"}
-    assert len(told["trajectories"]) == len(made)
-    assert told["trajectories"][0].keys() == {
+    printed = json.loads(out)
+    assert printed.keys() == {"emulated", "trajectories"}
+    assert len(printed["trajectories"]) == len(made)
+    assert printed["trajectories"][0].keys() == {
         *("id", "diagnosis", "probability", "probabilities", "guard", "because_of")
     }
     rows = (tmp_path / "found.csv").read_text().splitlines()
@@ -307,5 +307,5 @@ def test_a_bundle_is_made_of_what_was_fitted(
     assert made.provenance["seed"] == 3
     assert made.provenance["data"][0]["name"].startswith("EmulatedArmPi")
     assert (
-        made.guard.judge(made.twin.surrogate, emulated.with_label("Healthy")).suspicion.max() <= 1
+        made.guard.assess(made.twin.surrogate, emulated.with_label("Healthy")).max_score.max() <= 1
     )

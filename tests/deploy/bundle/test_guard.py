@@ -1,4 +1,4 @@
-"""What no class explains is flagged, what some class explains is not."""
+"""The guard flags what no class explains, and does not flag what some class explains."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ RANGES = Domain((0.0,), (100.0,), (5.0,), (-1.0,), (1.0,), (0.5,), mismatch=0.1,
 
 def toy(commands: list[float], observed: list[float]) -> rt.Trajectories:
     """One trajectory of one input and one output."""
-    told, seen = (np.array(each, dtype=float)[None, :, None] for each in (commands, observed))
-    return rt.Trajectories(commands=told, nominal=np.zeros_like(seen), observed=seen, rate=1.0)
+    u, y = (np.array(each, dtype=float)[None, :, None] for each in (commands, observed))
+    return rt.Trajectories(commands=u, nominal=np.zeros_like(y), observed=y, rate=1.0)
 
 
 def always(value: float) -> Callable[[rt.Trajectories], NDArray]:
@@ -31,23 +31,23 @@ def always(value: float) -> Callable[[rt.Trajectories], NDArray]:
     return lambda trajectories: np.full(len(trajectories), value)
 
 
-def test_the_scores_are_multiples_of_what_is_usual() -> None:
+def test_the_scores_are_multiples_of_the_limits() -> None:
     # Commands 4 beyond a range of 100, speed 0.5 over 5, an output 0.2 beyond a range of 2.
     odd = toy([98.5, 104.0, 99.0, 99.0], [0.0, 1.2, np.nan, 0.0])
-    verdicts = RANGES.judge(odd, always(0.2), always(2.0 + np.log(3.0)), steps=6)
+    verdicts = RANGES.assess(odd, always(0.2), always(2.0 + np.log(3.0)), steps=6)
     expected = [2.0, 5.0, 5.0, 2.0, 0.25 / 0.25, 6 / 4 / 2, 3.0, 0.0]
     np.testing.assert_allclose(verdicts.scores[0], expected, rtol=1e-6)
     assert verdicts.reason.tolist() == ["speed"]
     assert verdicts.verdict.tolist() == ["unusual"]
-    usual = RANGES.judge(toy([0.0, 5.0, 10.0], [0.0, 1.0, -1.0]), always(0.1), always(2.0))
-    assert (usual.verdict.tolist(), usual.reason.tolist()) == (["ok"], [""])
-    assert usual.suspicion.tolist() == [1.0]
+    inside = RANGES.assess(toy([0.0, 5.0, 10.0], [0.0, 1.0, -1.0]), always(0.1), always(2.0))
+    assert (inside.verdict.tolist(), inside.reason.tolist()) == (["ok"], [""])
+    assert inside.max_score.tolist() == [1.0]
 
 
-def test_without_commands_it_says_so() -> None:
+def test_trajectories_without_commands_are_refused() -> None:
     bare = toy([0.0, 0.0], [0.0, 0.0]).replace(commands=np.zeros((1, 2, 0)), inputs=None)
-    with pytest.raises(rt.InputError, match="without commands nothing says what is usual"):
-        RANGES.judge(bare, always(0.0), always(0.0))
+    with pytest.raises(rt.InputError, match="the ranges of commands are checked"):
+        RANGES.assess(bare, always(0.0), always(0.0))
 
 
 def never(trajectories: rt.Trajectories) -> NDArray:
@@ -57,10 +57,10 @@ def never(trajectories: rt.Trajectories) -> NDArray:
 @pytest.mark.parametrize("value", [3.4e38, -3.4e38, 1e37, 1e308, -1e308])
 @pytest.mark.parametrize("name", ["commands", "nominal", "observed"])
 def test_sentinels_reach_no_network(name: str, value: float) -> None:
-    usual = toy([0.0, 5.0, 10.0], [0.0, 1.0, -1.0])
-    array = getattr(usual, name).copy()
+    inside = toy([0.0, 5.0, 10.0], [0.0, 1.0, -1.0])
+    array = getattr(inside, name).copy()
     array[0, 1] = value
-    verdicts = RANGES.judge(usual.replace(**{name: array}), never, never)
+    verdicts = RANGES.assess(inside.replace(**{name: array}), never, never)
     assert verdicts.verdict.tolist() == ["outside"]
     reason = {"commands": "commands", "nominal": "nominal", "observed": "outputs"}[name]
     # 1e308 overflows the speed as well, in which case either of the two is named.
@@ -70,9 +70,9 @@ def test_sentinels_reach_no_network(name: str, value: float) -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", ["nominal", "residual"])
 def test_what_is_not_finite_is_outside(name: str, value: float) -> None:
-    usual = toy([0.0, 5.0, 10.0], [0.0, 1.0, -1.0])
+    inside = toy([0.0, 5.0, 10.0], [0.0, 1.0, -1.0])
     mismatch, energy = (value, 0.0) if name == "nominal" else (0.1, value)
-    verdicts = RANGES.judge(usual, always(mismatch), always(energy))
+    verdicts = RANGES.assess(inside, always(mismatch), always(energy))
     assert verdicts.verdict.tolist() == ["outside"]
     assert verdicts.reason.tolist() == [name]
 
@@ -86,15 +86,15 @@ def test_a_score_that_is_not_finite_is_the_largest(value: float) -> None:
 
 
 def test_nothing_measured_and_another_length_are_outside() -> None:
-    usual = toy([0.0, 5.0, 10.0], [0.0, 1.0, -1.0])
-    nothing = usual.replace(mask=np.zeros_like(usual.mask))
-    assert RANGES.judge(nothing, never, never).reason.tolist() == ["missing"]
+    inside = toy([0.0, 5.0, 10.0], [0.0, 1.0, -1.0])
+    nothing = inside.replace(mask=np.zeros_like(inside.mask))
+    assert RANGES.assess(nothing, never, never).reason.tolist() == ["missing"]
     for steps, verdict in ((6, "ok"), (7, "unusual"), (61, "outside")):
-        assert RANGES.judge(usual, always(0.1), always(0.0), steps=steps).verdict == verdict
+        assert RANGES.assess(inside, always(0.1), always(0.0), steps=steps).verdict == verdict
 
 
 @pytest.mark.parametrize("row", [[np.nan, 0.5], [np.inf, 0.0], [7.0, -6.0], [0.5, 0.6], [0, 0]])
-def test_what_are_no_probabilities_are_no_class(row: list[float]) -> None:
+def test_what_is_no_distribution_gives_no_class(row: list[float]) -> None:
     given = np.array([[0.2, 0.8], row])
     found = Prediction(("a", "b"), given, Verdicts(np.zeros((2, len(CHECKS)))))
     assert found.diagnosis.tolist() == ["b", ""]
@@ -114,7 +114,7 @@ def test_a_domain_that_is_not_finite_is_refused(name: str, value: object) -> Non
         replace(RANGES, low=(-1e308,), high=(1e308,))
 
 
-def test_ranges_take_in_all_that_was_seen() -> None:
+def test_ranges_cover_all_given_trajectories() -> None:
     around = Domain.around(
         [toy([1.0, 4.0, 2.0], [0.5, np.nan, 2.0]), toy([0.0, 1.0], [np.nan, 1.0])]
     )
@@ -130,8 +130,8 @@ def test_implausible_outputs_keep_the_nominal_path() -> None:
     assert ((made - features).abs().amax(dim=(1, 2)) > 0).all()
 
 
-def fooled(kind: str, real: rt.Trajectories) -> rt.Trajectories:
-    """Trajectories that are none: of the samples, of other trajectories, of another size."""
+def spoilt(kind: str, real: rt.Trajectories) -> rt.Trajectories:
+    """Implausible trajectories: samples, trajectories or channels permuted, or outputs scaled."""
     observed = real.observed
     match kind:
         case "time":
@@ -155,27 +155,27 @@ def fooled(kind: str, real: rt.Trajectories) -> rt.Trajectories:
 @pytest.mark.parametrize(
     "kind", ["time", "trajectories", "channels", "larger", "smaller", "foreign"]
 )
-def test_what_is_none_is_told_from_what_is(
+def test_implausible_trajectories_are_distinguished_from_plausible_ones(
     kind: str, guard: Guard, ibg: rt.Surrogate, emulated: rt.Trajectories
 ) -> None:
     """Of six kinds two were among what the energy learned from."""
-    good = guard.judge(ibg, emulated).suspicion
-    bad = guard.judge(ibg, fooled(kind, emulated)).suspicion
+    good = guard.assess(ibg, emulated).max_score
+    bad = guard.assess(ibg, spoilt(kind, emulated)).max_score
     truth = np.repeat([0, 1], len(emulated))
     assert roc_auc_score(truth, np.concatenate([good, bad])) > 0.95
 
 
 def test_what_some_class_explains_is_seldom_flagged(
-    guard: Guard, updated: rt.CorrectedTwin, case: rt.Case, emulated: rt.Trajectories
+    guard: Guard, exportable: rt.CorrectedTwin, case: rt.Case, emulated: rt.Trajectories
 ) -> None:
-    fresh = rt.generate(updated, case, per_class=20, seed=77)
-    assert (guard.judge(updated.surrogate, fresh).verdict != "ok").mean() < 0.05
+    fresh = rt.generate(exportable, case, per_class=20, seed=77)
+    assert (guard.assess(exportable.surrogate, fresh).verdict != "ok").mean() < 0.05
     # Faulty ones of the emulated robot, of which it has seen nothing.
     faulty = emulated[emulated.labels != "Healthy"]
-    assert (guard.judge(updated.surrogate, faulty).verdict != "ok").mean() <= 0.05
+    assert (guard.assess(exportable.surrogate, faulty).verdict != "ok").mean() <= 0.05
 
 
-def test_each_check_tells_its_reason(
+def test_each_check_names_its_reason(
     guard: Guard, ibg: rt.Surrogate, emulated: rt.Trajectories
 ) -> None:
     healthy = emulated.with_label("Healthy")
@@ -193,18 +193,18 @@ def test_each_check_tells_its_reason(
         "missing": {"mask": np.zeros_like(healthy.mask)},
     }
     for name, change in changes.items():
-        scores = guard.judge(ibg, healthy.replace(**change)).scores
+        scores = guard.assess(ibg, healthy.replace(**change)).scores
         assert (scores[:, CHECKS.index(name)] > 1).all(), name
     with pytest.raises(rt.InputError, match=r"trajectories\.inputs"):
-        guard.judge(ibg, healthy.replace(commands=np.zeros((len(healthy), 1000, 0)), inputs=None))
+        guard.assess(ibg, healthy.replace(commands=np.zeros((len(healthy), 1000, 0)), inputs=None))
 
 
 def test_the_same_seed_gives_the_same_guard(
-    updated: rt.CorrectedTwin, case: rt.Case, emulated: rt.Trajectories
+    exportable: rt.CorrectedTwin, case: rt.Case, emulated: rt.Trajectories
 ) -> None:
     short = Training(max_epochs=1, batch_size=32)
     one, two = (
-        fit_guard(updated, case, emulated, seed=4, count=45, training=short) for _ in range(2)
+        fit_guard(exportable, case, emulated, seed=4, count=45, training=short) for _ in range(2)
     )
     assert one.domain == two.domain
     weights = zip(one.state_dict().values(), two.state_dict().values(), strict=True)
@@ -212,10 +212,10 @@ def test_the_same_seed_gives_the_same_guard(
 
 
 def test_it_needs_something_healthy(
-    updated: rt.CorrectedTwin, case: rt.Case, emulated: rt.Trajectories
+    exportable: rt.CorrectedTwin, case: rt.Case, emulated: rt.Trajectories
 ) -> None:
     stuck = emulated.with_label("Motor_1_Stuck")
     with pytest.raises(rt.InputError, match="at least one healthy trajectory"):
-        fit_guard(updated, case, stuck, seed=0)
+        fit_guard(exportable, case, stuck, seed=0)
     with pytest.raises(rt.InputError, match="five generated ones per class"):
-        fit_guard(updated, replace(case), emulated, seed=0, count=20)
+        fit_guard(exportable, replace(case), emulated, seed=0, count=20)

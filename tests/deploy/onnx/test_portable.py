@@ -1,4 +1,4 @@
-"""The export says the same as torch, without torch."""
+"""The export computes the same as torch, without torch."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import subprocess
 import sys
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from time import process_time
 
 import numpy as np
 import onnx
 import pytest
 import torch
+from scipy.stats import kstest
 
 import retwin as rt
 from retwin.deploy.bundle.bundle import Bundle
@@ -36,7 +37,7 @@ portable, trajectories = Portable.load(sys.argv[1]), load(sys.argv[2])
 found = portable.predict(trajectories)
 made = portable.simulate(trajectories.commands, seed=0)
 np.savez(sys.argv[3], found=found.probabilities, scores=found.verdicts.scores, made=made.observed)
-assert not {"torch", "lightning", "sklearn"} & set(sys.modules), "torch was loaded"
+assert not {"torch", "sklearn"} & set(sys.modules), "torch was loaded"
 """
 
 
@@ -59,8 +60,8 @@ def test_it_predicts_the_same_in_a_process_without_torch(
     exported: Exported, bundle: Bundle, emulated: rt.Trajectories, tmp_path: Path
 ) -> None:
     rt.save(emulated, tmp_path / "real.npz")
-    told = [exported[0], tmp_path / "real.npz", tmp_path / "found.npz"]
-    subprocess.run([sys.executable, "-c", WITHOUT_TORCH, *map(str, told)], check=True)
+    arguments = [exported[0], tmp_path / "real.npz", tmp_path / "found.npz"]
+    subprocess.run([sys.executable, "-c", WITHOUT_TORCH, *map(str, arguments)], check=True)
     expected = bundle.predict(emulated)
     with np.load(tmp_path / "found.npz") as found:
         np.testing.assert_allclose(found["found"], expected.probabilities, atol=1e-5)
@@ -68,40 +69,101 @@ def test_it_predicts_the_same_in_a_process_without_torch(
         assert np.isfinite(found["made"]).all()
 
 
-def test_a_diagnosis_is_quick(portable: Portable, emulated: rt.Trajectories) -> None:
-    """Processor time of one trajectory, whatever else the machine does."""
-    times = []
-    for i in range(len(emulated)):
-        one = emulated[i : i + 1]
-        begin = process_time()
-        portable.predict(one)
-        times.append(process_time() - begin)
-    assert np.quantile(times, 0.9) < 5e-3
+def test_a_diagnosis_runs_each_graph_once(portable: Portable, emulated: rt.Trajectories) -> None:
+    """What makes it quick; its time depends on the machine, and benchmarks/bundle.py measures it.
+
+    The surrogate runs at every tenth sample only.
+    """
+    runs: list[str] = []
+    lengths: list[int] = []
+
+    def counted(name: str, **arrays: np.ndarray) -> np.ndarray:
+        runs.append(name)
+        if name == "surrogate":
+            lengths.append(arrays["commands"].shape[1])
+        return portable.graphs[name](**arrays)
+
+    graphs = {name: partial(counted, name) for name in portable.graphs}
+    replace(portable, graphs=graphs).predict(emulated[:1])
+    assert sorted(runs) == ["diagnoser", "features", "guard", "surrogate"]
+    assert lengths == [emulated.steps // 10]
 
 
-@pytest.mark.slow
-def test_it_simulates_by_the_same_law(
-    portable: Portable, updated: CorrectedTwin, case: rt.Case
+def noise_of_torch(twin: CorrectedTwin, count: int, movements: int, steps: int, seed: int):
+    """What `CorrectedTwin.simulate` draws for `count` trajectories, by the names of `Portable`."""
+    generator = torch.Generator().manual_seed(seed)
+    residual, sensor = twin.residual, twin.residual.correction.second
+    moves, size = (count, movements), len(residual.latent)
+    noise = {
+        "uniform": torch.rand(*moves, len(residual.sizes), generator=generator),
+        "segment_noise": torch.randn(*moves, size, generator=generator),
+        "trajectory_noise": torch.zeros(count, 1, size),
+    }
+    if residual.persistence.any():
+        noise["trajectory_noise"] = torch.randn(count, 1, size, generator=generator)
+    when = sensor.polls(count, steps, generator)
+    shape = *when.shape, len(twin.outputs)
+    level = torch.rand(shape, generator=generator, dtype=torch.float64).float()
+    noise |= {"phase": when[:, :1], "error_level": level}
+    noise |= {"glitch_level": torch.ones(*when.shape, 1), "glitch_noise": torch.zeros(shape)}
+    if sensor.glitch_rate:
+        noise["glitch_level"] = torch.rand(when.shape, generator=generator)[..., None]
+        noise["glitch_noise"] = torch.randn(shape, generator=generator)
+    return {name: values.numpy() for name, values in noise.items()}
+
+
+def test_the_same_noise_gives_the_same_outputs(
+    portable: Portable,
+    exportable: CorrectedTwin,
+    case: rt.Case,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Both draw the same noise, so whatever weights were trained, outputs differ by rounding.
+
+    Rounding itself is 2e-7, the same over three retrainings. It may also choose another mixture
+    component, or miss a segment or not: of 100 × 5 segments with at most 9 such choices each,
+    whose limits differ by 1e-7, that is 5e-4 expected trajectories. Two of them, where this test
+    fails, have a probability of 1e-7.
+    """
     assert isinstance(portable, rt.Twin)
-    commands = case.sampler.sample(200, rng=np.random.default_rng(3), timing=updated.timing)
-    faults = [case.faults["Motor_2_Stuck"], None] * 100
-    made, again, other = (
-        twin.simulate(commands, faults=faults, seed=9) for twin in (portable, portable, updated)
+    commands = case.sampler.sample(100, rng=np.random.default_rng(3), timing=exportable.timing)
+    faults = [case.faults["Motor_2_Stuck"], None] * 50
+    noise = noise_of_torch(exportable, 100, portable.facts.max_segments, commands.shape[1], seed=9)
+    monkeypatch.setattr(Portable, "_noise", lambda *_: noise)
+    made, other = (
+        twin.simulate(commands, faults=faults, seed=9) for twin in (portable, exportable)
     )
-    np.testing.assert_array_equal(made.observed, again.observed)
-    np.testing.assert_allclose(made.nominal, other.nominal, atol=1e-6)
     assert made.labels.tolist() == other.labels.tolist()
     assert made.emulated
-    for label in ("Stuck", "Healthy"):
-        sizes = [
-            np.quantile(np.abs(each.with_label(label).residual), [0.25, 0.5, 0.9], axis=(0, 1))
-            for each in (made, other)
-        ]
-        np.testing.assert_allclose(*sizes, rtol=0.15, atol=1e-4)
+    np.testing.assert_allclose(made.nominal, other.nominal, atol=1e-6)
+    differences = np.abs(made.observed - other.observed).max(axis=(1, 2))
+    assert np.sort(differences)[-2] < 1e-5
+    # What was compared is noise, and more than the tolerance.
+    assert np.abs(made.residual).max(axis=(1, 2)).min() > 1e-4
 
 
-def test_the_sensor_reads_as_the_operator_does(bundle: Bundle) -> None:
+def test_its_noise_is_uniform_and_normal(portable: Portable) -> None:
+    """All of it at once, by Kolmogorov and Smirnov; numpy's draws are the same on any machine."""
+    noise, again, other = (portable._noise(100, np.random.default_rng(seed)) for seed in (0, 0, 1))
+    for name, values in noise.items():
+        np.testing.assert_array_equal(values, again[name])
+    assert set(noise["phase"].flat) <= set(portable.sensor.phases)
+    known = {"uniform": "uniform", "error_level": "uniform", "glitch_level": "uniform"}
+    known |= {"segment_noise": "norm", "trajectory_noise": "norm", "glitch_noise": "norm"}
+    for name, distribution in known.items():
+        assert not np.array_equal(noise[name], other[name])
+        assert kstest(noise[name].ravel(), distribution).pvalue > 1e-3, name
+
+
+def test_the_same_seed_simulates_the_same(portable: Portable, emulated: rt.Trajectories) -> None:
+    made, again, other = (
+        portable.simulate(emulated.commands[:3], seed=seed).observed for seed in (9, 9, 10)
+    )
+    np.testing.assert_array_equal(made, again)
+    assert np.abs(made - other).max(axis=(1, 2)).min() > 0
+
+
+def test_the_sensor_records_as_the_operator_does(bundle: Bundle) -> None:
     fitted = bundle.twin.residual.correction.second
     sensor = replace(fitted, steps=(0.001, 0.0, 0.002), glitch_rate=0.3)
     outputs = torch.randn(6, 1000, 3, generator=torch.Generator().manual_seed(0))
@@ -112,9 +174,9 @@ def test_the_sensor_reads_as_the_operator_does(bundle: Bundle) -> None:
     phase = choice[torch.randint(len(choice), (6,), generator=generator)][:, None]
     shape = 6, -(-1000 // sensor.every), 3
     level = torch.rand(shape, generator=generator, dtype=torch.float64).float()
-    chance = torch.rand(shape[:2], generator=generator)[..., None]
-    glitch = torch.randn(shape, generator=generator)
-    made = SensorGraph(sensor, 3)(outputs, phase, level, chance, glitch)
+    glitch_level = torch.rand(shape[:2], generator=generator)[..., None]
+    glitch_noise = torch.randn(shape, generator=generator)
+    made = SensorGraph(sensor, 3)(outputs, phase, level, glitch_level, glitch_noise)
     torch.testing.assert_close(made, expected, atol=2e-5, rtol=0)
 
 
@@ -127,7 +189,7 @@ def test_features_are_those_of_the_diagnoser(emulated: rt.Trajectories, hidden: 
     torch.testing.assert_close(FeaturesGraph(features)(*arrays), features(seen))
 
 
-def test_what_it_was_not_made_for_is_refused(
+def test_other_lengths_rates_and_folders_are_refused(
     portable: Portable,
     bundle: Bundle,
     emulated: rt.Trajectories,
@@ -138,14 +200,14 @@ def test_what_it_was_not_made_for_is_refused(
         **{name: getattr(emulated, name)[:2, :500] for name in ("commands", "nominal", "observed")},
         mask=None,
     )
-    with pytest.raises(rt.InputError, match="1000 samples and at most 5 movements"):
+    with pytest.raises(rt.InputError, match="1000 samples and at most 5 segments"):
         portable.predict(short)
     with pytest.raises(rt.InputError, match=r"trajectories\.rate"):
         portable.predict(emulated.replace(rate=50.0))
     restless = 500 + 50 * np.sign(np.sin(np.arange(1000) / 20))[None, :, None] * np.ones(4)
-    with pytest.raises(rt.InputError, match="at most 5 movements"):
+    with pytest.raises(rt.InputError, match="at most 5 segments"):
         portable.simulate(restless, seed=0)
-    with pytest.raises(rt.InputError, match="expected a portable of schema 1"):
+    with pytest.raises(rt.InputError, match="expected a portable of schema 2"):
         bundle.save(tmp_path / "bundle")
         Portable.load(tmp_path / "bundle")
 
@@ -269,8 +331,21 @@ def test_a_damaged_export_is_refused(exported: Exported, tmp_path: Path) -> None
     for name in ("kind", "schema", "faults", "steps", "inputs", "rate", "domain", "sensor"):
         (folder / "model.json").write_text(json.dumps(about | {name: [[]]}))
         seal(folder)
-        with pytest.raises(rt.InputError, match=r"ONNX export|schema 1"):
+        with pytest.raises(rt.InputError, match=r"ONNX export|schema 2"):
             Portable.load(folder)
+
+
+def test_an_export_of_schema_1_names_the_command_that_makes_it_anew(
+    exported: Exported, call, emulated: rt.Trajectories, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(exported[0], tmp_path / "copy"))
+    about = json.loads((folder / "model.json").read_text())
+    (folder / "model.json").write_text(json.dumps(about | {"schema": 1}))
+    seal(folder)
+    rt.save(emulated, tmp_path / "real.npz")
+    code, out, err = call("bundle", "predict", folder, tmp_path / "real.npz")
+    assert (code, out) == (2, "")
+    assert "got 'portable' of schema 1; make it anew with retwin bundle export" in err
 
 
 def test_what_has_no_graph_is_named(bundle: Bundle, tmp_path: Path) -> None:
@@ -329,9 +404,9 @@ def test_the_commands_export_and_predict(
         assert len(rows) == 1 + len(emulated)
         assert call(*odd)[0] == 0
     words = ("bundle", "export", saved, "--onnx", tmp_path / "again", "--json")
-    told = json.loads(call(*words)[1])
-    assert told.keys() == {"saved", "differences"}
-    assert max(told["differences"].values()) < 0.01
+    printed = json.loads(call(*words)[1])
+    assert printed.keys() == {"saved", "differences"}
+    assert max(printed["differences"].values()) < 0.01
     code, _, err = call("bundle", "export", exported[0], "--onnx", tmp_path / "out")
     assert code == 2
     assert "expected a bundle of schema 1" in err

@@ -46,7 +46,7 @@ CASE = rt.Case(
         level, rt.Channels.numbered("u", 4, "%"), rt.Channels.numbered("y", 1, "m"), RATE
     ),
     emulator=None,
-    sampler=RampSampler((0.0,) * 4, (100.0,) * 4, movements=3, steps=STEPS, ramps=(800, 1600)),
+    sampler=RampSampler((0.0,) * 4, (100.0,) * 4, segments=3, steps=STEPS, ramps=(800, 1600)),
     correction=Additive(),
     output_correction=Additive(),
     sensor_rate=10.0,
@@ -60,7 +60,7 @@ def plan(n: int) -> SimulationPlan:
 
 
 def learn(data: Path, out: Path) -> None:
-    """A surrogate and a classifier, and what the latter says of all that it has seen."""
+    """Fit a surrogate and a classifier, and diagnose the whole training set."""
     made = rt.load(data, case=CASE)
     surrogate = rt.fit_surrogate(made, CASE.network, seed=0, training=BRIEF)
     diagnoser = rt.fit_diagnoser(made, seed=0, rate=CASE.sensor_rate, training=OF_CLASSES)

@@ -79,7 +79,7 @@ def test_blocks_change_nothing(sets: dict[str, Path], monkeypatch: pytest.Monkey
     found = []
     for block in (2**24, 10**5):
         monkeypatch.setattr(arrays, "BLOCK", block)
-        monkeypatch.setattr(surrogate, "SAMPLES", 5000)
+        monkeypatch.setattr(surrogate, "MAX_SAMPLES", 5000)
         network = rt.fit_surrogate(made, rt.MLP((4,)), seed=0, training=plant.BRIEF)
         diagnoser = rt.fit_diagnoser(made, seed=0, rate=1.0, training=plant.BRIEF)
         weights = [*network.state_dict().values(), *diagnoser.state_dict().values()]
@@ -92,7 +92,7 @@ def test_a_network_with_memory_learns_from_a_part(
     sets: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = rt.load(sets["small"])
-    monkeypatch.setattr(surrogate, "WINDOWED", 3 * plant.STEPS + 1)
+    monkeypatch.setattr(surrogate, "MAX_SEQUENCE_SAMPLES", 3 * plant.STEPS + 1)
     commands, nominal, there = surrogate._windows(made, np.array([5, 3, 8, 1]), 0)
     np.testing.assert_array_equal(commands, made.commands[[5, 3, 8]])
     np.testing.assert_array_equal(nominal, made.nominal[[5, 3, 8]])
@@ -105,7 +105,7 @@ def test_standardised_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     values = torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)) * 5 + 100
     values[:, 2] = 7.0
     whole = Standardise(3).fit(values)
-    monkeypatch.setattr("retwin.nets.networks.BLOCK", 70)
+    monkeypatch.setattr("retwin.nets.networks.ROWS_PER_BLOCK", 70)
     parts = Standardise(3).fit(values.view(10, 100, 3))
     np.testing.assert_allclose(parts.mean, values.double().mean(0), rtol=1e-6)
     np.testing.assert_allclose(parts.scale[:2], values.double().std(0, correction=0)[:2], rtol=1e-6)

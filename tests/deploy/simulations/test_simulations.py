@@ -1,4 +1,4 @@
-"""Scale: the same bytes however it is done, nothing done twice, nothing lost, nothing hidden."""
+"""Simulations to Zarr: the same bytes in every mode, nothing repeated, lost or hidden."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from retwin.twins.samplers import RampSampler
 from retwin.twins.twin import Chunk, SimulationError, simulate_in_chunks
 
 FAULTS = {"Healthy": None, "Stuck": rt.Stuck(0, 3), "Biased": rt.ActuatorBias(1)}
-SAMPLER = RampSampler((0.0, 0.0), (100.0, 100.0), movements=2, steps=30, ramps=(3, 5))
+SAMPLER = RampSampler((0.0, 0.0), (100.0, 100.0), segments=2, steps=30, ramps=(3, 5))
 
 
 VOLTAGES = rt.Channels(("a", "b"), ("V", "V"))
@@ -95,11 +95,11 @@ def calls(folder: Path) -> dict[str, int]:
 
 
 def test_every_trajectory_is_what_its_twin_says(tmp_path: Path) -> None:
-    told: list[float] = []
-    done = simulate_to(tmp_path / "a.zarr", plan(), progress=told.append, workers=1)
+    shares: list[float] = []
+    done = simulate_to(tmp_path / "a.zarr", plan(), progress=shares.append, workers=1)
     assert done == Simulated(tmp_path / "a.zarr", 95, {})
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
     assert os.listdir(tmp_path) == ["a.zarr"]
     made = rt.load(tmp_path / "a.zarr")
     assert made.labels.tolist() == (32 * ["Healthy", "Stuck", "Biased"])[:95]
@@ -183,7 +183,7 @@ def clean(whole: dict[str, Any]) -> Path:
 SCRIPT = """
 import sys
 sys.path.insert(0, {tests!r})
-from test_scale import Toy, plan
+from test_simulations import Toy, plan
 from retwin.deploy.simulations import simulate_to
 if __name__ == "__main__":
     twin = Toy({calls!r}, pause=0.1, fails_above=90.0)
@@ -285,9 +285,9 @@ def test_ctrl_c_leaves_what_is_finished(tmp_path: Path, whole: dict[str, Any]) -
         simulate_to(tmp_path / "a.zarr", whole["plan"], workers=1, progress=interrupt)
     finished = len(list((tmp_path / "a.zarr.part/done").iterdir()))
     assert 0 < finished < 12
-    told: list[float] = []
-    simulate_to(tmp_path / "a.zarr", whole["plan"], workers=1, progress=told.append)
-    assert told[0] == pytest.approx(finished * 8 / 95)
+    shares: list[float] = []
+    simulate_to(tmp_path / "a.zarr", whole["plan"], workers=1, progress=shares.append)
+    assert shares[0] == pytest.approx(finished * 8 / 95)
     assert sha256(tmp_path / "a.zarr") == whole["sha256"]
     assert sum(calls(folder).values()) <= 13
 
@@ -422,9 +422,9 @@ def test_rows_of_a_large_folder(tmp_path: Path) -> None:
 def test_a_newer_schema_is_refused(tmp_path: Path) -> None:
     simulate_to(tmp_path / "a.zarr", plan(n=3))
     file = tmp_path / "a.zarr" / "zarr.json"
-    told = json.loads(file.read_text())
-    told["attributes"]["retwin"]["schema"] = 3
-    file.write_text(json.dumps(told))
+    header = json.loads(file.read_text())
+    header["attributes"]["retwin"]["schema"] = 3
+    file.write_text(json.dumps(header))
     with pytest.raises(rt.InputError, match="schema 2 or older, got schema 3; upgrade"):
         rt.load(tmp_path / "a.zarr")
 
@@ -439,7 +439,7 @@ def test_a_newer_schema_is_refused(tmp_path: Path) -> None:
         ("another chunk", {"chunk": 9}),
         ("another n", {"n": 96}),
         ("another twin", {"twin": Toy(fails_above=1e3)}),
-        ("another commands", {"commands": replace(SAMPLER, movements=1)}),
+        ("another commands", {"commands": replace(SAMPLER, segments=1)}),
         ("another faults", {"faults": dict(reversed(FAULTS.items()))}),
         ("another clip, dtype", {"clip": True, "dtype": "float64"}),
     ],
@@ -467,7 +467,7 @@ def test_another_plan_is_refused(tmp_path: Path, match: str, changes: dict[str, 
         ("seed: ", {"seed": -1}),
         ("chunk: ", {"chunk": 0}),
         ("dtype: ", {"dtype": "int8"}),
-        ("faults: expected at least one class", {"faults": {}}),
+        ("faults: expected at least 1 class", {"faults": {}}),
         (r"commands: expected numbers of shape \(n, T, 2\)", {"commands": np.zeros((3, 30, 3))}),
         ("commands: expected finite", {"commands": np.full((3, 30, 2), np.nan)}),
         ("a from 0 to 100 V", {"commands": np.full((3, 30, 2), 101.0)}),
@@ -565,7 +565,8 @@ def test_what_a_twin_raises_tells_where(
     leaking = plan(twin=Leaking(fails_above=9.0), commands=given(12), n=None, chunk=4)
     with pytest.raises(kind, match="valve 3 leaks") as caught:
         simulate_to(tmp_path / "a.zarr", leaking, workers=workers)
-    assert re.fullmatch(r".*test_scale\.py:\d+, in trajectories 8 to 11", caught.value.__notes__[0])
+    (note,) = caught.value.__notes__
+    assert re.fullmatch(r".*test_simulations\.py:\d+, in trajectories 8 to 11", note)
     assert (tmp_path / "a.zarr.part").exists(), "it may go on when the twin is mended"
 
 
@@ -577,7 +578,7 @@ def test_bad_places_and_calls(tmp_path: Path) -> None:
 
     refused(r"\.npz or \.zarr", "a.csv")
     refused("at least 1", "a.zarr", workers=0)
-    refused("or none said with a scheduler", "a.zarr", workers=2, scheduler="tcp://nowhere:1")
+    refused("or None with a scheduler", "a.zarr", workers=2, scheduler="tcp://nowhere:1")
     refused("with workers", "a.npz", workers=2)
     refused("for more than 512 MB", "a.npz", plan=plan(n=10**7))
     refused("one trajectory per command", "a.zarr", plan=plan(twin=Short()))
@@ -648,7 +649,7 @@ CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
 
 
 def test_a_mujoco_twin_is_known_by_all_its_files(tmp_path: Path) -> None:
-    def told(arm: str, height: int) -> str:
+    def identity_of(arm: str, height: int) -> str:
         (tmp_path / "arm.xml").write_text(arm)
         corners = (f"v {x} {y} {height * z}\n" for x, y, z in CORNERS)
         (tmp_path / "box.obj").write_text("".join(corners))
@@ -657,9 +658,13 @@ def test_a_mujoco_twin_is_known_by_all_its_files(tmp_path: Path) -> None:
         return identity(twins.get(str(tmp_path / "model.xml"), outputs=["arm"]))
 
     (tmp_path / "model.xml").write_text(MODEL)
-    made = [told(ARM, 1), told(ARM.replace('mass="1"', 'mass="2"'), 1), told(ARM, 2)]
+    made = [
+        identity_of(ARM, 1),
+        identity_of(ARM.replace('mass="1"', 'mass="2"'), 1),
+        identity_of(ARM, 2),
+    ]
     assert len(set(made)) == 3
-    assert told(ARM, 1) == made[0]
+    assert identity_of(ARM, 1) == made[0]
 
 
 def test_identity_is_the_same_in_another_process(tmp_path: Path, network: rt.Surrogate) -> None:
@@ -669,13 +674,12 @@ def test_identity_is_the_same_in_another_process(tmp_path: Path, network: rt.Sur
         "case = rt.cases.armpi();"
         "print(*map(identity, (rt.Surrogate.load(sys.argv[1]), case.sampler, case.twin.physics)))"
     )
-    told = subprocess.run(
+    done = subprocess.run(
         [sys.executable, "-c", code, tmp_path / "model"], check=True, capture_output=True, text=True
     )
     case = rt.cases.armpi()
     parts = (rt.Surrogate.load(tmp_path / "model"), case.sampler, case.twin.physics)
-    mine = [identity(part) for part in parts]
-    assert told.stdout.split() == mine
+    assert done.stdout.split() == [identity(part) for part in parts]
 
 
 def test_workers_work_alone() -> None:

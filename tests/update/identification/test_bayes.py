@@ -25,7 +25,7 @@ from retwin.update.identification import (
     calibration_ranks,
     identify_bayes,
 )
-from retwin.update.identification.bayes import OUTSIDE
+from retwin.update.identification.bayes import SIGNIFICANCE
 from retwin.update.identification.summaries import Summaries
 
 WHITE = Noise(discrepancy=False)
@@ -60,7 +60,7 @@ def test_chains_find_the_posterior_of_the_linear_gaussian_model(
     assert (np.abs(chains.samples.mean(axis=0) - mean) < margin).all()
     assert chains.samples.std(axis=0) == pytest.approx(deviation, rel=0.12)
     assert chains.scales["noise"].mean() == pytest.approx(0.43, abs=0.03)
-    assert OUTSIDE < chains.misspecified <= 1, "no warning of data that the model did make"
+    assert SIGNIFICANCE < chains.misspecified <= 1, "no warning of data that the model did make"
     low, high = chains.interval(0.9)["a"]
     assert high - low == pytest.approx(2 * 1.645 * deviation[0], rel=0.15)
 
@@ -176,6 +176,14 @@ def test_bands_of_the_updated_twin_hold_held_out_trajectories() -> None:
         fidelity.observed <= fidelity.bands[:, -1]
     )
     assert inside.mean() == pytest.approx(0.9, abs=0.04)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_the_draws_from_the_prior_can_be_all_simulations(observed: rt.Trajectories) -> None:
+    method = NPE(simulations=50, rounds=1, samples=100, max_epochs=1)
+    found = identify_bayes(FAST, observed, seed=0, method=method, noise=WHITE)
+    assert found.figures["kept"] == 200
+    assert len(found.samples) == 100
 
 
 def test_bad_input_is_named(observed: rt.Trajectories, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""The RG per time step on a toy of known law: a filter of the input plus an autoregression."""
+"""The RG per sample on a toy of known distribution: a filtered input plus an autoregression."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from retwin.nets.training import Training
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive
 from retwin.update.residual import SequenceMixture, SequenceResidual, fit_residual, load_residual
-from retwin.update.residual.sequence import trusted
-from retwin.update.residual.sequence_fitting import held_parts
+from retwin.update.residual.sequence import shrunk
+from retwin.update.residual.sequence_fitting import held_out_parts
 
 STEPS = 800
 PERSISTENCE, SPREAD = 0.8, 0.2
@@ -39,7 +39,7 @@ def commands_of(n: int, seed: int) -> np.ndarray:
     return lfilter([0.5], [1, -0.85], white, axis=1).astype(np.float32)
 
 
-def gap(commands: np.ndarray) -> np.ndarray:
+def true_discrepancy(commands: np.ndarray) -> np.ndarray:
     """What the toy's twin lacks: a lag of the input, (n, T, 1)."""
     return lfilter([0.3], [1, -0.7], commands, axis=1)
 
@@ -49,7 +49,9 @@ def measured(twin: rt.Surrogate, n: int, seed: int) -> rt.Trajectories:
     white = np.random.default_rng(seed + 1).normal(size=(n, STEPS, 1))
     noise = SPREAD * lfilter([np.sqrt(1 - PERSISTENCE**2)], [1, -PERSISTENCE], white, axis=1)
     made = twin.simulate(commands, seed=0)
-    return made.replace(observed=made.nominal + (gap(commands) + noise).astype(np.float32))
+    return made.replace(
+        observed=made.nominal + (true_discrepancy(commands) + noise).astype(np.float32)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -73,18 +75,26 @@ def rg(twin: rt.Surrogate, record: rt.Trajectories) -> SequenceResidual:
     return fit_residual(twin, record, Additive(), SMALL, seed=0)
 
 
-def test_one_record_teaches_the_gap(twin: rt.Surrogate, rg: SequenceResidual) -> None:
-    """On inputs it has not seen, it errs by less than a third of the gap."""
+def test_one_record_teaches_the_discrepancy(twin: rt.Surrogate, rg: SequenceResidual) -> None:
+    """On inputs it has not seen, its error is below a quarter of the discrepancy.
+
+    Over 12 retrainings the ratio is 0.130, standard deviation 0.007.
+    """
     commands = commands_of(5, 99)
     z = rg.mean(rg.context(twin, commands)).numpy()
-    error = np.sqrt(np.square(z - gap(commands)).mean())
-    assert error < 0.25 * gap(commands).std()
+    error = np.sqrt(np.square(z - true_discrepancy(commands)).mean())
+    assert error < 0.25 * true_discrepancy(commands).std()
     assert float(rg.trust) > 0.9
 
 
-def test_draws_have_the_law_and_the_memory_of_the_noise(
+def test_draws_have_the_distribution_and_the_autocorrelation_of_the_noise(
     twin: rt.Surrogate, rg: SequenceResidual
 ) -> None:
+    """The limits are eight standard deviations away from what 12 retrainings give.
+
+    The spread is 0.202 with a standard deviation of 0.009; the autocorrelation, drawn as well as
+    fitted, 0.767 with one of 0.010.
+    """
     commands = np.repeat(commands_of(1, 98), 300, axis=0)
     context = rg.context(twin, commands)
     draws = rg.sample(context, generator=torch.Generator().manual_seed(0)).numpy()[..., 0]
@@ -96,6 +106,10 @@ def test_draws_have_the_law_and_the_memory_of_the_noise(
 
 
 def test_bands_hold_records_it_has_not_seen(twin: rt.Surrogate, rg: SequenceResidual) -> None:
+    """Over 12 retrainings the coverage is 0.880, standard deviation 0.0135: limits at six of them.
+
+    On held-out parts it is 0.909, standard deviation 0.007.
+    """
     fresh = measured(twin, 5, 50)
     inside = []
     for i in range(len(fresh)):
@@ -104,11 +118,11 @@ def test_bands_hold_records_it_has_not_seen(twin: rt.Surrogate, rg: SequenceResi
         low, high = np.quantile(draws, [0.05, 0.95], axis=0)
         z = fresh.residual[i]
         inside.append((low <= z) & (z <= high))
-    assert 0.82 < np.mean(inside) < 0.98
+    assert 0.80 < np.mean(inside) < 0.96
     assert 0.82 < rg.fitted.figures["coverage90"] < 0.98
 
 
-def test_a_gap_that_the_past_does_not_tell_is_not_believed(twin: rt.Surrogate) -> None:
+def test_a_discrepancy_that_the_past_does_not_predict_is_not_trusted(twin: rt.Surrogate) -> None:
     """One slow wave beside the input: members learn it by heart, and it holds nowhere else."""
     made = twin.simulate(commands_of(1, 20), seed=0)
     wave = np.sin(np.arange(STEPS) / 60)[None, :, None].astype(np.float32)
@@ -121,14 +135,14 @@ def test_a_gap_that_the_past_does_not_tell_is_not_believed(twin: rt.Surrogate) -
     assert z.std() < 0.4 * wave.std()
 
 
-def test_trust_is_a_share_of_the_way_and_leaves_the_shape() -> None:
-    law = GaussianMixture(
+def test_trust_shrinks_the_mean_and_leaves_the_shape() -> None:
+    mixture = GaussianMixture(
         torch.tensor([0.0, 0.0]), torch.tensor([[1.0], [5.0]]), torch.ones(2, 1, 1)
     )
-    (half,) = trusted([law], [torch.tensor([1.0])], [torch.tensor([0.5])])
+    (half,) = shrunk([mixture], [torch.tensor([1.0])], [torch.tensor([0.5])])
     torch.testing.assert_close(half.mean, torch.tensor([2.0]))
-    torch.testing.assert_close(half.means, law.means - 1.0)
-    torch.testing.assert_close(half.variance, law.variance)
+    torch.testing.assert_close(half.means, mixture.means - 1.0)
+    torch.testing.assert_close(half.variance, mixture.variance)
 
 
 def test_without_persistence_draws_are_white(twin: rt.Surrogate, record: rt.Trajectories) -> None:
@@ -148,10 +162,14 @@ def test_without_persistence_draws_are_white(twin: rt.Surrogate, record: rt.Traj
     assert not rg.persistence.any()
 
 
-def test_the_law_is_a_density(twin: rt.Surrogate, rg: SequenceResidual) -> None:
-    law = rg(rg.context(twin, commands_of(1, 5)[:, :50]))
+def test_the_distribution_is_a_density(twin: rt.Surrogate, rg: SequenceResidual) -> None:
+    distribution = rg(rg.context(twin, commands_of(1, 5)[:, :50]))
     grid = torch.linspace(-8, 8, 4001)
-    total = torch.stack([law.log_prob(v.expand(1, 50, 1)) for v in grid]).exp().sum(0) * 16 / 4000
+    total = (
+        torch.stack([distribution.log_prob(v.expand(1, 50, 1)) for v in grid]).exp().sum(0)
+        * 16
+        / 4000
+    )
     torch.testing.assert_close(total, torch.ones(1, 50), atol=1e-3, rtol=0)
 
 
@@ -182,11 +200,11 @@ def test_what_is_not_measured_does_not_count(twin: rt.Surrogate, record: rt.Traj
 
 
 def test_parts_are_held_out_once_and_by_whole_records_where_there_are_enough() -> None:
-    one = held_parts(torch.ones(1, 1000, dtype=torch.bool), SequenceMixture())
+    one = held_out_parts(torch.ones(1, 1000, dtype=torch.bool), SequenceMixture())
     assert (one.sum(dim=0) == 1).all()
     assert one.flatten(1).any(dim=1).all()
     every = torch.ones(12, 100, dtype=torch.bool)
-    several = held_parts(every, SequenceMixture(members=4))
+    several = held_out_parts(every, SequenceMixture(members=4))
     assert (several.all(dim=2) == several.any(dim=2)).all()
     assert (several.any(dim=2).sum(dim=1) == 3).all()
 
@@ -204,10 +222,11 @@ def test_the_corrected_twin_takes_it(
     assert first.observed.tobytes() != updated.simulate(commands, seed=5).observed.tobytes()
     assert load_residual(tmp_path / "model" / "residual").fitted == rg.fitted
     mean = replace(updated, random=False).simulate(commands, seed=4)
-    assert mean.observed.std() < first.observed.std()
+    np.testing.assert_allclose(mean.residual, rg.mean(rg.context(twin, commands)), atol=1e-6)
 
 
 def test_its_fidelity_is_measured(twin: rt.Surrogate, rg: SequenceResidual) -> None:
+    """Over 12 retrainings: coverage 0.903, standard deviation 0.011; CRPS 0.287 below, 0.003."""
     found = rt.measure_fidelity(CorrectedTwin(twin, rg), measured(twin, 3, 70), draws=40, seed=0)
     assert 0.75 < found.figures["coverage90"].value <= 1.0
     assert found.figures["crps_below/mean_only"].value > 0.1

@@ -1,4 +1,4 @@
-"""`animate`: one trajectory as a film, the nominal motion as a ghost of the observed one."""
+"""`animate`: a film of one trajectory, the nominal motion as a translucent ghost."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from retwin.cases.animation.film import check_film, write_film
 from retwin.cases.animation.scene import mujoco_pictures
 from retwin.cases.animation.shots import Pictures, Shots
 from retwin.cases.animation.sticks import stick_pictures
+from retwin.checks import finite, one_of, require
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically
 
-if TYPE_CHECKING:  # a case loads torch, which the worker that draws need not wait for
+if TYPE_CHECKING:  # a case loads torch, which the worker that draws does not need
     from retwin.cases.case import Body, Case
 
 __all__ = ["Renderer", "animate"]
@@ -41,31 +42,42 @@ def animate(
     renderer: Renderer = "auto",
     progress: Progress | None = None,
 ) -> Path:
-    """Film one trajectory to `path`, *.mp4 or *.gif, in real time and without a screen.
+    """Film one trajectory in real time, without a screen.
 
-    The nominal motion is a translucent ghost, the observed one solid; lines trace their tips. Only
-    outputs are measured: the observed pose is the nearest to the nominal one that explains them, an
-    inference and not a measurement. MuJoCo draws in a worker process, so a script calls this under
-    `if __name__ == "__main__":`.
+    The nominal motion is a translucent ghost, the observed motion is solid; lines trace the paths
+    of their tips. Only outputs are measured: the observed pose is an inference, the pose nearest to
+    the nominal one that explains the outputs. MuJoCo draws in a worker process, so a script calls
+    this under `if __name__ == "__main__":`.
 
     Parameters
     ----------
-    trajectories: any set of the case; commands that it lacks are recovered.
-    case: it must have a `body`.
-    index: which trajectory, by place or by id.
-    fps: pictures per second, 1 … 100.
-    size: width and height in pixels, even numbers from 160 to 4096.
-    renderer: "mujoco" draws the body's model, "stick" its skeleton with matplotlib; "auto" takes
-        MuJoCo where it can, else sticks, with a warning that says what is missing.
-    progress: called with the share done.
+    trajectories : Trajectories
+        A set of the case; missing commands are recovered.
+    case : Case
+        A case with a `body`.
+    path : str or path-like
+        The film, *.mp4 or *.gif.
+    index : int or str, default 0
+        The trajectory, by position or by id.
+    fps : float, default 25.0
+        Frames per second, from 1 to 100.
+    size : (int, int), default (640, 480)
+        Width and height in pixels, even numbers from 160 to 4096.
+    renderer : {"auto", "mujoco", "stick"}
+        "mujoco" draws the body's model, "stick" its skeleton with matplotlib. "auto" takes MuJoCo
+        where it is available, else the skeleton, with a warning that names what is missing.
+    progress : callable, optional
+        Called with the finished fraction.
 
     Returns
     -------
-    The film, written whole or not at all.
+    Path
+        The film, which is written completely or not at all.
 
     Raises
     ------
-    InputError: no such trajectory, a case without a body, another suffix, a size or rate out of
+    InputError
+        No such trajectory, a case without a body, another suffix, a size or frame rate out of
         range, MP4 without the extra `render`, or "mujoco" where it cannot draw.
 
     """
@@ -79,41 +91,31 @@ def animate(
         write_atomically(target) as part,
         _pictures(shots, body, size, renderer) as pictures,
     ):
-        told = _told(pictures, len(shots), progress)
-        write_film(captioned(told, shots), part, suffix, fps=fps, size=size)
+        reported = _reported(pictures, len(shots), progress)
+        write_film(captioned(reported, shots), part, suffix, fps=fps, size=size)
     return target
 
 
 def _check(fps: float, size: tuple[int, int], renderer: str) -> None:
-    if not 1 <= fps <= 100:
-        raise InputError(
-            "fps",
-            expected="1 to 100 pictures per second",
-            got=repr(fps),
-            remedy="25 is usual",
-        )
+    """Refuse settings out of range."""
+    finite("fps", fps, least=1, most=100, unit="frames per second", remedy="25 is common")
     # Video codecs halve the resolution of colour.
-    if any(not 160 <= side <= 4096 or side % 2 for side in size):
-        raise InputError(
-            "size",
-            expected="an even width and height from 160 to 4096 pixels",
-            got=f"{size[0]}x{size[1]}",
-            remedy="640x480 is usual",
-        )
-    if renderer not in get_args(Renderer):
-        raise InputError(
-            "renderer",
-            expected=" or ".join(get_args(Renderer)),
-            got=repr(renderer),
-            remedy="leave it out to have one chosen",
-        )
+    require(
+        all(160 <= side <= 4096 and side % 2 == 0 for side in size),
+        "size",
+        expected="an even width and height from 160 to 4096 pixels",
+        got=f"{size[0]}x{size[1]}",
+        remedy="640x480 is common",
+    )
+    one_of("renderer", renderer, get_args(Renderer), remedy="leave it out to have one chosen")
 
 
 def _body_of(case: Case) -> Body:
+    """The body of the case, or an InputError."""
     if case.body is None:
         raise InputError(
             "case",
-            expected="a case with a body, which says what can be drawn",
+            expected="a case with a body, which can be drawn",
             got=f"{case.name}, which has none",
             remedy="give the Case a body",
         )
@@ -122,31 +124,31 @@ def _body_of(case: Case) -> Body:
 
 def _chosen(trajectories: Trajectories, case: Case, index: int | str) -> Trajectories:
     """The one trajectory at `index`."""
-    if trajectories.outputs != case.outputs:
-        raise InputError(
-            "trajectories",
-            expected=f"outputs {list(case.outputs.names)}, as the case {case.name} has",
-            got=str(list(trajectories.outputs.names)),
-            remedy="give the case that the data belong to",
-        )
+    require(
+        trajectories.outputs == case.outputs,
+        "trajectories",
+        expected=f"outputs {list(case.outputs.names)}, as the case {case.name} has",
+        got=list(trajectories.outputs.names),
+        remedy="give the case that the data belong to",
+    )
     ids = trajectories.ids.tolist()
-    known = f"a place from 0 to {len(ids) - 1}" if ids else "a set that is not empty"
+    expected = f"a position from 0 to {len(ids) - 1}" if ids else "a set that is not empty"
     if isinstance(index, str):
         if index in ids:
             return trajectories[[ids.index(index)]]
-        known = f"one of {len(ids)} ids ({', '.join(ids[:3])}{', …' if len(ids) > 3 else ''})"
+        expected = f"one of {len(ids)} ids ({', '.join(ids[:3])}{', …' if len(ids) > 3 else ''})"
     elif 0 <= index < len(ids):
         return trajectories[[index]]
     raise InputError(
         "index",
-        expected=known,
+        expected=expected,
         got=repr(index),
-        remedy="`retwin data info FILE` says how many there are",
+        remedy="`retwin data info FILE` lists them",
     )
 
 
 def _shots(one: Trajectories, body: Body, fps: float) -> Shots:
-    """What every picture shows."""
+    """Poses and skeletons at the times of the frames."""
     count = 1 + int((one.steps - 1) / one.rate * fps + 1e-9)
     seconds = np.arange(count) / fps
     at = np.minimum(np.round(seconds * one.rate).astype(int), one.steps - 1)
@@ -164,7 +166,7 @@ def _shots(one: Trajectories, body: Body, fps: float) -> Shots:
 
 @contextmanager
 def _pictures(shots: Shots, body: Body, size: tuple[int, int], renderer: str) -> Iterator[Pictures]:
-    """The pictures, by the renderer that was asked for, or the best that can be had."""
+    """The pictures of the chosen renderer, or of the best one that is available."""
     if renderer == "stick":
         yield stick_pictures(shots, size)
         return
@@ -179,7 +181,8 @@ def _pictures(shots: Shots, body: Body, size: tuple[int, int], renderer: str) ->
         yield found
 
 
-def _told(pictures: Pictures, count: int, progress: Progress | None) -> Iterator[NDArray]:
+def _reported(pictures: Pictures, count: int, progress: Progress | None) -> Iterator[NDArray]:
+    """The same pictures; reports progress after each of them."""
     for i, picture in enumerate(pictures):
         yield picture
         if progress is not None:

@@ -1,4 +1,4 @@
-"""Captions: what the film shows, written on every picture."""
+"""Captions: title, time and legend on every picture of a film."""
 
 from __future__ import annotations
 
@@ -23,7 +23,21 @@ ALARM = (143, 45, 0)
 
 
 def captioned(pictures: Pictures, shots: Shots) -> Iterator[NDArray]:
-    """The pictures with title, time and legend; emulated data say so."""
+    """Add captions to pictures.
+
+    Parameters
+    ----------
+    pictures : iterable of ndarray, shape (height, width, 3)
+        One picture per frame.
+    shots : Shots
+        The frames.
+
+    Yields
+    ------
+    ndarray, shape (height, width, 3)
+        The picture with title, time and legend, and a note where data are emulated.
+
+    """
     from PIL import Image, ImageDraw
 
     for second, picture in zip(shots.seconds, pictures, strict=True):
@@ -33,6 +47,7 @@ def captioned(pictures: Pictures, shots: Shots) -> Iterator[NDArray]:
 
 
 def _write(draw: ImageDraw, size: tuple[int, int], shots: Shots, second: float) -> None:
+    """Draw the captions of one frame."""
     width, height = size
     text = max(9, round(min(width / 44, height / 31)))
     margin = text
@@ -42,17 +57,18 @@ def _write(draw: ImageDraw, size: tuple[int, int], shots: Shots, second: float) 
     if shots.emulated:
         draw.text((margin, margin + 1.5 * text), "EMULATED: no real measurements", ALARM, title)
     line = height - margin
-    for colour, words in (
+    for colour, text_line in (
         (SOLID, "observed: only the tip is measured, the pose is the nearest to the nominal"),
         (GHOST, "nominal (ghost)"),
     ):
         mark = (margin, line - 0.5 * text, margin + 1.4 * text, line - 0.25 * text)
         draw.rectangle(mark, fill=tuple(round(255 * part) for part in colour))
-        draw.text((margin + 2 * text, line), words, MUTED, _font(0.9 * text), anchor="ls")
+        draw.text((margin + 2 * text, line), text_line, MUTED, _font(0.9 * text), anchor="ls")
         line -= round(1.5 * text)
 
 
 def _font(size: float, *, bold: bool = False) -> FreeTypeFont:
+    """The font of the captions, which matplotlib brings along."""
     import matplotlib
     from PIL.ImageFont import truetype
 

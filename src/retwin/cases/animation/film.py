@@ -1,4 +1,4 @@
-"""Films: pictures to MP4 or GIF."""
+"""Encoding of pictures as MP4 or GIF."""
 
 from __future__ import annotations
 
@@ -10,38 +10,70 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.errors import InputError
+from retwin.checks import require
 
 __all__ = ["check_film", "write_film"]
 
 TICKS = 100
-"""GIF counts time in 1/100 s."""
+"""Units of time per second in a GIF."""
 
 
 def check_film(path: str | os.PathLike[str]) -> str:
-    """The suffix of `path` if a film can be written there, else an InputError."""
+    """Check that a film can be written.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The film.
+
+    Returns
+    -------
+    {".mp4", ".gif"}
+        Its suffix.
+
+    Raises
+    ------
+    InputError
+        Another suffix, or MP4 without the package that writes it.
+
+    """
     suffix = Path(path).suffix.lower()
-    if suffix not in (".mp4", ".gif"):
-        raise InputError(
-            "path",
-            expected="a name that ends in .mp4 or .gif",
-            got=str(path),
-            remedy="choose one of these formats by the name",
-        )
-    if suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise InputError(
-            "path",
-            expected="the package imageio-ffmpeg, which writes MP4",
-            got="an installation without it",
-            remedy='install it: pip install "retwin[render]", or write a *.gif',
-        )
+    require(
+        suffix in (".mp4", ".gif"),
+        "path",
+        expected="a name that ends in .mp4 or .gif",
+        got=path,
+        remedy="choose one of these formats by the name",
+    )
+    require(
+        suffix == ".gif" or importlib.util.find_spec("imageio_ffmpeg") is not None,
+        "path",
+        expected="the package imageio-ffmpeg, which writes MP4",
+        got="an installation without it",
+        remedy='install it: pip install "retwin[render]", or write a *.gif',
+    )
     return suffix
 
 
 def write_film(
     pictures: Iterable[NDArray], path: Path, suffix: str, *, fps: float, size: tuple[int, int]
 ) -> None:
-    """Write pictures (height, width, 3) of uint8 one after the other."""
+    """Encode pictures as they come.
+
+    Parameters
+    ----------
+    pictures : iterable of ndarray of uint8, shape (height, width, 3)
+        The frames.
+    path : Path
+        The film.
+    suffix : {".mp4", ".gif"}
+        Its format.
+    fps : float
+        Frames per second.
+    size : (int, int)
+        Width and height in pixels.
+
+    """
     if suffix == ".gif":
         _write_gif(pictures, path, fps)
     else:
@@ -49,14 +81,15 @@ def write_film(
 
 
 def _write_gif(pictures: Iterable[NDArray], path: Path, fps: float) -> None:
+    """Encode a GIF, for which all frames are in memory."""
     from PIL import Image
 
     frames = [Image.fromarray(picture) for picture in pictures]
-    # One palette for all: with one each, plain areas flicker.
+    # One palette for all frames: with one palette each, plain areas flicker.
     shown = np.hstack([np.asarray(frames[i]) for i in (0, len(frames) // 2, -1)])
     palette = Image.fromarray(shown).quantize(256, dither=Image.Dither.NONE)
     drawn = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
-    # From the moments and not from one length, so that rounding does not change the speed.
+    # Rounded times instead of a rounded duration, so that rounding does not change the speed.
     ends = np.round(np.arange(len(frames) + 1) * TICKS / fps).astype(int)
     milliseconds = (1000 // TICKS * np.diff(ends)).tolist()
     next(drawn).save(
@@ -65,6 +98,7 @@ def _write_gif(pictures: Iterable[NDArray], path: Path, fps: float) -> None:
 
 
 def _write_mp4(pictures: Iterable[NDArray], path: Path, fps: float, size: tuple[int, int]) -> None:
+    """Encode an MP4 by ffmpeg, frame by frame."""
     from imageio_ffmpeg import write_frames
 
     film = write_frames(

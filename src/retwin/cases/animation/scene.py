@@ -1,7 +1,7 @@
 """Solid bodies: the body's MJCF model drawn twice in one scene by MuJoCo, off screen.
 
-OpenGL is tied to one way of drawing for the life of a process and may end it, so the scene lives in
-a worker process. The caller's environment and its MuJoCo stay as they are.
+OpenGL is bound to one backend for the life of a process and may end the process, so the scene is
+drawn in a worker process. The caller's environment and its MuJoCo stay unchanged.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from pebble import ProcessExpired, ProcessPool
 
 from retwin.cases.animation.shots import GHOST, PAPER, RING, SOLID, Pictures, Shots, rings
+from retwin.checks import require
 from retwin.errors import InputError
 from retwin.processes import worker_pool
 
@@ -31,24 +32,39 @@ if TYPE_CHECKING:
 __all__ = ["mujoco_pictures", "offscreen_backend"]
 
 BACKENDS = ("egl", "osmesa")
-"""What draws without a screen, tried in this order unless MUJOCO_GL names one."""
-CHUNK = 10
-"""Pictures per task: enough to hide the transfer, few enough to show progress."""
-PATIENCE = 120.0
-"""Seconds after which a task hangs."""
+"""Backends that draw without a screen, tried in this order unless MUJOCO_GL names one."""
+FRAMES_PER_TASK = 10
+"""Number of frames per task: enough to hide the transfer, few enough to show progress."""
+TIMEOUT = 120.0
+"""Duration in s after which a task is ended as hung; software rendering is slow."""
 BROKEN = (RuntimeError, ProcessExpired, TimeoutError)
-"""How a worker ends that cannot draw."""
-GHOSTLY = 0.6
-"""Opacity of the ghost."""
+"""Errors of a worker that cannot draw."""
+GHOST_OPACITY = 0.6
+"""Opacity of the ghost, from 0 to 1."""
 NOMINAL, OBSERVED = 1, 2
-"""MuJoCo's groups of geometry, which can be shown apart."""
+"""MuJoCo's groups of geometry, which can be shown separately."""
 GHOST_PREFIX = "nominal/"
 ZERO = np.zeros(3)
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What a scene is made from: the model, its joints, where it stands, and the picture's size."""
+    """Settings of a scene.
+
+    Attributes
+    ----------
+    model : str
+        Path of the MJCF file.
+    joints : tuple of str
+        Joints that move.
+    root : tuple of float
+        Base of the chain in m.
+    reach : float
+        Largest distance from root to tip in m.
+    size : (int, int)
+        Width and height of the pictures in pixels.
+
+    """
 
     model: str
     joints: tuple[str, ...]
@@ -58,18 +74,27 @@ class Stage:
 
 
 def offscreen_backend() -> str:
-    """What draws here without a screen: a name that `MUJOCO_GL` knows.
+    """Find the backend that draws without a screen on this machine.
 
-    Raises InputError when a package is missing, or nothing can.
+    Returns
+    -------
+    str
+        A value of the environment variable `MUJOCO_GL`.
+
+    Raises
+    ------
+    InputError
+        A package is missing, or no backend works.
+
     """
     _check_opengl()
     reasons = []
     for backend in _backends():
         with worker_pool(1, _draw_with, (backend,)) as pool:
             try:
-                pool.schedule(_open, timeout=PATIENCE).result()
+                pool.schedule(_open, timeout=TIMEOUT).result()
             except BROKEN as error:
-                reasons.append(f"{backend}: {_brief(error)}")
+                reasons.append(f"{backend}: {_first_line(error)}")
             else:
                 return backend
     raise _nothing_draws(reasons)
@@ -77,21 +102,38 @@ def offscreen_backend() -> str:
 
 @contextmanager
 def mujoco_pictures(shots: Shots, body: Body, size: tuple[int, int]) -> Iterator[Pictures]:
-    """Pictures (height, width, 3), drawn in a worker process that lives as long as the block.
+    """Draw pictures in a worker process that lives as long as the block.
 
-    Raises InputError when the body has no model, a package is missing, or nothing here can draw
-    without a screen.
+    Parameters
+    ----------
+    shots : Shots
+        The frames.
+    body : Body
+        A body with a model.
+    size : (int, int)
+        Width and height in pixels.
+
+    Yields
+    ------
+    iterable of ndarray of uint8, shape (height, width, 3)
+        One picture per frame.
+
+    Raises
+    ------
+    InputError
+        The body has no model, a package is missing, or no backend works.
+
     """
     stage = Stage(_model(body), body.joints, tuple(shots.root.tolist()), shots.reach, size)
     reasons = []
     for backend in _backends():
         with ExitStack() as stack:
             pool = stack.enter_context(worker_pool(1, _draw_with, (backend,)))
-            first = _ask(pool, stage, shots, 0)
+            first = _schedule(pool, stage, shots, 0)
             try:
                 first.result()
             except BROKEN as error:
-                reasons.append(f"{backend}: {_brief(error)}")
+                reasons.append(f"{backend}: {_first_line(error)}")
                 continue
             with stack.pop_all():
                 yield _collect(pool, stage, shots, first)
@@ -100,11 +142,13 @@ def mujoco_pictures(shots: Shots, body: Body, size: tuple[int, int]) -> Iterator
 
 
 def _backends() -> tuple[str, ...]:
+    """The backends to try."""
     name = os.environ.get("MUJOCO_GL", "").lower()
     return (name,) if name else BACKENDS
 
 
 def _nothing_draws(reasons: Sequence[str]) -> InputError:
+    """The error for a machine on which no backend works."""
     return InputError(
         "renderer",
         expected="OpenGL that draws without a screen",
@@ -114,55 +158,57 @@ def _nothing_draws(reasons: Sequence[str]) -> InputError:
 
 
 def _model(body: Body) -> str:
-    """The body's model, if there is all that drawing it needs."""
-    if body.model is None:
-        raise InputError(
-            "renderer",
-            expected="a body with a model",
-            got="a body that is a chain of points only",
-            remedy="draw it as a stick figure",
-        )
+    """Path of the body's model, if it can be drawn."""
+    require(
+        body.model is not None,
+        "renderer",
+        expected="a body with a model",
+        got="a body that is a chain of points only",
+        remedy="draw it as a stick figure",
+    )
     _check_opengl()
     return str(body.model)
 
 
 def _check_opengl() -> None:
-    if importlib.util.find_spec("OpenGL") is None:
-        raise InputError(
-            "renderer",
-            expected="the package pyopengl, which draws solid bodies",
-            got="an installation without it",
-            remedy='install it: pip install "retwin[render]"',
-        )
+    """Refuse to draw without the package that draws."""
+    require(
+        importlib.util.find_spec("OpenGL") is not None,
+        "renderer",
+        expected="the package pyopengl, which draws solid bodies",
+        got="an installation without it",
+        remedy='install it: pip install "retwin[render]"',
+    )
 
 
-def _ask(pool: ProcessPool, stage: Stage, shots: Shots, first: int) -> Future[NDArray]:
-    """Have the pictures from `first` drawn, with the traces that lead to them."""
-    end = min(first + CHUNK, len(shots))
+def _schedule(pool: ProcessPool, stage: Stage, shots: Shots, first: int) -> Future[NDArray]:
+    """Schedule the frames from `first` on, with the traces that lead to them."""
+    end = min(first + FRAMES_PER_TASK, len(shots))
     joints = np.stack([shots.nominal[first:end], shots.observed[first:end]])
     tips = np.stack([shots.nominal_points[:end, -1], shots.observed_points[:end, -1]])
-    asked: Future[NDArray] = pool.schedule(_draw, (stage, joints, tips), timeout=PATIENCE)
-    return asked
+    task: Future[NDArray] = pool.schedule(_draw, (stage, joints, tips), timeout=TIMEOUT)
+    return task
 
 
-def _collect(pool: ProcessPool, stage: Stage, shots: Shots, asked: Future[NDArray]) -> Pictures:
-    """All pictures; one task is ahead while those of the one before are used."""
-    for first in range(CHUNK, len(shots) + CHUNK, CHUNK):
-        ahead = _ask(pool, stage, shots, first) if first < len(shots) else asked
-        yield from asked.result()
-        asked = ahead
+def _collect(pool: ProcessPool, stage: Stage, shots: Shots, task: Future[NDArray]) -> Pictures:
+    """All pictures; the next task runs while the pictures of one task are used."""
+    for first in range(FRAMES_PER_TASK, len(shots) + FRAMES_PER_TASK, FRAMES_PER_TASK):
+        following = _schedule(pool, stage, shots, first) if first < len(shots) else task
+        yield from task.result()
+        task = following
 
 
-def _brief(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
+    """The first line of an error's message."""
     if isinstance(error, TimeoutError):
-        return "it hangs"
+        return f"it hung for more than {TIMEOUT:g} s"
     first, *_ = str(error).splitlines() or [type(error).__name__]
     return first.rstrip(".")
 
 
 def _draw_with(backend: str) -> None:
-    """Called in the worker before MuJoCo is there: it looks at these when it is imported."""
-    # What cannot draw ends in an error that says why; a library's own lines would only repeat it.
+    """Set the backend in the worker, before the import of MuJoCo, which reads it."""
+    # A backend that does not work raises an error; a library's own warnings would repeat it.
     warnings.simplefilter("ignore")
     os.environ["MUJOCO_GL"] = backend
     os.environ.pop("PYOPENGL_PLATFORM", None)
@@ -171,8 +217,8 @@ def _draw_with(backend: str) -> None:
 def _draw(stage: Stage, joints: NDArray, tips: NDArray) -> NDArray:
     """Pictures (frames, height, width, 3) for joints (2, frames, joints), nominal and observed.
 
-    `tips` (2, all frames so far, 3) in m. In the worker; what fails there is a RuntimeError,
-    because the errors of OpenGL cannot cross to another process.
+    Runs in the worker. `tips` (2, all frames so far, 3) are in m. Failures are raised as
+    RuntimeError, because OpenGL's errors cannot be sent to another process.
     """
     try:
         scene = _scene(stage)
@@ -187,7 +233,7 @@ def _draw(stage: Stage, joints: NDArray, tips: NDArray) -> NDArray:
 
 
 def _open() -> None:
-    """In the worker: what MuJoCo draws on."""
+    """Open an OpenGL context in the worker."""
     try:
         import mujoco
 
@@ -196,14 +242,26 @@ def _open() -> None:
         raise RuntimeError(f"{type(error).__name__}: {error}") from None
 
 
-# Kept between the tasks of one worker.
 @lru_cache(maxsize=1)
 def _scene(stage: Stage) -> Scene:
+    """The scene, which a worker keeps between its tasks."""
     return Scene(stage)
 
 
 class Scene:
-    """The model twice, observed and nominal, and what draws them."""
+    """The model twice, observed and nominal, and its renderer.
+
+    Parameters
+    ----------
+    stage : Stage
+        Settings of the scene.
+
+    Raises
+    ------
+    InputError
+        The model lacks a joint.
+
+    """
 
     def __init__(self, stage: Stage) -> None:
         import mujoco
@@ -212,15 +270,15 @@ class Scene:
         self._stage = stage
         try:
             self._model = _compiled(stage)
-            self._places = [
-                [self._model.joint(f"{who}{name}").qposadr[0] for name in stage.joints]
-                for who in (GHOST_PREFIX, "")
+            self._addresses = [
+                [self._model.joint(f"{prefix}{name}").qposadr[0] for name in stage.joints]
+                for prefix in (GHOST_PREFIX, "")
             ]
         except (ValueError, KeyError) as error:
             raise InputError(
                 "model",
                 expected=f"an MJCF file with the joints {', '.join(stage.joints)}",
-                got=f"{stage.model} ({_brief(error)})",
+                got=f"{stage.model} ({_first_line(error)})",
                 remedy="make the body's model and its joints agree",
             ) from None
         self._data = mujoco.MjData(self._model)
@@ -233,21 +291,38 @@ class Scene:
         self._camera.distance = 2.75 * stage.reach * max(1.0, 4 / 3 * height / width)
         self._camera.azimuth, self._camera.elevation = 130, -18
         mujoco.mj_forward(self._model, self._data)
-        self._empty = self._seen()
+        self._background = self._rendered()
 
     def picture(self, joints: NDArray, tips: NDArray) -> NDArray:
-        """The picture (height, width, 3) for joints (2, joints) and traces (2, points, 3)."""
-        for places, values in zip(self._places, joints, strict=True):
-            self._data.qpos[places] = values
+        """Draw one frame.
+
+        Parameters
+        ----------
+        joints : ndarray, shape (2, joints)
+            Nominal and observed joint positions in rad or m.
+        tips : ndarray, shape (2, points, 3)
+            Traces of the nominal and the observed tip in m.
+
+        Returns
+        -------
+        ndarray of uint8, shape (height, width, 3)
+            The picture.
+
+        """
+        for addresses, values in zip(self._addresses, joints, strict=True):
+            self._data.qpos[addresses] = values
         self._mujoco.mj_kinematics(self._model, self._data)
-        solid = self._seen(OBSERVED, tuple(tips))
-        # Behind the solid one: where both poses agree, two surfaces in one place would flicker.
-        ghost = self._seen(NOMINAL)
-        only = (ghost != self._empty).any(axis=2) & (solid == self._empty).all(axis=2)
-        solid[only] = (1 - GHOSTLY) * self._empty[only] + GHOSTLY * ghost[only]
+        solid = self._rendered(OBSERVED, tuple(tips))
+        # The ghost is behind the solid body: two surfaces in one place would flicker.
+        ghost = self._rendered(NOMINAL)
+        ghost_only = (ghost != self._background).any(axis=2) & (solid == self._background).all(
+            axis=2
+        )
+        background = self._background[ghost_only]
+        solid[ghost_only] = (1 - GHOST_OPACITY) * background + GHOST_OPACITY * ghost[ghost_only]
         return solid
 
-    def _seen(self, group: int | None = None, tips: Sequence[NDArray] = ()) -> NDArray:
+    def _rendered(self, group: int | None = None, tips: Sequence[NDArray] = ()) -> NDArray:
         """The picture of the floor, the bodies of one group, and traces."""
         for each in (NOMINAL, OBSERVED):
             self._option.geomgroup[each] = each == group
@@ -262,21 +337,23 @@ class Scene:
         return picture
 
     def _line(self, points: NDArray, colour: Sequence[float], width: float) -> None:
-        """A line through the points; `width` in pixels of a picture 480 high."""
+        """Draw a line through the points; `width` in pixels of a picture 480 high."""
         scene, kind = self._renderer.scene, self._mujoco.mjtGeom.mjGEOM_LINE
-        # A long film would fill the scene: then every second point, or third, …
+        # A scene holds few objects: of long traces only every second or third point is drawn.
         kept = points[:: 1 + len(points) // (scene.maxgeom // 4)]
         for begin, end in pairwise(kept):
             geom = self._added(kind, colour)
             self._mujoco.mjv_connector(geom, kind, width * min(self._stage.size) / 480, begin, end)
 
     def _ball(self, point: NDArray, colour: Sequence[float]) -> None:
+        """Draw a ball at a point (3,) in m."""
         size = np.full(3, 0.018 * self._stage.reach)
         self._added(self._mujoco.mjtGeom.mjGEOM_SPHERE, colour, size, point)
 
     def _added(
         self, kind: Any, colour: Sequence[float], size: NDArray = ZERO, place: NDArray = ZERO
     ) -> Any:
+        """A new object in the scene."""
         scene = self._renderer.scene
         geom = scene.geoms[scene.ngeom]
         paint = np.array([*colour, 1], np.float32)
@@ -293,7 +370,7 @@ def _compiled(stage: Stage) -> Any:
     ghost = mujoco.MjSpec.from_file(stage.model)
     for spec, group in ((world, OBSERVED), (ghost, NOMINAL)):
         for geom in spec.geoms:
-            # Groups above 2 are by custom not for showing: shapes for contact, and the like.
+            # By convention groups above 2 are not shown: shapes for contact, for instance.
             geom.group = group if geom.group <= 2 else 5
             if geom.parent == spec.worldbody:
                 geom.group = 0 if spec is world else 5
@@ -301,10 +378,10 @@ def _compiled(stage: Stage) -> Any:
                 geom.material = ""
                 geom.rgba = [*GHOST, geom.rgba[3]]
     world.attach(ghost, prefix=GHOST_PREFIX, frame=world.worldbody.add_frame())
-    look = world.visual
-    look.global_.offwidth, look.global_.offheight = stage.size
-    look.headlight.ambient, look.headlight.diffuse = [0.5] * 3, [0.4] * 3
-    look.headlight.specular = [0.1] * 3
+    visual = world.visual
+    visual.global_.offwidth, visual.global_.offheight = stage.size
+    visual.headlight.ambient, visual.headlight.diffuse = [0.5] * 3, [0.4] * 3
+    visual.headlight.specular = [0.1] * 3
     world.worldbody.add_light(pos=[0.4, -0.6, 1.5], dir=[-0.25, 0.35, -1], diffuse=[0.35] * 3)
     for texture in world.textures:
         if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:

@@ -1,4 +1,4 @@
-"""`Shots`: what the pictures of a film show, whatever draws them."""
+"""`Shots`: the poses that the frames of a film show, independent of the renderer."""
 
 from __future__ import annotations
 
@@ -22,15 +22,20 @@ RING = (0.79, 0.81, 0.84)
 
 @dataclass(frozen=True, eq=False)
 class Shots:
-    """One trajectory at the moments of its pictures.
+    """One trajectory at the times of its frames.
 
     Attributes
     ----------
-    title: id and class.
-    emulated: whether a model made what stands for measurements.
-    seconds: (frames,) the moments.
-    nominal, observed: (frames, joints) joint positions.
-    nominal_points, observed_points: (frames, k, 3) the skeleton in m.
+    title : str
+        Id and class of the trajectory.
+    emulated : bool
+        Whether a model made the data that stand in for measurements.
+    seconds : ndarray, shape (frames,)
+        Times in s.
+    nominal, observed : ndarray, shape (frames, joints)
+        Joint positions in rad or m.
+    nominal_points, observed_points : ndarray, shape (frames, k, 3)
+        Points of the skeleton in m.
 
     """
 
@@ -47,19 +52,33 @@ class Shots:
 
     @property
     def root(self) -> NDArray:
-        """Where the chain stands (3,), in m."""
+        """Position (3,) of the base of the chain in m."""
         root: NDArray = self.nominal_points[0, 0]
         return root
 
     @property
     def reach(self) -> float:
-        """Greatest distance from root to tip that the chain allows, in m."""
+        """Largest possible distance from root to tip in m."""
         links = np.diff(self.nominal_points, axis=1)
         return float(np.linalg.norm(links, axis=2).sum(axis=1).max())
 
 
 def rings(root: NDArray, reach: float) -> list[NDArray]:
-    """Circles (points, 3) on the floor around the root, at thirds of the reach."""
+    """Circles on the floor around the root, at thirds of the reach.
+
+    Parameters
+    ----------
+    root : ndarray, shape (3,)
+        Base of the chain in m.
+    reach : float
+        Largest distance from root to tip in m.
+
+    Returns
+    -------
+    list of ndarray, shape (points, 3)
+        Three closed polygons in m.
+
+    """
     angle = np.linspace(0, 2 * np.pi, 61)
     circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    return [root + share * reach * circle for share in (1 / 3, 2 / 3, 1)]
+    return [root + fraction * reach * circle for fraction in (1 / 3, 2 / 3, 1)]

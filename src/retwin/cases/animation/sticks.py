@@ -1,4 +1,4 @@
-"""Stick figures: the skeleton drawn with matplotlib, where nothing better can be had."""
+"""Stick figures: the skeleton drawn with matplotlib, where MuJoCo cannot draw."""
 
 from __future__ import annotations
 
@@ -13,11 +13,26 @@ from retwin.cases.animation.shots import GHOST, PAPER, RING, SOLID, Shots, rings
 __all__ = ["stick_pictures"]
 
 DPI = 100
+"""Pixels per inch, by which matplotlib converts sizes."""
 
 
 def stick_pictures(shots: Shots, size: tuple[int, int]) -> Iterator[NDArray]:
-    """Pictures (height, width, 3) of the two skeletons and the paths of their tips."""
-    # Beside pyplot, so that no window system and no global state are touched.
+    """Draw the two skeletons and the paths of their tips.
+
+    Parameters
+    ----------
+    shots : Shots
+        The frames.
+    size : (int, int)
+        Width and height in pixels.
+
+    Yields
+    ------
+    ndarray of uint8, shape (height, width, 3)
+        One picture per frame.
+
+    """
+    # Without pyplot, which would use a window system and global state.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -47,7 +62,7 @@ def stick_pictures(shots: Shots, size: tuple[int, int]) -> Iterator[NDArray]:
 
 
 def _stage(axes: Any, shots: Shots) -> None:
-    """The whole workspace in view, seen from slightly above, on a light floor."""
+    """Show the whole workspace from slightly above, on a light floor."""
     root, reach = shots.root, shots.reach
     axes.set(
         xlim=(root[0] - reach, root[0] + reach),

@@ -1,8 +1,9 @@
-"""What can be drawn of the arm: its joints, and the pose behind a measured end-effector.
+"""Poses of the arm for drawing: joint angles behind a measured end-effector path.
 
 Only the end-effector is measured, three numbers for four joints. The observed pose is therefore an
-inference for pictures: of all poses that put the end-effector where it was seen, the nearest to the
-commanded one. A stuck motor may look like several that are a little off.
+inference, used for pictures only: among all poses that put the end-effector at its measured
+position, it is the one nearest to the commanded pose. The inferred pose of an arm with one stuck
+motor may deviate from the command in several joints.
 """
 
 from __future__ import annotations
@@ -15,23 +16,24 @@ from numpy.typing import NDArray
 
 from retwin.cases.armpi_fpv.closed_form import KinematicTwin
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
-from retwin.errors import InputError
 
 __all__ = ["ArmBody", "nearest_poses"]
 
 MODEL = Path(__file__).with_name("armpi.xml")
-NEARNESS = 5e-4
-"""Weight of a joint's distance from its command against the end-effector's, in m/rad.
+COMMAND_WEIGHT = 5e-4
+"""Weight in m/rad of a joint's deviation from its command against the end-effector's error.
 
-So small that the end-effector is met to some µm; near the straight pose, where the yaw is hardly
-seen, it keeps the yaw at its command.
+It is so small that the end-effector is met to a few µm. Near the straight pose, where the yaw
+hardly affects the end-effector, it keeps the yaw at its command.
 """
-STEPS = 8
-BETTER = 0.5
-"""The pose found from the command replaces the one that continues the motion at this share of its
-cost: without the margin the picture would flicker between two that are as good.
-"""
+GAUSS_NEWTON_STEPS = 8
+"""Number of damped Gauss-Newton steps per sample; they suffice since each sample starts at the
+pose of the sample before."""
+SWITCH_RATIO = 0.5
+"""Ratio of costs below which the pose found from the command replaces the one that continues the
+motion. Without this margin the picture would flicker between two poses of similar cost."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,10 @@ class ArmBody:
 
     Parameters
     ----------
-    twin: kinematics, and what a command means in rad.
-    model: MJCF file with joints `joint_1` … of the same order and sense.
+    twin : KinematicTwin
+        Kinematics, and the joint angles of commands.
+    model : Path, optional
+        MJCF file with joints `joint_1`, … of the same order and sense of rotation.
 
     """
 
@@ -54,27 +58,52 @@ class ArmBody:
         return tuple(f"joint_{i + 1}" for i in range(self.twin.arm.joints))
 
     def poses(self, trajectories: Trajectories) -> tuple[NDArray, NDArray]:
-        """Joint angles (n, T, joints) in rad: commanded, and nearest to what was observed.
+        """Commanded poses, and the nearest poses that explain the observed outputs.
 
-        Where nothing was measured, the measured path is joined linearly.
-        Raises InputError when commands or outputs are not those of the arm.
+        Parameters
+        ----------
+        trajectories : Trajectories
+            Trajectories of the arm; samples that were not measured are interpolated linearly.
+
+        Returns
+        -------
+        nominal, observed : ndarray, shape (n, T, joints)
+            Joint angles in rad.
+
+        Raises
+        ------
+        InputError
+            Commands or outputs are not those of the arm.
+
         """
         for name, has, needs in (
             ("commands", len(trajectories.inputs), self.twin.arm.joints),
             ("outputs", len(trajectories.outputs), 3),
         ):
-            if has != needs:
-                raise InputError(
-                    name,
-                    expected=f"{needs} channels, those of the arm",
-                    got=f"{has}",
-                    remedy="load the file with the arm's case, which completes commands",
-                )
+            require(
+                has == needs,
+                name,
+                expected=f"{needs} channels, those of the arm",
+                got=has,
+                remedy="load the file with the arm's case, which completes commands",
+            )
         nominal = self.twin.angles(trajectories.commands.astype(float))
-        return nominal, nearest_poses(self.twin.arm, nominal, _joined(trajectories))
+        return nominal, nearest_poses(self.twin.arm, nominal, _interpolated(trajectories))
 
     def skeleton(self, joints: NDArray) -> NDArray:
-        """Ground, shoulder, elbow, wrist and end-effector (..., 5, 3) in m."""
+        """Ground, shoulder, elbow, wrist and end-effector.
+
+        Parameters
+        ----------
+        joints : ndarray, shape (..., joints)
+            Joint angles in rad.
+
+        Returns
+        -------
+        ndarray, shape (..., 5, 3)
+            Positions in m.
+
+        """
         arm = self.twin.arm
         points = [np.zeros((*joints.shape[:-1], 3))]
         for count in range(len(arm.links) + 1):
@@ -84,12 +113,28 @@ class ArmBody:
 
 
 def nearest_poses(arm: YawPitchArm, commanded: NDArray, tip: NDArray) -> NDArray:
-    """Joint angles (n, T, joints) in rad that put the end-effector at `tip`, nearest to commanded.
+    """Poses that put the end-effector at given positions and are nearest to the commanded poses.
 
-    `commanded` (n, T, joints) in rad, `tip` (n, T, 3) in m. Minimises
-    |position(q) - tip|² + NEARNESS² |q - commanded|² sample by sample, from the sample before and
-    from the command, and stays with the former unless the latter is clearly better. A tip out of
-    reach gives a pose that points to it.
+    Parameters
+    ----------
+    arm : YawPitchArm
+        The kinematics.
+    commanded : ndarray, shape (n, T, joints)
+        Commanded joint angles in rad.
+    tip : ndarray, shape (n, T, 3)
+        End-effector positions in m.
+
+    Returns
+    -------
+    ndarray, shape (n, T, joints)
+        Joint angles in rad. For a position that the arm cannot attain, the pose points to it.
+
+    Notes
+    -----
+    Each sample minimises |position(q) - tip|² + COMMAND_WEIGHT² |q - commanded|², once from the
+    pose of the sample before and once from the command; the former is kept unless the latter has
+    a clearly lower cost.
+
     """
     out = np.empty_like(commanded)
     before = commanded[:, 0]
@@ -97,7 +142,7 @@ def nearest_poses(arm: YawPitchArm, commanded: NDArray, tip: NDArray) -> NDArray
     for t in range(commanded.shape[1]):
         goal = commanded[:, t]
         found, cost = _descend(arm, np.stack([before, goal]), goal, tip[:, t])
-        before = found[(cost[1] < BETTER * cost[0]).astype(int), chosen]
+        before = found[(cost[1] < SWITCH_RATIO * cost[0]).astype(int), chosen]
         out[:, t] = before
     return out
 
@@ -105,32 +150,32 @@ def nearest_poses(arm: YawPitchArm, commanded: NDArray, tip: NDArray) -> NDArray
 def _descend(
     arm: YawPitchArm, start: NDArray, commanded: NDArray, tip: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """Damped Gauss-Newton from `start` (..., joints): the poses, and their cost (...)."""
+    """Poses (..., joints) and their cost (...) by damped Gauss-Newton from `start`."""
 
     def cost_of(pose: NDArray) -> NDArray:
-        miss, stray = tip - arm.position(pose), NEARNESS * (commanded - pose)
-        return (miss**2).sum(axis=-1) + (stray**2).sum(axis=-1)
+        error, deviation = tip - arm.position(pose), COMMAND_WEIGHT * (commanded - pose)
+        return (error**2).sum(axis=-1) + (deviation**2).sum(axis=-1)
 
     pose, cost = start, cost_of(start)
     damping = np.full(cost.shape, 1e-4)
     eye = np.eye(start.shape[-1])
-    for _ in range(STEPS):
-        slope = arm.jacobian(pose)
-        turned = np.swapaxes(slope, -1, -2)
-        pull = turned @ (tip - arm.position(pose))[..., None]
-        pull += NEARNESS**2 * (commanded - pose)[..., None]
-        normal = turned @ slope + (NEARNESS**2 + damping)[..., None, None] * eye
-        tried = pose + np.linalg.solve(normal, pull)[..., 0]
-        new = cost_of(tried)
+    for _ in range(GAUSS_NEWTON_STEPS):
+        jacobian = arm.jacobian(pose)
+        transposed = np.swapaxes(jacobian, -1, -2)
+        gradient = transposed @ (tip - arm.position(pose))[..., None]
+        gradient += COMMAND_WEIGHT**2 * (commanded - pose)[..., None]
+        normal = transposed @ jacobian + (COMMAND_WEIGHT**2 + damping)[..., None, None] * eye
+        trial = pose + np.linalg.solve(normal, gradient)[..., 0]
+        new = cost_of(trial)
         better = new < cost
-        pose = np.where(better[..., None], tried, pose)
+        pose = np.where(better[..., None], trial, pose)
         cost = np.where(better, new, cost)
         damping = np.where(better, damping / 10, damping * 10)
     return pose, cost
 
 
-def _joined(trajectories: Trajectories) -> NDArray:
-    """The measured path (n, T, 3) without gaps; nominal where a channel was never measured."""
+def _interpolated(trajectories: Trajectories) -> NDArray:
+    """The measured path (n, T, 3), interpolated; nominal where a channel was never measured."""
     path = trajectories.observed.astype(float)
     time = np.arange(trajectories.steps)
     for i, channel in np.argwhere(~trajectories.mask.all(axis=1)):

@@ -18,7 +18,7 @@ from retwin.cases.case import Case
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults import ActuatorBias, Fault, Stuck, frozen_response
-from retwin.twins.samplers import draw_onsets
+from retwin.twins.ramps import draw_onsets
 from retwin.update.corrections import Chain, CommandSpace, DelayOffset, SampledSensor
 
 __all__ = ["ArmSampler", "armpi"]
@@ -48,11 +48,16 @@ class ArmSampler:
 
     Parameters
     ----------
-    movements: per trajectory.
-    steps: samples per trajectory.
-    period: samples from one onset to the next.
-    amplitude: greatest angle of a target from straight, in degrees, per motor.
-    speed: greatest speed of a motor, in degrees per sample.
+    movements : int, default 5
+        Movements per trajectory.
+    steps : int, default 1000
+        Samples per trajectory.
+    period : int, default 200
+        Samples from one onset to the next.
+    amplitude : tuple of float
+        Largest angle of a target from straight in degrees, one per motor.
+    speed : float, default 2.72
+        Largest speed of a motor in degrees per sample.
 
     """
 
@@ -65,15 +70,15 @@ class ArmSampler:
     def sample(
         self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
     ) -> NDArray:
-        """Commands (count, steps, 4) in units; see `CommandSampler`."""
+        """Draw commands (count, steps, 4) in units of 0.24 degrees; see `CommandSampler.sample`."""
         shape = (count, self.movements, len(self.amplitude))
         ramps = rng.choice(RAMPS, size=shape)
         goals = rng.uniform(-1, 1, size=shape) * self.amplitude
         targets = np.empty(shape)
         now = np.zeros((count, len(self.amplitude)))
         for movement in range(self.movements):
-            reach = self.speed * ramps[:, movement]
-            now = now + np.clip(goals[:, movement] - now, -reach, reach)
+            largest = self.speed * ramps[:, movement]
+            now = now + np.clip(goals[:, movement] - now, -largest, largest)
             now = UNIT * np.round(now / UNIT)
             targets[:, movement] = STRAIGHT - now / UNIT
         onsets = draw_onsets(count, self.movements, self.period, rng=rng, timing=timing)
@@ -82,13 +87,27 @@ class ArmSampler:
 
 
 def recover(trajectories: Trajectories, progress: Progress | None = None) -> Trajectories:
-    """Commands from the desired path (`nominal`); says how many movements stay ambiguous."""
+    """Recover commands from the desired path; a warning names ambiguous trajectories.
+
+    Parameters
+    ----------
+    trajectories : Trajectories
+        Trajectories whose `nominal` is the desired end-effector path in m.
+    progress : callable, optional
+        Called with the finished fraction.
+
+    Returns
+    -------
+    Trajectories
+        The same with commands.
+
+    """
     found = recover_commands(trajectories.nominal, arm=ARM, progress=progress)
-    unsure = np.any(found.ambiguous, axis=1)
-    if unsure.any():
+    ambiguous = np.any(found.ambiguous, axis=1)
+    if ambiguous.any():
         warnings.warn(
-            f"commands of {unsure.sum()} of {len(unsure)} trajectories are not certain: "
-            f"{', '.join(trajectories.ids[unsure][:5])}{' …' if unsure.sum() > 5 else ''}",
+            f"commands of {ambiguous.sum()} of {len(ambiguous)} trajectories are not certain: "
+            f"{', '.join(trajectories.ids[ambiguous][:5])}{' …' if ambiguous.sum() > 5 else ''}",
             stacklevel=2,
         )
     return trajectories.replace(
@@ -99,18 +118,35 @@ def recover(trajectories: Trajectories, progress: Progress | None = None) -> Tra
 
 
 ONSET = 49
+"""Sample, counted from 0, from which a stuck motor is held in the published protocol."""
 FAULTS: dict[str, Fault | None] = {
     HEALTHY: None,
     **{label: Stuck(i, ONSET) for i, label in enumerate(STUCK)},
     **{label: ActuatorBias(i) for i, label in enumerate(BIASED)},
 }
-"""The nine classes in their fixed order; the published protocol freezes at sample 49 (0-based)."""
+"""Faults of the nine classes in their fixed order."""
 
 
 def encoder_noise(trajectories: Trajectories, units: float, seed: int) -> Trajectories:
-    """Readings of a stuck motor that flicker by -1, 0 or 1 times `units`, seen at the output.
+    """Add encoder noise of stuck motors to the outputs.
 
-    The outputs move by the arm's Jacobian where the arm is told to be, the motor being held.
+    The encoder of a held motor varies by -1, 0 or 1 times `units` from sample to sample of the
+    sensor. The outputs change by the arm's Jacobian at the commanded pose with the motor held.
+
+    Parameters
+    ----------
+    trajectories : Trajectories
+        Trajectories of the arm; those of other classes stay unchanged.
+    units : float
+        Amplitude of the noise in command units.
+    seed : int
+        Seed of the noise.
+
+    Returns
+    -------
+    Trajectories
+        The same with other outputs.
+
     """
     rng = np.random.default_rng(seed)
     observed = trajectories.observed.copy()
@@ -118,16 +154,23 @@ def encoder_noise(trajectories: Trajectories, units: float, seed: int) -> Trajec
     time = np.arange(trajectories.steps)
     for i, label in enumerate(trajectories.labels):
         fault = FAULTS.get(str(label))
-        flicker = np.interp(time, polls, units * rng.integers(-1, 2, size=len(polls)))
+        noise = np.interp(time, polls, units * rng.integers(-1, 2, size=len(polls)))
         if isinstance(fault, Stuck):
             held = frozen_response(trajectories.commands[i : i + 1], [fault])[0]
             effect = ARM.jacobian(KINEMATIC.angles(held))[:, :, fault.actuator] * KINEMATIC.scale
-            observed[i] += np.where(time > ONSET, flicker, 0.0)[:, None] * effect
+            observed[i] += np.where(time > ONSET, noise, 0.0)[:, None] * effect
     return trajectories.replace(observed=observed)
 
 
 def armpi() -> Case:
-    """The case of the paper."""
+    """The case of the paper.
+
+    Returns
+    -------
+    Case
+        The case `armpi`.
+
+    """
     return Case(
         name="armpi",
         title="ArmPi FPV robot arm",

@@ -7,8 +7,8 @@ from retwin.data.trajectories import HEALTHY
 __all__ = ["BIASED", "CLASSES", "STUCK"]
 
 STUCK = tuple(f"Motor_{i}_Stuck" for i in range(1, 5))
-"""Motor i does not move any more."""
+"""Classes in which motor i stops moving."""
 BIASED = tuple(f"Motor_{i}_Steady_state_error" for i in range(1, 5))
-"""Motor i settles beside its target: the steady-state error (SSE) of the paper."""
+"""Classes in which motor i settles at a biased target: the paper's steady-state error (SSE)."""
 CLASSES = (HEALTHY, *STUCK, *BIASED)
-"""The order of probabilities and of confusion matrices."""
+"""All classes in the order of probabilities and of confusion matrices."""

@@ -12,18 +12,22 @@ from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults import Fault, frozen_response
-from retwin.twins.twin import Chunk, Limits, simulate_in_chunks
+from retwin.twins.limits import Limits
+from retwin.twins.twin import Chunk, simulate_in_chunks
 
 __all__ = ["KinematicTwin", "ServoLag"]
 
 
 @dataclass(frozen=True)
 class ServoLag:
-    """A joint's closed position loop, (P s + I) / ((1 + P) s + I): unit gain, lag 1/I on a ramp.
+    """A joint's closed position loop, (P s + I) / ((1 + P) s + I), of unit gain.
 
     Parameters
     ----------
-    proportional, integral: the loop's gains P (no unit) and I (1/s).
+    proportional : float
+        Proportional gain P of the loop, without unit.
+    integral : float
+        Integral gain I of the loop in 1/s, above 0; a ramp is followed with a lag of 1/I.
 
     """
 
@@ -32,13 +36,24 @@ class ServoLag:
 
     @property
     def seconds(self) -> float:
-        """How far a ramp is followed behind its command, in s."""
+        """Lag in s with which a ramp is followed."""
         return 1.0 / self.integral
 
     def respond(self, commands: NDArray, rate: float) -> NDArray:
-        """The response (n, T, d_u) to commands sampled at `rate`, linear between samples.
+        """Response to commands, from rest at the first command of every actuator.
 
-        Every actuator starts at rest at its first command.
+        Parameters
+        ----------
+        commands : ndarray, shape (n, T, d_u)
+            Commands, linear between samples.
+        rate : float
+            Sample rate in Hz.
+
+        Returns
+        -------
+        ndarray, shape (n, T, d_u)
+            The response in command units.
+
         """
         loop = ([self.proportional, self.integral], [1.0 + self.proportional, self.integral])
         numerator, denominator, _ = cont2discrete(loop, 1.0 / rate, method="foh")
@@ -50,17 +65,24 @@ class ServoLag:
 class KinematicTwin:
     """An arm whose joints follow their commands with a lag.
 
+    The nominal output is the forward kinematics of the clean commands without lag.
+
     Parameters
     ----------
-    arm: the kinematics.
-    centre: command at which a joint's angle is 0.
-    scale: rad per command unit.
-    lag: the joints' closed loop; None follows at once.
-    inputs, outputs: channels of commands and outputs.
-    rate: samples per second.
-    limits: of the commands, if there are any.
-
-    `nominal` is the forward kinematics of the clean commands without lag.
+    arm : YawPitchArm
+        The kinematics.
+    centre : float
+        Command at which a joint's angle is 0.
+    scale : float
+        Angle in rad per command unit.
+    lag : ServoLag, optional
+        The joints' closed loop; None follows without lag.
+    inputs, outputs : Channels
+        Channels of commands and outputs.
+    rate : float
+        Sample rate in Hz.
+    limits : Limits, optional
+        Range of the commands.
 
     """
 
@@ -74,15 +96,51 @@ class KinematicTwin:
     limits: Limits | None = None
 
     def angles(self, commands: NDArray) -> NDArray:
-        """Joint angles in rad for commands or responses in command units, any leading shape."""
+        """Joint angles of commands or responses.
+
+        Parameters
+        ----------
+        commands : ndarray, any shape
+            In command units.
+
+        Returns
+        -------
+        ndarray, same shape
+            Angles in rad.
+
+        """
         return (commands - self.centre) * commands.dtype.type(self.scale)
 
     def position(self, commands: NDArray) -> NDArray:
-        """End-effector (..., 3) in m when every joint stands where its command says."""
+        """End-effector position when every joint is at its command.
+
+        Parameters
+        ----------
+        commands : ndarray, shape (..., joints)
+            In command units.
+
+        Returns
+        -------
+        ndarray, shape (..., 3)
+            Position in m.
+
+        """
         return self.arm.position(self.angles(commands))
 
     def respond(self, commands: NDArray) -> NDArray:
-        """Where the joints go, in command units (n, T, d_u)."""
+        """Response of the joints to commands.
+
+        Parameters
+        ----------
+        commands : ndarray, shape (n, T, d_u)
+            In command units.
+
+        Returns
+        -------
+        ndarray, shape (n, T, d_u)
+            Joint positions in command units.
+
+        """
         return commands if self.lag is None else self.lag.respond(commands, self.rate)
 
     def simulate(
@@ -93,9 +151,10 @@ class KinematicTwin:
         seed: int,
         progress: Progress | None = None,
     ) -> Trajectories:
-        """See `Twin.simulate`; stuck actuators are held in their response, behind the lag."""
+        """See `Twin.simulate`; the lagged response of a stuck actuator is held."""
         return simulate_in_chunks(self, self._run, commands, faults, seed=seed, progress=progress)
 
     def _run(self, chunk: Chunk) -> tuple[NDArray, NDArray]:
+        """Nominal and observed outputs of a chunk."""
         response = frozen_response(self.respond(chunk.faulty_commands), chunk.faults)
         return self.position(chunk.commands), self.position(response)

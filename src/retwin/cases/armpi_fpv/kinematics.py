@@ -12,12 +12,14 @@ __all__ = ["YawPitchArm"]
 
 @dataclass(frozen=True)
 class YawPitchArm:
-    """A yaw joint about z followed by pitch joints about x, links along z when all angles are 0.
+    """A yaw joint about z and pitch joints about x; links along z when all angles are 0.
 
     Parameters
     ----------
-    base: height of the first pitch joint above the ground, in m.
-    links: length of the link behind each pitch joint, in m.
+    base : float
+        Height of the first pitch joint above the ground in m.
+    links : tuple of float
+        Length in m of the link behind each pitch joint.
 
     """
 
@@ -35,7 +37,19 @@ class YawPitchArm:
         return self.base + sum(self.links)
 
     def position(self, angles: NDArray) -> NDArray:
-        """End-effector position (..., 3) in m for joint angles (..., joints) in rad."""
+        """Forward kinematics.
+
+        Parameters
+        ----------
+        angles : ndarray, shape (..., joints)
+            Joint angles in rad.
+
+        Returns
+        -------
+        ndarray, shape (..., 3)
+            End-effector position in m.
+
+        """
         yaw = angles[..., 0]
         pitch = np.cumsum(angles[..., 1:], axis=-1)
         links = np.asarray(self.links, dtype=angles.dtype)
@@ -44,13 +58,25 @@ class YawPitchArm:
         return np.stack([np.sin(yaw) * radius, -np.cos(yaw) * radius, self.base + height], axis=-1)
 
     def jacobian(self, angles: NDArray) -> NDArray:
-        """Derivative (..., 3, joints) of `position` in m/rad."""
+        """Jacobian of `position`.
+
+        Parameters
+        ----------
+        angles : ndarray, shape (..., joints)
+            Joint angles in rad.
+
+        Returns
+        -------
+        ndarray, shape (..., 3, joints)
+            Derivatives in m/rad.
+
+        """
         yaw = angles[..., 0]
         pitch = np.cumsum(angles[..., 1:], axis=-1)
         links = np.asarray(self.links, dtype=angles.dtype)
         sine, cosine = np.sin(yaw), np.cos(yaw)
         radius = np.sin(pitch) @ links
-        # A pitch joint turns every link behind it: sums from the tip inwards.
+        # A pitch joint rotates every link behind it: sums from the tip inwards.
         d_radius = np.cumsum((np.cos(pitch) * links)[..., ::-1], axis=-1)[..., ::-1]
         d_height = -np.cumsum((np.sin(pitch) * links)[..., ::-1], axis=-1)[..., ::-1]
         by_yaw = np.stack([cosine * radius, sine * radius, np.zeros_like(radius)], axis=-1)

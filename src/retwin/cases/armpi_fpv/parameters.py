@@ -1,4 +1,4 @@
-"""The ArmPi arm with what is not known of it as parameters (Eq. 2 and 3)."""
+"""The ArmPi arm with its uncertain quantities as parameters (Eq. 2, 3)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ __all__ = ["armpi_parametric"]
 
 SERVOS = tuple(f"actuator.motor_{i}" for i in range(1, 6))
 GAIN, DAMPING = 0.008, 0.000082
-"""Of the servos in `armpi.xml`, whose length is a command unit."""
+"""Gains of the servos in `armpi.xml`, per command unit."""
 PER_RAD = KINEMATIC.scale**2
-"""What makes such a gain of one per rad."""
+"""Factor from a gain in N m/rad (N m s/rad) to the gain in `armpi.xml`, in command units."""
 
 
 def armpi_parametric(arm: ArmPiTwin | None = None) -> ParametricTwin:
@@ -25,9 +25,18 @@ def armpi_parametric(arm: ArmPiTwin | None = None) -> ParametricTwin:
     | `delay`, beyond the servos' own | samples of 10 ms | 0 to 20 |
     | `offset.motor_1` … `offset.motor_4` | command units of 0.24 degrees | -25 to 25 |
 
-    `arm` is by default that of the case; its `outside` must be "refuse", and its step 5 ms at most.
-    With longer ones the stiffest and least damped arms of this box break loose, and a fit to data
-    likes the brink of that: noise of the integration explains noise of the data.
+    Parameters
+    ----------
+    arm : ArmPiTwin, optional
+        By default that of the case. Its `outside` must be "refuse" and its step at most 5 ms: with
+        longer steps the stiffest and least damped arms in this range become unstable, and a fit to
+        data prefers parameters close to instability, where integration noise imitates data noise.
+
+    Returns
+    -------
+    ParametricTwin
+        The arm behind `CommandSide`.
+
     """
     arm = ArmPiTwin() if arm is None else arm
     stiffness = Parameter(

@@ -1,12 +1,13 @@
-"""The arm in its own plane: which postures and ramps of three pitch joints explain a path.
+"""The arm in its own plane: postures and ramps of three pitch joints that explain a path.
 
-Three joints give two outputs, so a rest alone leaves a whole curve of postures. Two things
-single one out. Real targets are whole command units: for each direction of the last link the two
-links before it are solved in closed form, and only whole units are kept; usually one posture per
-rest survives, and the cheapest chain of rests decides (`grid_chain`). Simulated targets are
-continuous: there the ramps decide, by Gauss-Newton over their combinations (`armpi_search`).
+Three joints determine two outputs, so that a rest of the path admits a whole curve of postures.
+Two facts make them unique. The targets of the real robot are whole command units: for each
+direction of the last link the two links before it are solved in closed form, and only whole units
+are kept. Usually one posture per rest remains, and the chain of rests with the lowest cost decides
+(`grid_chain`). Simulated targets are continuous: there the ramps decide, by Gauss-Newton over
+their combinations (`search`).
 
-Postures are in command steps of 0.24 deg from straight, signed as `YawPitchArm`'s angles.
+Postures are in command steps of 0.24 deg from straight, with the signs of `YawPitchArm`'s angles.
 """
 
 from __future__ import annotations
@@ -33,14 +34,21 @@ __all__ = [
 ]
 
 STEP = np.deg2rad(0.24)
-TURN = 1500  # steps in a full turn
-LIMIT = 500  # steps a motor can turn to either side
-TIE = 1.21  # mean squares closer than this cannot be told apart ...
-FLOOR = 1e-18  # ... nor those below this, in m^2: double precision is reached
-
-_MOST = 24  # postures kept per rest
-# (27, 3): indices of the ramp lengths of the three motors.
+"""Angle in rad of one command step."""
+TURN = 1500
+"""Steps in a full turn."""
+LIMIT = 500
+"""Largest angle of a motor to either side, in steps."""
+TIE = 1.21
+"""Ratio of mean square errors below which two explanations count as equally good (10 % in RMS)."""
+FLOOR = 1e-18
+"""Mean square error in m^2 below which explanations count as equally good: double precision."""
+POSTURES_PER_REST = 24
+"""Largest number of postures that are kept per rest; usually one or two are found."""
+EDGES_PER_BLOCK = 4000
+"""Number of pairs of postures whose costs are computed together, which bounds the memory."""
 COMBINATIONS = np.stack([axis.ravel() for axis in np.indices((3, 3, 3))], axis=1)
+"""Combinations (27, 3) of ramp durations: the index of each motor's duration."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +57,20 @@ class Plane:
 
     Attributes
     ----------
-    links: lengths of the three links in m.
-    radius, height: (n, M, K) samples of each movement in m, height above the first pitch joint.
-    parts: (n, M, 3, K) finished part of a ramp of each of the three lengths at the samples.
-    rests: (n, M + 1, 2) radius and height in m of each rest.
-    tolerance: (n,) how far in m a posture may be from a rest.
-    kinks: (n, M, 3) True where the path surely has the kink of a ramp of that length ending.
-    noise: (n, M) mean square error in m^2 that movements have apart from this plane.
+    links : tuple of float
+        Lengths of the three links in m.
+    radius, height : ndarray, shape (n, M, K)
+        Samples of each movement in m, the height above the first pitch joint.
+    parts : ndarray, shape (n, M, 3, K)
+        Finished fraction, at the samples, of a ramp of each of the three durations.
+    rests : ndarray, shape (n, M + 1, 2)
+        Radius and height of each rest in m.
+    tolerance : ndarray, shape (n,)
+        Largest distance in m of a posture from a rest.
+    kinks : ndarray of bool, shape (n, M, 3)
+        Where the path has the kink at the end of a ramp of that duration.
+    noise : ndarray, shape (n, M)
+        Mean square error of the movements in m^2 that does not stem from this plane.
 
     """
 
@@ -69,7 +84,19 @@ class Plane:
     noise: NDArray
 
     def rows(self, rows: NDArray) -> Plane:
-        """Some of the paths."""
+        """Select paths.
+
+        Parameters
+        ----------
+        rows : ndarray of int or bool
+            Index of the paths.
+
+        Returns
+        -------
+        Plane
+            The same quantities of these paths.
+
+        """
         return Plane(
             self.links,
             *(getattr(self, name)[rows] for name in list(self.__dataclass_fields__)[1:]),
@@ -78,9 +105,19 @@ class Plane:
 
 @dataclass(frozen=True)
 class Solution:
-    """What explains n paths: postures of the rests (n, M + 1, 3) in steps, indices (n, M, 3) of
-    the ramp lengths, mean square errors `cost` (n, M) in m^2, and which movements are `tied`
-    (n, M) with another explanation.
+    """Postures and ramps that explain n paths of M movements.
+
+    Attributes
+    ----------
+    postures : ndarray, shape (n, M + 1, 3)
+        Postures of the rests in steps.
+    lengths : ndarray of int, shape (n, M, 3)
+        Index of each motor's ramp duration.
+    cost : ndarray, shape (n, M)
+        Mean square error of each movement in m^2.
+    tied : ndarray of bool, shape (n, M)
+        Movements that another explanation fits equally well.
+
     """
 
     postures: NDArray
@@ -89,17 +126,55 @@ class Solution:
     tied: NDArray
 
     def rows(self, rows: NDArray) -> Solution:
-        """Some of the paths."""
+        """Select paths.
+
+        Parameters
+        ----------
+        rows : ndarray of int or bool
+            Index of the paths.
+
+        Returns
+        -------
+        Solution
+            The same quantities of these paths.
+
+        """
         return Solution(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
     def join(self, other: Solution) -> Solution:
-        """These paths and then the other ones."""
+        """Concatenate the paths of two solutions.
+
+        Parameters
+        ----------
+        other : Solution
+            Paths of as many movements.
+
+        Returns
+        -------
+        Solution
+            These paths, then the other ones.
+
+        """
         pairs = ((getattr(self, name), getattr(other, name)) for name in self.__dataclass_fields__)
         return Solution(*(np.concatenate(pair) for pair in pairs))
 
 
 def forward(angles: NDArray, links: tuple[float, ...]) -> tuple[NDArray, NDArray]:
-    """Radius and height of postures (..., 3) in steps."""
+    """Forward kinematics in the plane.
+
+    Parameters
+    ----------
+    angles : ndarray, shape (..., 3)
+        Postures in steps.
+    links : tuple of float
+        Lengths of the links in m.
+
+    Returns
+    -------
+    radius, height : ndarray, shape (...)
+        In m, the height above the first pitch joint.
+
+    """
     one, two, three = links
     # Written out: sums along an axis of three are slow, and this is the innermost loop.
     first = angles[..., 0] * STEP
@@ -112,7 +187,25 @@ def forward(angles: NDArray, links: tuple[float, ...]) -> tuple[NDArray, NDArray
 def with_tip(
     radius: NDArray, height: NDArray, tip: NDArray, bend: NDArray, links: tuple[float, ...]
 ) -> NDArray:
-    """Postures (..., 3) in steps that have the last link in direction `tip` and elbow `bend`."""
+    """Inverse kinematics for a given direction of the last link and a given elbow angle.
+
+    Parameters
+    ----------
+    radius, height : ndarray, shape (...)
+        Points in m.
+    tip : ndarray, shape (...)
+        Direction of the last link in steps.
+    bend : ndarray, shape (...)
+        Angle of the elbow in steps.
+    links : tuple of float
+        Lengths of the links in m.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Postures in steps.
+
+    """
     first, second, last = links
     wrist = np.arctan2(radius - last * np.sin(tip * STEP), height - last * np.cos(tip * STEP))
     inner = np.arctan2(second * np.sin(bend * STEP), first + second * np.cos(bend * STEP))
@@ -124,30 +217,60 @@ def with_tip(
 def bends(
     radius: NDArray, height: NDArray, tip: NDArray, slack: NDArray, links: tuple[float, ...]
 ) -> tuple[NDArray, NDArray]:
-    """Least and greatest bend of the elbow in steps that reach points (p,) to within `slack`.
+    """Range of elbow angles with which the arm attains points to within a tolerance.
 
-    Both are (p, tips); the least is above the greatest where the point is out of reach.
+    Parameters
+    ----------
+    radius, height : ndarray, shape (p,)
+        Points in m.
+    tip : ndarray, shape (q,)
+        Directions of the last link in steps.
+    slack : ndarray, shape (p,)
+        Tolerance in m.
+    links : tuple of float
+        Lengths of the links in m.
+
+    Returns
+    -------
+    low, high : ndarray, shape (p, q)
+        In steps; low is above high where the point cannot be attained.
+
     """
     first, second, last = links
-    reach = np.hypot(
+    distance = np.hypot(
         radius[:, None] - last * np.sin(tip * STEP), height[:, None] - last * np.cos(tip * STEP)
     )
 
-    def bend(distance: NDArray) -> NDArray:
-        cosine = (distance**2 - first**2 - second**2) / (2 * first * second)
+    def bend(length: NDArray) -> NDArray:
+        cosine = (length**2 - first**2 - second**2) / (2 * first * second)
         return np.arccos(np.clip(cosine, -1, 1)) / STEP
 
-    near = np.maximum(reach - slack[:, None], 0)
-    least = np.where(near <= first + second, bend(reach + slack[:, None]), np.inf)
-    return least, bend(near)
+    near = np.maximum(distance - slack[:, None], 0)
+    low = np.where(near <= first + second, bend(distance + slack[:, None]), np.inf)
+    return low, bend(near)
 
 
 def grid_postures(
     rests: NDArray, tolerance: NDArray, links: tuple[float, ...]
 ) -> tuple[NDArray, NDArray]:
-    """All postures on whole steps within tolerance (n,) of rests (n, R, 2), `_MOST` per rest.
+    """Postures on whole steps within a tolerance of the rests.
 
-    Returns the rests they belong to, in order, numbered path by path, and the postures (., 3).
+    Parameters
+    ----------
+    rests : ndarray, shape (n, R, 2)
+        Radius and height of each rest in m.
+    tolerance : ndarray, shape (n,)
+        Largest distance from a rest in m.
+    links : tuple of float
+        Lengths of the links in m.
+
+    Returns
+    -------
+    rest : ndarray of int, shape (c,)
+        Rest of each posture, counted path by path and in order.
+    posture : ndarray, shape (c, 3)
+        Postures in steps, at most `POSTURES_PER_REST` per rest, the nearest ones first.
+
     """
     radius, height = rests.reshape(-1, 2).T
     tolerance = np.repeat(tolerance, rests.shape[1])
@@ -171,7 +294,7 @@ def grid_postures(
     _, index = np.unique(keys, axis=0, return_index=True)
     index = index[np.lexsort((error[index], rest[index]))]
     rank = np.arange(index.size) - np.searchsorted(rest[index], rest[index])
-    index = index[rank < _MOST]
+    index = index[rank < POSTURES_PER_REST]
     return rest[index], posture[index]
 
 
@@ -188,9 +311,9 @@ def _ramp_costs(
     one, two, three = np.moveaxis(angle * STEP, -1, 0)
     second = one[:, :, None] + two[:, None]
     third = second[:, :, :, None] + three[:, None, None]
-    turns = [one[:, :, None, None], second[:, :, :, None], third]
-    r = sum(link * np.sin(turn) for link, turn in zip(plane.links, turns, strict=True))
-    h = sum(link * np.cos(turn) for link, turn in zip(plane.links, turns, strict=True))
+    angles = [one[:, :, None, None], second[:, :, :, None], third]
+    r = sum(link * np.sin(each) for link, each in zip(plane.links, angles, strict=True))
+    h = sum(link * np.cos(each) for link, each in zip(plane.links, angles, strict=True))
     error = (r - radius[:, None, None, None]) ** 2 + (h - height[:, None, None, None]) ** 2
     cost = error.mean(axis=-1).reshape(-1, 27)
     # A motor that stays has no ramp: leave one combination of the equal ones.
@@ -199,9 +322,20 @@ def _ramp_costs(
 
 
 def grid_chain(plane: Plane) -> tuple[NDArray, Solution]:
-    """Cheapest chain of whole-step postures.
+    """Find the chain of whole-step postures with the lowest cost.
 
-    Returns which paths (n,) have a posture on the grid for every rest, and their `Solution`.
+    Parameters
+    ----------
+    plane : Plane
+        n paths.
+
+    Returns
+    -------
+    on_grid : ndarray of bool, shape (n,)
+        Paths that have a posture on whole steps for every rest.
+    solution : Solution
+        Their explanation.
+
     """
     rests = plane.rests.shape[1]
     rest, posture = grid_postures(plane.rests, plane.tolerance, plane.links)
@@ -214,7 +348,7 @@ def grid_chain(plane: Plane) -> tuple[NDArray, Solution]:
 
 
 def _cheapest(plane: Plane, rest: NDArray, posture: NDArray) -> Solution:
-    """Cheapest chain through postures (c, 3) of `rest` (c,), every rest having at least one."""
+    """Chain of lowest cost through postures (c, 3) of `rest` (c,), at least one per rest."""
     count, moves = plane.noise.shape
     begin = np.searchsorted(rest, np.arange(count * (moves + 1) + 1))
     head = np.flatnonzero(rest % (moves + 1) < moves)
@@ -223,7 +357,7 @@ def _cheapest(plane: Plane, rest: NDArray, posture: NDArray) -> Solution:
     tail = begin[rest[head] + 1] + _count_up(number)
     owner, move = np.divmod(rest[head], moves + 1)
     cost = np.empty((head.size, 27))
-    for some in np.array_split(np.arange(head.size), head.size // 4000 + 1):
+    for some in np.array_split(np.arange(head.size), head.size // EDGES_PER_BLOCK + 1):
         at = owner[some], move[some]
         cost[some] = _ramp_costs(
             posture[head[some]], posture[tail[some]],

@@ -16,7 +16,7 @@ from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
-from retwin.twins.twin import Limits
+from retwin.twins.limits import Limits
 
 if TYPE_CHECKING:
     from retwin.twins.mujoco import MuJoCoTwin
@@ -24,15 +24,17 @@ if TYPE_CHECKING:
 __all__ = ["ARM", "KINEMATIC", "MODEL", "POLL", "STRAIGHT", "UNIT", "ArmPiTwin"]
 
 ARM = YawPitchArm(base=0.028505 + 0.0361, links=(0.10048, 0.094714, 0.05071))
+"""Kinematics of the arm, with the lengths of its URDF."""
 MODEL = Path(__file__).with_name("armpi.xml")
-"""The arm in MJCF."""
+"""Path of the arm's MJCF file."""
 STRAIGHT = 500.0
-"""The command at which a motor's angle is 0; commands go from 0 to 1000."""
+"""Command at which a motor's angle is 0, in units; commands go from 0 to 1000."""
 UNIT = 0.24
 """Degrees per command unit; a motor's angle in degrees is 120 - 0.24 units."""
 RATE = 100.0
+"""Sample rate in Hz of the published data."""
 POLL = 10
-"""Samples per reading of the real arm's motors; between them its data are straight lines."""
+"""Data samples per sensor sample of the real arm, whose data are linear in between."""
 
 KINEMATIC = KinematicTwin(
     ARM,
@@ -44,7 +46,7 @@ KINEMATIC = KinematicTwin(
     rate=RATE,
     limits=Limits((0.0,) * 4, (1000.0,) * 4),
 )
-"""The arm's kinematics behind a servo lag, fitted to the published twin."""
+"""The arm's kinematics behind a servo lag that is fitted to the published twin."""
 
 
 @dataclass(frozen=True)
@@ -52,14 +54,17 @@ class ArmPiTwin:
     """The arm as a MuJoCo model: masses and inertias of its URDF, servos with a transport delay.
 
     The servos' stiffness, damping and delay in `armpi.xml` are fitted to the published twin
-    (docs/results.md). Commands are servo units; the output is the end-effector in m; `nominal` is
-    the forward kinematics of the clean commands without any lag.
+    (docs/results.md). Commands are in servo units, the output is the end-effector position in m.
+    The nominal output is the forward kinematics of the clean commands without lag.
 
     Parameters
     ----------
-    step: integration step in s; from 1 to 10 ms paths differ by less than 0.1 mm RMS.
-    outside: "refuse" or "clip" commands outside 0 to 1000.
-    threads: that simulate; 0 takes all cores. The result does not depend on it.
+    step : float, default 0.005
+        Integration step in s; between 1 and 10 ms paths differ by less than 0.1 mm RMS.
+    outside : {"refuse", "clip"}
+        What is done with commands outside 0 to 1000.
+    threads : int, default 0
+        Threads that simulate; 0 takes all cores. The result does not depend on it.
 
     """
 
@@ -79,17 +84,17 @@ class ArmPiTwin:
 
     @property
     def rate(self) -> float:
-        """Samples per second."""
+        """Sample rate in Hz."""
         return RATE
 
     @property
     def limits(self) -> Limits:
-        """What the servos accept."""
+        """Range of the commands that the servos accept."""
         return Limits((0.0,) * 4, (1000.0,) * 4, self.outside)
 
     @cached_property
     def physics(self) -> MuJoCoTwin:
-        """The simulator inside."""
+        """The MuJoCo model that simulates."""
         from retwin.twins.mujoco import MuJoCoTwin
 
         return MuJoCoTwin(
@@ -114,7 +119,7 @@ class ArmPiTwin:
         parameters: Mapping[str, ArrayLike] | None = None,
         hidden: dict[str, NDArray] | None = None,
     ) -> Trajectories:
-        """See `MuJoCoTwin.simulate`; `hidden` has the angles of the five joints in rad."""
+        """See `MuJoCoTwin.simulate`; `hidden` gets the angles of the five joints in rad."""
         return self.physics.simulate(
             commands,
             faults=faults,
@@ -124,7 +129,19 @@ class ArmPiTwin:
             hidden=hidden,
         )
 
-    def respond(self, told: NDArray, frozen: NDArray, failed: dict[int, str]) -> NDArray:
-        """Where motors 1 to 4 go, in command units (n, T, 4); see `MuJoCoTwin.respond`."""
-        positions = self.physics.respond(told, frozen, failed)
+    def respond(self, commands: NDArray, frozen: NDArray, failed: dict[int, str]) -> NDArray:
+        """Integrate the response of motors 1 to 4.
+
+        Parameters
+        ----------
+        commands, frozen, failed
+            See `MuJoCoTwin.respond`.
+
+        Returns
+        -------
+        ndarray, shape (n, T, 4)
+            Angles in command units.
+
+        """
+        positions = self.physics.respond(commands, frozen, failed)
         return STRAIGHT + positions[..., : len(self.inputs)] / KINEMATIC.scale

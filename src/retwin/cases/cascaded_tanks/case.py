@@ -1,9 +1,14 @@
-"""The cascaded tanks benchmark: a pump's voltage in, the level of the lower of two tanks out.
+"""The cascaded tanks benchmark: from a pump's voltage to the level of the lower of two tanks.
 
-A real system with a hidden state, the upper tank's level, and physics that the simple twin lacks:
-tanks run over. One record to estimate from and one to validate on, of 1024 samples at 4 s, both
-from the same unknown state: M. Schoukens and J. P. Noël, "Three benchmarks addressing open
-challenges in nonlinear system identification", IFAC-PapersOnLine 50 (2017).
+A real system with a hidden state, the level of the upper tank, and with physics that the simple
+twin lacks: the tanks overflow. The benchmark has one record for estimation and one for validation,
+each of 1024 samples at 4 s and from the same unknown initial state.
+
+References
+----------
+M. Schoukens and J. P. Noël, "Three benchmarks addressing open challenges in nonlinear system
+identification", IFAC-PapersOnLine 50 (2017).
+
 """
 
 from __future__ import annotations
@@ -35,19 +40,38 @@ OVERFLOWING = TanksTwin(
     upper_power=0.814118,
     lower_power=0.352169,
 )
-"""All that is known of their physics; `identify` on the estimation record, see docs/tanks.md."""
+"""The complete physics, with parameters identified on the estimation record (docs/tanks.md)."""
 
 VOLTAGES = MultisineSampler((0.0,), (10.0,), 320, 1024, (2.8,), (1.0,), slow=19, fast=59)
-"""Voltages like the benchmark's: most of it slow, a third of a period each."""
+"""Voltages like the benchmark's, mostly slow; each trajectory is a third of a period."""
 
 
 def benchmark(twin: TanksTwin) -> ColumnRecords:
-    """Reads `dataBenchmark.csv`: the estimation record calibrates, the validation record tests."""
+    """Records of `dataBenchmark.csv`: estimation for calibration, validation for the test.
+
+    Parameters
+    ----------
+    twin : TanksTwin
+        The twin that gives the nominal output.
+
+    Returns
+    -------
+    ColumnRecords
+        A function from the file to both sets.
+
+    """
     return ColumnRecords(twin, {"pump": "uEst", "level": "yEst"}, {"pump": "uVal", "level": "yVal"})
 
 
 def tanks() -> Case:
-    """The case; it has no faults, so nothing is diagnosed."""
+    """The case with the simple twin; it has no faults, so nothing is diagnosed.
+
+    Returns
+    -------
+    Case
+        The case `tanks`.
+
+    """
     return Case(
         name="tanks",
         title="Cascaded tanks",
@@ -68,7 +92,14 @@ def tanks() -> Case:
 
 
 def tanks_overflow() -> Case:
-    """The same with a twin that knows of overflow and of the outlets' powers."""
+    """The case whose twin includes overflow and the exponents of the outflows.
+
+    Returns
+    -------
+    Case
+        The case `tanks_overflow`.
+
+    """
     return replace(
         tanks(),
         name="tanks_overflow",

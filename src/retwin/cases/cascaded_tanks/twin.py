@@ -1,14 +1,19 @@
-"""Two cascaded tanks: a pump fills the upper one, which drains into the lower one; one is measured.
+"""`TanksTwin`: a pump fills the upper of two tanks, which drains into the lower, measured one.
 
-Torricelli's law, after Schoukens and Noël, "Three benchmarks addressing open challenges in
-nonlinear system identification" (2017), with levels in volts of the lower tank's sensor:
+Torricelli's law, with levels in volts of the lower tank's sensor:
 
     upper level: x' = pump u - upper x^p
     lower level: y' = upper x^p - lower y^q
 
-with p = q = 1/2. A real outlet may be between that and laminar flow, where the power is 1, and a
-level need not be counted from the outlet. The upper tank's level is hidden. Its unit is such that
-it loses what the lower one gains.
+with p = q = 1/2. A real outlet may be between that and laminar flow, where the exponent is 1, and a
+level need not be counted from the outlet. The level of the upper tank is hidden; in its unit the
+upper tank loses as much as the lower one gains.
+
+References
+----------
+M. Schoukens and J. P. Noël, "Three benchmarks addressing open challenges in nonlinear system
+identification", IFAC-PapersOnLine 50 (2017).
+
 """
 
 from __future__ import annotations
@@ -23,42 +28,54 @@ from scipy.integrate import RK45
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
-from retwin.twins.parametric import Parameter, ParametricTwin, values_per_simulation
-from retwin.twins.twin import Chunk, Limits, simulate_in_chunks
+from retwin.twins.limits import Limits
+from retwin.twins.parameter_values import values_per_simulation
+from retwin.twins.parametric import Parameter, ParametricTwin
+from retwin.twins.twin import Chunk, simulate_in_chunks
 
 __all__ = ["TanksTwin", "tanks_parametric"]
 
 INPUTS = Channels(("pump",), ("V",))
 OUTPUTS = Channels(("level",), ("V",))
 RATE = 0.25
-"""Samples per second: one every 4 s."""
+"""Sample rate in Hz: one sample every 4 s, as in the benchmark."""
 FULL = 10.0
-"""The lower tank's level, in V, at which it overflows."""
+"""Level of the lower tank in V at which it overflows, where its sensor saturates."""
 WEIR = 0.5
-"""What runs over the edge, per V above it and s: so fast that levels stay close to the edge."""
+"""Overflow in V/s per V above the edge, so high that levels stay close to the edge."""
 PHYSICS = (
     *("pump", "upper", "lower", "start_upper", "start_lower"),
     *("edge", "spill", "upper_power", "lower_power"),
 )
+"""Names of the parameters."""
+TRAJECTORIES_PER_CHUNK = 512
+"""Number of trajectories that are integrated together."""
 
 
 @dataclass(frozen=True)
 class TanksTwin:
-    """The tanks in simulation, at one sample every 4 s; the pump's voltage is held in between.
+    """The tanks, at one sample every 4 s; the pump's voltage is held in between.
+
+    `simulate` takes the numbers as `parameters`. The defaults are the least-squares fit to the
+    benchmark's estimation record, see `benchmarks/tanks.py`. The lower level determines the upper
+    level and its start only weakly.
 
     Parameters
     ----------
-    pump: what a volt on the pump adds to the upper level, in V/(V s).
-    upper, lower: outflow of each tank at a level of 1 V, in V/s.
-    start_upper, start_lower: levels at the first sample, in V.
-    overflow: whether tanks run over; without, levels know no edge.
-    edge: of the upper tank, in V; the lower one's is at 10 V, where its reading ends.
-    spill: share of what runs over the upper edge that falls into the lower tank.
-    upper_power, lower_power: p and q, of the level in the outflow of each tank.
-
-    `simulate` takes the numbers as `parameters`, by name, one for all trajectories or one each.
-    The defaults are the least-squares fit to the benchmark's estimation record, see
-    `benchmarks/tanks.py`. The upper level is told badly by the lower one, and so is its start.
+    pump : float
+        Inflow of the upper tank in V/s per volt on the pump.
+    upper, lower : float
+        Outflow of each tank in V/s at a level of 1 V.
+    start_upper, start_lower : float
+        Levels at the first sample in V.
+    overflow : bool, default False
+        Whether the tanks overflow.
+    edge : float
+        Level in V at which the upper tank overflows; the lower one overflows at 10 V.
+    spill : float
+        Fraction of the upper tank's overflow that falls into the lower tank, from 0 to 1.
+    upper_power, lower_power : float
+        Exponents p and q of the levels in the outflow of each tank.
 
     """
 
@@ -85,12 +102,12 @@ class TanksTwin:
 
     @property
     def rate(self) -> float:
-        """Samples per second."""
+        """Sample rate in Hz."""
         return RATE
 
     @property
     def limits(self) -> Limits:
-        """A pump does not suck."""
+        """Range of the pump's voltage in V."""
         return Limits((0.0,), (10.0,))
 
     def simulate(
@@ -104,40 +121,40 @@ class TanksTwin:
     ) -> Trajectories:
         """See `TakesParameters.simulate`; a stuck pump holds its voltage."""
         count = len(commands)
-        own = values_per_simulation(parameters, PHYSICS, count)
+        own = values_per_simulation(parameters, count, allowed=PHYSICS)
         numbers = {name: own.get(name, np.full(count, getattr(self, name))) for name in PHYSICS}
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             some = {name: values[chunk.index] for name, values in numbers.items()}
             nominal = self._levels(chunk.commands, some)
-            return nominal, self._levels(chunk.held_commands, some) if any(
-                chunk.faults
-            ) else nominal
+            if not any(chunk.faults):
+                return nominal, nominal
+            return nominal, self._levels(chunk.held_commands, some)
 
         return simulate_in_chunks(
-            self, run, commands, faults, seed=seed, progress=progress, size=512
+            self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
         )
 
     def _levels(self, commands: NDArray, numbers: Mapping[str, NDArray]) -> NDArray:
-        """The lower level (n, T, 1); the upper one is not told."""
+        """The lower level (n, T, 1)."""
         voltage = commands[..., 0].T.astype(np.float64)
         levels = np.concatenate([numbers["start_upper"], numbers["start_lower"]])
-        told = np.empty(voltage.shape)
+        measured = np.empty(voltage.shape)
         for sample, held in enumerate(voltage):
-            told[sample] = levels[len(held) :]
+            measured[sample] = levels[len(held) :]
             levels = self._after(levels, held, numbers)
         if self.overflow:
-            np.minimum(told, FULL, out=told)
-        return told.T[..., None].astype(commands.dtype)
+            np.minimum(measured, FULL, out=measured)
+        return measured.T[..., None].astype(commands.dtype)
 
     def _after(self, levels: NDArray, voltage: NDArray, numbers: Mapping[str, NDArray]) -> NDArray:
         """Both levels (2 n,) one sample later: one step of Dormand and Prince's method.
 
-        The step is never refused, whatever its error: trajectories are integrated together, and
-        one must not depend on those beside it. A sample is short against the tanks' time.
+        The step is accepted whatever its error, because trajectories are integrated together and
+        must not depend on each other. A sample is short compared with the tanks' time constants.
         """
         solver = RK45(
-            lambda _, now: self._rates(now, voltage, numbers),
+            lambda _, now: self._derivatives(now, voltage, numbers),
             0.0,
             levels,
             1 / RATE,
@@ -147,7 +164,10 @@ class TanksTwin:
         solver.step()
         return np.maximum(solver.y, 0.0)
 
-    def _rates(self, levels: NDArray, voltage: NDArray, numbers: Mapping[str, NDArray]) -> NDArray:
+    def _derivatives(
+        self, levels: NDArray, voltage: NDArray, numbers: Mapping[str, NDArray]
+    ) -> NDArray:
+        """Time derivatives (2 n,) of both levels in V/s."""
         x, y = np.split(np.maximum(levels, 0.0), 2)
         between = numbers["upper"] * x ** numbers["upper_power"]
         upper = numbers["pump"] * voltage - between
@@ -162,9 +182,18 @@ class TanksTwin:
 def tanks_parametric(overflow: bool = False) -> ParametricTwin:
     """The tanks with their numbers as free parameters, for identification (Eq. 2, 3).
 
-    Five of them, of the simple physics. With `overflow` all that is known: also the upper tank's
-    edge, the share that spills into the lower tank, and the powers of the outflows. The start
-    levels are the system's own, the same in every record.
+    Parameters
+    ----------
+    overflow : bool, default False
+        Whether the complete physics is free: also the edge of the upper tank, the fraction that
+        spills into the lower tank, and the exponents of the outflows.
+
+    Returns
+    -------
+    ParametricTwin
+        Five or nine free parameters. The start levels are the system's own, the same in every
+        record.
+
     """
     bounds = {
         "pump": ("V/(V s)", 0.005, 0.3),

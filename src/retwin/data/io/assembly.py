@@ -1,23 +1,28 @@
-"""Blocks of numbers from a file, assembled into trajectories and validated against a case."""
+"""Trajectories from the arrays of a file, validated against a case."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
 
-__all__ = ["DataCase", "Raw", "assemble", "settle", "split_columns"]
+__all__ = ["DataCase", "Raw", "Reader", "assemble", "settle", "split_columns"]
+
+RATE_TOLERANCE = 1e-3
+"""Relative difference of sample rates that count as equal: files round their times."""
 
 
 class DataCase(Protocol):
-    """What a case says about its data."""
+    """Channels, sample rate and classes of the data of one system."""
 
     @property
     def inputs(self) -> Channels:
@@ -46,11 +51,40 @@ class DataCase(Protocol):
         ...
 
 
+class Reader(Protocol):
+    """A function that reads one file format."""
+
+    def __call__(
+        self,
+        path: Path,
+        *,
+        case: DataCase | None,
+        rate: float | None,
+        progress: Progress | None,
+    ) -> Trajectories:
+        """The trajectories at `path`; see `data.io.load`."""
+        ...
+
+
 @dataclass(frozen=True)
 class Raw:
-    """One trajectory as a file gives it: commands (T, d_u) or none, nominal and observed (T, d_y).
+    """One trajectory as it is in a file.
 
-    `where` names it in messages, `clock` is the sample rate that the file itself tells, if any.
+    Attributes
+    ----------
+    where : str
+        Its name in messages.
+    label : str
+        Its class name, "" if unknown.
+    nominal, observed : (T, d_y) array
+        The ideal outputs and the measured ones, NaN where one is missing.
+    commands : (T, d_u) array or None
+        None if the file holds none.
+    id : str or None
+        Its name in the set.
+    rate : float or None
+        The sample rate in Hz, None if the file does not hold it.
+
     """
 
     where: str
@@ -59,32 +93,39 @@ class Raw:
     observed: NDArray
     commands: NDArray | None = None
     id: str | None = None
-    clock: float | None = None
+    rate: float | None = None
 
 
 def split_columns(block: NDArray, where: str, case: DataCase | None) -> tuple[NDArray, ...]:
-    """Columns (T, k) as commands, nominal and observed; commands are (T, 0) when k = 2 d_y."""
+    """Columns (T, k) as commands, nominal and observed; commands are (T, 0) if k = 2 d_y.
+
+    Raises
+    ------
+    InputError
+        The number of columns fits neither layout.
+
+    """
     width = block.shape[1]
     if case is None:
         half, odd = divmod(width, 2)
-        if odd or not half:
-            raise InputError(
-                where,
-                expected="an even number of columns, nominal outputs then observed ones",
-                got=f"{width} columns",
-                remedy="give the case when commands come first",
-            )
+        require(
+            half and not odd,
+            where,
+            expected="an even number of columns, nominal outputs then observed ones",
+            got=f"{width} columns",
+            remedy="give the case when commands come first",
+        )
         first = 0
     else:
         half, first = len(case.outputs), width - 2 * len(case.outputs)
-        if first not in (0, len(case.inputs)):
-            raise InputError(
-                where,
-                expected=f"{2 * half} columns (nominal, observed) or "
-                f"{len(case.inputs) + 2 * half} (commands, nominal, observed)",
-                got=f"{width} columns",
-                remedy="give the case that the data belong to",
-            )
+        require(
+            first in (0, len(case.inputs)),
+            where,
+            expected=f"{2 * half} columns (nominal, observed) or "
+            f"{len(case.inputs) + 2 * half} (commands, nominal, observed)",
+            got=f"{width} columns",
+            remedy="give the case that the data belong to",
+        )
     return block[:, :first], block[:, first : first + half], block[:, first + half :]
 
 
@@ -96,22 +137,37 @@ def assemble(
     rate: float | None,
     inputs: Channels | None = None,
 ) -> Trajectories:
-    """Trajectories from `raws`, the shorter ones padded: last value held, mask False.
+    """Trajectories from `raws`; shorter ones are padded with the last value and mask False.
+
+    Parameters
+    ----------
+    raws : sequence of Raw
+        At least one.
+    source : Provenance
+        Where they come from.
+    case : DataCase or None
+        Sets the sample rate.
+    rate : float or None
+        The sample rate in Hz, None if the case or every file holds it.
+    inputs : Channels or None
+        Names of the commands, None for numbered ones.
 
     Raises
     ------
-    InputError: widths, rates or the presence of commands differ among `raws`; no rate is known.
+    InputError
+        Widths, sample rates or the presence of commands differ among `raws`, no sample rate is
+        known, or a command or nominal output is not finite.
 
     """
     first = raws[0]
     for raw in raws:
-        if (raw.commands is None) != (first.commands is None):
-            raise InputError(
-                raw.where,
-                expected="commands in every trajectory or in none",
-                got="commands in some trajectories only",
-                remedy="split the data into two sets",
-            )
+        require(
+            (raw.commands is None) == (first.commands is None),
+            raw.where,
+            expected="commands in every trajectory or in none",
+            got="commands in some trajectories only",
+            remedy="split the data into two sets",
+        )
         for name in ("nominal", "observed", "commands"):
             _same_width(name, raw, first)
     steps = max(len(raw.nominal) for raw in raws)
@@ -120,13 +176,13 @@ def assemble(
         none if raw.commands is None else raw.commands
         for raw, none in zip(raws, empty, strict=True)
     ]
-    _check_known(raws, commands)
+    _check_finite(raws, commands)
     lengths = np.array([len(raw.nominal) for raw in raws])
-    observed = _held([raw.observed for raw in raws], steps)
+    observed = _padded([raw.observed for raw in raws], steps)
     present = np.arange(steps)[None, :, None] < lengths[:, None, None]
     return Trajectories(
-        commands=_held(commands, steps),
-        nominal=_held([raw.nominal for raw in raws], steps),
+        commands=_padded(commands, steps),
+        nominal=_padded([raw.nominal for raw in raws], steps),
         observed=observed,
         rate=_common_rate(raws, case, rate),
         mask=np.isfinite(observed) & present,
@@ -138,46 +194,59 @@ def assemble(
 
 
 def settle(
-    trajectories: Trajectories, case: DataCase | None, progress: Progress | None
+    trajectories: Trajectories,
+    case: DataCase | None,
+    rate: float | None,
+    progress: Progress | None,
 ) -> Trajectories:
-    """`trajectories` with the channels and rate of `case`, labels checked, commands completed.
+    """`trajectories` with the channels of `case`, labels checked, commands completed.
 
     Raises
     ------
-    InputError: widths, rate, channels or class names that are not those of the case.
+    InputError
+        Widths, sample rate (Hz), channels or class names are not those of the case, or the sample
+        rate is not `rate`.
 
     """
+    if rate is not None:
+        require(
+            _close(rate, trajectories.rate),
+            "rate",
+            expected=f"{trajectories.rate:g} Hz, the sample rate of the file",
+            got=f"{rate:g} Hz",
+            remedy="leave rate out",
+        )
     if case is None:
         return trajectories
-    if trajectories.rate != case.rate:
-        raise InputError(
-            "rate",
-            expected=f"{case.rate:g} Hz, the rate of the case",
-            got=f"{trajectories.rate:g} Hz",
-            remedy="resample the data, or leave the case out",
-        )
+    require(
+        trajectories.rate == case.rate,
+        "rate",
+        expected=f"{case.rate:g} Hz, the sample rate of the case",
+        got=f"{trajectories.rate:g} Hz",
+        remedy="resample the data, or leave the case out",
+    )
     width = trajectories.commands.shape[2]
-    held = [("outputs", "y", trajectories.outputs, case.outputs)]
+    channels_of = [("outputs", "y", trajectories.outputs, case.outputs)]
     if width:
-        held.append(("inputs", "u", trajectories.inputs, case.inputs))
-    for name, prefix, channels, wanted in held:
+        channels_of.append(("inputs", "u", trajectories.inputs, case.inputs))
+    for name, prefix, channels, wanted in channels_of:
         # A set that was saved before anyone named its channels may be named now.
         unnamed = Channels.numbered(prefix, len(wanted))
-        if channels not in (wanted, unnamed):
-            raise InputError(
-                name,
-                expected=f"the channels of the case, {_told(wanted)}",
-                got=_told(channels),
-                remedy="give the case that the data belong to",
-            )
-    unknown = sorted(trajectories.known_labels - set(case.classes))
-    if unknown:
-        raise InputError(
-            "labels",
-            expected=f"classes of the case, {', '.join(case.classes)}",
-            got=f"the unknown class {unknown[0]!r}",
-            remedy="rename the class, or give the case that the data belong to",
+        require(
+            channels in (wanted, unnamed),
+            name,
+            expected=f"the channels of the case, {_described(wanted)}",
+            got=_described(channels),
+            remedy="give the case that the data belong to",
         )
+    unknown = sorted(trajectories.known_labels - set(case.classes))
+    require(
+        not unknown,
+        "labels",
+        expected=f"classes of the case, {', '.join(case.classes)}",
+        got=f"the unknown class {''.join(unknown[:1])!r}",
+        remedy="rename the class, or give the case that the data belong to",
+    )
     settled = trajectories.replace(
         outputs=case.outputs, inputs=case.inputs if width else trajectories.inputs
     )
@@ -186,33 +255,34 @@ def settle(
     return case.complete(settled, progress=progress)
 
 
-def _held(blocks: Sequence[NDArray], steps: int) -> NDArray:
-    """(n, steps, k) from blocks (T, k), the last value of each held."""
+def _padded(blocks: Sequence[NDArray], steps: int) -> NDArray:
+    """(n, steps, k) from blocks (T, k), each padded with its last value."""
     kind = np.result_type(*{block.dtype for block in blocks})
-    held = np.empty((len(blocks), steps, blocks[0].shape[1]), kind)
-    for row, block in zip(held, blocks, strict=True):
+    padded = np.empty((len(blocks), steps, blocks[0].shape[1]), kind)
+    for row, block in zip(padded, blocks, strict=True):
         row[: len(block)] = block
         row[len(block) :] = block[-1:]
-    return held
+    return padded
 
 
 def _same_width(name: str, raw: Raw, first: Raw) -> None:
-    mine, wanted = getattr(raw, name), getattr(first, name)
-    if mine is not None and mine.shape[1] != wanted.shape[1]:
-        raise InputError(
+    array, wanted = getattr(raw, name), getattr(first, name)
+    if array is not None:
+        require(
+            array.shape[1] == wanted.shape[1],
             raw.where,
             expected=f"{wanted.shape[1]} columns of {name}, as in {first.where}",
-            got=f"{mine.shape[1]}",
+            got=array.shape[1],
             remedy="keep data of different systems apart",
         )
 
 
-def _check_known(raws: Sequence[Raw], commands: Sequence[NDArray]) -> None:
-    """Name the place where a known input is NaN or infinite, or a measurement infinite."""
-    for raw, told in zip(raws, commands, strict=True):
+def _check_finite(raws: Sequence[Raw], commands: Sequence[NDArray]) -> None:
+    """Raise InputError, which names the sample, for inputs and outputs that are not finite."""
+    for raw, given in zip(raws, commands, strict=True):
         for name, block, bad in (
             ("nominal", raw.nominal, ~np.isfinite(raw.nominal)),
-            ("commands", told, ~np.isfinite(told)),
+            ("commands", given, ~np.isfinite(given)),
             ("observed", raw.observed, np.isinf(raw.observed)),
         ):
             if bad.any():
@@ -228,31 +298,34 @@ def _check_known(raws: Sequence[Raw], commands: Sequence[NDArray]) -> None:
 
 
 def _common_rate(raws: Sequence[Raw], case: DataCase | None, rate: float | None) -> float:
-    """The one sample rate of the set, in Hz: given, the case's, or told by every file."""
-    told = [(raw.clock, raw.where) for raw in raws if raw.clock is not None]
-    known = [(rate, "rate")] if rate is not None else []
-    known += [(float(case.rate), "the case")] if case is not None else []
-    known += told
-    if not known:
-        raise InputError(
+    """The sample rate of the set in Hz: given, the case's, or that in every file."""
+    found = [(rate, "the argument")] if rate is not None else []
+    found += [(float(case.rate), "the case")] if case is not None else []
+    found += [(raw.rate, raw.where) for raw in raws if raw.rate is not None]
+    require(
+        found,
+        "rate",
+        expected="the sample rate, which the file does not hold",
+        got="none",
+        remedy="give rate (in Hz) or case; on the command line --rate or --case",
+    )
+    first, origin = found[0]
+    for value, where in found[1:]:
+        require(
+            _close(value, first),
             "rate",
-            expected="the sample rate, which the file does not hold",
-            got="none",
-            remedy="give rate (in Hz) or case; on the command line --rate or --case",
+            expected=f"one sample rate, {first:g} Hz as in {origin}",
+            got=f"{value:g} Hz in {where}",
+            remedy="resample, or load the parts one by one",
         )
-    first, said_by = known[0]
-    for value, where in known[1:]:
-        if not np.isclose(value, first, rtol=1e-3, atol=0):
-            raise InputError(
-                "rate",
-                expected=f"one sample rate, {first:g} Hz as {said_by} says",
-                got=f"{value:g} Hz in {where}",
-                remedy="resample, or load the parts one by one",
-            )
-    return known[0][0] if case is None else float(case.rate)
+    return first if case is None else float(case.rate)
 
 
-def _told(channels: Channels) -> str:
+def _close(rate: float, other: float) -> bool:
+    return bool(np.isclose(rate, other, rtol=RATE_TOLERANCE, atol=0))
+
+
+def _described(channels: Channels) -> str:
     return (
         ", ".join(f"{n} [{u}]" for n, u in zip(channels.names, channels.units, strict=True))
         or "none"

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.io.assembly import DataCase, Raw, assemble, split_columns
 from retwin.data.io.mat import mat_variables, matrix
 from retwin.data.io.mat5 import Opaque
@@ -24,10 +25,17 @@ __all__ = ["read_class_folders"]
 
 Reader = Callable[[Path, str, "DataCase | None"], Raw]
 COORDINATES = 3
+"""Outputs per sample in the arm's authors' files: x, y and z."""
+PERIOD_RATIO = 1.5
+"""The largest ratio of two sample periods that count as jitter: one sample less makes it 2."""
 
 
 def read_class_folders(
-    path: Path, *, case: DataCase | None, rate: float | None, progress: Progress | None
+    path: Path,
+    *,
+    case: DataCase | None = None,
+    rate: float | None = None,
+    progress: Progress | None = None,
 ) -> Trajectories:
     """Trajectories of the files `path`/class name/*.csv or `path`/class name/dataset_*.mat.
 
@@ -39,19 +47,20 @@ def read_class_folders(
 
     Raises
     ------
-    InputError: no such files, files of both kinds, or one that does not hold what is expected.
+    InputError
+        There are no such files or files of both kinds, or one has other contents.
 
     """
     kinds: list[tuple[str, Reader]] = [("*.csv", _read_csv), ("dataset_*.mat", _read_dataset)]
     found = [(_in_order(path, pattern), read) for pattern, read in kinds]
     found = [(files, read) for files, read in found if files]
-    if len(found) != 1:
-        raise InputError(
-            "path",
-            expected="a folder per class with *.csv or dataset_*.mat files",
-            got=f"{'both kinds' if found else 'no such file'} in {path}",
-            remedy="keep the kinds apart" if found else "give the folder above the class folders",
-        )
+    require(
+        len(found) == 1,
+        "path",
+        expected="a folder per class with *.csv or dataset_*.mat files",
+        got=f"{'both kinds' if found else 'no such file'} in {path}",
+        remedy="keep the kinds apart" if found else "give the folder above the class folders",
+    )
     files, read = found[0]
     raws = []
     for i, file in enumerate(files):
@@ -100,7 +109,7 @@ def _read_csv(file: Path, where: str, case: DataCase | None) -> Raw:
 
 
 def _csv_error(file: Path, where: str, fallback: str) -> InputError:
-    """The error that names the first bad line of a CSV file, or `fallback` when none stands out."""
+    """The error that names the first bad line of a CSV file, `fallback` if no line is bad."""
     got, width = None, 0
     with file.open(encoding="utf-8-sig", errors="replace") as lines:
         for number, line in enumerate(lines, start=1):
@@ -138,11 +147,11 @@ def _read_dataset(file: Path, where: str, case: DataCase | None) -> Raw:
     if {"trajCmds", "trajResps"} <= set(paths):
         nominal = _upright(paths["trajCmds"], width, f"{where}: trajCmds")
         observed = _upright(paths["trajResps"], width, f"{where}: trajResps")
-        commands, clock = _motor_commands(file, where, len(nominal))
+        commands, recorded = _motor_commands(file, where, len(nominal))
     elif "dataset" in paths:
         both = _upright(paths["dataset"], 2 * width, f"{where}: dataset")
         nominal, observed = both[:, :width], both[:, width:]
-        commands, clock = None, None
+        commands, recorded = None, None
     else:
         raise InputError(
             where,
@@ -150,32 +159,32 @@ def _read_dataset(file: Path, where: str, case: DataCase | None) -> Raw:
             got=", ".join(sorted(mat_variables(file))) or "none",
             remedy="give the folder of the authors' data as it is",
         )
-    if len(nominal) != len(observed):
-        raise InputError(
-            f"{where}: trajResps",
-            expected=f"{len(nominal)} samples, as trajCmds",
-            got=f"{len(observed)}",
-            remedy="sample both on the same grid",
-        )
+    require(
+        len(nominal) == len(observed),
+        f"{where}: trajResps",
+        expected=f"{len(nominal)} samples, as trajCmds",
+        got=len(observed),
+        remedy="sample both on the same grid",
+    )
     label = file.parent.name
-    return Raw(where, label, nominal, observed, commands, f"{label}/{file.stem}", clock)
+    return Raw(where, label, nominal, observed, commands, f"{label}/{file.stem}", recorded)
 
 
 def _upright(value: Any, width: int, where: str) -> NDArray:
-    """`value` as (T, width), turned when it lies on its side and there is no doubt about it."""
+    """`value` as (T, width), transposed if only its first axis has that width."""
     block = matrix(value, where)
-    if (block.shape[0] == width) == (block.shape[1] == width):
-        raise InputError(
-            where,
-            expected=f"samples by {width} columns, or {width} rows by samples",
-            got=f"shape {block.shape}",
-            remedy="save samples by columns, with another number of samples than columns",
-        )
+    require(
+        (block.shape[0] == width) != (block.shape[1] == width),
+        where,
+        expected=f"samples by {width} columns, or {width} rows by samples",
+        got=f"shape {block.shape}",
+        remedy="save samples by columns, with another number of samples than columns",
+    )
     return block if block.shape[1] == width else block.T
 
 
 def _motor_commands(file: Path, where: str, steps: int) -> tuple[NDArray | None, float | None]:
-    """Commands (T, motors) in rad and their sample rate, as far as the file tells them.
+    """Commands (T, motors) in rad and their sample rate in Hz, None where the file has none.
 
     A table of numbers, or a cell per motor with a vector or with a struct of `Data` and `Time`.
     """
@@ -190,48 +199,49 @@ def _motor_commands(file: Path, where: str, steps: int) -> tuple[NDArray | None,
     if not series or any(data is None for data, _ in series):
         return None, None
     vectors = [data for data, _ in series if data is not None]
-    if any(len(data) != steps for data in vectors):
-        raise InputError(
-            where,
-            expected=f"{steps} samples per motor, as trajCmds",
-            got=", ".join(str(len(data)) for data in vectors),
-            remedy="sample commands and paths on the same grid",
-        )
+    require(
+        all(len(data) == steps for data in vectors),
+        where,
+        expected=f"{steps} samples per motor, as trajCmds",
+        got=", ".join(str(len(data)) for data in vectors),
+        remedy="sample commands and paths on the same grid",
+    )
     rates = {round(rate, 3) for _, rate in series if rate is not None}
-    if len(rates) > 1:
-        raise InputError(
-            where,
-            expected="one sample rate",
-            got=", ".join(f"{rate:g} Hz" for rate in sorted(rates)),
-            remedy="sample all motors on the same grid",
-        )
+    require(
+        len(rates) <= 1,
+        where,
+        expected="one sample rate",
+        got=", ".join(f"{rate:g} Hz" for rate in sorted(rates)),
+        remedy="sample all motors on the same grid",
+    )
     return np.stack(vectors, axis=1), next(iter(rates), None)
 
 
 def _series(cell: Any, where: str) -> tuple[NDArray | None, float | None]:
-    """Values (T,) and sample rate of one motor; no values when they cannot be decoded."""
+    """Values (T,) and sample rate (Hz) of one motor; None for what cannot be decoded."""
     if isinstance(cell, Opaque):
         return None, None
     data = _vector(cell.get("Data") if isinstance(cell, dict) else cell, where)
     if not isinstance(cell, dict) or "Time" not in cell:
         return data, None
     times = _vector(cell["Time"], where)
-    gaps = np.diff(times)
-    if len(times) != len(data) or not len(gaps) or not np.all(np.isfinite(gaps) & (gaps > 0)):
-        raise InputError(
-            where,
-            expected="one growing time per value",
-            got=f"{len(times)} times for {len(data)} values, or times that do not grow",
-            remedy="repair the Time of the motor commands",
-        )
-    if gaps.max() > 1.5 * gaps.min():
-        raise InputError(
-            where,
-            expected="a constant sample rate",
-            got=f"steps from {gaps.min():g} to {gaps.max():g} s",
-            remedy="resample the commands",
-        )
-    return data, float(1 / np.median(gaps))
+    periods = np.diff(times)
+    growing = len(periods) and np.all(np.isfinite(periods) & (periods > 0))
+    require(
+        len(times) == len(data) and growing,
+        where,
+        expected="one growing time per value",
+        got=f"{len(times)} times for {len(data)} values, or times that do not grow",
+        remedy="repair the Time of the motor commands",
+    )
+    require(
+        periods.max() <= PERIOD_RATIO * periods.min(),
+        where,
+        expected="a constant sample rate",
+        got=f"steps from {periods.min():g} to {periods.max():g} s",
+        remedy="resample the commands",
+    )
+    return data, float(1 / np.median(periods))
 
 
 def _vector(value: Any, where: str) -> NDArray:

@@ -1,4 +1,4 @@
-"""The header of retwin's own formats.
+"""The header of NPZ and Zarr sets, as JSON values, with the digests of the arrays.
 
 Schema 1, in NPZ and Zarr: a set that was saved as a whole, with the SHA-256 of every array. Schema
 2, in Zarr only: a set that was written chunk by chunk, in any order, with the SHA-256 of every
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.trajectories import Channels, Provenance, Trajectories
-from retwin.errors import InputError
 
 __all__ = [
     "CHUNKED",
@@ -35,16 +35,19 @@ __all__ = [
 
 FORMAT = "retwin-trajectories"
 SCHEMA = 1
+"""The schema of sets that were saved as a whole."""
 CHUNKED = 2
 """The schema of sets that were written chunk by chunk."""
 NAMES = ("commands", "nominal", "observed", "mask", "labels", "ids")
+"""The arrays of a set that was saved as a whole, in the order of their digests."""
 CHUNKED_NAMES = NAMES[:-1]
+"""The arrays of a set that was written chunk by chunk."""
 FAILED = -1
-"""In place of the class's number: this trajectory could not be simulated."""
+"""The label, in place of a class's number, of a trajectory that could not be simulated."""
 
 
 def arrays_of(trajectories: Trajectories) -> dict[str, NDArray]:
-    """The arrays to write, in an order, byte order and text width that only content decides."""
+    """The arrays to write; their order, byte order and text width depend on the content alone."""
     arrays = {}
     for name in NAMES:
         array = np.asarray(getattr(trajectories, name))
@@ -56,7 +59,7 @@ def arrays_of(trajectories: Trajectories) -> dict[str, NDArray]:
 
 
 def header_of(trajectories: Trajectories, arrays: Mapping[str, NDArray]) -> dict[str, Any]:
-    """What the arrays do not say, as JSON values, and their shapes and SHA-256."""
+    """Sample rate, channels and provenance as JSON values; shapes and SHA-256 of the arrays."""
     return _about(trajectories, SCHEMA) | {
         "arrays": {
             name: {"shape": list(arrays[name].shape), "sha256": _digest(arrays[name])}
@@ -74,16 +77,22 @@ def chunked_header(
     digests: Sequence[str],
     failed: Mapping[int, str],
 ) -> dict[str, Any]:
-    """What the arrays of a set written in chunks do not say, as JSON values.
+    """The header of a set that is written chunk by chunk, as JSON values.
 
     Parameters
     ----------
-    some: trajectories of the set, or none of them: for samples, channels, rate and provenance.
-    count: trajectories, with those that failed.
-    classes: the class names that the numbers in `labels` stand for.
-    chunk: trajectories per chunk; the last one may be shorter.
-    digests: the `chunk_digest` of every chunk, in order.
-    failed: index of every trajectory that could not be simulated, and the reason.
+    some : Trajectories
+        Some trajectories of the set, or none: for samples, channels, rate and provenance.
+    count : int
+        The number of trajectories, with those that failed.
+    classes : sequence of str
+        The class names for which the numbers in `labels` stand.
+    chunk : int
+        Trajectories per chunk; the last chunk may be shorter.
+    digests : sequence of str
+        The `chunk_digest` of every chunk, in order.
+    failed : mapping of int to str
+        The index of every trajectory that could not be simulated, and the reason.
 
     """
     shapes = {name: [count, *getattr(some, name).shape[1:]] for name in CHUNKED_NAMES}
@@ -97,37 +106,48 @@ def chunked_header(
 
 
 def check_header(header: Any, where: str, newest: int = SCHEMA) -> None:
-    """Refuse a header of another format or of a schema above `newest`, the last one known."""
+    """Check the format and schema of a header.
+
+    Raises
+    ------
+    InputError
+        It is of another format, or of a schema above `newest`, the latest that is known.
+
+    """
     schema = header.get("schema") if isinstance(header, dict) else None
-    if not isinstance(header, dict) or header.get("format") != FORMAT or type(schema) is not int:
-        raise InputError(
-            where,
-            expected="trajectories saved by retwin",
-            got="another kind of file",
-            remedy="give a file that `retwin data convert` wrote",
-        )
-    if not 1 <= schema <= newest:
-        raise InputError(
-            where,
-            expected=f"schema {newest} or older",
-            got=f"schema {schema}",
-            remedy="upgrade retwin: pip install --upgrade retwin",
-        )
+    require(
+        isinstance(header, dict) and header.get("format") == FORMAT and type(schema) is int,
+        where,
+        expected="trajectories saved by retwin",
+        got="another kind of file",
+        remedy="give a file that `retwin data convert` wrote",
+    )
+    require(
+        isinstance(schema, int) and 1 <= schema <= newest,
+        where,
+        expected=f"schema {newest} or older",
+        got=f"schema {schema}",
+        remedy="upgrade retwin: pip install --upgrade retwin",
+    )
 
 
 def restore(header: Mapping[str, Any], arrays: Mapping[str, NDArray], where: str) -> Trajectories:
     """The trajectories that `header` and `arrays` describe, checked against their SHA-256.
 
-    Raises InputError when the arrays are not those that were written.
+    Raises
+    ------
+    InputError
+        The arrays are not those that were written.
+
     """
     for name in NAMES:
-        if header["arrays"][name]["sha256"] != _digest(arrays[name]):
-            raise InputError(
-                where,
-                expected=f"the array {name!r} as it was written",
-                got="other bytes",
-                remedy="the file is damaged: get or make it again",
-            )
+        require(
+            header["arrays"][name]["sha256"] == _digest(arrays[name]),
+            where,
+            expected=f"the array {name!r} as it was written",
+            got="other bytes",
+            remedy="the file is damaged: get or make it again",
+        )
     return Trajectories(**{**arrays, **_read_about(header)})
 
 
@@ -155,14 +175,21 @@ def chunk_digest(arrays: Mapping[str, NDArray]) -> str:
 def check_chunk(
     header: Mapping[str, Any], arrays: Mapping[str, NDArray], number: int, where: str
 ) -> None:
-    """Raise InputError when the arrays of a chunk are not those that were written."""
-    if header["chunks"][number] != chunk_digest(arrays):
-        raise InputError(
-            where,
-            expected=f"chunk {number} as it was written",
-            got="other bytes",
-            remedy="the folder is damaged: get or make it again",
-        )
+    """Check the arrays of a chunk against their SHA-256.
+
+    Raises
+    ------
+    InputError
+        They are not those that were written.
+
+    """
+    require(
+        header["chunks"][number] == chunk_digest(arrays),
+        where,
+        expected=f"chunk {number} as it was written",
+        got="other bytes",
+        remedy="the folder is damaged: get or make it again",
+    )
 
 
 def _digest(array: NDArray) -> str:
@@ -197,5 +224,5 @@ def _channels(channels: Channels) -> dict[str, list[str]]:
     return {"names": list(channels.names), "units": list(channels.units)}
 
 
-def _read_channels(told: Mapping[str, Any]) -> Channels:
-    return Channels(tuple(map(str, told["names"])), tuple(map(str, told["units"])))
+def _read_channels(values: Mapping[str, Any]) -> Channels:
+    return Channels(tuple(map(str, values["names"])), tuple(map(str, values["units"])))

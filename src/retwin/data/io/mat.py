@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.io.assembly import DataCase, Raw, assemble, split_columns
 from retwin.data.io.mat5 import NewerMat, read_mat5
 from retwin.data.trajectories import Provenance, Trajectories
@@ -17,9 +18,12 @@ from retwin.serialisation.files import sha256
 __all__ = ["mat_variables", "matrix", "read_mat"]
 
 PAIRS = (("X_array", "y_array"), ("X_test_array", "y_test_array"))
+"""The names of the variables that hold trajectories and class names."""
 
 
-def read_mat(path: Path, *, case: DataCase | None, rate: float | None) -> Trajectories:
+def read_mat(
+    path: Path, *, case: DataCase | None = None, rate: float | None = None, **_: Any
+) -> Trajectories:
     """Trajectories of a MAT v5 file in the public layout.
 
     `X_array` and `y_array`, or `X_test_array` and `y_test_array`: n cells of (T, 2 d_y) numbers,
@@ -27,29 +31,30 @@ def read_mat(path: Path, *, case: DataCase | None, rate: float | None) -> Trajec
 
     Raises
     ------
-    InputError: a damaged file, other variables, shapes or types, or no known rate.
+    InputError
+        The file is damaged, has other variables, shapes or types, or no sample rate is known.
 
     """
     variables = mat_variables(path)
     found = [pair for pair in PAIRS if set(pair) <= set(variables)]
-    if len(found) != 1:
-        raise InputError(
-            path.name,
-            expected=" or ".join(f"{x} with {y}" for x, y in PAIRS) + ", one pair of them",
-            got=f"the variables {', '.join(sorted(variables)) or 'none'}",
-            remedy="save trajectories and class names under these names; for dataset_*.mat files "
-            "give the folder that holds one folder per class",
-        )
+    require(
+        len(found) == 1,
+        path.name,
+        expected=" or ".join(f"{x} with {y}" for x, y in PAIRS) + ", one pair of them",
+        got=f"the variables {', '.join(sorted(variables)) or 'none'}",
+        remedy="save trajectories and class names under these names; for dataset_*.mat files "
+        "give the folder that holds one folder per class",
+    )
     (x_name, y_name) = found[0]
     blocks = _cells(variables[x_name], f"{path.name}: {x_name}")
     labels = _cells(variables[y_name], f"{path.name}: {y_name}")
-    if not blocks or len(blocks) != len(labels):
-        raise InputError(
-            f"{path.name}: {y_name}",
-            expected=f"at least one trajectory and one class name for each, {len(blocks)}",
-            got=f"{len(labels)}",
-            remedy="give one class name per trajectory ('' when it is unknown)",
-        )
+    require(
+        blocks and len(blocks) == len(labels),
+        f"{path.name}: {y_name}",
+        expected=f"at least one trajectory and one class name for each, {len(blocks)}",
+        got=len(labels),
+        remedy="give one class name per trajectory ('' when it is unknown)",
+    )
     raws = []
     for i, (cell, label) in enumerate(zip(blocks, labels, strict=True)):
         where = f"{path.name}: {x_name}, trajectory {i}"
@@ -69,7 +74,11 @@ def read_mat(path: Path, *, case: DataCase | None, rate: float | None) -> Trajec
 def mat_variables(path: Path, names: list[str] | None = None) -> dict[str, Any]:
     """The variables of a MAT file (those in `names`), as `read_mat5` gives them.
 
-    Raises InputError for a file that is damaged or of the HDF5 kind (v7.3).
+    Raises
+    ------
+    InputError
+        The file is damaged or of version 7.3 (HDF5).
+
     """
     try:
         return read_mat5(path.read_bytes(), names)
@@ -90,15 +99,22 @@ def mat_variables(path: Path, names: list[str] | None = None) -> dict[str, Any]:
 
 
 def matrix(value: Any, where: str) -> NDArray:
-    """`value` as a table (T, k) of floats in native byte order, with T and k above 0."""
+    """`value` as a table (T, k) of floats in native byte order, with T and k above 0.
+
+    Raises
+    ------
+    InputError
+        It is no table of real numbers.
+
+    """
     block = np.asarray(value)
-    if block.dtype.kind not in "iuf" or block.ndim != 2 or not block.size:
-        raise InputError(
-            where,
-            expected="a table of real numbers, samples by columns",
-            got=f"{block.dtype} of shape {block.shape}",
-            remedy="save the numbers as a two-dimensional array",
-        )
+    require(
+        block.dtype.kind in "iuf" and block.ndim == 2 and block.size,
+        where,
+        expected="a table of real numbers, samples by columns",
+        got=f"{block.dtype} of shape {block.shape}",
+        remedy="save the numbers as a two-dimensional array",
+    )
     if block.dtype.kind != "f":
         return block.astype(np.float64)
     return block.astype(block.dtype.newbyteorder("="), copy=False)
@@ -106,24 +122,24 @@ def matrix(value: Any, where: str) -> NDArray:
 
 def _cells(value: Any, where: str) -> list[Any]:
     cells = np.asarray(value)
-    if cells.dtype != object or cells.size not in (0, max(cells.shape, default=0)):
-        raise InputError(
-            where,
-            expected="a row of cells, one per trajectory",
-            got=f"{cells.dtype} of shape {cells.shape}",
-            remedy="save a cell array of size 1 by n",
-        )
+    require(
+        cells.dtype == object and cells.size in (0, max(cells.shape, default=0)),
+        where,
+        expected="a row of cells, one per trajectory",
+        got=f"{cells.dtype} of shape {cells.shape}",
+        remedy="save a cell array of size 1 by n",
+    )
     return list(cells.ravel())
 
 
 def _text(value: Any, where: str) -> str:
     name = np.asarray(value)
     # An empty text has no element: a trajectory without a label.
-    if name.dtype.kind != "U" or name.size > 1:
-        raise InputError(
-            where,
-            expected="a class name",
-            got=f"{name.dtype} of shape {name.shape}",
-            remedy="save class names as texts",
-        )
+    require(
+        name.dtype.kind == "U" and name.size <= 1,
+        where,
+        expected="a class name",
+        got=f"{name.dtype} of shape {name.shape}",
+        remedy="save class names as texts",
+    )
     return str(name.item()) if name.size else ""

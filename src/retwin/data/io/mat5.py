@@ -2,7 +2,7 @@
 
 `scipy.io.loadmat` trusts the tags in the file: one flipped bit can end the whole process with a
 segmentation fault (18 of the 640 bytes of a small file have such a bit). This reader checks every
-size and type before it uses them. Its results are held against scipy's in the tests.
+size and type before it uses them. The tests compare its results with scipy's.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 __all__ = ["Damaged", "NewerMat", "Opaque", "read_mat5"]
 
 HEADER = 128
+"""Bytes before the first variable."""
 INT32, UINT32, MATRIX, COMPRESSED = 5, 6, 14, 15
 CELL, STRUCT, OBJECT, CHAR, OPAQUE = 1, 2, 3, 4, 17
 COMPLEX = 0x0800
-# How numbers and texts are stored, by the type in a tag.
 STORED = {
     1: "i1",
     2: "u1",
@@ -36,15 +36,17 @@ STORED = {
     12: "i8",
     13: "u8",
 }
+"""How numbers are stored, by the type in a tag."""
 TEXTS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
-# What an array is in MATLAB, by its class.
+"""How texts are stored, by the type in a tag."""
 NUMBERS = {
     6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"
 }  # fmt: skip
+"""The type of the numbers of an array, by its class in MATLAB."""
 
 
 class Damaged(ValueError):
-    """The file does not keep to the format."""
+    """The file violates the format."""
 
 
 class NewerMat(ValueError):
@@ -61,13 +63,19 @@ class Opaque:
 def read_mat5(data: bytes, names: Collection[str] | None = None) -> dict[str, Any]:
     """The variables in the bytes of a MAT file (only those in `names`).
 
-    Numbers become arrays of their MATLAB type, texts arrays of str (one per row), cells object
-    arrays, a struct a dict (an array of structs an object array), and whatever else an `Opaque`.
+    Returns
+    -------
+    dict of str to value
+        Numbers become arrays of their MATLAB type, texts arrays of str (one per row), cells object
+        arrays, a struct a dict (an array of structs an object array), and anything else an
+        `Opaque`.
 
     Raises
     ------
-    NewerMat: the file is of version 7.3.
-    Damaged, or whatever a decoder says: the file does not keep to the format.
+    NewerMat
+        The file is of version 7.3.
+    Damaged, ValueError, struct.error, zlib.error
+        The file violates the format.
 
     """
     order = {b"IM": "<", b"MI": ">"}.get(data[126:HEADER])

@@ -1,22 +1,24 @@
-"""retwin's own file: NPZ with a JSON header, the same bytes for the same trajectories."""
+"""NPZ with a JSON header: the file format of retwin, the same bytes for the same trajectories."""
 
 from __future__ import annotations
 
 import json
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.io.header import NAMES, arrays_of, check_header, header_of, restore
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError, brief
 
 __all__ = ["read_npz", "write_npz"]
 
-# The oldest date a zip can hold: the time of writing must not change the bytes.
 DATE = (1980, 1, 1, 0, 0, 0)
+"""The date of each entry of the ZIP file, its earliest: the time of writing is not in the bytes."""
 
 
 def write_npz(trajectories: Trajectories, path: Path) -> None:
@@ -34,21 +36,25 @@ def write_npz(trajectories: Trajectories, path: Path) -> None:
                 np.lib.format.write_array(file, array, allow_pickle=False)
 
 
-def read_npz(path: Path) -> Trajectories:
-    """Trajectories that `write_npz` wrote.
+def read_npz(path: Path, **_: Any) -> Trajectories:
+    """Trajectories that `write_npz` wrote; the file holds all that other formats must be given.
 
-    Raises InputError for a damaged file, another kind of NPZ, pickled objects, a newer schema.
+    Raises
+    ------
+    InputError
+        The file is damaged, another kind of NPZ, holds pickled objects, or has a newer schema.
+
     """
     try:
         # Not np.load: it leaves a damaged file open.
         with zipfile.ZipFile(path) as archive:
-            if "header.npy" not in archive.namelist():
-                raise InputError(
-                    path.name,
-                    expected="trajectories saved by retwin, with a header",
-                    got="an NPZ file without",
-                    remedy="give a file that `retwin data convert` wrote",
-                )
+            require(
+                "header.npy" in archive.namelist(),
+                path.name,
+                expected="trajectories saved by retwin, with a header",
+                got="an NPZ file without",
+                remedy="give a file that `retwin data convert` wrote",
+            )
             header = json.loads(_array(archive, "header").tobytes())
             check_header(header, path.name)
             arrays = {name: _array(archive, name) for name in NAMES}

@@ -1,4 +1,4 @@
-"""Arrays that no memory holds: rows on disk, in a file without a name, then a map of it."""
+"""Arrays larger than the memory: rows in a temporary file, then a memory map of it."""
 
 from __future__ import annotations
 
@@ -15,22 +15,24 @@ __all__ = ["Scratch"]
 
 
 class Scratch:
-    """Rows of one array, taken one after the other to a file in the folder for temporary files.
+    """Rows of one array, appended to a temporary file and then mapped into memory.
 
-    The file has no name: when nobody holds its map any more, or the process is killed, it is gone.
-    A context manager: after it no rows are taken, and what was made is still there.
+    The file has no name, so that it is gone when no map of it exists any more, also if the process
+    is killed. After its block as a context manager, no rows can be appended; arrays stay valid.
 
     Parameters
     ----------
-    row: shape of one row.
-    dtype: of the numbers.
+    row : sequence of int
+        The shape of one row.
+    dtype : numpy.dtype
+        The type of the numbers.
 
     """
 
     def __init__(self, row: Sequence[int], dtype: np.dtype) -> None:
         self._row, self._dtype = tuple(row), dtype
         self._count = 0
-        # Unbuffered, so that a full disk is told where the rows are given.
+        # Unbuffered, so that a full disk raises where rows are appended.
         self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - closed at exit
 
     def __enter__(self) -> Scratch:
@@ -40,7 +42,7 @@ class Scratch:
         self._file.close()
 
     def append(self, rows: NDArray) -> None:
-        """Take these rows; InputError when the disk has no room for them."""
+        """Append rows; InputError if the disk has no room for them."""
         rest = np.ascontiguousarray(rows, self._dtype).reshape(-1).view(np.uint8).data
         try:
             while rest:
@@ -55,8 +57,8 @@ class Scratch:
         self._count += len(rows)
 
     def array(self) -> NDArray:
-        """All rows (n, …), read-only; those looked at come into memory, and may leave it again."""
+        """All rows (n, …) as a read-only memory map."""
         shape = (self._count, *self._row)
         if math.prod(shape) == 0:
-            return np.empty(shape, self._dtype)  # nothing cannot be mapped
+            return np.empty(shape, self._dtype)  # an empty file cannot be mapped
         return np.memmap(self._file, self._dtype, mode="r", shape=shape)

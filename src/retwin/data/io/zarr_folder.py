@@ -1,8 +1,8 @@
 """Zarr: chunked folders for sets that are large; needs the extra `scale`.
 
-`write_zarr` writes a set that is at hand. A set that no memory holds is written by several
-processes, chunk by chunk: `create_chunked`, then `write_chunk` in any order, then `seal_chunked`.
-Of either kind, what is read is a map of an uncompressed copy on disk (`Scratch`), not memory.
+`write_zarr` writes a set that is in memory. A set that is larger than the memory is written by
+several processes, chunk by chunk: `create_chunked`, then `write_chunk` in any order, then
+`seal_chunked`. Either kind is read into a memory map of an uncompressed copy on disk (`Scratch`).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from retwin.checks import needs_extra, require
 from retwin.data.io.header import (
     CHUNKED,
     CHUNKED_NAMES,
@@ -42,18 +43,24 @@ __all__ = [
     "write_zarr",
 ]
 
-CHUNK = 128
-"""Trajectories that are stored together, at most."""
-CHUNK_BYTES = 2**23
-"""Bytes of them, at most: a chunk is in memory as a whole, and more than once while packed."""
+TRAJECTORIES_PER_CHUNK = 128
+"""The largest number of trajectories in one chunk: enough that a set has few files."""
+BYTES_PER_CHUNK = 2**23
+"""The largest size of a chunk in bytes: a chunk is in memory as a whole, with its packed copies."""
 KEY = "retwin"
+"""The attribute of the Zarr group that holds the header."""
 TEXTS = ("labels", "ids")
+"""The arrays of texts, which are stored in the header."""
 
 
 def write_zarr(trajectories: Trajectories, path: Path) -> None:
     """Write `trajectories` to the folder `path`, in chunks of whole trajectories.
 
-    Raises InputError when the package zarr is not installed.
+    Raises
+    ------
+    InputError
+        The package zarr is not installed.
+
     """
     zarr = _zarr()
     arrays = arrays_of(trajectories)
@@ -65,7 +72,9 @@ def write_zarr(trajectories: Trajectories, path: Path) -> None:
     group.attrs[KEY] = header | texts
     for name, array in arrays.items():
         rest = [max(1, size) for size in array.shape[1:]]
-        count = min(CHUNK, max(1, CHUNK_BYTES // (math.prod(rest) * array.itemsize)))
+        count = min(
+            TRAJECTORIES_PER_CHUNK, max(1, BYTES_PER_CHUNK // (math.prod(rest) * array.itemsize))
+        )
         target = group.create_array(
             name, shape=array.shape, dtype=array.dtype, chunks=(count, *rest)
         )
@@ -73,15 +82,29 @@ def write_zarr(trajectories: Trajectories, path: Path) -> None:
             target[rows] = array[rows]
 
 
-def read_zarr(path: Path, rows: slice = slice(None)) -> Trajectories:
+def read_zarr(path: Path, rows: slice = slice(None), **_: Any) -> Trajectories:
     """Trajectories that `write_zarr` wrote, or that were written chunk by chunk.
 
-    Their arrays are read-only maps of a copy among the temporary files, so a set may be larger than
-    the memory. Of a set in chunks, only the chunks that hold `rows` are read; each is checked as a
-    whole.
+    Parameters
+    ----------
+    path : Path
+        The folder; it holds all that other formats must be given.
+    rows : slice
+        The trajectories to read. Of a set that was written chunk by chunk, only the chunks that
+        hold them are read, each of which is checked as a whole.
 
-    Raises InputError for a damaged folder, one of another kind, a newer schema, no room for the
-    copy, no memory for a chunk, or when the package zarr is not installed.
+    Returns
+    -------
+    Trajectories
+        Its arrays are read-only memory maps of a copy among the temporary files, so that a set may
+        be larger than the memory.
+
+    Raises
+    ------
+    InputError
+        The folder is damaged, of another kind or of a newer schema, the disk has no room for the
+        copy, the memory has none for a chunk, or the package zarr is not installed.
+
     """
     zarr = _zarr()
     try:
@@ -91,7 +114,9 @@ def read_zarr(path: Path, rows: slice = slice(None)) -> Trajectories:
             return _read_chunks(group, header, path.name, rows)
         arrays = {name: np.array(header[name], dtype=np.str_) for name in TEXTS}
         for name in set(NAMES) - set(TEXTS):
-            _check_size(group[name], header["arrays"][name]["shape"], CHUNK, path.name)
+            _check_size(
+                group[name], header["arrays"][name]["shape"], TRAJECTORIES_PER_CHUNK, path.name
+            )
             arrays[name] = _copied(group[name])
         return restore(header, arrays, path.name)[rows]
     except InputError:
@@ -108,7 +133,14 @@ def read_zarr(path: Path, rows: slice = slice(None)) -> Trajectories:
 
 
 def read_header(path: Path) -> dict[str, Any]:
-    """The header of a folder without its arrays; raises as `read_zarr` does."""
+    """The header of a folder without its arrays.
+
+    Raises
+    ------
+    InputError
+        See `read_zarr`.
+
+    """
     zarr = _zarr()
     try:
         return _header(zarr.open_group(str(path), mode="r"), path.name)
@@ -121,7 +153,13 @@ def read_header(path: Path) -> dict[str, Any]:
 def create_chunked(path: Path, header: Mapping[str, Any], dtype: DTypeLike) -> None:
     """Make the arrays of `chunked_header` in the new folder `path`, still without any values.
 
-    Numbers are stored as `dtype`. Raises InputError when the package zarr is not installed.
+    Numbers are stored as `dtype`.
+
+    Raises
+    ------
+    InputError
+        The package zarr is not installed.
+
     """
     group = _zarr().open_group(str(path), mode="w", zarr_format=3)
     kinds = {"mask": np.dtype(bool), "labels": np.dtype(np.int16)}
@@ -135,7 +173,8 @@ def create_chunked(path: Path, header: Mapping[str, Any], dtype: DTypeLike) -> N
 def write_chunk(path: Path, begin: int, arrays: Mapping[str, NDArray]) -> str:
     """Write the chunk whose first trajectory is `begin`, and return its `chunk_digest`.
 
-    A chunk is a file of its own per array: processes that write different ones do not meet.
+    Each array has one file per chunk, so that processes that write different chunks never write
+    the same file.
     """
     group = _zarr().open_group(str(path), mode="r+")
     for name in CHUNKED_NAMES:
@@ -145,9 +184,9 @@ def write_chunk(path: Path, begin: int, arrays: Mapping[str, NDArray]) -> str:
 
 
 def seal_chunked(path: Path, header: Mapping[str, Any]) -> None:
-    """Put the header on a folder whose chunks are all written; before that, nobody can read it."""
-    for left_over in path.rglob("*.partial"):  # of a process that was killed while it wrote
-        left_over.unlink()
+    """Write the header of a folder whose chunks are complete; without it, reading is refused."""
+    for unfinished in path.rglob("*.partial"):  # a process was killed while it wrote
+        unfinished.unlink()
     _zarr().open_group(str(path), mode="r+").attrs[KEY] = dict(header)
 
 
@@ -158,7 +197,7 @@ def _header(group: Any, where: str) -> dict[str, Any]:
 
 
 def _copied(stored: Any) -> NDArray:
-    """An array of Zarr as a map, with one chunk at a time in memory."""
+    """An array of Zarr as a memory map; one chunk at a time is in memory."""
     if not stored.size:
         return np.empty(stored.shape, stored.dtype)
     with Scratch(stored.shape[1:], stored.dtype) as scratch:
@@ -168,7 +207,7 @@ def _copied(stored: Any) -> NDArray:
 
 
 def _read_chunks(group: Any, header: Mapping[str, Any], where: str, rows: slice) -> Trajectories:
-    """The trajectories at `rows` that did not fail, with one chunk at a time in memory."""
+    """The trajectories at `rows` that did not fail; one chunk at a time is in memory."""
     size = int(header["chunk"])
     for name in CHUNKED_NAMES:
         _check_size(group[name], header["arrays"][name]["shape"], size, where)
@@ -197,15 +236,15 @@ def _chunks(count: int, size: int) -> list[slice]:
 
 
 def _check_size(array: Any, shape: list[int], chunk: int, where: str) -> None:
-    """Refuse a size that was not written, before memory is taken for it."""
+    """Raise InputError for a size that was not written, before memory is allocated for it."""
     largest = chunk * math.prod(max(1, size) for size in shape[1:])
-    if list(array.shape) != shape or math.prod(array.chunks) > largest:
-        raise InputError(
-            f"{where}: {array.basename}",
-            expected=f"shape {tuple(shape)}",
-            got=f"shape {array.shape} in chunks of {array.chunks}",
-            remedy="the folder is damaged: get or make it again",
-        )
+    require(
+        list(array.shape) == shape and math.prod(array.chunks) <= largest,
+        f"{where}: {array.basename}",
+        expected=f"shape {tuple(shape)}",
+        got=f"shape {array.shape} in chunks of {array.chunks}",
+        remedy="the folder is damaged: get or make it again",
+    )
 
 
 def _damaged(path: Path, error: Exception) -> InputError:
@@ -218,13 +257,4 @@ def _damaged(path: Path, error: Exception) -> InputError:
 
 
 def _zarr() -> Any:
-    try:
-        import zarr
-    except ImportError:
-        raise InputError(
-            "path",
-            expected="the package zarr, which reads and writes Zarr folders",
-            got="an installation without it",
-            remedy='install it: pip install "retwin[scale]"',
-        ) from None
-    return zarr
+    return needs_extra("zarr", "scale", "reads and writes Zarr folders")

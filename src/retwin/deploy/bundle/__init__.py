@@ -1,5 +1,5 @@
-"""Bundles: all that was fitted in one sealed folder, which knows where it may be trusted.
+"""Bundles: corrected twin, diagnoser and guard in one sealed folder.
 
-`bundle.py` is the whole with torch; `portable.py` predicts from its ONNX export on onnxruntime and
-numpy alone. Nothing is imported here, so that the latter never waits for torch.
+`bundle.py` needs torch; `retwin.deploy.onnx.portable` predicts from a bundle's ONNX export with
+onnxruntime and numpy alone. Nothing is imported here, so that the latter loads no torch.
 """

@@ -13,14 +13,14 @@ import torch
 
 from retwin._version import __version__
 from retwin.cases.case import Case
+from retwin.checks import require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Trajectories
 from retwin.deploy.bundle.facts import SAMPLERS, Facts
 from retwin.deploy.bundle.guard import Guard
-from retwin.deploy.bundle.seal import SCHEMA, distrusting, read_sealed, seal
-from retwin.deploy.bundle.verdicts import Prediction
-from retwin.diagnosis import load_diagnoser
-from retwin.diagnosis.saved import Saved
+from retwin.deploy.bundle.seal import SCHEMAS, open_sealed, seal
+from retwin.deploy.bundle.verdicts import Prediction, no_diagnoser
+from retwin.diagnosis import FittedDiagnoser, load_diagnoser
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.models import read_model, write_model
@@ -31,22 +31,27 @@ __all__ = ["Bundle"]
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """All that was fitted for one machine; works without the data that it was fitted to.
+    """Everything that was fitted for one machine; it works without the data it was fitted to.
 
     Attributes
     ----------
-    twin: surrogate, residual model, correction and sensor.
-    guard: which trajectories it may be asked about.
-    diagnoser: tells the classes apart; None where there are none.
-    facts: what it keeps of its case.
-    provenance: versions, data with their SHA-256, and what the maker wishes to add.
+    twin : CorrectedTwin
+        Surrogate, residual model, correction and sensor.
+    guard : Guard
+        Checks of whether a trajectory can be diagnosed.
+    facts : Facts
+        The values of the case that are kept.
+    diagnoser : diagnoser or None
+        Classifier of trajectories; None for a bundle that only simulates.
+    provenance : mapping
+        Versions, data with their SHA-256, and the maker's notes.
 
     """
 
     twin: CorrectedTwin
     guard: Guard
     facts: Facts
-    diagnoser: Saved | None = None
+    diagnoser: FittedDiagnoser | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -55,7 +60,7 @@ class Bundle:
         case: Case,
         twin: CorrectedTwin,
         guard: Guard,
-        diagnoser: Saved | None = None,
+        diagnoser: FittedDiagnoser | None = None,
         *,
         data: Sequence[Trajectories] = (),
         notes: Mapping[str, Any] | None = None,
@@ -64,31 +69,42 @@ class Bundle:
 
         Parameters
         ----------
-        case, twin, guard, diagnoser: what goes together.
-        data: the sets that it was fitted to, the calibration first; only names, SHA-256 and the
-            number of movements are kept.
-        notes: plain values beside the provenance, such as the command and its seed.
+        case : Case
+            The case; its faults, sensor rate and, if possible, its command sampler are kept.
+        twin, guard, diagnoser : CorrectedTwin, Guard, diagnoser or None
+            What was fitted.
+        data : sequence of Trajectories
+            The sets that it was fitted to, the calibration set first. Only their names, SHA-256
+            and greatest number of segments are kept.
+        notes : mapping, optional
+            Plain values for the provenance, such as the command and its seed.
+
+        Returns
+        -------
+        Bundle
+            The bundle, not yet saved.
 
         Raises
         ------
-        InputError: a diagnoser of other classes than the case's.
+        InputError
+            If the diagnoser's classes are not the case's.
 
         """
-        if diagnoser is not None and set(diagnoser.classes) != set(case.classes):
-            raise InputError(
-                "diagnoser",
-                expected=f"one of the classes of {case.name}, {', '.join(case.classes)}",
-                got=", ".join(diagnoser.classes),
-                remedy="train it on trajectories of this case",
-            )
+        require(
+            diagnoser is None or set(diagnoser.classes) == set(case.classes),
+            "diagnoser",
+            expected=f"one of the classes of {case.name}, {', '.join(case.classes)}",
+            got=", ".join(() if diagnoser is None else diagnoser.classes),
+            remedy="train it on trajectories of this case",
+        )
         probe = case.sampler.sample(8, rng=np.random.default_rng(0))
-        movements = [Segments.from_commands(each.commands).most for each in data if len(each)]
+        sets = [probe, *(each.commands for each in data if len(each))]
         facts = Facts(
             case=case.name,
             faults=dict(case.faults),
             sensor_rate=case.sensor_rate,
             steps=case.sampler.steps,
-            movements=max([Segments.from_commands(probe).most, *movements]),
+            max_segments=max(Segments.from_commands(commands).max_count for commands in sets),
             sampler=case.sampler if isinstance(case.sampler, SAMPLERS) else None,
         )
         provenance = {
@@ -103,9 +119,13 @@ class Bundle:
 
     @property
     def case(self) -> Case:
-        """A case made from the facts alone, its twin the corrected one.
+        """A case from the facts alone, with the corrected twin as its twin.
 
-        Raises InputError where commands are drawn by code of the case, which a bundle cannot hold.
+        Raises
+        ------
+        InputError
+            If commands are drawn by code of the case, which a bundle cannot hold.
+
         """
         if self.facts.sampler is None:
             raise InputError(
@@ -128,24 +148,28 @@ class Bundle:
         )
 
     def predict(self, trajectories: Trajectories) -> Prediction:
-        """Diagnose trajectories, and say which of them the bundle was not made for.
+        """Diagnose trajectories, and flag those that the bundle was not made for.
 
-        A trajectory that is outside has no diagnosis, and its probabilities are NaN.
+        Parameters
+        ----------
+        trajectories : Trajectories
+            The n trajectories, with commands; labels are not used.
+
+        Returns
+        -------
+        Prediction
+            Probabilities and verdicts; a trajectory that is outside has no diagnosis, and its
+            probabilities are NaN.
 
         Raises
         ------
-        InputError: a bundle without a diagnoser; other channels or another rate than it was made
-            for, or no commands.
+        InputError
+            If the bundle has no diagnoser, or if channels or rate are not those of the bundle.
 
         """
         if self.diagnoser is None:
-            raise InputError(
-                "bundle",
-                expected="one with a diagnoser",
-                got="one without",
-                remedy="train a diagnoser and make the bundle anew",
-            )
-        verdicts = self.guard.judge(self.twin.surrogate, trajectories, steps=self.facts.steps)
+            raise no_diagnoser()
+        verdicts = self.guard.assess(self.twin.surrogate, trajectories, steps=self.facts.steps)
         return Prediction.of(
             self.diagnoser.classes, verdicts, trajectories, self.diagnoser.predict_proba
         )
@@ -158,15 +182,15 @@ class Bundle:
         seed: int,
         progress: Progress | None = None,
     ) -> Trajectories:
-        """A balanced labelled set, see `retwin.generate`; by default for `self.case`."""
+        """A balanced labelled set, see `retwin.generate`; by default of `self.case`."""
         return generate(
             self.twin, case or self.case, per_class=per_class, seed=seed, progress=progress
         )
 
     def save(self, folder: str | Path) -> None:
-        """Write one sealed folder, whole or not at all; the same bundle gives the same bytes."""
+        """Write one sealed folder, atomically; the same bundle gives the same bytes."""
         about = {
-            "schema": SCHEMA,
+            "schema": SCHEMAS["bundle"],
             **self.facts.about(),
             "diagnoser": self.diagnoser is not None,
             "provenance": dict(self.provenance),
@@ -187,14 +211,13 @@ class Bundle:
 
         Raises
         ------
-        InputError: a file that was changed, is missing or was added; another kind or schema; or a
-            folder that was sealed but holds no bundle.
+        InputError
+            If a file was changed, removed or added; if the folder is of another kind or schema; or
+            if it is sealed and holds no bundle.
 
         """
-        about = read_sealed(folder, "bundle")
         folder = Path(folder)
-        remedy = "make it anew with Bundle.save"
-        with distrusting(folder, expected="a bundle", remedy=remedy):
+        with open_sealed(folder, "bundle") as about:
             return cls(
                 twin=CorrectedTwin.load(folder / "twin"),
                 guard=Guard.of(*read_model(folder / "guard", "guard")),

@@ -1,4 +1,4 @@
-"""`Facts`: what a bundle keeps of its case, so that it is of use without the case's code."""
+"""`Facts`: the values of a case that a bundle keeps, so that it works without the case's code."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from retwin.errors import InputError
+from retwin.checks import positive, whole
 from retwin.serialisation.configs import from_config, to_config
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.samplers import RampSampler
 
-__all__ = ["Facts"]
+__all__ = ["SAMPLERS", "Facts"]
 
 FAULTS = (Stuck, ActuatorBias)
+"""Kinds of faults that a bundle can describe; no others are constructed from a file."""
 SAMPLERS = (RampSampler,)
+"""Kinds of command samplers that a bundle can describe; others remain code of the case."""
 
 
 @dataclass(frozen=True)
@@ -23,12 +25,23 @@ class Facts:
 
     Attributes
     ----------
-    case: its name.
-    faults: class name to fault, None for healthy, in the order of the classes.
-    sensor_rate: samples per second that the measuring chain really takes.
-    steps: samples per trajectory.
-    movements: per trajectory, at most.
-    sampler: draws commands; None for one that is code of the case.
+    case : str
+        Name of the case.
+    faults : mapping of str to Fault or None
+        Fault of each class, None for the healthy one, in the order of the classes.
+    sensor_rate : float
+        Measurements per second of the real sensor, in Hz.
+    steps : int
+        Samples per trajectory, at least 2.
+    max_segments : int
+        Greatest number of segments in a trajectory.
+    sampler : RampSampler or None
+        Command sampler; None if commands are drawn by code of the case.
+
+    Raises
+    ------
+    InputError
+        If a number is outside its range.
 
     """
 
@@ -36,25 +49,22 @@ class Facts:
     faults: Mapping[str, Fault | None]
     sensor_rate: float
     steps: int
-    movements: int
+    max_segments: int
     sampler: RampSampler | None = None
 
     def __post_init__(self) -> None:
-        if not (self.steps >= 2 and self.movements >= 0 and self.sensor_rate > 0):
-            raise InputError(
-                "facts",
-                expected="two steps or more, no negative number of movements, a positive rate",
-                got=f"{self.steps}, {self.movements}, {self.sensor_rate}",
-                remedy="take them from the case",
-            )
+        remedy = "take it from the case"
+        whole("facts.steps", self.steps, least=2, remedy=remedy)
+        whole("facts.max_segments", self.max_segments, remedy=remedy)
+        positive("facts.sensor_rate", self.sensor_rate, unit="Hz", remedy=remedy)
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Class names in their fixed order."""
+        """Names of the classes in their fixed order."""
         return tuple(self.faults)
 
     def about(self) -> dict[str, Any]:
-        """As plain values, for JSON; InputError for a fault that is not retwin's own."""
+        """The facts as JSON values; InputError for a fault that is none of `FAULTS`."""
         return {
             "case": self.case,
             "faults": {
@@ -63,13 +73,13 @@ class Facts:
             },
             "sensor_rate": self.sensor_rate,
             "steps": self.steps,
-            "movements": self.movements,
+            "movements": self.max_segments,
             "sampler": None if self.sampler is None else to_config(self.sampler, SAMPLERS),
         }
 
     @classmethod
     def of(cls, about: Mapping[str, Any]) -> Facts:
-        """From what `about` gave."""
+        """The facts from the JSON values of `about`."""
         faults = {
             name: None if fault is None else from_config(fault, FAULTS)
             for name, fault in about["faults"].items()
@@ -80,6 +90,6 @@ class Facts:
             faults=faults,
             sensor_rate=float(about["sensor_rate"]),
             steps=int(about["steps"]),
-            movements=int(about["movements"]),
+            max_segments=int(about["movements"]),
             sampler=None if sampler is None else from_config(sampler, SAMPLERS),
         )

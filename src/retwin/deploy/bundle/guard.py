@@ -1,10 +1,16 @@
-"""`Guard`: which trajectories are of the kind that a corrected twin can give at all.
+"""`Guard`: which trajectories a corrected twin could have generated.
 
-A diagnoser answers whatever it is shown. The guard says when not to listen: commands or outputs
-outside the ranges it was made for, a nominal path that is not the commands', and residuals that no
-class explains. The last is an energy, learned by telling generated trajectories from implausible
-ones (noise-contrastive estimation: Gutmann and Hyvärinen, JMLR 13, 307, 2012): the log odds of a
-residual being something else than what the twin, its faults and its corrections give.
+A diagnoser classifies whatever it is given. The guard flags trajectories that the diagnoser was not
+made for: commands or outputs outside their ranges, a nominal path that does not follow from the
+commands, and residuals that no class explains. The last check is an energy, the log odds that a
+residual is not one that the twin, its faults and its corrections give. A classifier of generated
+and implausible trajectories learns it by noise-contrastive estimation.
+
+References
+----------
+M. Gutmann and A. Hyvärinen, Noise-contrastive estimation of unnormalized statistical models, JMLR
+13, 307, 2012.
+
 """
 
 from __future__ import annotations
@@ -19,10 +25,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retwin.cases.case import Case
+from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, Trajectories
-from retwin.deploy.bundle.verdicts import Domain, Verdicts
+from retwin.deploy.bundle.verdicts import Domain, Verdicts, check_channels
 from retwin.diagnosis.features import Features
-from retwin.errors import InputError
 from retwin.nets.networks import CNN, NETWORKS, Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress
@@ -34,31 +40,44 @@ __all__ = ["Guard", "fit_guard"]
 
 NETWORK = CNN(channels=(32, 64), dropout=0.1)
 TRAINING = Training(max_epochs=15, batch_size=64, learning_rate=3e-3, weight_decay=1e-2)
-SHARE = 0.99
-"""Of generated trajectories are usual."""
-TWICE = 2.0
-"""Nominal paths may differ from the surrogate so many times as much as calibrated ones do."""
-NOTHING = 0.05
-"""A difference, in spreads, that is usual whatever calibrated ones show."""
-ODDS = 10.0
-"""Odds against a trajectory that are usual whatever calibrated ones show: most are plausible.
+ENERGY_QUANTILE = 0.99
+"""Share of held-out generated trajectories whose energy is within the limit."""
+MISMATCH_FACTOR = 2.0
+"""Limit of the nominal mismatch, in multiples of the largest one of calibration trajectories."""
+MIN_MISMATCH = 0.05
+"""Smallest limit of the nominal mismatch, in standard deviations of the nominal output."""
+MIN_ODDS = 10.0
+"""Smallest limit of the odds against a trajectory, as implausible trajectories are rare.
 
-NOTHING and ODDS were set when the scores of set A had been seen, see docs/bundle.md.
+MIN_MISMATCH and MIN_ODDS were chosen after scores of set A were known, see docs/bundle.md.
 """
-SIZES = (-0.5, 0.7)
-"""Log of the least and the greatest size of a bend, in standard deviations of the residual."""
-KNOTS = 10
-CHUNK = 256
+LOG_BEND_SCALE = (-0.5, 0.7)
+"""Range of the log of a bend's size, in standard deviations of the residual (0.6 to 2.0).
+
+It was chosen after scores of set A were known, see docs/bundle.md.
+"""
+MAX_KNOTS = 10
+"""Greatest number of random levels of a bend."""
+TRAJECTORIES_PER_BATCH = 256
+"""Trajectories whose energy is computed together; it bounds the memory of activations."""
 
 
 class Guard(nn.Module):
-    """Energies of trajectories, and the limits beyond which they are not to be trusted.
+    """Energy of trajectories, and the limits beyond which they are flagged.
 
     Parameters
     ----------
-    network: the config of the energy's network.
-    features: what it looks at.
-    domain: ranges and limits.
+    network : Network
+        Config of the energy's network.
+    features : Features
+        Features of a trajectory that the energy is a function of.
+    domain : Domain
+        Ranges and limits.
+
+    Attributes
+    ----------
+    fitted : Fit or None
+        History of the training.
 
     """
 
@@ -72,44 +91,56 @@ class Guard(nn.Module):
         self.fitted: Fit | None = None
 
     def forward(self, features: Tensor) -> Tensor:
-        """Energies (n,) of features (n, T', 2 d_y): log odds against being plausible."""
+        """Energies (n,) of features (n, T', 2 d_y), in log odds against being plausible."""
         return self.network(self.before(features))[:, 0]
 
     @torch.no_grad()
     def energy(self, trajectories: Trajectories) -> NDArray:
-        """Energies (n,); InputError for other output channels or another rate."""
-        parts = [self(part) for part in self.features(trajectories).split(CHUNK)]
-        return torch.cat(parts).double().numpy()
+        """Energies (n,) of trajectories; InputError for other output channels or another rate."""
+        batches = self.features(trajectories).split(TRAJECTORIES_PER_BATCH)
+        return torch.cat([self(batch) for batch in batches]).double().numpy()
 
     def stride(self, surrogate: Surrogate) -> int:
-        """Every how many samples it asks the surrogate: all, where that remembers."""
+        """Samples from one evaluation of the surrogate to the next; 1 for one with memory."""
         return self.features.stride if surrogate.memoryless else 1
 
     def mismatch(self, surrogate: Surrogate, trajectories: Trajectories) -> NDArray:
-        """How far (n,) nominal paths are from what the surrogate says of the commands."""
+        """Root mean square difference (n,) of nominal outputs and surrogate, in spreads."""
         every = slice(None, None, self.stride(surrogate))
         predicted = surrogate.predict(trajectories.commands[:, every])
         return self.domain.differences(trajectories.nominal[:, every], predicted)
 
-    def judge(
+    def assess(
         self, surrogate: Surrogate, trajectories: Trajectories, *, steps: int | None = None
     ) -> Verdicts:
-        """The verdict on each trajectory; `steps` as for `Domain.judge`.
+        """Score trajectories in all checks but that of the probabilities.
 
-        Raises InputError for other channels or another rate, or trajectories without commands.
+        Parameters
+        ----------
+        surrogate : Surrogate
+            Surrogate of the corrected twin, which predicts nominal outputs from commands.
+        trajectories : Trajectories
+            The n trajectories.
+        steps : int, optional
+            Samples of the trajectories that the bundle was made for; by default any number.
+
+        Returns
+        -------
+        Verdicts
+            Scores, verdicts and reasons of the n trajectories.
+
+        Raises
+        ------
+        InputError
+            If inputs, outputs or rate are not those of the surrogate.
+
         """
-        if trajectories.inputs != surrogate.inputs:
-            raise InputError(
-                "trajectories.inputs",
-                expected=f"{surrogate.inputs}",
-                got=f"{trajectories.inputs}",
-                remedy="read the file with its case, which recovers commands",
-            )
+        check_channels(trajectories, surrogate)
         mismatch = partial(self.mismatch, surrogate)
-        return self.domain.judge(trajectories, mismatch, self.energy, steps=steps)
+        return self.domain.assess(trajectories, mismatch, self.energy, steps=steps)
 
     def about(self) -> dict[str, Any]:
-        """Everything but the weights, for JSON."""
+        """Everything but the weights, as JSON values."""
         return {
             "network": to_config(self.config, NETWORKS),
             **self.features.about(),
@@ -119,7 +150,7 @@ class Guard(nn.Module):
 
     @classmethod
     def of(cls, about: dict[str, Any], weights: dict[str, Tensor]) -> Guard:
-        """From what `about` gave, and the weights."""
+        """The guard from the JSON values of `about` and the weights."""
         network = from_config(about["network"], NETWORKS)
         guard = cls(network, Features.of(about), Domain.of(about["domain"]))
         guard.load_state_dict(weights)
@@ -137,45 +168,69 @@ def fit_guard(
     training: Training = TRAINING,
     progress: Progress | None = None,
 ) -> Guard:
-    """Learn what is usual from trajectories that the twin generates, and from healthy ones.
+    """Fit the energy to trajectories that the twin generates, and set all limits.
+
+    The limit of the energy is the 0.99 quantile over held-out generated trajectories (split
+    conformal prediction), raised to the largest energy of the calibration trajectories and to
+    odds of 10 to 1.
 
     Parameters
     ----------
-    twin: generates all classes of `case`.
-    calibration: real trajectories; where they are labelled only healthy ones are looked at, and
-        none of them trains the energy. All of them are usual by definition.
-    seed: same seed, same guard on the same machine.
-    count: trajectories to generate, over all classes; a fifth sets the energy's limit.
-    training: of the energy.
+    twin : CorrectedTwin
+        Generates all classes of `case`.
+    case : Case
+        Classes, commands and sensor rate.
+    calibration : Trajectories
+        Real trajectories, of which only healthy ones are used if they are labelled. They do not
+        train the energy, and all of them are within the limits.
+    seed : int
+        Same seed, same guard on the same machine.
+    count : int
+        Trajectories to generate over all classes; a fifth of them sets the energy's limit.
+    training : Training
+        Settings of the energy's training.
+    progress : callable, optional
+        Called with the share that is done.
 
-    The limit of the energy is what 99 % of held-out generated trajectories keep (split conformal
-    prediction), widened to take in the calibrated ones, and odds of 10 to 1.
+    Returns
+    -------
+    Guard
+        The fitted guard.
 
     Raises
     ------
-    InputError: no healthy trajectory, or fewer generated ones than five per class.
+    InputError
+        If there is no healthy trajectory, or if fewer than five per class are to be generated.
 
     """
     healthy = calibration.with_label(HEALTHY) if calibration.known_labels else calibration
-    each = count // len(case.classes)
-    if len(healthy) == 0 or each < 5:
-        raise InputError(
-            "calibration" if len(healthy) == 0 else "count",
-            expected="at least one healthy trajectory, and five generated ones per class",
-            got=f"{len(healthy)} and {each}",
-            remedy="calibrate on some healthy trajectories, and generate more",
-        )
-    made = generate(twin, case, per_class=each, seed=seed)
-    learnt, held_out = made.split(0.8, seed=seed)
+    per_class = count // len(case.classes)
+    require(
+        len(healthy) > 0,
+        "calibration",
+        expected="at least one healthy trajectory",
+        got="none",
+        remedy="calibrate on some healthy trajectories",
+    )
+    require(
+        per_class >= 5,
+        "count",
+        expected=f"at least five generated ones per class, {5 * len(case.classes)}",
+        got=count,
+        remedy="generate more",
+    )
+    made = generate(twin, case, per_class=per_class, seed=seed)
+    training_part, held_out = made.split(0.8, seed=seed)
     features = Features.at(made, min(case.sensor_rate, made.rate))
     with isolated(seed):
         guard = Guard(NETWORK, features, Domain.around([made, healthy]))
-    guard.fitted = _train(guard, features(learnt), training, seed, progress)
-    usual = np.quantile(guard.energy(held_out), SHARE, method="higher")
+    guard.fitted = _train(guard, features(training_part), training, seed, progress)
+    limit = np.quantile(guard.energy(held_out), ENERGY_QUANTILE, method="higher")
+    mismatch = MISMATCH_FACTOR * guard.mismatch(twin.surrogate, healthy).max()
     guard.domain = replace(
         guard.domain,
-        mismatch=float(max(TWICE * guard.mismatch(twin.surrogate, healthy).max(), NOTHING)),
-        energy=float(max(usual, guard.energy(healthy).max(), np.log(ODDS))),
+        mismatch=float(max(mismatch, MIN_MISMATCH)),
+        energy=float(max(limit, guard.energy(healthy).max(), np.log(MIN_ODDS))),
     )
     return guard
 
@@ -183,7 +238,7 @@ def fit_guard(
 def _train(
     guard: Guard, plausible: Tensor, training: Training, seed: int, progress: Progress | None
 ) -> Fit:
-    """Train the energy on features (n, T', 2 d_y) of plausible trajectories."""
+    """Train the energy on features (n, T', 2 d_y) of generated trajectories."""
     guard.before.fit(plausible)
     generator = torch.Generator().manual_seed(seed)
 
@@ -197,10 +252,11 @@ def _train(
 
 
 def implausible(features: Tensor, generator: torch.Generator) -> Tensor:
-    """The same nominal paths (b, T', 2 d_y) with outputs that belong to something else.
+    """Features (b, T', 2 d_y) with the same nominal paths and implausible outputs.
 
-    Each one by a draw: the outputs of the next trajectory of the batch; a random walk over the
-    range of the outputs; its own outputs, bent by a curve through up to ten random levels.
+    For each trajectory one of three kinds is drawn: the outputs of the next trajectory of the
+    batch; a random walk over the range of the outputs; its own outputs plus a curve through up to
+    ten random levels.
     """
     nominal, residual = features.chunk(2, dim=-1)
     observed = nominal + residual
@@ -215,11 +271,11 @@ def implausible(features: Tensor, generator: torch.Generator) -> Tensor:
     walk = normal(count, steps, width).cumsum(dim=1)
     walk = walk / walk.abs().amax(dim=1, keepdim=True) * uniform(0.0, 2.0)
     wandering = observed.mean(dim=(0, 1)) + walk * observed.std(dim=(0, 1), correction=0)
-    knots = int(torch.randint(1, KNOTS + 1, (1,), generator=generator))
+    knots = int(torch.randint(1, MAX_KNOTS + 1, (1,), generator=generator))
     bend = nn.functional.interpolate(normal(count, width, knots), size=steps, mode="linear")
     bend = bend.transpose(1, 2) * residual.std(dim=(0, 1), correction=0)
-    bent = observed + uniform(*SIZES).exp() * bend
+    bent = observed + uniform(*LOG_BEND_SCALE).exp() * bend
     kinds = torch.stack([observed.roll(1, dims=0), wandering, bent])
-    which = torch.randint(len(kinds), (count,), generator=generator)
-    drawn = kinds[which, torch.arange(count)]
+    kind = torch.randint(len(kinds), (count,), generator=generator)
+    drawn = kinds[kind, torch.arange(count)]
     return torch.cat([nominal, drawn - nominal], dim=-1)

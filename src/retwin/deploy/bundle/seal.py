@@ -1,8 +1,8 @@
-"""A sealed folder: SHA256SUMS names every file in it, and one changed byte is refused.
+"""Sealed folders: `SHA256SUMS` lists every file of the folder, and one changed byte is refused.
 
-The seal is what `sha256sum` writes and `sha256sum --check SHA256SUMS` reads. It tells damage, not
-who wrote the folder: whoever can change a file can seal it again. What keeps a forged folder from
-doing harm is that reading it runs no code that it names.
+`sha256sum --check SHA256SUMS` verifies the same file. The seal detects damage; it does not
+authenticate, since whoever can change a file can seal the folder again. A forged folder can do no
+harm because reading it runs no code that it names.
 """
 
 from __future__ import annotations
@@ -13,23 +13,33 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from retwin.checks import require
 from retwin.errors import InputError
 from retwin.serialisation.files import sha256
 
-__all__ = ["SCHEMA", "SUMS", "distrusting", "read_sealed", "seal", "verify_seal"]
+__all__ = ["SCHEMAS", "SUMS", "open_sealed", "read_sealed", "refusing", "seal", "verify_seal"]
 
 SUMS = "SHA256SUMS"
-SCHEMA = 1
-"""Of bundles and of their exports; older ones would be migrated in `read_sealed`."""
-LARGEST = 2**20
-"""Bytes of a description at most; no bundle's is near it."""
+"""Name of the file with the checksums, in the format of `sha256sum`."""
+SCHEMAS = {"bundle": 1, "portable": 2}
+"""Schema that is written and read, for each kind of sealed folder: a bundle, or its ONNX export.
+
+Exports of schema 1 named inputs of their graphs otherwise, so they are refused.
+"""
+REMEDIES = {
+    "bundle": "make it anew with Bundle.save",
+    "portable": "make it anew with retwin bundle export",
+}
+EXPECTED = {"bundle": "a bundle", "portable": "the ONNX export of a bundle"}
+MAX_DESCRIPTION_BYTES = 2**20
+"""Greatest size of model.json; that of a bundle is some kilobytes."""
 
 
 @contextmanager
-def distrusting(folder: str | Path, *, expected: str, remedy: str) -> Iterator[None]:
-    """InputError for whatever goes wrong when the contents of a sealed folder are read.
+def refusing(folder: str | Path, *, expected: str, remedy: str) -> Iterator[None]:
+    """Turn every exception that reading untrusted contents raises into an InputError.
 
-    Its seal is whole, so nothing was damaged: whoever made it put anything at all in there.
+    The contents are untrusted although the seal is intact, since anyone can seal a folder.
     """
     try:
         yield
@@ -40,19 +50,42 @@ def distrusting(folder: str | Path, *, expected: str, remedy: str) -> Iterator[N
         raise InputError(str(folder), expected=expected, got=got, remedy=remedy) from None
 
 
+@contextmanager
+def open_sealed(folder: str | Path, kind: str) -> Iterator[dict[str, Any]]:
+    """Verify a sealed folder and yield its description, for whatever loads it.
+
+    Parameters
+    ----------
+    folder : path
+        The sealed folder.
+    kind : {"bundle", "portable"}
+        Kind that the folder must be of.
+
+    Raises
+    ------
+    InputError
+        If `read_sealed` raises it, or if the block inside `with` raises anything.
+
+    """
+    about = read_sealed(folder, kind)
+    with refusing(folder, expected=EXPECTED[kind], remedy=REMEDIES[kind]):
+        yield about
+
+
 def seal(folder: Path) -> None:
-    """Write the sums of all files that are in `folder` now."""
+    """Write the checksums of all files that are in `folder` now."""
     (folder / SUMS).write_bytes(_sums(folder))
 
 
 def verify_seal(folder: str | Path) -> None:
-    """Hold every file of a sealed folder against its sum.
+    """Compare every file of a sealed folder with its checksum.
 
-    Hidden files (names that begin with a dot) do not count: file managers leave them about.
+    Hidden files (names that begin with a dot) are ignored, since file managers create them.
 
     Raises
     ------
-    InputError: no sealed folder, a file that was changed, is missing or was added, or a link.
+    InputError
+        If the folder is not sealed, if a file was changed, removed or added, or if one is a link.
 
     """
     folder = Path(folder)
@@ -60,32 +93,37 @@ def verify_seal(folder: str | Path) -> None:
         written = (folder / SUMS).read_bytes()
         found = _sums(folder)
     except OSError as error:
-        raise _refused(folder, f"{type(error).__name__}: {error.strerror}") from None
+        raise _damaged(folder, f"{type(error).__name__}: {error.strerror}") from None
     if written != found:
-        raise _refused(folder, _difference(written, found))
+        raise _damaged(folder, _difference(written, found))
 
 
 def read_sealed(folder: str | Path, *kinds: str) -> dict[str, Any]:
-    """The description of a sealed folder of one of these kinds, after its seal was verified.
+    """The description in a sealed folder of one of these kinds, after the seal was verified.
 
-    Raises InputError as `verify_seal` does, and for another kind or schema.
+    Raises
+    ------
+    InputError
+        If `verify_seal` raises it, or if the folder is of another kind or schema.
+
     """
     verify_seal(folder)
     file = Path(folder) / "model.json"
     try:
-        if file.stat().st_size > LARGEST:
+        if file.stat().st_size > MAX_DESCRIPTION_BYTES:
             raise ValueError("too long")
         about = json.loads(file.read_text(encoding="utf-8"))
-        found = about["kind"], about["schema"]
+        kind, schema = about["kind"], about["schema"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise _refused(Path(folder), f"model.json with {type(error).__name__}") from None
-    if found[0] not in kinds or found[1] != SCHEMA:
-        raise InputError(
-            str(folder),
-            expected=f"a {' or '.join(kinds)} of schema {SCHEMA}",
-            got=f"{str(found[0])[:40]!r} of schema {str(found[1])[:40]}",
-            remedy="make it anew with this version of retwin, or read it with the one that made it",
-        )
+        raise _damaged(Path(folder), f"model.json with {type(error).__name__}") from None
+    require(
+        kind in kinds and schema == SCHEMAS[kind],
+        str(folder),
+        expected=" or ".join(f"a {each} of schema {SCHEMAS[each]}" for each in kinds),
+        got=f"{str(kind)[:40]!r} of schema {str(schema)[:40]}",
+        remedy=REMEDIES[kind if kind in kinds else kinds[0]]
+        + ", or read it with the version of retwin that made it",
+    )
     return dict(about)
 
 
@@ -97,29 +135,29 @@ def _sums(folder: Path) -> bytes:
         if any(part.startswith(".") for part in name.split("/")) or name == SUMS:
             continue
         if file.is_symlink():
-            raise _refused(folder, f"a link, {name}")
+            raise _damaged(folder, f"a link, {name}")
         if file.is_file():
             lines.append(f"{sha256(file)}  {name}\n")
     return "".join(lines).encode("utf-8", "surrogateescape")
 
 
 def _difference(written: bytes, found: bytes) -> str:
-    """What of a folder differs from its seal, in a few words."""
-    told, there = (
+    """The first difference between the checksums as written and as found, in a few words."""
+    sealed, present = (
         dict(line.rpartition(b"  ")[::-2] for line in text.splitlines())
         for text in (written, found)
     )
-    for words, names in (
-        ("changed", [name for name in there if name in told and told[name] != there[name]]),
-        ("missing", sorted(told.keys() - there.keys())),
-        ("not of the bundle", sorted(there.keys() - told.keys())),
+    for state, names in (
+        ("changed", [name for name in present if sealed.get(name, present[name]) != present[name]]),
+        ("missing", sorted(sealed.keys() - present.keys())),
+        ("not of the bundle", sorted(present.keys() - sealed.keys())),
     ):
         if names:
-            return f"{names[0].decode('utf-8', 'replace')[:80]!r}, which is {words}"
+            return f"{names[0].decode('utf-8', 'replace')[:80]!r}, which is {state}"
     return f"{SUMS}, which is changed"
 
 
-def _refused(folder: Path, got: str) -> InputError:
+def _damaged(folder: Path, got: str) -> InputError:
     return InputError(
         str(folder),
         expected=f"a bundle whose files are those of its {SUMS}",

@@ -1,6 +1,6 @@
-"""What a bundle says of a trajectory: probabilities of the classes, and whether to trust them.
+"""Predictions of a bundle: class probabilities, and checks of whether to trust them.
 
-Only numpy: the ONNX export uses it too.
+Only numpy is needed, so that the ONNX export uses the same checks as the bundle.
 """
 
 from __future__ import annotations
@@ -12,80 +12,98 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
+from retwin.twins.twin import Twin
 
-__all__ = ["CHECKS", "OUTSIDE", "Domain", "Prediction", "Verdicts", "distributions"]
+__all__ = [
+    "CHECKS",
+    "OUTSIDE",
+    "Domain",
+    "Prediction",
+    "Verdicts",
+    "are_probabilities",
+    "check_channels",
+    "no_diagnoser",
+]
 
 CHECKS = (
     *("commands", "speed", "outputs", "nominal", "missing", "length", "residual"),
     "probabilities",
 )
-"""The checks, in the order of their scores; the last one is of the diagnoser's output."""
+"""Names of the checks, in the order of their scores; the last checks the diagnoser's output."""
 RANGES = ("low", "high", "speed", "floor", "ceiling", "spread")
+"""Fields of `Domain` that have one number per channel."""
 TOLERANCE = 0.02
-"""Share of a range by which a value may leave it and still be usual."""
-UNMEASURED = 0.25
-"""Share of missing measurements that is usual at most."""
-LENGTHS = 2.0
-"""A trajectory may usually be so many times longer or shorter than those of the bundle."""
+"""Limit of how far a value may leave its range, as a share of the range's width."""
+MISSING_LIMIT = 0.25
+"""Limit of the share of missing measurements."""
+LENGTH_LIMIT = 2.0
+"""Limit of the ratio between a trajectory's length and that of the bundle's, or its inverse."""
 OUTSIDE = 10.0
-"""A trajectory is outside when a score is so many times what is usual."""
-SUM = 1e-3
-"""Greatest difference from one of the sum of a trajectory's probabilities."""
+"""Score, in multiples of a check's limit, above which a trajectory is outside."""
+SUM_TOLERANCE = 1e-3
+"""Greatest difference from 1 of the sum of probabilities, far above the rounding of float32."""
+MAX_LOG_ODDS = 50.0
+"""Bound of the log odds before `exp`, far beyond every limit and below any overflow."""
 
 Function = Callable[[Trajectories], NDArray]
-"""Numbers (n,) or (n, k) of n trajectories."""
+"""Function of n trajectories to numbers (n,) or (n, k)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Verdicts:
-    """How far n trajectories can be trusted to be of the kind that the bundle was made for.
+    """Scores of n trajectories in the guard's checks, and the verdicts that follow from them.
 
     Attributes
     ----------
-    scores: (n, 8), for each of CHECKS, how many times its usual limit a trajectory reaches; 0 where
-        it was not computed, because an earlier check had found the trajectory outside. A score
-        that is not finite counts as infinite.
+    scores : ndarray, shape (n, 8)
+        For each of `CHECKS`, a trajectory's value divided by the check's limit, at least 0. A score
+        is 0 if it was not computed because an earlier check had found the trajectory outside, and
+        counts as infinite if it is not finite.
 
     """
 
     scores: NDArray
 
     @property
-    def suspicion(self) -> NDArray:
-        """The largest score (n,), infinite where one is not finite."""
-        largest: NDArray = self._finite.max(axis=1)
+    def max_score(self) -> NDArray:
+        """The largest score of each trajectory (n,), infinite if one is not finite."""
+        largest: NDArray = self._ordered.max(axis=1)
         return largest
 
     @property
     def verdict(self) -> NDArray:
-        """(n,) "ok"; "unusual" above 1; "outside" above 10: the diagnosis then means nothing."""
-        level = (self.suspicion > 1).astype(int) + (self.suspicion > OUTSIDE)
+        """Verdicts (n,): "outside" for scores above 10, "unusual" above 1, "ok" otherwise."""
+        level = (self.max_score > 1).astype(int) + (self.max_score > OUTSIDE)
         return np.array(["ok", "unusual", "outside"])[level]
 
     @property
     def reason(self) -> NDArray:
-        """(n,) the check with the largest score; "" where all is ok."""
-        worst = np.array(CHECKS)[self._finite.argmax(axis=1)]
-        return np.where(self.suspicion > 1, worst, "")
+        """Names (n,) of the checks with the largest score; "" if the verdict is "ok"."""
+        worst = np.array(CHECKS)[self._ordered.argmax(axis=1)]
+        return np.where(self.max_score > 1, worst, "")
 
     @property
-    def _finite(self) -> NDArray:
-        """The scores, infinite where they are not finite: NaN compares as if it were usual."""
+    def _ordered(self) -> NDArray:
+        """The scores with infinity for NaN, which no comparison finds large."""
         return np.where(np.isfinite(self.scores), self.scores, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a bundle says of n trajectories.
+    """Class probabilities and verdicts of n trajectories.
 
     Attributes
     ----------
-    classes: names, in the order of the probabilities.
-    probabilities: (n, classes), NaN for a trajectory that is outside.
-    verdicts: whether to trust them; outside where the given probabilities are not finite, not
-        between 0 and 1, or do not sum to one.
+    classes : tuple of str
+        Names, in the order of the probabilities.
+    probabilities : ndarray, shape (n, len(classes))
+        Probabilities, NaN for a trajectory that is outside.
+    verdicts : Verdicts
+        Verdicts; a trajectory is also outside if the given probabilities are not finite, not
+        between 0 and 1, or do not sum to 1.
 
     """
 
@@ -95,7 +113,7 @@ class Prediction:
 
     def __post_init__(self) -> None:
         outside = self.verdicts.verdict == "outside"
-        unsound = ~(distributions(self.probabilities) | outside)
+        unsound = ~(are_probabilities(self.probabilities) | outside)
         scores = self.verdicts.scores.copy()
         scores[unsound, CHECKS.index("probabilities")] = np.inf
         empty = (outside | unsound)[:, None]
@@ -110,36 +128,43 @@ class Prediction:
         trajectories: Trajectories,
         probabilities: Function,
     ) -> Prediction:
-        """With the `probabilities` of the trajectories that are not outside: no others are run."""
+        """A prediction for which `probabilities` is called only with trajectories not outside."""
         rows = verdicts.verdict != "outside"
         found = np.full((len(trajectories), len(classes)), np.nan)
         if rows.any():
-            found[rows] = probabilities(_some(trajectories, rows))
+            found[rows] = probabilities(_subset(trajectories, rows))
         return cls(classes, found, verdicts)
 
     @property
     def diagnosis(self) -> NDArray:
-        """(n,) the most probable class; "" for a trajectory that is outside."""
+        """The most probable class of each trajectory (n,); "" if it is outside."""
         best = np.array(self.classes)[self.probabilities.argmax(axis=1)]
         return np.where(self.verdicts.verdict == "outside", "", best)
 
 
 @dataclass(frozen=True)
 class Domain:
-    """What a bundle was made for, in plain numbers.
+    """The ranges and limits of the trajectories that a bundle was made for.
 
     Attributes
     ----------
-    low, high: least and greatest command of each input, in its unit.
-    speed: greatest change of each command from sample to sample.
-    floor, ceiling: least and greatest observed value of each output.
-    spread: standard deviation of each nominal output, of the first set.
-    mismatch: difference of nominal output and surrogate that is usual at most, in spreads.
-    energy: the guard's energy that is usual at most.
+    low, high : tuple of float
+        Least and greatest value of each command, in its unit.
+    speed : tuple of float
+        Greatest change of each command from one sample to the next, in its unit.
+    floor, ceiling : tuple of float
+        Least and greatest observed value of each output, in its unit.
+    spread : tuple of float
+        Standard deviation of each nominal output, in its unit.
+    mismatch : float
+        Limit of the root mean square difference between nominal output and surrogate, in spreads.
+    energy : float
+        Limit of the guard's energy, in log odds.
 
     Raises
     ------
-    InputError: a number, or the width of a range, that is not finite.
+    InputError
+        If a number, or the width of a range, is not finite.
 
     """
 
@@ -159,44 +184,47 @@ class Domain:
                 np.subtract(self.ceiling, self.floor),
             ]
         numbers = [getattr(self, each.name) for each in fields(self)]
-        if not all(np.isfinite(each).all() for each in [*numbers, *widths]):
-            raise InputError(
-                "domain",
-                expected="finite ranges and limits",
-                got=f"{self}",
-                remedy="make the bundle and its export anew",
-            )
+        require(
+            all(np.isfinite(each).all() for each in [*numbers, *widths]),
+            "domain",
+            expected="finite ranges and limits",
+            got=self,
+            remedy="make the bundle and its export anew",
+        )
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Domain:
-        """From the values that `asdict` gave, JSON lists or tuples alike."""
+        """The domain from the values of `dataclasses.asdict`, with JSON lists or tuples."""
         return cls(
-            **{name: _plain(values[name]) for name in RANGES},
+            **{name: _floats(values[name]) for name in RANGES},
             mismatch=float(values["mismatch"]),
             energy=float(values["energy"]),
         )
 
     @classmethod
     def around(cls, sets: Sequence[Trajectories]) -> Domain:
-        """The ranges that these sets cover; limits of mismatch and energy stay open."""
-        seen = [np.ma.array(each.observed, mask=~each.mask) for each in sets]
+        """The ranges that these sets cover, spreads of the first one; both limits are 0."""
+        measured = [np.ma.array(each.observed, mask=~each.mask) for each in sets]
         speeds = [np.abs(np.diff(each.commands, axis=1)) for each in sets]
         spread = sets[0].nominal.std(axis=(0, 1), dtype=np.float64)
+        floors, ceilings = (
+            [getattr(each, end)(axis=(0, 1)) for each in measured] for end in ("min", "max")
+        )
         return cls(
-            low=_plain(np.min([each.commands.min(axis=(0, 1)) for each in sets], axis=0)),
-            high=_plain(np.max([each.commands.max(axis=(0, 1)) for each in sets], axis=0)),
-            speed=_plain(np.max([each.max(axis=(0, 1)) for each in speeds], axis=0)),
-            floor=_plain(np.ma.min([each.min(axis=(0, 1)) for each in seen], axis=0).filled(0.0)),
-            ceiling=_plain(np.ma.max([each.max(axis=(0, 1)) for each in seen], axis=0).filled(0.0)),
-            spread=_plain(_positive(spread)),
+            low=_floats(np.min([each.commands.min(axis=(0, 1)) for each in sets], axis=0)),
+            high=_floats(np.max([each.commands.max(axis=(0, 1)) for each in sets], axis=0)),
+            speed=_floats(np.max([each.max(axis=(0, 1)) for each in speeds], axis=0)),
+            floor=_floats(np.ma.min(floors, axis=0).filled(0.0)),
+            ceiling=_floats(np.ma.max(ceilings, axis=0).filled(0.0)),
+            spread=_floats(_nonzero(spread)),
         )
 
     def differences(self, nominal: NDArray, predicted: NDArray) -> NDArray:
-        """Root mean square (n,) of nominal minus predicted outputs, in spreads."""
+        """Root mean square difference of outputs (n, T, d_y) per trajectory (n,), in spreads."""
         error = np.subtract(nominal, predicted, dtype=np.float64) / np.array(self.spread)
         return np.sqrt(np.square(error).mean(axis=(1, 2)))
 
-    def judge(
+    def assess(
         self,
         trajectories: Trajectories,
         mismatch: Function,
@@ -204,34 +232,43 @@ class Domain:
         *,
         steps: int | None = None,
     ) -> Verdicts:
-        """The verdicts on trajectories.
+        """Score trajectories in all checks but the last.
+
+        Magnitudes are checked first, in float64. A network therefore only gets numbers of the size
+        that it was trained on.
 
         Parameters
         ----------
-        trajectories: their magnitudes are checked first, in float64.
-        mismatch, energy: each is called with the trajectories that no check before it has found
-            outside, so that a network only gets numbers of the size that it was trained on.
-        steps: samples of the trajectories that the bundle was made for; by default any number.
+        trajectories : Trajectories
+            The n trajectories.
+        mismatch, energy : callable
+            Functions of trajectories to numbers (n,), called only with the trajectories that no
+            check before has found outside.
+        steps : int, optional
+            Samples of the trajectories that the bundle was made for; by default any number.
 
-        Raises InputError where there are no commands, or other channels.
+        Raises
+        ------
+        InputError
+            If there are no commands, or those of another number of channels.
 
         """
-        if trajectories.commands.shape[2] != len(self.low):
-            raise InputError(
-                "trajectories.commands",
-                expected=f"{len(self.low)} columns: without commands nothing says what is usual",
-                got=f"{trajectories.commands.shape[2]}",
-                remedy="read the file with its case, which recovers commands",
-            )
+        require(
+            trajectories.commands.shape[2] == len(self.low),
+            "trajectories.commands",
+            expected=f"{len(self.low)} columns, since the ranges of commands are checked",
+            got=trajectories.commands.shape[2],
+            remedy="read the file with its case, which recovers commands",
+        )
 
         def nominal(some: Trajectories) -> NDArray:
             return mismatch(some) / self.mismatch
 
         def residual(some: Trajectories) -> NDArray:
-            # Energies are log odds: this is by how much the odds are worse than is usual.
+            # Energies are log odds, so this is the ratio of the odds to those at the limit.
             energies = energy(some)
-            worse = np.exp(np.clip(energies - self.energy, -50, 50))
-            return np.where(np.isfinite(energies), worse, np.inf)
+            odds = np.exp(np.clip(energies - self.energy, -MAX_LOG_ODDS, MAX_LOG_ODDS))
+            return np.where(np.isfinite(energies), odds, np.inf)
 
         # What overflows is not finite, and what is not finite is outside.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -241,53 +278,76 @@ class Domain:
             for name, score in (("nominal", nominal), ("residual", residual)):
                 rows = np.all(scores <= OUTSIDE, axis=1)
                 if rows.any():
-                    scores[rows, CHECKS.index(name)] = score(_some(trajectories, rows))
+                    scores[rows, CHECKS.index(name)] = score(_subset(trajectories, rows))
         return Verdicts(scores)
 
     def _magnitudes(self, trajectories: Trajectories, steps: int) -> dict[str, NDArray]:
         """The scores (n,) that need no network, by check."""
         speed = np.abs(np.diff(trajectories.commands.astype(np.float64), axis=1)).max(axis=1)
-        there = trajectories.mask.mean(axis=(1, 2))
+        measured = trajectories.mask.mean(axis=(1, 2))
         ratio = max(trajectories.steps / steps, steps / trajectories.steps)
-        # The limit of nominal outputs is their mismatch. Here is only excluded what would overflow:
-        # more than a whole range beyond the range of the observed ones.
-        far = _beyond(trajectories.nominal, self.floor, self.ceiling) > 1 / TOLERANCE
+        # The limit of nominal outputs is their mismatch. Excluded here is only what would overflow:
+        # more than a whole range beyond the range of the observed outputs.
+        far = _excess(trajectories.nominal, self.floor, self.ceiling) > 1 / TOLERANCE
         return {
-            "commands": _beyond(trajectories.commands, self.low, self.high),
-            "speed": _beyond(speed[:, None], np.zeros(len(self.speed)), self.speed),
-            "outputs": _beyond(trajectories.observed, self.floor, self.ceiling, trajectories.mask),
+            "commands": _excess(trajectories.commands, self.low, self.high),
+            "speed": _excess(speed[:, None], np.zeros(len(self.speed)), self.speed),
+            "outputs": _excess(trajectories.observed, self.floor, self.ceiling, trajectories.mask),
             "nominal": np.where(far, np.inf, 0.0),
-            "missing": np.where(there > 0, (1 - there) / UNMEASURED, np.inf),
-            "length": np.full(len(trajectories), ratio / LENGTHS),
+            "missing": np.where(measured > 0, (1 - measured) / MISSING_LIMIT, np.inf),
+            "length": np.full(len(trajectories), ratio / LENGTH_LIMIT),
         }
 
 
-def _some(trajectories: Trajectories, rows: NDArray) -> Trajectories:
-    """The trajectories at these flags (n,), without a copy where they are all."""
+def no_diagnoser() -> InputError:
+    """The error of a bundle, or of its export, that has no diagnoser and is to predict."""
+    return InputError(
+        "bundle",
+        expected="one with a diagnoser",
+        got="one without",
+        remedy="train a diagnoser, then make the bundle and its export anew",
+    )
+
+
+def check_channels(trajectories: Trajectories, model: Twin) -> None:
+    """Raise InputError unless inputs, outputs and rate of the trajectories are the model's."""
+    for name in ("inputs", "outputs", "rate"):
+        expected, got = getattr(model, name), getattr(trajectories, name)
+        require(
+            expected == got,
+            f"trajectories.{name}",
+            expected=f"what the bundle was made for, {expected}",
+            got=got,
+            remedy="resample or rename, and read files with their case, which recovers commands",
+        )
+
+
+def _subset(trajectories: Trajectories, rows: NDArray) -> Trajectories:
+    """The trajectories at these flags (n,), not copied if the flags are all true."""
     return trajectories if rows.all() else trajectories[rows]
 
 
-def distributions(probabilities: NDArray) -> NDArray:
-    """Which rows (n,) are probabilities that sum to one; NaN and infinities compare false."""
-    between = np.all((probabilities >= 0) & (probabilities <= 1), axis=1)
-    sound: NDArray = between & (np.abs(probabilities.sum(axis=1) - 1) <= SUM)
+def are_probabilities(values: NDArray) -> NDArray:
+    """Flags (n,) of the rows (n, classes) that are between 0 and 1 and sum to 1; NaN is false."""
+    between = np.all((values >= 0) & (values <= 1), axis=1)
+    sound: NDArray = between & (np.abs(values.sum(axis=1) - 1) <= SUM_TOLERANCE)
     return sound
 
 
-def _beyond(values: NDArray, low: Any, high: Any, mask: NDArray | None = None) -> NDArray:
-    """How far (n,) values (n, T, d) leave their range at most, in tolerated shares of it."""
+def _excess(values: NDArray, low: Any, high: Any, mask: NDArray | None = None) -> NDArray:
+    """How far (n,) values (n, T, d) leave their range at most, in tolerated shares of its width."""
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-    over = np.maximum(low - values, values - high) / _positive(high - low)
+    over = np.maximum(low - values, values - high) / _nonzero(high - low)
     if mask is not None:
         over = np.where(mask, over, 0.0)
     farthest: NDArray = np.maximum(over, 0.0).max(axis=(1, 2)) / TOLERANCE
     return farthest
 
 
-def _positive(sizes: NDArray) -> NDArray:
-    """The sizes, 1 where one is 0: a channel that never varies has no unit of its own."""
+def _nonzero(sizes: NDArray) -> NDArray:
+    """The sizes, 1 for a channel that never varies."""
     return np.where(sizes > 0, sizes, 1.0)
 
 
-def _plain(values: Iterable[float]) -> tuple[float, ...]:
+def _floats(values: Iterable[float]) -> tuple[float, ...]:
     return tuple(float(value) for value in values)

@@ -1,1 +1,1 @@
-"""The ONNX export of a bundle, and its use without torch."""
+"""The ONNX export of a bundle: `export` writes it with torch, `portable` uses it without."""

@@ -1,4 +1,4 @@
-"""What is exported: each part of a bundle as a function of tensors alone, noise among them."""
+"""The exported modules: each part of a bundle as a function of tensors, noise included."""
 
 from __future__ import annotations
 
@@ -29,23 +29,27 @@ __all__ = [
 
 
 @dataclass
-class Movements:
-    """`Segments` whose times are tensors: theirs are checked, which a graph cannot be."""
+class TensorSegments:
+    """`Segments` with tensors for times, and without its checks, which a graph cannot hold."""
 
     start: Tensor
     settle: Tensor
     stop: Tensor
     valid: Tensor
     steps: int
-    most: int
+    max_count: int
 
 
 class ResidualGraph(nn.Module):
-    """z (n, M, d_z) drawn by this noise, see `ResidualModel.drawn`.
+    """Discrepancies z as a function of given noise, see `ResidualModel.drawn`.
 
-    Takes clean commands (n, T, d_u), nominal outputs (n, T, d_y), the movements' times in samples
-    (n, M), uniform noise (n, M, blocks), normal noise of each movement (n, M, d_z), and of each
-    trajectory (n, 1, d_z).
+    Parameters
+    ----------
+    residual : ResidualModel
+        The conditional distribution of z, a mixture.
+    rate : float
+        Sample rate in Hz.
+
     """
 
     def __init__(self, residual: ResidualModel, rate: float) -> None:
@@ -61,23 +65,51 @@ class ResidualGraph(nn.Module):
         settle: Tensor,
         stop: Tensor,
         uniform: Tensor,
-        own: Tensor,
-        common: Tensor,
+        segment_noise: Tensor,
+        trajectory_noise: Tensor,
     ) -> Tensor:
-        """Draws of z (n, M, d_z)."""
+        """Draw z.
+
+        Parameters
+        ----------
+        commands : Tensor, shape (n, T, d_u)
+            Commands without faults.
+        nominal : Tensor, shape (n, T, d_y)
+            Nominal outputs.
+        start, settle, stop : Tensor, shape (n, M)
+            Times of the segments, in samples.
+        uniform : Tensor, shape (n, M, blocks)
+            Uniform noise in [0, 1), which selects components of the mixtures.
+        segment_noise : Tensor, shape (n, M, d_z)
+            Standard normal noise of each segment.
+        trajectory_noise : Tensor, shape (n, 1, d_z)
+            Standard normal noise that all segments of a trajectory share.
+
+        Returns
+        -------
+        Tensor, shape (n, M, d_z)
+            Draws of z, within the bounds of the residual model.
+
+        """
         valid = torch.ones_like(start, dtype=torch.bool)
         context = _context(commands, nominal, (start, settle, stop, valid), self.rate)
-        law = self.residual.distribution(describe(context))
+        distribution = self.residual.distribution(describe(context))
         shared = self.residual.persistence
-        z = law.from_noise(uniform, shared.sqrt() * common + (1 - shared).sqrt() * own)
+        noise = shared.sqrt() * trajectory_noise + (1 - shared).sqrt() * segment_noise
+        z = distribution.from_noise(uniform, noise)
         return z.clamp(-self.residual.bounds, self.residual.bounds)
 
 
 class CorrectionGraph(nn.Module):
-    """Corrected outputs (n, T, d_y), before a sensor reads them.
+    """Corrected outputs before the sensor, as a function of commands, segments and z.
 
-    Takes commands with the faults' effect on the reference (n, T, d_u), the sample from which each
-    actuator is held (n, d_u), the movements (n, M) and z (n, M, d_z).
+    Parameters
+    ----------
+    correction : Correction
+        The operator g.
+    surrogate : Surrogate
+        Predicts outputs from commands.
+
     """
 
     def __init__(self, correction: Correction, surrogate: Surrogate) -> None:
@@ -87,7 +119,7 @@ class CorrectionGraph(nn.Module):
 
     def forward(
         self,
-        told: Tensor,
+        faulty_commands: Tensor,
         frozen: Tensor,
         start: Tensor,
         settle: Tensor,
@@ -95,10 +127,31 @@ class CorrectionGraph(nn.Module):
         valid: Tensor,
         z: Tensor,
     ) -> Tensor:
-        """Corrected outputs (n, T, d_y)."""
-        time = torch.minimum(torch.arange(told.shape[1])[:, None], frozen[:, None])
-        path = self.surrogate(told.gather(1, time))
-        context = _context(told, path, (start, settle, stop, valid), 1.0, self.surrogate, frozen)
+        """Correct the outputs.
+
+        Parameters
+        ----------
+        faulty_commands : Tensor, shape (n, T, d_u)
+            Commands after the faults that change the reference.
+        frozen : Tensor, shape (n, d_u)
+            Sample from which each actuator is stuck, T for one that never is.
+        start, settle, stop : Tensor, shape (n, M)
+            Times of the segments, in samples.
+        valid : Tensor, shape (n, M)
+            Whether a segment exists.
+        z : Tensor, shape (n, M, d_z)
+            Discrepancies.
+
+        Returns
+        -------
+        Tensor, shape (n, T, d_y)
+            Corrected outputs.
+
+        """
+        time = torch.minimum(torch.arange(faulty_commands.shape[1])[:, None], frozen[:, None])
+        path = self.surrogate(faulty_commands.gather(1, time))
+        times = start, settle, stop, valid
+        context = _context(faulty_commands, path, times, 1.0, self.surrogate, frozen)
         return self.correction.apply(context, z)
 
 
@@ -110,54 +163,84 @@ def _context(
     surrogate: Callable[[Tensor], Tensor] | None = None,
     frozen: Tensor | None = None,
 ) -> Context:
-    """A context of tensors, for what looks at either commands or a path of it."""
-    steps, most = commands.shape[1], times[0].shape[1]
+    """A context whose nominal and corrected outputs are both `outputs`."""
+    steps, count = commands.shape[1], times[0].shape[1]
     return Context(
         surrogate=cast(Any, surrogate),
         commands=commands,
         faulty_commands=commands,
         frozen=cast(Tensor, frozen),
         nominal=outputs,
-        segments=cast(Segments, Movements(*times, steps=steps, most=most)),
+        segments=cast(Segments, TensorSegments(*times, steps=steps, max_count=count)),
         rate=rate,
         corrected=outputs,
     )
 
 
 class SensorGraph(nn.Module):
-    """The record (n, T, d_y) of corrected outputs (n, T, d_y), see `SampledSensor.read`.
+    """The record of corrected outputs as a function of given noise, see `SampledSensor.read`.
 
-    Takes the sample of the first reading (n, 1); of each reading the level of its error
-    (n, R, d_y) and of a glitch (n, R, 1), both uniform; and a glitch's size, normal (n, R, d_y).
+    Parameters
+    ----------
+    sensor : SampledSensor
+        The fitted sensor.
+    width : int
+        Number of outputs, d_y.
+
     """
 
-    law: Tensor
-    size: Tensor
-    steps: Tensor
+    error_quantiles: Tensor
+    glitch_size: Tensor
+    resolution: Tensor
 
     def __init__(self, sensor: SampledSensor, width: int) -> None:
         super().__init__()
         self.every = sensor.every or 1
-        self.rate = sensor.glitch_rate or 0.0
-        law = sensor.noise or ((0.0, 0.0),) * width
+        self.glitch_probability = sensor.glitch_rate or 0.0
         for name, values in (
-            ("law", law),
-            ("size", sensor.glitch_size or (0.0,) * width),
-            ("steps", sensor.steps or (0.0,) * width),
+            ("error_quantiles", sensor.noise or ((0.0, 0.0),) * width),
+            ("glitch_size", sensor.glitch_size or (0.0,) * width),
+            ("resolution", sensor.steps or (0.0,) * width),
         ):
             self.register_buffer(name, torch.tensor(values, dtype=torch.float32))
 
     def forward(
-        self, outputs: Tensor, phase: Tensor, level: Tensor, chance: Tensor, glitch: Tensor
+        self,
+        outputs: Tensor,
+        phase: Tensor,
+        error_level: Tensor,
+        glitch_level: Tensor,
+        glitch_noise: Tensor,
     ) -> Tensor:
-        """The record (n, T, d_y)."""
+        """Record outputs with S sensor samples per trajectory.
+
+        Parameters
+        ----------
+        outputs : Tensor, shape (n, T, d_y)
+            Corrected outputs.
+        phase : Tensor, shape (n, 1)
+            Index of the first sensor sample.
+        error_level : Tensor, shape (n, S, d_y)
+            Uniform noise in [0, 1): levels of the quantiles of the sensor's error.
+        glitch_level : Tensor, shape (n, S, 1)
+            Uniform noise in [0, 1): a glitch occurs below the glitch's probability.
+        glitch_noise : Tensor, shape (n, S, d_y)
+            Standard normal noise that scales a glitch.
+
+        Returns
+        -------
+        Tensor, shape (n, T, d_y)
+            The record, linear between sensor samples.
+
+        """
         steps, width = outputs.shape[1], outputs.shape[2]
-        at = phase + self.every * torch.arange(level.shape[1])
+        at = phase + self.every * torch.arange(error_level.shape[1])
         last = (at < steps).sum(dim=1, keepdim=True) - 1
         values = outputs.gather(1, at.clamp_max(steps - 1)[..., None].expand(-1, -1, width))
-        values = values + self._error(level) + (chance < self.rate) * self.size * glitch
-        whole = self.steps * (values / self.steps.clamp_min(1e-30)).round()
-        values = torch.where(self.steps > 0, whole, values)
+        glitch = (glitch_level < self.glitch_probability) * self.glitch_size * glitch_noise
+        values = values + self._error(error_level) + glitch
+        rounded = self.resolution * (values / self.resolution.clamp_min(1e-30)).round()
+        values = torch.where(self.resolution > 0, rounded, values)
         place = ((torch.arange(steps) - phase) / self.every).clamp_min(0)
         left = place.floor().long().minimum(last)
         share = (place - left).clamp(0, 1)[..., None]
@@ -168,33 +251,46 @@ class SensorGraph(nn.Module):
         return before + share * (after - before)
 
     def _error(self, level: Tensor) -> Tensor:
-        """The quantiles (n, R, d_y) of the law at these levels, linear between those it tells."""
-        place = level * (self.law.shape[1] - 1)
-        below = place.floor().long().clamp(0, self.law.shape[1] - 2)
-        law = self.law.T[None].expand(level.shape[0], -1, -1)
-        left, right = law.gather(1, below), law.gather(1, below + 1)
+        """The sensor's errors (n, S, d_y) at these levels, linear between the fitted quantiles."""
+        last = self.error_quantiles.shape[1] - 1
+        place = level * last
+        below = place.floor().long().clamp(0, last - 1)
+        quantiles = self.error_quantiles.T[None].expand(level.shape[0], -1, -1)
+        left, right = quantiles.gather(1, below), quantiles.gather(1, below + 1)
         return left + (place - below) * (right - left)
 
 
 def sensor_of(correction: Correction) -> SampledSensor | None:
-    """The sensor that records what the operator leaves, if there is one."""
+    """The sensor at the end of a chain of operators, None if there is none."""
     last = correction.second if isinstance(correction, Chain) else None
     return last if isinstance(last, SampledSensor) and last.every is not None else None
 
 
 class FeaturesGraph(nn.Module):
-    """Features (n, T', 2 d_y), see `Features`.
-
-    Takes nominal and observed outputs (n, T, d_y), where there is a measurement (n, T, d_y), and
-    the sample (n, 1) until which the start is hidden, 0 where it is shown.
-    """
+    """Features of trajectories, see `Features`."""
 
     def __init__(self, features: Features) -> None:
         super().__init__()
         self.stride = features.stride
 
     def forward(self, nominal: Tensor, observed: Tensor, mask: Tensor, settled: Tensor) -> Tensor:
-        """Features (n, T', 2 d_y)."""
+        """Compute features.
+
+        Parameters
+        ----------
+        nominal, observed : Tensor, shape (n, T, d_y)
+            Nominal and observed outputs.
+        mask : Tensor, shape (n, T, d_y)
+            Whether an output was measured.
+        settled : Tensor, shape (n, 1)
+            Sample until which the start is hidden, 0 if it is not.
+
+        Returns
+        -------
+        Tensor, shape (n, T', 2 d_y)
+            Features.
+
+        """
         time = torch.arange(0, nominal.shape[1], self.stride)
         residual = torch.where(mask, observed - nominal, torch.zeros_like(nominal))
         hidden = (time < settled)[..., None]
@@ -204,19 +300,19 @@ class FeaturesGraph(nn.Module):
 
 
 class DiagnoserGraph(nn.Module):
-    """Probabilities (n, classes) of features (n, T', 2 d_y)."""
+    """Class probabilities as a function of features."""
 
     def __init__(self, diagnoser: NetworkDiagnoser) -> None:
         super().__init__()
         self.diagnoser = diagnoser
 
     def forward(self, features: Tensor) -> Tensor:
-        """Probabilities (n, classes)."""
+        """Probabilities (n, classes) of features (n, T', 2 d_y)."""
         return self.diagnoser(features).softmax(dim=1)
 
 
 class GuardGraph(nn.Module):
-    """Energies (n,) of the same as `FeaturesGraph` takes, nothing of it hidden."""
+    """Energies as a function of the inputs of `FeaturesGraph`; the start is never hidden."""
 
     def __init__(self, guard: nn.Module, features: Features) -> None:
         super().__init__()
@@ -224,6 +320,6 @@ class GuardGraph(nn.Module):
         self.features = FeaturesGraph(features)
 
     def forward(self, nominal: Tensor, observed: Tensor, mask: Tensor) -> Tensor:
-        """Energies (n,)."""
-        shown = torch.zeros_like(nominal[:, :1, 0], dtype=torch.int64)
-        return self.guard(self.features(nominal, observed, mask, shown))
+        """Energies (n,), in log odds."""
+        start = torch.zeros_like(nominal[:, :1, 0], dtype=torch.int64)
+        return self.guard(self.features(nominal, observed, mask, start))

@@ -1,4 +1,4 @@
-"""ONNX for operators of torch that its exporter does not know, or not in the form we use them."""
+"""ONNX translations of torch operators that torch's exporter lacks in the form used here."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ __all__ = ["translations"]
 
 
 def translations() -> dict[Callable[..., Any], Callable[..., Any]]:
-    """Operator of torch to what stands for it in ONNX; needs onnxscript."""
+    """Torch operator to the function that builds its ONNX nodes; needs onnxscript."""
     from onnxscript import opset18
 
-    op: Any = opset18  # its types are those of values, ours are those of a graph's names
+    op: Any = opset18  # it is typed for values, here it builds nodes
 
     def ints(*values: int) -> Any:
         return op.Constant(value_ints=values)
@@ -27,13 +27,13 @@ def translations() -> dict[Callable[..., Any], Callable[..., Any]]:
         side: Any = None,
         sorter: Any = None,
     ) -> Any:
-        """How many of a few boundaries (..., K) are at or below each value (..., T)."""
+        """Count the boundaries (..., K) below each value (..., T); K is small."""
         below = op.LessOrEqual if right else op.Less
         before = below(op.Unsqueeze(boundaries, ints(-2)), op.Unsqueeze(values, ints(-1)))
         return op.ReduceSum(op.Cast(before, to=7), ints(-1), keepdims=0)
 
     def cummax(values: Any, dim: int) -> Any:
-        """The greatest of (n, K) so far, along the last axis, and its place; K is small."""
+        """Cumulative maximum of (n, K) along the last axis, and its index; K is small."""
         count = op.Shape(values, start=-1)
         square = op.Expand(op.Constant(value_float=1.0), op.Concat(count, count, axis=0))
         seen = op.Greater(op.Trilu(square, upper=0), op.Constant(value_float=0.5))
@@ -43,7 +43,7 @@ def translations() -> dict[Callable[..., Any], Callable[..., Any]]:
         return greatest, op.ArgMax(candidates, axis=-1, keepdims=0)
 
     def amax(values: Any, dim: Any = (), keepdim: bool = False) -> Any:
-        """The greatest over some axes, or over all."""
+        """Maximum over some axes, or over all."""
         axes = (dim,) if isinstance(dim, int) else tuple(dim or ())
         kept = int(keepdim)
         return (

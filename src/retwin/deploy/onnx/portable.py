@@ -1,4 +1,4 @@
-"""`Portable`: a bundle's ONNX export, on onnxruntime and numpy alone: torch is never loaded."""
+"""`Portable`: a bundle's ONNX export, used with onnxruntime and numpy; torch is never imported."""
 
 from __future__ import annotations
 
@@ -11,11 +11,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import needs_extra, require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.deploy.bundle.facts import Facts
-from retwin.deploy.bundle.seal import distrusting, read_sealed
-from retwin.deploy.bundle.verdicts import Domain, Prediction, distributions
+from retwin.deploy.bundle.seal import open_sealed, refusing
+from retwin.deploy.bundle.verdicts import (
+    Domain,
+    Prediction,
+    are_probabilities,
+    check_channels,
+    no_diagnoser,
+)
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
@@ -27,42 +34,87 @@ if TYPE_CHECKING:
 __all__ = ["Portable", "padded_times", "settled_at"]
 
 GRAPHS = ("surrogate", "residual", "correction", "guard")
-"""Those that every export has."""
-EXPORTED = "a graph that retwin bundle export wrote"
+"""Names of the graphs that every export has."""
+EXPECTED = "a graph that retwin bundle export wrote"
 REMEDY = "make it anew with retwin bundle export"
 
 
 @dataclass(frozen=True)
-class Reader:
-    """The sensor's period, and the samples of which one is its first reading's."""
+class Sensor:
+    """Settings of the sensor's graph.
+
+    Attributes
+    ----------
+    every : int
+        Samples from one measurement to the next.
+    phases : tuple of int
+        Possible indices of the first measured sample.
+
+    """
 
     every: int
     phases: tuple[int, ...]
 
+    @classmethod
+    def of(cls, about: Mapping[str, Any]) -> Sensor:
+        """The settings from JSON values."""
+        every = int(about["every"])
+        return cls(every, tuple(int(phase) for phase in about["phases"] or range(every)))
+
 
 @dataclass(frozen=True)
-class Judge:
-    """What a diagnoser looks at and tells; `settled`: readings that its start stays hidden for."""
+class Classifier:
+    """Settings of the diagnoser's graphs.
+
+    Attributes
+    ----------
+    classes : tuple of str
+        Names of the classes.
+    stride : int
+        Samples from one feature to the next.
+    settled : int or None
+        Features after the first motion until which the start is hidden; None if it is not.
+
+    """
 
     classes: tuple[str, ...]
     stride: int
     settled: int | None
 
+    @classmethod
+    def of(cls, about: Mapping[str, Any]) -> Classifier:
+        """The settings from JSON values."""
+        settled = about["settled"]
+        names = tuple(str(name) for name in about["classes"])
+        return cls(names, int(about["stride"]), None if settled is None else int(settled))
+
 
 @dataclass(frozen=True, eq=False)
 class Portable:
-    """Predicts as the `Bundle` it was exported from; and simulates, as any `Twin`.
+    """A bundle's export, which predicts as the `Bundle` does and simulates as any `Twin` does.
 
     Attributes
     ----------
-    graphs: name to a function from named arrays to an array.
-    facts: what it keeps of its case.
-    inputs, outputs, rate: channels and samples per second.
-    domain: ranges and limits of the guard.
-    stride: every how many samples the guard holds the nominal path against the surrogate.
-    sensor, diagnoser: how their graphs are used; None where there are none.
-    emulated: whether it was fitted to a stand-in for the real system.
-    provenance: versions and data, as the bundle's.
+    graphs : mapping of str to Graph
+        Functions from named arrays to an array.
+    facts : Facts
+        The values of the case that are kept.
+    inputs, outputs : Channels
+        Channels of commands and outputs.
+    rate : float
+        Sample rate in Hz.
+    domain : Domain
+        Ranges and limits of the guard.
+    stride : int
+        Samples from one to the next at which the guard compares nominal outputs and surrogate.
+    sensor : Sensor or None
+        Settings of the sensor; None if there is none.
+    diagnoser : Classifier or None
+        Settings of the diagnoser; None if there is none.
+    emulated : bool
+        Whether the bundle was fitted to an emulation of the real system.
+    provenance : mapping
+        Versions and data, as in the bundle.
 
     """
 
@@ -73,8 +125,8 @@ class Portable:
     rate: float
     domain: Domain
     stride: int = 1
-    sensor: Reader | None = None
-    diagnoser: Judge | None = None
+    sensor: Sensor | None = None
+    diagnoser: Classifier | None = None
     emulated: bool = False
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
@@ -84,23 +136,32 @@ class Portable:
 
         Parameters
         ----------
-        folder: the export.
-        threads: of onnxruntime; more than one pays for large batches only.
+        folder : path
+            Folder of the export.
+        threads : int
+            Threads of onnxruntime; more than one helps with large batches only.
+
+        Returns
+        -------
+        Portable
+            The export, ready to predict and to simulate.
 
         Raises
         ------
-        InputError: a file that was changed, is missing or was added; another kind or schema; no
-            graphs; onnxruntime is not installed.
+        InputError
+            If onnxruntime is not installed; if a file was changed, removed or added; if the folder
+            is of another kind or schema; or if it is sealed and holds no graphs.
 
         """
-        runtime = _runtime()
-        about = read_sealed(folder, "portable")
+        runtime = needs_extra("onnxruntime", "onnx", "runs the graphs")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = threads
-        options.log_severity_level = 4  # what is wrong is raised, not printed
-        with distrusting(folder, expected="the ONNX export of a bundle", remedy=REMEDY):
-            sensor, judge = _reader(about["sensor"]), _judge(about["diagnoser"])
-            names = [*GRAPHS, *["sensor"] * bool(sensor), *["features", "diagnoser"] * bool(judge)]
+        options.log_severity_level = 4  # errors are raised, and need not be printed too
+        with open_sealed(folder, "portable") as about:
+            sensor = None if about["sensor"] is None else Sensor.of(about["sensor"])
+            classifier = None if about["diagnoser"] is None else Classifier.of(about["diagnoser"])
+            names = [*GRAPHS, *["sensor"] * bool(sensor)]
+            names += ["features", "diagnoser"] * bool(classifier)
             files = {name: Path(folder) / f"{name}.onnx" for name in names}
             return cls(
                 graphs={
@@ -116,40 +177,45 @@ class Portable:
                 domain=Domain.of(about["domain"]),
                 stride=int(about["stride"]),
                 sensor=sensor,
-                diagnoser=judge,
+                diagnoser=classifier,
                 emulated=bool(about["emulated"]),
                 provenance=dict(about["provenance"]),
             )
 
     def predict(self, trajectories: Trajectories) -> Prediction:
-        """Diagnose trajectories, see `Bundle.predict`; they are as long as those it was made for.
+        """Diagnose trajectories, and flag those that the bundle was not made for.
+
+        Parameters
+        ----------
+        trajectories : Trajectories
+            The n trajectories, with commands, as long as those of the bundle.
+
+        Returns
+        -------
+        Prediction
+            Probabilities and verdicts, as from `Bundle.predict`.
 
         Raises
         ------
-        InputError: an export without a diagnoser; other channels or another rate than it was made
-            for, or no commands; another length that is not outside; a graph whose output has
-            another shape, is not finite, or is no probabilities.
+        InputError
+            If the export has no diagnoser; if channels, rate or length are not those of the bundle;
+            or if the output of a graph has another shape, is not finite, or is no probabilities.
 
         """
-        judge = self.diagnoser
-        if judge is None:
-            raise InputError(
-                "bundle",
-                expected="one with a diagnoser",
-                got="one without",
-                remedy="train a diagnoser, then make the bundle and its export anew",
-            )
-        self._check(trajectories)
-        verdicts = self.domain.judge(
+        classifier = self.diagnoser
+        if classifier is None:
+            raise no_diagnoser()
+        check_channels(trajectories, self)
+        verdicts = self.domain.assess(
             trajectories, self._mismatch, self._energy, steps=self.facts.steps
         )
         return Prediction.of(
-            judge.classes, verdicts, trajectories, partial(self._probabilities, judge)
+            classifier.classes, verdicts, trajectories, partial(self._probabilities, classifier)
         )
 
     def _mismatch(self, trajectories: Trajectories) -> NDArray:
         """See `Guard.mismatch`."""
-        self._fits(trajectories.steps, 0)
+        self._check_size(trajectories.steps, 0)
         every = slice(None, None, self.stride)
         nominal = trajectories.nominal[:, every]
         commands = _single(trajectories.commands[:, every])
@@ -158,15 +224,15 @@ class Portable:
 
     def _energy(self, trajectories: Trajectories) -> NDArray:
         """See `Guard.energy`."""
-        return self.graphs["guard"].checked((len(trajectories),), **_seen(trajectories))
+        return self.graphs["guard"].checked((len(trajectories),), **_outputs(trajectories))
 
-    def _probabilities(self, judge: Judge, trajectories: Trajectories) -> NDArray:
-        """Probabilities (n, classes) as the diagnoser gives them."""
-        settled = settled_at(trajectories, judge.stride, judge.settled)
-        features = self.graphs["features"](**_seen(trajectories), settled=settled)
-        shape = len(trajectories), len(judge.classes)
+    def _probabilities(self, classifier: Classifier, trajectories: Trajectories) -> NDArray:
+        """Probabilities (n, classes) from the diagnoser's graph."""
+        settled = settled_at(trajectories, classifier.stride, classifier.settled)
+        features = self.graphs["features"](**_outputs(trajectories), settled=settled)
+        shape = len(trajectories), len(classifier.classes)
         found = self.graphs["diagnoser"].checked(shape, features=features).astype(np.float64)
-        if not distributions(found).all():
+        if not are_probabilities(found).all():
             raise self.graphs["diagnoser"].refused("numbers that are no probabilities")
         return found
 
@@ -178,16 +244,23 @@ class Portable:
         seed: int,
         progress: Progress | None = None,
     ) -> Trajectories:
-        """See `Twin.simulate`; the law of `CorrectedTwin.simulate`, other draws for the same seed.
+        """See `Twin.simulate`.
 
-        Raises InputError beside, for another length or more movements than it was made for.
+        The distribution is that of `CorrectedTwin.simulate`; draws of the same seed differ.
+
+        Raises
+        ------
+        InputError
+            If `Twin.simulate` raises it; or if trajectories have another length or more segments
+            than those of the bundle.
+
         """
         rng = np.random.default_rng(checked_seed(seed))
         checked = _single(checked_commands(commands, self.inputs))
-        self._fits(checked.shape[1], Segments.from_commands(checked).most)
+        self._check_size(checked.shape[1], Segments.from_commands(checked).max_count)
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            return self._corrected(chunk, rng)
+            return self._corrected(chunk, self._noise(len(chunk.commands), rng))
 
         return simulate_in_chunks(
             self,
@@ -199,59 +272,71 @@ class Portable:
             emulated=self.emulated,
         )
 
-    def _corrected(self, chunk: Chunk, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
-        """Nominal outputs, and corrected and recorded ones, with noise from `rng`."""
-        nominal = self.graphs["surrogate"](commands=chunk.commands)
-        moves = padded_times(chunk.segments, self.facts.movements)
-        count, most = moves["valid"].shape
+    def _noise(self, count: int, rng: np.random.Generator) -> dict[str, NDArray]:
+        """The noise of the residual model and the sensor for `count` trajectories, by graph input.
+
+        All of it is independent. `uniform` (n, M, blocks), `error_level` (n, R, d_y) and
+        `glitch_level` (n, R, 1) are uniform on [0, 1); `segment_noise` (n, M, d_z),
+        `trajectory_noise` (n, 1, d_z) and `glitch_noise` (n, R, d_y) are standard normal; `phase`
+        (n, 1) is one of the sensor's phases.
+        """
         residual = self.graphs["residual"]
-        blocks, size = residual.width("uniform"), residual.width("own")
-        z = residual(
-            commands=chunk.commands,
-            nominal=nominal,
-            **moves,
-            uniform=rng.random((count, most, blocks), np.float32),
-            own=rng.standard_normal((count, most, size), np.float32),
-            common=rng.standard_normal((count, 1, size), np.float32),
-        )
+        blocks, size = residual.width("uniform"), residual.width("segment_noise")
+        shape = count, self.facts.max_segments
+        noise: dict[str, NDArray] = {
+            "uniform": rng.random((*shape, blocks), np.float32),
+            "segment_noise": rng.standard_normal((*shape, size), np.float32),
+            "trajectory_noise": rng.standard_normal((count, 1, size), np.float32),
+        }
+        if self.sensor is None:
+            return noise
+        samples = count, -(-self.facts.steps // self.sensor.every)
+        width = len(self.outputs)
+        return noise | {
+            "phase": rng.choice(self.sensor.phases, size=(count, 1)).astype(np.int64),
+            "error_level": rng.random((*samples, width), np.float32),
+            "glitch_level": rng.random((*samples, 1), np.float32),
+            "glitch_noise": rng.standard_normal((*samples, width), np.float32),
+        }
+
+    def _corrected(self, chunk: Chunk, noise: Mapping[str, NDArray]) -> tuple[NDArray, NDArray]:
+        """Nominal outputs and recorded corrected outputs, for noise as `_noise` draws it."""
+        nominal = self.graphs["surrogate"](commands=chunk.commands)
+        segments = padded_times(chunk.segments, self.facts.max_segments)
+        z = self.graphs["residual"](commands=chunk.commands, nominal=nominal, **segments, **noise)
         outputs = self.graphs["correction"](
-            told=_single(chunk.faulty_commands), frozen=chunk.frozen.astype(np.int64), **moves, z=z
+            faulty_commands=_single(chunk.faulty_commands),
+            frozen=chunk.frozen.astype(np.int64),
+            **segments,
+            z=z,
         )
         if self.sensor is None:
             return nominal, outputs
-        readings = count, -(-outputs.shape[1] // self.sensor.every), outputs.shape[2]
-        recorded = self.graphs["sensor"](
-            outputs=outputs,
-            phase=rng.choice(self.sensor.phases, size=(count, 1)).astype(np.int64),
-            level=rng.random(readings, np.float32),
-            chance=rng.random((*readings[:2], 1), np.float32),
-            glitch=rng.standard_normal(readings, np.float32),
+        return nominal, self.graphs["sensor"](outputs=outputs, **noise)
+
+    def _check_size(self, steps: int, segments: int) -> None:
+        """Raise InputError for another length or more segments than the graphs have."""
+        facts = self.facts
+        require(
+            steps == facts.steps and segments <= facts.max_segments,
+            "trajectories",
+            expected=f"{facts.steps} samples and at most {facts.max_segments} segments",
+            got=f"{steps} samples, {segments} segments",
+            remedy="cut them, or use the bundle with torch, which takes any length",
         )
-        return nominal, recorded
-
-    def _check(self, trajectories: Trajectories) -> None:
-        for name in ("inputs", "outputs", "rate"):
-            ours, theirs = getattr(self, name), getattr(trajectories, name)
-            if ours != theirs:
-                raise InputError(
-                    f"trajectories.{name}",
-                    expected=f"what the bundle was made for, {ours}",
-                    got=f"{theirs}",
-                    remedy="resample or rename, and read files with their case",
-                )
-
-    def _fits(self, steps: int, movements: int) -> None:
-        if steps != self.facts.steps or movements > self.facts.movements:
-            raise InputError(
-                "trajectories",
-                expected=f"{self.facts.steps} samples and at most {self.facts.movements} movements",
-                got=f"{steps} samples, {movements} movements",
-                remedy="cut them, or use the bundle with torch, which takes any length",
-            )
 
 
 class Graph:
-    """A session of onnxruntime as a function of named arrays; what it does not take is left out."""
+    """A session of onnxruntime as a function of named arrays; others are ignored.
+
+    Parameters
+    ----------
+    session : onnxruntime.InferenceSession
+        The session.
+    file : Path
+        File of the graph, for messages.
+
+    """
 
     def __init__(self, session: InferenceSession, file: Path) -> None:
         self.session = session
@@ -259,14 +344,14 @@ class Graph:
         self.inputs = {each.name: each.shape for each in session.get_inputs()}
 
     def __call__(self, **arrays: NDArray) -> NDArray:
-        """The one output; InputError where the graph does not run."""
+        """The output of the graph; InputError if it does not run."""
         given = {name: array for name, array in arrays.items() if name in self.inputs}
-        with distrusting(self.file, expected=EXPORTED, remedy=REMEDY):
+        with refusing(self.file, expected=EXPECTED, remedy=REMEDY):
             result: NDArray = self.session.run(None, given)[0]
         return result
 
     def checked(self, shape: tuple[int, ...], **arrays: NDArray) -> NDArray:
-        """The output for arrays of usual size; InputError if it has another shape or NaN."""
+        """The output; InputError if it has another shape or is not finite."""
         result = self(**arrays)
         if result.shape != shape:
             raise self.refused(f"an output of shape {result.shape} for {shape}")
@@ -276,43 +361,15 @@ class Graph:
 
     def refused(self, got: str) -> InputError:
         """The error for an output that no graph of `export_onnx` has."""
-        return InputError(str(self.file), expected=EXPORTED, got=got, remedy=REMEDY)
+        return InputError(str(self.file), expected=EXPECTED, got=got, remedy=REMEDY)
 
     def width(self, name: str) -> int:
         """Size of the last axis of an input."""
         return int(self.inputs[name][-1])
 
 
-def _runtime() -> Any:
-    try:
-        import onnxruntime
-    except ImportError:
-        raise InputError(
-            "onnx",
-            expected="the package onnxruntime",
-            got="an installation without it",
-            remedy='install it: pip install "retwin[onnx]", or pip install onnxruntime',
-        ) from None
-    return onnxruntime
-
-
-def _reader(about: Mapping[str, Any] | None) -> Reader | None:
-    if about is None:
-        return None
-    every = int(about["every"])
-    return Reader(every, tuple(int(phase) for phase in about["phases"] or range(every)))
-
-
-def _judge(about: Mapping[str, Any] | None) -> Judge | None:
-    if about is None:
-        return None
-    settled = about["settled"]
-    names = tuple(str(name) for name in about["classes"])
-    return Judge(names, int(about["stride"]), None if settled is None else int(settled))
-
-
-def _seen(trajectories: Trajectories) -> dict[str, NDArray]:
-    """The inputs of the graphs that look at trajectories."""
+def _outputs(trajectories: Trajectories) -> dict[str, NDArray]:
+    """Outputs and mask by name, as the graphs of guard and features take them."""
     return {
         "nominal": _single(trajectories.nominal),
         "observed": _single(trajectories.observed),
@@ -324,9 +381,9 @@ def _single(values: NDArray) -> NDArray:
     return np.ascontiguousarray(values, dtype=np.float32)
 
 
-def padded_times(segments: Segments, movements: int) -> dict[str, NDArray]:
-    """Times of movements (n, movements), padded as `Segments` pads."""
-    missing = ((0, 0), (0, movements - segments.most))
+def padded_times(segments: Segments, max_segments: int) -> dict[str, NDArray]:
+    """Times of segments (n, max_segments) in samples, by name; absent segments as in `Segments`."""
+    missing = ((0, 0), (0, max_segments - segments.max_count))
     padded = {
         name: _single(np.pad(getattr(segments, name), missing, constant_values=segments.steps))
         for name in ("start", "settle", "stop")
@@ -335,12 +392,12 @@ def padded_times(segments: Segments, movements: int) -> dict[str, NDArray]:
 
 
 def settled_at(trajectories: Trajectories, stride: int, margin: int | None) -> NDArray:
-    """The sample (n, 1) until which the start is hidden, see `Features`; 0 where it is shown."""
+    """Index (n, 1) of the sample until which `Features` hide the start; 0 if they do not."""
     last = trajectories.steps - 1
     if margin is None:
         return np.zeros((len(trajectories), 1), dtype=np.int64)
     segments = Segments.from_commands(trajectories.commands)
-    if segments.most == 0:
+    if segments.max_count == 0:
         return np.full((len(trajectories), 1), last)
     end = np.ceil(segments.settle[:, :1]).astype(np.int64) + margin * stride
     return np.minimum(end, last)

@@ -1,4 +1,8 @@
-"""Scale: any number of trajectories into one Zarr folder; bounded memory, resumable, spread out."""
+"""Simulations of any number of trajectories into one Zarr folder.
+
+Memory is bounded by one chunk per worker, an interrupted job resumes, and chunks are distributed
+over processes or a Dask cluster.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`SimulationPlan`: what is to be simulated. The plan alone decides the bytes, chunk by chunk."""
+"""`SimulationPlan`: what is simulated, and the simulation of one chunk of it.
+
+The bytes of a chunk depend on the plan and the chunk's number alone.
+"""
 
 from __future__ import annotations
 
@@ -12,32 +15,41 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from retwin.checks import at_least, one_of, require, whole
 from retwin.data.io.header import CHUNKED_NAMES, FAILED
 from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError, place_of
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
-from retwin.twins.twin import Limits, SimulationError, Twin, checked_commands
+from retwin.twins.limits import Limits
+from retwin.twins.twin import SimulationError, Twin, checked_commands
 
 if TYPE_CHECKING:  # a worker that simulates without torch need not load it
     from retwin.twins.samplers import CommandSampler
 
-__all__ = ["Made", "Recorded", "SimulationPlan", "make_chunk"]
+__all__ = ["Recorded", "SimulatedChunk", "SimulationPlan", "simulate_chunk"]
 
-LONGEST_REASON = 200
-"""Characters kept of why a trajectory failed: a million of them must fit a header."""
+MAX_REASON_CHARACTERS = 200
+"""Greatest number of characters of a failure's reason; a header holds up to a million of them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """Commands (k, T, d_u) that are at hand: in memory, or in a file *.npy that is mapped."""
+    """Given commands, as opposed to a sampler that draws them.
 
-    held: NDArray | Path
+    Attributes
+    ----------
+    source : ndarray or Path
+        Commands of shape (k, T, d_u), or an NPY file with them that is memory-mapped.
+
+    """
+
+    source: NDArray | Path
 
     @property
     def array(self) -> NDArray:
-        """The commands; from a file only what is used is read."""
-        return self.held if isinstance(self.held, np.ndarray) else np.load(self.held, "r")
+        """The commands (k, T, d_u); only the used part of a file is read."""
+        return self.source if isinstance(self.source, np.ndarray) else np.load(self.source, "r")
 
     @property
     def steps(self) -> int:
@@ -47,27 +59,35 @@ class Recorded:
 
 @dataclass(frozen=True, eq=False)
 class SimulationPlan:
-    """What is to be simulated, and with which seed.
+    """What is simulated, and with which seed; the same plan gives the same bytes on one machine.
 
     Parameters
     ----------
-    twin: any twin. One with `timing` (k, M) in samples, as a corrected twin has, hands it to the
-        sampler.
-    commands: a sampler that draws them; or the commands themselves, (k, T, d_u) or the
-        trajectories that hold them, taken in turn: trajectory i gets row i mod k.
-    seed: same plan, same bytes on the same machine.
-    n: trajectories; by default one for every row of commands.
-    faults: class name to fault, `None` for healthy, dealt in turn: trajectory i is of class
-        i mod (number of classes). The faults of a case give a balanced set.
-    clip: whether commands outside the twin's limits are put on the limit, where the twin itself
-        would refuse them.
-    chunk: trajectories that are simulated, written and, after an interruption, repeated together.
-    dtype: of the numbers that are stored. The twin gets the commands as they are stored.
+    twin : Twin
+        The twin. A corrected twin has `timing` (k, M) in samples, which the sampler gets.
+    commands : CommandSampler, Trajectories or ndarray
+        A sampler; or commands of shape (k, T, d_u), or trajectories with such commands, where
+        trajectory i gets row i mod k.
+    seed : int
+        Seed of commands and simulations, at least 0.
+    n : int, optional
+        Number of trajectories; by default one for each row of given commands.
+    faults : mapping of str to Fault or None
+        Fault of each class, None for the healthy one. Trajectory i is of class i mod (number of
+        classes), so the faults of a case give a balanced set.
+    clip : bool
+        Whether commands outside the twin's limits are clipped, which the twin may refuse otherwise.
+    chunk : int
+        Trajectories that are simulated and written together, at least 1. An interruption loses at
+        most one chunk per worker.
+    dtype : {"float32", "float64"}
+        Type of the stored numbers; the twin gets the commands as they are stored.
 
     Raises
     ------
-    InputError: commands of another width, rate or channels than the twin's, not finite, or outside
-        its limits; no n where there is no row to count; numbers that are not positive; no class.
+    InputError
+        If commands are not finite, outside the limits, or have other channels or another rate than
+        the twin; if `n` is missing; if a number is outside its range; or if there is no class.
 
     """
 
@@ -81,37 +101,20 @@ class SimulationPlan:
     dtype: Literal["float32", "float64"] = "float32"
 
     def __post_init__(self) -> None:
-        if self.dtype not in ("float32", "float64"):
-            raise InputError(
-                "dtype",
-                expected="'float32' or 'float64'",
-                got=repr(self.dtype),
-                remedy="say how numbers are to be stored",
-            )
+        one_of("dtype", self.dtype, ("float32", "float64"))
         if isinstance(self.commands, Trajectories):
-            _check_kin(self.commands, self.twin)
+            _check_compatible(self.commands, self.twin)
             object.__setattr__(self, "commands", self.commands.commands)
         if isinstance(self.commands, np.ndarray):
             array = self._within(checked_commands(self.commands, self.twin.inputs))
             object.__setattr__(self, "commands", Recorded(array.astype(self.dtype, copy=False)))
         if self.n is None and isinstance(self.commands, Recorded):
             object.__setattr__(self, "n", len(self.commands.array))
-        for name, least in (("n", 1), ("chunk", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if not (isinstance(value, int | np.integer) and value >= least):
-                raise InputError(
-                    name,
-                    expected=f"a whole number of at least {least}",
-                    got=repr(value),
-                    remedy="give one; a sampler does not say how many trajectories it is to draw",
-                )
-        if not self.faults:
-            raise InputError(
-                "faults",
-                expected="at least one class",
-                got="none",
-                remedy=f"give {{'{HEALTHY}': None}} for healthy trajectories only",
-            )
+        whole("n", self.n, least=1, remedy="give the number of trajectories that are to be drawn")
+        whole("chunk", self.chunk, least=1)
+        whole("seed", self.seed)
+        remedy = f"give {{'{HEALTHY}': None}} for healthy trajectories only"
+        at_least("faults", self.faults, 1, "class", remedy=remedy)
 
     @property
     def count(self) -> int:
@@ -127,16 +130,16 @@ class SimulationPlan:
 
     @property
     def chunks(self) -> int:
-        """How many chunks there are."""
+        """Number of chunks."""
         return -(-self.count // self.chunk)
 
     def rows(self, number: int) -> NDArray:
-        """The indices of the trajectories in a chunk."""
+        """Indices of the trajectories in a chunk."""
         begin = number * self.chunk
         return np.arange(begin, min(begin + self.chunk, self.count))
 
     def empty(self, *, emulated: bool = False) -> Trajectories:
-        """None of the trajectories, but what they have in common."""
+        """An empty set with the channels, rate and provenance of the trajectories."""
         outputs = np.empty((0, self.steps, len(self.twin.outputs)), self.dtype)
         return Trajectories(
             commands=np.empty((0, self.steps, len(self.twin.inputs)), self.dtype),
@@ -150,21 +153,21 @@ class SimulationPlan:
         )
 
     def drawn(self, rows: NDArray, rng: np.random.Generator) -> NDArray:
-        """The commands (n, T, d_u) of the trajectories `rows`, as they are stored."""
+        """Commands (n, T, d_u) of the trajectories `rows`, as they are stored."""
         if isinstance(self.commands, Recorded):
-            held = self.commands.array
-            return np.ascontiguousarray(held[rows % len(held)])
+            given = self.commands.array
+            return np.ascontiguousarray(given[rows % len(given)])
         assert not isinstance(self.commands, Trajectories | np.ndarray)
         timing = getattr(self.twin, "timing", None)
         drawn = self.commands.sample(len(rows), rng=rng, timing=timing)
         drawn = checked_commands(drawn, self.twin.inputs)
-        if drawn.shape[:2] != (len(rows), self.steps):
-            raise InputError(
-                "commands",
-                expected=f"{len(rows)} trajectories of {self.steps} samples from the sampler",
-                got=f"shape {drawn.shape}",
-                remedy="have `sample` draw as many as it is asked for, of `steps` samples",
-            )
+        require(
+            drawn.shape[:2] == (len(rows), self.steps),
+            "commands",
+            expected=f"{len(rows)} trajectories of {self.steps} samples from the sampler",
+            got=f"shape {drawn.shape}",
+            remedy="have `sample` return the requested number of trajectories, of `steps` samples",
+        )
         return self._within(drawn).astype(self.dtype, copy=False)
 
     def _within(self, commands: NDArray) -> NDArray:
@@ -176,42 +179,72 @@ class SimulationPlan:
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
-    """One chunk: its arrays by name, as they are stored, which trajectories failed and why."""
+class SimulatedChunk:
+    """One simulated chunk.
+
+    Attributes
+    ----------
+    arrays : mapping of str to ndarray
+        Arrays as they are stored, in the order of `CHUNKED_NAMES`.
+    failed : mapping of int to str
+        Index and reason of every trajectory that failed.
+    emulated : bool
+        Whether the twin emulates a real system.
+
+    """
 
     arrays: Mapping[str, NDArray]
     failed: Mapping[int, str]
     emulated: bool
 
 
-def make_chunk(plan: SimulationPlan, number: int, progress: Progress | None = None) -> Made:
-    """Simulate one chunk of the plan; the same bytes wherever and in whatever order it is done.
+def simulate_chunk(
+    plan: SimulationPlan, number: int, progress: Progress | None = None
+) -> SimulatedChunk:
+    """Simulate one chunk of a plan.
 
     A trajectory that failed keeps its commands; its outputs are 0 with the mask False.
 
+    Parameters
+    ----------
+    plan : SimulationPlan
+        The plan.
+    number : int
+        Number of the chunk, from 0.
+    progress : callable, optional
+        Called with the share of the chunk that is done.
+
+    Returns
+    -------
+    SimulatedChunk
+        The same bytes wherever and in whatever order chunks are simulated.
+
     Raises
     ------
-    InputError: the twin refuses the commands or faults, or returns other shapes.
-    SimulationError: every trajectory of the very first chunk failed, so all others would.
-    Exception: whatever else the twin raises, with a note of where and of which trajectories.
+    InputError
+        If the twin refuses commands or faults, or returns other shapes.
+    SimulationError
+        If every trajectory of the first chunk failed, so that all others would.
+    Exception
+        Whatever else the twin raises, with a note of the line and the trajectories.
 
     """
     rows = plan.rows(number)
     try:
-        return _made(plan, number, rows, progress)
+        return _simulated(plan, number, rows, progress)
     except InputError as error:
-        raise _of_the_whole(error, int(rows[0])) from error
+        raise _renumbered(error, int(rows[0])) from error
     except SimulationError:
         raise
     except Exception as error:
-        # The line goes into the note, for a traceback does not come out of a worker process.
+        # The note holds the line, since a worker process does not return its traceback.
         at = ", ".join(filter(None, (place_of(error), f"in trajectories {rows[0]} to {rows[-1]}")))
         error.add_note(at)
         raise
 
 
-def _of_the_whole(error: InputError, begin: int) -> InputError:
-    """The error with the number that a trajectory has in the plan: the twin counts in its chunk."""
+def _renumbered(error: InputError, begin: int) -> InputError:
+    """The error with a trajectory's index in the plan instead of that in its chunk."""
 
     def counted(found: re.Match[str]) -> str:
         return f"trajectory {begin + int(found[1])}"
@@ -220,11 +253,13 @@ def _of_the_whole(error: InputError, begin: int) -> InputError:
     return InputError(error.argument, expected=error.expected, got=got, remedy=error.remedy)
 
 
-def _made(plan: SimulationPlan, number: int, rows: NDArray, progress: Progress | None) -> Made:
+def _simulated(
+    plan: SimulationPlan, number: int, rows: NDArray, progress: Progress | None
+) -> SimulatedChunk:
     for_commands, for_twin = np.random.SeedSequence(plan.seed, spawn_key=(number,)).spawn(2)
     classes = rows % len(plan.faults)
     faults = list(plan.faults.values())
-    # More threads than one would not only crowd the cores: they sum in another order.
+    # With more threads sums would have another order, hence other bytes, and workers would compete.
     with threadpool_limits(limits=1):
         commands = plan.drawn(rows, np.random.default_rng(for_commands))
         try:
@@ -252,15 +287,15 @@ def _stored(
     commands: NDArray,
     classes: NDArray,
     begin: int,
-) -> Made:
+) -> SimulatedChunk:
     width = len(plan.twin.outputs)
-    if made.observed.shape != (len(good), plan.steps, width):
-        raise InputError(
-            "twin",
-            expected=f"outputs of shape {(len(good), plan.steps, width)}",
-            got=str(made.observed.shape),
-            remedy="have `simulate` return one trajectory per command, on the commands' time grid",
-        )
+    require(
+        made.observed.shape == (len(good), plan.steps, width),
+        "twin",
+        expected=f"outputs of shape {(len(good), plan.steps, width)}",
+        got=made.observed.shape,
+        remedy="have `simulate` return one trajectory per command, on the commands' time grid",
+    )
     given = {name: getattr(made, name) for name in ("commands", "nominal", "observed")}
     with np.errstate(over="ignore"):
         given = {name: array.astype(plan.dtype) for name, array in given.items()}
@@ -277,27 +312,29 @@ def _stored(
         arrays[name][good[finite]] = values[finite]
     arrays["labels"][good[finite]] = classes[good[finite]]
     assert tuple(arrays) == CHUNKED_NAMES
-    told = {int(begin) + i: " ".join(failed[i].split())[:LONGEST_REASON] for i in sorted(failed)}
-    return Made(arrays, told, made.emulated)
+    reasons = {
+        int(begin) + i: " ".join(failed[i].split())[:MAX_REASON_CHARACTERS] for i in sorted(failed)
+    }
+    return SimulatedChunk(arrays, reasons, made.emulated)
 
 
-def _check_kin(trajectories: Trajectories, twin: Twin) -> None:
+def _check_compatible(trajectories: Trajectories, twin: Twin) -> None:
     """Refuse commands that were recorded at another rate or on other channels than the twin's."""
-    if trajectories.rate != twin.rate:
-        raise InputError(
-            "commands",
-            expected=f"the rate of the twin, {twin.rate:g} Hz",
-            got=f"{trajectories.rate:g} Hz",
-            remedy="resample them, or have the twin run at their rate",
-        )
-    # A set whose channels nobody has named may be named now.
-    if trajectories.inputs not in (twin.inputs, Channels.numbered("u", len(twin.inputs))):
-        raise InputError(
-            "commands",
-            expected=f"the inputs of the twin, {_named(twin.inputs)}",
-            got=_named(trajectories.inputs),
-            remedy="give commands for this twin; a file without commands needs its case",
-        )
+    require(
+        trajectories.rate == twin.rate,
+        "commands",
+        expected=f"the rate of the twin, {twin.rate:g} Hz",
+        got=f"{trajectories.rate:g} Hz",
+        remedy="resample them, or have the twin run at their rate",
+    )
+    # Channels without names of their own are those of the twin.
+    require(
+        trajectories.inputs in (twin.inputs, Channels.numbered("u", len(twin.inputs))),
+        "commands",
+        expected=f"the inputs of the twin, {_named(twin.inputs)}",
+        got=_named(trajectories.inputs),
+        remedy="give commands for this twin; a file without commands needs its case",
+    )
 
 
 def _named(channels: Channels) -> str:

@@ -1,9 +1,14 @@
-"""How real what a twin generates is, on measured healthy trajectories that it has not seen."""
+"""Fidelity: how well the distribution of a twin's outputs matches measured healthy trajectories."""
 
 from retwin.evaluation.fidelity.figures import Fidelity, Figure
 from retwin.evaluation.fidelity.measure import measure_fidelity, measure_widening
-from retwin.evaluation.fidelity.portrait import Overlay, predictive_overlay
-from retwin.evaluation.fidelity.simulation import Simulation, simulate_records
+from retwin.evaluation.fidelity.overlay import Overlay, predictive_overlay
+from retwin.evaluation.fidelity.simulation import (
+    Simulation,
+    record_means,
+    simulate_records,
+    simulation_scores,
+)
 
 __all__ = [
     "Fidelity",
@@ -13,5 +18,7 @@ __all__ = [
     "measure_fidelity",
     "measure_widening",
     "predictive_overlay",
+    "record_means",
     "simulate_records",
+    "simulation_scores",
 ]

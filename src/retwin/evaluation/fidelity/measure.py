@@ -1,9 +1,9 @@
-"""Simulate what was commanded many times, and hold what was measured against the draws."""
+"""`measure_fidelity`: simulations of measured commands, compared with the measured outputs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -11,11 +11,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from retwin.checks import require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Trajectories
-from retwin.errors import InputError
-from retwin.evaluation.fidelity.figures import BINS, LEVELS, Fidelity
+from retwin.evaluation.fidelity.figures import BINS, Fidelity
 from retwin.progress import Progress
+from retwin.scores.distributions import (
+    LEVELS,
+    crps,
+    grouped_quantile,
+    pit_histograms,
+    quantiles,
+)
+from retwin.scores.energy import energy_score
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import DelayOffset
@@ -23,13 +31,16 @@ from retwin.update.residual import infer_discrepancy, segment
 
 __all__ = ["measure_fidelity", "measure_widening"]
 
-MOVEMENT = DelayOffset()
-"""Tells TDe and TPE of every twin alike, whatever operator its own residual model has."""
+DISCREPANCY = DelayOffset()
+"""The correction by which delays and offsets of every twin are inferred, whatever the correction
+of its own residual model: so twins compare."""
 INFERRED = 19
-"""Draws per trajectory of which z* is inferred: one more lies within their range 9 times in 10."""
+"""Draws per trajectory whose z is inferred: a further draw is within their range with probability
+18 / 20 = 0.9."""
 REFERENCE = 99
-"""Draws per trajectory that in turn stand for the measured one."""
+"""Draws per trajectory whose PIT is computed as that of a perfect generator: p-values of 0.01."""
 WINDOWS = 20
+"""Windows of time in which the features of the classifier two-sample test are computed."""
 
 
 def measure_fidelity(
@@ -43,24 +54,40 @@ def measure_fidelity(
     widening: float | None = None,
     progress: Progress | None = None,
 ) -> Fidelity:
-    """How well a twin's draws match measured trajectories that it was not fitted to.
+    """Compare a twin's draws with measured trajectories that it was not calibrated on.
 
     Parameters
     ----------
-    twin: usually a `CorrectedTwin`; TDe and TPE are compared for such a one only.
-    trajectories: healthy ones, with commands, never those of the calibration.
-    draws: simulations per trajectory, 19 at least; one trajectory's are held at a time.
-    seed: same seed, same bytes on the same machine.
-    rate: samples per second to look at, a whole part of the data's; the sensor's true rate serves
-        best. By default the data's.
-    against: rivals by name, scored on the same trajectories; by default the mean correction alone
+    twin : Twin
+        Usually a `CorrectedTwin`; delays and offsets are compared for such a one only.
+    trajectories : Trajectories
+        Healthy ones with commands, never those of the calibration.
+    draws : int
+        Simulations per trajectory, at least 19; those of one trajectory are in memory at a time.
+    seed : int
+        The same seed gives the same bytes on the same machine.
+    rate : float, optional
+        Sample rate of the comparison in Hz, best the true rate of the sensor; the rate of the
+        trajectories is a whole multiple of it. By default that rate.
+    against : mapping of str to Twin, optional
+        Other twins by name, scored on the same trajectories; by default the mean correction
         ("mean_only") of a `CorrectedTwin`.
-    widening: factor for bands about their median, see `measure_widening`, as a further figure.
+    widening : float, optional
+        Factor of the bands about their median, see `measure_widening`, for one more figure.
+    progress : Progress, optional
+        Called with the share that is done.
+
+    Returns
+    -------
+    Fidelity
+        Scores of each trajectory, and their figures.
 
     Raises
     ------
-    InputError: no trajectory, one with a fault, one never measured; channels or a rate that are
-        not the twin's; a `rate` that does not divide the data's; fewer than 19 draws.
+    InputError
+        If there is no trajectory, one has a fault or was never measured; if channels or rate are
+        not the twin's; if `rate` does not divide that of the trajectories; or if there are fewer
+        than 19 draws.
 
     """
     stride = _checked(twin, trajectories, rate, draws)
@@ -71,14 +98,15 @@ def measure_fidelity(
     segments = _segments(twin, trajectories)
     seeds = np.random.SeedSequence(seed).generate_state(2 * len(trajectories)).reshape(-1, 2)
     rows: list[dict[str, Any]] = []
-    for i, (for_twin, for_ties) in enumerate(seeds.tolist()):
+    for i, (twin_seed, tie_seed) in enumerate(seeds.tolist()):
         one = trajectories[[i]]
-        made = _simulate(twin, one, draws, for_twin)
-        row = _score(one, made, stride, np.random.default_rng(for_ties))
+        ensemble = _Ensemble.simulated(twin, one, draws, twin_seed, stride)
+        row = ensemble.scores(np.random.default_rng(tie_seed))
         for name, rival in against.items():
-            theirs = _simulate(rival, one, draws, for_twin)
-            row[f"rival/{name}"] = _accuracy(one, theirs, stride)
-        row["movements"] = _movements(twin, made[: INFERRED + 1], segments[[i]], stride)
+            other = _Ensemble.simulated(rival, one, draws, twin_seed, stride)
+            row[f"rival/{name}"] = other.accuracy()
+        members = ensemble.members[: INFERRED + 1]
+        row["segment_values"] = _segment_values(twin, members, segments[[i]], stride)
         rows.append(row)
         if progress is not None:
             progress((i + 1) / len(trajectories))
@@ -89,16 +117,18 @@ def measure_fidelity(
         )
         for name in against
     }
-    names = ("nominal", "observed", "seen", "bands", "crps", "energy", "pit", "features")
+    names = (
+        *("nominal", "observed", "seen", "bands", "crps", "energy", "pit", "features"),
+        "segment_values",
+    )
     return Fidelity(
         outputs=trajectories.outputs,
-        movement=_movement_channels(twin),
+        segment_channels=_segment_channels(twin),
         rate=trajectories.rate / stride,
         draws=draws,
         ids=trajectories.ids,
         rivals=rivals,
         widening=np.full(len(trajectories), np.nan if widening is None else widening),
-        movements=np.stack([row["movements"] for row in rows]),
         **{name: np.stack([row[name] for row in rows]) for name in names},
     )
 
@@ -111,172 +141,177 @@ def measure_widening(
     seed: int,
     rate: float | None = None,
 ) -> float:
-    """By which factor the 90 % bands must be widened about their median to hold 90 % of points.
+    """The factor by which 90 % bands must be widened about their median to cover 90 %.
 
     Split conformal prediction with trajectories as groups, whose distributions are pooled: the
-    factor holds on average over trajectories, the more exactly the more there are. The twin must
-    not have seen these trajectories, and they must not be those it is then judged on. Infinite
-    when more than a tenth of the points lie off bands of no width.
+    coverage holds on average over trajectories.
 
-    Raises InputError like `measure_fidelity`.
+    Parameters
+    ----------
+    twin : Twin
+        The twin whose bands are widened.
+    trajectories : Trajectories
+        Healthy ones, neither those of the calibration nor those of a later test.
+    draws, seed, rate
+        See `measure_fidelity`.
+
+    Returns
+    -------
+    float
+        Infinite if more than a tenth of the samples lie outside bands without width.
+
+    Raises
+    ------
+    InputError
+        As `measure_fidelity` does.
+
+    References
+    ----------
+    Dunn, Wasserman and Ramdas, "Distribution-free prediction sets for two-layer hierarchical
+    models", JASA 118 (2023): the method that pools the distributions of the groups.
+
     """
     stride = _checked(twin, trajectories, rate, draws)
     seeds = np.random.SeedSequence(seed).generate_state(len(trajectories)).tolist()
-    ratios, weights = [], []
-    for i, for_twin in enumerate(seeds):
-        made = _simulate(twin, trajectories[[i]], draws, for_twin)
-        seen = made.mask[0, ::stride].all(axis=1)
-        values = made.observed[:, ::stride][:, seen]
-        low, middle, high = _quantiles(values[1:], LEVELS[::2])
-        off = values[0] - middle
-        width = np.where(off >= 0, high - middle, middle - low)
+    ratios = []
+    for i, twin_seed in enumerate(seeds):
+        ensemble = _Ensemble.simulated(twin, trajectories[[i]], draws, twin_seed, stride)
+        values = ensemble.members.observed[:, ::stride][:, ensemble.seen]
+        low, middle, high = quantiles(values[1:], LEVELS[::2])
+        error = values[0] - middle
+        width = np.where(error >= 0, high - middle, middle - low)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.where(off == 0, 0.0, np.abs(off) / width)
-        ratios.append(ratio.ravel())
-        weights.append(np.full(ratio.size, 1 / ratio.size))
-    pooled, shares = np.concatenate(ratios), np.concatenate(weights)
-    order = np.argsort(pooled, kind="stable")
-    reached = np.cumsum(shares[order]) / len(trajectories)
-    return float(pooled[order][np.searchsorted(reached, 0.9 - 1e-9)])
+            ratios.append(np.where(error == 0, 0.0, np.abs(error) / width).ravel())
+    return grouped_quantile(ratios, 0.9)
 
 
 def _checked(twin: Twin, trajectories: Trajectories, rate: float | None, draws: int) -> int:
-    """Every how many samples to look; InputError for what cannot be compared."""
+    """The stride of the comparison in samples; InputError for what cannot be compared."""
     healthy = np.isin(trajectories.labels, (HEALTHY, UNLABELLED))
-    if len(trajectories) == 0 or not healthy.all():
-        raise InputError(
-            "trajectories",
-            expected="healthy trajectories, one at least",
-            got=f"{len(trajectories)}, {int((~healthy).sum())} of them with a fault",
-            remedy=f"take trajectories.with_label({HEALTHY!r})",
-        )
-    if not np.all(np.any(np.all(trajectories.mask, axis=2), axis=1)):
-        raise InputError(
-            "trajectories",
-            expected="some sample with all outputs measured in each",
-            got="one that was never measured",
-            remedy="leave it out",
-        )
+    require(
+        len(trajectories) > 0 and healthy.all(),
+        "trajectories",
+        expected="healthy trajectories, one at least",
+        got=f"{len(trajectories)}, {int((~healthy).sum())} of them with a fault",
+        remedy=f"take trajectories.with_label({HEALTHY!r})",
+    )
+    require(
+        np.all(np.any(np.all(trajectories.mask, axis=2), axis=1)),
+        "trajectories",
+        expected="some sample with all outputs measured in each",
+        got="one that was never measured",
+        remedy="leave it out",
+    )
     for name in ("inputs", "outputs", "rate"):
-        ours, theirs = getattr(twin, name), getattr(trajectories, name)
-        if ours != theirs:
-            raise InputError(
-                f"trajectories.{name}",
-                expected=f"what the twin has, {ours}",
-                got=f"{theirs}",
-                remedy="load the file with its case, or convert it",
-            )
-    if draws < INFERRED:
-        raise InputError(
-            "draws", expected=f"at least {INFERRED}", got=repr(draws), remedy="200 serve well"
+        expected, given = getattr(twin, name), getattr(trajectories, name)
+        require(
+            given == expected,
+            f"trajectories.{name}",
+            expected=f"what the twin has, {expected}",
+            got=given,
+            remedy="load the file with its case, or convert it",
         )
+    whole("draws", draws, least=INFERRED, remedy="take the default of 200")
     stride = 1 if rate is None else round(trajectories.rate / rate) if rate > 0 else 0
-    if stride < 1 or (rate is not None and abs(stride * rate - trajectories.rate) > 1e-6):
-        raise InputError(
-            "rate",
-            expected=f"{trajectories.rate:g} Hz, the data's rate, or a whole part of it",
-            got=f"{rate}",
-            remedy="choose a rate that takes every sample, every second, every third …",
-        )
+    require(
+        stride >= 1 and (rate is None or abs(stride * rate - trajectories.rate) <= 1e-6),
+        "rate",
+        expected=f"{trajectories.rate:g} Hz, the data's rate, or a whole part of it",
+        got=rate,
+        remedy="choose the rate of the data divided by a whole number",
+    )
     return stride
 
 
-def _simulate(twin: Twin, one: Trajectories, draws: int, seed: int) -> Trajectories:
-    """The measured trajectory, then `draws` simulations of its commands, all seen where it is."""
-    made = twin.simulate(np.repeat(one.commands, draws, axis=0), seed=seed)
-    observed = np.concatenate([one.observed, made.observed.astype(one.observed.dtype)])
-    return Trajectories(
-        commands=np.repeat(one.commands, draws + 1, axis=0),
-        nominal=np.repeat(one.nominal, draws + 1, axis=0),
-        observed=observed,
-        mask=np.repeat(one.mask, draws + 1, axis=0),
-        rate=one.rate,
-        inputs=one.inputs,
-        outputs=one.outputs,
-    )
+@dataclass(frozen=True)
+class _Ensemble:
+    """A measured trajectory, then simulations of its commands.
 
-
-def _score(
-    one: Trajectories, made: Trajectories, stride: int, rng: np.random.Generator
-) -> dict[str, Any]:
-    """What `Fidelity` tells of one trajectory, its movements apart."""
-    seen = made.mask[0, ::stride].all(axis=1)
-    values = made.observed[:, ::stride]
-    residual = made.residual[: INFERRED + 1, : one.lengths[0] : stride]
-    crps, energy = _accuracy(one, made, stride)
-    return {
-        "nominal": one.nominal[0, ::stride],
-        "observed": values[0],
-        "seen": seen,
-        "bands": _quantiles(values[1:], LEVELS),
-        "crps": crps,
-        "energy": energy,
-        "pit": _pit(values[:, seen].astype(np.float64), rng),
-        "features": _features(residual),
-    }
-
-
-def _quantiles(draws: NDArray, levels: Sequence[float]) -> NDArray:
-    """(levels, P, d), such that one more draw lies below each with just that chance."""
-    return np.quantile(draws, levels, axis=0, method="weibull")
-
-
-def _accuracy(one: Trajectories, made: Trajectories, stride: int) -> tuple[NDArray, float]:
-    """CRPS of every output (d,), and the energy score of all samples and outputs as one vector.
-
-    Both without the bias of few draws ("fair"), so a point forecast and an ensemble compare.
+    `one` is the measured trajectory, `members` (1 + draws) all of them, which share its mask.
     """
-    import scoringrules
-    from scipy.spatial.distance import pdist
 
-    seen = made.mask[0, ::stride].all(axis=1)
-    values = made.observed[:, ::stride][:, seen].astype(np.float64)
-    crps = scoringrules.crps_ensemble(values[0], values[1:], m_axis=0, estimator="pwm")
-    # Outputs of different units must be made comparable before they are put into one vector.
-    spread = one.nominal[0, ::stride][seen].std(axis=0, dtype=np.float64)
-    unit = 1.0 if one.outputs.comparable else np.where(spread > 0, spread, 1.0)
-    flat = (values / unit).reshape(len(values), -1) / np.sqrt(len(values[0]))
-    # scipy's distances, as scoringrules' energy score holds draws² × samples numbers at once.
-    error = np.linalg.norm(flat[1:] - flat[0], axis=1).mean()
-    return crps.mean(axis=0), float(error - 0.5 * pdist(flat[1:]).mean())
+    one: Trajectories
+    members: Trajectories
+    stride: int
 
+    @classmethod
+    def simulated(
+        cls, twin: Twin, one: Trajectories, draws: int, seed: int, stride: int
+    ) -> _Ensemble:
+        """With `draws` simulations by the twin."""
+        made = twin.simulate(np.repeat(one.commands, draws, axis=0), seed=seed)
+        members = Trajectories(
+            commands=np.repeat(one.commands, draws + 1, axis=0),
+            nominal=np.repeat(one.nominal, draws + 1, axis=0),
+            observed=np.concatenate([one.observed, made.observed.astype(one.observed.dtype)]),
+            mask=np.repeat(one.mask, draws + 1, axis=0),
+            rate=one.rate,
+            inputs=one.inputs,
+            outputs=one.outputs,
+        )
+        return cls(one, members, stride)
 
-def _pit(values: NDArray, rng: np.random.Generator) -> NDArray:
-    """Shares (1 + 99, d, 100) of the PIT of each member of (1 + draws, P, d) among all others.
+    @property
+    def seen(self) -> NDArray:
+        """Whether all outputs of a sample were measured (P,)."""
+        return np.asarray(self.one.mask[0, :: self.stride].all(axis=1))
 
-    Members that agree to the last digit are ranked at random, and the PIT is drawn within its step.
-    """
-    order = np.lexsort((rng.random(values.shape), values), axis=0)
-    rank = np.empty_like(order)
-    np.put_along_axis(rank, order, np.arange(len(values))[:, None, None], axis=0)
-    some = rank[: REFERENCE + 1]
-    place = ((some + rng.random(some.shape)) / len(values) * BINS).astype(int).clip(max=BINS - 1)
-    members, moments, outputs = place.shape
-    row = np.arange(members)[:, None, None] * outputs + np.arange(outputs)
-    counts = np.bincount((row * BINS + place).ravel(), minlength=members * outputs * BINS)
-    return (counts.reshape(members, outputs, BINS) / moments).astype(np.float32)
+    @property
+    def values(self) -> NDArray:
+        """Measured samples of all members (1 + draws, P, d), in double precision."""
+        seen = self.members.observed[:, :: self.stride][:, self.seen]
+        values: NDArray = seen.astype(np.float64)
+        return values
+
+    def scores(self, rng: np.random.Generator) -> dict[str, Any]:
+        """The fields of `Fidelity` for one trajectory, except those per segment."""
+        every = slice(None, None, self.stride)
+        observed = self.members.observed[:, every]
+        residual = self.members.residual[: INFERRED + 1, : self.one.lengths[0] : self.stride]
+        score, energy = self.accuracy()
+        return {
+            "nominal": self.one.nominal[0, every],
+            "observed": observed[0],
+            "seen": self.seen,
+            "bands": quantiles(observed[1:]),
+            "crps": score,
+            "energy": energy,
+            "pit": pit_histograms(self.values, members=REFERENCE + 1, bins=BINS, rng=rng),
+            "features": _features(residual),
+        }
+
+    def accuracy(self) -> tuple[NDArray, float]:
+        """CRPS of each output (d,), and the energy score of all samples and outputs together."""
+        values = self.values
+        # Outputs of different units are standardised before they are put into one vector.
+        nominal = self.one.nominal[0, :: self.stride][self.seen]
+        scale = nominal.std(axis=0, dtype=np.float64)
+        unit = 1.0 if self.one.outputs.comparable else np.where(scale > 0, scale, 1.0)
+        score = crps(values[0], values[1:]).mean(axis=0)
+        values /= unit
+        return score, float(energy_score(values[1:], values[0]))
 
 
 def _features(residual: NDArray) -> NDArray:
-    """Mean, spread and step of each output's residual (m, P, d) in 20 windows of time, (m, F)."""
+    """Mean, deviation and mean step of the residual (m, P, d) in 20 windows of time, (m, F)."""
     steps = np.abs(np.diff(residual, axis=1, append=residual[:, -1:]))
     edges = np.arange(WINDOWS + 1) * residual.shape[1] // WINDOWS
     # Every window has a sample, however short a trajectory is.
-    parts = [slice(a, max(a + 1, b)) for a, b in pairwise(edges)]
-    told = [
+    windows = [slice(a, max(a + 1, b)) for a, b in pairwise(edges)]
+    values = [
         value
-        for part in parts
+        for window in windows
         for value in (
-            residual[:, part].mean(axis=1),
-            residual[:, part].std(axis=1),
-            steps[:, part].mean(axis=1),
+            residual[:, window].mean(axis=1),
+            residual[:, window].std(axis=1),
+            steps[:, window].mean(axis=1),
         )
     ]
-    return np.concatenate(told, axis=1).astype(np.float32)
+    return np.concatenate(values, axis=1).astype(np.float32)
 
 
 def _segments(twin: Twin, trajectories: Trajectories) -> Segments:
-    """Movements, by the rule that the twin itself goes by."""
+    """Segments by the rule of the twin's residual model, where it has one."""
     commands = trajectories.commands
     if isinstance(twin, CorrectedTwin) and twin.residual.segmentation == "path":
         found = segment(commands, twin.surrogate.predict(commands), "path")
@@ -285,33 +320,34 @@ def _segments(twin: Twin, trajectories: Trajectories) -> Segments:
     return found.until(trajectories.lengths)
 
 
-def _movement_channels(twin: Twin) -> Channels:
+def _segment_channels(twin: Twin) -> Channels:
+    """Names and units of `_segment_values`."""
     noise = tuple(f"noise_{name}" for name in twin.outputs.names)
     if not isinstance(twin, CorrectedTwin):
         return Channels(noise, twin.outputs.units)
-    latent = MOVEMENT.latent(twin.inputs, twin.outputs)
+    latent = DISCREPANCY.latent(twin.inputs, twin.outputs)
     return Channels(latent.names + noise, latent.units + twin.outputs.units)
 
 
-def _movements(twin: Twin, made: Trajectories, segments: Segments, stride: int) -> NDArray:
-    """TDe, TPE and plateau noise (m, M, k), measured and drawn alike; NaN where not told."""
-    noise = _plateau_noise(made, segments, stride)
+def _segment_values(twin: Twin, members: Trajectories, segments: Segments, stride: int) -> NDArray:
+    """Delay, offsets and steady-state noise (m, M, k) of all members; NaN if not identified."""
+    noise = _steady_noise(members, segments, stride)
     if not isinstance(twin, CorrectedTwin):
         return noise
-    every = segments[np.zeros(len(made), dtype=int)]
-    _, found = infer_discrepancy(twin.surrogate, made, MOVEMENT, segments=every)
+    repeated = segments[np.zeros(len(members), dtype=int)]
+    _, found = infer_discrepancy(twin.surrogate, members, DISCREPANCY, segments=repeated)
     z = torch.where(found.identified, found.z, torch.nan).numpy()
     return np.concatenate([z, noise], axis=2)
 
 
-def _plateau_noise(made: Trajectories, segments: Segments, stride: int) -> NDArray:
-    """Standard deviation (m, M, d) in the second half of each steady part, when all is at rest."""
-    noise = np.full((len(made), segments.most, len(made.outputs)), np.nan)
-    time = np.arange(0, made.steps, stride)
-    seen = made.mask[0, ::stride].all(axis=1)
+def _steady_noise(members: Trajectories, segments: Segments, stride: int) -> NDArray:
+    """Standard deviation (m, M, d) in the second half of each steady part, after transients."""
+    noise = np.full((len(members), segments.max_count, len(members.outputs)), np.nan)
+    time = np.arange(0, members.steps, stride)
+    seen = members.mask[0, ::stride].all(axis=1)
     for m in np.flatnonzero(segments.valid[0]):
         settle, stop = segments.settle[0, m], segments.stop[0, m]
         inside = seen & (time >= (settle + stop) / 2) & (time < stop)
         if inside.sum() >= 3:
-            noise[:, m] = made.observed[:, ::stride][:, inside].std(axis=1)
+            noise[:, m] = members.observed[:, ::stride][:, inside].std(axis=1)
     return noise

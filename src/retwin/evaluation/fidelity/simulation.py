@@ -1,7 +1,8 @@
-"""What a twin says of measured records, sample by sample, and how far off it is."""
+"""Test records simulated from their commands alone, and the scores of that simulation."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,27 +10,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
-from retwin.evaluation.fidelity.figures import LEVELS
 from retwin.progress import Progress
+from retwin.scores.distributions import central_band, crps, inside, quantiles
 from retwin.serialisation.files import write_atomically
 from retwin.twins.twin import Twin
 
-__all__ = ["Simulation", "simulate_records"]
+__all__ = ["Simulation", "record_means", "simulate_records", "simulation_scores"]
 
 _ARRAYS = ("ids", "observed", "mean", "bands", "crps")
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """n records of T samples in d outputs, simulated many times from their commands alone.
+    """n records of T samples in d outputs, each simulated many times from its commands alone.
 
     Attributes
     ----------
-    ids: (n,).
-    observed: (n, T, d), NaN where nothing was measured.
-    mean: (n, T, d), of the draws.
-    bands: (n, 5, T, d), their 5, 25, 50, 75 and 95 % quantiles.
-    crps: (n, T, d) in the outputs' units, without the bias of few draws; NaN like `observed`.
+    ids : NDArray
+        Names of the records (n,).
+    observed : NDArray
+        Measured outputs (n, T, d); NaN where nothing was measured.
+    mean : NDArray
+        Mean of the draws (n, T, d).
+    bands : NDArray
+        5, 25, 50, 75 and 95 % quantiles of the draws (n, 5, T, d).
+    crps : NDArray
+        CRPS (n, T, d) in the outputs' units, without the bias of a finite ensemble; NaN where
+        nothing was measured.
 
     """
 
@@ -41,14 +48,37 @@ class Simulation:
 
     @property
     def random(self) -> bool:
-        """Whether the twin has any chance in it; one without has no bands to speak of."""
+        """Whether the draws differ; the bands of a deterministic twin have no width."""
         return bool(np.any(self.bands[:, 0] < self.bands[:, -1]))
 
-    def inside(self, level: int) -> NDArray:
-        """Whether each sample (n, T, d) lies inside the central 50 or 90 % band; NaN like it."""
-        low, high = (self.bands[:, i] for i in ((1, 3) if level == 50 else (0, 4)))
-        within = (low <= self.observed) & (self.observed <= high)
-        return np.where(np.isnan(self.observed), np.nan, within)
+    def per_sample(self) -> NDArray:
+        """Squared error, CRPS, and whether a value is inside the 50 and the 90 % band.
+
+        Returns
+        -------
+        NDArray
+            (n, T, d, 4); NaN where nothing was measured. Both shares of a deterministic twin are
+            NaN.
+
+        """
+        error = np.square(self.mean - self.observed)
+        bounds = [central_band(self.bands, level, axis=1) for level in (50, 90)]
+        hits = [inside(self.observed, *each) for each in bounds]
+        if not self.random:
+            hits = [np.full_like(error, np.nan)] * 2
+        return np.stack([error, self.crps, *hits], axis=-1)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Simulation], ids: NDArray) -> Simulation:
+        """Simulations of several folds as one, in the order of `ids`."""
+        names = np.concatenate([part.ids for part in parts]).tolist()
+        order = [names.index(name) for name in ids.tolist()]
+        return cls(
+            **{
+                name: np.concatenate([getattr(part, name) for part in parts])[order]
+                for name in _ARRAYS
+            }
+        )
 
     def save(self, file: str | Path) -> None:
         """Write an NPZ file; `load` reads it."""
@@ -71,21 +101,77 @@ def simulate_records(
     seed: int,
     progress: Progress | None = None,
 ) -> Simulation:
-    """Simulate each record's commands `draws` times; measured outputs are only held against it.
+    """Simulate each record's commands many times, and score the draws.
 
-    This is simulation, not prediction: no measured output is used, at no sample.
+    No measured output is used in the simulation, at no sample: this is no one-step prediction.
+
+    Parameters
+    ----------
+    twin : Twin
+        It simulates the commands of the records.
+    records : Trajectories
+        n records with commands.
+    draws : int
+        Simulations of each record.
+    seed : int
+        The same seed gives the same bytes on the same machine.
+    progress : Progress, optional
+        Called with the share that is done.
+
+    Returns
+    -------
+    Simulation
+        Draws of the records, summarised.
+
     """
-    import scoringrules
-
     seeds = np.random.SeedSequence(seed).generate_state(len(records)).tolist()
     measured = np.where(records.mask, records.observed, np.nan).astype(np.float64)
     means, bands, scores = [], [], []
-    for i, for_twin in enumerate(seeds):
+    for i, twin_seed in enumerate(seeds):
         commands = np.repeat(records.commands[[i]], draws, axis=0)
-        made = twin.simulate(commands, seed=for_twin).observed.astype(np.float64)
+        made = twin.simulate(commands, seed=twin_seed).observed.astype(np.float64)
         means.append(made.mean(axis=0))
-        bands.append(np.quantile(made, LEVELS, axis=0, method="weibull"))
-        scores.append(scoringrules.crps_ensemble(measured[i], made, m_axis=0, estimator="pwm"))
+        bands.append(quantiles(made))
+        scores.append(crps(measured[i], made))
         if progress is not None:
             progress((i + 1) / len(records))
     return Simulation(records.ids, measured, *map(np.stack, (means, bands, scores)))
+
+
+def record_means(values: NDArray) -> NDArray:
+    """Mean of values (n, T, ...) over samples, then over records; NaN ones are left out."""
+    seen = np.isfinite(values)
+    with np.errstate(invalid="ignore"):
+        each = np.where(seen, values, 0.0).sum(axis=1) / seen.sum(axis=1)
+    mean: NDArray = each.mean(axis=0)
+    return mean
+
+
+def simulation_scores(means: NDArray, records: Trajectories) -> dict[str, NDArray]:
+    """Scores averaged over outputs.
+
+    Parameters
+    ----------
+    means : NDArray
+        Means (..., d, 4) of what `Simulation.per_sample` returns.
+    records : Trajectories
+        The measured records, for the standard deviation and the units of their outputs.
+
+    Returns
+    -------
+    dict of str to NDArray
+        `rmse` and `crps` (...), NaN where the outputs have different units; `nrmse`, the RMSE
+        divided by each output's standard deviation; `coverage50` and `coverage90`.
+
+    """
+    observed = np.where(records.mask, records.observed, np.nan)
+    deviation = np.nanstd(observed.astype(float), axis=(0, 1))
+    comparable = 1.0 if records.outputs.comparable else np.nan
+    square, score, half, wide = np.moveaxis(means, -1, 0)
+    return {
+        "rmse": comparable * np.sqrt(square.mean(axis=-1)),
+        "nrmse": (np.sqrt(square) / deviation).mean(axis=-1),
+        "crps": comparable * score.mean(axis=-1),
+        "coverage50": half.mean(axis=-1),
+        "coverage90": wide.mean(axis=-1),
+    }

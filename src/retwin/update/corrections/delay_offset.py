@@ -55,7 +55,7 @@ class DelayOffset:
 
     def apply(self, context: Context, z: Tensor) -> Tensor:
         """The corrected path (n, T, d_y), continuous, for z (n, M, 1 + d_y)."""
-        if context.segments.most == 0:
+        if context.segments.max_count == 0:
             return context.path
         knots = Knots.of(context.segments, z[..., 0].to(context.path))
         offset = knots.between(knots.spread(z[..., 1:].to(context.path)))
@@ -84,7 +84,7 @@ class DelayOffset:
     def _infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         unit = context.unit.double()
         model = _Model(context.segments, context.path / unit, observed / unit, mask)
-        n, most, width = len(context), context.segments.most, len(unit)
+        n, most, width = len(context), context.segments.max_count, len(unit)
         valid = torch.as_tensor(context.segments.valid)
         z = torch.zeros(n, most, 1 + width, dtype=torch.float64)
         if most == 0:

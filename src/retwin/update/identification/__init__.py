@@ -1,4 +1,7 @@
-"""Updating a twin's own parameters: least squares (Eq. 2) and Bayes (Eq. 3), the rivals."""
+"""Identification of a twin's own parameters by least squares (Eq. 2) and Bayes (Eq. 3).
+
+These are the baselines that a corrected twin is compared with.
+"""
 
 from retwin.update.identification.bayes import calibration_ranks, identify_bayes
 from retwin.update.identification.identify import Updated, identify

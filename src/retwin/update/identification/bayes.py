@@ -1,4 +1,4 @@
-"""Bayesian updating (Eq. 3): the rival that finds all plausible parameters."""
+"""Bayesian identification (Eq. 3): the posterior distribution of a twin's parameters."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from retwin.update.identification.summaries import Summaries, outlyingness
 
 __all__ = ["calibration_ranks", "identify_bayes"]
 
-KEPT = 4000
-"""Draws of the posterior that are kept at most."""
-OUTSIDE = 0.02
-"""Share of prior predictive data below which the measured ones count as outside."""
+MAX_DRAWS = 4000
+"""Largest number of draws of the posterior that are kept."""
+SIGNIFICANCE = 0.02
+"""Prior predictive p-value of the measured data below which the twin counts as misspecified."""
 
 
 def identify_bayes(
@@ -39,23 +39,36 @@ def identify_bayes(
 ) -> Posterior:
     """The posterior of a twin's parameters given measured outputs, p(θ | y_obs, u) (Eq. 3).
 
+    A warning is given where the data lie outside the prior predictive distribution of the twin with
+    noise, and where chains are short.
+
     Parameters
     ----------
-    twin: says which parameters are free; the prior is uniform within their bounds.
-    observed: healthy calibration trajectories with commands; what is masked does not count.
-    seed: the same seed gives the same result on the same machine.
-    method: `MCMC` for twins that are fast, as surrogates are; `NPE` counts its simulations.
-    noise: law of the output error, whose scales are inferred too.
-    rate: samples per second to look at, a whole part of the data's; by default all. The sensor's
-        true rate: with a discrepancy all samples of it count, without one it is wrong to count
-        samples that the sensor has only joined up.
+    twin : ParametricTwin
+        Declares the free parameters; the prior is uniform within their bounds.
+    observed : Trajectories
+        Healthy calibration trajectories with commands; masked samples are not used.
+    seed : int
+        The same seed gives the same result on the same machine.
+    method : MCMC or NPE
+        `MCMC` for fast twins such as surrogates; `NPE` needs few simulations.
+    noise : Noise
+        Distribution of the output error, whose scales are inferred too.
+    rate : float, optional
+        Sample rate of the residuals in Hz, a whole part of the data's, which is the default. Give
+        the sensor's true rate: interpolated samples are no measurements, and without a
+        discrepancy the posterior is too narrow if they count.
+    progress : callable, optional
+        Called with the share of the method's steps that are done.
 
-    Warns where the data lie outside what the twin can produce with any parameters and such noise,
-    and where chains are short.
+    Returns
+    -------
+    Posterior
 
     Raises
     ------
-    InputError: as `identify`; too few walkers; a package of the extra `bayes` is missing.
+    InputError
+        As `identify`; or too few walkers; or a package of the extra `bayes` is missing.
 
     """
     began = time.perf_counter()
@@ -63,21 +76,21 @@ def identify_bayes(
         seeds = np.random.SeedSequence(seed).generate_state(4).tolist()
         for_method, for_check, for_kept, for_prior = seeds
         problem = Problem(misfit, noise, for_prior)
-        points, figures, doubt = method.sample(problem, seed=for_method, progress=progress)
-        outside = _outside(problem, np.random.default_rng(for_check))
-        order = np.random.default_rng(for_kept).permutation(len(points))[:KEPT]
+        points, figures, warning = method.sample(problem, seed=for_method, progress=progress)
+        p_value = _prior_predictive(problem, np.random.default_rng(for_check))
+        order = np.random.default_rng(for_kept).permutation(len(points))[:MAX_DRAWS]
         samples, logs = problem.physical(points[order])
         mean = samples.mean(axis=0)
         figures["rms_after"] = misfit.rms_of(misfit.residuals(mean[None]))
         figures["rms_before"] = misfit.rms
-    doubts = [doubt] if doubt else []
-    if outside < OUTSIDE:
-        doubts.append(
-            f"misspecified: the data lie farther out than {1 - outside:.1%} of what the twin and "
-            "its noise can produce"
+    found = [warning] if warning else []
+    if p_value < SIGNIFICANCE:
+        found.append(
+            f"misspecified: the data lie farther out than {1 - p_value:.1%} of simulations with "
+            "parameters and noise from the prior"
         )
-    if doubts:
-        warnings.warn("; ".join(doubts), stacklevel=2)
+    if found:
+        warnings.warn("; ".join(found), stacklevel=2)
     updated = PosteriorTwin(
         twin.with_values(mean), noise, samples, logs, misfit.unit, misfit.stride, observed.emulated
     )
@@ -86,20 +99,20 @@ def identify_bayes(
         names=twin.names,
         samples=samples,
         scales=dict(zip(noise.names, np.exp(logs).T, strict=True)),
-        misspecified=outside,
+        misspecified=p_value,
         twin_runs=misfit.twin_runs,
         seconds=time.perf_counter() - began,
         figures=figures,
-        reason="; ".join([f"{type(method).__name__} drew {len(points)} samples", *doubts]),
+        reason="; ".join([f"{type(method).__name__} drew {len(points)} samples", *found]),
     )
 
 
-def _outside(problem: Problem, rng: np.random.Generator) -> float:
-    """Share of prior predictive data that lie as far out as the measured ones."""
+def _prior_predictive(problem: Problem, rng: np.random.Generator) -> float:
+    """The prior predictive p-value of the measured data."""
     points, paths = problem.prior
     seen = problem.misfit.seen
     summaries = Summaries.of(paths)
-    _, simulated = problem.seen_noisily(points, paths, problem.box, summaries, rng)
+    _, simulated = problem.with_noise(points, paths, problem.box, summaries, rng)
     flat = simulated.reshape(-1, simulated.shape[-1])
     return outlyingness(summaries(problem.measured, seen)[0], flat)
 
@@ -116,10 +129,32 @@ def calibration_ranks(
 ) -> NDArray:
     """Simulation-based calibration (Talts et al. 2018): ranks (count, k) from 0 to 1.
 
-    Parameters, scales and data are drawn from the prior `count` times, and updated as measured data
-    are. The rank is the share of the posterior below the true value; if the method is right, ranks
-    are uniform. A hump in the middle tells of a posterior that is too wide, horns of one that is
-    too narrow.
+    Parameters, scales and data are drawn from the prior `count` times, and identified as measured
+    data are. The rank is the share of the posterior below the true value; for a correct method
+    ranks are uniform. They concentrate at 0.5 for a posterior that is too wide, at 0 and 1 for one
+    that is too narrow.
+
+    Parameters
+    ----------
+    twin, method, noise, rate
+        As in `identify_bayes`.
+    commands : NDArray
+        (n, T, d_u), commands of each data set.
+    count : int
+        Number of data sets.
+    seed : int
+        The same seed gives the same ranks on the same machine.
+
+    Returns
+    -------
+    NDArray
+        (count, k).
+
+    References
+    ----------
+    Talts et al., "Validating Bayesian inference algorithms with simulation-based calibration",
+    2018.
+
     """
     blank = twin.simulate(commands, seed=0)
     with misfit_of(twin, blank, seed=0, rate=rate, processes=1) as misfit:
@@ -128,8 +163,8 @@ def calibration_ranks(
     for i, sequence in enumerate(np.random.SeedSequence(seed).spawn(count)):
         rng = np.random.default_rng(sequence)
         theta, logs = problem.physical(rng.random((1, problem.size)))
-        true = PosteriorTwin(twin, noise, theta, logs, misfit.unit, misfit.stride)
-        made = true.simulate(commands, seed=int(rng.integers(2**31)))
+        truth = PosteriorTwin(twin, noise, theta, logs, misfit.unit, misfit.stride)
+        made = truth.simulate(commands, seed=int(rng.integers(2**31)))
         data = made.replace(nominal=blank.nominal)
         drawn = _posterior(twin, data, method, problem, int(rng.integers(2**31)), rate)
         ranks[i] = np.mean(drawn < theta[0], axis=0)

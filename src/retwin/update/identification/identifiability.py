@@ -1,4 +1,4 @@
-"""What measured outputs say about parameters, and what they leave open."""
+"""Identifiability: which parameters, and which combinations, the measured outputs determine."""
 
 from __future__ import annotations
 
@@ -7,32 +7,45 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PLAUSIBLE", "Identifiability", "identifiability", "noise_of"]
+__all__ = ["CHI2_95", "Identifiability", "identifiability", "noise_of"]
 
-FLAT = 1e-5
-"""Singular values below this share of the greatest count as none: so exact are differences."""
-PLAUSIBLE = 3.84
-"""95 % of chi-square with one degree of freedom."""
+RANK_TOLERANCE = 1e-5
+"""Singular values below this share of the largest count as 0: finite differences are no better."""
+CHI2_95 = 3.84
+"""95 % quantile of the chi-square distribution with one degree of freedom."""
 UNIFORM = 12**-0.5
-"""Standard deviation of what is only known to lie within its bounds, in widths of the bounds."""
+"""Standard deviation of a uniform distribution between the bounds, in widths of the bounds."""
+AGREEMENT = 0.05
+"""Distance of equally good optima, in widths of the bounds, up to which they agree in any case."""
+MAX_AUTOCORRELATION = 0.999
+"""Largest lag-one autocorrelation, which bounds the correlation time at 1999 samples."""
 
 
 @dataclass(frozen=True, eq=False)
 class Identifiability:
-    """The local picture at the optimum, from the singular values of the Jacobian.
+    """Local identifiability at the optimum, from the singular values of the Jacobian.
 
     Attributes
     ----------
-    names: of the parameters.
-    errors: standard error of each in its unit; infinite where the outputs do not tell it.
-    correlation: (k, k) of the estimates; NaN where an error is infinite.
-    singular_values: (k,) of the Jacobian with parameters in widths of their bounds and residuals in
-        standard deviations, descending: 1/s is how well a direction is known, in widths.
-    directions: (k, k), row i belongs to `singular_values[i]`; the last is known worst.
-    at_bound: (k,) bool, the optimum lies on a bound: the true value may lie beyond.
-    identified: (k,) bool, the outputs narrow it to less than its bounds do, and starts that fit
-        equally well agree on it.
-    independent: residuals that tell something of their own; neighbouring errors are alike.
+    names : tuple of str
+        Names of the parameters.
+    errors : NDArray
+        (k,), standard errors in the parameters' units; infinite where outputs do not depend on
+        the parameter.
+    correlation : NDArray
+        (k, k), of the estimates; NaN where an error is infinite.
+    singular_values : NDArray
+        (k,), descending, of the Jacobian with parameters in widths of their bounds and residuals in
+        standard deviations: 1/s is the standard error along a direction, in widths.
+    directions : NDArray
+        (k, k), row i belongs to `singular_values[i]`; the last is the least identified.
+    at_bound : NDArray
+        (k,) bool, the optimum lies on a bound, and the true value may lie beyond it.
+    identified : NDArray
+        (k,) bool, the standard error is below that of a uniform distribution between the bounds,
+        and starts that fit equally well agree.
+    independent : float
+        Effective sample size of the residuals, which are autocorrelated.
 
     """
 
@@ -46,24 +59,24 @@ class Identifiability:
     independent: float
 
     @property
-    def doubts(self) -> str:
-        """What is not identified or lies on a bound, in words; "" if nothing."""
-        said = []
+    def warning(self) -> str:
+        """The parameters that are not identified or lie on a bound; "" if there are none."""
+        parts = []
+        names = np.array(self.names)
         if not self.identified.all():
-            open_ = [n for n, known in zip(self.names, self.identified, strict=True) if not known]
-            said.append(f"not identified: {', '.join(open_)} ({self.worst})")
+            open_ = ", ".join(names[~self.identified])
+            parts.append(f"not identified: {open_} ({self.least_identified})")
         if self.at_bound.any():
-            edge = [n for n, there in zip(self.names, self.at_bound, strict=True) if there]
-            said.append(f"at a bound: {', '.join(edge)}")
-        return "; ".join(said)
+            parts.append(f"at a bound: {', '.join(names[self.at_bound])}")
+        return "; ".join(parts)
 
     @property
-    def worst(self) -> str:
-        """The combination that is known worst, in words."""
+    def least_identified(self) -> str:
+        """The combination of parameters that is least identified, as a text."""
         direction = self.directions[-1]
         shown = np.argsort(-np.abs(direction))[:3]
         terms = [f"{direction[i]:+.2f} {self.names[i]}" for i in shown if abs(direction[i]) > 0.1]
-        return f"known worst: {' '.join(terms)}, in widths of the bounds"
+        return f"least identified: {' '.join(terms)}, in widths of the bounds"
 
 
 def identifiability(
@@ -74,34 +87,45 @@ def identifiability(
     measured: int,
     width: NDArray,
     at_bound: NDArray,
-    rivals: NDArray,
+    alternatives: NDArray,
 ) -> Identifiability:
-    """The picture at an optimum.
+    """The identifiability at an optimum.
 
     Parameters
     ----------
-    names: of the parameters.
-    jacobian: (n, P, d_y, k) by parameters in widths of their bounds.
-    residual: (n, P, d_y), 0 where nothing was measured.
-    measured: how many were.
-    width: (k,) of the bounds.
-    at_bound: (k,) bool.
-    rivals: (r, k), optima from other starts that fit as well, less the best one, in widths.
+    names : tuple of str
+        Names of the parameters.
+    jacobian : NDArray
+        (n, P, d_y, k), by parameters in widths of their bounds.
+    residual : NDArray
+        (n, P, d_y), 0 where nothing was measured.
+    measured : int
+        Number of measured values.
+    width : NDArray
+        (k,), widths of the bounds.
+    at_bound : NDArray
+        (k,) bool.
+    alternatives : NDArray
+        (r, k), optima from other starts that fit as well, minus the best one, in widths.
+
+    Returns
+    -------
+    Identifiability
 
     """
     flat = jacobian.reshape(-1, jacobian.shape[-1])
     noise = np.sqrt(noise_of(residual, measured, len(names)))
     _, singular, directions = np.linalg.svd(flat, full_matrices=False)
-    known = singular > FLAT * singular.max(initial=0.0)
+    nonzero = singular > RANK_TOLERANCE * singular.max(initial=0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        open_ = np.where(known, noise / singular, np.inf)
-        # A direction without length in a parameter says nothing of it, however open it is.
+        uncertainty = np.where(nonzero, noise / singular, np.inf)
+        # A direction does not concern a parameter in which it has no component.
         part = np.where(np.abs(directions) > 1e-6, directions, 0.0)
-        scaled = np.where(part == 0, 0.0, part * open_[:, None])
+        scaled = np.where(part == 0, 0.0, part * uncertainty[:, None])
         errors = np.sqrt(np.sum(scaled**2, axis=0))
         correlation = (scaled.T @ scaled) / np.outer(errors, errors)
-    apart = np.abs(rivals).max(axis=0, initial=0.0)
-    agree = apart <= np.maximum(4 * errors, 0.05)
+    distance = np.abs(alternatives).max(axis=0, initial=0.0)
+    agree = distance <= np.maximum(4 * errors, AGREEMENT)
     return Identifiability(
         names=names,
         errors=errors * width,
@@ -115,15 +139,15 @@ def identifiability(
 
 
 def noise_of(residual: NDArray, measured: int, free: int) -> float:
-    """Variance per independent residual that a fit of `free` parameters leaves."""
+    """Variance per effective sample of the residuals after a fit of `free` parameters."""
     return float(np.sum(residual**2)) / max(measured - free, 1) * correlation_time(residual)
 
 
 def correlation_time(residual: NDArray) -> float:
-    """Samples per independent one, from the lag-one correlation of residuals (n, P, d_y)."""
+    """Samples per effective one, from the lag-one autocorrelation of residuals (n, P, d_y)."""
     power = float(np.sum(residual**2))
     if power == 0 or residual.shape[1] < 2:
         return 1.0
-    alike = float(np.sum(residual[:, 1:] * residual[:, :-1])) / power
-    alike = min(max(alike, 0.0), 0.999)
-    return (1 + alike) / (1 - alike)
+    correlation = float(np.sum(residual[:, 1:] * residual[:, :-1])) / power
+    correlation = min(max(correlation, 0.0), MAX_AUTOCORRELATION)
+    return (1 + correlation) / (1 - correlation)

@@ -1,4 +1,4 @@
-"""Deterministic parameter identification (Eq. 2): the rival that finds the best parameters."""
+"""Deterministic identification (Eq. 2): the parameters that fit measured outputs best."""
 
 from __future__ import annotations
 
@@ -13,13 +13,20 @@ from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
 from retwin.update.identification.identifiability import (
-    PLAUSIBLE,
+    CHI2_95,
     Identifiability,
     identifiability,
     noise_of,
 )
 from retwin.update.identification.misfit import misfit_of
-from retwin.update.identification.search import EDGE, Evolution, LeastSquares, Loss, Optimum, Search
+from retwin.update.identification.search import (
+    AT_BOUND,
+    Evolution,
+    LeastSquares,
+    Loss,
+    Optimum,
+    Search,
+)
 
 __all__ = ["Updated", "identify"]
 
@@ -30,18 +37,31 @@ class Updated:
 
     Attributes
     ----------
-    twin: the updated twin; a `Twin`.
-    values, errors: θ̂ and its standard errors by name. Errors allow for neighbouring residuals being
-        alike, and for what a robust loss left out; they do not know of a twin that cannot fit.
-    objective: ‖y_obs − f(θ̂, u)‖ of Eq. 2 over all measurements.
-    starts: all starts' optima, best first.
-    identifiability: what the outputs leave open.
-    twin_runs: trajectories simulated.
-    seconds: that it took.
-    figures: `rms_before` and `rms_after` in output units (relative to each output's standard
-        deviation where units differ), `measurements`, `independent`, `starts_agreeing`.
-    reason: why the search ended, and what is in doubt.
-    loss, scale: under which it was searched, and the residual beyond which a robust one forgives.
+    twin : ParametricTwin
+        The updated twin.
+    values, errors : dict of str to float
+        θ̂ and its standard errors by name. The errors allow for autocorrelated residuals and for a
+        robust loss, but not for a twin that cannot fit the data.
+    objective : float
+        ‖y_obs − f(θ̂, u)‖ of Eq. 2 over all measurements.
+    starts : tuple of Optimum
+        The optima of all starts, best first.
+    identifiability : Identifiability
+        What the outputs determine.
+    twin_runs : int
+        Trajectories simulated.
+    seconds : float
+        Duration of the identification.
+    figures : dict of str to float
+        `rms_before` and `rms_after` in output units (relative to each output's standard deviation
+        where units differ), `measurements`, `independent`, the effective sample size, and
+        `starts_agreeing`.
+    reason : str
+        Why the search ended, and the warnings.
+    loss : str
+        The loss that was minimised.
+    scale : float
+        The residual beyond which a robust loss grows slower.
 
     """
 
@@ -71,23 +91,37 @@ def identify(
 ) -> Updated:
     """The parameters that fit measured outputs best, θ̂ = argmin ‖y_obs − f(θ, u)‖ (Eq. 2).
 
+    A warning names parameters that are not identified or whose best value lies on a bound.
+
     Parameters
     ----------
-    twin: says which parameters are free, within which bounds, and where the search starts.
-    observed: healthy calibration trajectories with commands; what is masked does not count.
-    seed: of the starts; the same seed gives the same result.
-    method: `LeastSquares` from several starts, or `Evolution`, a global search; with loss="linear"
-        the plain norm of Eq. 2, by default a robust one.
-    rate: samples per second to look at, a whole part of the data's; by default all. The sensor's
-        true rate serves best: samples in between say nothing new.
-    processes: that values of the parameters are spread over. 1 for twins that use all cores.
+    twin : ParametricTwin
+        Declares the free parameters, their bounds, and the first start.
+    observed : Trajectories
+        Healthy calibration trajectories with commands; masked samples are not used.
+    seed : int
+        Seed of the starts; the same seed gives the same result.
+    method : LeastSquares or Evolution
+        Local searches from several starts, or a global search. Their loss is robust by default;
+        loss="linear" is the norm of Eq. 2.
+    rate : float, optional
+        Sample rate of the residuals in Hz, a whole part of the data's, which is the default. The
+        sensor's true rate is best: interpolated samples hold no information.
+    processes : int
+        Worker processes over which values of the parameters are distributed; 1 for twins that use
+        all cores.
+    progress : callable, optional
+        Called with the share of the search that is done.
 
-    Warns where a parameter is not identified, or its best value lies on a bound.
+    Returns
+    -------
+    Updated
 
     Raises
     ------
-    InputError: a twin without declared parameters, no healthy trajectory, channels or a rate that
-        are not the twin's, no more measurements than parameters.
+    InputError
+        A twin without declared parameters, no healthy trajectory, channels or a rate that differ
+        from the twin's, or not more measurements than parameters.
 
     """
     began = time.perf_counter()
@@ -97,50 +131,49 @@ def identify(
         optima = search.run(np.random.default_rng(seed))
         best, point = optima[0]
         residual = misfit.residuals(np.array([best.values]))[0]
-        picture, agreeing = _picture(search, optima, point, residual)
-    if picture.doubts:
-        warnings.warn(picture.doubts, stacklevel=2)
-    independent, measurements = picture.independent, float(misfit.seen.sum())
+        found, agreeing = _identifiability(search, optima, point, residual)
+    if found.warning:
+        warnings.warn(found.warning, stacklevel=2)
     return Updated(
         twin=twin.with_values(best.values),
         values=dict(zip(twin.names, best.values, strict=True)),
-        errors=dict(zip(twin.names, picture.errors.tolist(), strict=True)),
+        errors=dict(zip(twin.names, found.errors.tolist(), strict=True)),
         objective=float(np.sqrt(np.sum(residual**2))),
         starts=tuple(each for each, _ in optima),
-        identifiability=picture,
+        identifiability=found,
         twin_runs=misfit.twin_runs,
         seconds=time.perf_counter() - began,
         figures={
             "rms_before": before,
             "rms_after": misfit.rms_of(residual),
-            "measurements": measurements,
-            "independent": independent,
+            "measurements": float(misfit.seen.sum()),
+            "independent": found.independent,
             "starts_agreeing": float(agreeing),
         },
-        reason="; ".join(filter(None, [best.reason, picture.doubts])),
+        reason="; ".join(filter(None, [best.reason, found.warning])),
         loss=search.loss,
         scale=search.scale,
     )
 
 
-def _picture(
+def _identifiability(
     search: Search, optima: list[tuple[Optimum, NDArray]], best: NDArray, residual: NDArray
 ) -> tuple[Identifiability, int]:
-    """What is identified, and how many starts fit as well as the best one."""
+    """The identifiability at the best optimum, and how many starts fit as well as it."""
     misfit = search.misfit
-    # An outlier tells as little of the errors as it told of the optimum.
-    _, residual, rise = search.judged(residual)
-    # As well as the best one: within what noise alone does to the objective (95 % of chi-square).
+    # Outliers have as little weight in the standard errors as they had in the optimum.
+    _, residual, curvature = search.linearised(residual)
+    # As well as the best: within the 95 % range of the objective under noise (chi-square).
     measured, lowest = int(misfit.seen.sum()), optima[0][0].objective ** 2
-    margin = PLAUSIBLE * rise * noise_of(residual, measured, len(best)) + 1e-6 * lowest
-    rivals = [point for each, point in optima if each.objective**2 <= lowest + margin]
-    picture = identifiability(
+    margin = CHI2_95 * curvature * noise_of(residual, measured, len(best)) + 1e-6 * lowest
+    alternatives = [point for each, point in optima if each.objective**2 <= lowest + margin]
+    found = identifiability(
         misfit.twin.names,
         search.jacobian(best).reshape(*residual.shape, -1),
         residual,
         measured=measured,
         width=misfit.high - misfit.low,
-        at_bound=(best <= EDGE) | (best >= 1 - EDGE),
-        rivals=np.array(rivals) - best,
+        at_bound=(best <= AT_BOUND) | (best >= 1 - AT_BOUND),
+        alternatives=np.array(alternatives) - best,
     )
-    return picture, len(rivals)
+    return found, len(alternatives)

@@ -9,31 +9,55 @@ import numpy as np
 from numpy.typing import NDArray
 from pebble import ProcessPool
 
+from retwin.checks import require, whole
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
-from retwin.errors import InputError
 from retwin.processes import sendable_errors, worker_pool
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import SimulationError, checked_seed
 
-__all__ = ["Misfit", "check_counts", "misfit_of"]
+__all__ = ["Misfit", "misfit_of"]
 
 
 class Misfit:
-    """How far a twin is off measured trajectories, at the samples that the sensor took.
+    """Residuals of a twin on measured trajectories, at the samples that the sensor took.
 
     Residuals are in units of `unit`: 1 where all outputs share a physical unit, so that the norm is
-    that of Eq. 2; else the standard deviation of each output at the twin's present values.
+    that of Eq. 2; otherwise the standard deviation of each output at the twin's present values.
+
+    Parameters
+    ----------
+    twin : ParametricTwin
+        The twin at its present values.
+    observed : Trajectories
+        Measured healthy trajectories.
+    stride : int
+        Every how many samples residuals are computed.
+    seed : int
+        Seed of the simulations.
+    pool : ProcessPool, optional
+        Worker processes, over which values of the parameters are distributed.
+    processes : int
+        Number of these.
 
     Attributes
     ----------
-    twin: the twin, at its present values.
-    observed: measured, healthy.
-    stride: every how many samples to look.
-    seen: (n, P, d_y) bool, what was measured.
-    unit: (d_y,), physical units per unit of a residual.
-    spread: standard deviation of the twin's outputs, over `unit`: what is a large residual.
-    low, high: bounds of the parameters, (k,).
-    twin_runs: trajectories simulated so far.
+    seen : NDArray
+        (n, P, d_y) bool, the measured samples.
+    unit : NDArray
+        (d_y,), physical units per unit of a residual.
+    spread : float
+        Standard deviation of the twin's outputs over `unit`, the scale of a large residual.
+    low, high : NDArray
+        (k,), bounds of the parameters.
+    present : NDArray
+        (n, P, d_y), outputs at the present values.
+    twin_runs : int
+        Trajectories simulated so far.
+
+    Raises
+    ------
+    InputError
+        The simulation fails at the present values.
 
     """
 
@@ -59,13 +83,13 @@ class Misfit:
         self._commands = observed.commands.astype(np.float64)
         self._measured = observed.observed[:, ::stride].astype(np.float64)
         self.present = self.outputs(np.array([twin.values]))[0]
-        if np.isnan(self.present).any():
-            raise InputError(
-                "twin",
-                expected="one that can simulate the commands at its present values",
-                got="a simulation that failed",
-                remedy="choose other starts of the parameters",
-            )
+        require(
+            not np.isnan(self.present).any(),
+            "twin",
+            expected="one that can simulate the commands at its present values",
+            got="a simulation that failed",
+            remedy="choose other starts of the parameters",
+        )
         each = self.present.std(axis=(0, 1))
         alike = len(set(observed.outputs.units)) == 1
         self.unit = np.ones(len(each)) if alike else np.maximum(each, 1e-12)
@@ -73,7 +97,7 @@ class Misfit:
 
     @property
     def interval(self) -> float:
-        """Seconds between the samples that are looked at."""
+        """Seconds between the samples of the residuals."""
         return self.stride / self.observed.rate
 
     @property
@@ -96,11 +120,11 @@ class Misfit:
         return self.residuals_of(self.outputs(theta))
 
     def residuals_of(self, outputs: NDArray) -> NDArray:
-        """Residuals (m, n, P, d_y) of outputs that were simulated."""
+        """Residuals (m, n, P, d_y) of simulated outputs; 0 where nothing was measured."""
         return np.where(self.seen, (self._measured - outputs) / self.unit, 0.0)
 
     def rms_of(self, residual: NDArray) -> float:
-        """Root mean square over what was measured."""
+        """Root mean square of residuals (n, P, d_y) over the measured samples."""
         return float(np.sqrt(np.sum(residual**2) / self.seen.sum()))
 
 
@@ -113,12 +137,12 @@ def misfit_of(
     rate: float | None,
     processes: int,
 ) -> Iterator[Misfit]:
-    """The misfit, with worker processes for as long as the block lasts if more than one is asked.
+    """The misfit of a twin, with worker processes during the block if `processes` exceeds 1.
 
-    Raises InputError for what cannot be compared.
+    Raises InputError if twin and data do not fit each other.
     """
     checked_seed(seed)
-    check_counts(processes=processes)
+    whole("processes", processes, least=1)
     stride = _checked(twin, observed, rate)
     if processes == 1:
         yield Misfit(twin, observed, stride=stride, seed=seed)
@@ -136,7 +160,7 @@ def _outputs(
     try:
         observed = twin.simulate(repeated, seed=seed, parameters=values).observed
     except SimulationError as error:
-        # Some parameters are beyond what can be simulated: that is for the search to find out.
+        # Parameters within the bounds can be beyond what the twin can simulate.
         observed = np.full((*repeated.shape[:2], len(twin.outputs)), np.nan)
         observed[error.finished.ids.astype(int)] = error.finished.observed
     made = observed[:, ::stride].astype(np.float64)
@@ -151,57 +175,45 @@ def _in_worker(
 
 
 def _checked(twin: ParametricTwin, observed: Trajectories, rate: float | None) -> int:
-    """Every how many samples to look; InputError for what cannot be compared."""
-    if not isinstance(twin, ParametricTwin):
-        raise InputError(
-            "twin",
-            expected="a ParametricTwin, which declares what is free",
-            got=type(twin).__name__,
-            remedy="see ParametricTwin, CommandSide and ParametricTwin.built",
-        )
+    """The stride of the residuals; InputError if twin and data do not fit each other."""
+    require(
+        isinstance(twin, ParametricTwin),
+        "twin",
+        expected="a ParametricTwin, which declares its free parameters",
+        got=type(twin).__name__,
+        remedy="see ParametricTwin, CommandSide and ParametricTwin.built",
+    )
     healthy = np.isin(observed.labels, (HEALTHY, UNLABELLED))
-    if len(observed) == 0 or not healthy.all():
-        raise InputError(
-            "observed",
-            expected="healthy trajectories, one at least",
-            got=f"{len(observed)}, {int((~healthy).sum())} of them with a fault",
-            remedy=f"take observed.with_label({HEALTHY!r})",
-        )
+    require(
+        len(observed) > 0 and healthy.all(),
+        "observed",
+        expected="healthy trajectories, one at least",
+        got=f"{len(observed)}, {int((~healthy).sum())} of them with a fault",
+        remedy=f"take observed.with_label({HEALTHY!r})",
+    )
     for name in ("inputs", "outputs", "rate"):
-        ours, theirs = getattr(twin, name), getattr(observed, name)
-        if ours != theirs:
-            raise InputError(
-                f"observed.{name}",
-                expected=f"what the twin has, {ours}",
-                got=f"{theirs}",
-                remedy="load the file with its case, or convert it",
-            )
+        expected, got = getattr(twin, name), getattr(observed, name)
+        require(
+            expected == got,
+            f"observed.{name}",
+            expected=f"that of the twin, {expected}",
+            got=got,
+            remedy="load the file with its case, or convert it",
+        )
     stride = 1 if rate is None else round(observed.rate / rate) if rate > 0 else 0
-    if stride < 1 or (rate is not None and abs(stride * rate - observed.rate) > 1e-6):
-        raise InputError(
-            "rate",
-            expected=f"{observed.rate:g} Hz, the data's rate, or a whole part of it",
-            got=f"{rate}",
-            remedy="the sensor's true rate serves best",
-        )
+    require(
+        stride >= 1 and (rate is None or abs(stride * rate - observed.rate) <= 1e-6),
+        "rate",
+        expected=f"{observed.rate:g} Hz, the data's rate, or a whole part of it",
+        got=rate,
+        remedy="give the sensor's true rate",
+    )
     count = int(observed.mask[:, ::stride].sum())
-    if count <= len(twin.parameters):
-        raise InputError(
-            "observed",
-            expected=f"more measurements than parameters, {len(twin.parameters)}",
-            got=f"{count}",
-            remedy="give more trajectories, a higher rate, or free fewer parameters",
-        )
+    require(
+        count > len(twin.parameters),
+        "observed",
+        expected=f"more measurements than parameters, {len(twin.parameters)}",
+        got=count,
+        remedy="give more trajectories, a higher rate, or free fewer parameters",
+    )
     return stride
-
-
-def check_counts(least: int = 1, **counts: int) -> None:
-    """InputError, by its name, for anything but a whole number of at least `least`."""
-    for name, value in counts.items():
-        if not (isinstance(value, int | np.integer) and value >= least):
-            raise InputError(
-                name,
-                expected=f"a whole number of at least {least}",
-                got=repr(value),
-                remedy="leave it out: the default serves well",
-            )

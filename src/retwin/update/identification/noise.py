@@ -1,9 +1,8 @@
-"""`Noise`: what is between a twin's outputs and measured ones, besides its parameters.
+"""`Noise`: the distribution of the output error, white noise and a correlated discrepancy.
 
-White noise, and on demand Kennedy and O'Hagan's discrepancy (2001): a Gaussian process on the
-output error, here an Ornstein-Uhlenbeck process over time (Matérn 1/2), one of its own for every
-trajectory and output. It is integrated out exactly by a Kalman filter, whose cost is linear in the
-number of samples.
+The discrepancy is that of Kennedy and O'Hagan (2001), a Gaussian process on the output error: here
+an Ornstein-Uhlenbeck process over time (Matérn 1/2), independent for each trajectory and output. A
+Kalman filter integrates it out exactly, at a cost linear in the number of samples.
 """
 
 from __future__ import annotations
@@ -14,31 +13,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from retwin.errors import InputError
+from retwin.checks import require
 
 __all__ = ["Noise"]
 
-LEAST = 1e-5
-"""Least scale of noise and discrepancy, over the spread of the twin's outputs."""
+MIN_SCALE = 1e-5
+"""Smallest scale of noise and discrepancy, over the standard deviation of the twin's outputs."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """The law of the output error; its scales are inferred with the parameters.
+    """The distribution of the output error; its scales are inferred with the parameters.
 
-    Scales are log-uniform from 1e-5 to 1 times the spread of the twin's outputs, the time-scale of
-    the discrepancy from one sample to the length of a trajectory.
+    The prior of the scales is log-uniform, from 1e-5 to 1 times the standard deviation of the
+    twin's outputs, and that of the discrepancy's time constant from one sample to the length of a
+    trajectory.
 
     Parameters
     ----------
-    discrepancy: whether there is an error that lasts, next to white noise. Without it, whatever a
-        twin cannot do makes the posterior too sure of itself.
-    degrees: of freedom of Student's t for the white noise; None is Gaussian, and the discrepancy
-        needs that.
+    discrepancy : bool
+        Whether the error has a part that is correlated in time beside the white noise. Without it
+        the posterior of a twin that cannot fit the data is too narrow.
+    degrees : float or None
+        Degrees of freedom of Student's t for the white noise, above 2; None is Gaussian, which the
+        discrepancy requires.
 
     Raises
     ------
-    InputError: not more than two degrees of freedom, or Student's t with a discrepancy.
+    InputError
+        Not more than two degrees of freedom, or Student's t with a discrepancy.
 
     """
 
@@ -46,31 +49,31 @@ class Noise:
     degrees: float | None = None
 
     def __post_init__(self) -> None:
-        if self.degrees is not None and (self.discrepancy or not self.degrees > 2):
-            raise InputError(
-                "degrees",
-                expected="more than 2 degrees of freedom, or None; None with a discrepancy",
-                got=f"{self.degrees} with discrepancy={self.discrepancy}",
-                remedy="4 forgives outliers; give discrepancy=False with it",
-            )
+        require(
+            self.degrees is None or (self.degrees > 2 and not self.discrepancy),
+            "degrees",
+            expected="more than 2 degrees of freedom, or None; None with a discrepancy",
+            got=f"{self.degrees} with discrepancy={self.discrepancy}",
+            remedy="give discrepancy=False; 4 degrees are robust to outliers",
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the scales."""
+        """Names of the scales."""
         return ("noise", "discrepancy", "duration") if self.discrepancy else ("noise",)
 
     def bounds(self, spread: float, interval: float, samples: int) -> tuple[NDArray, NDArray]:
-        """Low and high of the scales' natural logarithms: in units of residuals, and in s."""
+        """Bounds (q,) of the scales' natural logarithms: in units of residuals, and in s."""
         spread = max(spread, 1e-12)
         count = len(self.names)
-        low = np.log([spread * LEAST, spread * LEAST, interval][:count])
+        low = np.log([spread * MIN_SCALE, spread * MIN_SCALE, interval][:count])
         high = np.log([spread, spread, interval * max(samples, 2)][:count])
         return low, high
 
     def log_likelihood(
         self, residual: NDArray, seen: NDArray, logs: NDArray, interval: float
     ) -> NDArray:
-        """Of residuals (m, n, P, d) at scales (m, q), (m,); only what was seen (n, P, d) counts."""
+        """Log-likelihood (m,) at `logs` (m, q) of residuals (m, n, P, d) where `seen` (n, P, d)."""
         scales = np.exp(logs)
         noise = scales[:, 0, None, None]
         if self.discrepancy:
@@ -87,7 +90,7 @@ class Noise:
     def draw(
         self, rng: np.random.Generator, logs: NDArray, samples: int, width: int, interval: float
     ) -> NDArray:
-        """Output errors (n, P, d) for scales (n, q)."""
+        """Draws of the output error (n, P, d) at logarithms of scales (n, q)."""
         scales = np.exp(logs)
         shape = (len(logs), samples, width)
         white = rng.normal(size=shape)
@@ -97,12 +100,12 @@ class Noise:
         if not self.discrepancy:
             return error
         steps = rng.normal(size=shape)
-        keep = np.exp(-interval / scales[:, 2])[:, None]
-        lasting = steps[:, 0]
+        decay = np.exp(-interval / scales[:, 2])[:, None]
+        correlated = steps[:, 0]
         for p in range(samples):
             if p > 0:
-                lasting = keep * lasting + np.sqrt(1 - keep**2) * steps[:, p]
-            error[:, p] += scales[:, 1, None] * lasting
+                correlated = decay * correlated + np.sqrt(1 - decay**2) * steps[:, p]
+            error[:, p] += scales[:, 1, None] * correlated
         return error
 
 
@@ -114,22 +117,22 @@ def _filtered(
     duration: NDArray,
     interval: float,
 ) -> NDArray:
-    """Log-likelihood (m,) of an Ornstein-Uhlenbeck process seen through white noise."""
-    whole = (amplitude**2)[:, None, None]
-    keep = np.exp(-interval / duration)[:, None, None]
+    """Log-likelihood (m,) of an Ornstein-Uhlenbeck process observed with white noise."""
+    stationary = (amplitude**2)[:, None, None]
+    decay = np.exp(-interval / duration)[:, None, None]
     mean = np.zeros((*residual.shape[:2], residual.shape[3]))
-    variance = whole
+    variance = stationary
     total = np.zeros(len(residual))
     for p in range(residual.shape[2]):
-        there = seen[:, p]
-        spread = variance + noise**2
-        off = residual[:, :, p] - mean
-        each = -0.5 * (off**2 / spread + np.log(2 * np.pi * spread))
-        total += np.sum(each * there, axis=(1, 2))
-        gain = variance / spread
-        # Where nothing was seen the state stays as uncertain as it was; nowhere, mostly.
-        known = variance * (1 - gain)
-        variance = known if there.all() else np.where(there, known, variance)
-        mean = keep * (mean + gain * off * there)
-        variance = keep**2 * variance + (1 - keep**2) * whole
+        measured = seen[:, p]
+        total_variance = variance + noise**2
+        innovation = residual[:, :, p] - mean
+        each = -0.5 * (innovation**2 / total_variance + np.log(2 * np.pi * total_variance))
+        total += np.sum(each * measured, axis=(1, 2))
+        gain = variance / total_variance
+        # Without a measurement there is no update; the shortcut serves complete data.
+        updated = variance * (1 - gain)
+        variance = updated if measured.all() else np.where(measured, updated, variance)
+        mean = decay * (mean + gain * innovation * measured)
+        variance = decay**2 * variance + (1 - decay**2) * stationary
     return total

@@ -1,4 +1,4 @@
-"""What Bayesian updating gives: draws of the parameters, and a twin that draws from them."""
+"""The posterior of Bayesian identification: its draws, and a twin that draws from them."""
 
 from __future__ import annotations
 
@@ -10,38 +10,46 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
-from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
-from retwin.twins.around import Around, generator_of
 from retwin.twins.faults import Fault
-from retwin.twins.noisy import interpolate_samples, readings
+from retwin.twins.noisy import interpolate_samples, sensor_sample_count
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.randomised import simulate_with_parameters
 from retwin.twins.twin import Chunk, simulate_in_chunks
+from retwin.twins.wrapper import TwinWrapper, chunk_generator
 from retwin.update.identification.noise import Noise
 
 __all__ = ["Posterior", "PosteriorTwin"]
 
 KIND = "posterior"
+"""Kind of the saved model."""
 
 
 @dataclass(frozen=True, eq=False)
-class PosteriorTwin(Around):
+class PosteriorTwin(TwinWrapper):
     """A twin with parameters, noise and discrepancy drawn from the posterior per trajectory.
 
     Parameters
     ----------
-    twin: the twin; its values are the posterior mean, which gives the nominal output where the twin
-        has none that is free of parameters.
-    noise: law of the output error.
-    samples: (s, k) of the parameters.
-    logs: (s, q) of the scales' logarithms that belong to them.
-    unit: (d_y,) physical units per unit of an error.
-    stride: samples per reading of the sensor; between them errors are linear.
-    emulated: whether the data it was fitted to were emulated.
+    twin : ParametricTwin
+        The twin at the posterior mean, which gives the nominal output if that depends on the
+        parameters.
+    noise : Noise
+        Distribution of the output error.
+    samples : NDArray
+        (s, k), draws of the parameters.
+    logs : NDArray
+        (s, q), logarithms of the scales of the same draws.
+    unit : NDArray
+        (d_y,), physical units per unit of an error.
+    stride : int
+        Samples of the record per sample of the sensor; errors are linear in between.
+    emulated : bool
+        Whether the data that it was fitted to were emulated.
 
     """
 
@@ -61,10 +69,10 @@ class PosteriorTwin(Around):
         seed: int,
         progress: Progress | None = None,
     ) -> Trajectories:
-        """See `Twin.simulate`; the output error comes last, on faulty trajectories too."""
+        """See `Twin.simulate`; the output error is added last, to faulty trajectories too."""
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            rng = generator_of(seed, chunk, 2)
+            rng = chunk_generator(seed, chunk, 2)
             drawn = rng.integers(len(self.samples), size=len(chunk.commands))
             ideal, observed = simulate_with_parameters(
                 self.twin, chunk, self.samples[drawn], seed=seed
@@ -76,13 +84,13 @@ class PosteriorTwin(Around):
         )
 
     def _error(self, rng: np.random.Generator, logs: NDArray, steps: int) -> NDArray:
-        """Errors (n, steps, d_y) in output units, drawn at the sensor's rate."""
-        count = readings(steps, self.stride)
+        """Errors (n, steps, d_y) in output units, drawn at the sensor's rate and interpolated."""
+        count = sensor_sample_count(steps, self.stride)
         read = self.noise.draw(rng, logs, count, len(self.outputs), self.stride / self.rate)
         return self.unit * interpolate_samples(read, self.stride, steps)
 
     def save(self, folder: str | Path) -> None:
-        """Write the draws and what they are of; the twin itself is not written."""
+        """Write the draws and the names of the parameters; the twin itself is not written."""
         about = {
             "names": self.twin.names,
             "values": self.twin.values,
@@ -96,18 +104,18 @@ class PosteriorTwin(Around):
 
     @classmethod
     def load(cls, folder: str | Path, twin: ParametricTwin) -> PosteriorTwin:
-        """Read what `save` wrote, for the same twin at whatever values.
+        """Read what `save` wrote, for the same twin at any values.
 
-        Raises InputError when it is no posterior, damaged, or one of other parameters.
+        Raises InputError if the folder holds no posterior, is damaged, or has other parameters.
         """
         about, drawn = read_model(folder, KIND)
-        if tuple(about["names"]) != twin.names:
-            raise InputError(
-                "twin",
-                expected=f"one with the parameters {', '.join(about['names'])}",
-                got=", ".join(twin.names),
-                remedy="give the twin whose posterior it is",
-            )
+        require(
+            tuple(about["names"]) == twin.names,
+            "twin",
+            expected=f"one with the parameters {', '.join(about['names'])}",
+            got=", ".join(twin.names),
+            remedy="give the twin whose posterior it is",
+        )
         return cls(
             twin.with_values(about["values"]),
             from_config(about["noise"], (Noise,)),
@@ -123,17 +131,26 @@ class Posterior:
 
     Attributes
     ----------
-    twin: the updated twin; a `Twin` that draws θ, noise and discrepancy per trajectory.
-    names: of the parameters.
-    samples: (s, k) draws of the parameters.
-    scales: draws (s,) by name of the noise's scales: "noise" and "discrepancy" in output units
-        (relative to each output's standard deviation where units differ), "duration" in s.
-    misspecified: share of prior predictive data that lie as far out as the measured ones. Near 0,
-        no parameters and no noise that was thought possible make such data.
-    twin_runs: trajectories simulated.
-    seconds: that it took.
-    figures: what the sampler tells of itself, and `rms_after` of the posterior mean.
-    reason: how it ended, and what is in doubt.
+    twin : PosteriorTwin
+        The updated twin, which draws θ, noise and discrepancy per trajectory.
+    names : tuple of str
+        Names of the parameters.
+    samples : NDArray
+        (s, k), draws of the parameters.
+    scales : dict of str to NDArray
+        Draws (s,) of the scales of the noise: "noise" and "discrepancy" in output units (relative
+        to each output's standard deviation where units differ), "duration" in s.
+    misspecified : float
+        Prior predictive p-value of the measured data. Near 0, no parameters and noise within the
+        prior give such data.
+    twin_runs : int
+        Trajectories simulated.
+    seconds : float
+        Duration of the identification.
+    figures : dict of str to float
+        Diagnostics of the method, and `rms_before` and `rms_after` of the posterior mean.
+    reason : str
+        How many samples were drawn, and the warnings.
 
     """
 
@@ -158,6 +175,6 @@ class Posterior:
         return dict(zip(self.names, self.samples.std(axis=0).tolist(), strict=True))
 
     def interval(self, share: float = 0.9) -> dict[str, tuple[float, float]]:
-        """The central interval that holds `share` of the posterior, by name."""
+        """The central credible interval of probability `share`, by name."""
         ends = np.quantile(self.samples, [(1 - share) / 2, (1 + share) / 2], axis=0)
         return {n: (float(a), float(b)) for n, (a, b) in zip(self.names, ends.T, strict=True)}

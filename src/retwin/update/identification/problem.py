@@ -1,4 +1,4 @@
-"""The posterior as a problem on a box: parameters and scales of the noise, from 0 to 1."""
+"""The posterior density on the unit box of parameters and scales of the noise."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from retwin.update.identification.summaries import Summaries
 
 __all__ = ["Problem"]
 
-PREDICTED = 200
-"""Draws from the prior that the measured data are held against."""
+PRIOR_DRAWS = 200
+"""Draws from the prior whose simulations the measured data are compared with."""
 NOISES = 32
-"""Draws of the noise, with scales of their own, through which each simulated path is seen."""
-TOGETHER = 64
-"""Values of the parameters that are simulated at once."""
+"""Draws of the noise, each with its own scales, that are added to a simulated path."""
+VALUES_PER_BATCH = 64
+"""Values of the parameters that are simulated in one batch, which bounds the memory."""
 
 
 class Problem:
@@ -26,12 +26,21 @@ class Problem:
 
     The prior is uniform on the unit box: uniform in the parameters, log-uniform in the scales.
 
+    Parameters
+    ----------
+    misfit : Misfit
+        Twin and measured data.
+    noise : Noise
+        Distribution of the output error.
+    seed : int
+        Seed of the draws from the prior.
+
     Attributes
     ----------
-    misfit, noise: of the data and of the output error.
-    seed: of the draws from the prior.
-    low, width: (k + q,) of the box in physical units.
-    parameters: k.
+    low, width : NDArray
+        (k + q,), lower corner and edges of the box in physical units.
+    parameters : int
+        k.
 
     """
 
@@ -41,9 +50,9 @@ class Problem:
         self.seed = seed
         self.parameters = len(misfit.low)
         samples = misfit.seen.shape[1]
-        least, greatest = noise.bounds(misfit.spread, misfit.interval, samples)
-        self.low = np.concatenate([misfit.low, least])
-        self.width = np.concatenate([misfit.high, greatest]) - self.low
+        low, high = noise.bounds(misfit.spread, misfit.interval, samples)
+        self.low = np.concatenate([misfit.low, low])
+        self.width = np.concatenate([misfit.high, high]) - self.low
 
     @property
     def size(self) -> int:
@@ -68,27 +77,27 @@ class Problem:
         return out
 
     def paths(self, points: NDArray) -> NDArray:
-        """Noise-free paths (m, n, P, d_y) less that at the twin's present values, as residuals."""
+        """Noise-free outputs (m, n, P, d_y) minus the present ones, in residual units."""
         theta, _ = self.physical(points)
-        parts = [theta[i : i + TOGETHER] for i in range(0, len(theta), TOGETHER)]
+        parts = [theta[i : i + VALUES_PER_BATCH] for i in range(0, len(theta), VALUES_PER_BATCH)]
         outputs = np.concatenate([self.misfit.outputs(part) for part in parts])
-        off = (outputs - self.misfit.present) / self.misfit.unit
-        return np.where(self.misfit.seen, off, 0.0)
+        difference = (outputs - self.misfit.present) / self.misfit.unit
+        return np.where(self.misfit.seen, difference, 0.0)
 
     @cached_property
     def prior(self) -> tuple[NDArray, NDArray]:
-        """Points from the prior that could be simulated, and their `paths`; simulated once."""
-        points = np.random.default_rng(self.seed).random((PREDICTED, self.size))
+        """Points from the prior whose simulation succeeds, and their `paths`; computed once."""
+        points = np.random.default_rng(self.seed).random((PRIOR_DRAWS, self.size))
         paths = self.paths(points)
         good = np.isfinite(paths).all(axis=(1, 2, 3))
         return points[good], paths[good]
 
     @property
     def box(self) -> NDArray:
-        """Least and greatest points, (2, k + q)."""
+        """Lower and upper corner, (2, k + q)."""
         return np.array([np.zeros(self.size), np.ones(self.size)])
 
-    def seen_noisily(
+    def with_noise(
         self,
         points: NDArray,
         paths: NDArray,
@@ -96,25 +105,24 @@ class Problem:
         summaries: Summaries,
         rng: np.random.Generator,
     ) -> tuple[NDArray, NDArray]:
-        """Each of m points, and summaries of its path seen through noise, `NOISES` times.
+        """Points (m, NOISES, K) and summaries (m, NOISES, S) of their paths with drawn noise.
 
-        (m, NOISES, K) and (m, NOISES, S); the scales of the noise are drawn within the box. That
-        costs no simulation.
+        The scales of the noise are drawn within `box`; this costs no simulation.
         """
         low, high = box[:, self.parameters :]
         count, samples, width = self.misfit.seen.shape
-        told, known = [], []
+        drawn, summarised = [], []
         for _ in range(NOISES):
             again = points.copy()
             again[:, self.parameters :] = rng.uniform(low, high, size=(len(points), len(low)))
             logs = np.repeat(self.physical(again)[1], count, axis=0)
             errors = self.noise.draw(rng, logs, samples, width, self.misfit.interval)
             seen = self.misfit.seen
-            told.append(again)
-            known.append(summaries(paths + errors.reshape(paths.shape) * seen, seen))
-        return np.stack(told, axis=1), np.stack(known, axis=1)
+            drawn.append(again)
+            summarised.append(summaries(paths + errors.reshape(paths.shape) * seen, seen))
+        return np.stack(drawn, axis=1), np.stack(summarised, axis=1)
 
     @property
     def measured(self) -> NDArray:
-        """The measured path (1, n, P, d_y) in the same terms."""
+        """The measured outputs (1, n, P, d_y) minus the present ones, in residual units."""
         return self.misfit.residuals_of(self.misfit.present[None])

@@ -1,4 +1,4 @@
-"""Profile likelihood: how well the others can make up for one parameter that is held."""
+"""Profile likelihood: the best fit of the other parameters as a function of one."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import one_of, whole
 from retwin.data.trajectories import Trajectories
-from retwin.errors import InputError
-from retwin.update.identification.identifiability import PLAUSIBLE, noise_of
+from retwin.update.identification.identifiability import CHI2_95, noise_of
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.misfit import misfit_of
 from retwin.update.identification.search import LeastSquares, Search
@@ -19,16 +19,19 @@ __all__ = ["Profile", "profile"]
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """How well the best of all others fits when one parameter is held (profile likelihood).
+    """The profile likelihood of one parameter.
 
     Attributes
     ----------
-    name: of the parameter.
-    values: (g,) where it was held.
-    objective: (g,) of Eq. 2 there (or what a robust loss makes of it), all others fitted anew.
-    rise: (g,) of twice the negative log-likelihood over the best; neighbouring residuals are alike,
-        and the noise is what the best fit leaves. Below 3.84 the value is plausible at 95 %.
-    interval: least and greatest plausible value; at a bound, it may go on beyond.
+    name : str
+        Name of the parameter.
+    values : NDArray
+        (g,), the values at which it is held.
+    objective : NDArray
+        (g,), Eq. 2 (or the root of the sum of robust losses) there, with all others fitted anew.
+    rise : NDArray
+        (g,), twice the negative log-likelihood minus its minimum, with the noise that the best fit
+        leaves and its autocorrelation. A value is in the 95 % interval where it is below 3.84.
 
     """
 
@@ -39,16 +42,14 @@ class Profile:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """See above; between the grid's points it is linear."""
-        inside = self.rise <= PLAUSIBLE
+        """The 95 % interval, by linear interpolation; at a bound it may extend beyond it."""
+        inside = self.rise <= CHI2_95
         first, last = np.flatnonzero(inside)[[0, -1]]
         low, high = self.values[first], self.values[last]
         if first > 0:
-            low = np.interp(
-                PLAUSIBLE, self.rise[[first, first - 1]], self.values[[first, first - 1]]
-            )
+            low = np.interp(CHI2_95, self.rise[[first, first - 1]], self.values[[first, first - 1]])
         if last < len(self.values) - 1:
-            high = np.interp(PLAUSIBLE, self.rise[[last, last + 1]], self.values[[last, last + 1]])
+            high = np.interp(CHI2_95, self.rise[[last, last + 1]], self.values[[last, last + 1]])
         return float(low), float(high)
 
 
@@ -65,35 +66,40 @@ def profile(
 
     Parameters
     ----------
-    updated, observed, rate, processes: as they were in `identify`.
-    name: of the parameter.
-    points: where to hold it: across four standard errors to each side, within the bounds, and at
-        the optimum itself.
+    updated : Updated
+        Result of `identify`.
+    observed, rate, processes
+        As in `identify`.
+    name : str
+        Name of the parameter.
+    points : int
+        Values at which it is held, at least 3, within the bounds and up to four standard errors to
+        either side, in addition to the optimum.
+
+    Returns
+    -------
+    Profile
 
     Raises
     ------
-    InputError: no such parameter, fewer than three points.
+    InputError
+        No such parameter, or fewer than three points.
 
     """
     names = updated.twin.names
-    if name not in names or points < 3:
-        raise InputError(
-            "name" if name not in names else "points",
-            expected=f"one of {', '.join(names)}" if name not in names else "at least 3",
-            got=repr(name) if name not in names else repr(points),
-            remedy="check the spelling" if name not in names else "15 serve well",
-        )
+    one_of("name", name, names)
+    whole("points", points, least=3)
     which = names.index(name)
     with misfit_of(updated.twin, observed, seed=0, rate=rate, processes=processes) as misfit:
         search = Search(misfit, LeastSquares(starts=1), None)
         search.loss, search.scale = updated.loss, updated.scale
         best = (np.array(updated.twin.values) - misfit.low) / search.width
-        reach = 4 * updated.errors[name] / search.width[which]
-        low, high = max(best[which] - reach, 0.0), min(best[which] + reach, 1.0)
+        distance = 4 * updated.errors[name] / search.width[which]
+        low, high = max(best[which] - distance, 0.0), min(best[which] + distance, 1.0)
         grid = np.unique(np.append(np.linspace(low, high, points), best[which]))
-        sums = _held(search, which, grid, best)
-        _, residual, rise = search.judged(misfit.residuals(search.theta(best[None]))[0])
-        noise = rise * noise_of(residual, int(misfit.seen.sum()), len(names))
+        sums = _profiled(search, which, grid, best)
+        _, residual, curvature = search.linearised(misfit.residuals(search.theta(best[None]))[0])
+        noise = curvature * noise_of(residual, int(misfit.seen.sum()), len(names))
     return Profile(
         name,
         misfit.low[which] + search.width[which] * grid,
@@ -102,8 +108,8 @@ def profile(
     )
 
 
-def _held(search: Search, which: int, grid: NDArray, best: NDArray) -> NDArray:
-    """Sums of squares with one parameter held on a grid, from the optimum outwards."""
+def _profiled(search: Search, which: int, grid: NDArray, best: NDArray) -> NDArray:
+    """Sums of losses with one parameter held on a grid, from the optimum outwards."""
     others = np.arange(len(best)) != which
     search.free = others
     sums = np.empty(len(grid))
@@ -115,6 +121,6 @@ def _held(search: Search, which: int, grid: NDArray, best: NDArray) -> NDArray:
             if others.any():
                 point = search.descend(point).x
             residual = search.residuals(point[None]).reshape(search.misfit.seen.shape)
-            sums[i] = search.judged(residual)[0]
+            sums[i] = search.linearised(residual)[0]
     search.free, search.held = np.ones(len(best), dtype=bool), np.zeros(len(best))
     return sums

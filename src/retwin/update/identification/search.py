@@ -1,4 +1,4 @@
-"""The search for the best parameters: least squares from several starts, or evolution."""
+"""The search for the optimum: least squares from several starts, or differential evolution."""
 
 from __future__ import annotations
 
@@ -11,24 +11,27 @@ from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, differential_evolution, least_squares
 from scipy.stats.qmc import LatinHypercube
 
-from retwin.errors import InputError
+from retwin.checks import one_of, whole
 from retwin.progress import Progress
-from retwin.update.identification.misfit import Misfit, check_counts
+from retwin.update.identification.misfit import Misfit
 
-__all__ = ["EDGE", "Evolution", "LeastSquares", "Loss", "Optimum", "Search"]
+__all__ = ["AT_BOUND", "Evolution", "LeastSquares", "Loss", "Optimum", "Search"]
 
-NUDGE = 1e-3
-"""Step of the differences, in widths of the bounds."""
-EXACT = 1e-6
-"""Share of the objective, and of the parameters, below which a step changes nothing: far below what
-noise does to them."""
+DIFFERENCE = 1e-3
+"""Step of the finite differences, in widths of the bounds."""
+TOLERANCE = 1e-6
+"""Relative change of the objective, and of the parameters, at which the search stops. It is far
+below the effect of noise on them."""
 FAILED = 1e3
-"""Residual of what could not be simulated, in standard deviations of the output."""
-EDGE = 1e-3
-"""How near a bound counts as on it, in widths of the bounds."""
+"""Residual of a simulation that fails, in standard deviations of the output."""
+AT_BOUND = 1e-3
+"""Distance from a bound that counts as on it, in widths of the bounds."""
+MIN_CURVATURE = 0.05
+"""Smallest mean curvature of a robust loss, which is negative where most residuals are outliers."""
 POLISH = 60
-"""Greatest number of trial steps after a global search."""
+"""Largest number of trial steps after a global search."""
 Loss = Literal["linear", "soft_l1", "cauchy"]
+"""Loss functions of scipy's `least_squares`: the squares of Eq. 2, and two robust ones."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +40,19 @@ class LeastSquares:
 
     Parameters
     ----------
-    starts: the present values, and a Latin hypercube within the bounds.
-    loss: "linear" is Eq. 2. The others forgive outliers, such as glitches and missed movements,
-        beyond 1.4826 times the median absolute residual of the linear optimum: "soft_l1" counts
-        them by their size instead of its square, "cauchy" hardly at all.
-    evaluations: greatest number of trial steps per start.
+    starts : int
+        The present values, and the others from a Latin hypercube within the bounds; at least 1.
+    loss : str
+        "linear" is Eq. 2. The others are robust to outliers such as glitches and missed segments,
+        beyond 1.4826 times the median absolute residual of the linear optimum: "soft_l1" grows
+        linearly with their size, "cauchy" with its logarithm.
+    evaluations : int
+        Largest number of trial steps per start, at least 1.
+
+    Raises
+    ------
+    InputError
+        An unknown loss, or a count below 1.
 
     """
 
@@ -50,8 +61,9 @@ class LeastSquares:
     evaluations: int = 60
 
     def __post_init__(self) -> None:
-        check_counts(starts=self.starts, evaluations=self.evaluations)
-        _check_loss(self.loss)
+        whole("starts", self.starts, least=1)
+        whole("evaluations", self.evaluations, least=1)
+        one_of("loss", self.loss, get_args(Loss))
 
 
 @dataclass(frozen=True)
@@ -60,9 +72,17 @@ class Evolution:
 
     Parameters
     ----------
-    population: members per parameter.
-    generations: at most.
-    loss: see `LeastSquares`; for the polish. The search itself minimises the plain norm.
+    population : int
+        Members of the population per parameter, at least 1.
+    generations : int
+        Largest number of generations, at least 1.
+    loss : str
+        Loss of the final least squares, see `LeastSquares`. The evolution minimises Eq. 2.
+
+    Raises
+    ------
+    InputError
+        An unknown loss, or a count below 1.
 
     """
 
@@ -71,27 +91,23 @@ class Evolution:
     loss: Loss = "soft_l1"
 
     def __post_init__(self) -> None:
-        check_counts(population=self.population, generations=self.generations)
-        _check_loss(self.loss)
-
-
-def _check_loss(loss: str) -> None:
-    known = get_args(Loss)
-    if loss not in known:
-        raise InputError(
-            "loss", expected=f"one of {', '.join(known)}", got=repr(loss), remedy="leave it out"
-        )
+        whole("population", self.population, least=1)
+        whole("generations", self.generations, least=1)
+        one_of("loss", self.loss, get_args(Loss))
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """Where one start ended.
+    """The optimum from one start.
 
     Attributes
     ----------
-    start, values: parameters before and after.
-    objective: ‖y_obs − f(θ, u)‖ there (under a robust loss, what that makes of it).
-    reason: why it stopped.
+    start, values : tuple of float
+        Parameters before and after the search.
+    objective : float
+        ‖y_obs − f(θ, u)‖ there; under a robust loss the square root of the sum of losses.
+    reason : str
+        Why the search stopped.
 
     """
 
@@ -102,7 +118,27 @@ class Optimum:
 
 
 class Search:
-    """Points are parameters in widths of their bounds, from 0 to 1."""
+    """The search over points, which are parameters in widths of their bounds, from 0 to 1.
+
+    Parameters
+    ----------
+    misfit : Misfit
+        Twin and measured data.
+    method : LeastSquares or Evolution
+        Settings.
+    progress : callable or None
+        Called with the share of the starts that are done.
+
+    Attributes
+    ----------
+    free : NDArray
+        (k,) bool, the parameters that are searched.
+    held : NDArray
+        (k,), the point of the others, 0 where a parameter is free.
+    loss, scale
+        The loss of the last search, and the residual beyond which a robust one grows slower.
+
+    """
 
     def __init__(
         self, misfit: Misfit, method: LeastSquares | Evolution, progress: Progress | None
@@ -132,7 +168,7 @@ class Search:
             if self.progress is not None:
                 self.progress(done / len(starts) * (0.5 if robust else 1.0))
         if robust:
-            # One scale for all: optima under different ones could not be compared.
+            # All starts share one scale, so that their optima are comparable.
             best = min(found, key=lambda each: each.cost)
             middle = float(np.median(np.abs(best.fun[self.misfit.seen.ravel()])))
             self.loss = self.method.loss
@@ -148,7 +184,7 @@ class Search:
         assert isinstance(self.method, Evolution)
         generations = self.method.generations
 
-        def tell(intermediate_result: OptimizeResult) -> None:
+        def report(intermediate_result: OptimizeResult) -> None:
             if self.progress is not None:
                 self.progress(min(0.95, intermediate_result.nit / generations))
 
@@ -166,46 +202,46 @@ class Search:
             vectorized=True,
             updating="deferred",
             polish=False,
-            callback=tell,
+            callback=report,
         )
         return found.x
 
     def theta(self, points: NDArray) -> NDArray:
-        """Parameters (m, k) at points (m, free ones); those that are held are added."""
+        """Parameters (m, k) at points (m, number of free ones), completed by those held."""
         whole = np.tile(self.held, (len(points), 1))
         whole[:, self.free] = points
         return self.misfit.low + self.width * whole
 
     def residuals(self, points: NDArray) -> NDArray:
-        """Residuals (m, everything) at points (m, k)."""
+        """Residuals (m, n P d_y) at points (m, number of free ones)."""
         flat = self.misfit.residuals(self.theta(points)).reshape(len(points), -1)
         return np.nan_to_num(flat, nan=FAILED * self.misfit.spread)
 
     def jacobian(
-        self, point: NDArray, *, sides: Literal[1, 2] = 2, there: NDArray | None = None
+        self, point: NDArray, *, sides: Literal[1, 2] = 2, residual: NDArray | None = None
     ) -> NDArray:
-        """Derivative (everything, k) at a point (k,): differences to one or both sides, one batch.
+        """Derivative (n P d_y, k) at a point (k,) by one-sided or central differences.
 
-        One-sided at a bound, and beside what cannot be simulated: its residual is no slope. `there`
-        are the residuals (everything,) at the point, where they are known.
+        Differences are one-sided at a bound and next to a simulation that fails. `residual`
+        (n P d_y,) is that at the point, if it is known.
         """
-        step = np.diag(np.where(point > 0.5, -NUDGE, NUDGE))
+        step = np.diag(np.where(point > 0.5, -DIFFERENCE, DIFFERENCE))
         inward, outward = np.clip(point + step, 0, 1), np.clip(point - step, 0, 1)
-        if there is None:
-            there = self.residuals(point[None])[0]
+        if residual is None:
+            residual = self.residuals(point[None])[0]
         points = np.concatenate([inward, outward]) if sides == 2 else inward
         residuals = self.misfit.residuals(self.theta(points)).reshape(len(points), -1)
-        broken = np.isnan(residuals).any(axis=1)
-        points[broken], residuals[broken] = point, there
+        failed = np.isnan(residuals).any(axis=1)
+        points[failed], residuals[failed] = point, residual
         size = len(point)
         length = np.diag(points[:size] - (points[size:] if sides == 2 else point))[:, None]
-        difference = residuals[:size] - (residuals[size:] if sides == 2 else there)
+        difference = residuals[:size] - (residuals[size:] if sides == 2 else residual)
         return np.divide(difference, length, out=np.zeros_like(difference), where=length != 0).T
 
     def descend(self, start: NDArray) -> OptimizeResult:
-        """The optimum nearest to a start."""
+        """The local optimum from a start."""
 
-        # A derivative is asked for where the residuals were asked for last.
+        # The derivative is computed at the point of the last residuals.
         @lru_cache(maxsize=1)
         def residuals(point: tuple[float, ...]) -> NDArray:
             return self.residuals(np.array([point]))[0]
@@ -213,36 +249,41 @@ class Search:
         return least_squares(
             lambda point: residuals(tuple(point)),
             start,
-            lambda point: self.jacobian(point, sides=1, there=residuals(tuple(point))),
+            lambda point: self.jacobian(point, sides=1, residual=residuals(tuple(point))),
             bounds=(0.0, 1.0),
-            ftol=EXACT,
-            xtol=EXACT,
+            ftol=TOLERANCE,
+            xtol=TOLERANCE,
             loss=self.loss,
             f_scale=self.scale,
             max_nfev=getattr(self.method, "evaluations", POLISH),
         )
 
-    def judged(self, residual: NDArray) -> tuple[float, NDArray, float]:
-        """What the loss makes of all squares together, and how the optimum hangs on residuals.
+    def linearised(self, residual: NDArray) -> tuple[float, NDArray, float]:
+        """The sum of losses, equivalent residuals for least squares, and the mean curvature.
 
-        To first order it is that of least squares for residuals as the second says; the loss
-        rises from there as the squares do, times the third (Huber 1981, section 7.6).
+        To first order the optimum depends on data as that of least squares with the equivalent
+        residuals. Near it the loss grows as the squares times the curvature.
+
+        References
+        ----------
+        Huber, "Robust Statistics", 1981, section 7.6.
+
         """
-        size = (residual / self.scale) ** 2
+        square = (residual / self.scale) ** 2
         if self.loss == "soft_l1":
-            root = np.sqrt(1 + size)
-            total, pull, slope = 2 * np.sum(root - 1), residual / root, root**-3
+            root = np.sqrt(1 + square)
+            total, gradient, curvature = 2 * np.sum(root - 1), residual / root, root**-3
         elif self.loss == "cauchy":
-            total, pull = np.sum(np.log1p(size)), residual / (1 + size)
-            slope = (1 - size) / (1 + size) ** 2
+            total, gradient = np.sum(np.log1p(square)), residual / (1 + square)
+            curvature = (1 - square) / (1 + square) ** 2
         else:
             return float(np.sum(residual**2)), residual, 1.0
-        mean = max(float(np.mean(slope[self.misfit.seen])), 0.05)
-        return float(self.scale**2 * total), pull / mean, mean
+        mean = max(float(np.mean(curvature[self.misfit.seen])), MIN_CURVATURE)
+        return float(self.scale**2 * total), gradient / mean, mean
 
     def _optimum(self, start: NDArray, found: OptimizeResult) -> tuple[Optimum, NDArray]:
         begin, end = self.theta(np.stack([start, found.x]))
-        # scipy's cost is half the sum of squares, or of what a robust loss makes of them.
+        # scipy's cost is half the sum of losses.
         value = float(np.sqrt(2 * found.cost))
         reason = " ".join(found.message.replace("`", "").split()).rstrip(".")
         return Optimum(tuple(begin.tolist()), tuple(end.tolist()), value, reason), found.x

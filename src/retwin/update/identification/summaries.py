@@ -1,4 +1,4 @@
-"""A few numbers that tell most of what measured outputs say of parameters and noise."""
+"""Summary statistics of measured outputs for the inference of parameters and noise."""
 
 from __future__ import annotations
 
@@ -11,53 +11,57 @@ from sklearn.covariance import LedoitWolf
 __all__ = ["Summaries", "outlyingness"]
 
 COMPONENTS = 20
-FLAT = 1e-4
-"""Directions in which paths move less than this share of the most are left out."""
+"""Largest number of principal components."""
+RANK_TOLERANCE = 1e-4
+"""Components whose singular value is below this share of the largest are left out."""
 LAGS = (1, 2, 4, 8, 16)
+"""Lags, in samples, at which the increments of the noise are summarised."""
 
 
 @dataclass(frozen=True, eq=False)
 class Principal:
-    """The directions in which noise-free simulated data differ most.
+    """Principal components of noise-free simulated data.
 
     Attributes
     ----------
-    components: (c, N) principal directions of flattened data.
-    middle: (N,) their mean.
+    components : NDArray
+        (c, N), principal directions of flattened data.
+    mean : NDArray
+        (N,), their mean.
 
     """
 
     components: NDArray
-    middle: NDArray
+    mean: NDArray
 
     @classmethod
     def of(cls, data: NDArray) -> Principal:
-        """From simulated data (m, ...)."""
+        """The components of simulated data (m, ...)."""
         flat = data.reshape(len(data), -1)
-        middle = flat.mean(axis=0)
-        _, singular, directions = np.linalg.svd(flat - middle, full_matrices=False)
-        known = singular > FLAT * singular.max(initial=0.0)
-        return cls(directions[known][:COMPONENTS], middle)
+        mean = flat.mean(axis=0)
+        _, singular, directions = np.linalg.svd(flat - mean, full_matrices=False)
+        kept = singular > RANK_TOLERANCE * singular.max(initial=0.0)
+        return cls(directions[kept][:COMPONENTS], mean)
 
     def __call__(self, data: NDArray, seen: NDArray) -> tuple[NDArray, NDArray]:
-        """Scores (m, c) of data (m, ...), and what they leave over; 0 where nothing was seen."""
-        off = data.reshape(len(data), -1) - self.middle * seen.ravel()
-        scores = off @ self.components.T
-        return scores, (off - scores @ self.components).reshape(data.shape) * seen
+        """Scores (m, c) of data (m, ...), and the remainder, which is 0 where not `seen`."""
+        centred = data.reshape(len(data), -1) - self.mean * seen.ravel()
+        scores = centred @ self.components.T
+        return scores, (centred - scores @ self.components).reshape(data.shape) * seen
 
 
 @dataclass(frozen=True, eq=False)
 class Summaries:
-    """Where a set of paths lies on the manifold that the twin can reach, and how far off it is.
+    """Summary statistics of a set of output paths.
 
-    Principal components of noise-free simulated paths say where. So do those of their steps from
-    sample to sample: an error that lasts spoils the paths, and hardly the steps. What the former
-    leave over is noise: its size, and how it differs from itself some samples later, say of what
-    kind.
+    The scores of the principal components of noise-free simulated paths depend on the parameters.
+    So do those of the steps from sample to sample, which a correlated error hardly affects. The
+    mean square of the remainder, and of its increments over several lags, depend on the noise.
 
     Attributes
     ----------
-    paths, steps: the principal directions of both.
+    paths, steps : Principal
+        Principal components of the paths and of their steps.
 
     """
 
@@ -66,31 +70,32 @@ class Summaries:
 
     @classmethod
     def of(cls, paths: NDArray) -> Summaries:
-        """From noise-free paths (m, n, P, d_y)."""
+        """The summaries that noise-free paths (m, n, P, d_y) define."""
         return cls(Principal.of(paths), Principal.of(np.diff(paths, axis=2)))
 
     def __call__(self, paths: NDArray, seen: NDArray) -> NDArray:
         """Summaries (m, s) of paths (m, n, P, d_y), 0 where nothing was `seen` (n, P, d_y)."""
-        scores, rest = self.paths(paths, seen)
+        scores, remainder = self.paths(paths, seen)
         both = seen[:, 1:] & seen[:, :-1]
-        quick, _ = self.steps(np.diff(paths, axis=2) * both, both)
-        told = [np.sum(rest**2, axis=(1, 2, 3)) / seen.sum()]
+        step_scores, _ = self.steps(np.diff(paths, axis=2) * both, both)
+        powers = [np.sum(remainder**2, axis=(1, 2, 3)) / seen.sum()]
         for lag in LAGS:
             if lag < paths.shape[2] // 2:
                 both = seen[:, lag:] & seen[:, :-lag]
-                steps = (rest[:, :, lag:] - rest[:, :, :-lag]) ** 2 * both
-                told.append(np.sum(steps, axis=(1, 2, 3)) / max(both.sum(), 1))
-        return np.column_stack([scores, quick, np.log(np.array(told).T + 1e-300)])
+                steps = (remainder[:, :, lag:] - remainder[:, :, :-lag]) ** 2 * both
+                powers.append(np.sum(steps, axis=(1, 2, 3)) / max(both.sum(), 1))
+        return np.column_stack([scores, step_scores, np.log(np.array(powers).T + 1e-300)])
 
 
 def outlyingness(measured: NDArray, simulated: NDArray) -> float:
-    """Share of simulated summaries (m, s) as far out as the measured ones (s,), by Mahalanobis.
+    """The p-value of measured summaries (s,) among simulated ones (m, s), by Mahalanobis distance.
 
-    Half of them say what is usual, the others how far out is usual.
+    Half of the simulated summaries give mean and covariance, the others the distribution of the
+    distance.
     """
     half = len(simulated) // 2
-    # Ratios of neighbouring lags tell white from lasting: standardised, none drowns another.
+    # Standardised, so that the shrinkage of the covariance treats all summaries alike.
     scale = simulated[:half].std(axis=0).clip(1e-12)
-    law = LedoitWolf().fit(simulated[:half] / scale)
-    far = law.mahalanobis(np.concatenate([measured[None], simulated[half:]]) / scale)
-    return float((1 + np.sum(far[1:] >= far[0])) / len(far))
+    distribution = LedoitWolf().fit(simulated[:half] / scale)
+    distance = distribution.mahalanobis(np.concatenate([measured[None], simulated[half:]]) / scale)
+    return float((1 + np.sum(distance[1:] >= distance[0])) / len(distance))

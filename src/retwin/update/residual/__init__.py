@@ -1,4 +1,4 @@
-"""Residual Generator (RG), Eq. 6–10: the distribution of the gap z, given what was commanded."""
+"""Residual Generator (RG), Eq. 6–10: the distribution of the discrepancy z given the commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fit_residual`: z* from outputs alone, then the law of z (Eq. 7–10)."""
+"""`fit_residual`: z* from outputs alone, then the distribution of z (Eq. 7–10)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from retwin.checks import require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
@@ -28,7 +29,7 @@ from retwin.update.corrections import (
     sample_mask,
 )
 from retwin.update.residual.model import ResidualModel, segment
-from retwin.update.residual.penalties import penalties
+from retwin.update.residual.penalties import checked_bounds, penalties
 from retwin.update.residual.refining import refine
 from retwin.update.residual.sequence import SequenceMixture, SequenceResidual
 from retwin.update.residual.sequence_fitting import fit_sequence
@@ -38,8 +39,10 @@ from retwin.update.surrogate import Surrogate
 
 __all__ = ["fit_residual", "infer_discrepancy"]
 
-LEAST = 1e-12
-"""The largest |z| of a gap that is none: what is a millionth of it has squares in float32 still."""
+SMALLEST = 1e-12
+"""Smallest value taken for the largest |z*|: a millionth of it still has a square in float32."""
+BOUND_MARGIN = 1.25
+"""Default bound b of Eq. 9, over the largest |z*|."""
 
 
 def infer_discrepancy(
@@ -50,10 +53,27 @@ def infer_discrepancy(
     segments: Segments | None = None,
     faults: Sequence[Fault | None] | None = None,
 ) -> tuple[Context, Discrepancy]:
-    """z* of measured trajectories: what g must add to the surrogate to explain them (for Eq. 7).
+    """The discrepancies z* with which g explains measured trajectories best (for Eq. 7).
 
-    `faults`, one per trajectory or none, are what is known to be broken: how much is inferred
-    beside z* by operators that can (`Discrepancy.severity`).
+    Parameters
+    ----------
+    surrogate : Surrogate
+        The IBG.
+    trajectories : Trajectories
+        Commands and measured outputs.
+    correction : Correction
+        The operator g.
+    segments : Segments, optional
+        One row per trajectory; by default from command events.
+    faults : sequence of Fault or None, optional
+        The known fault of each trajectory. An operator with `severities` infers its severity
+        together with z* (`Discrepancy.severity`).
+
+    Returns
+    -------
+    Context, Discrepancy
+        What g is applied to, and z* with its uncertainty.
+
     """
     context = _context(surrogate, trajectories, segments, faults)
     return context, correction.infer(context, *_measured(trajectories))
@@ -101,27 +121,45 @@ def fit_residual(
     segments: Segments | str = "commands",
     progress: Progress | None = None,
 ) -> ResidualModel | SequenceResidual:
-    """Fit the RG to measured trajectories, outputs only (Eq. 7–10).
+    """Fit the residual model to measured trajectories, from outputs alone (Eq. 7–10).
 
     Parameters
     ----------
-    surrogate: the IBG.
-    calibration: real trajectories with commands. As few as six do; fewer than three leave none to
-        validate on (a warning).
-    correction: what z means; a sensor in it is fitted too.
-    density: what the law of z may look like; a `SequenceMixture` for an operator with one z per
-        sample, which learns from one record too.
-    calibrate_on: "healthy" by default: the offset would absorb the faults of others. "all", as if
-        there were no faults. Or what fault each label stands for, `case.faults`: then all
-        trajectories serve, and an operator that can (`severities`) tells fault and gap apart.
-    bounds: b of Eq. 9, (d_z,); by default 1.25 times the largest |z*|.
-    segments: "commands", "path", or the movements themselves, one row per trajectory; generated
-        trajectories then get theirs from command events.
+    surrogate : Surrogate
+        The IBG.
+    calibration : Trajectories
+        Real trajectories with commands. Six suffice; of fewer than three none is held out for
+        validation, with a warning.
+    correction : Correction
+        The operator g, which defines z. The parameters of a sensor in it are fitted too.
+    density : Density or SequenceMixture
+        Family of distributions of z; a `SequenceMixture` for an operator with one z per sample,
+        which can be fitted to a single record.
+    seed : int
+        The same seed gives the same weights on the same machine.
+    calibrate_on : str or mapping
+        "healthy" uses healthy trajectories only, since the offset would absorb the faults of
+        others. "all" uses all, as if there were no faults. A mapping from label to fault, such as
+        `case.faults`, uses the trajectories with these labels; an operator with `severities` then
+        separates fault and discrepancy.
+    bounds : NDArray, optional
+        (d_z,), b of Eq. 9; by default 1.25 times the largest |z*|.
+    segments : Segments or str
+        "commands", "path" (see `segment`), or the segments, one row per trajectory; the segments
+        of generated trajectories are then from command events.
+    progress : callable, optional
+        Called with the share of the training that is done.
+
+    Returns
+    -------
+    ResidualModel or SequenceResidual
+        The latter for a `SequenceMixture`.
 
     Raises
     ------
-    InputError: no trajectory to calibrate on, no movement in any, nothing measured that tells of
-        the gap, an unknown `calibrate_on`.
+    InputError
+        No trajectory to calibrate on, no segment in any, no measurement from which z is
+        identified, or an unknown `calibrate_on`.
 
     """
     _check_match(surrogate, calibration)
@@ -134,22 +172,22 @@ def fit_residual(
         rule, parts = segments, segment(used.commands, used.nominal, segments)
     else:
         rule, parts = "commands", segments[keep]
-    if not (stepwise or parts.valid.any()):
-        raise InputError(
-            "calibration",
-            expected="trajectories with movements",
-            got="commands that never change",
-            remedy="give segments='path', or the movements themselves",
-        )
+    require(
+        stepwise or parts.valid.any(),
+        "calibration",
+        expected="trajectories with segments of motion",
+        got="commands that never change",
+        remedy="give segments='path', or the segments themselves",
+    )
     context = _context(surrogate, used, parts, faults)
     correction, found = fit_sensor(correction, context, *_measured(used))
-    if not found.identified.any():
-        raise InputError(
-            "calibration",
-            expected="measurements that tell something of the gap",
-            got=f"{int(used.mask.all(axis=2).sum())} samples with all outputs measured",
-            remedy="check the mask; leave an output out that is never measured",
-        )
+    require(
+        found.identified.any(),
+        "calibration",
+        expected="measurements that identify the discrepancy",
+        got=f"{int(used.mask.all(axis=2).sum())} samples with all outputs measured",
+        remedy="check the mask; leave an output out that is never measured",
+    )
     if isinstance(density, SequenceMixture):
         return fit_sequence(
             used, correction, density, context, found, seed=seed, bounds=bounds, progress=progress
@@ -160,12 +198,12 @@ def fit_residual(
         )
     targets = Targets.of(model, context, found, seed=seed)
     _prepare(model, targets, bounds, seed)
-    fitted, held = _validation_split(used, seed)
+    fitted, held_out = _validation_split(used, seed)
     result = train(
         model,
         _objective(density),
         targets.examples(model, fitted),
-        None if held is None else targets.examples(model, held),
+        None if held_out is None else targets.examples(model, held_out),
         density.training,
         seed=seed,
         progress=progress,
@@ -173,12 +211,12 @@ def fit_residual(
     if targets.posterior:
         model.persistence.copy_(targets.persistence(model))
     figures = {"trajectories": float(len(used)), "movements": float(parts.valid.sum())}
-    if density.refinement is not None and held is not None:
+    if density.refinement is not None and held_out is not None:
         observed, mask = _measured(used)
-        read = sample_mask(correction, observed, mask)
+        sampled = sample_mask(correction, observed, mask)
         figures |= refine(
-            model, context, observed, read, fitted=fitted, held=held, how=density.refinement,
-            seed=seed, progress=progress,
+            model, context, observed, sampled, fitted=fitted, held_out=held_out,
+            how=density.refinement, seed=seed, progress=progress,
         )  # fmt: skip
     model.emulated = used.emulated
     onsets = Segments.from_commands(calibration.commands)
@@ -193,10 +231,10 @@ def _context(
     segments: Segments | None,
     faults: Sequence[Fault | None] | None,
 ) -> Context:
-    """What is corrected; of a known fault any severity, since that is inferred."""
+    """What g is applied to; the severity of a known fault is arbitrary, since it is inferred."""
     commands = trajectories.commands
     parts = Segments.from_commands(commands) if segments is None else segments
-    # What follows the last sample is padding, and no rest that was measured.
+    # Padding after the last sample is no steady part.
     parts = parts.until(trajectories.lengths)
     if faults is None:
         return Context.of(surrogate, commands, parts, rate=trajectories.rate)
@@ -212,30 +250,30 @@ def _context(
 
 
 def _measured(trajectories: Trajectories) -> tuple[Tensor, Tensor]:
-    """Outputs and where they were measured, (n, T, d_y) each."""
+    """Measured outputs and their mask, (n, T, d_y) each."""
     return torch.tensor(trajectories.observed), torch.tensor(trajectories.mask)
 
 
 def _check_match(surrogate: Surrogate, calibration: Trajectories) -> None:
-    """Calibration data must speak of the same channels at the same rate as the surrogate."""
+    """Require the calibration data to have the surrogate's channels and rate."""
     for name in ("inputs", "outputs", "rate"):
-        ours, theirs = getattr(surrogate, name), getattr(calibration, name)
-        if ours != theirs:
-            raise InputError(
-                f"calibration.{name}",
-                expected=f"what the surrogate was trained on, {ours}",
-                got=f"{theirs}",
-                remedy="load the file with its case, or convert it",
-            )
+        expected, got = getattr(surrogate, name), getattr(calibration, name)
+        require(
+            expected == got,
+            f"calibration.{name}",
+            expected=f"that of the surrogate, {expected}",
+            got=got,
+            remedy="load the file with its case, or convert it",
+        )
 
 
 def _chosen(
     calibration: Trajectories,
     calibrate_on: str | Mapping[str, Fault | None],
     severities: bool,
-    enough: int,
+    minimum: int,
 ) -> tuple[NDArray, list[Fault | None] | None]:
-    """Which trajectories serve, and the faults in them, where they are known and can be told."""
+    """Indices of the trajectories to use, and their faults if their severities are inferred."""
     labels = calibration.labels
     faults = None
     if isinstance(calibrate_on, Mapping):
@@ -246,19 +284,19 @@ def _chosen(
     else:
         raise InputError(
             "calibrate_on",
-            expected="'healthy', 'all', or what fault each label stands for",
+            expected="'healthy', 'all', or a mapping from label to fault",
             got=repr(calibrate_on),
             remedy="'all' lets the offset absorb faults; use it for comparison only",
         )
-    if not keep.any():
-        wanted = repr(HEALTHY) if isinstance(calibrate_on, str) else ", ".join(calibrate_on)
-        raise InputError(
-            "calibration",
-            expected=f"at least one trajectory labelled {wanted}",
-            got=f"labels {sorted(calibration.known_labels) or 'none'}",
-            remedy="label healthy trajectories, or calibrate on 'all'",
-        )
-    if keep.sum() < enough:
+    wanted = repr(HEALTHY) if isinstance(calibrate_on, str) else ", ".join(calibrate_on)
+    require(
+        keep.any(),
+        "calibration",
+        expected=f"at least one trajectory labelled {wanted}",
+        got=f"labels {sorted(calibration.known_labels) or 'none'}",
+        remedy="label healthy trajectories, or calibrate on 'all'",
+    )
+    if keep.sum() < minimum:
         warnings.warn(
             f"calibration: {keep.sum()} trajectories to calibrate on, at least three are needed to "
             "hold one out; training runs to its last epoch without validation",
@@ -269,7 +307,7 @@ def _chosen(
 
 @torch.no_grad()
 def _prepare(model: ResidualModel, targets: Targets, bounds: NDArray | None, seed: int) -> None:
-    """Standardise, bound and start the model from the data it is trained on."""
+    """Take units, bounds and initial heads of the model from the data that it is trained on."""
     valid, z = targets.valid, targets.z
     model.before.fit(targets.features[valid])
     for head, part in model.parts():
@@ -277,48 +315,46 @@ def _prepare(model: ResidualModel, targets: Targets, bounds: NDArray | None, see
             model.shift[part], model.scale[part], model.bounds[part] = 0.0, 1.0, 1.0
             head.initialise(z[:, valid][..., part].flatten(0, 1).double().numpy(), seed)
             continue
-        known = targets.told[..., part].all(dim=-1) & valid
-        values = z[:, known if known.any() else valid][..., part].flatten(0, 1)
-        # Robust: a few missed movements must not set the unit in which the others are told.
+        identified = targets.identified[..., part].all(dim=-1) & valid
+        values = z[:, identified if identified.any() else valid][..., part].flatten(0, 1)
+        # Robust: the unit of z must not depend on a few missed segments.
         shift = values.median(dim=0).values
         scale = 1.4826 * (values - shift).abs().median(dim=0).values
         spread = values.std(dim=0, correction=0)
-        largest = values.abs().amax(dim=0).clamp_min(LEAST)
+        largest = values.abs().amax(dim=0).clamp_min(SMALLEST)
         scale = torch.maximum(scale, 0.1 * spread).maximum(1e-6 * largest)
         model.shift[part], model.scale[part] = shift, scale
-        model.bounds[part] = 1.25 * largest
+        model.bounds[part] = BOUND_MARGIN * largest
         head.initialise(((values - shift) / scale).double().numpy(), seed)
     if bounds is not None:
-        if np.shape(bounds) != (len(model.latent),) or not (np.asarray(bounds) > 0).all():
-            raise InputError(
-                "bounds",
-                expected=f"one positive bound for each of {', '.join(model.latent.names)}",
-                got=repr(bounds),
-                remedy="leave bounds out to take them from the data",
-            )
-        model.bounds.copy_(torch.as_tensor(bounds, dtype=torch.float32))
+        model.bounds.copy_(checked_bounds(bounds, model.latent))
 
 
 def _validation_split(used: Trajectories, seed: int) -> tuple[Tensor, Tensor | None]:
-    """Rows to train on, and about a fifth of the trajectories (one at least) to validate on."""
+    """Indices to train on, and a fifth of the trajectories, at least one, for validation."""
     if len(used) < 3:
         return torch.arange(len(used)), None
     order = torch.as_tensor(np.random.default_rng(seed).permutation(len(used)))
-    held = max(1, round(0.2 * len(used)))
-    return order[held:], order[:held]
+    count = max(1, round(0.2 * len(used)))
+    return order[count:], order[:count]
 
 
 def _objective(density: Density) -> Loss:
-    """L_RG of Eq. 10, averaged over movements."""
+    """L_RG of Eq. 10, averaged over segments."""
 
     def loss(model: Any, batch: tuple[Tensor, ...]) -> Tensor:
-        features, z, known, valid = batch
-        law = model.distribution(features)
-        # Unknown blocks are left out of the likelihood; a placeholder keeps them finite.
-        told = law.block_log_prob(z)
-        nll = -torch.where(known, told, 0.0).sum() / known.sum().clamp_min(1) * known.shape[-1]
+        features, z, identified, valid = batch
+        distribution = model.distribution(features)
+        # Blocks that are not identified hold a finite placeholder and are not in the likelihood.
+        log_prob = torch.where(identified, distribution.block_log_prob(z), 0.0).sum()
+        nll = -log_prob / identified.sum().clamp_min(1) * identified.shape[-1]
         return nll + penalties(
-            law.mean, model.bounds, model.scale, valid, density.smoothness, density.boundedness
+            distribution.mean,
+            model.bounds,
+            model.scale,
+            valid,
+            density.smoothness,
+            density.boundedness,
         )
 
     return loss

@@ -1,4 +1,4 @@
-"""`ResidualModel`: the Residual Generator (RG), Eq. 6–8: what was commanded in, a law of z out."""
+"""`ResidualModel`: the Residual Generator (RG), Eq. 6–8, with one z per segment."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from retwin.checks import one_of, require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
-from retwin.errors import InputError
 from retwin.nets.mixtures import BernoulliHead, Blocks
 from retwin.nets.networks import Standardise
 from retwin.nets.training import Fit
@@ -28,9 +28,31 @@ __all__ = ["ResidualModel", "describe", "segment"]
 
 
 class ResidualModel(nn.Module):
-    """Call it on a `Context`: out comes a torch `Distribution` over z (n, M, d_z).
+    """The distribution of z (n, M, d_z) given a `Context`: call it to get a torch distribution.
 
-    Holds its correction operator, so that it knows what z means.
+    Parameters
+    ----------
+    correction : Correction
+        The operator g, with one z per segment.
+    density : Density
+        Settings of the distribution and of its encoder.
+    inputs, outputs : Channels
+        Channels of the commands and of the outputs.
+    segmentation : str
+        Rule by which segments are found, see `segment`.
+
+    Attributes
+    ----------
+    latent : Channels
+        Names and units of the components of z.
+    emulated, timing, fitted
+        See `Residual`.
+
+    Raises
+    ------
+    InputError
+        The operator has no z per segment.
+
     """
 
     bounds: Tensor
@@ -53,14 +75,14 @@ class ResidualModel(nn.Module):
         self.inputs = inputs
         self.outputs = outputs
         self.segmentation = segmentation
-        if getattr(correction, "resolution", "") != "segment":
-            raise InputError(
-                "correction",
-                expected="an operator with one z per movement",
-                got=repr(correction),
-                remedy="use DelayOffset, CommandSpace, or a Chain of one with a SampledSensor; or, "
-                "for one z per sample, a SequenceMixture as the density",
-            )
+        require(
+            getattr(correction, "resolution", "") == "segment",
+            "correction",
+            expected="an operator with one z per segment",
+            got=repr(correction),
+            remedy="use DelayOffset, CommandSpace, or a Chain of one with a SampledSensor; or, for "
+            "one z per sample, a SequenceMixture as the density",
+        )
         self.latent = correction.latent(inputs, outputs)
         self.emulated = False
         self.timing: NDArray = np.empty((0, 0))
@@ -94,7 +116,7 @@ class ResidualModel(nn.Module):
         faulty_commands: NDArray | None = None,
         frozen: NDArray | None = None,
     ) -> Context:
-        """What this model is called on, for commands (n, T, d_u), movements found by its rule."""
+        """The context of commands (n, T, d_u), with segments by this model's rule unless given."""
         if segments is None or self.segmentation == "path":
             nominal = surrogate.predict(commands) if self.segmentation == "path" else commands
             segments = segment(commands, nominal, self.segmentation)
@@ -108,18 +130,18 @@ class ResidualModel(nn.Module):
         )
 
     def forward(self, context: Context) -> Blocks:
-        """q_ψ(z | u, ŷ), in physical units."""
+        """The distribution q_ψ(z | u, ŷ), in physical units."""
         return self.distribution(describe(context))
 
     def parts(self) -> Iterator[tuple[Any, slice]]:
-        """Every head, and where in z its block lies."""
+        """Each head, and the slice of z that its block is."""
         begin = 0
         for head, size in zip(self.heads, self.sizes, strict=True):
             yield head, slice(begin, begin + size)
             begin += size
 
     def distribution(self, features: Tensor) -> Blocks:
-        """q_ψ for described movements (..., F), see `describe`."""
+        """The distribution q_ψ for features (..., F) of segments, see `describe`."""
         encoded = self.encoder(self.before(features))
         parts = zip(
             self.heads, self.shift.split(self.sizes), self.scale.split(self.sizes), strict=True
@@ -128,7 +150,7 @@ class ResidualModel(nn.Module):
 
     @torch.no_grad()
     def mean(self, context: Context) -> Tensor:
-        """The mean z̄ (n, M, d_z) of Eq. 8, within b."""
+        """The mean z̄ (n, M, d_z) of Eq. 8, clipped at b."""
         return self(context).mean.clamp(-self.bounds, self.bounds)
 
     @torch.no_grad()
@@ -136,23 +158,23 @@ class ResidualModel(nn.Module):
         """Draws of z (n, M, d_z), see `drawn`."""
         return self.drawn(self(context), generator=generator)
 
-    def drawn(self, law: Blocks, *, generator: torch.Generator) -> Tensor:
-        """Draws of z (n, M, d_z) clipped at b, differentiable: regularising z̄ bounds no samples.
+    def drawn(self, distribution: Blocks, *, generator: torch.Generator) -> Tensor:
+        """Draws of z (n, M, d_z), clipped at b, since the penalty on z̄ does not bound samples.
 
-        Errors persist within a trajectory: the noise of its movements has a part in common, such
-        that normal scores of z correlate by `persistence`. What each movement's z is distributed
-        like does not change by that.
+        The noise of the segments of a trajectory has a common part, so that the normal scores of z
+        correlate by `persistence`. The marginal distribution of each segment's z is unchanged.
+        Draws are differentiable.
         """
-        shape = law.batch_shape
-        uniform = torch.rand(*shape, len(law.blocks), generator=generator).to(self.bounds)
+        shape = distribution.batch_shape
+        uniform = torch.rand(*shape, len(distribution.blocks), generator=generator).to(self.bounds)
         own = torch.randn(*shape, len(self.latent), generator=generator).to(self.bounds)
         if self.persistence.any():
             common = torch.randn(shape[0], 1, len(self.latent), generator=generator).to(own)
             own = self.persistence.sqrt() * common + (1 - self.persistence).sqrt() * own
-        return law.from_noise(uniform, own).clamp(-self.bounds, self.bounds)
+        return distribution.from_noise(uniform, own).clamp(-self.bounds, self.bounds)
 
     def save(self, folder: str | Path) -> None:
-        """Write weights and description, see `retwin.serialisation.models`."""
+        """Write the weights and the description, see `retwin.serialisation.models`."""
         about = {
             "correction": to_config(self.correction, OPERATORS),
             "density": to_config(self.density, DENSITIES),
@@ -168,7 +190,10 @@ class ResidualModel(nn.Module):
 
     @classmethod
     def load(cls, folder: str | Path) -> ResidualModel:
-        """Read what `save` wrote; InputError when it is not a residual model or damaged."""
+        """Read what `save` wrote.
+
+        Raises InputError if the folder holds no residual model or is damaged.
+        """
         about, weights = read_model(folder, "residual")
         model = cls(
             from_config(about["correction"], OPERATORS),
@@ -185,10 +210,10 @@ class ResidualModel(nn.Module):
 
 
 def describe(context: Context) -> Tensor:
-    """What the RG may know of each movement, (n, M, F).
+    """The features (n, M, F) of each segment that the residual model is conditioned on.
 
-    Commands and nominal output before, amid and after the motion; length of the motion and of the
-    steady part in s. Always of the clean commands: the RG is not told of faults.
+    These are commands and nominal outputs at the start, the middle and the end of the motion, and
+    the durations of the motion and of the steady part in s, all of the commands without faults.
     """
     segments = context.segments
     start, settle, stop = (
@@ -205,12 +230,25 @@ def describe(context: Context) -> Tensor:
 
 
 def segment(commands: NDArray, nominal: NDArray, rule: str = "commands") -> Segments:
-    """Movements by `rule`: "commands" from command events, "path" from the nominal path's speed."""
-    if rule not in ("commands", "path"):
-        raise InputError(
-            "segments",
-            expected="'commands' or 'path'",
-            got=repr(rule),
-            remedy="use 'path' for a twin without command events",
-        )
+    """The segments of trajectories.
+
+    Parameters
+    ----------
+    commands, nominal : NDArray
+        (n, T, d_u) and (n, T, d_y).
+    rule : str
+        "commands" finds them from command events, "path" from the speed of the nominal output.
+
+    Returns
+    -------
+    Segments
+        One row per trajectory.
+
+    Raises
+    ------
+    InputError
+        An unknown rule.
+
+    """
+    one_of("segments", rule, ("commands", "path"), remedy="use 'path' without command events")
     return Segments.from_commands(commands) if rule == "commands" else Segments.from_path(nominal)

@@ -1,10 +1,10 @@
-"""Fine-tuning the RG on outputs, the paper's future work: g and the surrogate are differentiable.
+"""Fine-tuning of the residual model on outputs, the paper's future work.
 
-The likelihood of z trusts z*; what counts is how simulated outputs compare with measured ones. The
-energy score of simulated trajectories is minimised from the likelihood's solution on. Which
-component of a mixture is drawn, and what happens or not, has no gradient: only what the components
-are like is refined, in the last layer; a flow has no such limit. What is gained must show on
-trajectories held out, or nothing is changed.
+The likelihood of z takes z* as exact, although what counts is how well simulated outputs agree with
+measured ones. Since g and the surrogate are differentiable, the energy score of simulated
+trajectories is minimised, starting at the maximum of the likelihood. The choice of a mixture's
+component, and an event, have no gradient: of a mixture only the means and covariances of the
+components are refined, in the last layer; a flow has no such limit.
 """
 
 from __future__ import annotations
@@ -19,14 +19,16 @@ from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import BernoulliHead
 from retwin.nets.training import train
 from retwin.progress import Progress
+from retwin.scores.energy import energy_score
 from retwin.update.corrections import Context, measured_outputs
 from retwin.update.residual.model import ResidualModel, describe
 from retwin.update.residual.settings import Refinement
 
-__all__ = ["energy_score", "refine"]
+__all__ = ["refine"]
 
-CHECKS = 64
-"""Simulations of each held-out trajectory by which before and after are compared."""
+HELD_OUT_DRAWS = 64
+"""Simulations of each held-out trajectory that the energy score before and after is estimated
+from. They are four times as many as in training by default, to halve the error of the estimate."""
 
 
 def refine(
@@ -36,86 +38,93 @@ def refine(
     mask: Tensor,
     *,
     fitted: Tensor,
-    held: Tensor,
+    held_out: Tensor,
     how: Refinement,
     seed: int,
     progress: Progress | None = None,
 ) -> dict[str, float]:
-    """Refine `model` in place; say what the energy score of held-out trajectories was and is.
+    """Refine `model` in place if that lowers the energy score of held-out trajectories.
 
     Parameters
     ----------
-    context: of n trajectories.
-    observed, mask: (n, T, d_y), what was measured; only readings should be unmasked.
-    fitted, held: rows to learn from, and those kept back.
+    model : ResidualModel
+        Fitted by its likelihood.
+    context : Context
+        Commands and nominal outputs of n trajectories.
+    observed, mask : Tensor
+        (n, T, d_y), measured outputs, and where they are true samples of the sensor.
+    fitted, held_out : Tensor
+        Indices of the trajectories to train on, and of those for validation.
+    how : Refinement
+        Settings.
+    seed : int
+        Seed of the draws and of the training.
+    progress : callable, optional
+        Called with the share of the epochs that are done.
+
+    Returns
+    -------
+    dict of str to float
+        "energy before" and "energy after", the score of the held-out trajectories in units of the
+        outputs' spread, and "refined", 1 if the refined weights were kept.
 
     """
     features = describe(context)
     unit = _unit(observed, mask, model.outputs)
+    measured = [
+        values[seen] / unit for values, seen in zip(observed, mask.all(dim=-1), strict=True)
+    ]
     frozen = [model.encoder, *(head for head in model.heads if isinstance(head, BernoulliHead))]
 
     def score(network: Any, batch: tuple[Tensor, ...], draws: int, seed: int) -> Tensor:
-        rows = batch[1].cpu()
+        features, rows = batch
         generator = torch.Generator().manual_seed(seed)
-        law = network.distribution(batch[0].repeat_interleave(draws, dim=0))
-        z = network.drawn(law, generator=generator).cpu()
+        distribution = network.distribution(features.repeat_interleave(draws, dim=0))
+        z = network.drawn(distribution, generator=generator)
         every = context[rows.repeat_interleave(draws).numpy()]
-        made = measured_outputs(network.correction, every, z, generator).unflatten(
-            0, (len(rows), draws)
-        )
-        return energy_score(made / unit, observed[rows] / unit, mask[rows]).mean()
+        outputs = measured_outputs(network.correction, every, z, generator) / unit
+        return torch.stack(
+            [
+                energy_score(made[:, mask[row].all(dim=-1)], measured[row])
+                for row, made in zip(rows.tolist(), outputs.split(draws), strict=True)
+            ]
+        ).mean()
 
-    seeds = iter(torch.randint(2**31, (100_000,), generator=torch.Generator().manual_seed(seed)))
+    fresh = torch.Generator().manual_seed(seed)
 
     def loss(network: Any, batch: tuple[Tensor, ...]) -> Tensor:
-        return score(network, batch, how.draws, int(next(seeds)) if network.training else seed)
+        # New draws at each training step; the same in each validation, to compare epochs.
+        training = torch.is_grad_enabled()
+        drawn = int(torch.randint(2**31, (), generator=fresh)) if training else seed
+        return score(network, batch, how.draws, drawn)
 
     @torch.no_grad()
-    def on_held() -> float:
-        return float(score(model.eval(), (features[held], held), CHECKS, seed + 1))
+    def held_out_score() -> float:
+        batch = (features[held_out], held_out)
+        return float(score(model.eval(), batch, HELD_OUT_DRAWS, seed + 1))
 
-    before, start = on_held(), copy.deepcopy(model.state_dict())
+    before, start = held_out_score(), copy.deepcopy(model.state_dict())
     for part in frozen:
         part.requires_grad_(False)
     train(
         model,
         loss,
         (features[fitted], fitted),
-        (features[held], held),
+        (features[held_out], held_out),
         how.training,
         seed=seed,
         progress=progress,
     )
     for part in frozen:
         part.requires_grad_(True)
-    after = on_held()
+    after = held_out_score()
     kept = after < before
     if not kept:
         model.load_state_dict(start)
     return {"energy before": before, "energy after": after, "refined": float(kept)}
 
 
-def energy_score(made: Tensor, observed: Tensor, mask: Tensor) -> Tensor:
-    """The energy score (n,) of S simulations (n, S, T, d) of measured outputs (n, T, d).
-
-    All measured samples and outputs are one vector, its norm per root of the number of samples;
-    unbiased for any number of simulations.
-    """
-    seen = mask.all(dim=-1)
-    weight = (seen / seen.sum(dim=1, keepdim=True).clamp_min(1)).sqrt()[:, None, :, None]
-    flat = ((made - torch.nan_to_num(observed)[:, None]) * weight).flatten(2)
-    draws = flat.shape[1]
-    error = _norm(flat).mean(dim=1)
-    one, other = torch.triu_indices(draws, draws, 1)
-    return error - 0.5 * _norm(flat[:, one] - flat[:, other]).mean(dim=1)
-
-
-def _norm(vectors: Tensor) -> Tensor:
-    """Their lengths; differentiable where there is none."""
-    return (vectors.square().sum(dim=-1) + 1e-24).sqrt()
-
-
 def _unit(observed: Tensor, mask: Tensor, outputs: Channels) -> Tensor:
-    """What outputs are divided by, (d,): their spread, or one for all where units are the same."""
+    """Divisor (d_y,) of the outputs: their spread, the mean one where their units are the same."""
     spread = observed[mask.all(dim=-1)].std(dim=0).clamp_min(1e-12)
     return spread.mean().expand_as(spread) if outputs.comparable else spread

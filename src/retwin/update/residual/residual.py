@@ -1,4 +1,4 @@
-"""What every residual model offers: the law of z for a context, drawn or averaged."""
+"""The interface of residual models: draws and the mean of z for a context."""
 
 from __future__ import annotations
 
@@ -21,15 +21,20 @@ __all__ = ["Residual", "load_residual"]
 
 
 class Residual(Protocol):
-    """A fitted RG, whatever its resolution; see `ResidualModel` and `SequenceResidual`.
+    """A fitted residual model, with one z per segment or per sample.
 
     Attributes
     ----------
-    correction: what z means.
-    segmentation: by which rule movements are found, see `segment`.
-    emulated: whether it was fitted to a stand-in for the real system.
-    timing: (k, M) onsets in samples that it was calibrated on.
-    fitted: what it remembers of its training.
+    correction : Correction
+        The operator g, which defines z.
+    segmentation : str
+        Rule by which segments are found, see `segment`.
+    emulated : bool
+        Whether it was fitted to an emulated system instead of the real one.
+    timing : NDArray
+        (k, M) onsets, in samples, of the segments of the calibration trajectories.
+    fitted : Fit or None
+        Record of the training.
 
     """
 
@@ -48,7 +53,7 @@ class Residual(Protocol):
         faulty_commands: NDArray | None = None,
         frozen: NDArray | None = None,
     ) -> Context:
-        """What it is called on, for commands (n, T, d_u)."""
+        """The context of commands (n, T, d_u), which the model is conditioned on."""
         ...
 
     def mean(self, context: Context) -> Tensor:
@@ -60,12 +65,12 @@ class Residual(Protocol):
         ...
 
     def save(self, folder: str | Path) -> None:
-        """Write weights and description."""
+        """Write the weights and the description."""
         ...
 
 
 def load_residual(folder: str | Path) -> ResidualModel | SequenceResidual:
-    """The residual model that was saved there, of either kind; InputError where there is none."""
+    """The residual model that `folder` holds, of either kind; InputError if it holds none."""
     if kind_of(folder) == "sequence residual":
         return SequenceResidual.load(folder)
     return ResidualModel.load(folder)

@@ -1,9 +1,9 @@
-"""`SequenceResidual`: the RG per time step (Eq. 6 over t): past u and ŷ in, a law of z_t out.
+"""`SequenceResidual`: the Residual Generator with one z per sample (Eq. 6 over t).
 
-Several members, each a causal network that did not see other parts of the data, make one law. In
-time, z is autoregressive: the normal score of z_t is drawn given that of z_{t-1}. So trajectories
-are coherent while each z_t keeps its law, and nothing learns to copy a z_{t-1} that it will not be
-given when it simulates.
+It is an ensemble of causal networks, each trained without another part of the data, which predict
+the distribution of z_t from the past of u and ŷ. Over time, the normal scores of z_t are an
+autoregression: z is correlated in time while each z_t keeps its predicted distribution, and no
+network is trained with a past z that it does not have in simulation.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from torch import Tensor, nn
 
+from retwin.checks import require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
-from retwin.errors import InputError
 from retwin.nets.mixtures import Blocks, GaussianMixture, MixtureHead
 from retwin.nets.networks import LSTM, NETWORKS, Network, Standardise
 from retwin.nets.training import Fit, Training
@@ -30,32 +30,54 @@ from retwin.serialisation.models import read_model, write_model
 from retwin.update.corrections import OPERATORS, Context, Correction
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["Member", "SequenceMixture", "SequenceResidual", "past", "trusted", "widened"]
+__all__ = ["Member", "SequenceMixture", "SequenceResidual", "past", "shrunk", "widened"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceMixture:
-    """A mixture of Gaussians at every sample, given the past; how it looks and learns.
+    """A mixture of Gaussians at each sample, conditioned on the past.
 
     Parameters
     ----------
-    network: a causal sequence network, `LSTM` or `TCN`, that sums up the past of u and ŷ.
-    features: numbers that it tells the mixture of each sample.
-    components: K of Eq. 6, for each member.
-    dropout: of those numbers.
-    smoothness, boundedness: λ_s and λ_b of Eq. 10, on z̄ in standard units (Eq. 9 over t).
-    members: networks; each is judged on another part of the data, which it does not learn from.
-    block, gap: samples of a part of a record that is held out, and of those beside it that are not
-        learned from either, as they say nearly the same. With as many records as members, whole
-        records are held out.
-    window, burn_in: samples of a window to learn from; those at its begin that only warm the
-        network up, the record's own begin apart.
-    moderation: β of β-NLL (Seitzer et al. 2022): at 0 it is the likelihood, which learns least
-        where it errs most; at 1 the mean learns as by least squares.
-    refit: whether members learn anew from all data once they are judged; else each is kept without
-        what it held out.
-    persistent: whether z_t is drawn given z_{t-1}; else draws are independent in time.
-    training: epochs, rate; a batch is so many windows. None stops early.
+    network : Network
+        Causal sequence network, `LSTM` or `TCN`, that encodes the past of u and ŷ.
+    features : int
+        Width of the encoding, at least 1.
+    components : int
+        K of Eq. 6 for each member, at least 1.
+    dropout : float
+        Dropout of the encoding, from 0 to below 1.
+    smoothness, boundedness : float
+        λ_s and λ_b of Eq. 10, on z̄ in standard units (Eq. 9 over t).
+    members : int
+        Networks of the ensemble, at least 2; each holds out another part of the data.
+    block, gap : int
+        Samples of a held-out part of a record, and samples on either side of it that are not
+        trained on either, since they correlate with it. With at least as many records as members,
+        whole records are held out.
+    window, burn_in : int
+        Samples of a training window, and those at its start that are not in the loss, since the
+        state of the network has not settled, except at the start of a record.
+    moderation : float
+        β of β-NLL, from 0, the likelihood, to 1, at which the gradient of the mean is that of
+        least squares.
+    refit : bool
+        Whether the members are trained anew on all data after the calibration on held-out parts.
+    persistent : bool
+        Whether z_t is drawn given z_{t-1}; otherwise draws are independent in time.
+    training : Training
+        Settings of the training of each member, without early stopping; `batch_size` counts
+        windows.
+
+    Raises
+    ------
+    InputError
+        A setting out of its range.
+
+    References
+    ----------
+    Seitzer et al., "On the pitfalls of heteroscedastic uncertainty estimation with probabilistic
+    neural networks", ICLR 2022.
 
     """
 
@@ -87,22 +109,33 @@ class SequenceMixture:
             and 0 <= self.dropout < 1
             and 0 <= self.moderation <= 1
         )
-        if not sound:
-            raise InputError(
-                "density",
-                expected="members of at least 2, features, components and block of at least 1, "
-                "burn_in below window, dropout and moderation from 0 to 1",
-                got=repr(self),
-                remedy="leave out what you do not need to change",
-            )
+        require(
+            sound,
+            "density",
+            expected="members of at least 2, features, components and block of at least 1, "
+            "burn_in below window, dropout and moderation from 0 to 1",
+            got=repr(self),
+            remedy="leave out what you do not need to change",
+        )
 
 
 CONFIGS: tuple[type, ...] = (SequenceMixture, Training, *NETWORKS)
-"""Those that a model folder may name."""
+"""The kinds of settings that a saved model may name."""
 
 
 class Member(nn.Module):
-    """One causal network with its heads: standardised past in, laws of the blocks of z_t out."""
+    """One network of the ensemble, from the standardised past to distributions of z_t.
+
+    Parameters
+    ----------
+    density : SequenceMixture
+        Settings.
+    inputs : int
+        Channels of u and ŷ together.
+    widths : sequence of int
+        Number of components of each block of z.
+
+    """
 
     def __init__(self, density: SequenceMixture, inputs: int, widths: Sequence[int]) -> None:
         super().__init__()
@@ -116,15 +149,41 @@ class Member(nn.Module):
     def forward(
         self, past: Tensor, shift: Sequence[Tensor], scale: Sequence[Tensor]
     ) -> list[GaussianMixture]:
-        """The law of each block (n, T), in physical units."""
-        told = self.encoder(past)
-        return [head(told, *unit) for head, *unit in zip(self.heads, shift, scale, strict=True)]
+        """The distribution of each block (n, T) for the past (n, T, d), in physical units."""
+        encoded = self.encoder(past)
+        return [head(encoded, *unit) for head, *unit in zip(self.heads, shift, scale, strict=True)]
 
 
 class SequenceResidual(nn.Module):
-    """Call it on a `Context`: out comes a torch `Distribution` over z (n, T, d_z), all members'.
+    """The distribution of z (n, T, d_z) given a `Context`: call it to get a torch distribution.
 
-    Has what a `ResidualModel` has, for an operator with one z per sample.
+    Parameters
+    ----------
+    correction : Correction
+        The operator g, with one z per sample.
+    density : SequenceMixture
+        Settings.
+    inputs, outputs : Channels
+        Channels of the commands and of the outputs.
+
+    Attributes
+    ----------
+    latent : Channels
+        Names and units of the components of z.
+    trust : Tensor
+        (d_z,), factor from 0 to 1 by which means are shrunk towards `shift`.
+    spread : Tensor
+        Factor by which standard deviations are multiplied.
+    persistence : Tensor
+        (d_z,), autoregressive coefficient of the normal scores of z.
+    segmentation, emulated, timing, fitted
+        See `Residual`.
+
+    Raises
+    ------
+    InputError
+        The operator has no z per sample, or an event among its components.
+
     """
 
     bounds: Tensor
@@ -145,13 +204,13 @@ class SequenceResidual(nn.Module):
         super().__init__()
         blocks = correction.heads(inputs, outputs)
         kinds = {block.kind for block in blocks}
-        if correction.resolution != "step" or kinds != {"mixture"}:
-            raise InputError(
-                "correction",
-                expected="an operator with one z per sample, none of it an event",
-                got=repr(correction),
-                remedy="use Additive, or a density such as Mixture for one z per movement",
-            )
+        require(
+            correction.resolution == "step" and kinds == {"mixture"},
+            "correction",
+            expected="an operator with one z per sample, none of it an event",
+            got=repr(correction),
+            remedy="use Additive, or a density such as Mixture for one z per segment",
+        )
         self.correction = correction
         self.density = density
         self.inputs = inputs
@@ -170,7 +229,7 @@ class SequenceResidual(nn.Module):
         self.register_buffer("persistence", torch.zeros(len(self.latent)))
 
     def fresh(self) -> nn.ModuleList:
-        """Members that have learned nothing."""
+        """Members with random initial weights."""
         width = len(self.inputs) + len(self.outputs)
         return nn.ModuleList(
             Member(self.density, width, self.sizes) for _ in range(self.density.members)
@@ -185,7 +244,7 @@ class SequenceResidual(nn.Module):
         faulty_commands: NDArray | None = None,
         frozen: NDArray | None = None,
     ) -> Context:
-        """What this model is called on, for commands (n, T, d_u)."""
+        """The context of commands (n, T, d_u), which the model is conditioned on."""
         parts = Segments.from_commands(commands) if segments is None else segments
         return Context.of(
             surrogate,
@@ -197,53 +256,53 @@ class SequenceResidual(nn.Module):
         )
 
     def forward(self, context: Context) -> Blocks:
-        """q_ψ(z_t | past of u and ŷ): every member as likely as the others."""
-        laws = list(self.laws(past(context)))
-        return Blocks([_together([law[block] for law in laws]) for block in range(len(self.sizes))])
+        """The distribution q_ψ(z_t | past of u and ŷ), members with equal weights."""
+        members = list(self.distributions(past(context)))
+        blocks = range(len(self.sizes))
+        return Blocks([_pooled([member[block] for member in members]) for block in blocks])
 
-    def laws(self, features: Tensor) -> Iterator[list[GaussianMixture]]:
-        """What each member says of the past (n, T, F): a law for each block of z.
+    def distributions(self, features: Tensor) -> Iterator[list[GaussianMixture]]:
+        """Per member, the calibrated distribution of each block for the past (n, T, F)."""
+        shift, trust = self.shift.split(self.sizes), self.trust.split(self.sizes)
+        for member in self.members:
+            yield widened(shrunk(self.predict(member, features), shift, trust), self.spread)
 
-        Believed as far as members proved right where they had not looked.
-        """
-        parts = self.shift.split(self.sizes), self.trust.split(self.sizes)
-        told = (self.told(member, features) for member in self.members)
-        return (widened(trusted(laws, *parts), self.spread) for laws in told)
-
-    def told(self, member: nn.Module, features: Tensor) -> list[GaussianMixture]:
-        """What one member says, believed as it is."""
+    def predict(self, member: nn.Module, features: Tensor) -> list[GaussianMixture]:
+        """The distribution of each block that one member predicts, before calibration."""
         units = self.shift.split(self.sizes), self.scale.split(self.sizes)
-        laws: list[GaussianMixture] = member(self.before(features), *units)
-        return laws
+        blocks: list[GaussianMixture] = member(self.before(features), *units)
+        return blocks
 
     @torch.no_grad()
     def mean(self, context: Context) -> Tensor:
-        """The mean z̄ (n, T, d_z) of Eq. 8, within b."""
+        """The mean z̄ (n, T, d_z) of Eq. 8, clipped at b."""
         return self(context).mean.clamp(-self.bounds, self.bounds)
 
     @torch.no_grad()
     def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:
-        """Draws of z (n, T, d_z), clipped at b: one member for each trajectory, then z_t in turn.
+        """Draws of z (n, T, d_z), clipped at b, each trajectory from one member.
 
-        Which component is drawn, and where in it, has a normal score that is autoregressive with
-        `persistence`; so z_t is distributed as the law says, whatever z_{t-1} was.
+        The normal noise that selects the component, and that within it, is autoregressive with
+        `persistence`, so each z_t has the predicted marginal distribution.
         """
-        laws = list(self.laws(past(context)))
-        n, steps = laws[0][0].batch_shape
-        who = torch.randint(len(laws), (n,), generator=generator)
-        chosen = Blocks(
-            [_picked([law[block] for law in laws], who) for block in range(len(self.sizes))]
+        members = list(self.distributions(past(context)))
+        n, steps = members[0][0].batch_shape
+        chosen = torch.randint(len(members), (n,), generator=generator)
+        drawn_from = Blocks(
+            [_picked([each[block] for each in members], chosen) for block in range(len(self.sizes))]
         )
         first = torch.stack([part[0] for part in self.persistence.split(self.sizes)])
-        which = _persisting(torch.randn(n, steps, len(first), generator=generator), first)
-        where = _persisting(
+        of_components = _autoregressive(
+            torch.randn(n, steps, len(first), generator=generator), first
+        )
+        of_values = _autoregressive(
             torch.randn(n, steps, len(self.latent), generator=generator), self.persistence
         )
-        z = chosen.from_noise(torch.special.ndtr(which), where)
+        z = drawn_from.from_noise(torch.special.ndtr(of_components), of_values)
         return z.clamp(-self.bounds, self.bounds)
 
     def save(self, folder: str | Path) -> None:
-        """Write weights and description, see `retwin.serialisation.models`."""
+        """Write the weights and the description, see `retwin.serialisation.models`."""
         about = {
             "correction": to_config(self.correction, OPERATORS),
             "density": to_config(self.density, CONFIGS),
@@ -257,7 +316,10 @@ class SequenceResidual(nn.Module):
 
     @classmethod
     def load(cls, folder: str | Path) -> SequenceResidual:
-        """Read what `save` wrote; InputError when it is no such model or damaged."""
+        """Read what `save` wrote.
+
+        Raises InputError if the folder holds no such model or is damaged.
+        """
         about, weights = read_model(folder, "sequence residual")
         model = cls(
             from_config(about["correction"], OPERATORS),
@@ -272,53 +334,54 @@ class SequenceResidual(nn.Module):
 
 
 def past(context: Context) -> Tensor:
-    """What the RG may know of each sample: clean commands and nominal output, (n, T, d_u + d_y)."""
+    """The features (n, T, d_u + d_y): commands without faults, and nominal outputs."""
     return torch.cat([context.commands.to(context.nominal), context.nominal], dim=-1)
 
 
-def trusted(
-    laws: Sequence[GaussianMixture], shift: Sequence[Tensor], trust: Sequence[Tensor]
+def shrunk(
+    blocks: Sequence[GaussianMixture], shift: Sequence[Tensor], trust: Sequence[Tensor]
 ) -> list[GaussianMixture]:
-    """The same laws, their means at `shift` plus that share `trust` (d,) of their way from it."""
+    """The mixtures with their means moved to `shift` plus `trust` (d,) times their distance."""
     moved = []
-    for law, middle, share in zip(laws, shift, trust, strict=True):
-        back = (1 - share) * (law.mean - middle)
-        means = law.means - back.unsqueeze(-2)
-        moved.append(GaussianMixture(law.mixture_distribution.logits, means, law.factor))
+    for block, middle, factor in zip(blocks, shift, trust, strict=True):
+        back = (1 - factor) * (block.mean - middle)
+        means = block.means - back.unsqueeze(-2)
+        moved.append(GaussianMixture(block.mixture_distribution.logits, means, block.factor))
     return moved
 
 
-def widened(laws: Sequence[GaussianMixture], spread: Tensor | float) -> list[GaussianMixture]:
-    """The same laws, every component `spread` times as wide."""
+def widened(blocks: Sequence[GaussianMixture], spread: Tensor | float) -> list[GaussianMixture]:
+    """The mixtures with the standard deviations of all components multiplied by `spread`."""
     return [
-        GaussianMixture(law.mixture_distribution.logits, law.means, spread * law.factor)
-        for law in laws
+        GaussianMixture(block.mixture_distribution.logits, block.means, spread * block.factor)
+        for block in blocks
     ]
 
 
-def _together(laws: Sequence[GaussianMixture]) -> GaussianMixture:
-    """One mixture of several, each with the same weight."""
-    logits = [law.mixture_distribution.logits.log_softmax(dim=-1) for law in laws]
+def _pooled(members: Sequence[GaussianMixture]) -> GaussianMixture:
+    """The mixture of several mixtures with equal weights."""
+    logits = [each.mixture_distribution.logits.log_softmax(dim=-1) for each in members]
     return GaussianMixture(
         torch.cat(logits, dim=-1),
-        torch.cat([law.means for law in laws], dim=-2),
-        torch.cat([law.factor for law in laws], dim=-3),
+        torch.cat([each.means for each in members], dim=-2),
+        torch.cat([each.factor for each in members], dim=-3),
     )
 
 
-def _picked(laws: Sequence[GaussianMixture], who: Tensor) -> GaussianMixture:
-    """For each trajectory the law of one of several, `who` (n,)."""
-    row = torch.arange(len(who))
-    told: Any = zip(
-        *((law.mixture_distribution.logits, law.means, law.factor) for law in laws), strict=True
+def _picked(members: Sequence[GaussianMixture], chosen: Tensor) -> GaussianMixture:
+    """For each trajectory the mixture of the member `chosen` (n,)."""
+    row = torch.arange(len(chosen))
+    parts: Any = zip(
+        *((each.mixture_distribution.logits, each.means, each.factor) for each in members),
+        strict=True,
     )
-    return GaussianMixture(*(torch.stack(part)[who, row] for part in told))
+    return GaussianMixture(*(torch.stack(part)[chosen, row] for part in parts))
 
 
-def _persisting(noise: Tensor, persistence: Tensor) -> Tensor:
-    """White noise (n, T, d) as a stationary autoregression of unit variance, φ (d,)."""
+def _autoregressive(noise: Tensor, coefficients: Tensor) -> Tensor:
+    """A stationary first-order autoregression of unit variance from white noise (n, T, d)."""
     made = noise.numpy().astype(np.float64)
-    for component, share in enumerate(persistence.double().tolist()):
-        made[:, 1:, component] *= np.sqrt(1 - share**2)
-        made[..., component] = lfilter([1.0], [1.0, -share], made[..., component], axis=1)
+    for component, coefficient in enumerate(coefficients.double().tolist()):
+        made[:, 1:, component] *= np.sqrt(1 - coefficient**2)
+        made[..., component] = lfilter([1.0], [1.0, -coefficient], made[..., component], axis=1)
     return torch.as_tensor(made).to(noise)

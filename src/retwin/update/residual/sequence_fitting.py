@@ -1,4 +1,4 @@
-"""Fitting the RG per time step: windows, parts held out with a gap, and what those parts tell."""
+"""Fitting the residual model per sample: windows, cross-validation with a gap, calibration."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
-from retwin.errors import InputError
 from retwin.nets.mixtures import Blocks
 from retwin.nets.training import Fit, Loss, isolated, train
 from retwin.progress import Progress
 from retwin.update.corrections import Context, Correction, Discrepancy
-from retwin.update.residual.penalties import penalties
+from retwin.update.residual.penalties import checked_bounds, penalties
 from retwin.update.residual.sequence import (
     SequenceMixture,
     SequenceResidual,
     past,
-    trusted,
+    shrunk,
     widened,
 )
 
-__all__ = ["fit_sequence", "held_parts"]
+__all__ = ["fit_sequence", "held_out_parts"]
 
 SPREADS = np.geomspace(0.5, 4.0, 85)
-"""Factors by which members may prove too wide or too narrow."""
-MIDDLE = 1.6449
-"""Nine tenths of normal scores are smaller."""
-LONGEST = 0.999
-"""Persistence that is never exceeded: beyond, a record shows no end of it."""
+"""Candidates for the factor of the standard deviations, 2.5 % from one to the next."""
+QUANTILE90 = 1.6449
+"""Absolute value that a standard normal variable exceeds with probability 0.1."""
+MAX_PERSISTENCE = 0.999
+"""Largest persistence; beyond it the correlation time exceeds the length of common records."""
 
 
 def fit_sequence(
@@ -48,43 +48,72 @@ def fit_sequence(
     bounds: NDArray | None = None,
     progress: Progress | None = None,
 ) -> SequenceResidual:
-    """The RG of measured records `used`, one at least, whose z* was `found`.
+    """Fit the residual model of measured records, given their discrepancies.
 
-    Its `fitted.figures` tell of parts held out, each judged by the member that did not see it:
-    `rmse_NAME` in the output's unit, beside `rmse_NAME/constant` of a z that is always the mean,
-    `trust_NAME`, `nll`, `coverage90`, and the `spread` that was needed. Trust and spread are chosen
-    on those parts, which flatters them a little.
+    Parameters
+    ----------
+    used : Trajectories
+        Measured records, at least one.
+    correction : Correction
+        The operator g.
+    density : SequenceMixture
+        Settings.
+    context : Context
+        Commands and nominal outputs of the records.
+    found : Discrepancy
+        Their z*.
+    seed : int
+        Seed of initial weights, order of windows and dropout.
+    bounds : NDArray, optional
+        (d_z,), b of Eq. 9; by default 1.25 times the largest |z*|.
+    progress : callable, optional
+        Called with the share of the members that are trained.
+
+    Returns
+    -------
+    SequenceResidual
+        Its `fitted.figures` are of held-out parts, each predicted by the member that did not train
+        on it: `rmse_NAME` in the output's unit, `rmse_NAME/constant` of the mean of z as the
+        prediction, `trust_NAME`, `nll`, `coverage90` and `spread`. Trust and spread are chosen on
+        the same parts, so the figures are slightly optimistic.
+
+    Raises
+    ------
+    InputError
+        A part of the data has no measurement, or a bound is not positive.
+
     """
     with isolated(seed):
         model = SequenceResidual(correction, density, inputs=used.inputs, outputs=used.outputs)
-    known = found.identified.all(dim=-1)
-    data = _Records(past(context), found.z.float(), known, torch.as_tensor(used.lengths))
-    there = torch.arange(used.steps) < data.lengths[:, None]
-    held = held_parts(there, density)
-    if not (held & data.known).flatten(1).any(dim=1).all():
-        raise InputError(
-            "calibration",
-            expected=f"measurements in each of {density.members} parts of the data",
-            got=f"{int(data.known.sum())} measured samples, some parts with none",
-            remedy="give longer records, fewer members, or shorter blocks",
-        )
+    identified = found.identified.all(dim=-1)
+    data = _Records(past(context), found.z.float(), identified, torch.as_tensor(used.lengths))
+    valid = torch.arange(used.steps) < data.lengths[:, None]
+    held_out = held_out_parts(valid, density)
+    require(
+        (held_out & identified).flatten(1).any(dim=1).all(),
+        "calibration",
+        expected=f"measurements in each of {density.members} parts of the data",
+        got=f"{int(identified.sum())} measured samples, some parts with none",
+        remedy="give longer records, fewer members, or shorter blocks",
+    )
     _prepare(model, data, bounds, seed)
-    seen = [data.known & ~_dilated(part, density.gap) for part in held]
-    tell = _told(progress, (1 + density.refit) * len(seen))
-    fits = _trained(model, data, seen, seed, tell)
-    figures = _calibrate(model, data, held)
+    fitted = [identified & ~_dilated(part, density.gap) for part in held_out]
+    report = _counter(progress, (1 + density.refit) * len(fitted))
+    fits = _trained(model, data, fitted, seed, report)
+    figures = _calibrate(model, data, held_out)
     if density.refit:
         with isolated(seed + 1):
             model.members = model.fresh()
-        _start(model, data, seed)
-        fits = _trained(model, data, [data.known] * len(seen), seed + len(seen), tell)
+        _initialise(model, data, seed)
+        every = [identified] * len(fitted)
+        fits = _trained(model, data, every, seed + len(fitted), report)
     model.emulated = used.emulated
     model.fitted = _summary(fits, figures)
     return model.eval()
 
 
-def _told(progress: Progress | None, steps: int) -> Callable[[], None]:
-    """Call it after each of so many steps."""
+def _counter(progress: Progress | None, steps: int) -> Callable[[], None]:
+    """A function that reports progress when it is called after each of `steps` steps."""
     done = count(1)
     return lambda: progress(next(done) / steps) if progress is not None else None
 
@@ -92,48 +121,42 @@ def _told(progress: Progress | None, steps: int) -> Callable[[], None]:
 def _trained(
     model: SequenceResidual,
     data: _Records,
-    seen: Sequence[Tensor],
+    fitted: Sequence[Tensor],
     seed: int,
-    tell: Callable[[], None],
+    report: Callable[[], None],
 ) -> list[Fit]:
-    """Each member trained to the end on what it has `seen` (n, T).
+    """Train each member to the last epoch on the samples `fitted` (n, T).
 
-    None stops early on what it holds out: how much of its mean is to be believed is judged there.
+    The held-out part does not stop the training early, since the member is calibrated on it.
     """
     fits = []
-    for k, (member, part) in enumerate(zip(model.members, seen, strict=True)):
+    for k, (member, part) in enumerate(zip(model.members, fitted, strict=True)):
         windows = data.windows(model.density, part)
         how = model.density.training
         fits.append(train(member, _objective(model), windows, None, how, seed=seed + k))
-        tell()
+        report()
     return fits
 
 
 @dataclass(frozen=True, eq=False)
 class _Records:
-    """What is known of each sample (n, T, F), its z (n, T, d_z), and whether that is known.
-
-    Records have `lengths` (n,); what follows is padding.
-    """
+    """Features (n, T, F), z (n, T, d_z), whether z is identified (n, T), and lengths (n,)."""
 
     features: Tensor
     z: Tensor
-    known: Tensor
+    identified: Tensor
     lengths: Tensor
 
     def windows(self, density: SequenceMixture, usable: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Features, z and flags of windows (m, W); what only warms the network up is not flagged.
-
-        The network starts at rest in each window as it does at a record's begin.
-        """
+        """Features, z and flags of windows (m, W); samples of the burn-in are not flagged."""
         longest = int(self.lengths.max())
         width = min(density.window, longest)
         stride = max(1, (width - density.burn_in) // 2)
         # The last window of a record ends with it.
         last = (self.lengths - width).clamp_min(0)
-        begins = torch.arange(0, longest - width + stride, stride)[:, None]
-        turn, record = (begins < last + stride).nonzero().unbind(dim=1)
-        starts = torch.minimum(begins, last)[turn, record][:, None]
+        grid = torch.arange(0, longest - width + stride, stride)[:, None]
+        row, record = (grid < last + stride).nonzero().unbind(dim=1)
+        starts = torch.minimum(grid, last)[row, record][:, None]
         time = torch.arange(width)
         inside = record[:, None], starts + time
         flags = usable[inside] & ((time >= density.burn_in) | (starts == 0))
@@ -141,53 +164,56 @@ class _Records:
         return self.features[inside][some], self.z[inside][some], flags[some]
 
 
-def held_parts(there: Tensor, density: SequenceMixture) -> Tensor:
-    """(members, n, T) bool: what each member holds out; all of them together hold out everything.
+def held_out_parts(valid: Tensor, density: SequenceMixture) -> Tensor:
+    """The folds of the cross-validation: whole records if there are enough, or else blocks.
 
-    Whole records where there are enough of them, else blocks of samples dealt out in turn, of those
-    that are `there` (n, T) and no padding.
+    Parameters
+    ----------
+    valid : Tensor
+        (n, T) bool, the samples that are no padding.
+    density : SequenceMixture
+        Settings.
+
+    Returns
+    -------
+    Tensor
+        (members, n, T) bool, the samples that each member holds out; together they are all.
+
     """
-    if len(there) >= density.members:
-        turn = (torch.arange(len(there)) % density.members)[:, None].expand_as(there)
+    if len(valid) >= density.members:
+        fold = (torch.arange(len(valid)) % density.members)[:, None].expand_as(valid)
     else:
-        # Not fewer blocks than members, however short a record is.
-        block = min(density.block, max(1, int(there.sum()) // density.members))
-        place = (there.flatten().cumsum(dim=0) - 1).view_as(there)
-        turn = place // block % density.members
-    return turn == torch.arange(density.members)[:, None, None]
+        # A short record has at least as many blocks as there are members.
+        block = min(density.block, max(1, int(valid.sum()) // density.members))
+        place = (valid.flatten().cumsum(dim=0) - 1).view_as(valid)
+        fold = place // block % density.members
+    return fold == torch.arange(density.members)[:, None, None]
 
 
-def _dilated(held: Tensor, gap: int) -> Tensor:
-    """What is held out (n, T), and `gap` samples on either side."""
-    wide = torch.nn.functional.max_pool1d(held.float()[:, None], 2 * gap + 1, 1, gap)
+def _dilated(held_out: Tensor, gap: int) -> Tensor:
+    """The flags (n, T) with `gap` samples more on either side."""
+    wide = torch.nn.functional.max_pool1d(held_out.float()[:, None], 2 * gap + 1, 1, gap)
     return wide[:, 0] > 0
 
 
 @torch.no_grad()
 def _prepare(model: SequenceResidual, data: _Records, bounds: NDArray | None, seed: int) -> None:
-    """Standardise, bound and start the model from the data it is trained on."""
-    values = data.z[data.known]
-    model.before.fit(data.features[data.known])
+    """Take units, bounds and initial heads of the model from the data that it is trained on."""
+    values = data.z[data.identified]
+    model.before.fit(data.features[data.identified])
     model.shift.copy_(values.mean(dim=0))
     largest = values.abs().amax(dim=0).clamp_min(1e-12)
     model.scale.copy_(values.std(dim=0, correction=0).maximum(1e-6 * largest))
     model.bounds.copy_(1.25 * largest)
     if bounds is not None:
-        if np.shape(bounds) != (len(model.latent),) or not (np.asarray(bounds) > 0).all():
-            raise InputError(
-                "bounds",
-                expected=f"one positive bound for each of {', '.join(model.latent.names)}",
-                got=repr(bounds),
-                remedy="leave bounds out to take them from the data",
-            )
-        model.bounds.copy_(torch.as_tensor(bounds, dtype=torch.float32))
-    _start(model, data, seed)
+        model.bounds.copy_(checked_bounds(bounds, model.latent))
+    _initialise(model, data, seed)
 
 
 @torch.no_grad()
-def _start(model: SequenceResidual, data: _Records, seed: int) -> None:
-    """Every head at the clusters of z, whatever the past."""
-    standard = ((data.z[data.known] - model.shift) / model.scale).double()
+def _initialise(model: SequenceResidual, data: _Records, seed: int) -> None:
+    """Start every head at the clusters of z."""
+    standard = ((data.z[data.identified] - model.shift) / model.scale).double()
     for k, member in enumerate(model.members):
         heads: Any = member.heads
         for head, part in zip(heads, standard.split(model.sizes, dim=-1), strict=True):
@@ -199,84 +225,88 @@ def _objective(model: SequenceResidual) -> Loss:
     density = model.density
 
     def loss(member: Any, batch: tuple[Tensor, ...]) -> Tensor:
-        features, z, known = batch
-        law = Blocks(model.told(member, features))
-        width = (law.variance.sqrt() / model.scale).detach().mean(dim=-1)
-        nll = -law.log_prob(z) * width ** (2 * density.moderation)
-        nll = torch.where(known, nll, 0.0).sum() / known.sum().clamp_min(1)
+        features, z, used = batch
+        distribution = Blocks(model.predict(member, features))
+        deviation = (distribution.variance.sqrt() / model.scale).detach().mean(dim=-1)
+        nll = -distribution.log_prob(z) * deviation ** (2 * density.moderation)
+        nll = torch.where(used, nll, 0.0).sum() / used.sum().clamp_min(1)
         return nll + penalties(
-            law.mean, model.bounds, model.scale, known, density.smoothness, density.boundedness
+            distribution.mean,
+            model.bounds,
+            model.scale,
+            used,
+            density.smoothness,
+            density.boundedness,
         )
 
     return loss
 
 
 @torch.no_grad()
-def _calibrate(model: SequenceResidual, data: _Records, held: Tensor) -> dict[str, float]:
-    """What to believe of members, seen where they have not looked; the figures there.
-
-    How much of their means, how wide errors are, and how long they last.
-    """
+def _calibrate(model: SequenceResidual, data: _Records, held_out: Tensor) -> dict[str, float]:
+    """Set trust, spread and persistence from held-out parts; the figures of these parts."""
     model.eval()
-    held = held & data.known
-    plain = [model.told(member, data.features) for member in model.members]
-    means = torch.stack([Blocks(law).mean for law in plain])
-    z = data.z.expand_as(means)[held]
-    trust = _trust(means[held] - model.shift, z - model.shift)
-    model.trust.copy_(trust)
-    plain = [
-        trusted(law, *(each.split(model.sizes) for each in (model.shift, trust))) for law in plain
-    ]
+    held_out = held_out & data.identified
+    predicted = [model.predict(member, data.features) for member in model.members]
+    means = torch.stack([Blocks(blocks).mean for blocks in predicted])
+    z = data.z.expand_as(means)[held_out]
+    model.trust.copy_(_trust(means[held_out] - model.shift, z - model.shift))
+    shift, trust = model.shift.split(model.sizes), model.trust.split(model.sizes)
+    predicted = [shrunk(blocks, shift, trust) for blocks in predicted]
 
-    def likelihood(spread: float) -> float:
-        made = zip(plain, held, strict=True)
-        told = (Blocks(widened(law, spread)).log_prob(data.z)[part].sum() for law, part in made)
-        return float(sum(told))
+    def log_likelihood(spread: float) -> float:
+        parts = zip(predicted, held_out, strict=True)
+        return float(
+            sum(
+                Blocks(widened(blocks, spread)).log_prob(data.z)[part].sum()
+                for blocks, part in parts
+            )
+        )
 
-    spread = max(SPREADS.tolist(), key=likelihood)
+    spread = max(SPREADS.tolist(), key=log_likelihood)
     model.spread.fill_(spread)
-    laws = [Blocks(widened(law, spread)) for law in plain]
-    scores = torch.stack([law.normal_scores(data.z) for law in laws])
+    distributions = [Blocks(widened(blocks, spread)) for blocks in predicted]
+    scores = torch.stack([each.normal_scores(data.z) for each in distributions])
     if model.density.persistent:
-        model.persistence.copy_(_persistence(scores, held))
+        model.persistence.copy_(_persistence(scores, held_out))
     figures = {
-        "samples": float(held.sum()),
-        "nll": -likelihood(spread) / int(held.sum()),
+        "samples": float(held_out.sum()),
+        "nll": -log_likelihood(spread) / int(held_out.sum()),
         "spread": spread,
-        "coverage90": float((scores[held].abs() < MIDDLE).float().mean()),
+        "coverage90": float((scores[held_out].abs() < QUANTILE90).float().mean()),
     }
-    error = torch.stack([law.mean for law in laws])[held] - z
+    error = torch.stack([each.mean for each in distributions])[held_out] - z
     by_name = {
         "rmse_{}": error.square().mean(dim=0).sqrt(),
         "rmse_{}/constant": (z - model.shift).square().mean(dim=0).sqrt(),
-        "trust_{}": trust,
+        "trust_{}": model.trust,
     }
     for label, values in by_name.items():
-        figures |= {
-            label.format(name): value
-            for name, value in zip(model.latent.names, values.tolist(), strict=True)
-        }
+        for name, value in zip(model.latent.names, values.tolist(), strict=True):
+            figures[label.format(name)] = value
     return figures
 
 
-def _trust(told: Tensor, z: Tensor) -> Tensor:
-    """The share of what members told (k, d_z) that comes nearest to z, from 0 to 1, (d_z,).
+def _trust(predicted: Tensor, z: Tensor) -> Tensor:
+    """The factors (d_z,), from 0 to 1, that fit predicted means (k, d_z) to z by least squares.
 
-    A network that learned from one record sees more in it than holds elsewhere; a mean that holds
-    nowhere else is worth nothing.
+    A network trained on one record explains more of it than of others; a mean that explains nothing
+    of held-out parts has the factor 0.
     """
-    return ((told * z).sum(dim=0) / told.square().sum(dim=0).clamp_min(1e-12)).clamp(0.0, 1.0)
+    power = predicted.square().sum(dim=0).clamp_min(1e-12)
+    return ((predicted * z).sum(dim=0) / power).clamp(0.0, 1.0)
 
 
-def _persistence(scores: Tensor, held: Tensor) -> Tensor:
-    """Correlation of neighbouring normal scores (…, T, d_z) where both are `held`, (d_z,)."""
-    both = held[..., 1:] & held[..., :-1]
-    ahead, now = scores[..., 1:, :][both], scores[..., :-1, :][both]
-    power = 0.5 * (ahead.square() + now.square()).sum(dim=0)
-    return ((ahead * now).sum(dim=0) / power.clamp_min(1e-9)).clamp(0.0, LONGEST)
+def _persistence(scores: Tensor, held_out: Tensor) -> Tensor:
+    """Lag-one autocorrelation (d_z,) of normal scores (..., T, d_z) where both are held out."""
+    both = held_out[..., 1:] & held_out[..., :-1]
+    following, current = scores[..., 1:, :][both], scores[..., :-1, :][both]
+    power = 0.5 * (following.square() + current.square()).sum(dim=0)
+    correlation = (following * current).sum(dim=0) / power.clamp_min(1e-9)
+    return correlation.clamp(0.0, MAX_PERSISTENCE)
 
 
 def _summary(fits: list[Fit], figures: dict[str, float]) -> Fit:
-    """What the members' trainings were like, as one."""
+    """One record of the trainings of all members."""
     history = {f"train {k + 1}": fit.history["train"] for k, fit in enumerate(fits)}
     return Fit(figures, history, fits[0].best_epoch, f"{len(fits)} members, {fits[0].reason}")

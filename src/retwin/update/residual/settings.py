@@ -1,4 +1,4 @@
-"""How the residual model looks and learns."""
+"""Settings of the residual model: family of distributions, encoder, training, refinement."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import nn
 
-from retwin.errors import InputError
+from retwin.checks import require, whole
 from retwin.nets.flows import FlowHead
 from retwin.nets.mixtures import MixtureHead
 from retwin.nets.training import Training
@@ -17,12 +17,14 @@ __all__ = ["DENSITIES", "Density", "Flow", "Mixture", "Refinement"]
 
 @dataclass(frozen=True)
 class Refinement:
-    """Fine-tuning of the RG on outputs, after its likelihood: see `refining`.
+    """Settings of the fine-tuning on outputs, after the maximum of the likelihood (`refine`).
 
     Parameters
     ----------
-    draws: simulations of each trajectory that an energy score is estimated from.
-    training: epochs, rate, patience; a batch is so many trajectories.
+    draws : int
+        Simulations of each trajectory from which its energy score is estimated, at least 2.
+    training : Training
+        Settings of the training; `batch_size` counts trajectories.
 
     """
 
@@ -32,23 +34,25 @@ class Refinement:
     )
 
     def __post_init__(self) -> None:
-        if self.draws < 2:
-            raise InputError(
-                "draws", expected="at least 2", got=repr(self.draws), remedy="16 serve well"
-            )
+        whole("draws", self.draws, least=2)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Density(ABC):
-    """What all residual models share: an encoder of the context, and how it learns.
+    """Settings that all families of distributions of z share.
 
     Parameters
     ----------
-    hidden: widths of the shared encoder.
-    dropout: of the encoder.
-    smoothness, boundedness: λ_s and λ_b of Eq. 10, on z in standard units.
-    training: epochs, rate, patience.
-    refinement: fine-tuning on outputs afterwards; None leaves it.
+    hidden : tuple of int
+        Widths of the hidden layers of the encoder of the context.
+    dropout : float
+        Dropout of the encoder, from 0 to below 1.
+    smoothness, boundedness : float
+        λ_s and λ_b of Eq. 10, on z̄ in standard units.
+    training : Training
+        Settings of the training.
+    refinement : Refinement or None
+        Fine-tuning on outputs afterwards; None for none.
 
     """
 
@@ -67,18 +71,17 @@ class Density(ABC):
     refinement: Refinement | None = None
 
     def __post_init__(self) -> None:
-        self._check("dropout", self.dropout, 0 <= self.dropout < 1, "from 0 to below 1")
-
-    @staticmethod
-    def _check(name: str, value: object, sound: bool, expected: str) -> None:
-        if not sound:
-            raise InputError(
-                name, expected=expected, got=repr(value), remedy="leave it out for the default"
-            )
+        require(
+            0 <= self.dropout < 1,
+            "dropout",
+            expected="a number from 0 to below 1",
+            got=self.dropout,
+            remedy="leave it out for the default",
+        )
 
     @abstractmethod
     def head(self, features: int, width: int) -> nn.Module:
-        """From an encoded context (..., features) to a law of `width` components of z."""
+        """The layer from an encoded context (..., features) to a distribution over (..., width)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,9 +90,8 @@ class Mixture(Density):
 
     Parameters
     ----------
-    components: K of Eq. 6, for each head.
-
-    The others are those of `Density`.
+    components : int
+        K of Eq. 6, for each block; at least 1. The other parameters are those of `Density`.
 
     """
 
@@ -97,10 +99,10 @@ class Mixture(Density):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check("components", self.components, self.components >= 1, "at least 1")
+        whole("components", self.components, least=1)
 
     def head(self, features: int, width: int) -> MixtureHead:
-        """A mixture density head."""
+        """The last layer of a mixture density network."""
         return MixtureHead(features, width, self.components)
 
 
@@ -110,10 +112,10 @@ class Flow(Density):
 
     Parameters
     ----------
-    transforms: autoregressive transformations in series.
-    bins: of the splines in them.
-
-    The others are those of `Density`.
+    transforms : int
+        Autoregressive transformations in series, at least 1.
+    bins : int
+        Bins of each spline, at least 2. The other parameters are those of `Density`.
 
     """
 
@@ -122,13 +124,13 @@ class Flow(Density):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check("transforms", self.transforms, self.transforms >= 1, "at least 1")
-        self._check("bins", self.bins, self.bins >= 2, "at least 2")
+        whole("transforms", self.transforms, least=1)
+        whole("bins", self.bins, least=2)
 
     def head(self, features: int, width: int) -> FlowHead:
-        """A head of neural splines."""
+        """The last layer of a network that predicts a neural spline flow."""
         return FlowHead(features, width, transforms=self.transforms, bins=self.bins)
 
 
 DENSITIES: tuple[type, ...] = (Mixture, Flow, Refinement, Training)
-"""Those that a model folder may name, and their parts."""
+"""The kinds of settings that a saved residual model may name."""

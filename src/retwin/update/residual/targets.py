@@ -1,4 +1,4 @@
-"""What the RG learns from: z* of every movement, or draws from its posterior."""
+"""Training data of the residual model: z* of each segment, or draws from its posterior."""
 
 from __future__ import annotations
 
@@ -14,26 +14,34 @@ from retwin.update.residual.model import ResidualModel, describe
 __all__ = ["Targets"]
 
 DRAWS = 20
-"""Draws of z per trajectory from its posterior: together they tell what the outputs do not."""
+"""Draws of z per trajectory from its posterior. They represent the uncertainty that outputs leave;
+with twenty the error of a mean is below a quarter of a standard deviation."""
+MAX_PERSISTENCE = 0.9
+"""Largest persistence, since a few trajectories cannot distinguish a larger one from 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """Features and z of n trajectories of M movements, R draws of each.
+    """Features and z of n trajectories of M segments, R draws of each.
 
     Attributes
     ----------
-    features: (n, M, F), see `describe`.
-    z: (R, n, M, d_z).
-    told: (n, M, d_z) bool, what may be learned from.
-    valid: (n, M) bool, movements that exist.
-    posterior: whether z are draws from a posterior.
+    features : Tensor
+        (n, M, F), see `describe`.
+    z : Tensor
+        (R, n, M, d_z).
+    identified : Tensor
+        (n, M, d_z) bool, the components of z to train on.
+    valid : Tensor
+        (n, M) bool, the segments that exist.
+    posterior : bool
+        Whether z are draws from a posterior.
 
     """
 
     features: Tensor
     z: Tensor
-    told: Tensor
+    identified: Tensor
     valid: Tensor
     posterior: bool
 
@@ -41,7 +49,7 @@ class Targets:
     def of(
         cls, model: ResidualModel, context: Context, found: Discrepancy, *, seed: int
     ) -> Targets:
-        """Those of inferred discrepancies."""
+        """The training data from inferred discrepancies `found`."""
         valid = torch.as_tensor(context.segments.valid)
         if not found.posterior:
             return cls(describe(context), found.z.float()[None], found.identified, valid, False)
@@ -51,37 +59,38 @@ class Targets:
         noise = torch.randn(DRAWS, *found.z.shape, generator=generator, dtype=found.z.dtype)
         drawn = found.z + torch.einsum("nmij,rnmj->rnmi", root, noise)
         for head, part in model.parts():
-            # What is decided, one way or the other, has no width to draw from.
+            # An event is decided; it has no variance.
             if isinstance(head, BernoulliHead):
                 drawn[..., part] = found.z[..., part]
-        told = valid[..., None].expand_as(found.z)
-        return cls(describe(context), (drawn * valid[..., None]).float(), told, valid, True)
+        all_valid = valid[..., None].expand_as(found.z)
+        return cls(describe(context), (drawn * valid[..., None]).float(), all_valid, valid, True)
 
     def examples(self, model: ResidualModel, rows: Tensor) -> tuple[Tensor, ...]:
-        """Features, z, known (…, heads) and valid of some trajectories, every draw an example."""
-        parts = self.told[rows].split(model.sizes, dim=-1)
-        known = torch.stack([part.all(dim=-1) for part in parts], dim=-1)
+        """Features, z, identified (..., heads) and valid; each draw of z is an example."""
+        parts = self.identified[rows].split(model.sizes, dim=-1)
+        identified = torch.stack([part.all(dim=-1) for part in parts], dim=-1)
         repeated = [
             each.expand(len(self.z), *each.shape).flatten(0, 1)
-            for each in (self.features[rows], known, self.valid[rows])
+            for each in (self.features[rows], identified, self.valid[rows])
         ]
         return repeated[0], self.z[:, rows].flatten(0, 1), *repeated[1:]
 
     @torch.no_grad()
     def persistence(self, model: ResidualModel) -> Tensor:
-        """How alike the movements of a trajectory err (d_z,): correlation of their normal scores.
+        """Intraclass correlation (d_z,) of normal scores between the segments of a trajectory.
 
-        One-way analysis of variance, averaged over draws; shrunk where trajectories are few.
+        By one-way analysis of variance, shrunk towards 0 where trajectories are few.
         """
         scores = model.distribution(self.features).normal_scores(self.z)
         score = torch.where(self.valid[..., None], scores, torch.nan).mean(dim=0)
-        enough = self.valid.sum(dim=1) > 1
-        if enough.sum() < 3:
+        several = self.valid.sum(dim=1) > 1
+        if several.sum() < 3:
             return torch.zeros(len(model.latent))
-        score, count = score[enough], self.valid.sum(dim=1)[enough][:, None]
-        own = score.nanmean(dim=1)
-        within = torch.nansum((score - own[:, None]).square(), dim=(0, 1)) / (count - 1).sum()
-        between = (count * (own - own.mean(dim=0)).square()).sum(dim=0) / (len(own) - 1)
+        score, count = score[several], self.valid.sum(dim=1)[several][:, None]
+        mean = score.nanmean(dim=1)
+        within = torch.nansum((score - mean[:, None]).square(), dim=(0, 1)) / (count - 1).sum()
+        between = (count * (mean - mean.mean(dim=0)).square()).sum(dim=0) / (len(mean) - 1)
         size = count.float().mean()
-        alike = (between - within) / (between + (size - 1) * within).clamp_min(1e-9)
-        return (alike * (len(own) - 1) / (len(own) + 3)).nan_to_num(0.0).clamp(0.0, 0.9)
+        correlation = (between - within) / (between + (size - 1) * within).clamp_min(1e-9)
+        shrunk = correlation * (len(mean) - 1) / (len(mean) + 3)
+        return shrunk.nan_to_num(0.0).clamp(0.0, MAX_PERSISTENCE)

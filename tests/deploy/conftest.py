@@ -1,4 +1,4 @@
-"""One bundle for all its tests, of small nets, and its export."""
+"""One bundle of small networks for all its tests, and its export."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ QUICK = Training(max_epochs=8, batch_size=32, learning_rate=3e-3, weight_decay=1
 
 
 @pytest.fixture(scope="session")
-def updated(ibg: rt.Surrogate, case: rt.Case, emulated: rt.Trajectories) -> rt.CorrectedTwin:
-    """With all there is to export: corrections in command space, and a sensor."""
+def exportable(ibg: rt.Surrogate, case: rt.Case, emulated: rt.Trajectories) -> rt.CorrectedTwin:
+    """A corrected twin with everything that can be exported: command space and a sensor."""
     rg = rt.fit_residual(ibg, emulated, case.correction, seed=0)
     return rt.CorrectedTwin(ibg, rg, case="armpi")
 
 
 @pytest.fixture(scope="session")
-def guard(updated: rt.CorrectedTwin, case: rt.Case, emulated: rt.Trajectories) -> Guard:
-    return fit_guard(updated, case, emulated, seed=0, count=900, training=QUICK)
+def guard(exportable: rt.CorrectedTwin, case: rt.Case, emulated: rt.Trajectories) -> Guard:
+    return fit_guard(exportable, case, emulated, seed=0, count=900, training=QUICK)
 
 
 @pytest.fixture(scope="session")
 def bundle(
-    updated: rt.CorrectedTwin, case: rt.Case, guard: Guard, emulated: rt.Trajectories
+    exportable: rt.CorrectedTwin, case: rt.Case, guard: Guard, emulated: rt.Trajectories
 ) -> Bundle:
-    made = rt.generate(updated, case, per_class=20, seed=5)
+    made = rt.generate(exportable, case, per_class=20, seed=5)
     small = rt.CNN(channels=(16, 32))
     cnn = rt.fit_diagnoser(made, small, seed=0, classes=case.classes, training=QUICK)
-    return Bundle.of(case, updated, guard, cnn, data=[emulated], notes={"seed": 0})
+    return Bundle.of(case, exportable, guard, cnn, data=[emulated], notes={"seed": 0})
 
 
 @pytest.fixture(scope="session")
@@ -63,7 +63,7 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
         monkeypatch.setenv("COLUMNS", "200")
         with pytest.raises(SystemExit) as ended:
             main()
-        said = capsys.readouterr()
-        return int(ended.value.code or 0), said.out, said.err
+        printed = capsys.readouterr()
+        return int(ended.value.code or 0), printed.out, printed.err
 
     return run

@@ -1,0 +1,297 @@
+"""`PathFit`: onsets, yaw and postures of n paths with equally many movements, fitted together."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.cases.armpi_fpv.kinematics import YawPitchArm
+from retwin.cases.armpi_fpv.plane import FLOOR, LIMIT, STEP, TIE, TURN, Plane, grid_chain
+from retwin.cases.armpi_fpv.ramps import RAMPS, STRAIGHT, ramp_commands, unit_angles
+from retwin.cases.armpi_fpv.search import free_chain
+
+__all__ = ["PathFit", "path_noise"]
+
+HALF_TURN = TURN // 2
+"""Command units in half a turn."""
+ROUNDING = 1.5e-6
+"""Error in m, above that of rounding the published paths to 1e-6 m per axis."""
+LARGEST_NOISE = 1e-4
+"""Distance in m between samples at rest above which it is not attributed to noise."""
+EXPLAINED = 5e-5
+"""RMS error in m above which a movement counts as not explained."""
+SIMILAR = 2e-3
+"""RMS error in m above which a movement is not similar to one of this arm."""
+REGULARISATION = 1e-14
+"""Weight in m^2 of a straight yaw: far less than that of a single sample off the axis."""
+
+
+def path_noise(path: NDArray) -> NDArray:
+    """Estimate the noise of paths.
+
+    Parameters
+    ----------
+    path : ndarray, shape (n, T, 3)
+        End-effector positions in m.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Distance in m between successive samples at rest; 0 for paths without noise.
+
+    """
+    speed = np.linalg.norm(np.diff(path, axis=1), axis=2)
+    # The arm rests for at least a quarter of its paths.
+    return np.minimum(np.quantile(speed, 0.25, axis=1), LARGEST_NOISE)
+
+
+class PathFit:
+    """The fit of n paths with M movements each.
+
+    Inside, a motor's angle is a number of steps `500 - unit` of 0.24 deg, with the signs of
+    `YawPitchArm`'s angles.
+
+    Parameters
+    ----------
+    path : ndarray, shape (n, T, 3)
+        End-effector positions in m.
+    spans : ndarray of int, shape (n, M, 2)
+        First and last moving step of each movement.
+    arm : YawPitchArm
+        The arm that made the paths.
+
+    Attributes
+    ----------
+    moves : int
+        Movements per path, M.
+    onsets : ndarray, shape (n, M)
+        Onsets in samples.
+    steps : ndarray, shape (n, M + 1, 4)
+        Angles of the motors at the rests in steps.
+    closed, whole : ndarray of bool, shape (n,)
+        See `Recovery`.
+
+    """
+
+    def __init__(self, path: NDArray, spans: NDArray, arm: YawPitchArm) -> None:
+        self.path, self.arm = path, arm
+        self.count, self.moves = spans.shape[:2]
+        self.length = path.shape[1]
+        self.first, self.last = spans[..., 0], spans[..., 1]
+        x, y, z = np.moveaxis(path, 2, 0)
+        rho = np.hypot(x, y)
+        # On the axis the plane of the arm is undetermined; the sample before determines it.
+        self.determined = rho > 2e-5
+        index = np.where(self.determined, np.arange(self.length), -1)
+        index = np.maximum.accumulate(index, axis=1)
+        index = np.where(index < 0, np.argmax(self.determined, axis=1)[:, None], index)
+        yaw = np.take_along_axis(np.arctan2(x, -y), index, axis=1)
+        # Modulo half a turn the plane is continuous: r changes its sign on the axis.
+        yaw = np.unwrap(yaw, period=np.pi, axis=1)
+        middle = (yaw.max(axis=1) + yaw.min(axis=1)) / 2
+        self.yaw = yaw - np.pi * np.rint(middle / np.pi)[:, None]
+        self.radius = x * np.sin(self.yaw) - y * np.cos(self.yaw)
+        self.height = z - arm.base
+        self.steps = np.zeros((self.count, self.moves + 1, 4))
+        self.index = np.zeros((self.count, self.moves, 4), dtype=int)
+        self.whole = np.zeros(self.count, dtype=bool)
+        self.tied = np.zeros((self.count, self.moves), dtype=bool)
+        self._find_onsets()
+
+    def _find_onsets(self) -> None:
+        """Onsets (n, M), and whether ramps count both ends, from partial first and last steps."""
+        row = np.arange(self.count)[:, None]
+        speed = np.linalg.norm(np.diff(self.path, axis=1, append=self.path[:, -1:]), axis=2)
+
+        def part_of_step(step: NDArray, towards: int) -> NDArray:
+            one = np.take_along_axis(speed, step, axis=1)
+            inside = np.clip(step[..., None] + [towards, 2 * towards], 0, self.length - 1)
+            two, three = np.moveaxis(speed[row[:, None], inside.reshape(*step.shape, 2)], 2, 0)
+            return np.clip(one / np.maximum(2 * two - three, 1e-12), 0, 1)
+
+        self.onsets = self.first + 1 - part_of_step(self.first, 1)
+        span = self.last + part_of_step(self.last, -1) - self.onsets
+        spans = np.array(RAMPS)
+        lasts = np.abs(span[..., None] - spans).min(axis=2, initial=9).sum(axis=1)
+        counts = np.abs(span[..., None] - spans + 1).min(axis=2, initial=9).sum(axis=1)
+        self.closed = counts < lasts
+        # A ramp that counts both its ends has them on samples.
+        whole = np.rint(self.onsets)
+        near = self.closed & (np.abs(self.onsets - whole) < 0.1).all(axis=1)
+        self.onsets = np.where(near[:, None], whole, self.onsets)
+
+    def solve(self) -> None:
+        """Fit commands and onsets, repeatedly and with more effort where that can help."""
+        some = np.arange(self.count)
+        for effort in (1, 1, 2, 4):
+            before = self.onsets
+            self._solve(some, effort)
+            self._refine()
+            self.square = (self._error(self.onsets) ** 2).sum(axis=2)
+            self.cost = self._per_movement(self.square)
+            again = (self.cost > self.tolerance[:, None] ** 2).any(axis=1)
+            # More effort does not help where no movement is similar to one of this arm.
+            again &= (self.cost < SIMILAR**2).any(axis=1)
+            if effort == 1 and some.size == self.count:
+                # Commands depend on the onsets, and onsets on the commands.
+                again |= (np.abs(self.onsets - before) > 1e-9).any(axis=1)
+            some = np.flatnonzero(again)
+            if some.size == 0:
+                break
+
+    @property
+    def rms(self) -> NDArray:
+        """RMS error (n,) of the paths in m."""
+        return np.sqrt(self.square.mean(axis=1))
+
+    @property
+    def ambiguous(self) -> NDArray:
+        """Movements (n, M) that are tied, cut off, not explained, or have a mirrored solution."""
+        # Half a turn of yaw away there is a second solution unless it is beyond the motor's range.
+        low, high = self.steps[..., 0].min(axis=1), self.steps[..., 0].max(axis=1)
+        mirrored = (low - HALF_TURN >= -LIMIT) | (high + HALF_TURN <= LIMIT)
+        cut = self.last >= self.length - 2
+        return self.tied | (self.cost > EXPLAINED**2) | cut | mirrored[:, None]
+
+    def _per_movement(self, values: NDArray) -> NDArray:
+        """Mean (n, M) of values (n, T) from just before a movement to just after it."""
+        total = np.cumsum(np.pad(values, ((0, 0), (1, 0))), axis=1)
+        low, high = np.maximum(self.first - 1, 0), np.minimum(self.last + 3, self.length)
+        span = np.take_along_axis(total, high, axis=1) - np.take_along_axis(total, low, axis=1)
+        return span / (high - low)
+
+    def _rests(self) -> tuple[NDArray, NDArray]:
+        """Mean radius and height (n, M + 1, 2) of the rests in m, and their tolerance (n,)."""
+        none = np.zeros((self.count, 1), dtype=int)
+        low = np.concatenate([none, self.last + 1], axis=1)
+        high = np.concatenate([self.first, none + self.length - 1], axis=1)
+        where = []
+        for signal in (self.radius, self.height):
+            total = np.cumsum(np.pad(signal, ((0, 0), (1, 0))), axis=1)
+            sums = np.take_along_axis(total, high + 1, 1) - np.take_along_axis(total, low, 1)
+            where.append(sums / (high + 1 - low))
+        return np.stack(where, axis=2), ROUNDING + path_noise(self.path)
+
+    def _kinks(self) -> NDArray:
+        """Where the path has the kink at the end of a ramp (n, M, 3), well above the tolerance."""
+        plane = np.stack([self.radius, self.height], axis=2)
+        ends = self.onsets[..., None] + np.array(RAMPS) - self.closed[:, None, None]
+        at = np.rint(ends).astype(int)[..., None]
+        row = np.arange(self.count)[:, None, None, None]
+
+        def speed(offsets: tuple[int, ...]) -> NDArray:
+            index = np.clip(at + np.array(offsets), 0, self.length - 1)
+            return np.diff(plane[row, index], axis=3)
+
+        # Without a kink, parabolas through the speed on either side meet at the end of the ramp.
+        weights = np.linalg.pinv(np.vander(np.arange(-5.5, -1), 3))[-1]
+        before, after = speed((-6, -5, -4, -3, -2, -1)), speed((1, 2, 3, 4, 5, 6))
+        jump = np.einsum("nmlkd,k->nmld", before, weights)
+        jump -= np.einsum("nmlkd,k->nmld", after, weights[::-1])
+        return np.linalg.norm(jump, axis=3) > 10 * self.tolerance[:, None, None]
+
+    def _solve(self, rows: NDArray, effort: int) -> None:
+        """Fit the commands of some rows for the present onsets."""
+        until = np.pad(self.first[:, 1:], ((0, 0), (0, 1)), constant_values=self.length - 1)
+        offsets = np.arange(-4, RAMPS[-1] + 6, 2)
+        index = np.floor(self.onsets).astype(int)[..., None] + offsets
+        index = np.clip(index, 0, until[..., None][:, : self.moves])
+        elapsed = index - self.onsets[..., None]
+        spans = np.array(RAMPS) - self.closed[:, None, None]
+        parts = np.clip(elapsed[:, :, None] / spans[..., None], 0, 1)
+        yaw_error = self._yaw_error(index, parts)
+        row = np.arange(self.count)[:, None, None]
+        rests, self.tolerance = self._rests()
+        plane = Plane(
+            self.arm.links, self.radius[row, index], self.height[row, index], parts,
+            rests, self.tolerance, self._kinks(), yaw_error.min(axis=2),
+        )  # fmt: skip
+        plane = plane.rows(rows)
+        whole, found = grid_chain(plane)
+        # A single rest may be near the grid by coincidence, all rests of a path are not.
+        good: NDArray = np.all(found.cost < EXPLAINED**2, axis=1)
+        whole[whole] = good
+        self.whole[rows] = whole
+        free = free_chain(plane.rows(~whole), effort)
+        for some, solution in ((rows[whole], found.rows(good)), (rows[~whole], free)):
+            self.steps[some, :, 1:] = solution.postures.clip(-LIMIT, LIMIT)
+            self.index[some, :, 1:] = solution.lengths
+            self.tied[some] = solution.tied
+        self._set_yaw(rows, parts, yaw_error)
+
+    def _yaw_error(self, index: NDArray, parts: NDArray) -> NDArray:
+        """Mean square error (n, M, 3) in m^2 of the best yaw ramp of each length."""
+        row = np.arange(self.count)[:, None, None]
+        self.weight = np.where(self.determined[row, index], self.radius[row, index] ** 2, 0)
+        self.angle = self.yaw[row, index] / STEP
+        w, y = self.weight[:, :, None], self.angle[:, :, None]
+        a, b = 1 - parts, parts
+        aa, ab, bb = ((w * u * v).sum(-1) for u, v in ((a, a), (a, b), (b, b)))
+        ay, by = (w * a * y).sum(-1), (w * b * y).sum(-1)
+        aa, bb = aa + REGULARISATION, bb + REGULARISATION
+        det = aa * bb - ab**2
+        old, new = (bb * ay - ab * by) / det, (aa * by - ab * ay) / det
+        fit = old[..., None] * a + new[..., None] * b
+        return (w * (y - fit) ** 2).mean(axis=-1) * STEP**2
+
+    def _set_yaw(self, rows: NDArray, parts: NDArray, error: NDArray) -> None:
+        """Ramps and rests of the yaw motor, by weighted least squares over each path."""
+        moves = np.arange(self.moves)
+        parts, error, weight, angle = parts[rows], error[rows], self.weight[rows], self.angle[rows]
+        length = np.argmin(error, axis=2)
+        part = np.take_along_axis(parts, length[..., None, None], axis=2)[:, :, 0]
+        matrix = np.zeros((rows.size, self.moves + 1, self.moves + 1))
+        vector = np.zeros((rows.size, self.moves + 1))
+        hats = (1 - part, part)
+        for i in range(2):
+            vector[:, moves + i] += (weight * hats[i] * angle).sum(axis=2)
+            for j in range(2):
+                matrix[:, moves + i, moves + j] += (weight * hats[i] * hats[j]).sum(axis=2)
+        # Where the data do not determine the yaw, the regularisation makes it straight.
+        inverse = np.linalg.inv(matrix + REGULARISATION * np.eye(self.moves + 1))
+        yaw = (inverse @ vector[..., None])[..., 0]
+        if self.moves == 0:
+            yaw[:, 0] = np.median(self.yaw[rows], axis=1) / STEP * self.determined[rows].any(axis=1)
+        whole = self.whole[rows, None]
+        yaw = np.where(whole, np.rint(yaw), yaw).clip(-LIMIT, LIMIT)
+        self.steps[rows, :, 0] = yaw
+        ordered = np.sort(error, axis=2)
+        noise = ordered[..., 0] + FLOOR
+        moved = np.abs(np.diff(yaw, axis=1)) > np.where(whole, 0, 0.5)
+        # A motor that stays has no ramp.
+        self.index[rows, :, 0] = np.where(moved | ~whole, length, 0)
+        deviation = np.sqrt(np.einsum("nii->ni", inverse)) / STEP
+        uncertain = np.maximum(deviation[:, 1:], deviation[:, :-1]) * np.sqrt(noise) > 0.2
+        self.tied[rows] |= uncertain | (moved & (ordered[..., 1] <= TIE * noise))
+
+    @property
+    def ramps(self) -> NDArray:
+        """Ramp lengths (n, M, 4) in samples."""
+        return np.array(RAMPS)[self.index]
+
+    def commands(self, onsets: NDArray) -> NDArray:
+        """Commands (n, T, 4) in units for onsets (n, M) in samples."""
+        units = STRAIGHT - self.steps
+        return ramp_commands(
+            units[:, 0], units[:, 1:], self.ramps, onsets, self.length, closed=self.closed
+        )
+
+    def _error(self, onsets: NDArray) -> NDArray:
+        """Error (n, T, 3) in m of the forward kinematics."""
+        return self.arm.position(unit_angles(self.commands(onsets))) - self.path
+
+    def _refine(self) -> None:
+        """Gauss-Newton on the onsets; movements do not overlap, so their equations are separate."""
+        difference = 1e-3  # samples
+        for _ in range(2):
+            error = self._error(self.onsets)
+            slope = (self._error(self.onsets + difference) - error) / difference
+            power = self._per_movement((slope**2).sum(axis=2))
+            shift = self._per_movement((slope * error).sum(axis=2)) / np.maximum(power, FLOOR)
+            # A movement that the commands do not explain does not determine its onset.
+            explained = self._per_movement((error**2).sum(axis=2)) < EXPLAINED**2
+            self.onsets = self.onsets - np.where(explained, np.clip(shift, -2, 2), 0)
+        whole = np.rint(self.onsets)
+        fitted = self._per_movement((self._error(self.onsets) ** 2).sum(axis=2))
+        rounded = self._per_movement((self._error(whole) ** 2).sum(axis=2))
+        self.onsets = np.where(rounded <= TIE * fitted + FLOOR, whole, self.onsets)

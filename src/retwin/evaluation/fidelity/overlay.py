@@ -1,0 +1,159 @@
+"""Each trajectory beside the predictive distribution of its commands without a fault."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from retwin.data.segments import Segments
+from retwin.data.trajectories import Channels, Trajectories
+from retwin.progress import Progress
+from retwin.scores.distributions import quantiles
+from retwin.serialisation.files import write_atomically
+from retwin.update.corrected import CorrectedTwin
+from retwin.update.residual import infer_discrepancy, segment
+
+__all__ = ["Overlay", "predictive_overlay"]
+
+_ARRAYS = ("ids", "bands", "z", "deviation", "times")
+
+
+@dataclass(frozen=True, eq=False)
+class Overlay:
+    """Predictive overlay of n trajectories at P samples of d outputs, with at most M segments.
+
+    Attributes
+    ----------
+    latent : Channels
+        Names and units of the k components of z.
+    ids : NDArray
+        Names of the trajectories (n,).
+    bands : NDArray
+        5, 25, 50, 75 and 95 % quantiles of the outputs without a fault (n, 5, P, d).
+    z, deviation : NDArray
+        Inferred discrepancy of each segment under the assumption that there is no fault, and its
+        standard deviation (n, M, k); NaN where the outputs do not identify it.
+    times : NDArray
+        Onset, end of the motion part and end of each segment in s (n, M, 3); NaN for none.
+
+    """
+
+    latent: Channels
+    ids: NDArray
+    bands: NDArray
+    z: NDArray
+    deviation: NDArray
+    times: NDArray
+
+    def save(self, file: str | Path) -> None:
+        """Write an NPZ file; `load` reads it."""
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        latent = np.array([self.latent.names, self.latent.units])
+        with write_atomically(Path(file)) as part:
+            np.savez_compressed(part, allow_pickle=False, latent=latent, **arrays)
+
+    @classmethod
+    def load(cls, file: str | Path) -> Overlay:
+        """Read what `save` wrote."""
+        with np.load(file, allow_pickle=False) as found:
+            latent = Channels(*(tuple(row.tolist()) for row in found["latent"]))
+            return cls(latent, **{name: found[name] for name in _ARRAYS})
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Overlay]) -> Overlay:
+        """Overlays of several sets as one; missing segments are filled with NaN."""
+        segments = max(part.times.shape[1] for part in parts)
+
+        def padded(values: NDArray) -> NDArray:
+            missing = segments - values.shape[1]
+            return np.pad(values, ((0, 0), (0, missing), (0, 0)), constant_values=np.nan)
+
+        return cls(
+            parts[0].latent,
+            np.concatenate([part.ids for part in parts]),
+            np.concatenate([part.bands for part in parts]),
+            *(
+                np.concatenate([padded(getattr(part, name)) for part in parts])
+                for name in ("z", "deviation", "times")
+            ),
+        )
+
+
+def predictive_overlay(
+    twin: CorrectedTwin,
+    trajectories: Trajectories,
+    *,
+    draws: int = 100,
+    seed: int,
+    rate: float,
+    progress: Progress | None = None,
+) -> Overlay:
+    """Simulate each trajectory's commands without a fault, and infer its z without a fault.
+
+    Where there is a fault, outputs leave the bands and z is implausible.
+
+    Parameters
+    ----------
+    twin : CorrectedTwin
+        Calibrated on healthy trajectories.
+    trajectories : Trajectories
+        n measured trajectories with commands, healthy or not.
+    draws : int
+        Simulations of each trajectory.
+    seed : int
+        The same seed gives the same bytes on the same machine.
+    rate : float
+        Sample rate of the bands in Hz; the rate of the trajectories is a whole multiple of it.
+    progress : Progress, optional
+        Called with the share that is done.
+
+    Returns
+    -------
+    Overlay
+        Bands, discrepancies and segment times. z is NaN for corrections per sample.
+
+    """
+    segments = segment(
+        trajectories.commands,
+        twin.surrogate.predict(trajectories.commands),
+        twin.residual.segmentation or "commands",
+    )
+    stride = max(1, round(trajectories.rate / rate))
+    seeds = np.random.SeedSequence(seed).generate_state(len(trajectories)).tolist()
+    bands = []
+    for i, twin_seed in enumerate(seeds):
+        commands = np.repeat(trajectories.commands[[i]], draws, axis=0)
+        bands.append(quantiles(twin.simulate(commands, seed=twin_seed).observed[:, ::stride]))
+        if progress is not None:
+            progress((i + 1) / len(trajectories))
+    z, deviation = _discrepancies(twin, trajectories, segments)
+    times = np.stack([segments.start, segments.settle, segments.stop], axis=-1)
+    return Overlay(
+        twin.residual.correction.latent(twin.inputs, twin.outputs),
+        trajectories.ids,
+        np.stack(bands).astype(np.float32),
+        z.astype(np.float32),
+        deviation.astype(np.float32),
+        np.where(segments.valid[..., None], times / trajectories.rate, np.nan),
+    )
+
+
+def _discrepancies(
+    twin: CorrectedTwin, trajectories: Trajectories, segments: Segments
+) -> tuple[NDArray, NDArray]:
+    """Inferred z and its standard deviation (n, M, k); NaN where it is not identified."""
+    correction = twin.residual.correction
+    if correction.resolution != "segment":
+        latent = correction.latent(twin.inputs, twin.outputs)
+        missing = np.full((*segments.valid.shape, len(latent)), np.nan)
+        return missing, missing
+    _, found = infer_discrepancy(twin.surrogate, trajectories, correction, segments=segments)
+    variance = found.covariance.diagonal(dim1=2, dim2=3).clamp_min(0.0)
+    known = found.identified & torch.as_tensor(segments.valid)[..., None]
+    z = torch.where(known, found.z, torch.nan).numpy()
+    return z, torch.where(known, variance.sqrt(), torch.nan).numpy()

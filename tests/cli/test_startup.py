@@ -1,0 +1,81 @@
+"""Start-up: a command that needs no torch imports none, and takes little processor time."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from retwin.data.io import save
+from retwin.data.trajectories import Trajectories
+
+BARE = "import numpy, pydantic, rich, typer"
+COMMAND = f"""
+{BARE}
+from retwin.cli import main
+sys.argv[0] = "retwin"
+main()
+"""
+MEASURED = """
+import atexit, json, resource, sys
+def report(path=sys.argv.pop(1)):
+    who = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
+    used = [resource.getrusage(each) for each in who]
+    seconds = sum(each.ru_utime + each.ru_stime for each in used)
+    heavy = sorted({"torch", "lightning", "sklearn"} & set(sys.modules))
+    open(path, "w").write(json.dumps([seconds, heavy]))
+atexit.register(report)
+"""
+FACTOR = 12.0
+"""Greatest processor time of a command, in multiples of a bare import, which takes 0.14 s.
+
+Most take 2 to 3; `doctor`, which starts a process that draws, takes 5; a command that imports torch
+takes 20 and more. The rest is room for a busy machine, on which both times vary.
+"""
+
+
+def measured(code: str, words: tuple[str, ...], folder: Path) -> tuple[int, float, list[str]]:
+    """Exit code, seconds of processor time with its children, and heavy packages imported."""
+    command = [sys.executable, "-c", MEASURED + code, str(folder / "used.json"), *words]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    seconds, heavy = json.loads((folder / "used.json").read_text())
+    return done.returncode, seconds, heavy
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with made.npz, a set of trajectories."""
+    outputs = np.zeros((3, 20, 2))
+    made = Trajectories(commands=outputs, nominal=outputs, observed=outputs, rate=10.0)
+    save(made, tmp_path / "made.npz")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (("--version",), 0),
+        (("--help",), 0),
+        (("fit", "--help"), 0),
+        (("twin", "list"), 0),
+        (("twin", "info", "armpi-kinematic"), 0),
+        (("data", "info", "made.npz"), 0),
+        (("data", "convert", "made.npz", "again.npz"), 0),
+        (("data", "fetch", "nonsense"), 2),
+        (("bundle", "verify", "nowhere"), 2),
+        (("report", "nowhere"), 2),
+        (("doctor",), 0),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
+)
+def test_a_command_without_torch_starts_at_once(
+    words: tuple[str, ...], code: int, folder: Path
+) -> None:
+    _, bare, _ = measured(BARE, (), folder)
+    found, seconds, heavy = measured(COMMAND, words, folder)
+    assert (found, heavy) == (code, [])
+    assert seconds < FACTOR * bare

@@ -1,0 +1,97 @@
+"""The catalog: an entry is all that an implementation needs beside its own module."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from retwin.catalog import (
+    CORRECTIONS,
+    DOWNLOADS,
+    FORMATS,
+    SOURCES,
+    Entry,
+    FormatEntry,
+    lookup,
+    make,
+    resolve,
+)
+from retwin.data.io import load, save
+from retwin.data.trajectories import Trajectories
+from retwin.errors import InputError
+
+
+def example() -> Trajectories:
+    values = np.arange(12.0).reshape(2, 3, 2)
+    return Trajectories(values, values, values + 1, rate=10.0)
+
+
+@pytest.fixture
+def text_format(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A format of text files, in a module and an entry of its own."""
+
+    def read(path: Path, *, rate: float | None, **_: Any) -> Trajectories:
+        values = np.loadtxt(path, ndmin=2)[None]
+        return Trajectories(values[..., :0], values, values, rate=rate or 1.0)
+
+    def write(trajectories: Trajectories, path: Path) -> None:
+        np.savetxt(path, trajectories.observed[0])
+
+    module = ModuleType("text_format")
+    module.read, module.write = read, write  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "text_format", module)
+    entry = FormatEntry("numbers as text", "text_format:read", "text_format:write")
+    monkeypatch.setitem(FORMATS, ".txt", entry)  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("text_format")
+def test_a_new_format_is_one_module_and_one_entry(tmp_path: Path) -> None:
+    save(example(), tmp_path / "a.txt")
+    again = load(tmp_path / "a.txt", rate=5.0)
+    np.testing.assert_array_equal(again.observed[0], example().observed[0])
+    assert again.rate == 5.0
+    with pytest.raises(InputError, match=r"ends in \.npz or \.zarr or \.txt"):
+        save(example(), tmp_path / "a.csv")
+    (tmp_path / "a.csv").touch()
+    with pytest.raises(InputError, match=r"a file \*\.mat or \*\.npz or \*\.txt, a folder"):
+        load(tmp_path / "a.csv")
+
+
+def test_an_entry_is_found_by_its_name() -> None:
+    assert lookup(CORRECTIONS, "additive", "correction") is CORRECTIONS["additive"]
+    with pytest.raises(InputError, match=r"correction: expected one of additive, .* got 'warped'"):
+        lookup(CORRECTIONS, "warped", "correction")
+    with pytest.raises(InputError, match="got 3"):
+        make(CORRECTIONS, 3, "correction")  # type: ignore[arg-type]
+
+
+def test_a_target_is_imported_when_it_is_resolved() -> None:
+    assert resolve("math:pi") == pytest.approx(np.pi)
+    assert make({"empty": Entry("builtins:dict", "an empty table")}, "empty", "kind") == {}
+    with pytest.raises(ImportError):
+        resolve("no_such_module:thing")
+    with pytest.raises(AttributeError):
+        resolve("math:no_such_number")
+
+
+def test_every_source_has_one_implementation_and_known_parts() -> None:
+    for name, source in SOURCES.items():
+        given = [source.twin, source.diagnoser, *[" ".join(source.pool)]]
+        assert sum(map(bool, given)) == 1, name
+        assert set(source.pool) <= set(SOURCES), name
+
+
+def test_every_download_states_address_and_digest() -> None:
+    for public in DOWNLOADS.values():
+        assert public.url.startswith("https://")
+        assert len(bytes.fromhex(public.sha256)) == 32
+
+
+def test_a_format_without_a_writer_is_only_read() -> None:
+    with pytest.raises(InputError, match=r"ends in \.npz or \.zarr, got .*\.mat"):
+        save(example(), "a.mat")
