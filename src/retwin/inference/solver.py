@@ -25,8 +25,10 @@ MAX_STEPS = 25
 """Gauss-Newton steps at most."""
 REWEIGHTINGS = 3
 """Times that samples are weighted anew within a step: cheap beside a call of the surrogate."""
-DAMPING = 1e-3
-"""Damping of the first step, relative to the diagonal of the curvature."""
+DAMPING = 1e-6
+"""Damping to begin with, relative to the diagonal of the curvature: next to none."""
+DAMPING_AFTER_FAILURE = 1e-3
+"""Damping at least, after a step that did not decrease the objective."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +126,7 @@ def gauss_newton_step(
     *,
     damping: Tensor | None = None,
     bounds: Bounds | None = None,
+    reweightings: int = REWEIGHTINGS,
 ) -> Step:
     """The step from x (R, P) to the optimum of the linearised problem, samples being reweighted.
 
@@ -133,27 +136,33 @@ def gauss_newton_step(
         Residual (R, K, d) and Jacobian (R, K, d, P) at x.
     damping : Tensor, optional
         (R,), relative to the diagonal of the curvature; 0 by default.
+    bounds : Bounds, optional
+        Limits of x.
+    reweightings : int
+        Times that samples are weighted anew, at least 1.
 
     """
     residual, jacobian = linearised
-    flat = jacobian.flatten(1, 2)
+    # Curvature and slope in one product: what takes time here is to pass through the Jacobian.
+    joined = torch.cat([jacobian, residual[..., None]], dim=-1).flatten(1, 2)
     gradient, move, left = prior.gradient(x), torch.zeros_like(x), residual
     first = None
-    for _ in range(REWEIGHTINGS):
-        weighted = flat * noise.precision(problem, left).flatten(1)[..., None]
-        curvature = weighted.mT @ flat + prior.precision
+    for _ in range(reweightings):
+        weighted = joined * noise.precision(problem, left).flatten(1)[..., None]
+        product = weighted[..., :-1].mT @ joined
+        curvature = product[..., :-1] + prior.precision
         first = curvature if first is None else first
-        slope = gradient + torch.einsum("npq,nq->np", prior.precision, move)
-        slope = (weighted.mT @ left.flatten(1)[..., None])[..., 0] - slope
+        # From x, not from the previous move on.
+        slope = product[..., -1] - gradient
         if damping is not None:
             added = damping[:, None] * curvature.diagonal(dim1=1, dim2=2)
-            slope, curvature = slope - added * move, curvature + torch.diag_embed(added)
-        move = move + _solved(curvature, slope)
-        left = residual - (flat @ move[..., None]).view_as(residual)
+            curvature = curvature + torch.diag_embed(added)
+        move = _solved(curvature, slope)
+        left = _left(joined, move).view_as(residual)
     there = x + move
     if bounds is not None:
         there = bounds.moved(x, move)
-        left = residual - (flat @ (there - x)[..., None]).view_as(residual)
+        left = _left(joined, there - x).view_as(residual)
     predicted = noise.misfit(problem, left).sum(dim=1) + prior.energy(there)
     return Step(there, predicted, first)  # type: ignore[arg-type]
 
@@ -166,6 +175,7 @@ def solve(
     *,
     bounds: Bounds | None = None,
     minimum_evidence: Tensor | None = None,
+    reweightings: int = REWEIGHTINGS,
 ) -> Solution:
     """The most probable latent variables, from `start` (R, P) on.
 
@@ -183,6 +193,9 @@ def solve(
         (R,), log evidence; a row is given up when its second or a later step is not predicted to
         reach that much. Steps that are damped more than the first one predict too little to be
         judged by.
+    reweightings : int
+        Times that samples are weighted anew within a step, at least 1: fewer where the Jacobian
+        costs less than that.
 
     """
     x, linearised = start, problem.linearised(start)
@@ -194,7 +207,14 @@ def solve(
     rows, damping = torch.arange(len(x)), torch.full_like(energy, DAMPING)
     for count in range(MAX_STEPS + 1):
         step = gauss_newton_step(
-            problem, prior, noise, x, linearised, damping=damping, bounds=bounds
+            problem,
+            prior,
+            noise,
+            x,
+            linearised,
+            damping=damping,
+            bounds=bounds,
+            reweightings=reweightings,
         )
         occam = 0.5 * (prior.log_determinant - torch.linalg.slogdet(step.curvature)[1])
         done = (energy - step.objective < TOLERANCE) | (count == MAX_STEPS)
@@ -220,8 +240,14 @@ def solve(
         x = torch.where(better[:, None], trial, x)
         energy = torch.where(better, there, energy)
         linearised = _chosen(better, tried, linearised)
-        damping = (damping * torch.where(better, 0.25, 8.0)).clamp(1e-9, 1e6)
+        raised = (8 * damping).clamp(DAMPING_AFTER_FAILURE, 1e6)
+        damping = torch.where(better, (damping / 4).clamp_min(1e-9), raised)
     return found
+
+
+def _left(joined: Tensor, move: Tensor) -> Tensor:
+    """Residual (R, K d) of the linearised problem after a move (R, P)."""
+    return (joined @ torch.cat([-move, torch.ones_like(move[:, :1])], dim=1)[..., None])[..., 0]
 
 
 def _chosen(

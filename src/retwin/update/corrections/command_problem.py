@@ -332,7 +332,7 @@ class CommandProblem:
         rows = torch.arange(n).repeat_interleave(len(moves))
         x = (self.per_segment(x)[:, None] + moves).flatten(0, 1)
         commands = effective_commands(
-            self.reference[rows],
+            self.reference,
             self.segments[rows.numpy()],
             torch.cat([x, self.missed[rows]], dim=-1),
             self._times[rows],

@@ -22,7 +22,7 @@ from retwin.update.corrections.path_problem import MAX_STEP, PathProblem, path_a
 
 __all__ = ["DelayOffset"]
 
-ROUNDS = 6
+ROUNDS = 5
 """Times that the noise is estimated anew, and z with it."""
 TRAJECTORIES_PER_BATCH = 128
 """Trajectories inferred together, which bounds memory."""
@@ -104,12 +104,13 @@ class DelayOffset:
         z[..., 1:] = problem.first_offset(self.delay_range[1])
         z[..., 0] = problem.first_delay(z.flatten(1), self.delay_range)
         problem = problem.with_motion(z[..., 0])
+        bounds = self._bounds(problem)
         belief = self._learned(problem, problem.residual(z.flatten(1)))
         solution, belief = expectation_maximisation(
             Solution.of_prior(belief[1], z.flatten(1)),
             belief,
             infer=lambda found, belief: solve(
-                problem, belief[1], belief[0], found.x, bounds=self._bounds(problem)
+                problem, belief[1], belief[0], found.x, bounds=bounds, reweightings=1
             ),
             learn=lambda found, _: self._learned(problem, problem.residual(found.x)),
             rounds=ROUNDS,

@@ -22,7 +22,8 @@ def effective_commands(
     Parameters
     ----------
     reference : Tensor
-        (n, T, d_u), the commands that were sent, faults on them included.
+        (n, T, d_u), the commands that were sent, faults on them included; or (n / r, T, d_u), where
+        each row serves r successive rows of the other arguments.
     segments : Segments
         M at most.
     z : Tensor
@@ -39,7 +40,7 @@ def effective_commands(
         (n, S, d_u), differentiable in z.
 
     """
-    times = times.to(z.dtype).expand(len(reference), -1)
+    times = times.to(z.dtype).expand(len(z), -1)
     if frozen is None:
         return _moving(reference, segments, z, times)
     since = frozen.to(z.dtype)
@@ -53,19 +54,19 @@ def _moving(reference: Tensor, segments: Segments, z: Tensor, times: Tensor) -> 
     """The effective commands of actuators that no fault holds, at `times` (n, S)."""
     width = reference.shape[2]
     if not z.shape[1]:
-        return interpolate(reference, times)
+        return _repeated(reference, times)
     delay, offset, missed = z.split([1, width, width], dim=-1)
     start, settle = (torch.as_tensor(t, dtype=z.dtype) for t in (segments.start, segments.settle))
     count = torch.as_tensor(segments.valid).sum(dim=1, keepdim=True)
-    first, last = interpolate(reference, start), interpolate(reference, settle)  # (n, M, d_u)
+    first, last = _repeated(reference, start), _repeated(reference, settle)  # (n, M, d_u)
     # The error of every actuator after each segment; before the first one there is none.
-    error = [torch.zeros_like(reference[:, 0])]
+    error = [torch.zeros_like(offset[:, 0])]
     for m in range(z.shape[1]):
         stays = first[:, m] + error[-1] - last[:, m]
         error.append(offset[:, m] + missed[:, m] * (stays - offset[:, m]))
     errors = torch.stack(error, dim=1)  # (n, 1 + M, d_u)
     source = Knots.of(segments, delay[..., 0], times).source_time()
-    undelayed = interpolate(reference, source)
+    undelayed = _repeated(reference, source)
     index = torch.searchsorted(start, source.detach().contiguous(), right=True).minimum(count)
     segment = (index - 1).clamp_min(0)
     a, b = gather_samples(first, segment), gather_samples(last, segment)
@@ -81,3 +82,11 @@ def _moving(reference: Tensor, segments: Segments, z: Tensor, times: Tensor) -> 
     before, after = gather_samples(errors, segment), gather_samples(errors, segment + 1)
     current = before + share * (after - before)
     return undelayed + torch.where(index[..., None] > 0, current, torch.zeros_like(current))
+
+
+def _repeated(reference: Tensor, times: Tensor) -> Tensor:
+    """The reference (n / r, T, d_u) at `times` (n, S): (n, S, d_u), without r copies of it."""
+    if len(reference) == len(times):
+        return interpolate(reference, times)
+    rows = times.reshape(len(reference), -1)
+    return interpolate(reference, rows).reshape(*times.shape, -1)
