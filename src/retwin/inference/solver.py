@@ -145,14 +145,13 @@ def gauss_newton_step(
     residual, jacobian = linearised
     # Curvature and slope in one product: what takes time here is to pass through the Jacobian.
     joined = torch.cat([jacobian, residual[..., None]], dim=-1).flatten(1, 2)
-    gradient, move, left = prior.gradient(x), torch.zeros_like(x), residual
-    first = None
-    for _ in range(reweightings):
+    gradient, left = prior.gradient(x), residual
+    for count in range(reweightings):
         weighted = joined * noise.precision(problem, left).flatten(1)[..., None]
         product = weighted[..., :-1].mT @ joined
         curvature = product[..., :-1] + prior.precision
-        first = curvature if first is None else first
-        # From x, not from the previous move on.
+        if not count:
+            undamped = curvature
         slope = product[..., -1] - gradient
         if damping is not None:
             added = damping[:, None] * curvature.diagonal(dim1=1, dim2=2)
@@ -164,7 +163,7 @@ def gauss_newton_step(
         there = bounds.moved(x, move)
         left = _left(joined, there - x).view_as(residual)
     predicted = noise.misfit(problem, left).sum(dim=1) + prior.energy(there)
-    return Step(there, predicted, first)  # type: ignore[arg-type]
+    return Step(there, predicted, undamped)
 
 
 def solve(
