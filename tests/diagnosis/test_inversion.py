@@ -66,12 +66,12 @@ def at_rest(commands: np.ndarray) -> tuple[CommandProblem, np.ndarray]:
 def test_evidence_is_that_of_a_gaussian() -> None:
     """Laplace's approximation is exact where nothing is curved and the noise has no tails."""
     rng = np.random.default_rng(0)
-    problem, movement = at_rest(SAMPLER.sample(1, rng=rng))
+    problem, segment = at_rest(SAMPLER.sample(1, rng=rng))
     segments, size = problem.valid.shape[1], 3 * problem.valid.shape[1]
     noise = Noise(torch.full((2, 3), 0.07), torch.ones(2, dtype=torch.float64), StudentT(1e9))
-    turn = np.zeros((len(movement) * 3, size))
-    for s, m in enumerate(movement):
-        turn[3 * s : 3 * s + 3, 3 * m + 1 : 3 * m + 3] = MAP
+    design = np.zeros((len(segment) * 3, size))
+    for s, m in enumerate(segment):
+        design[3 * s : 3 * s + 3, 3 * m + 1 : 3 * m + 3] = MAP
     residual = problem.residual(problem.zero)[0].numpy().ravel()
     differences = []
     for width in (0.02, 0.5):
@@ -83,15 +83,17 @@ def test_evidence_is_that_of_a_gaussian() -> None:
             torch.full((1, segments, 2), -40.0, dtype=torch.float64),
         )
         found = fitted(problem, prior, noise, problem.zero)
-        gaussian = multivariate_normal(cov=turn @ covariance @ turn.T + 0.07**2 * np.eye(len(turn)))
+        gaussian = multivariate_normal(
+            cov=design @ covariance @ design.T + 0.07**2 * np.eye(len(design))
+        )
         differences.append(float(found.evidence[0]) - gaussian.logpdf(residual))
-        gain = covariance @ turn.T @ np.linalg.inv(gaussian.cov_object.covariance)
+        gain = covariance @ design.T @ np.linalg.inv(gaussian.cov_object.covariance)
         np.testing.assert_allclose(found.x.numpy().ravel(), gain @ residual, atol=1e-4)
         np.testing.assert_allclose(
-            found.solution.covariance[0].numpy(), covariance - gain @ turn @ covariance, atol=1e-5
+            found.solution.covariance[0].numpy(), covariance - gain @ design @ covariance, atol=1e-5
         )
     # What both have in common is the density of the noise at 0.
-    common = len(turn) * np.log(0.07 * np.sqrt(2 * np.pi))
+    common = len(design) * np.log(0.07 * np.sqrt(2 * np.pi))
     np.testing.assert_allclose(differences, common, atol=1e-3)
 
 
@@ -121,7 +123,7 @@ def test_correlated_noise_is_learned_at_every_polling_phase() -> None:
 
 @pytest.mark.parametrize("mean", [(25.0, -30.0), (3.0, 20.0), (0.0, -9.0)])
 def test_limits_of_a_bias_are_integrated(mean: tuple[float, float]) -> None:
-    """Against a fine grid over the four boxes of two movements."""
+    """Against a fine grid over the four boxes of two segments."""
     covariance = np.array([[16.0, 9.0], [9.0, 25.0]])
     width, low, high = 32.0, 10.0, 50.0
     drawn = draw_biases(
@@ -137,10 +139,10 @@ def test_limits_of_a_bias_are_integrated(mean: tuple[float, float]) -> None:
     mass = multivariate_normal(mean, covariance).pdf(grid) / believed / (2 * (high - low)) ** 2
     np.testing.assert_allclose(drawn.gain[0], np.log(mass.sum() * 0.01), atol=0.03)
     average = (grid * mass[..., None]).sum(axis=(0, 1)) / mass.sum()
-    told = drawn.summary(0.9)[0]
-    np.testing.assert_allclose(told[:, 0], average, atol=0.5)
-    assert (told[:, 1] <= told[:, 0]).all()
-    assert (told[:, 0] <= told[:, 2]).all()
+    summary = drawn.summary(0.9)[0]
+    np.testing.assert_allclose(summary[:, 0], average, atol=0.5)
+    assert (summary[:, 1] <= summary[:, 0]).all()
+    assert (summary[:, 0] <= summary[:, 2]).all()
 
 
 TOY: dict[str, rt.Fault | None] = {
@@ -151,17 +153,17 @@ TOY: dict[str, rt.Fault | None] = {
 
 
 def toy(count: int, label: str, seed: int) -> tuple[rt.Trajectories, list, np.ndarray]:
-    """A linear system of two actuators that come late and end off their targets."""
+    """A linear system of two actuators with delays and offsets."""
     rng = np.random.default_rng(seed)
     commands = SAMPLER.sample(count, rng=rng)
     segments = rt.Segments.from_commands(commands)
     faults = draw_faults([TOY[label]] * count, segments, seed)
-    told = torch.tensor(faulty_commands(commands, faults, segments), dtype=torch.float64)
+    faulty = torch.tensor(faulty_commands(commands, faults, segments), dtype=torch.float64)
     shape = segments.start.shape
     z = [rng.normal(4, 0.5, (*shape, 1)), rng.normal(0, 0.02, (*shape, 2)), np.zeros((*shape, 2))]
     frozen = torch.tensor(frozen_from(faults, *commands.shape[1:]))
     latent = torch.tensor(np.concatenate(z, axis=2))
-    done = effective_commands(told, segments, latent, torch.arange(400), frozen).numpy()
+    done = effective_commands(faulty, segments, latent, torch.arange(400), frozen).numpy()
     outputs = (done @ MAP.T)[:, np.arange(400) // 10 * 10]
     noise = rng.normal(0, 0.004, (count, 40, 3)).repeat(10, axis=1)
     mask = np.zeros(outputs.shape, dtype=bool)
@@ -260,13 +262,13 @@ def test_intervals_of_severities_cover(diagnosis: Diagnosis, arm: tuple) -> None
     each, (_, drawn, hidden) = np.arange(len(truth)), arm
     biased, stuck = np.flatnonzero(truth >= 5), np.flatnonzero((truth > 0) & (truth < 5))
     bias = np.array([drawn[i].bias for i in biased])
-    told = [part[each, truth][biased] for part in vars(diagnosis.bias).values()]
-    assert np.abs(told[0] - bias).mean() < 8.0, "2 degrees; knowing nothing gives 30 units"
-    assert 0.8 <= ((told[1] <= bias) & (bias <= told[2])).mean() <= 1.0
+    estimate = [part[each, truth][biased] for part in vars(diagnosis.bias).values()]
+    assert np.abs(estimate[0] - bias).mean() < 8.0, "2 degrees; knowing nothing gives 30 units"
+    assert 0.8 <= ((estimate[1] <= bias) & (bias <= estimate[2])).mean() <= 1.0
     level = hidden["angles"][stuck, -1, truth[stuck] - 1]
-    told = [part[each, truth][stuck] for part in vars(diagnosis.level).values()]
-    assert np.abs(told[0] - level).mean() < 4.0
-    assert ((told[1] <= level) & (level <= told[2])).mean() >= 0.7
+    estimate = [part[each, truth][stuck] for part in vars(diagnosis.level).values()]
+    assert np.abs(estimate[0] - level).mean() < 4.0
+    assert ((estimate[1] <= level) & (level <= estimate[2])).mean() >= 0.7
     assert (diagnosis.onset.value[stuck, truth[stuck]] == 49).all()
 
 
@@ -288,7 +290,7 @@ def played(inversion: InversionDiagnoser, case: rt.Case, z: Tensor) -> rt.Trajec
 
 
 def test_a_missed_movement_is_no_fault(inversion: InversionDiagnoser, case: rt.Case) -> None:
-    """Stuck and missed differ by persistence: one movement is no more than a discrepancy."""
+    """Stuck and missed differ by persistence: one segment is no more than a discrepancy."""
     z = torch.zeros(4, 5, 9)
     z[..., 0] = 4.5
     z[torch.arange(4), torch.tensor([1, 2, 3, 4]), 5 + torch.arange(4)] = 1.0

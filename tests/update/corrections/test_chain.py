@@ -30,19 +30,19 @@ def arrays(made: rt.Trajectories) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_between_readings_a_record_tells_nothing(exact, measured: rt.Trajectories) -> None:
-    """The chain finds the readings itself: the same as being told where they are."""
+    """The chain finds the samples itself: the same as if their places were given."""
     context = context_of(exact, measured)
     observed, mask = arrays(measured)
-    told = mask.clone()
-    told[:] = False
-    told[:, ::POLL] = mask[:, ::POLL]
-    ours, truth = (
+    sampled = mask.clone()
+    sampled[:] = False
+    sampled[:, ::POLL] = mask[:, ::POLL]
+    found, truth = (
         ROBOT.infer(context, observed, mask),
-        rt.CommandSpace().infer(context, observed, told),
+        rt.CommandSpace().infer(context, observed, sampled),
     )
-    torch.testing.assert_close(ours.z, truth.z)
-    torch.testing.assert_close(ours.covariance, truth.covariance)
-    assert sample_mask(ROBOT, observed, mask).equal(told)
+    torch.testing.assert_close(found.z, truth.z)
+    torch.testing.assert_close(found.covariance, truth.covariance)
+    assert sample_mask(ROBOT, observed, mask).equal(sampled)
 
 
 def test_the_sensor_is_fitted_with_z(exact, measured: rt.Trajectories) -> None:

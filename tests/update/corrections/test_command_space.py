@@ -27,9 +27,11 @@ def context_of(exact, commands: np.ndarray, faults: list | None = None) -> rt.Co
     if faults is None:
         return rt.Context.of(exact, commands, segments, rate=100.0)
     drawn = draw_faults(faults, segments, 0)
-    told = faulty_commands(commands, drawn, segments)
+    faulty = faulty_commands(commands, drawn, segments)
     frozen = frozen_from(drawn, *commands.shape[1:])
-    return rt.Context.of(exact, commands, segments, rate=100.0, faulty_commands=told, frozen=frozen)
+    return rt.Context.of(
+        exact, commands, segments, rate=100.0, faulty_commands=faulty, frozen=frozen
+    )
 
 
 def polled(n: int, steps: int = 1000) -> Tensor:
@@ -59,14 +61,14 @@ def drawn(shape: tuple[int, int], *, missed: float = 0.05, seed: int = 0) -> Ten
 
 
 def test_it_does_what_the_emulated_arm_does(commands: np.ndarray) -> None:
-    """Against the emulator's own loop over movements, written apart."""
+    """Against the emulator's own loop over segments, written apart."""
     segments = rt.Segments.from_commands(commands)
     z = drawn(segments.start.shape, missed=0.2)
     when = torch.arange(1000.0, dtype=torch.float64)
-    ours = effective_commands(torch.tensor(commands, dtype=torch.float64), segments, z, when)
+    effective = effective_commands(torch.tensor(commands, dtype=torch.float64), segments, z, when)
     parts = z.numpy()
     truth = {"delay": parts[..., 0], "offset": parts[..., 1:5], "missed": parts[..., 5:] > 0}
-    np.testing.assert_allclose(ours.numpy(), _effective(commands, segments, truth), atol=1e-3)
+    np.testing.assert_allclose(effective.numpy(), _effective(commands, segments, truth), atol=1e-3)
 
 
 def test_a_missed_movement_is_caught_up_with_the_next(exact) -> None:
@@ -77,9 +79,9 @@ def test_a_missed_movement_is_caught_up_with_the_next(exact) -> None:
     z[0, 0, 5 + 1] = 1.0
     when = torch.tensor([0.0, 100, 300, 380, 500], dtype=torch.float64)
     segments = rt.Segments.from_commands(commands)
-    told = effective_commands(torch.tensor(commands), segments, z, when)
-    np.testing.assert_allclose(told[0, :, 1], [500, 500, 500, 590, 680], atol=1e-6)
-    assert (told[0, :, [0, 2, 3]] == 500).all()
+    effective = effective_commands(torch.tensor(commands), segments, z, when)
+    np.testing.assert_allclose(effective[0, :, 1], [500, 500, 500, 590, 680], atol=1e-6)
+    assert (effective[0, :, [0, 2, 3]] == 500).all()
 
 
 def test_a_stuck_actuator_stays_where_z_had_brought_it(exact, commands: np.ndarray) -> None:
@@ -94,17 +96,17 @@ def test_a_stuck_actuator_stays_where_z_had_brought_it(exact, commands: np.ndarr
 
 @pytest.mark.parametrize("memoryless", [True, False])
 def test_some_samples_are_those_of_the_whole(exact, commands: np.ndarray, memoryless: bool) -> None:
-    """Also of a surrogate that must be told all that came before."""
+    """Also of a surrogate that depends on all earlier commands."""
 
     class Twin:
         asked = 0
 
-        def __call__(self, told: Tensor) -> Tensor:
-            return exact(told) if memoryless else exact(told).cumsum(dim=1)
+        def __call__(self, commands: Tensor) -> Tensor:
+            return exact(commands) if memoryless else exact(commands).cumsum(dim=1)
 
-        def predict(self, told: np.ndarray) -> np.ndarray:
+        def predict(self, commands: np.ndarray) -> np.ndarray:
             self.asked += 1
-            return self(torch.tensor(told)).numpy()
+            return self(torch.tensor(commands)).numpy()
 
     twin = Twin()
     twin.memoryless = memoryless  # type: ignore[attr-defined]
@@ -117,33 +119,33 @@ def test_some_samples_are_those_of_the_whole(exact, commands: np.ndarray, memory
     assert twin.asked == 1, "nobody asked what the outputs would be without z"
 
 
-def lateness(angles: np.ndarray, commands: np.ndarray, segments: rt.Segments) -> np.ndarray:
-    """How late the joints were, (n, M) in samples, seen on themselves; NaN where none moved.
+def joint_delay(angles: np.ndarray, commands: np.ndarray, segments: rt.Segments) -> np.ndarray:
+    """Delay of the joints, (n, M) in samples, measured on themselves; NaN where none moved.
 
-    A joint's delay is the area between the shares of its way that it was told to have gone and that
-    it has gone; joints count by the square of their way, as in least squares.
+    A joint's delay is the area between the shares of its way that were commanded and covered;
+    joints count by the square of their way, as in least squares.
     """
-    late = np.full(segments.start.shape, np.nan)
+    delay = np.full(segments.start.shape, np.nan)
     for i, m in np.argwhere(segments.valid):
         begin, stop = int(segments.start[i, m]), int(np.ceil(segments.stop[i, m]))
-        path, told = angles[i, begin:stop], commands[i, begin:stop].astype(float)
-        way, meant = path[-1] - path[0], told[-1] - told[0]
+        path, command = angles[i, begin:stop], commands[i, begin:stop].astype(float)
+        way, meant = path[-1] - path[0], command[-1] - command[0]
         moved = np.minimum(np.abs(way), np.abs(meant)) > 20
         if moved.any():
-            behind = ((told - told[0])[:, moved] / meant[moved]).sum(axis=0)
+            behind = ((command - command[0])[:, moved] / meant[moved]).sum(axis=0)
             behind -= ((path - path[0])[:, moved] / way[moved]).sum(axis=0)
-            late[i, m] = np.average(behind, weights=way[moved] ** 2)
-    return late
+            delay[i, m] = np.average(behind, weights=way[moved] ** 2)
+    return delay
 
 
 def test_the_ruler_of_delays_is_straight(case: rt.Case, commands: np.ndarray) -> None:
-    """Where servos have neither dead zone nor play, joints are as late as was drawn."""
+    """Where servos have neither dead zone nor play, joints are delayed as was drawn."""
     hidden: dict[str, np.ndarray] = {}
     tight = replace(case.emulator, dead_zone=0.0, backlash=0.0, missed=0.0)
     tight.simulate(commands, seed=3, hidden=hidden)
-    late = lateness(hidden["angles"], commands, rt.Segments.from_commands(commands))
+    delay = joint_delay(hidden["angles"], commands, rt.Segments.from_commands(commands))
     drawn_delay = hidden["delay"] + 100 * KINEMATIC.lag.seconds
-    np.testing.assert_allclose(late, drawn_delay, atol=0.05)
+    np.testing.assert_allclose(delay, drawn_delay, atol=0.05)
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +169,7 @@ def understood(exact, case: rt.Case) -> dict[str, np.ndarray]:
         "offset error": (z[..., 1:5] - (reached - targets))[good],
         "offset": (reached - targets)[good],
         "offset deviation": deviation[..., 1:5][good],
-        "delay error": z[..., 0] - lateness(hidden["angles"], commands, segments),
+        "delay error": z[..., 0] - joint_delay(hidden["angles"], commands, segments),
         "delay": hidden["delay"],
         "delay deviation": deviation[..., 0],
     }
@@ -213,7 +215,7 @@ def test_what_the_outputs_do_not_tell_is_said(exact, commands: np.ndarray) -> No
 
 
 def test_a_fault_does_not_pass_for_a_discrepancy(exact, commands: np.ndarray) -> None:
-    """The bias of a faulty motor is told as severity, and leaves the offsets alone."""
+    """The bias of a faulty motor is its severity, and leaves the offsets alone."""
     faults = [rt.ActuatorBias(0, bias=(30.0, -20.0, 40.0, -35.0, 25.0)), *[None] * 11]
     truth = context_of(exact, commands, faults)
     z = drawn(truth.segments.start.shape, missed=0.0)

@@ -30,7 +30,7 @@ def everything(outputs: Tensor) -> Tensor:
     return torch.ones(outputs.shape, dtype=torch.bool)
 
 
-def movements(n: int) -> rt.Segments:
+def segments_of(n: int) -> rt.Segments:
     start = np.tile([50.0, 250.0, 450.0], (n, 1))
     stop = np.tile([250.0, 450.0, 600.0], (n, 1))
     return rt.Segments(start, start + 60, stop, np.ones((n, 3), dtype=bool), STEPS)
@@ -63,7 +63,7 @@ def test_errors_glitches_and_rounding_are_found_again() -> None:
     )  # fmt: skip
     path = paths(n)
     record = made.read(path, generator())
-    found = rt.SampledSensor().fitted(record, everything(record), path, movements(n))
+    found = rt.SampledSensor().fitted(record, everything(record), path, segments_of(n))
     assert found.steps == (0.0, pytest.approx(0.05, rel=1e-6))
     assert found.glitch_rate == pytest.approx(0.02, abs=0.01)
     assert found.glitch_size[0] == pytest.approx(0.5, rel=0.4)
@@ -75,7 +75,7 @@ def test_errors_glitches_and_rounding_are_found_again() -> None:
 def test_what_is_given_is_kept() -> None:
     path = paths()
     given = rt.SampledSensor(every=3, phases=(1,), glitch_rate=0.25, noise=(ERRORS, ERRORS))
-    found = given.fitted(path, everything(path), path, movements(len(path)))
+    found = given.fitted(path, everything(path), path, segments_of(len(path)))
     kept = (found.every, found.phases, found.glitch_rate, found.noise)
     assert kept == (3, (1,), 0.25, (ERRORS, ERRORS))
 
@@ -100,8 +100,8 @@ def test_only_readings_count() -> None:
     assert not read[0, :100].any()
     several = rt.SampledSensor(every=10, phases=(2, 5))
     record = several.read(path, generator())
-    told = several.sample_mask(record, everything(record))
-    first = told.all(dim=-1).int().argmax(dim=1)
+    sampled = several.sample_mask(record, everything(record))
+    first = sampled.all(dim=-1).int().argmax(dim=1)
     assert set(first.tolist()) == {2, 5}
 
 
