@@ -78,7 +78,6 @@ _HOME = {
     "fit_surrogate": "update.surrogate",
     "generate": "update.corrected",
     "identify": "update.identification",
-    "identify_bayes": "update.identification",
     "infer_discrepancy": "update.residual",
     "load": "data.io",
     "load_diagnoser": "diagnosis",
@@ -159,7 +158,7 @@ if TYPE_CHECKING:
         Discrepancy,
         SampledSensor,
     )
-    from retwin.update.identification import identify, identify_bayes
+    from retwin.update.identification import identify
     from retwin.update.residual import (
         Flow,
         Mixture,
