@@ -20,7 +20,7 @@ from record import record
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import UNIT
 from retwin.diagnosis import Diagnosis, Estimate, fit_inversion
-from retwin.scores.statistics import score
+from retwin.scores.classification import score
 from retwin.twins.faults import ActuatorBias, Stuck, draw_faults
 
 HEALTHY = 6

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from retwin.report.canvas import INK, MUTED, RULE, blank, dress
-from retwin.report.words import PALETTE
+from retwin.report.png import blank, dress
+from retwin.report.style import PALETTE, hexadecimal
 
 __all__ = [
     "BLUE",
@@ -27,6 +27,7 @@ __all__ = [
     "title",
 ]
 
+INK, MUTED, RULE = map(hexadecimal, ("ink", "muted", "rule"))
 IMAGES = Path(__file__).parents[1] / "images"
 BLUE, ORANGE, GREEN, PINK = (light for light, _ in PALETTE[:4])
 COLOURS = 128

@@ -53,7 +53,7 @@ _HOME = {
     "ResidualModel": "update.residual",
     "Rocket": "diagnosis",
     "SampledSensor": "update.corrections",
-    "Scores": "scores.statistics",
+    "Scores": "scores.classification",
     "Segments": "data.segments",
     "SequenceMixture": "update.residual",
     "SequenceResidual": "update.residual",
@@ -136,7 +136,7 @@ if TYPE_CHECKING:
     from retwin.nets.networks import CNN, LSTM, MLP, TCN, LSTMClassifier, StateSpace
     from retwin.nets.training import Training
     from retwin.report import write_report
-    from retwin.scores.statistics import Scores
+    from retwin.scores.classification import Scores
     from retwin.study import StudyData, StudyPlan, run_study
     from retwin.twins.faults import ActuatorBias, Fault, Stuck
     from retwin.twins.fmu import FMUTwin

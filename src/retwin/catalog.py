@@ -114,6 +114,9 @@ class SourceEntry:
         The extra of the package that it needs.
     simulates : bool
         Whether it occurs only in studies of cases without classes.
+    role : str
+        Its role in what a report states: "plain" (the twin as it is), "surrogate" (the surrogate
+        without residual model), "updated" (the surrogate with its residual model) or "".
 
     """
 
@@ -127,6 +130,7 @@ class SourceEntry:
     parametric: bool = False
     extra: str = ""
     simulates: bool = False
+    role: str = ""
 
     @property
     def per_fold(self) -> bool:
@@ -363,15 +367,25 @@ _IDENTIFIED = ("surrogate", "pi_ls")
 _IDENTIFIED_OUTPUT = ("residual", "pi_ls")
 
 SOURCES: Mapping[str, SourceEntry] = {
-    "dt": SourceEntry("Digital twin", "none", diagnoser="retwin.study.sources:recorded_twin"),
+    "dt": SourceEntry(
+        "Digital twin", "none", diagnoser="retwin.study.sources:recorded_twin", role="plain"
+    ),
     "twin": SourceEntry(
-        "Digital twin", "none", twin="retwin.study.sources:plain_twin", simulates=True
+        "Digital twin",
+        "none",
+        twin="retwin.study.sources:plain_twin",
+        simulates=True,
+        role="plain",
     ),
     "randomised": SourceEntry(
         "Randomised twin", "none", twin="retwin.study.sources:randomised_twin", parametric=True
     ),
     "ibg": SourceEntry(
-        "IBG alone", "timing", (_SURROGATE,), twin="retwin.study.sources:surrogate_alone"
+        "IBG alone",
+        "timing",
+        (_SURROGATE,),
+        twin="retwin.study.sources:surrogate_alone",
+        role="surrogate",
     ),
     "dt_noise": SourceEntry(
         "IBG + output noise", "healthy", (_SURROGATE,), twin="retwin.study.sources:noisy_surrogate"
@@ -410,7 +424,11 @@ SOURCES: Mapping[str, SourceEntry] = {
         twin="retwin.study.sources:mean_corrected",
     ),
     "ibg_rg": SourceEntry(
-        "IBG + RG", "healthy", (_SURROGATE, _OUTPUT), twin="retwin.study.sources:output_corrected"
+        "IBG + RG",
+        "healthy",
+        (_SURROGATE, _OUTPUT),
+        twin="retwin.study.sources:output_corrected",
+        role="updated",
     ),
     "pi_ls_rg": SourceEntry(
         "Least squares, then IBG + RG",
@@ -425,6 +443,7 @@ SOURCES: Mapping[str, SourceEntry] = {
         "healthy",
         (_SURROGATE, _COMMAND),
         twin="retwin.study.sources:command_corrected",
+        role="updated",
     ),
     "fine_tuned": SourceEntry(
         "Fine-tuned on labels",

@@ -17,7 +17,7 @@ from retwin.diagnosis import Diagnosis, InversionDiagnoser, evidence, fit_invers
 from retwin.diagnosis.evidence import Belief, Noise
 from retwin.diagnosis.severity import draw_biases
 from retwin.nets.training import Training
-from retwin.scores.statistics import score
+from retwin.scores.classification import score
 from retwin.testing import DIAGNOSER_CHECKS, DiagnoserSubject
 from retwin.twins.faults import draw_faults, faulty_commands, frozen_from
 from retwin.twins.samplers import RampSampler

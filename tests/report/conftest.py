@@ -11,6 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from retwin.report.page import render
+from retwin.report.sections import sections_of
+from retwin.report.study import read_study
+
 MOTORS = range(1, 5)
 CLASSES = [
     "Healthy",
@@ -55,12 +59,12 @@ def _source(rng: np.random.Generator, truth: NDArray, skill: float, runs: int) -
         "auroc_micro": 0.86 + 0.05 * skill + 0.005 * rng.standard_normal(runs),
         "ece": 0.1 + 0.02 * rng.random(runs),
     }
-    told: dict[str, Any] = {name: list(map(float, values)) for name, values in scores.items()}
-    told["intervals"] = {
+    content: dict[str, Any] = {name: list(map(float, values)) for name, values in scores.items()}
+    content["intervals"] = {
         name: [float(np.mean(values)) - 0.06, min(float(np.mean(values)) + 0.05, 1.0)]
         for name, values in scores.items()
     }
-    told |= {
+    content |= {
         "confusion": confusion.tolist(),
         "predictions": predictions.tolist(),
         "fault_protocol_known": True,
@@ -70,7 +74,7 @@ def _source(rng: np.random.Generator, truth: NDArray, skill: float, runs: int) -
         "train_s": 21.5,
         "predict_s": 0.0004,
     }
-    return told, {"probabilities": probabilities.astype(np.float32)}
+    return content, {"probabilities": probabilities.astype(np.float32)}
 
 
 def _comparison(sources: dict[str, Any], a: str, b: str, metric: str) -> dict[str, Any]:
@@ -92,20 +96,20 @@ def _comparison(sources: dict[str, Any], a: str, b: str, metric: str) -> dict[st
 
 def _discrepancy(rng: np.random.Generator) -> dict[str, NDArray]:
     def draw(count: int) -> NDArray:
-        late = rng.random(count) < 0.3
-        delay = np.where(late, rng.normal(24, 4, count), rng.normal(11, 3, count))
+        slow = rng.random(count) < 0.3
+        delay = np.where(slow, rng.normal(24, 4, count), rng.normal(11, 3, count))
         offset = rng.multivariate_normal([0.002, -0.001, -0.004], 1e-5 * np.eye(3), count)
         noise = 0.0003 * rng.gamma(4, 0.25, (count, 3))
         return np.column_stack([delay, offset, noise])
 
     observed = draw(240)
-    observed[:9, 0], observed[:9, 1:4] = 180.0, 0.2  # missed movements
-    observed[200:, 0] = np.nan  # not told by the outputs
+    observed[:9, 0], observed[:9, 1:4] = 180.0, 0.2  # missed segments
+    observed[200:, 0] = np.nan  # not identified
     return {"z/ibg_rg/observed": observed, "z/ibg_rg/predicted": draw(4000)}
 
 
 def _bands(rng: np.random.Generator) -> dict[str, NDArray]:
-    """Two trajectories of 20 moments, one of them never measured at the end."""
+    """Two trajectories of 20 samples, one of them never measured at the end."""
     nominal = np.repeat(np.linspace(0, 0.2, 20)[None, :, None], 2, axis=0) * np.ones(3)
     spread = 0.004 * np.array([-1.64, -0.67, 0, 0.67, 1.64])[:, None, None]
     seen = np.ones((2, 20), dtype=bool)
@@ -162,8 +166,8 @@ def _fidelity() -> dict[str, Any]:
     }
 
 
-def _portrait(rng: np.random.Generator, n: int) -> dict[str, NDArray]:
-    """n trajectories of 21 moments in 2 s with two movements; the last one was hardly measured."""
+def _overlay(rng: np.random.Generator, n: int) -> dict[str, NDArray]:
+    """n trajectories of 21 samples in 2 s with two segments; the last one was hardly measured."""
     nominal = np.linspace(0, 0.2, 21)[:, None] * np.array([1.0, -1.0, 0.5])
     observed = nominal + 0.004 * rng.standard_normal((n, 21, 3))
     observed[-1, 5:] = np.nan
@@ -205,8 +209,8 @@ def synthetic(*, runs: int = 10, per_class: int = 10) -> Study:
     arrays = _discrepancy(rng) | _bands(rng)
     seen = {"dt": "none", "ibg": "timing", "ibg_rg": "healthy"}
     for name, skill in SKILL.items():
-        told, made = _source(rng, truth, skill, runs)
-        sources[name] = {**told, "real_data": seen[name], "twin_runs": 3600}
+        content, made = _source(rng, truth, skill, runs)
+        sources[name] = {**content, "real_data": seen[name], "twin_runs": 3600}
         arrays[f"probabilities/{name}"] = made["probabilities"]
     metrics = ("macro_f1", "balanced_accuracy", "auroc", "healthy_recall")
     pairs = (("ibg_rg", "dt"), ("ibg_rg", "ibg"), ("ibg", "dt"))
@@ -281,7 +285,7 @@ def synthetic(*, runs: int = 10, per_class: int = 10) -> Study:
             "machine": "2 cores",
         },
     }
-    arrays |= _portrait(rng, len(truth)) | _poses(len(truth))
+    arrays |= _overlay(rng, len(truth)) | _poses(len(truth))
     return results, arrays
 
 
@@ -309,3 +313,14 @@ def write(tmp_path: Path) -> Callable[[Study], Path]:
         return tmp_path
 
     return _write
+
+
+@pytest.fixture
+def rendered() -> Callable[[Path], str]:
+    """The page of the study in a folder, without images."""
+
+    def _rendered(folder: Path) -> str:
+        whole = read_study(folder)
+        return render(whole, sections_of(whole), {})
+
+    return _rendered

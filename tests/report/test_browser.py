@@ -20,7 +20,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 import retwin as rt
-from retwin.report.words import CHROME
+from retwin.report.style import CHROME
 
 PATIENCE = 120_000  # ms, for machines that are busy
 # The last one draws in space without a graphics card.
@@ -33,11 +33,11 @@ A4 = {"width": 695, "height": 1000}
 
 @dataclass
 class Opened:
-    """A page, what it complained of, and what it asked for beside itself."""
+    """A page, its errors, and the addresses that it requested."""
 
     page: Page
     errors: list[str] = field(default_factory=list)
-    asked: list[str] = field(default_factory=list)
+    requested: list[str] = field(default_factory=list)
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +82,9 @@ def opened(browser: Browser, file: Path, **options: Any) -> Opened:
     found = Opened(browser.new_context(offline=True, **options).new_page())
     page = found.page
     page.set_default_timeout(PATIENCE)
-    page.on("console", lambda said: said.type == "error" and found.errors.append(said.text))
+    page.on("console", lambda entry: entry.type == "error" and found.errors.append(entry.text))
     page.on("pageerror", lambda error: found.errors.append(str(error)))
-    page.on("request", lambda asked: found.asked.append(asked.url))
+    page.on("request", lambda request: found.requested.append(request.url))
     page.goto(file.as_uri())
     page.wait_for_selector("#explore-outputs .main-svg")
     return found
@@ -92,7 +92,7 @@ def opened(browser: Browser, file: Path, **options: Any) -> Opened:
 
 @pytest.fixture(scope="module")
 def desk(browser: Browser, study_page: Path) -> Opened:
-    """On a desk; light until a test says otherwise."""
+    """On a desk; light unless a test changes it."""
     return opened(browser, study_page, viewport=SCREEN, color_scheme="light")
 
 
@@ -112,12 +112,12 @@ def dark(desk: Opened) -> Iterator[Page]:
 
 
 def rgb(colour: str) -> str:
-    """`#rrggbb` as browsers say it."""
+    """`#rrggbb` as browsers write it."""
     return f"rgb({', '.join(str(int(colour[at : at + 2], 16)) for at in (1, 3, 5))})"
 
 
 def explored(page: Page) -> tuple[str, list[float]]:
-    """Which trajectory the explorer says it shows, and what it draws of it."""
+    """The trajectory that the explorer names, and what it draws of it."""
     drawn: list[float] = page.evaluate(
         "document.getElementById('explore-outputs').data.find((t) => t.name === 'measured').y"
     )
@@ -136,7 +136,7 @@ def serious(page: Page) -> list[tuple[str, str]]:
 
 def test_it_opens_from_a_file_without_network_and_without_errors(desk: Opened) -> None:
     assert desk.errors == []
-    assert len(desk.asked) == 1, "the page itself"
+    assert len(desk.requested) == 1, "the page itself"
     sizes = desk.page.eval_on_selector_all(
         ".picture",
         "(all) => all.map((each) => each.querySelector('svg, canvas')?.getBoundingClientRect())"
@@ -188,11 +188,11 @@ def test_a_rate_of_ones_own(desk: Opened) -> None:
     """Two healthy test trajectories tell a third and two thirds apart."""
     page = desk.page
     page.fill("#calculate-rate", "60")
-    told = page.inner_text("#calculate-told")
-    assert "threshold" in told
-    assert "327" in told, "a third of the 980 that are healthy, of 1000 with 2 % faulty"
-    page.fill("#calculate-broken", "10")
-    assert "300" in page.inner_text("#calculate-told")
+    result = page.inner_text("#calculate-result")
+    assert "threshold" in result
+    assert "327" in result, "a third of the 980 that are healthy, of 1000 with 2 % faulty"
+    page.fill("#calculate-faulty", "10")
+    assert "300" in page.inner_text("#calculate-result")
     page.fill("#calculate-rate", "20")
     assert "it takes 4 of them at least" in page.inner_text("#calculate-best")
     page.fill("#calculate-missed", "0")

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 import retwin as rt
 from retwin.errors import InputError
-from retwin.report.explorer import explorer, packed
-from retwin.report.page import render
-from retwin.report.results import read_results
+from retwin.report.sections.explorer import packed
+from retwin.report.study import read_study
 from retwin.study.files import Roles
 from retwin.study.results import _poses
 from retwin.study.work import Work
@@ -26,41 +25,43 @@ Study = tuple[dict[str, Any], dict[str, NDArray]]
 Write = Callable[[Study], Path]
 
 
-def unpacked(told: dict[str, Any]) -> NDArray:
+def unpacked(code: dict[str, Any]) -> NDArray:
     """What the page's script does."""
-    codes = np.frombuffer(base64.b64decode(told["codes"]), "<i2").reshape(told["shape"])
-    values = told["low"] + told["step"] * (codes.astype(float) + 32767)
+    codes = np.frombuffer(base64.b64decode(code["codes"]), "<i2").reshape(code["shape"])
+    values = code["low"] + code["step"] * (codes.astype(float) + 32767)
     return np.where(codes == -32768, np.nan, values)
 
 
 def content_of(page: str) -> dict[str, Any]:
     found = re.search(r'<script type="application/json" id="explorer-content">(.*?)</script>', page)
     assert found is not None
-    told: dict[str, Any] = json.loads(found[1])
-    return told
+    content: dict[str, Any] = json.loads(found[1])
+    return content
 
 
-def test_all_trajectories_are_in_the_page(study: Study, write: Write) -> None:
+def test_all_trajectories_are_in_the_page(
+    study: Study, write: Write, rendered: Callable[[Path], str]
+) -> None:
     results, arrays = study
-    told = content_of(render(read_results(write(study)), {}))
-    assert told["ids"] == results["data"]["test"]["ids"]
-    assert [told["classes"][k] for k in told["truth"][::10]][:2] == ["Healthy", "M1 stuck"]
-    observed = unpacked(told["observed"])
+    content = content_of(rendered(write(study)))
+    assert content["ids"] == results["data"]["test"]["ids"]
+    assert [content["classes"][k] for k in content["truth"][::10]][:2] == ["Healthy", "M1 stuck"]
+    observed = unpacked(content["observed"])
     expected = 1000 * arrays["portrait/observed"]
-    np.testing.assert_allclose(observed, expected, atol=told["observed"]["step"])
+    np.testing.assert_allclose(observed, expected, atol=content["observed"]["step"])
     np.testing.assert_allclose(
-        unpacked(told["probabilities"]),
+        unpacked(content["probabilities"]),
         np.array(
             [arrays[f"probabilities/{name}"].mean(axis=0) for name in ("dt", "ibg", "ibg_rg")]
         ),
         atol=1e-4,
     )
-    assert told["inputs"]["units"] == ["deg"] * 4
-    np.testing.assert_allclose(unpacked(told["commands"])[0, 0], 0.24 * 400, atol=0.01)
-    latent = told["latent"]
+    assert content["inputs"]["units"] == ["deg"] * 4
+    np.testing.assert_allclose(unpacked(content["commands"])[0, 0], 0.24 * 400, atol=0.01)
+    latent = content["latent"]
     assert (latent["names"], latent["units"]) == (["delay", "offset motor 1"], ["samples", "deg"])
     assert latent["z"][0][1][0] is None
-    pose = unpacked(told["pose"]["observed"]) - unpacked(told["pose"]["nominal"])
+    pose = unpacked(content["pose"]["observed"]) - unpacked(content["pose"]["nominal"])
     np.testing.assert_allclose(pose[1, :, -1, 1], 0.01, atol=1e-4)
 
 
@@ -71,24 +72,28 @@ def test_packed_numbers_come_back() -> None:
     assert np.isnan(unpacked(packed(np.full(3, np.nan)))).all()
 
 
-def test_what_is_not_there_is_left_out(study: Study, write: Write) -> None:
+def test_what_is_not_there_is_left_out(
+    study: Study, write: Write, rendered: Callable[[Path], str]
+) -> None:
     for name in ("pose/nominal", "pose/observed"):
         del study[1][name]
-    page = render(read_results(write(study)), {})
+    page = rendered(write(study))
     assert content_of(page)["pose"] is None
     assert "explore-pose" not in page.split("<script")[0]
     assert "an inference and not a measurement" not in page
     del study[0]["portrait"]
-    page = render(read_results(write(study)), {})
+    page = rendered(write(study))
     assert '<section id="explorer">' not in page
     assert "explorer-content" not in page
 
 
-def test_emulated_trajectories_say_so(study: Study, write: Write) -> None:
+def test_emulated_trajectories_say_so(
+    study: Study, write: Write, rendered: Callable[[Path], str]
+) -> None:
     study[0]["emulated"] = True
-    section = explorer(read_results(write(study)))
-    assert section is not None
-    assert section.blocks[0].caption.startswith("Emulated data, no real measurements.")
+    page = rendered(write(study))
+    section = page[page.index('<section id="explorer">') :]
+    assert "<figcaption>Emulated data, no real measurements. Pick any" in section
 
 
 @pytest.mark.parametrize(
@@ -107,8 +112,8 @@ def test_emulated_trajectories_say_so(study: Study, write: Write) -> None:
 )
 def test_arrays_that_do_not_fit(study: Study, write: Write, name: str, value: NDArray) -> None:
     study[1][name] = value
-    with pytest.raises(InputError, match=r"portrait/bands|test's outputs"):
-        read_results(write(study))
+    with pytest.raises(InputError, match=f"^{name}: expected"):
+        read_study(write(study))
 
 
 def test_what_a_study_keeps_of_poses(

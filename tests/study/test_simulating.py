@@ -182,10 +182,10 @@ def test_a_case_may_split_its_file_itself(tmp_path: Path) -> None:
     plan = replace(PLAN, sources=("twin", "ibg"))
     data = rt.StudyData(records=tmp_path / "file.npz")
     results = rt.run_study(split, plan, data, tmp_path / "study", processes=1)
-    assert results["data"]["test"]["ids"] == ["record 4"]
-    assert results["data"]["calibration"]["n"] == 4
-    low, high = results["sources"]["twin"]["intervals"]["rmse"]
-    assert low < results["sources"]["twin"]["rmse"][0] < high, "blocks of the one record"
+    assert results.data.test.ids == ["record 4"]
+    assert results.data.calibration.n == 4
+    low, high = results.sources["twin"].interval("rmse")
+    assert low < results.sources["twin"].runs("rmse")[0] < high, "blocks of the one record"
     with pytest.raises(rt.InputError, match="a case that declares how its file is split"):
         rt.run_study(plant(), plan, data, tmp_path / "other", processes=1)
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.scores.statistics import METRICS
+from retwin.scores.classification import METRICS
 from retwin.study import possible_sources
 from retwin.study.files import Files, Job, Roles
 from retwin.study.trial import SEES, Trial
@@ -29,7 +29,7 @@ COMMAND = "study armpi --runs 2 --per-class 10 --folds 2 --seed 3 --processes 2 
 def finished(case: rt.Case, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, Path]:
     out = tmp_path_factory.mktemp("study") / "whole"
     results = rt.run_study(case, PLAN, rt.StudyData(), out, processes=2)
-    return results, out
+    return json.loads(results.to_json()), out
 
 
 def comparable(out: Path) -> dict[str, Any]:
@@ -150,13 +150,13 @@ def test_calibration_and_test_sets_keep_their_roles(
     plan = rt.StudyPlan(sources=("dt", "ibg_rg"), runs=1, per_class=8)
     data = rt.StudyData(tmp_path / "twin.npz", tmp_path / "c.npz", tmp_path / "t.npz")
     results = rt.run_study(case, plan, data, tmp_path / "out", processes=2)
-    assert results["data"]["test"]["ids"] == test.ids.tolist()
+    assert results.data.test.ids == test.ids.tolist()
     healthy = calibration.with_label("Healthy")
-    assert results["data"]["calibration"]["n"] == len(calibration)
-    assert results["data"]["calibration"]["used"] == healthy.ids.tolist()
-    assert results["data"]["twin"]["n"] == 108
-    row = next(r for r in results["comparisons"] if r["metric"] == "macro_f1")
-    assert row["p"] is None, "one run has no Welch test"
+    assert results.data.calibration.n == len(calibration)
+    assert results.data.calibration.used == healthy.ids.tolist()
+    assert results.data.twin.n == 108
+    row = next(r for r in results.comparisons if r.metric == "macro_f1")
+    assert row.p is None, "one run has no Welch test"
 
 
 def test_folds_test_everything_once_and_never_what_they_calibrate_on(
@@ -239,11 +239,11 @@ def test_a_study_grows(finished: tuple[dict, Path], case: rt.Case, tmp_path: Pat
     plan = replace(PLAN, runs=1, sources=sources, learning_curve=True)
     results = rt.run_study(case, plan, rt.StudyData(), out, processes=2)
     assert {p: p.stat().st_mtime_ns for p in kept} == kept
-    assert list(results["sources"]) == list(sources)
+    assert list(results.sources) == list(sources)
     first = finished[0]["sources"]["dt"]
-    assert results["sources"]["dt"]["predictions"] == first["predictions"][:1]
-    assert results["sources"]["dt"]["generate_s"] is None
-    curve = [(row["source"], row["healthy"]) for row in results["learning_curve"]]
+    assert results.sources["dt"].predictions == first["predictions"][:1]
+    assert results.sources["dt"].generate_s is None
+    curve = [(row.source, row.healthy) for row in results.learning_curve or []]
     assert curve == [("dt_noise", count) for count in (1, 2, 4, 5)]
     assert rt.write_report(out).stat().st_size < 10_000_000
 

@@ -40,14 +40,14 @@ def test_every_source_is_made(
     assert list(plan.sources) == diagnosing
     results = rt.run_study(case, plan, data, tmp_path / "all", processes=2)
     untouched = ("dt", "randomised", "dann", "dann_transductive")
-    for name, source in results["sources"].items():
-        assert np.array(source["predictions"]).shape == (1, 18)
-        assert source["twin_runs"] > 0, name
-        assert (source["update_s"] > 0) == (name not in untouched)
-    inversion = results["sources"]["inversion"]
-    assert inversion["macro_f1"][0] > 0.8, "it needs no training set, however small the study is"
-    assert inversion["generate_s"] is None
-    assert inversion["predict_s"] > 0
+    for name, source in results.sources.items():
+        assert np.array(source.predictions).shape == (1, 18)
+        assert source.twin_runs > 0, name
+        assert (source.update_s > 0) == (name not in untouched)
+    inversion = results.sources["inversion"]
+    assert inversion.runs("macro_f1")[0] > 0.8, "it needs no training set"
+    assert inversion.generate_s is None
+    assert inversion.predict_s > 0
     assert rt.write_report(tmp_path / "all").stat().st_size < 10_000_000
 
 
@@ -63,7 +63,7 @@ def test_the_whole_job_runs_on_the_public_files(case: rt.Case, tmp_path: Path) -
     plan = rt.StudyPlan(sources=("dt", "ibg_rg"), runs=1, folds=2, per_class=40)
     data = rt.StudyData(twin=tmp_path / "sim.npz", real=real)
     results = rt.run_study(case, plan, data, tmp_path / "out", processes=1)
-    assert results["emulated"] is False
-    assert results["published"]["ibg_rg"]["healthy_recall"] == "0.62"
-    assert results["sources"]["ibg_rg"]["auroc"][0] > 0.8
+    assert results.emulated is False
+    assert results.published["ibg_rg"]["healthy_recall"] == "0.62"
+    assert results.sources["ibg_rg"].runs("auroc")[0] > 0.8
     assert rt.write_report(tmp_path / "out").stat().st_size < 10_000_000

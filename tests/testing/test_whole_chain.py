@@ -492,7 +492,7 @@ def test_a_study_of_two_classes_makes_a_page(tmp_path: Path) -> None:
     plan = rt.StudyPlan(sources=("dt", "ibg_rg"), runs=1, folds=2, per_class=50)
     data = rt.StudyData(real=tmp_path / "real.npz")
     results = rt.run_study(toy.case, plan, data, tmp_path / "study", processes=1)
-    assert results["classes"] == [HEALTHY, "Stuck"]
-    assert results["sources"]["ibg_rg"]["accuracy"][0] >= 0.7
+    assert results.classes == [HEALTHY, "Stuck"]
+    assert results.sources["ibg_rg"].runs("accuracy")[0] >= 0.7
     page = rt.write_report(tmp_path / "study")
     assert "Stuck" in Path(page).read_text("utf-8")

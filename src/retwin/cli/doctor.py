@@ -44,6 +44,7 @@ COLOURS = {"ok": "green", "warning": "yellow", "missing": "cyan", "broken": "bol
 
 EXTRAS = {
     "bayes": "Bayesian updating, the source pi_bayes",
+    "fetch": "downloads of public data",
     "flows": "normalising flows as the distribution of the discrepancy",
     "fmu": "twins that are FMUs",
     "onnx": "bundles that need no torch",
@@ -360,7 +361,11 @@ def _rendering() -> Iterator[Check]:
 
 def _data() -> Iterator[Check]:
     yield _own_data(os.environ.get("RETWIN_DATA", ""))
-    cache = cache_folder()
+    try:
+        cache = cache_folder()
+    except InputError as error:
+        yield Check("data", "cache", "missing", error.got, error.remedy)
+        return
     for name, known in DOWNLOADS.items():
         file, get = cache / known.file, f"retwin data fetch {name}"
         if not file.is_file():

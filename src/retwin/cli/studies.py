@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -19,6 +18,9 @@ from retwin.cli.completion import complete_sources, one_of
 from retwin.cli.options import CaseArgument, Json, Seed
 from retwin.cli.terminal import answer, bar, command_given, note, resumable, table
 from retwin.errors import InputError
+
+if TYPE_CHECKING:
+    from retwin.results import Results
 
 __all__ = ["demo", "report", "study"]
 
@@ -210,63 +212,62 @@ def _run(
         _title(results),
         _table(results),
         "",
-        *_gaps(results),
+        *_differences(results),
         as_json=as_json,
     )
     note(f"Report: {page}")
 
 
-def _summary(results: Mapping[str, Any], page: Path) -> dict[str, Any]:
-    """What is shown as a table, in JSON; everything else is in results.json."""
+def _summary(results: Results, page: Path) -> dict[str, Any]:
+    """The contents of the table as JSON; everything else is in results.json."""
     shown = _metrics(results)
     return {
-        **{key: results[key] for key in ("title", "emulated", "classifier", "runs")},
-        "test_trajectories": results["data"]["test"]["n"],
+        "title": results.title,
+        "emulated": results.emulated,
+        "classifier": results.classifier,
+        "runs": results.runs,
+        "test_trajectories": results.data.test.n,
         "sources": {
-            name: {"title": source["title"], **{metric: source[metric] for metric in shown}}
-            for name, source in results["sources"].items()
+            name: {"title": source.title, **{metric: source.runs(metric) for metric in shown}}
+            for name, source in results.sources.items()
         },
         "comparisons": [
-            {key: row[key] for key in ("a", "b", "metric", "mean_diff", "bootstrap_ci95")}
-            for row in results["comparisons"]
+            row.model_dump(include={"a", "b", "metric", "mean_diff", "bootstrap_ci95"})
+            for row in results.comparisons
         ],
         "report": str(page),
     }
 
 
-def _title(results: Mapping[str, Any]) -> str:
-    n, runs = results["data"]["test"]["n"], results["runs"]
-    kind = "EMULATED data (no real measurements)" if results["emulated"] else results["title"]
+def _title(results: Results) -> str:
+    n, runs = results.data.test.size, results.runs
+    kind = "EMULATED data (no real measurements)" if results.emulated else results.title
     counted = f"{runs} run{'s' if runs > 1 else ''}"
     what = f"{n} test trajector{'ies' if n > 1 else 'y'}"
-    return ", ".join(filter(None, (f"{kind}: {what}", counted, results["classifier"])))
+    return ", ".join(filter(None, (f"{kind}: {what}", counted, results.classifier)))
 
 
-def _table(results: Mapping[str, Any]) -> Table:
-    sources, shown = results["sources"], _metrics(results)
+def _table(results: Results) -> Table:
+    sources, shown = results.sources, _metrics(results)
     titles = [COLUMNS[metric] for metric in shown]
     made = table(
-        ("training data" if results["classes"] else "source", *titles),
+        ("training data" if results.classes else "source", *titles),
         [
-            (source["title"], *(_over_runs(source[metric]) for metric in shown))
+            (source.title, *(_over_runs(source.runs(metric)) for metric in shown))
             for source in sources.values()
         ],
         numbers=titles,
     )
-    for name, figures in results["published"].items():
-        title = sources[name]["title"] if name in sources else name
+    for name, figures in results.published.items():
+        title = sources[name].title if name in sources else name
         cells = (f"  paper: {title}", *(figures.get(metric, "") for metric in shown))
         made.add_row(*(escape(str(cell)) for cell in cells), style="dim")
     return made
 
 
-def _metrics(results: Mapping[str, Any]) -> list[str]:
-    """Those that this study has: of diagnoses, or of simulations."""
-    return [
-        metric
-        for metric in COLUMNS
-        if any(metric in source for source in results["sources"].values())
-    ]
+def _metrics(results: Results) -> list[str]:
+    """The metrics of this study: those of diagnoses, or those of simulations."""
+    return [metric for metric in COLUMNS if results.has(metric)]
 
 
 def _over_runs(values: list[float]) -> str:
@@ -276,15 +277,12 @@ def _over_runs(values: list[float]) -> str:
     return mean if len(values) < 2 else f"{mean} ± {np.std(values, ddof=1):.3f}"
 
 
-def _gaps(results: Mapping[str, Any]) -> list[str]:
-    """What each source gains over the plain twin, with the interval over test trajectories."""
-    told = []
-    first, metric = next(iter(results["sources"])), "macro_f1" if results["classes"] else "nrmse"
-    for row in results["comparisons"]:
-        if row["b"] == first and row["metric"] == metric:
-            low, high = row["bootstrap_ci95"]
-            told.append(
-                f"{row['a']} - {first}, {COLUMNS[metric]}: {row['mean_diff']:+.3f} "
-                f"(95 % bootstrap interval {low:+.3f} to {high:+.3f})"
-            )
-    return told
+def _differences(results: Results) -> list[str]:
+    """The difference of each source from the plain twin, with its interval."""
+    first, metric = next(iter(results.sources)), "macro_f1" if results.classes else "nrmse"
+    return [
+        f"{row.a} - {first}, {COLUMNS[metric]}: {row.mean_diff:+.3f} "
+        f"(95 % bootstrap interval {row.interval[0]:+.3f} to {row.interval[1]:+.3f})"
+        for row in results.comparisons
+        if row.b == first and row.metric == metric and row.interval is not None
+    ]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from retwin.catalog import DOWNLOADS, PublicFile
-from retwin.checks import require
+from retwin.checks import needs_extra, require
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.files import sha256 as sha256_of
@@ -54,7 +54,8 @@ def fetch(
     Raises
     ------
     InputError
-        The name is unknown and has no `url` and `sha256`, or the address is not http(s).
+        The name is unknown and has no `url` and `sha256`, the address is not http(s), or the extra
+        `fetch` is missing.
     OSError
         There is no network or no such file, or the folder cannot be written.
     RuntimeError
@@ -73,8 +74,7 @@ def fetch(
     target = place / known.file
     if target.is_file() and sha256_of(target) == known.sha256:
         return target
-    import pooch
-
+    pooch = needs_extra("pooch", "fetch", "downloads public files")
     try:
         with _quiet(pooch.get_logger()):
             pooch.retrieve(
@@ -106,8 +106,7 @@ def cache_folder() -> Path:
     if given:
         return Path(given)
     # Imported late: it takes half a second, and only downloads need it.
-    import pooch
-
+    pooch = needs_extra("pooch", "fetch", "downloads public files")
     return Path(pooch.os_cache("retwin"))
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis import Diagnoser
-from retwin.scores.statistics import Scores, score
+from retwin.scores.classification import Scores, score
 
 __all__ = ["evaluate", "finite_probabilities"]
 

@@ -6,158 +6,171 @@ import base64
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FunctionLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from retwin.report.blocks import Calculator, Explorer, Plot, Section
-from retwin.report.claims import claims
-from retwin.report.figures import FIGURES, draw_figures
-from retwin.report.results import Results, read_results
-from retwin.report.sections import SECTIONS
-from retwin.report.verdict import verdict
-from retwin.report.words import CHROME, PALETTE, counted, slot, symbol
+from retwin.report import labels
+from retwin.report.blocks import Section
+from retwin.report.figure import Figure
+from retwin.report.plotly_specs import panel_spec
+from retwin.report.png import png
+from retwin.report.sections import sections_of
+from retwin.report.study import Study, read_study
+from retwin.report.style import CHROME, PALETTE, colour_of, symbol
+from retwin.report.verdict import claims, outcome_of, verdict
 from retwin.serialisation.files import write_atomically
 
-__all__ = ["render", "write_report"]
+__all__ = ["FIGURES", "render", "write_report"]
 
-EMULATED = "EMULATED data: no real measurements"
+FIGURES = (
+    "scores",
+    "confusion",
+    "roc",
+    "reliability",
+    "simulation",
+    "movement",
+    "tde",
+    "tpe",
+    "noise",
+    "z",
+    "pit",
+    "bands",
+    "learning",
+)
+"""The files `figures/NAME.png`; of a second source `NAME-2.png`."""
+FILTERS = {
+    "class_name": labels.class_name,
+    "counted": labels.counted,
+    "duration": labels.duration,
+    "in_sentence": labels.in_sentence,
+    "mean_and_deviation": labels.mean_and_deviation,
+    "metric": labels.metric_name,
+    "number": labels.number,
+    "signed": labels.signed,
+    "source_in_sentence": labels.source_in_sentence,
+    "source_name": labels.source_name,
+    "span": labels.span,
+    "outcome": outcome_of,
+    "one_line": lambda text: Markup(" ").join(text.split()),
+}
+"""What templates apply to values; see `retwin.report.labels`."""
 
 
 def write_report(folder: str | os.PathLike[str]) -> Path:
-    """Make `report.html` and `figures/*.png` from `results.json` and `arrays.npz` of a study.
+    """Make `report.html` and `figures/*.png` from the results of a study.
 
     Parameters
     ----------
-    folder: that of the study, which the report goes to as well.
+    folder : path
+        The folder of the study, to which the report goes as well.
 
     Returns
     -------
-    The page; it needs no other file and no network.
+    Path
+        The page; it needs no other file and no network.
 
     Raises
     ------
-    InputError: results.json is missing, damaged or of another schema, or arrays.npz is damaged.
+    InputError
+        If results.json is missing, damaged or of another schema, or arrays.npz is damaged or does
+        not agree with it.
 
     """
-    results = read_results(folder)
-    images = draw_figures(results)
+    study = read_study(folder)
+    sections = sections_of(study)
+    images = {
+        figure.name: png(figure, emulated=study.results.emulated)
+        for section in sections
+        for figure in (*section.figures, *section.further)
+    }
     figures = Path(folder) / "figures"
     for name, image in images.items():
         with write_atomically(figures / f"{name}.png") as part:
             part.write_bytes(image)
-    for stale in figures.glob("*.png"):  # from an earlier report whose results had it
+    for stale in figures.glob("*.png"):  # of an earlier report, whose results had them
         if stale.stem not in images and stale.stem.split("-")[0] in FIGURES:
             stale.unlink()
     page = Path(folder) / "report.html"
     with write_atomically(page) as part:
-        part.write_text(render(results, images), encoding="utf-8", newline="\n")
+        part.write_text(render(study, sections, images), encoding="utf-8", newline="\n")
     return page
 
 
-def render(results: Results, images: dict[str, bytes]) -> str:
-    """The page as text; `images` stand in for the plots where scripts do not run."""
-    made = [section for make in SECTIONS if (section := make(results)) is not None]
-    specs = _specs(made)
-    blocks = [block for section in made for block in section.blocks]
-    contents = {
-        block.kind: Markup(_script_json(block.content))
-        for block in blocks
-        if isinstance(block, Explorer | Calculator)
-    }
+def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes]) -> str:
+    """The page as text; `images` take the place of the figures where scripts do not run."""
     environment = Environment(
-        loader=FunctionLoader(_asset),
+        loader=PackageLoader("retwin.report"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals |= {"slot": slot, "symbol": symbol}
+    environment.filters |= FILTERS
+    environment.globals |= {
+        "results": study.results,
+        "word": study.word,
+        "anchors": {section.key for section in sections},
+        "images": {name: base64.b64encode(data).decode() for name, data in images.items()},
+        "colour_of": colour_of,
+        "symbol": symbol,
+    }
+    bodies = {
+        section.key: Markup(
+            environment.get_template(f"{section.key}.html.j2").render(section.values)
+        )
+        for section in sections
+    }
+    specs = _specs(sections)
+    contents = {name: value for each in sections for name, value in each.scripts.items()}
     return environment.get_template("page.html.j2").render(
-        title=results.title or results.case,
-        anchors={section.key for section in made},
-        subtitle=_subtitle(results),
-        emulated=EMULATED if results.emulated else "",
-        verdict=verdict(results),
-        claims=claims(results),
-        sections=made,
-        colours={
-            **{f"c{place}": pair for place, pair in enumerate(PALETTE)},
-            **CHROME,
-        },
-        style=Markup(_asset("page.css")),
-        script=Markup(_asset("page.js")),
-        specs=Markup(_script_json(specs)),
-        contents=contents,
-        scripts={kind: Markup(_asset(f"{kind}.js")) for kind in contents},
+        sections=sections,
+        bodies=bodies,
+        verdict=verdict(study),
+        claims=claims(study),
+        colours={**{f"c{place}": pair for place, pair in enumerate(PALETTE)}, **CHROME},
+        style=_asset("page.css"),
+        script=_asset("page.js"),
+        specs=_script_json(specs),
+        contents={name: _script_json(content) for name, content in contents.items()},
+        scripts={name: _asset(f"{name}.js") for name in contents},
         plotly=Markup(get_plotlyjs()) if specs or "explorer" in contents else "",
-        images={name: base64.b64encode(data).decode() for name, data in images.items()},
     )
 
 
-def _asset(name: str) -> str:
-    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
+def _asset(name: str) -> Markup:
+    folder = resources.files(__package__).joinpath("templates")
+    return Markup(folder.joinpath(name).read_text(encoding="utf-8"))
 
 
 def _specs(sections: Sequence[Section]) -> dict[str, Any]:
     """Plotly's data by the id of the element that shows them."""
     return {
-        f"plot-{block.name}-{place}": {**panel.spec, "height": panel.height, "narrow": panel.narrow}
+        f"plot-{figure.name}-{place}": panel_spec(panel)
         for section in sections
-        for block in section.blocks
-        if isinstance(block, Plot)
-        for place, panel in enumerate(block.panels)
+        for figure in section.figures
+        if isinstance(figure, Figure)
+        for place, panel in enumerate(figure.panels)
     }
 
 
-def _script_json(value: Any) -> str:
-    """JSON that may stand inside a script element whatever its strings hold."""
+def _script_json(value: Any) -> Markup:
+    """JSON that may stand inside a script element whatever its texts contain."""
     text = json.dumps(_finite(value), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for sign in "<>&\u2028\u2029":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
-    return text
+    return Markup(text)
 
 
 def _finite(value: Any) -> Any:
-    """The same with null for numbers that JSON cannot hold."""
+    """The same value with null for numbers that JSON does not have."""
     if isinstance(value, dict):
         return {key: _finite(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
         return [_finite(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _subtitle(results: Results) -> list[str]:
-    """What was updated with which data, and how it was scored."""
-    data, lines = results.data, []
-    twin, calibration, test = data.twin, data.calibration, data.test
-    word = "emulated" if results.emulated else "real"
-    if twin.n:
-        source = f" ({twin.name})" if twin.name else ""
-        lines.append(f"A twin known by {counted(twin.n, 'trajectory')}{source}")
-        if calibration.n:
-            used = calibration.n if calibration.used is None else len(calibration.used)
-            source = f" ({calibration.name})" if calibration.name else ""
-            of = "" if used == calibration.n else f"{used} of "
-            lines[-1] += (
-                f", updated with {of}{counted(calibration.n, f'{word} trajectory')}{source}"
-            )
-        lines[-1] += "."
-    if test.n or test.labels:
-        source = f" ({test.name})" if test.name else ""
-        size = test.n or len(test.labels)
-        how = [f"Scored on {counted(size, f'{word} trajectory')}{source}"]
-        how.append(counted(results.runs, "run"))
-        if results.classifier:
-            how.append(f"classifier {results.classifier.upper()}")
-        if results.preset:
-            how.append(f"preset {results.preset}")
-        lines.append("; ".join(how) + ".")
-    if data.protocol:
-        lines.append(f"{data.protocol[0].upper()}{data.protocol[1:].rstrip('.')}.")
-    return lines

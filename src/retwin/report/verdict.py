@@ -1,143 +1,159 @@
-"""What may be said: which source is better, and the sentences at the top of the page."""
+"""The statements at the head of the page: which source is better, and what is claimed of it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 
 from retwin.catalog import METRICS
-from retwin.report.parts import Comparison
-from retwin.report.results import Results
-from retwin.report.words import (
-    MAIN,
-    counted,
-    in_sentence,
-    number,
-    signed,
-    source_name,
-    span,
-)
+from retwin.report.labels import MAIN, order, with_role
+from retwin.report.study import Study
+from retwin.results import Comparison, Results
+from retwin.scores.comparison import compliance, outcome
 
-__all__ = ["between", "headline", "outcome", "verdict"]
+__all__ = ["Claim", "claims", "headline", "outcome_of", "verdict"]
 
-
-def outcome(comparison: Comparison) -> str:
-    """`better` or `worse` when the interval leaves zero out, `open` when not, else nothing."""
-    interval = comparison.interval
-    direction = METRICS[comparison.metric].better if comparison.metric in METRICS else 0
-    if interval is None or direction == 0:
-        return ""
-    if interval[0] <= 0 <= interval[1]:
-        return "open"
-    return "better" if (interval[0] > 0) == (direction > 0) else "worse"
+COVERAGE = (0.85, 0.95)
+"""The required coverage of the 90 % band."""
+RECALL = 0.9
+"""The required recall of healthy trajectories."""
+QUICK, SLOW = 600.0, 3600.0
+"""Seconds up to which the update counts as quick, and beyond which as slow."""
+LIGHTS = {"better": "holds", "open": "open", "worse": "fails"}
 
 
-def verdict(results: Results) -> list[str]:
-    """Up to three plain sentences; "better" only where the bootstrap interval leaves zero out."""
-    pair = headline(results.comparisons)
-    if pair is None:
-        return []
-    found = {each.metric: each for each in between(results.comparisons, *pair)}
-    metric = next((name for name in METRICS if name in found and outcome(found[name])), None)
-    if metric is None:
-        return []
-    sentences = [_first(results, found[metric])]
-    others = [each for name, each in found.items() if name in MAIN and name != metric]
-    sentences += _second(others)
-    rival = _leading(results, metric, pair)
-    if rival is not None:
-        sentences.append(rival)
-    alone = between(results.comparisons, pair[0], "ibg")
-    sentences += [_third(each) for each in alone if each.metric == metric and outcome(each)]
-    return sentences[:3]
+@dataclass(frozen=True)
+class Claim:
+    """A claim about the updated twin.
+
+    Attributes
+    ----------
+    key, title : str
+        Its name in the template `claims.html.j2`, and its title.
+    light : str
+        "holds", "open" or "fails".
+    values : dict
+        The variables of its sentences.
+
+    """
+
+    key: str
+    title: str
+    light: str
+    values: dict[str, Any]
 
 
-def _leading(results: Results, metric: str, pair: tuple[str, str]) -> str | None:
-    """Which other source has the best mean, if any is ahead of the headline's."""
-    best = max(results.sources, key=lambda name: _rank(results, name, metric))
-    if best in pair or _rank(results, best, metric) <= _rank(results, pair[0], metric):
-        return None
-    found = [e for e in between(results.comparisons, best, pair[0]) if e.metric == metric]
-    if not found:
-        return None
-    gap = f"{signed(found[0].mean_diff)}, 95 % interval {span(found[0].interval, sign=True)}"
-    sure = "is ahead" if outcome(found[0]) == "better" else "has the best mean, undecided"
-    return (
-        f"Of all sources, {in_sentence(source_name(best))} {sure}: "
-        f"{in_sentence(METRICS[metric].title)} "
-        f"{number(results.sources[best].mean(metric))} ({gap})."
-    )
+def outcome_of(comparison: Comparison) -> str:
+    """The outcome of a comparison, see `retwin.scores.comparison.outcome`."""
+    known = METRICS.get(comparison.metric)
+    return outcome(comparison.interval, known.better if known else 0)
 
 
-def _rank(results: Results, source: str, metric: str) -> float:
-    """The more, the better; a target to meet ranks nobody."""
-    value = METRICS[metric].better * results.sources[source].mean(metric)
-    return value if np.isfinite(value) else -np.inf
+def headline(results: Results) -> tuple[str, str] | None:
+    """The pair that the page is about: the updated twin and the plain one, else the first pair.
 
-
-def headline(found: Sequence[Comparison]) -> tuple[str, str] | None:
-    """The updated twin against the plain one, else the first pair in the file."""
-    for updated, plain in product(("ibg_rg_command", "ibg_rg"), ("dt", "twin")):
-        if between(found, updated, plain):
-            return updated, plain
+    Of several updated twins it is the last one in the catalog.
+    """
+    found = results.comparisons
+    names = {name for each in found for name in (each.a, each.b)}
+    updated, plain = (with_role(order(names), role) for role in ("updated", "plain"))
+    for pair in product(reversed(updated), plain):
+        if results.compared(*pair):
+            return pair
     return (found[0].a, found[0].b) if found else None
 
 
-def between(found: Sequence[Comparison], a: str, b: str) -> list[Comparison]:
-    """What is known of this pair, a minus b, score by score."""
-    return [each.seen_from(a) for each in found if {each.a, each.b} == {a, b}]
+def verdict(study: Study) -> dict[str, Any] | None:
+    """The values of up to three sentences; None where no interval is known.
+
+    `first` is the comparison of the headline's pair on the first metric that has an outcome,
+    `others` those on the other main metrics, `rival` that of the best other source with the
+    updated twin, and `surrogate` that of the updated twin with the surrogate alone.
+    """
+    results = study.results
+    pair = headline(results)
+    if pair is None:
+        return None
+    found = results.compared(*pair)
+    metric = next((name for name in METRICS if name in found and outcome_of(found[name])), None)
+    if metric is None:
+        return None
+    alone = [results.compared(pair[0], name) for name in with_role(results.sources, "surrogate")]
+    others = [each for name, each in found.items() if name in MAIN and name != metric]
+    return {
+        "first": found[metric],
+        "others": {
+            result: [each for each in others if outcome_of(each) == result]
+            for result in ("better", "worse", "open")
+        },
+        "rival": _rival(results, metric, pair),
+        "surrogate": next(
+            (each[metric] for each in alone if metric in each and outcome_of(each[metric])), None
+        ),
+    }
 
 
-def _first(results: Results, found: Comparison) -> str:
-    a, b = (in_sentence(source_name(each)) for each in (found.a, found.b))
-    means = [
-        number(results.sources[each].mean(found.metric)) if each in results.sources else "–"
-        for each in (found.a, found.b)
-    ]
-    count = results.data.test.n or len(results.data.test.labels)
-    on = counted(count, "test trajectory") if count else "the test trajectories"
-    what = f"{in_sentence(METRICS[found.metric].title)} {means[0]} against {means[1]}"
-    difference = (
-        f"difference {signed(found.mean_diff)}, 95 % interval {span(found.interval, sign=True)}"
-    )
-    result = outcome(found)
-    doing, by = ("training", "on") if results.classes else ("simulation", "by")
-    if result == "open":
-        return (
-            f"On {on}, {doing} {by} {a} cannot be told apart from {doing} {by} {b}: {what}, "
-            f"and the interval of the difference includes zero ({difference})."
-        )
-    return f"On {on}, {doing} {by} {a} is {result} than {by} {b}: {what} ({difference})."
+def _rival(results: Results, metric: str, pair: tuple[str, str]) -> Comparison | None:
+    """The comparison of the source with the best mean, if that is better than the updated one."""
+
+    def rank(name: str) -> float:
+        value = METRICS[metric].better * results.sources[name].mean(metric)
+        return value if math.isfinite(value) else -np.inf
+
+    best = max(results.sources, key=rank)
+    if best in pair or rank(best) <= rank(pair[0]):
+        return None
+    return results.compared(best, pair[0]).get(metric)
 
 
-def _second(found: Sequence[Comparison]) -> list[str]:
-    """The other main scores of the same pair, grouped by what their intervals say."""
-    said = []
-    for result, words in (("better", "also better"), ("worse", "worse"), ("open", "undecided")):
-        each = [
-            f"{in_sentence(METRICS[one.metric].title)} "
-            f"({signed(one.mean_diff)}, {span(one.interval, sign=True)})"
-            for one in found
-            if outcome(one) == result
-        ]
-        if each:
-            said.append(f"{words}: {', '.join(each)}")
-    text = "; ".join(said)
-    return [f"{text[0].upper()}{text[1:]}."] if text else []
+def claims(study: Study) -> list[Claim]:
+    """The claims about the updated twin; what was not measured is not claimed."""
+    pair = headline(study.results)
+    if pair is None:
+        return []
+    found = [_accuracy(study, pair), _calibration(study, pair[0]), _false_alarms(study, pair[0])]
+    return [claim for claim in (*found, _time(study, pair[0])) if claim is not None]
 
 
-def _third(found: Comparison) -> str:
-    """What the residual model adds to the surrogate alone."""
-    meaning = {
-        "better": "so the residual model itself helps",
-        "worse": "so the residual model itself does harm",
-        "open": "so it is not shown that the residual model itself helps",
-    }[outcome(found)]
-    name = in_sentence(METRICS[found.metric].title)
-    gap = f"{signed(found.mean_diff)} ({span(found.interval, sign=True)})"
-    return (
-        f"Against {in_sentence(source_name('ibg'))}, given the same commands, the "
-        f"difference in {name} is {gap}, {meaning}."
-    )
+def _accuracy(study: Study, pair: tuple[str, str]) -> Claim | None:
+    found = study.results.compared(*pair)
+    metric = next((name for name in METRICS if name in found), None)
+    light = LIGHTS.get(outcome_of(found[metric])) if metric else None
+    if metric is None or light is None:
+        return None
+    return Claim("accuracy", "Accuracy", light, {"found": found[metric]})
+
+
+def _calibration(study: Study, source: str) -> Claim | None:
+    fidelity, each = study.results.fidelity.get(source), study.results.sources[source]
+    figure = fidelity.figures.get("coverage90") if fidelity else None
+    value = each.mean("coverage90") if figure is None else figure.value
+    ends = each.interval("coverage90") if figure is None else figure.ends
+    if not math.isfinite(value):
+        return None
+    low, high = COVERAGE
+    values = {"value": value, "ends": ends, "low": low, "high": high}
+    return Claim("calibration", "Calibration", compliance(value, ends, low, high), values)
+
+
+def _false_alarms(study: Study, source: str) -> Claim | None:
+    each = study.results.sources[source]
+    recall, ends = each.mean("healthy_recall"), each.interval("healthy_recall")
+    if not math.isfinite(recall):
+        return None
+    values = {"value": recall, "ends": ends, "low": RECALL}
+    return Claim("false_alarms", "False alarms", compliance(recall, ends, RECALL), values)
+
+
+def _time(study: Study, source: str) -> Claim | None:
+    each = study.results.sources[source]
+    parts = [part for part in (each.update_s, each.generate_s) if part is not None]
+    if not parts:
+        return None
+    light = "holds" if sum(parts) <= QUICK else "open" if sum(parts) <= SLOW else "fails"
+    values = {"seconds": sum(parts), "generated": each.generated, "quick": QUICK, "slow": SLOW}
+    return Claim("time", "Time", light, values)

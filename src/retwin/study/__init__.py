@@ -21,6 +21,7 @@ from retwin.checks import at_least, require, whole
 from retwin.data.io import load, save
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
+from retwin.results import Results
 from retwin.serialisation.files import sha256, write_atomically
 from retwin.serialisation.identity import identity
 from retwin.study.files import Files, Roles
@@ -90,7 +91,7 @@ def run_study(
     processes: int | None = None,
     report: Report | None = None,
     command: str = "",
-) -> dict[str, Any]:
+) -> Results:
     """Run or resume a study; write `results.json` and `arrays.npz` in `out`.
 
     Parameters
@@ -113,7 +114,7 @@ def run_study(
 
     Returns
     -------
-    dict
+    Results
         The contents of `results.json`.
 
     Raises

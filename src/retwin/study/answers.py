@@ -14,14 +14,8 @@ from retwin.catalog import SOURCES
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.pooled import pool_probabilities
 from retwin.evaluation.fidelity import Simulation, record_means, simulation_scores
-from retwin.scores.statistics import (
-    METRICS,
-    bootstrap,
-    bootstrap_means,
-    bootstrap_weights,
-    confusion,
-    score,
-)
+from retwin.scores.bootstrap import bootstrap, bootstrap_means, bootstrap_weights
+from retwin.scores.classification import METRICS, confusion, score
 from retwin.study.work import Work
 
 __all__ = ["Answers", "Diagnoses", "Simulations", "answers"]

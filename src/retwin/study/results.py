@@ -1,8 +1,7 @@
-"""From the results of all jobs to `results.json` and `arrays.npz` (schema 1)."""
+"""Collect the results of all jobs in `results.json` (`retwin.results`) and `arrays.npz`."""
 
 from __future__ import annotations
 
-import json
 import platform
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -17,95 +16,114 @@ from numpy.typing import NDArray
 from retwin.catalog import SOURCES
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.fidelity import Fidelity, Overlay
-from retwin.scores.statistics import compare_runs, holm
+from retwin.results import SCHEMA, CurvePoint, Results, SourceResults
+from retwin.scores.comparison import compare_runs, holm
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.models import read_about
 from retwin.study.answers import Answers, answers
 from retwin.study.files import Job
 from retwin.study.work import Work
 
-__all__ = ["SCHEMA", "write_results"]
-
-SCHEMA = 1
+__all__ = ["write_results"]
 
 
 def write_results(
     work: Work, out: Path, *, about: Mapping[str, Any], provenance: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Collect every job's result, score it, write both files; returns what `results.json` holds.
+) -> Results:
+    """Collect and score every job's result, and write `results.json` and `arrays.npz`.
 
-    `about` holds the description of the data, `provenance` how the study was called.
+    Parameters
+    ----------
+    work : Work
+        The finished jobs.
+    out : Path
+        The folder of the study.
+    about : mapping
+        The description of the data.
+    provenance : mapping
+        The command, the seed.
+
+    Returns
+    -------
+    Results
+        The contents of `results.json`.
+
     """
     real = work.files.real_data()
     test = real[sorted(work.roles.tested)]
     found = answers(work)
     drawn = {name: found.drawn(name) for name in work.plan.sources}
-    sources = {name: _source(work, found, name, drawn[name]) for name in work.plan.sources}
     judged = {name: _judged(work, name) for name in work.plan.sources}
     fidelity = {name: each for name, each in judged.items() if each is not None}
-    diagnosed = work.case.diagnosed
-    results = {
-        "schema": SCHEMA,
-        "case": work.case.name,
-        "title": work.case.title,
-        "preset": work.plan.preset,
-        "classifier": work.plan.classifier_name if diagnosed else "",
-        "runs": work.plan.number_of_runs,
-        "classes": list(work.case.classes) if diagnosed else [],
-        "inputs": vars(work.case.inputs),
-        "outputs": vars(work.case.outputs),
-        "emulated": real.emulated,
-        "data": _data(work, real, test, about),
-        "sources": sources,
-        "published": {} if real.emulated else dict(work.case.published),
-        "comparisons": _comparisons(found, sources, drawn),
-        "surrogate": _surrogate(work),
-        "fidelity": {name: each.as_dict() for name, each in fidelity.items()},
-        "learning_curve": _learning_curve(work, found) or None,
-        "timing": _timing(work),
-        "provenance": {**_machine(), **provenance},
-    }
+    sources = {name: _source(work, found, name, drawn[name]) for name in work.plan.sources}
     arrays = found.arrays()
     for name, each in fidelity.items():
         arrays |= _fidelity_arrays(name, each)
-    portrait = _portrait(work)
-    if portrait is not None:
-        arrays |= _portrait_arrays(work, test, portrait) | _poses(work, test)
-        results["portrait"] = {
+    overlay = _overlay(work)
+    shown: dict[str, Any] = {}
+    if overlay is not None:
+        arrays |= _overlay_arrays(work, test, overlay) | _poses(work, test)
+        shown["portrait"] = {
             "source": work.overlay_jobs()[0].name,
-            "movement": portrait.latent.names,
-            "movement_units": portrait.latent.units,
+            "movement": overlay.latent.names,
+            "movement_units": overlay.latent.units,
         }
+    diagnosed = work.case.diagnosed
+    results = Results.model_validate(
+        {
+            "schema": SCHEMA,
+            "case": work.case.name,
+            "title": work.case.title,
+            "preset": work.plan.preset,
+            "classifier": work.plan.classifier_name if diagnosed else "",
+            "runs": work.plan.number_of_runs,
+            "classes": list(work.case.classes) if diagnosed else [],
+            "inputs": vars(work.case.inputs),
+            "outputs": vars(work.case.outputs),
+            "emulated": real.emulated,
+            "data": _data(work, real, test, about),
+            "sources": sources,
+            "published": {} if real.emulated else dict(work.case.published),
+            "comparisons": _comparisons(found, sources, drawn),
+            "surrogate": _surrogate(work),
+            "fidelity": {name: each.as_dict() for name, each in fidelity.items()},
+            "learning_curve": _learning_curve(work, found) or None,
+            "timing": _timing(work),
+            "provenance": {**_machine(), **provenance},
+            **shown,
+        }
+    )
     with write_atomically(out / "arrays.npz") as part:
         np.savez_compressed(part, allow_pickle=False, **arrays)
     with write_atomically(out / "results.json") as part:
-        part.write_text(json.dumps(_plain(results), indent=1, allow_nan=False), encoding="utf-8")
+        part.write_text(results.to_json(), encoding="utf-8")
     return results
 
 
-def _source(work: Work, found: Answers, name: str, drawn: Mapping[str, NDArray]) -> dict[str, Any]:
-    return {
-        **found.scores(name),
-        "intervals": {metric: _interval(each) for metric, each in drawn.items()},
+def _source(work: Work, found: Answers, name: str, drawn: Mapping[str, NDArray]) -> SourceResults:
+    return SourceResults(
+        scores=found.scores(name),
+        intervals={metric: _interval(each) for metric, each in drawn.items()},
         **found.details(name),
-        "title": SOURCES[name].title,
-        "real_data": work.sees(name),
+        title=SOURCES[name].title,
+        real_data=work.sees(name),
         **_costs(work, name),
-    }
+    )
 
 
-def _interval(drawn: NDArray) -> list[float] | None:
-    """The middle 95 % of draws; None where there is none."""
+def _interval(drawn: NDArray) -> tuple[float, float] | None:
+    """The central 95 % of the finite draws; None if there are none."""
     known = drawn[np.isfinite(drawn)]
-    return np.quantile(known, [0.025, 0.975]).tolist() if len(known) else None
+    if not len(known):
+        return None
+    low, high = np.quantile(known, [0.025, 0.975]).tolist()
+    return low, high
 
 
 def _costs(work: Work, source: str) -> dict[str, Any]:
-    """What a source takes in one run and fold, with all that must be made before it.
+    """The costs of a source in one run and fold, all stages before it included.
 
-    `update_s`: to update the twin. `generate_s`: for its training set, whose size is `generated`.
-    `train_s`: for the diagnoser. `predict_s`: per trajectory. `twin_runs`: of the twin itself.
-    None where nothing is done. `notes`: what went not quite well.
+    The keys are those of `SourceResults`.
     """
     costs: dict[str, list[dict[str, Any]]] = {}
     for job in _with_all_before(work, work.answers(source)):
@@ -158,31 +176,32 @@ def _timing(work: Work) -> dict[str, Any]:
     }
 
 
-def _learning_curve(work: Work, found: Answers) -> list[dict[str, Any]]:
-    """Scores and coverage of each source against the healthy trajectories it was calibrated on."""
-    rows = []
+def _learning_curve(work: Work, found: Answers) -> list[CurvePoint]:
+    """Scores and coverage of each source by its number of healthy calibration trajectories."""
+    points = []
     for source in work.plan.sources:
         counts = work.counts(source)
         for healthy in (*counts, 0) if counts else ():
-            row: dict[str, Any] = {"source": source, "healthy": healthy or work.healthy}
-            scores, drawn = found.scores(source, healthy), found.drawn(source, healthy)
-            for metric in found.curved:
-                row[metric] = scores[metric]
-                row[f"{metric}_interval"] = _interval(drawn[metric])
+            values, drawn = found.scores(source, healthy), found.drawn(source, healthy)
+            scores: dict[str, Any] = {metric: values[metric] for metric in found.curved}
+            intervals = {metric: _interval(drawn[metric]) for metric in found.curved}
             judged = _judged(work, source, healthy)
             if judged is not None:
                 covered = judged.figures["coverage90"]
-                row |= {"coverage90": covered.value, "coverage90_interval": covered.interval}
-            rows.append(row)
-    return rows
+                scores["coverage90"], intervals["coverage90"] = covered.value, covered.interval
+            count = healthy or work.healthy
+            points.append(
+                CurvePoint(source=source, healthy=count, scores=scores, intervals=intervals)
+            )
+    return points
 
 
 def _comparisons(
     found: Answers,
-    sources: Mapping[str, Mapping[str, Any]],
+    sources: Mapping[str, SourceResults],
     drawn: Mapping[str, Mapping[str, NDArray]],
 ) -> list[dict[str, Any]]:
-    """Every pair of sources, the later one against the earlier one."""
+    """Every pair of sources, the later one minus the earlier one."""
     out = []
     for b, a in combinations(sources, 2):
         rows: list[dict[str, Any]] = [
@@ -190,7 +209,7 @@ def _comparisons(
                 "a": a,
                 "b": b,
                 "metric": metric,
-                **compare_runs(sources[a][metric], sources[b][metric]),
+                **compare_runs(sources[a].runs(metric), sources[b].runs(metric)),
                 "p_holm": None,
                 "bootstrap_ci95": _interval(drawn[a][metric] - drawn[b][metric]),
             }
@@ -242,7 +261,7 @@ def _surrogate(work: Work) -> dict[str, Any]:
 
 
 def _judged(work: Work, source: str, healthy: int = 0) -> Fidelity | None:
-    """How real a source's trajectories are, over all folds; None where none was held out."""
+    """The fidelity of a source over all folds; None if no healthy trajectory is held out."""
     labels = work.files.real_data().labels
     parts = [
         Fidelity.load(work.files.path(job))
@@ -253,19 +272,19 @@ def _judged(work: Work, source: str, healthy: int = 0) -> Fidelity | None:
 
 
 def _fidelity_arrays(source: str, found: Fidelity) -> dict[str, NDArray]:
-    """What the report draws of it.
+    """The arrays of the report's figures.
 
-    `z/SOURCE/observed` and `/predicted` (k, d), per movement, NaN where outputs do not tell it;
+    `z/SOURCE/observed` and `/predicted` (k, d), per segment, NaN where z is not identified;
     `pit/SOURCE` (3, 20), see `Fidelity.pit_shares`; `bands/SOURCE/…`: `nominal` and `observed`
     (2, P, d), `seen` (2, P), `quantiles` (2, 5, P, d), `ids` (2,), of the trajectory with the
     median energy score and of the one with the worst; `rate` in Hz.
     """
-    told = np.isfinite(found.segment_values).any(axis=-1)
+    identified = np.isfinite(found.segment_values).any(axis=-1)
     order = np.argsort(found.energy, kind="stable").tolist()
     index = list(dict.fromkeys([order[(len(order) - 1) // 2], order[-1]]))
     return {
-        f"z/{source}/observed": found.segment_values[:, 0][told[:, 0]].astype(np.float32),
-        f"z/{source}/predicted": found.segment_values[:, 1:][told[:, 1:]].astype(np.float32),
+        f"z/{source}/observed": found.segment_values[:, 0][identified[:, 0]].astype(np.float32),
+        f"z/{source}/predicted": found.segment_values[:, 1:][identified[:, 1:]].astype(np.float32),
         f"pit/{source}": found.pit_shares(),
         f"bands/{source}/nominal": found.nominal[index].astype(np.float32),
         f"bands/{source}/observed": found.observed[index].astype(np.float32),
@@ -276,26 +295,26 @@ def _fidelity_arrays(source: str, found: Fidelity) -> dict[str, NDArray]:
     }
 
 
-def _portrait(work: Work) -> Overlay | None:
-    """Of all test trajectories; None where no twin was corrected."""
+def _overlay(work: Work) -> Overlay | None:
+    """The predictions beside all test trajectories; None if no twin was corrected."""
     made = [Overlay.load(work.files.path(job)) for job in work.overlay_jobs()]
     return Overlay.concatenate(made) if made else None
 
 
-def _portrait_arrays(work: Work, test: Trajectories, portrait: Overlay) -> dict[str, NDArray]:
+def _overlay_arrays(work: Work, test: Trajectories, overlay: Overlay) -> dict[str, NDArray]:
     """Every test trajectory at the sensor's rate, in the order of `data.test.ids`.
 
     `portrait/commands` (n, P, d_u), `/nominal`, `/observed` (n, P, d), the latter NaN where not
     measured, and `/rate` in Hz; the rest as in `Overlay`.
     """
     every = max(1, round(test.rate / work.case.sensor_rate))
-    names = portrait.ids.tolist()
+    names = overlay.ids.tolist()
     order = [names.index(name) for name in test.ids.tolist()]
     found = {
         "commands": test.commands[:, ::every],
         "nominal": test.nominal[:, ::every],
         "observed": np.where(test.mask, test.observed, np.nan)[:, ::every],
-        **{name: getattr(portrait, name)[order] for name in ("bands", "z", "deviation", "times")},
+        **{name: getattr(overlay, name)[order] for name in ("bands", "z", "deviation", "times")},
         "rate": np.array(test.rate / every),
     }
     return {f"portrait/{name}": each.astype(np.float32) for name, each in found.items()}
@@ -326,14 +345,3 @@ def _machine() -> dict[str, str]:
         "machine": platform.platform(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-
-
-def _plain(value: Any) -> Any:
-    """JSON has no NaN: undefined figures become null."""
-    if isinstance(value, Mapping):
-        return {key: _plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value

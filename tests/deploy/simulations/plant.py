@@ -77,7 +77,7 @@ def study(data: Path, out: Path) -> None:
     found = rt.run_study(
         CASE, plan, rt.StudyData(twin=data, real=out / "real.npz"), out / "study", processes=1
     )
-    assert found["data"]["twin"]["n"] == len(rt.load(data))
+    assert found.data.twin.n == len(rt.load(data))
 
 
 def copy(data: Path, out: Path) -> None:

@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Channels
+from retwin.scores.bootstrap import bootstrap_weights
 from retwin.scores.distributions import (
     central_band,
     cumulative_counts,
     ks_distance,
     share_as_far,
 )
-from retwin.scores.statistics import bootstrap_weights
 from retwin.serialisation.files import write_atomically
 
 __all__ = ["BINS", "Fidelity", "Figure"]

@@ -1,0 +1,251 @@
+"""What a figure shows: arrays, labels and units, prepared once for the page and for the PNG.
+
+Colours are names: `c0` to `c7` of the palette, or those of `retwin.report.style.CHROME`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "Axis",
+    "Band",
+    "Bars",
+    "Dimension",
+    "Figure",
+    "Heading",
+    "Key",
+    "Line",
+    "Mark",
+    "Matrices",
+    "Matrix",
+    "Panel",
+    "Points",
+    "Row",
+    "Spans",
+    "draw_bands",
+    "edges_of",
+]
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line through points (n,), NaN for a break; `step` holds each value up to the next x."""
+
+    x: ArrayLike
+    y: ArrayLike
+    name: str
+    colour: str
+    dash: str = "solid"
+    width: float = 1.8
+    step: bool = False
+    hover: bool = True
+    alpha: float = 1
+
+
+@dataclass(frozen=True)
+class Band:
+    """The area between two lines over x (n,)."""
+
+    x: ArrayLike
+    low: ArrayLike
+    high: ArrayLike
+    name: str
+    colour: str
+    alpha: float = 0.2
+
+
+@dataclass(frozen=True)
+class Points:
+    """Symbols at (x, y), with intervals `low` to `high` along an axis, and a line if it has a dash.
+
+    `texts` are shown where a reader points at them.
+    """
+
+    x: ArrayLike
+    y: ArrayLike
+    name: str
+    colour: str
+    symbol: str = "circle"
+    low: ArrayLike | None = None
+    high: ArrayLike | None = None
+    along: Literal["x", "y"] = "x"
+    texts: Sequence[str] = ()
+    dash: str = ""
+    size: int = 9
+    bar_width: float = 2
+
+
+@dataclass(frozen=True)
+class Bars:
+    """A histogram: heights (n,) between edges (n + 1,)."""
+
+    edges: NDArray
+    heights: NDArray
+    name: str
+    colour: str
+
+
+@dataclass(frozen=True)
+class Spans:
+    """Intervals (n, 2) of x that are shaded."""
+
+    intervals: Sequence[tuple[float, float]]
+    colour: str = "grid"
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """A thick line from `start` to `end` with a name so many pixels beside its middle."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    name: str
+    beside: tuple[float, float]
+    colour: str = "c1"
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A bold text at the left end of the x axis, at `y`."""
+
+    text: str
+    y: float
+
+
+Mark = Line | Band | Points | Bars | Spans | Dimension | Heading
+
+
+@dataclass(frozen=True)
+class Axis:
+    """An axis.
+
+    Attributes
+    ----------
+    label, unit : str
+        The quantity, and its unit or "".
+    limits : (float, float)
+        First and last value; None for what the marks need.
+    kind : str
+        "number"; "share", with one decimal; "percent"; "log"; "names", whose `ticks` are texts.
+    step : float
+        Distance of ticks.
+    ticks : mapping of float to str
+        The ticks.
+    count : int
+        Ticks at most, where neither is given.
+    from_zero : bool
+        Whether the axis begins at 0.
+
+    """
+
+    label: str
+    unit: str = ""
+    limits: tuple[float, float] | None = None
+    kind: Literal["number", "share", "percent", "log", "names"] = "number"
+    step: float | None = None
+    ticks: Mapping[float, str] = field(default_factory=dict)
+    count: int = 6
+    from_zero: bool = False
+
+    @property
+    def title(self) -> str:
+        """The quantity with its unit."""
+        return f"{self.label}, {self.unit}" if self.unit else self.label
+
+
+@dataclass(frozen=True)
+class Row:
+    """Marks on a y axis."""
+
+    y: Axis
+    marks: Sequence[Mark]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One or two rows of marks above a common x axis; `height` in pixels of the page.
+
+    Where there is little room, the tick labels of the y axis are left out if `narrow_bare`.
+    """
+
+    x: Axis
+    rows: Sequence[Row]
+    alt: str
+    title: str = ""
+    height: int = 340
+    narrow_bare: bool = False
+
+
+@dataclass(frozen=True)
+class Key:
+    """An entry of the legend: a text, a colour, and a mark (a dash, a symbol, `bar`)."""
+
+    text: str
+    colour: str
+    mark: str = "solid"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Panels under a legend.
+
+    Attributes
+    ----------
+    name : str
+        That of its PNG, and of its element on the page.
+    source : str
+        The source that it is about; "" for several.
+    columns : int
+        Panels side by side in the PNG, at most.
+    narrow : bool
+        Whether its caption stands beside it on the page where there is room.
+
+    """
+
+    name: str
+    panels: Sequence[Panel]
+    keys: Sequence[Key] = ()
+    source: str = ""
+    columns: int = 3
+    narrow: bool = False
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """Confusion counts of one source, their shares of each row, and how many are correct."""
+
+    title: str
+    source: str
+    counts: Sequence[Sequence[int]]
+    shares: NDArray
+    correct: int
+    total: int
+
+
+@dataclass(frozen=True)
+class Matrices:
+    """Confusion matrices side by side."""
+
+    name: str
+    classes: Sequence[str]
+    matrices: Sequence[Matrix]
+
+
+def draw_bands(x: ArrayLike, quantiles: ArrayLike, colour: str, alpha: float = 0.4) -> list[Mark]:
+    """The 90 % and 50 % bands of draws, from quantiles (5, n) at 5, 25, 50, 75 and 95 %."""
+    rows = np.asarray(quantiles)
+    return [
+        Band(x, rows[0], rows[4], "90 % of the draws", colour, 0.2),
+        Band(x, rows[1], rows[3], "50 % of the draws", colour, alpha),
+    ]
+
+
+def edges_of(values: NDArray, edges: NDArray) -> tuple[NDArray, NDArray]:
+    """The outline (x, y) of a histogram's shares (n,) between edges (n + 1,)."""
+    return np.repeat(edges, 2)[1:-1], np.repeat(values, 2)

@@ -1,0 +1,182 @@
+"""Names, numbers and units as text, the same everywhere on the page and in the figures."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.catalog import METRICS, SOURCES
+
+__all__ = [
+    "MAIN",
+    "MANY",
+    "class_name",
+    "counted",
+    "duration",
+    "in_sentence",
+    "latent_names",
+    "mean_and_deviation",
+    "metric_name",
+    "number",
+    "order",
+    "p_value",
+    "quantity",
+    "real_data",
+    "signed",
+    "source_in_sentence",
+    "source_name",
+    "span",
+    "stage_name",
+    "with_role",
+    "with_unit",
+]
+
+MANY = 5
+"""Number of sources beyond which figures and tables show a selection."""
+MAIN = tuple(name for name, metric in METRICS.items() if metric.headline)
+"""The metrics that summarise a study."""
+REAL_DATA = {
+    "none": "none",
+    "timing": "timing of commands",
+    "healthy": "healthy only",
+    "unlabelled": "unlabelled, not of the test set",
+    "transductive": "TEST OUTPUTS without labels (transductive)",
+    "labelled": "labelled, some of each class",
+}
+
+
+def with_role(sources: Iterable[str], role: Literal["plain", "surrogate", "updated"]) -> list[str]:
+    """The sources of that role, see `retwin.catalog.SourceEntry`."""
+    return [name for name in sources if name in SOURCES and SOURCES[name].role == role]
+
+
+def source_name(source: str) -> str:
+    """The source's title; an unknown source keeps its name."""
+    return SOURCES[source].title if source in SOURCES else source
+
+
+def source_in_sentence(source: str) -> str:
+    """The source's title in the middle of a sentence."""
+    text = in_sentence(source_name(source))
+    return f"the {text}" if with_role([source], "plain") else text
+
+
+def metric_name(metric: str) -> str:
+    """The metric's title."""
+    return METRICS[metric].title
+
+
+def in_sentence(title: str) -> str:
+    """A title in the middle of a sentence."""
+    return title if title[:2].isupper() else f"{title[:1].lower()}{title[1:]}"
+
+
+def order(sources: Iterable[str]) -> list[str]:
+    """Sources in the catalog's order, then the unknown ones."""
+    known = {name: place for place, name in enumerate(SOURCES)}
+    return sorted(sources, key=lambda name: known.get(name, len(known)))
+
+
+def class_name(name: str) -> str:
+    """Short: `Motor_1_Steady_state_error` is `M1 bias`."""
+    short = re.sub(r"^([A-Za-z])[a-z]*_(\d+)_", r"\1\2 ", name)
+    short = re.sub(r"steady_state_error$", "bias", short, flags=re.IGNORECASE).replace("_", " ")
+    return re.sub(r"(?<= )\w+$", lambda word: word.group().lower(), short)
+
+
+def latent_names(name: str) -> tuple[str, str]:
+    """Title of a component of z, and the quantity on its axis."""
+    if name.startswith("delay"):
+        return f"TDe{name[5:].replace('_', ' ')}", "delay"
+    for start, title, what in (("offset_", "TPE", "offset"), ("noise_", "Noise", "noise")):
+        if name.startswith(start):
+            rest = name[len(start) :].replace("_", " ")
+            return f"{title} {rest}", f"{what} {rest}"
+    return name.replace("_", " "), name.replace("_", " ")
+
+
+def stage_name(key: str) -> str:
+    """`surrogate_fit_s` as `Surrogate fit`."""
+    words = re.sub(r"_s$", "", key).replace("_", " ").strip()
+    return words[:1].upper() + words[1:]
+
+
+def counted(count: int, what: str) -> str:
+    """`1 trajectory`, `5 trajectories`, `3 runs`."""
+    several = f"{what[:-1]}ies" if what.endswith("y") else f"{what}s"
+    return f"{count} {what if count == 1 else several}"
+
+
+def real_data(text: str | None) -> str:
+    """The real data that a source learns from."""
+    return "not said" if text is None else REAL_DATA.get(text, text)
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Fixed digits with a true minus; a dash for what is not defined."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return f"{round(value, digits) + 0.0:.{digits}f}".replace("-", "−")
+
+
+def signed(value: float, digits: int = 3) -> str:
+    """With its sign, also when positive."""
+    text = number(value, digits)
+    return f"+{text}" if round(value, digits) > 0 else text
+
+
+def span(interval: Sequence[float] | None, digits: int = 3, *, sign: bool = False) -> str:
+    """`0.69 to 0.81`."""
+    if interval is None:
+        return "–"
+    show = signed if sign else number
+    return f"{show(interval[0], digits)} to {show(interval[1], digits)}"
+
+
+def mean_and_deviation(values: Sequence[float] | NDArray) -> str:
+    """Mean ± standard deviation over runs; the value alone of one run."""
+    finite = np.asarray(values, dtype=float)
+    finite = finite[np.isfinite(finite)]
+    if len(finite) < 2:
+        return number(float(finite[0]) if len(finite) else None)
+    return f"{number(float(finite.mean()))} ± {number(float(finite.std(ddof=1)))}"
+
+
+def p_value(p: float | None) -> str:
+    """Three digits, or `< 0.001`."""
+    return "< 0.001" if p is not None and p < 0.001 else number(p)
+
+
+def duration(seconds: float | None) -> str:
+    """Seconds in the unit that suits them."""
+    if seconds is None or not math.isfinite(seconds):
+        return "–"
+    if seconds < 0.1:
+        return f"{1000 * seconds:.2g} ms"
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    if seconds < 7200:
+        return f"{seconds / 60:.1f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def quantity(unit: str) -> tuple[float, str]:
+    """Factor and unit in which values are shown.
+
+    Lengths are in millimetres, `m` is `(1000, "mm")`, and counts of a unit are in that unit,
+    `0.24 deg` is `(0.24, "deg")`.
+    """
+    if unit == "m":
+        return 1000.0, "mm"
+    counts = re.fullmatch(r"(\d*\.?\d+) (.+)", unit)
+    return (float(counts[1]), counts[2]) if counts else (1.0, unit)
+
+
+def with_unit(title: str, unit: str) -> str:
+    """`CRPS x, mm`; the title alone where there is no unit."""
+    return f"{title}, {unit}" if unit else title

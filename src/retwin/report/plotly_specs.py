@@ -1,0 +1,193 @@
+"""Figures as plotly's data, which `page.js` draws in the page's style.
+
+`@NAME` stands for a colour of the page.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from retwin.report.figure import (
+    Axis,
+    Band,
+    Bars,
+    Dimension,
+    Heading,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Row,
+    Spans,
+)
+
+__all__ = ["panel_spec"]
+
+FORMATS = {"share": ".1f", "percent": ".0%"}
+HOVER = {"share": ".3f", "percent": ".1%"}
+UPPER, LOWER = [0.38, 1], [0, 0.3]
+"""The parts of the height that two rows take."""
+
+
+def panel_spec(panel: Panel) -> dict[str, Any]:
+    """Data and layout of a panel; `narrow` holds what of the layout differs on a narrow screen."""
+    first, *others = panel.rows
+    x, y = _axis(panel.x), _axis(first.y)
+    layout: dict[str, Any] = {"xaxis": x, "yaxis": y}
+    data = _traces(first, panel.x)
+    if others:
+        y["domain"], x["anchor"] = UPPER, "y2"
+        layout["yaxis2"] = _axis(others[0].y) | {"domain": LOWER, "zeroline": True}
+        layout["yaxis2"]["zerolinecolor"] = "@rule"
+        data += [{**trace, "yaxis": "y2"} for trace in _traces(others[0], panel.x)]
+    if shapes := [each for mark in first.marks for each in _shapes(mark)]:
+        layout["shapes"] = shapes
+    if annotations := [each for mark in first.marks for each in _annotations(mark)]:
+        layout["annotations"] = annotations
+    narrow = {"yaxis": {**y, "showticklabels": False}} if panel.narrow_bare else {}
+    return {"data": data, "layout": layout, "height": panel.height, "narrow": narrow}
+
+
+def _axis(axis: Axis) -> dict[str, Any]:
+    made: dict[str, Any] = {"title": {"text": _escaped(axis.title)}}
+    if axis.limits is not None:
+        made["range"] = _numbers(axis.limits)
+    if axis.kind == "log":
+        made["type"] = "log"
+    if axis.kind == "names":
+        made |= {"showgrid": False, "ticks": "", "showline": False}
+    if axis.kind in FORMATS:
+        made["tickformat"] = FORMATS[axis.kind]
+    if axis.from_zero:
+        made["rangemode"] = "tozero"
+    if axis.ticks:
+        made["tickvals"] = list(axis.ticks)
+        made["ticktext"] = [_escaped(text) for text in axis.ticks.values()]
+    elif axis.step is not None:
+        made["dtick"] = axis.step
+    else:
+        made["nticks"] = axis.count
+    return made
+
+
+def _traces(row: Row, x: Axis) -> list[dict[str, Any]]:
+    return [each for mark in row.marks if (each := _trace(mark, x, row.y)) is not None]
+
+
+def _trace(mark: Mark, x: Axis, y: Axis) -> dict[str, Any] | None:
+    """The trace of a mark; None for a mark that is a shape or an annotation."""
+    where = f"%{{y:{HOVER.get(y.kind, '.4g')}}} at %{{x:{HOVER.get(x.kind, '.4g')}}} {x.unit}"
+    match mark:
+        case Line():
+            colour = f"@{mark.colour}" + (f"/{mark.alpha}" if mark.alpha < 1 else "")
+            line = {"color": colour, "width": mark.width, "dash": mark.dash}
+            shape = {"shape": "hv"} if mark.step else {}
+            points = {"x": _numbers(mark.x), "y": _numbers(mark.y)}
+            hover = _hover(mark.name, where) if mark.hover else {"hoverinfo": "skip"}
+            return _scatter(mark.name, "lines", **points, line={**line, **shape}, **hover)
+        case Band():
+            along, low, high = map(_numbers, (mark.x, mark.low, mark.high))
+            return _scatter(
+                mark.name,
+                "lines",
+                x=along + along[::-1],
+                y=high + low[::-1],
+                fill="toself",
+                fillcolor=f"@{mark.colour}/{mark.alpha}",
+                line={"width": 0},
+                hoverinfo="skip",
+            )
+        case Points():
+            return _points(mark, where)
+        case Bars():
+            return {
+                "type": "bar",
+                "name": mark.name,
+                "x": _numbers((mark.edges[1:] + mark.edges[:-1]) / 2),
+                "y": _numbers(mark.heights),
+                "width": float(np.diff(mark.edges).mean()),
+                "marker": {"color": f"@{mark.colour}", "line": {"width": 0}},
+                **_hover(mark.name, where),
+            }
+    return None
+
+
+def _points(mark: Points, where: str) -> dict[str, Any]:
+    made = _scatter(
+        mark.name,
+        "lines+markers" if mark.dash else "markers",
+        x=_numbers(mark.x),
+        y=_numbers(mark.y),
+        marker={"color": f"@{mark.colour}", "size": mark.size, "symbol": mark.symbol},
+        **_hover(mark.name, "%{text}" if mark.texts else where),
+    )
+    if mark.texts:
+        made["text"] = list(mark.texts)
+    if mark.dash:
+        made["line"] = {"color": f"@{mark.colour}", "width": 2.2, "dash": mark.dash}
+    if mark.low is not None and mark.high is not None:
+        middle = np.asarray(mark.x if mark.along == "x" else mark.y, dtype=float)
+        made[f"error_{mark.along}"] = {
+            "type": "data",
+            "symmetric": False,
+            "array": _numbers(np.maximum(np.asarray(mark.high) - middle, 0)),
+            "arrayminus": _numbers(np.maximum(middle - np.asarray(mark.low), 0)),
+            "color": f"@{mark.colour}",
+            "thickness": mark.bar_width,
+            "width": 0,
+        }
+    return made
+
+
+def _scatter(name: str, mode: str, **more: Any) -> dict[str, Any]:
+    return {"type": "scatter", "mode": mode, "name": _escaped(name), **more}
+
+
+def _hover(name: str, text: str) -> dict[str, str]:
+    return {"hovertemplate": f"{_escaped(name)}<br>{text.rstrip()}<extra></extra>"}
+
+
+def _shapes(mark: Mark) -> list[dict[str, Any]]:
+    if isinstance(mark, Spans):
+        area = {"type": "rect", "yref": "paper", "y0": 0, "y1": 1, "layer": "below"}
+        fill = {"fillcolor": f"@{mark.colour}", "line": {"width": 0}}
+        return [{**area, **fill, "x0": start, "x1": end} for start, end in mark.intervals]
+    if isinstance(mark, Dimension):
+        corners = (*mark.start, *mark.end)
+        ends = dict(zip(("x0", "y0", "x1", "y1"), corners, strict=True))
+        return [{"type": "line", **ends, "line": {"color": f"@{mark.colour}", "width": 4}}]
+    return []
+
+
+def _annotations(mark: Mark) -> list[dict[str, Any]]:
+    if isinstance(mark, Heading):
+        place = {"x": 0, "xref": "paper", "xanchor": "left", "y": mark.y, "showarrow": False}
+        return [{"text": f"<b>{_escaped(mark.text)}</b>", **place, "font": {"color": "@ink"}}]
+    if isinstance(mark, Dimension):
+        middle = [(a + b) / 2 for a, b in zip(mark.start, mark.end, strict=True)]
+        return [
+            {
+                "text": f"<b>{_escaped(mark.name)}</b>",
+                **dict(zip(("x", "y", "ax", "ay"), (*middle, *mark.beside), strict=True)),
+                "font": {"color": "@ink", "size": 14},
+                "arrowcolor": "@ink",
+                "arrowhead": 2,
+                "arrowwidth": 1,
+                "standoff": 5,
+            }
+        ]
+    return []
+
+
+def _escaped(text: str) -> str:
+    return html.escape(text, quote=False)
+
+
+def _numbers(values: ArrayLike | Sequence[float]) -> list[float]:
+    """Five digits, so that the page stays small."""
+    return [float(f"{value:.5g}") for value in np.asarray(values, dtype=float)]

@@ -1,0 +1,164 @@
+"""The model card: scope, known failures, data, versions, and the command that repeats the study."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+from urllib.parse import quote
+
+from retwin.report.blocks import Cell, Column, Link, Section, Table
+from retwin.report.labels import class_name, counted, latent_names, quantity, real_data, source_name
+from retwin.report.study import Study
+from retwin.report.verdict import headline
+from retwin.results import ChannelNames, Dataset
+from retwin.scores.classification import row_shares
+
+__all__ = ["card"]
+
+SIGNIFICANT = 0.05
+"""The p-value at or below which generated and observed values count as different."""
+POOR = 0.5
+"""The recall below which a class counts as not recognised."""
+
+
+def card(study: Study) -> Section:
+    """Of the headline's updated twin, else of the first source."""
+    results = study.results
+    pair = headline(results)
+    source = pair[0] if pair else next(iter(results.sources))
+    each = results.sources[source]
+    fidelity = results.fidelity.get(source)
+    values: dict[str, Any] = {
+        "source": source,
+        "scope": _scope(study, source),
+        "protocol_known": each.fault_protocol_known,
+        "confused": _confused(study, source),
+        "missed": _missed(study, source),
+        "unlike": [
+            (latent_names(name)[0], figure)
+            for name, figure in (fidelity.agreement if fidelity else {}).items()
+            if figure.p is not None and figure.p <= SIGNIFICANT
+        ],
+        "notes": each.notes,
+        "data": _data(study),
+        "protocol": results.data.protocol.rstrip("."),
+        "used": results.data.calibration.used,
+        "tested": results.data.test.ids,
+        "setup": _setup(study),
+        "command": results.provenance.get("command"),
+    }
+    return Section("card", "Model card", values)
+
+
+def _scope(study: Study, source: str) -> dict[str, str]:
+    results, word = study.results, study.word
+    calibration, test = results.data.calibration, results.data.test
+    used = calibration.n if calibration.used is None else len(calibration.used)
+    counts = Counter(class_name(label) for label in test.labels if results.classes)
+    tested = ", ".join(f"{count} {label}" for label, count in counts.items())
+    facts = {
+        "system": results.title or results.case,
+        "updated twin": source_name(source),
+        f"{word} data it saw": real_data(results.sources[source].real_data),
+        "commands": _channels(results.inputs),
+        "outputs": _channels(results.outputs),
+        "classes": ", ".join(map(class_name, results.classes)),
+        "calibrated on": counted(used, f"{word} trajectory") if used else "",
+        "tested on": tested or (counted(test.n, "trajectory") if test.n else ""),
+        "a trajectory": _length(study),
+    }
+    return {term: text for term, text in facts.items() if text}
+
+
+def _channels(channels: ChannelNames) -> str:
+    units = [*channels.units, *[""] * len(channels.names)]
+    return ", ".join(
+        f"{name} ({quantity(unit)[1]})" if unit not in ("", "1") else name
+        for name, unit in zip(channels.names, units, strict=False)
+    )
+
+
+def _length(study: Study) -> str:
+    """The duration of a trajectory, and the sample rate of its measurement."""
+    bands, rate = (study.arrays.get(f"portrait/{name}") for name in ("bands", "rate"))
+    if bands is None or rate is None:
+        return ""
+    return f"{bands.shape[2] / float(rate):.0f} s at {float(rate):g} Hz"
+
+
+def _confused(study: Study, source: str) -> list[tuple[str, str, Cell]]:
+    """True class, diagnosis, and the trajectories that the mean over runs diagnoses so.
+
+    False alarms stand first, then faults that are missed or confused.
+    """
+    if source not in study.diagnosing:
+        return []
+    answers = study.probabilities(source).mean(axis=0).argmax(axis=1).tolist()
+    wrong: dict[tuple[int, int], list[str]] = {}
+    ids = study.results.data.test.ids
+    for name, true, answer in zip(ids, study.truth.tolist(), answers, strict=False):
+        if true != answer:
+            wrong.setdefault((true, answer), []).append(name)
+    names = [class_name(name) for name in study.results.classes]
+    return [
+        (names[true], names[answer], _trajectories(study, found))
+        for (true, answer), found in sorted(wrong.items())
+    ]
+
+
+def _missed(study: Study, source: str) -> list[tuple[str, float]]:
+    """The classes with a poor recall over all runs."""
+    counts = study.results.sources[source].confusion
+    if counts is None or source not in study.diagnosing:
+        return []
+    recalls = row_shares(counts).diagonal().tolist()
+    return [
+        (class_name(name), recall)
+        for name, row, recall in zip(study.results.classes, counts, recalls, strict=True)
+        if sum(row) and recall < POOR
+    ]
+
+
+def _trajectories(study: Study, names: Sequence[str]) -> Cell:
+    """Their ids, as links to the explorer where there is one."""
+    if not study.explorable:
+        return Cell(", ".join(names))
+    return Cell("", links=[Link(name, f"trajectory={quote(name, safe='')}") for name in names])
+
+
+def _setup(study: Study) -> dict[str, str]:
+    results = study.results
+    setup = {"preset": results.preset, "classifier": results.classifier, "runs": results.runs}
+    facts = {**setup, **results.provenance}
+    return {
+        key.replace("_", " "): str(value)
+        for key, value in facts.items()
+        if key != "command" and value not in (None, "")
+    }
+
+
+def _data(study: Study) -> Table | None:
+    data = study.results.data
+    roles = {"Twin": data.twin, "Calibration": data.calibration, "Test": data.test}
+    rows = [
+        _data_row(role, each) for role, each in roles.items() if each.n is not None or each.sha256
+    ]
+    columns = [
+        Column("Role", numeric=False),
+        Column("File", numeric=False),
+        Column("Trajectories"),
+        Column("used"),
+        Column("SHA-256", numeric=False),
+    ]
+    return Table("Data", columns, rows) if rows else None
+
+
+def _data_row(role: str, each: Dataset) -> list[Cell]:
+    return [
+        Cell(role),
+        Cell(each.name or "–"),
+        Cell("–" if each.n is None else str(each.n)),
+        Cell("all" if each.used is None else str(len(each.used))),
+        Cell(each.sha256 or "–", tone="code"),
+    ]

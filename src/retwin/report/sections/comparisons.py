@@ -1,0 +1,117 @@
+"""Every pair of sources on every metric: Welch's test over runs, bootstrap over trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from retwin.catalog import METRICS
+from retwin.report.blocks import Cell, Column, Forest, Section, Table
+from retwin.report.labels import (
+    MANY,
+    in_sentence,
+    metric_name,
+    number,
+    order,
+    p_value,
+    signed,
+    source_name,
+    span,
+)
+from retwin.report.study import Study
+from retwin.report.verdict import headline, outcome_of
+from retwin.results import Comparison
+
+__all__ = ["comparisons"]
+
+SELECTED = ("macro_f1", "healthy_recall")
+"""The metrics that the table of pairs shows of many sources."""
+
+
+def comparisons(study: Study) -> Section | None:
+    """Of many sources a matrix of differences, and the pairs with the headline's sources only."""
+    found = [each for each in study.results.comparisons if each.metric in METRICS]
+    if not found:
+        return None
+    many = len(study.sources) > MANY
+    metric = next(name for name in METRICS if any(each.metric == name for each in found))
+    matrix = _matrix(study, found, metric) if many else None
+    if many:
+        pair = set(headline(study.results) or ())
+        selected = [e for e in found if {e.a, e.b} & pair and e.metric in SELECTED]
+        found = selected or found
+    values = {
+        "matrix": matrix,
+        "metric": metric_name(metric),
+        "pairs": _pairs(found),
+        "many": many,
+    }
+    return Section("comparisons", "Comparisons", values)
+
+
+def _matrix(study: Study, found: Sequence[Comparison], metric: str) -> Table:
+    """The difference of each row's source from each column's, with its outcome."""
+    rows = []
+    for place, source in enumerate(study.sources):
+        pairs = [e.with_first(source) for e in found if e.metric == metric and source in (e.a, e.b)]
+        cells = {e.b: Cell(signed(100 * e.mean_diff, 0), tone=outcome_of(e)) for e in pairs}
+        name = Cell(f"{place + 1}. {source_name(source)}", source=source)
+        rows.append([name, *(cells.get(other, Cell("")) for other in study.sources)])
+    others = [Column(str(place + 1), group="minus") for place in range(len(study.sources))]
+    title = f"Who is better than whom in {in_sentence(metric_name(metric))}"
+    return Table(title, [Column("Source", numeric=False), *others], rows)
+
+
+def _pairs(found: Sequence[Comparison]) -> Table:
+    columns = [
+        Column("Score", numeric=False),
+        Column("Reading", numeric=False),
+        Column("Difference"),
+        Column("95 % interval"),
+        Column("", numeric=False),
+        Column("t (df)", group="Welch’s test over runs"),
+        Column("p", group="Welch’s test over runs"),
+        Column("p, Holm", group="Welch’s test over runs"),
+    ]
+    shown = [each.interval for each in found if each.interval is not None]
+    low, high = min([0.0, *(lo for lo, _ in shown)]), max([0.0, *(hi for _, hi in shown)])
+    rows: list[list[Cell]] = []
+    last: tuple[str, str] | None = None
+    for each in _sorted(found):
+        if (each.a, each.b) != last:
+            rows.append([Cell(f"{source_name(each.a)} minus {source_name(each.b)}")])
+        last = each.a, each.b
+        rows.append(_row(each, low, high))
+    return Table("Differences, pair by pair", columns, rows)
+
+
+def _sorted(found: Sequence[Comparison]) -> list[Comparison]:
+    """Pair by pair, metrics in the catalog's order; the later source of a pair stands first."""
+    ranked = order(dict.fromkeys(name for each in found for name in (each.a, each.b)))
+    oriented = [each.with_first(max(each.a, each.b, key=ranked.index)) for each in found]
+    metrics = list(METRICS)
+    return sorted(
+        oriented, key=lambda e: (-ranked.index(e.a), ranked.index(e.b), metrics.index(e.metric))
+    )
+
+
+def _row(each: Comparison, low: float, high: float) -> list[Cell]:
+    forest = None
+    if each.interval is not None and np.isfinite(each.mean_diff) and high > low:
+        lower, at, upper, zero = (
+            100 * (value - low) / (high - low)
+            for value in (each.interval[0], each.mean_diff, each.interval[1], 0.0)
+        )
+        forest = Forest(lower, min(max(at, 0), 100), upper, zero)
+    result = outcome_of(each)
+    return [
+        Cell(metric_name(each.metric)),
+        Cell("undecided" if result == "open" else result or "–", tone=result),
+        Cell(signed(each.mean_diff)),
+        Cell(span(each.interval, sign=True)),
+        Cell("", forest=forest, source=each.a),
+        Cell(f"{number(each.t, 2)} ({number(each.df, 1)})" if each.t is not None else "–"),
+        Cell(p_value(each.p)),
+        Cell(p_value(each.p_holm)),
+    ]

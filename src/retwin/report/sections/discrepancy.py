@@ -1,0 +1,163 @@
+"""The discrepancy: what was observed of it, and what the corrected twins generate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from retwin.report.blocks import Cell, Section, Table, columns
+from retwin.report.figure import Axis, Bars, Figure, Key, Line, Mark, Panel, Row
+from retwin.report.labels import (
+    latent_names,
+    number,
+    order,
+    quantity,
+    source_name,
+    span,
+    with_role,
+    with_unit,
+)
+from retwin.report.sections.segment import segment, segment_figure
+from retwin.report.study import Study
+from retwin.report.style import colour_of
+from retwin.results import FidelityFigure
+from retwin.scores.histograms import Histogram, common_histogram
+
+__all__ = ["Latent", "detailed", "discrepancy", "figure_cell", "latents", "suffixes", "titled"]
+
+FEW = 3
+"""The number of sources up to which all are shown in detail."""
+KINDS = {"tde": "delay", "tpe": "offset_", "noise": "noise_"}
+"""The figures by name, and the first letters of the components of z that they show."""
+
+
+@dataclass(frozen=True)
+class Latent:
+    """A component of z: its name, its unit, and its observed and generated values in bins."""
+
+    name: str
+    unit: str
+    values: Histogram
+
+
+def discrepancy(study: Study) -> Section | None:
+    """One segment, observed and generated distributions of z, and tests of their agreement."""
+    found = segment(study)
+    example = None if found is None else segment_figure(found)
+    groups = [_groups(study, source) for source in suffixes(study)]
+    shown = [group for each in groups for group in each if group["source"] in detailed(study)]
+    tables = [
+        {"table": table, "segments": study.results.fidelity[source].segments}
+        for source in detailed(study)
+        if (table := _agreement(study, source)) is not None
+    ]
+    if example is None and not shown and not tables:
+        return None
+    figures = ([example] if example else []) + [group["figure"] for group in shown]
+    further = [
+        group["figure"]
+        for each in groups
+        for group in each
+        if group["source"] not in detailed(study)
+    ]
+    values = {"segment": found, "example": example, "groups": shown, "tables": tables}
+    return Section("discrepancy", "Discrepancy", values, figures, further)
+
+
+def suffixes(study: Study) -> dict[str, str]:
+    """The end of the figures' names for each source: empty for the first, then -2, -3."""
+    known = order(study.results.fidelity)
+    return {source: f"-{place + 1}" if place else "" for place, source in enumerate(known)}
+
+
+def detailed(study: Study) -> list[str]:
+    """Sources that are shown in detail; of many, the updated ones."""
+    known = order(study.results.fidelity)
+    return known if len(known) <= FEW else with_role(known, "updated") or known[-FEW:]
+
+
+def titled(study: Study, source: str, title: str) -> str:
+    """The title of a table, with the source where there are several."""
+    return f"{title}, {source_name(source)}" if len(study.results.fidelity) > 1 else title
+
+
+def figure_cell(figure: FidelityFigure | None, digits: int = 3, factor: float = 1.0) -> Cell:
+    """A figure with its interval below it."""
+    if figure is None:
+        return Cell("–")
+    scaled = None if figure.ends is None else [factor * end for end in figure.ends]
+    below = "" if scaled is None else f"[{span(scaled, digits)}]"
+    return Cell(number(factor * figure.value, digits), below)
+
+
+def latents(study: Study, source: str) -> list[Latent]:
+    """Every component of z of which there are observed and generated values."""
+    both = [study.arrays.get(f"z/{source}/{name}") for name in ("observed", "predicted")]
+    fidelity = study.results.fidelity[source]
+    units = [*fidelity.latent_units, *[""] * len(fidelity.latents)]
+    found = []
+    for column, name in enumerate(fidelity.latents):
+        factor, unit = quantity(units[column])
+        values = [factor * each[:, column] for each in both if each is not None]
+        histogram = common_histogram(*values) if len(values) == 2 else None
+        if histogram is not None:
+            found.append(Latent(name, unit, histogram))
+    return found
+
+
+def _groups(study: Study, source: str) -> list[dict[str, Any]]:
+    """Delays, offsets, noise and the rest: a figure each, with what its caption states."""
+    left = latents(study, source)
+    groups = []
+    for name, start in {**KINDS, "z": ""}.items():
+        shown = [each for each in left if each.name.startswith(start)]
+        left = [each for each in left if each not in shown]
+        if shown:
+            figure = _figure(source, f"{name}{suffixes(study)[source]}", shown)
+            groups.append({"source": source, "kind": name, "figure": figure, "latents": shown})
+    return groups
+
+
+def _figure(source: str, name: str, shown: list[Latent]) -> Figure:
+    """Observed as bars, generated as a stepped line, a panel per component."""
+    keys = [Key("observed", "observed", "bar"), Key("generated", colour_of(source))]
+    panels = [_panel(each, colour_of(source)) for each in shown]
+    return Figure(name, panels, keys, source, narrow=len(panels) == 1)
+
+
+def _panel(latent: Latent, colour: str) -> Panel:
+    title, label = latent_names(latent.name)
+    values = latent.values
+    low, high = float(values.edges[0]), float(values.edges[-1])
+    # A step to each bin's share at its left edge; the first point lifts the line from zero.
+    edges = np.concatenate([values.edges[:1], values.edges])
+    shares = np.concatenate([[0], values.generated, [0]])
+    marks: list[Mark] = [
+        Bars(values.edges, values.observed, "observed", "observed"),
+        Line(edges, shares, "generated", colour, width=2.2, step=True),
+    ]
+    limits = f"{number(low, 1)} to {number(high, 1)}"
+    return Panel(
+        Axis(label, latent.unit, (low, high), count=7),
+        [Row(Axis("share per bin", kind="percent", from_zero=True), marks)],
+        with_unit(f"{title}, observed and generated, {limits}", latent.unit),
+        title,
+        height=300,
+    )
+
+
+def _agreement(study: Study, source: str) -> Table | None:
+    fidelity = study.results.fidelity[source]
+    rows = [
+        [
+            Cell(latent_names(name)[0]),
+            figure_cell(distance, 2),
+            Cell(number(distance.p, 2)),
+            figure_cell(fidelity.figures.get(f"coverage90/{name}"), 2),
+        ]
+        for name, distance in fidelity.agreement.items()
+    ]
+    heads = columns("Per movement", "KS distance", "p", "in the 90 % range")
+    return Table(titled(study, source, "Agreement per movement"), heads, rows) if rows else None

@@ -1,0 +1,128 @@
+"""The explorer: any test trajectory in full, picked by the reader."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.report.blocks import Section
+from retwin.report.figure import Key
+from retwin.report.labels import class_name, quantity, source_name
+from retwin.report.study import Study
+from retwin.report.style import DASHES, PALETTE, colour_index, colour_of
+from retwin.results import OverlayInfo
+
+__all__ = ["explorer", "packed"]
+
+MISSING = -32768
+"""The code of a number that is not defined."""
+STEPS = 65534
+"""The number of steps from the smallest to the largest number."""
+
+
+def explorer(study: Study) -> Section | None:
+    """Commands, outputs, bands, segments, z, probabilities and poses of each trajectory."""
+    overlay = study.results.overlay
+    if overlay is None or not study.explorable:
+        return None
+    healthy = f"90 % and 50 % of what a healthy twin would do: {source_name(overlay.source)}"
+    keys = [
+        Key("measured", "ink"),
+        Key("nominal", "muted", "dot"),
+        Key(healthy, colour_of(overlay.source), "bar"),
+        Key("in motion", "grid", "bar"),
+        *(
+            Key(f"command {name}", f"c{u % len(PALETTE)}", DASHES[u % len(DASHES)])
+            for u, name in enumerate(study.results.inputs.names)
+        ),
+    ]
+    content = _content(study, overlay)
+    values = {
+        "keys": keys,
+        "latent": content["latent"] is not None,
+        "pose": content["pose"] is not None,
+    }
+    return Section("explorer", "Explorer", values, scripts={"explorer": content})
+
+
+def _content(study: Study, overlay: OverlayInfo) -> dict[str, Any]:
+    """Everything that the page's script draws, as JSON."""
+    results, arrays = study.results, study.arrays
+    outputs = [quantity(unit) for unit in results.outputs.units]
+    inputs = [quantity(unit) for unit in results.inputs.units]
+    scale = np.array([factor for factor, _ in outputs])
+    sources = [name for name in study.sources if study.probabilities(name).size]
+    probabilities = [study.probabilities(name).mean(axis=0) for name in sources]
+    return {
+        "ids": results.data.test.ids,
+        "truth": study.truth.tolist(),
+        "classes": [class_name(name) for name in results.classes],
+        "sources": [{"name": source_name(n), "colour": colour_index(n)} for n in sources],
+        "probabilities": packed(np.array(probabilities)) if sources else None,
+        "rate": float(arrays["portrait/rate"]),
+        "inputs": {"names": results.inputs.names, "units": [unit for _, unit in inputs]},
+        "outputs": {"names": results.outputs.names, "units": [unit for _, unit in outputs]},
+        "commands": packed(np.array([f for f, _ in inputs]) * arrays["portrait/commands"]),
+        **{
+            name: packed(scale * arrays[f"portrait/{name}"])
+            for name in ("nominal", "observed", "bands")
+        },
+        "times": packed(arrays["portrait/times"]),
+        "colour": colour_index(overlay.source),
+        "latent": _latent(study, overlay),
+        "pose": _poses(study),
+    }
+
+
+def _latent(study: Study, overlay: OverlayInfo) -> dict[str, Any] | None:
+    """The inferred z and its standard deviation, in the units that are shown."""
+    arrays = study.arrays
+    if not np.isfinite(arrays["portrait/z"]).any():
+        return None
+    factors = [quantity(unit) for unit in overlay.latent_units]
+    scale = np.array([factor for factor, _ in factors])
+    return {
+        "names": [name.replace("_", " ") for name in overlay.latents],
+        "units": [unit for _, unit in factors],
+        "z": _rounded(scale * arrays["portrait/z"]),
+        "deviation": _rounded(scale * arrays["portrait/deviation"]),
+    }
+
+
+def _rounded(values: NDArray) -> Any:
+    """Nested lists with four digits; a few numbers of very different size are not packed."""
+    flat = [float(f"{value:.4g}") for value in values.ravel()]
+    return np.array(flat).reshape(values.shape).tolist()
+
+
+def _poses(study: Study) -> dict[str, Any] | None:
+    """Chains of points (n, P, points, 3), and the box around all of them."""
+    if "pose/observed" not in study.arrays:
+        return None
+    nominal, observed = (study.arrays[f"pose/{name}"] for name in ("nominal", "observed"))
+    both = np.concatenate([nominal, observed])
+    low, high = both.min(axis=(0, 1, 2)), both.max(axis=(0, 1, 2))
+    margin = 0.06 * (high - low).max()
+    return {
+        "nominal": packed(nominal),
+        "observed": packed(observed),
+        "low": np.round(low - margin * np.array([1, 1, 0]), 4).tolist(),
+        "high": np.round(high + margin, 4).tolist(),
+    }
+
+
+def packed(values: NDArray) -> dict[str, Any]:
+    """Numbers in 16 bits each, in equal steps from the smallest to the largest.
+
+    The page's script computes low + step (code + 32767); the code -32768 is a missing number.
+    """
+    known = values[np.isfinite(values)]
+    low = float(known.min()) if known.size else 0.0
+    step = (float(known.max()) - low) / STEPS if known.size else 0.0
+    codes = np.zeros(values.shape) if step == 0 else (values - low) / step
+    codes = np.where(np.isfinite(values), np.round(codes) - 32767, MISSING)
+    text = base64.b64encode(codes.astype("<i2").tobytes()).decode()
+    return {"low": low, "step": step, "shape": list(values.shape), "codes": text}

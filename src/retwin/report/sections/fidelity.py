@@ -1,0 +1,206 @@
+"""Fidelity of the draws of corrected twins: scores, calibration, and figures of both."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.report.blocks import Cell, Column, Section, Table, columns
+from retwin.report.figure import (
+    Axis,
+    Band,
+    Figure,
+    Key,
+    Line,
+    Mark,
+    Panel,
+    Row,
+    draw_bands,
+    edges_of,
+)
+from retwin.report.labels import number, order, quantity, source_name, span, with_unit
+from retwin.report.sections.discrepancy import detailed, figure_cell, suffixes, titled
+from retwin.report.study import Study
+from retwin.report.style import colour_of
+from retwin.results import Fidelity
+
+__all__ = ["fidelity"]
+
+RIVALS = {"mean_only": "Mean only", "single_gaussian": "One Gaussian"}
+"""Titles of the simpler generators."""
+SHARES = {
+    "coverage50": "in the 50 % band",
+    "coverage90": "in the 90 % band",
+    "pit": "PIT from uniform",
+    "auroc": "AUROC, real or generated",
+}
+"""Columns of the table of all sources."""
+
+
+def fidelity(study: Study) -> Section | None:
+    """Scores of the draws beside those of simpler generators, and their calibration."""
+    known = {name: study.results.fidelity[name] for name in order(study.results.fidelity)}
+    judged = [name for name, each in known.items() if each.figures]
+    figures = {name: _figures(study, name) for name in known}
+    details: list[dict[str, Any]] = [
+        {
+            "source": name,
+            "fidelity": known[name],
+            "scores": _scores(study, name),
+            "calibration": _calibration(study, name),
+            "figures": figures[name],
+        }
+        for name in detailed(study)
+        if name in judged
+    ]
+    if not details and len(judged) < 2:
+        return None
+    values: dict[str, Any] = {
+        "overview": _overview(study, judged) if len(judged) > 1 else None,
+        "partial": set(judged) > set(detailed(study)),
+        "details": details,
+        "several": len(known) > 1,
+        "fewest": min(each.trajectories or 0 for each in known.values()),
+    }
+    names = [each["source"] for each in details]
+    shown = [figure for name in names for figure in figures[name].values()]
+    further = [f for name in known if name not in names for f in figures[name].values()]
+    return Section("fidelity", "Fidelity", values, shown, further)
+
+
+def _lengths(each: Fidelity, energy: str) -> list[tuple[str, str, float, str]]:
+    """Key, title, factor and unit of the CRPS of each output; `energy` is put behind them."""
+    units = [*each.units, *[""] * len(each.outputs)]
+    rows = [(f"crps/{n}", f"CRPS {n}", u) for n, u in zip(each.outputs, units, strict=False)]
+    if energy:
+        rows.append(("crps", energy, ""))
+    rows.append(("energy", "Energy score", units[0] if len(set(each.units)) == 1 else ""))
+    return [(key, title, *quantity(unit)) for key, title, unit in rows]
+
+
+def _overview(study: Study, sources: list[str]) -> Table:
+    """A row per source."""
+    known = {name: study.results.fidelity[name].figures for name in sources}
+    lengths = _lengths(study.results.fidelity[sources[0]], "")
+    shown = [*lengths, *((key, title, 1.0, "") for key, title in SHARES.items())]
+    shown = [each for each in shown if any(each[0] in figures for figures in known.values())]
+    heads = columns("Source", *(with_unit(title, unit) for _, title, _, unit in shown))
+    rows = [
+        [
+            Cell(source_name(name), source=name),
+            *(figure_cell(figures.get(key), 2, factor) for key, _, factor, _ in shown),
+        ]
+        for name, figures in known.items()
+    ]
+    return Table("How real, source by source", heads, rows)
+
+
+def _scores(study: Study, source: str) -> Table:
+    """CRPS and energy score of this twin and its rivals, and the paired differences."""
+    each = study.results.fidelity[source]
+    heads = columns("Score", source_name(source))
+    for rival in each.rivals:
+        name = RIVALS.get(rival, rival)
+        heads += [Column("score", group=name), Column("ours below by, %", group=name)]
+    rows = []
+    for key, title, factor, unit in _lengths(each, "CRPS, mean over outputs"):
+        kind, *output = key.split("/", 1)
+        row = [Cell(with_unit(title, unit)), figure_cell(each.figures.get(key), 2, factor)]
+        for rival in each.rivals:
+            row.append(figure_cell(each.figures.get(f"{key}/{rival}"), 2, factor))
+            below = "/".join([f"{kind}_below", *output, rival])
+            row.append(figure_cell(each.figures.get(below), 0, 100.0))
+        rows.append(row)
+    return Table(titled(study, source, "Scores of the draws"), heads, rows)
+
+
+def _calibration(study: Study, source: str) -> Table:
+    each = study.results.fidelity[source]
+    widened = f"90 % band, widened × {number(each.widening, 2)}"
+    lines = {
+        "coverage50": ("Points inside the 50 % band", "0.50"),
+        "coverage90": ("Points inside the 90 % band", "0.90"),
+        "coverage90_widened": (f"Points inside the {widened}", "0.90"),
+        "pit": ("PIT, distance from uniform", "0"),
+        "auroc": ("Classifier of real against generated, AUROC", "0.50"),
+    }
+    rows = [
+        [
+            Cell(title),
+            Cell(number(each.figures[key].value, 2)),
+            Cell(span(each.figures[key].ends, 2)),
+            Cell(number(each.figures[key].p, 2)),
+            Cell(ideal),
+        ]
+        for key, (title, ideal) in lines.items()
+        if key in each.figures
+    ]
+    heads = columns("Calibration", "Value", "95 % interval", "p", "Ideal")
+    return Table(titled(study, source, "Calibration of the draws"), heads, rows)
+
+
+def _figures(study: Study, source: str) -> dict[str, Figure]:
+    """The PIT histogram and the bands, as far as their arrays are there."""
+    added = suffixes(study)[source]
+    pit = study.arrays.get(f"pit/{source}")
+    found = {} if pit is None else {"pit": _pit(source, f"pit{added}", pit)}
+    if study.bands(source):
+        found["bands"] = _bands(study, source, f"bands{added}")
+    return found
+
+
+def _pit(source: str, name: str, pit: NDArray) -> Figure:
+    """Shares of the PIT (3, bins): measured, and the 90 % range of perfect generators."""
+    count = pit.shape[1]
+    edges = np.linspace(0, 1, count + 1)
+    colour = colour_of(source)
+    x, measured = edges_of(pit[0], edges)
+    marks: list[Mark] = [
+        Band(x, np.repeat(pit[1], 2), np.repeat(pit[2], 2), "perfect generators", colour, 0.25),
+        Line([0, 1], [1 / count] * 2, "uniform", "muted", "dot", 1, hover=False),
+        Line(x, measured, "measured", "ink"),
+    ]
+    panel = Panel(
+        Axis("share of draws below the measured value", limits=(0, 1), kind="share", step=0.2),
+        [Row(Axis("share of points", kind="percent", from_zero=True), marks)],
+        "Histogram of the probability integral transform",
+    )
+    keys = [
+        Key("measured", "ink"),
+        Key("where 90 % of perfect generators lie", colour, "bar"),
+        Key("uniform", "muted", "dot"),
+    ]
+    return Figure(name, [panel], keys, source, narrow=True)
+
+
+def _bands(study: Study, source: str, name: str) -> Figure:
+    """Measured outputs within the bands of the draws, both minus the nominal output.
+
+    The first trajectory is the typical one, the second the worst.
+    """
+    parts, each = study.bands(source), study.results.fidelity[source]
+    units = [*each.units, *[""] * len(each.outputs)]
+    residual = np.where(parts["seen"][..., None], parts["observed"] - parts["nominal"], np.nan)
+    quantiles = parts["quantiles"] - parts["nominal"][:, None]
+    time = np.arange(residual.shape[1]) / float(parts["rate"])
+    panels = []
+    for i, trajectory in enumerate(parts["ids"].tolist()):
+        for c, output in enumerate(each.outputs):
+            factor, unit = quantity(units[c])
+            marks: list[Mark] = [
+                *draw_bands(time, factor * quantiles[i, :, :, c], colour_of(source)),
+                Line(time, factor * residual[i, :, c], "measured", "ink", width=1.6),
+            ]
+            first = trajectory == parts["ids"][0]
+            panel = Panel(
+                Axis("time", "s", (time[0], time[-1])),
+                [Row(Axis(f"{output} minus nominal", unit), marks)],
+                f"{output} of trajectory {trajectory} within the bands of the draws",
+                f"{output}, {'typical' if first else 'worst'} ({trajectory})",
+                height=280,
+            )
+            panels.append(panel)
+    keys = [Key("measured", "ink"), Key("90 % and 50 % of the draws", colour_of(source), "bar")]
+    return Figure(name, panels, keys, source, columns=len(each.outputs))

@@ -1,0 +1,101 @@
+"""The paper item by item, and where the same stands on this page."""
+
+from __future__ import annotations
+
+from retwin.report.blocks import Cell, Column, Link, Section, Table
+from retwin.report.labels import (
+    duration,
+    in_sentence,
+    latent_names,
+    mean_and_deviation,
+    metric_name,
+    number,
+    order,
+    source_name,
+)
+from retwin.report.sections.costs import BULK
+from retwin.report.study import Study
+
+__all__ = ["paper"]
+
+METRICS = ("macro_f1", "balanced_accuracy", "auroc", "healthy_recall")
+"""The metrics of the paper's Table 1."""
+PAPER, HERE = "the paper", "this study"
+
+
+def paper(study: Study) -> Section | None:
+    """Table 1, figures 2 to 6 and the times: the paper's, this study's, and links to them."""
+    known = [name for name in order(study.results.published) if name in study.sources]
+    if not known:
+        return None
+    columns = [
+        Column("Of the paper", numeric=False),
+        *(Column(source_name(name), group=PAPER, paper=True) for name in known),
+        *(Column(source_name(name), group=HERE) for name in known),
+        Column("on this page", numeric=False),
+    ]
+    dashes = ["–"] * len(known)
+    rows = [
+        *(
+            _row(
+                f"Table 1: {in_sentence(metric_name(metric))}",
+                _published(study, known, metric),
+                _means(study, known, metric),
+                Link("Scores", "scores"),
+            )
+            for metric in METRICS
+        ),
+        _row("Figure 2: segments, TDe, TPE", dashes, dashes, Link("Discrepancy", "discrepancy")),
+        _row(
+            "Figure 3: confusions, share right",
+            dashes,
+            _means(study, known, "accuracy"),
+            Link("Confusions", "confusion"),
+        ),
+        _row(
+            "Figure 4: micro-averaged ROC, area",
+            dashes,
+            _means(study, known, "auroc_micro"),
+            Link("ROC", "roc"),
+        ),
+        *_distributions(study, known),
+        _row(
+            f"Section 5: {BULK} trajectories in",
+            _published(study, known, "generate"),
+            [duration(study.sources[name].generation_seconds(BULK)) for name in known],
+            Link("Time", "time"),
+        ),
+    ]
+    table = Table("Table 1 and figures 2 to 6", columns, rows)
+    return Section("paper", "The paper and this study", {"table": table})
+
+
+def _row(what: str, published: list[str], here: list[str], link: Link) -> list[Cell]:
+    return [Cell(what), *map(Cell, published), *map(Cell, here), Cell("", links=[link])]
+
+
+def _published(study: Study, known: list[str], key: str) -> list[str]:
+    return [study.results.published[name].get(key, "–") for name in known]
+
+
+def _means(study: Study, known: list[str], metric: str) -> list[str]:
+    return [mean_and_deviation(study.sources[name].runs(metric)) for name in known]
+
+
+def _distributions(study: Study, known: list[str]) -> list[list[Cell]]:
+    """KS distances of delays (figure 5) and of offsets (figure 6), a row per component."""
+    fidelity = [study.results.fidelity.get(name) for name in known]
+    found = [each.agreement if each else {} for each in fidelity]
+    rows = []
+    for name in dict.fromkeys(name for each in found for name in each):
+        figure = 5 if name.startswith("delay") else 6 if name.startswith("offset_") else None
+        if figure is None:
+            continue
+        here = [
+            f"{number(each[name].value, 2)} (p {number(each[name].p, 2)})" if name in each else "–"
+            for each in found
+        ]
+        what = f"Figure {figure}: {latent_names(name)[0]}, KS distance"
+        link = Link("Discrepancy", "discrepancy")
+        rows.append(_row(what, ["–"] * len(known), here, link))
+    return rows

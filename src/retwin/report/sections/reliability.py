@@ -1,0 +1,64 @@
+"""Reliability diagrams: the share of correct diagnoses by their confidence."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from retwin.report.blocks import Section
+from retwin.report.figure import Axis, Figure, Key, Line, Mark, Panel, Points, Row
+from retwin.report.labels import source_name
+from retwin.report.sections.roc import selected
+from retwin.report.study import Study
+from retwin.report.style import colour_of, symbol
+from retwin.scores import calibration
+
+__all__ = ["reliability"]
+
+
+def reliability(study: Study) -> Section | None:
+    """A diagram for each of the selected sources."""
+    sources = selected(study)
+    if not sources:
+        return None
+    keys = [
+        Key("answers, in the colour of their source", "ink", "circle"),
+        Key("where 90 % of perfectly calibrated classifiers lie", "observed", "bar"),
+        Key("as sure as right", "muted", "dot"),
+    ]
+    figure = Figure("reliability", [_panel(study, name) for name in sources], keys)
+    errors = [
+        (study.sources[name].runs("ece"), calibration.calibration_floor(study.probabilities(name)))
+        for name in sources
+    ]
+    values = {"figure": figure, "errors": errors}
+    return Section("reliability", "Reliability", values, [figure])
+
+
+def _panel(study: Study, source: str) -> Panel:
+    found = calibration.reliability(study.probabilities(source), study.truth)
+    title, colour = source_name(source), colour_of(source)
+    gaps = np.full(len(found.confidence), np.nan)
+    bars = np.stack([found.low, found.high, gaps], axis=1).ravel()
+    share: dict[str, Any] = {"limits": (-0.03, 1.05), "kind": "share", "step": 0.2}
+    marks: list[Mark] = [
+        Line([0, 1], [0, 1], "as sure as right", "muted", "dot", width=1, hover=False),
+        Line(
+            np.repeat(found.confidence, 3),
+            bars,
+            "perfectly calibrated",
+            colour,
+            width=7,
+            alpha=0.35,
+            hover=False,
+        ),
+        Points(found.confidence, found.accuracy, title, colour, symbol(source)),
+    ]
+    return Panel(
+        Axis("confidence", **share),
+        [Row(Axis("share that is right", **share), marks)],
+        f"{title}: share of right answers against their confidence",
+        title,
+        height=300,
+    )

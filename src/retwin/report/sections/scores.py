@@ -1,0 +1,202 @@
+"""The scores of all sources beside the paper's, as tables and as a figure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from retwin.catalog import METRICS
+from retwin.report.blocks import Cell, Column, Section, Table
+from retwin.report.figure import Axis, Figure, Heading, Key, Mark, Panel, Points, Row
+from retwin.report.labels import (
+    MAIN,
+    MANY,
+    mean_and_deviation,
+    metric_name,
+    number,
+    real_data,
+    source_name,
+    span,
+    with_unit,
+)
+from retwin.report.study import Study
+from retwin.report.style import colour_of, symbol
+from retwin.results import Results, SourceResults
+from retwin.scores.calibration import calibration_floor
+
+__all__ = ["further_scores", "scores"]
+
+FURTHER = tuple(
+    name for name, metric in METRICS.items() if not metric.headline and metric.unit == "1"
+)
+"""The metrics of the second table."""
+FEW = ("macro_f1", "healthy_recall")
+"""The metrics of diagnoses that the figure shows of many sources."""
+
+
+def scores(study: Study) -> Section | None:
+    """Table 1 of the paper, with this study's scores, and the same as a figure."""
+    shown = [name for name in MAIN if study.results.has(name)]
+    if not shown:
+        return None
+    values = _table_values(study, shown, "Scores of all sources")
+    many = len(study.sources) > MANY
+    drawn = [name for name in shown if not (many and study.results.classes) or name in FEW]
+    drawn = [name for name in drawn if METRICS[name].better > 0]
+    figures = [_figure(study, drawn)] if drawn else []
+    published = any(key.mark == "diamond" for figure in figures for key in figure.keys)
+    values |= {"figure": next(iter(figures), None), "published": published}
+    return Section("scores", "Scores", values, figures)
+
+
+def further_scores(study: Study) -> Section | None:
+    """The scores that the paper does not give, and the noise floor of the calibration error."""
+    shown = [name for name in FURTHER if study.results.has(name)]
+    if not shown:
+        return None
+    ece = study.results.has("ece")
+    floors = {
+        name: calibration_floor(study.probabilities(name)) if name in study.diagnosing else None
+        for name in (study.sources if ece else ())
+    }
+    computed = any(floor is not None for floor in floors.values())
+    title = "Further scores of all sources"
+    values = _table_values(study, shown, title, floors if computed else {})
+    values |= {"ece": ece, "computed": computed, "count": study.results.data.test.size or "few"}
+    return Section("further", "Further scores", values)
+
+
+def _table_values(
+    study: Study, metrics: Sequence[str], title: str, floors: dict[str, float | None] | None = None
+) -> dict[str, Any]:
+    """A row per source, and what the caption states of it."""
+    results = study.results
+    paper = any(_in_paper(results, name) for name in metrics)
+    columns = [Column("Training data" if results.classes else "Source", numeric=False)]
+    for name in metrics:
+        columns += _columns(results, name, paper)
+    if floors:
+        columns.append(Column("ECE floor", group="ECE floor" if columns[-1].group else ""))
+    best = {name: _best(results, name) for name in metrics}
+    rows = []
+    for name, source in study.sources.items():
+        used = f"{study.word} data: {real_data(source.real_data)}"
+        known = ["fault protocol known"] if source.fault_protocol_known else []
+        row = [Cell(source_name(name), "; ".join([used, *known]), source=name)]
+        for metric in metrics:
+            interval = source.interval(metric)
+            text = mean_and_deviation(source.runs(metric))
+            below = f"[{span(interval)}]" if interval else ""
+            row.append(Cell(text, below, best=name in best[metric]))
+            if _in_paper(results, metric):
+                row.append(Cell(results.published.get(name, {}).get(metric, "–")))
+        rows.append([*row, Cell(number(floors[name]))] if floors else row)
+    return {
+        "table": Table(title, columns, rows),
+        "paper": paper,
+        "intervals": any(source.intervals for source in study.sources.values()),
+        "protocol_known": any(source.fault_protocol_known for source in study.sources.values()),
+    }
+
+
+def _columns(results: Results, metric: str, paper: bool) -> list[Column]:
+    """One column, or two under the metric's name where the paper has it too."""
+    unit = (results.outputs.units or [""])[0] if METRICS[metric].unit == "output" else ""
+    title = with_unit(metric_name(metric), unit)
+    if not paper:
+        return [Column(title)]
+    here = Column("this study", group=title)
+    published = Column("paper", group=title, paper=True)
+    return [here, published] if _in_paper(results, metric) else [here]
+
+
+def _in_paper(results: Results, metric: str) -> bool:
+    return any(metric in results.published.get(source, {}) for source in results.sources)
+
+
+def _best(results: Results, metric: str) -> list[str]:
+    """The sources with the best mean; none where there is no choice."""
+    better = METRICS[metric].better
+    means = {name: better * each.mean(metric) for name, each in results.sources.items()}
+    known = {name: mean for name, mean in means.items() if np.isfinite(mean)}
+    if len(known) < 2 or better == 0:
+        return []
+    return [name for name, mean in known.items() if mean == max(known.values())]
+
+
+def _figure(study: Study, metrics: Sequence[str]) -> Figure:
+    """Means, intervals and the paper's figures, a lane per metric and source."""
+    sources = study.sources
+    width = 0.76 / max(len(sources), 2)
+    lanes = {name: width * (place + 0.5) - 0.3 for place, name in enumerate(sources)}
+    marks: list[Mark] = [
+        Heading(metric_name(name), place - 0.42) for place, name in enumerate(metrics)
+    ]
+    keys = [Key(source_name(name), colour_of(name), symbol(name)) for name in sources]
+    for name, source in sources.items():
+        marks.append(_points(name, source, metrics, lanes[name]))
+        values = study.results.published.get(name, {})
+        found = {m: _published(values[m]) for m in metrics if m in values}
+        known = [(m, value) for m, value in found.items() if value is not None]
+        if known:
+            heights = [metrics.index(m) + lanes[name] + 0.35 * width for m, _ in known]
+            marks.append(_published_points(name, [value for _, value in known], heights))
+    if len(marks) > len(metrics) + len(sources):
+        keys.append(Key("paper’s mean ± sd over its runs", "muted", "diamond"))
+    ticks = {
+        place + lane: source_name(name)
+        for place in range(len(metrics))
+        for name, lane in lanes.items()
+    }
+    y = Axis("", limits=(len(metrics) - 0.5, -0.55), kind="names", ticks=ticks)
+    panel = Panel(
+        Axis("score", limits=(-0.01, 1.02), kind="share", step=0.2),
+        [Row(y, marks)],
+        "Scores of every source as dots with intervals",
+        height=70 + len(metrics) * (30 + 24 * max(len(sources), 2)),
+        narrow_bare=True,
+    )
+    return Figure("scores", [panel], keys)
+
+
+def _points(name: str, source: SourceResults, metrics: Sequence[str], lane: float) -> Points:
+    shown = [metric for metric in metrics if metric in source.scores]
+    means = [source.mean(metric) for metric in shown]
+    ends = [source.interval(m) or (mean, mean) for m, mean in zip(shown, means, strict=True)]
+    return Points(
+        means,
+        [metrics.index(metric) + lane for metric in shown],
+        source_name(name),
+        colour_of(name),
+        symbol(name),
+        low=[low for low, _ in ends],
+        high=[high for _, high in ends],
+        texts=[f"{mean_and_deviation(source.runs(m))} [{span(source.interval(m))}]" for m in shown],
+        size=10,
+    )
+
+
+def _published_points(
+    name: str, values: Sequence[tuple[float, float]], heights: Sequence[float]
+) -> Points:
+    """The paper's means with one standard deviation, as open diamonds."""
+    return Points(
+        [mean for mean, _ in values],
+        heights,
+        f"{source_name(name)} (paper)",
+        colour_of(name),
+        "diamond-open",
+        low=[mean - deviation for mean, deviation in values],
+        high=[mean + deviation for mean, deviation in values],
+        texts=[number(mean) for mean, _ in values],
+        bar_width=1,
+    )
+
+
+def _published(text: str) -> tuple[float, float] | None:
+    """Mean and deviation from a text like `0.753 ± 0.026`; None if it is no score."""
+    found = re.fullmatch(r"\s*([01]?\.\d+)\s*(?:±\s*([01]?\.\d+))?\s*", text)
+    return (float(found[1]), float(found[2] or 0)) if found else None

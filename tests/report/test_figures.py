@@ -1,0 +1,110 @@
+"""Figures: what is prepared for both renderers, and what these make of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+from numpy.typing import NDArray
+
+from retwin.report.figure import Figure, Line
+from retwin.report.plotly_specs import panel_spec
+from retwin.report.png import draw
+from retwin.report.sections import SECTIONS, sections_of
+from retwin.report.sections.discrepancy import latents
+from retwin.report.sections.fidelity import fidelity
+from retwin.report.sections.segment import segment
+from retwin.report.study import Study
+from retwin.results import Results
+
+Content = tuple[dict[str, Any], dict[str, NDArray]]
+
+
+def study_of(content: Content) -> Study:
+    return Study(Results.model_validate(content[0]), content[1])
+
+
+def test_a_segment_has_the_delay_and_the_offset_that_were_put_in(study: Content) -> None:
+    """Two ramps of 100 mm in 0.6 s, of which the measured second one has 80 ms and 5 mm more."""
+    time = np.arange(21) / 10
+    arrays = study[1]
+    nominal, observed = (np.zeros((90, 21, 3)) for _ in range(2))
+    nominal[..., 1] = np.interp(time, [0.1, 0.7, 1.0, 1.6], [0, 0.1, 0.1, 0.2])
+    observed[..., 1] = np.interp(time, [0.1, 0.7, 1.08, 1.68], [0, 0.1, 0.1, 0.205])
+    arrays |= {"portrait/nominal": nominal, "portrait/observed": observed}
+    arrays["portrait/times"] = np.tile([[0.1, 0.7, 1.0], [1.0, 1.7, 2.0]], (90, 1, 1))
+    found = segment(study_of(study))
+    assert found is not None
+    assert (found.output, found.unit) == ("y", "mm")
+    assert found.error.midpoints[0][1] == pytest.approx(150)
+    assert found.labels == ("TDe 80 ms", "TPE 5.0 mm")
+
+
+def test_no_segment_without_one_that_was_measured(study: Content) -> None:
+    study[1]["portrait/observed"][:, 3] = np.nan
+    assert segment(study_of(study)) is None
+
+
+def test_latents_count_what_lies_outside(study: Content) -> None:
+    delay, x, *_ = latents(study_of(study), "ibg_rg")
+    assert (delay.values.counts, delay.values.outside) == ((200, 4000), (9, 0))
+    assert delay.values.observed.sum() == pytest.approx(191 / 200)
+    assert x.unit == "mm"
+    assert 8 < x.values.edges[-1] < 50, "the outliers at 200 mm do not stretch it"
+
+
+def test_bands_are_what_was_measured_minus_the_nominal_output(study: Content) -> None:
+    section = fidelity(study_of(study))
+    assert section is not None
+    shown = section.figures[1]
+    assert isinstance(shown, Figure)
+    titles = [panel.title for panel in shown.panels]
+    assert titles == [
+        f"{output}, {which} ({trajectory})"
+        for which, trajectory in (("typical", "real_a/000"), ("worst", "real_a/001"))
+        for output in "xyz"
+    ]
+    last = shown.panels[-1]
+    light, _, measured = last.rows[0].marks
+    assert isinstance(measured, Line)
+    assert last.rows[0].y.unit == "mm"
+    assert last.x.limits == (0, pytest.approx(1.9))
+    assert np.isfinite(measured.y).sum() == 15
+    np.testing.assert_allclose(light.high[0] - light.low[0], 4 * 2 * 1.64)
+    del study[1]["bands/ibg_rg/seen"]
+    section = fidelity(study_of(study))
+    assert section is not None
+    assert [figure.name for figure in section.figures] == ["pit"]
+
+
+def test_figures_are_valid_for_both_renderers(study: Content) -> None:
+    def coloured(value: object) -> object:
+        if isinstance(value, dict):
+            return {key: coloured(each) for key, each in value.items()}
+        if isinstance(value, list):
+            return [coloured(each) for each in value]
+        return "#123456" if isinstance(value, str) and value.startswith("@") else value
+
+    sections = sections_of(study_of(study))
+    assert len(sections) == len(SECTIONS) - 1, "all but that of a case without classes"
+    shown = [figure for section in sections for figure in section.figures]
+    assert [figure.name for figure in shown] == [
+        "scores",
+        "confusion",
+        "roc",
+        "reliability",
+        "movement",
+        "tde",
+        "tpe",
+        "noise",
+        "pit",
+        "bands",
+        "learning",
+    ]
+    for figure in shown:
+        assert draw(figure).axes
+        for panel in figure.panels if isinstance(figure, Figure) else ():
+            spec = panel_spec(panel)
+            assert go.Figure(coloured({key: spec[key] for key in ("data", "layout")})).data
