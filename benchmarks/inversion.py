@@ -4,8 +4,9 @@ On the emulated robot, calibrated on 6 healthy trajectories, as many as set A ha
 per class and seed that no step has seen. Beside the published protocol, which freezes at a known
 sample, stuck actuators freeze at any sample of the first four fifths. Targets: macro-F1 and healthy
 recall of 0.9, ECE of at most 0.1, 90 % intervals that cover 85 to 95 %, at most 1 second per
-trajectory on two cores. Chosen on the emulated robot, with other seeds: how much wider the law of
-discrepancies is made for having been learned from few (`CAUTION`).
+trajectory on two cores. The factor by which the distribution of discrepancies is widened, since it
+was learned from few trajectories (`EXTRA_VARIANCE`), was chosen on the emulated robot, with other
+seeds.
 """
 
 from __future__ import annotations

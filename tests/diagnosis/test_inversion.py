@@ -13,16 +13,19 @@ from scipy.stats import multivariate_normal
 from torch import Tensor
 
 import retwin as rt
-from retwin.diagnosis import Diagnosis, InversionDiagnoser, evidence, fit_inversion
-from retwin.diagnosis.evidence import Belief, Noise
+from retwin.diagnosis import Diagnosis, InversionDiagnoser, fit_inversion
+from retwin.diagnosis.latent_prior import LatentPrior
+from retwin.diagnosis.missed_segments import fitted
 from retwin.diagnosis.severity import draw_biases
+from retwin.inference.losses import StudentT
+from retwin.inference.noise import Noise
 from retwin.nets.training import Training
 from retwin.scores.classification import score
 from retwin.testing import DIAGNOSER_CHECKS, DiagnoserSubject
 from retwin.twins.faults import draw_faults, faulty_commands, frozen_from
 from retwin.twins.samplers import RampSampler
-from retwin.update.corrections.command_effect import effective
-from retwin.update.corrections.command_problem import Problem
+from retwin.update.corrections.command_problem import CommandProblem
+from retwin.update.corrections.effective_commands import effective_commands
 
 CHAIN = rt.Chain(rt.CommandSpace(), rt.SampledSensor())
 MAP = np.array([[1.0, 0.5], [-0.3, 0.8], [0.2, -1.0]])
@@ -41,8 +44,15 @@ class Linear:
         return (commands @ MAP.T).astype(np.float32)
 
 
-def at_rest(commands: np.ndarray) -> tuple[Problem, np.ndarray]:
-    """Two readings of each rest, where no delay is seen; their movements."""
+def posed(context: rt.Context, observed: Tensor, mask: Tensor) -> CommandProblem:
+    one = torch.ones((), dtype=torch.float64)
+    return CommandProblem.of(
+        context, observed, mask, delay_range=(-5.0, 30.0), max_samples=200, unit=one
+    )
+
+
+def at_rest(commands: np.ndarray) -> tuple[CommandProblem, np.ndarray]:
+    """Two samples of each rest, where no delay is seen; their segments."""
     segments = rt.Segments.from_commands(commands)
     context = rt.Context.of(Linear(), commands, segments, rate=100.0)
     when = np.stack([segments.stop[0] - 30, segments.stop[0] - 20], axis=1).astype(int).ravel()
@@ -50,43 +60,39 @@ def at_rest(commands: np.ndarray) -> tuple[Problem, np.ndarray]:
     mask[:, when] = True
     noise = np.random.default_rng(3).normal(0, 0.1, (1, commands.shape[1], 3))
     observed = torch.tensor(context.nominal.numpy() + noise)
-    problem = Problem(rt.CommandSpace(), context, observed, mask)
-    problem.observed, problem.unit = problem.observed * problem.unit, torch.ones(())
-    return problem, np.repeat(np.arange(segments.max_count), 2)
+    return posed(context, observed, mask), np.repeat(np.arange(segments.max_count), 2)
 
 
-def test_evidence_is_that_of_a_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evidence_is_that_of_a_gaussian() -> None:
     """Laplace's approximation is exact where nothing is curved and the noise has no tails."""
-    monkeypatch.setattr(evidence, "TAILS", 1e9)
     rng = np.random.default_rng(0)
     problem, movement = at_rest(SAMPLER.sample(1, rng=rng))
-    movements, size = problem.valid.shape[1], 3 * problem.valid.shape[1]
-    noise = Noise(torch.full((2, 3), 0.07), torch.ones(2, dtype=torch.float64))
+    segments, size = problem.valid.shape[1], 3 * problem.valid.shape[1]
+    noise = Noise(torch.full((2, 3), 0.07), torch.ones(2, dtype=torch.float64), StudentT(1e9))
     turn = np.zeros((len(movement) * 3, size))
     for s, m in enumerate(movement):
         turn[3 * s : 3 * s + 3, 3 * m + 1 : 3 * m + 3] = MAP
-    residual = problem.residual(*problem.nothing())[0].numpy().ravel()
-    gaps = []
+    residual = problem.residual(problem.zero)[0].numpy().ravel()
+    differences = []
     for width in (0.02, 0.5):
         root = rng.normal(0, width, (size, size))
         covariance = root @ root.T + 0.01 * np.eye(size)
-        belief = Belief.of(
+        prior = LatentPrior.of(
             torch.zeros(1, size, dtype=torch.float64),
             torch.tensor(covariance)[None],
-            torch.full((1, movements, 2), -40.0, dtype=torch.float64),
+            torch.full((1, segments, 2), -40.0, dtype=torch.float64),
         )
-        x, missed = problem.nothing()
-        found = evidence.solve(problem, x, missed, belief, noise)
-        law = multivariate_normal(cov=turn @ covariance @ turn.T + 0.07**2 * np.eye(len(turn)))
-        gaps.append(float(found.evidence[0]) - law.logpdf(residual))
-        gain = covariance @ turn.T @ np.linalg.inv(law.cov_object.covariance)
+        found = fitted(problem, prior, noise, problem.zero)
+        gaussian = multivariate_normal(cov=turn @ covariance @ turn.T + 0.07**2 * np.eye(len(turn)))
+        differences.append(float(found.evidence[0]) - gaussian.logpdf(residual))
+        gain = covariance @ turn.T @ np.linalg.inv(gaussian.cov_object.covariance)
         np.testing.assert_allclose(found.x.numpy().ravel(), gain @ residual, atol=1e-4)
         np.testing.assert_allclose(
-            found.covariance[0].numpy(), covariance - gain @ turn @ covariance, atol=1e-5
+            found.solution.covariance[0].numpy(), covariance - gain @ turn @ covariance, atol=1e-5
         )
     # What both have in common is the density of the noise at 0.
     common = len(turn) * np.log(0.07 * np.sqrt(2 * np.pi))
-    np.testing.assert_allclose(gaps, common, atol=1e-3)
+    np.testing.assert_allclose(differences, common, atol=1e-3)
 
 
 def test_correlated_noise_is_learned_at_every_polling_phase() -> None:
@@ -104,14 +110,11 @@ def test_correlated_noise_is_learned_at_every_polling_phase() -> None:
         mask = torch.zeros(4, 400, 3, dtype=torch.bool)
         for row, phase in enumerate(phases):
             mask[row, phase::4] = True
-        problem = Problem(rt.CommandSpace(), context, observed, mask)
-        problem.observed, problem.unit = problem.observed * problem.unit, torch.ones(())
-        x, missed = problem.nothing()
-        size = x[0].numel()
-        covariance = 1e-8 * torch.eye(size, dtype=torch.float64).expand(4, -1, -1)
-        fit = evidence.Fit(x, missed, covariance, torch.zeros(4, dtype=torch.float64))
-        noise = Noise.first(problem.residual(x, missed), problem)
-        thinning.append(noise.learned(problem, fit).thinning)
+        problem = posed(context, observed, mask)
+        residual = problem.residual(problem.zero)
+        noise = Noise.from_median(problem, residual, groups=2)
+        found = noise.learned(problem, residual, max_effective=problem.max_effective)
+        thinning.append(found.thinning)
     assert thinning[0][0] > 10
     torch.testing.assert_close(thinning[1], thinning[0], rtol=0.2, atol=0.0)
 
@@ -158,7 +161,7 @@ def toy(count: int, label: str, seed: int) -> tuple[rt.Trajectories, list, np.nd
     z = [rng.normal(4, 0.5, (*shape, 1)), rng.normal(0, 0.02, (*shape, 2)), np.zeros((*shape, 2))]
     frozen = torch.tensor(frozen_from(faults, *commands.shape[1:]))
     latent = torch.tensor(np.concatenate(z, axis=2))
-    done = effective(told, segments, latent, torch.arange(400), frozen).numpy()
+    done = effective_commands(told, segments, latent, torch.arange(400), frozen).numpy()
     outputs = (done @ MAP.T)[:, np.arange(400) // 10 * 10]
     noise = rng.normal(0, 0.004, (count, 40, 3)).repeat(10, axis=1)
     mask = np.zeros(outputs.shape, dtype=bool)
@@ -338,7 +341,7 @@ def test_what_cannot_be_inverted_is_refused(
         InversionDiagnoser(*parts, known, noise=inversion.noise)
     with pytest.raises(rt.InputError, match="at least two classes"):
         InversionDiagnoser(*parts, {"Healthy": None}, noise=inversion.noise)
-    with pytest.raises(rt.InputError, match="what actuators are effectively told"):
+    with pytest.raises(rt.InputError, match="the actuators' effective commands"):
         InversionDiagnoser(parts[0], rg, inversion.faults, noise=inversion.noise)
     faulty = emulated.with_label("Motor_1_Stuck")
     with pytest.raises(rt.InputError, match="at least one trajectory labelled 'Healthy'"):

@@ -1,6 +1,6 @@
 """`InversionDiagnoser`: which fault explains the outputs, by physics and evidence alone.
 
-No training. Every class is a hypothesis about what the actuators were effectively told, under the
+No training. Every class is a hypothesis about the effective commands of the actuators, under the
 discrepancy that the residual model has learned from healthy trajectories. The marginal likelihood
 of the measured outputs under each gives the probabilities of the classes, and the commands that
 explain them best give the severity of the fault.
@@ -19,18 +19,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, Trajectories
-from retwin.diagnosis.evidence import Noise, best_pattern
-from retwin.diagnosis.hypotheses import (
-    COVER,
-    Hypotheses,
-    Inversion,
-    checked,
-    command_space,
-    healthy_belief,
-    posed,
-)
+from retwin.diagnosis.hypotheses import Hypotheses, checked
+from retwin.diagnosis.latent_prior import LatentPrior, command_problem, command_space
+from retwin.diagnosis.missed_segments import Fit, best_fit, fitted_noise
+from retwin.diagnosis.onsets import Onsets
+from retwin.diagnosis.severity import biases, stuck_level
 from retwin.errors import InputError
+from retwin.inference.noise import Noise
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
@@ -39,12 +36,14 @@ from retwin.update.corrections import Context, sample_mask
 from retwin.update.residual import Residual, ResidualModel
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["Diagnosis", "Estimate", "InversionDiagnoser", "fit_inversion"]
+__all__ = ["Diagnosis", "Estimate", "Inversion", "InversionDiagnoser", "fit_inversion", "invert"]
 
-CHUNK = 16
-"""Trajectories inverted together."""
+TRAJECTORIES_PER_BATCH = 16
+"""Trajectories inverted together, which bounds memory."""
 ROUNDS = 5
-"""Of expectation and maximisation of the noise."""
+"""Rounds of expectation-maximisation of the noise."""
+COVERAGE = 0.9
+"""Coverage of all intervals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,16 +57,22 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What an inversion says of n trajectories; severities as if each class were the true one.
+    """The diagnosis of n trajectories; severities as if each class were the true one.
 
     Attributes
     ----------
-    classes: names, C.
-    probabilities: (n, C).
-    evidence: (n, C), log marginal likelihood of the outputs, up to a constant of each trajectory.
-    level: (n, C), where a stuck actuator stands, in its command's unit.
-    onset: (n, C), the sample from which on it does.
-    bias: (n, C, M), error of a biased actuator in each movement, in its command's unit.
+    classes : tuple of str
+        Names, C.
+    probabilities : NDArray
+        (n, C), each row sums to one.
+    evidence : NDArray
+        (n, C), log marginal likelihood of the outputs, up to a constant of each trajectory.
+    level : Estimate
+        (n, C), where a stuck actuator stands, in its command's unit.
+    onset : Estimate
+        (n, C), the sample from which it is stuck.
+    bias : Estimate
+        (n, C, M), error of a biased actuator in each segment, in its command's unit.
 
     """
 
@@ -79,21 +84,63 @@ class Diagnosis:
     bias: Estimate
 
 
+@dataclass(frozen=True, eq=False)
+class Inversion:
+    """What was inferred of R hypotheses.
+
+    Attributes
+    ----------
+    evidence : Tensor
+        (R,), log marginal likelihood, up to a constant of each trajectory.
+    level, level_deviation : Tensor
+        (R,), where the faulty actuator is in the end, in its command's unit.
+    onsets : Onsets
+        Of a stuck actuator.
+    bias : Tensor
+        (R, M, 3), mean and interval of the bias in every segment; NaN where there is none.
+    fit : Fit
+        The most probable z.
+
+    """
+
+    evidence: Tensor
+    level: Tensor
+    level_deviation: Tensor
+    onsets: Onsets
+    bias: Tensor
+    fit: Fit
+
+
+def invert(rows: Hypotheses, noise: Noise) -> Inversion:
+    """The evidence for every hypothesis, and the severity of its fault."""
+    onsets = Onsets.of(rows, noise)
+    held = rows.held(onsets.best)
+    fit, evidence = best_fit(held.problem, held.prior, noise, held.start, held.trajectory)
+    bias, gain = biases(held, fit, COVERAGE)
+    level, deviation = stuck_level(held, fit, onsets.best, noise)
+    return Inversion(evidence + onsets.gain + gain, level, deviation, onsets, bias, fit)
+
+
 class InversionDiagnoser:
-    """Tells classes of faults apart by the evidence for each; see `fit_inversion`.
+    """Class probabilities from the evidence for each fault; see `fit_inversion`.
 
     Parameters
     ----------
-    surrogate: the IBG.
-    residual: an RG with `CommandSpace`, fitted on healthy trajectories.
-    faults: class name to fault, None for healthy, in the order of the probabilities. What a fault
-        leaves open is inferred: an onset between its limits, the bias of every movement.
-    noise: what a healthy reading leaves unexplained.
+    surrogate : Surrogate
+        The IBG.
+    residual : ResidualModel
+        With `CommandSpace`, fitted on healthy trajectories.
+    faults : mapping of str to Fault or None
+        Class name to fault, None for healthy, in the order of the probabilities. What a fault
+        leaves open is inferred: an onset between its limits, the bias of every segment.
+    noise : Noise
+        What a healthy sample leaves unexplained, in the outputs' units.
 
     Raises
     ------
-    InputError: fewer than two classes, a fault that cannot be inverted, a residual model of
-        something else than commands.
+    InputError
+        There are fewer than two classes, a fault cannot be inverted, or the residual model has
+        another correction.
 
     """
 
@@ -124,27 +171,28 @@ class InversionDiagnoser:
     def diagnose(
         self, trajectories: Trajectories, *, progress: Progress | None = None
     ) -> Diagnosis:
-        """Probabilities and severities of every class; all classes are alike beforehand.
+        """Probabilities and severities of every class; all classes are equally probable beforehand.
 
         Raises
         ------
-        InputError: other channels or another sample rate than the surrogate's.
+        InputError
+            The channels or the sample rate are not those of the surrogate.
 
         """
-        given = _Readings.of(self.surrogate, self.residual, trajectories)
+        given = _Samples.of(self.surrogate, self.residual, trajectories)
         faults = tuple(self.faults.values())
         parts = []
-        for begin in range(0, len(trajectories), CHUNK):
-            part = given[begin : begin + CHUNK]
+        for begin in range(0, len(trajectories), TRAJECTORIES_PER_BATCH):
+            part = given[begin : begin + TRAJECTORIES_PER_BATCH]
             rows = Hypotheses.of(faults, self.residual, *part)
-            parts.append(_severities(rows, rows.inverted(self.noise), len(faults)))
+            parts.append(_severities(rows, invert(rows, self.noise), len(faults)))
             if progress is not None:
-                progress(min(1.0, (begin + CHUNK) / len(trajectories)))
+                progress(min(1.0, (begin + TRAJECTORIES_PER_BATCH) / len(trajectories)))
         evidence, level, onset, bias = (np.concatenate(each) for each in zip(*parts, strict=True))
-        chance = np.exp(evidence - evidence.max(axis=1, keepdims=True))
+        share = np.exp(evidence - evidence.max(axis=1, keepdims=True))
         return Diagnosis(
             self.classes,
-            chance / chance.sum(axis=1, keepdims=True),
+            share / share.sum(axis=1, keepdims=True),
             evidence,
             *(Estimate(*np.moveaxis(each, -1, 0)) for each in (level, onset, bias)),
         )
@@ -156,7 +204,8 @@ class InversionDiagnoser:
             for name, fault in self.faults.items()
         ]
         about = {"faults": faults}
-        with write_model(folder, "inversion", about, vars(self.noise)) as inside:
+        noise = {"scale": self.noise.scale, "thinning": self.noise.thinning}
+        with write_model(folder, "inversion", about, noise) as inside:
             self.surrogate.save(inside / "surrogate")
             self.residual.save(inside / "residual")
 
@@ -173,12 +222,12 @@ class InversionDiagnoser:
             Surrogate.load(folder / "surrogate"),
             ResidualModel.load(folder / "residual"),
             faults,
-            noise=Noise(**weights),
+            noise=Noise(weights["scale"], weights["thinning"]),
         )
 
 
 FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
-"""Those that can be inverted, and that a model folder may name."""
+"""The faults that can be inverted, and that a model folder may name."""
 
 
 @torch.no_grad()
@@ -192,44 +241,48 @@ def fit_inversion(
 
     Parameters
     ----------
-    surrogate, residual: of the updated twin; the residual model with `CommandSpace`.
-    calibration: those the residual model was fitted to; healthy ones are used, others left out.
-    faults: class name to fault, as a case has them.
+    surrogate : Surrogate
+        Of the updated twin.
+    residual : Residual
+        Of the updated twin, a `ResidualModel` with `CommandSpace`.
+    calibration : Trajectories
+        Those that the residual model was fitted to; the healthy ones are used.
+    faults : mapping of str to Fault or None
+        Class name to fault, as a case has them.
 
     Raises
     ------
-    InputError: no healthy trajectory, and whatever `InversionDiagnoser` refuses.
+    InputError
+        There is no healthy trajectory, and whatever `InversionDiagnoser` refuses.
 
     """
     if not isinstance(residual, ResidualModel):
         raise InputError(
             "residual",
-            expected="a residual model with one z per movement",
+            expected="a residual model with one z per segment",
             got=type(residual).__name__,
             remedy="fit it with CommandSpace",
         )
     healthy = calibration.with_label(HEALTHY)
-    if not len(healthy):
-        raise InputError(
-            "calibration",
-            expected=f"at least one trajectory labelled {HEALTHY!r}",
-            got=f"labels {sorted(calibration.known_labels) or 'none'}",
-            remedy="label healthy trajectories",
-        )
-    context, observed, mask = _Readings.of(surrogate, residual, healthy)[:]
-    problem = posed(residual, context, observed, mask)
-    belief = healthy_belief(residual, context)
-    x = belief.mean.unflatten(1, (context.segments.max_count, -1))
-    noise = Noise.first(problem.residual(x, torch.zeros_like(x[..., 1:])), problem)
-    each = torch.arange(len(healthy))
-    for _ in range(ROUNDS):
-        fit, _ = best_pattern(problem, x, belief, noise, each)
-        x, noise = fit.x, noise.learned(problem, fit)
-    return InversionDiagnoser(surrogate, residual, faults, noise=noise)
+    require(
+        len(healthy),
+        "calibration",
+        expected=f"at least one trajectory labelled {HEALTHY!r}",
+        got=f"labels {sorted(calibration.known_labels) or 'none'}",
+        remedy="label healthy trajectories",
+    )
+    context, observed, mask = _Samples.of(surrogate, residual, healthy)[:]
+    problem = command_problem(residual, context, observed, mask)
+    return InversionDiagnoser(
+        surrogate,
+        residual,
+        faults,
+        noise=fitted_noise(problem, LatentPrior.healthy(residual, context), rounds=ROUNDS),
+    )
 
 
 class _Precise:
-    """A surrogate in double precision: what it says does not depend on the batch it is asked in."""
+    """A surrogate in double precision: no output depends on the batch that it is computed in."""
 
     def __init__(self, surrogate: Surrogate) -> None:
         self.memoryless = surrogate.memoryless
@@ -241,8 +294,8 @@ class _Precise:
 
 
 @dataclass(frozen=True, eq=False)
-class _Readings:
-    """What a diagnoser looks at: commands and their context, outputs at the true readings."""
+class _Samples:
+    """The inputs of a diagnosis: the commands' context, and outputs where they were sampled."""
 
     context: Context
     observed: Tensor
@@ -251,33 +304,24 @@ class _Readings:
     @classmethod
     def of(
         cls, surrogate: Surrogate, residual: ResidualModel, trajectories: Trajectories
-    ) -> _Readings:
+    ) -> _Samples:
         """Those of `trajectories`, which must have the channels and the rate of the surrogate."""
         for name in ("inputs", "outputs", "rate"):
-            ours, theirs = getattr(surrogate, name), getattr(trajectories, name)
-            if ours != theirs:
-                raise InputError(
-                    f"trajectories.{name}",
-                    expected=f"what the surrogate was trained on, {ours}",
-                    got=f"{theirs}",
-                    remedy="resample or rename, or load the file with its case",
-                )
+            expected, got = getattr(surrogate, name), getattr(trajectories, name)
+            require(
+                expected == got,
+                f"trajectories.{name}",
+                expected=f"what the surrogate was trained on, {expected}",
+                got=got,
+                remedy="resample or rename, or load the file with its case",
+            )
         context = residual.context(surrogate, np.ascontiguousarray(trajectories.commands))
         observed = torch.as_tensor(trajectories.observed.astype(np.float64))
         mask = torch.as_tensor(trajectories.mask.copy())
-        correction = residual.correction
-        # One by one: when a sensor was read must not be told by the trajectories beside.
-        read = torch.cat(
-            [
-                sample_mask(correction, observed[i : i + 1], mask[i : i + 1])
-                for i in range(len(mask))
-            ]
-        )
-        # Where there are many, every so many of them tell enough.
-        order = read.all(dim=-1).cumsum(dim=1)
-        every = -(-order[:, -1:] // command_space(correction).most)
-        read &= ((order - 1) % every.clamp_min(1) == 0)[..., None]
-        return cls(replace(context, surrogate=_Precise(surrogate)), observed, read)
+        # One by one: the timing of a trajectory's samples must not depend on the others.
+        one_by_one = [slice(i, i + 1) for i in range(len(mask))]
+        sampled = [sample_mask(residual.correction, observed[i], mask[i]) for i in one_by_one]
+        return cls(replace(context, surrogate=_Precise(surrogate)), observed, torch.cat(sampled))
 
     def __getitem__(self, rows: slice) -> tuple[Context, Tensor, Tensor]:
         return self.context[rows], self.observed[rows], self.mask[rows]
@@ -285,19 +329,19 @@ class _Readings:
 
 def _severities(rows: Hypotheses, found: Inversion, classes: int) -> tuple[NDArray, ...]:
     """Evidence (n, C), and value, low and high of level, onset (n, C, 3) and bias (n, C, M, 3)."""
-    reach = NormalDist().inv_cdf(0.5 + COVER / 2) * found.doubt
-    level = torch.stack([found.level, found.level - reach, found.level + reach], dim=1)
-    samples, chance = found.onsets.samples, found.onsets.chance
-    below, last = chance.cumsum(dim=1), samples.shape[1] - 1
+    half = NormalDist().inv_cdf(0.5 + COVERAGE / 2) * found.level_deviation
+    level = torch.stack([found.level, found.level - half, found.level + half], dim=1)
+    samples, probability = found.onsets.samples, found.onsets.probability
+    below, last = probability.cumsum(dim=1), samples.shape[1] - 1
     ends = [
         samples.gather(1, (below < share).sum(dim=1, keepdim=True).clamp_max(last))
-        for share in ((1 - COVER) / 2, (1 + COVER) / 2)
+        for share in ((1 - COVERAGE) / 2, (1 + COVERAGE) / 2)
     ]
-    onset = torch.cat([(chance * samples).sum(dim=1, keepdim=True), *ends], dim=1)
-    # An actuator lags its command by up to the delay, and only the level tells when it stopped.
-    lag = found.fit.x[..., 0].abs().mean(dim=1, keepdim=True)
-    onset = onset + lag * torch.tensor([0.0, -1.0, 1.0])
-    loose = ~rows.stuck[:, None]
-    level, onset = (each.masked_fill(loose, torch.nan) for each in (level, onset))
-    told = (found.evidence, level, onset, found.bias)
-    return tuple(each.unflatten(0, (-1, classes)).numpy() for each in told)
+    onset = torch.cat([(probability * samples).sum(dim=1, keepdim=True), *ends], dim=1)
+    # An actuator lags its command by up to the delay, and only the level shows when it stopped.
+    delay = rows.problem.per_segment(found.fit.x)[..., 0]
+    onset = onset + delay.abs().mean(dim=1, keepdim=True) * torch.tensor([0.0, -1.0, 1.0])
+    free = ~rows.stuck[:, None]
+    level, onset = (each.masked_fill(free, torch.nan) for each in (level, onset))
+    every = (found.evidence, level, onset, found.bias)
+    return tuple(each.unflatten(0, (-1, classes)).numpy() for each in every)

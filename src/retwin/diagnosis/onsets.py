@@ -1,73 +1,76 @@
-"""When did an actuator get stuck? Every onset that its fault allows is weighed.
+"""The posterior of the onset from which an actuator is stuck.
 
-Each movement is taken for the one in which, or after which, it happened. The outputs are explained
-for the onset in it that seems best; then all its onsets are tried on that explanation, which may
-give way for each as far as it is unsure.
+Each segment is taken for the one in which, or in the rest after which, it happened. The outputs are
+explained for the most probable onset in it; then all its onsets are evaluated on the linearised
+problem there.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from retwin.diagnosis.evidence import Noise, reach, solve
-
-if TYPE_CHECKING:
-    from retwin.diagnosis.hypotheses import Hypotheses
+from retwin.diagnosis.hypotheses import Hypotheses
+from retwin.diagnosis.missed_segments import fitted
+from retwin.inference.noise import Noise
+from retwin.inference.solver import gauss_newton_step
 
 __all__ = ["Onsets"]
 
 COARSE = 25
-"""Onsets of each movement that are tried first."""
+"""Onsets of each segment that are evaluated first."""
 FINE = 8
-"""Samples before and after the best of them that are tried one by one."""
+"""Samples before and after the best of them that are evaluated one by one."""
 PASSES = 2
-"""Of explaining the outputs for the best onset."""
+"""Times that the outputs are explained for the best onset."""
 
 
 @dataclass(frozen=True, eq=False)
 class Onsets:
-    """What the outputs say of the onset, in each of R rows.
+    """The posterior of the onset in each of R rows.
 
     Attributes
     ----------
-    samples: (R, G), onsets in order.
-    chance: (R, G), the probability of each, sums to one.
-    best: (R,), the most probable one.
-    gain: (R,), log evidence that all together have beyond that of the best.
+    samples : Tensor
+        (R, G), onsets in order.
+    probability : Tensor
+        (R, G), of each onset; sums to one.
+    best : Tensor
+        (R,), the most probable onset.
+    gain : Tensor
+        (R,), log evidence that all together have beyond that of the best.
 
     """
 
     samples: Tensor
-    chance: Tensor
+    probability: Tensor
     best: Tensor
     gain: Tensor
 
     @classmethod
     def of(cls, rows: Hypotheses, noise: Noise) -> Onsets:
-        """Those of every row; where a fault names one onset, there is nothing to find."""
+        """Of every row; where a fault fixes the onset, there is nothing to infer."""
         first, last = rows.onsets.unbind(dim=1)
-        loose = (last > first).nonzero()[:, 0]
-        found = cls._found(rows[loose], noise) if len(loose) else None
+        open_rows = (last > first).nonzero()[:, 0]
+        found = cls._inferred(rows[open_rows], noise) if len(open_rows) else None
         size = 1 if found is None else found.samples.shape[1]
         samples = first[:, None].repeat(1, size)
-        chance = torch.zeros(samples.shape, dtype=torch.float64)
-        chance[:, 0] = 1.0
+        probability = torch.zeros(samples.shape, dtype=torch.float64)
+        probability[:, 0] = 1.0
         best, gain = first.clone(), torch.zeros(len(first), dtype=torch.float64)
         if found is not None:
-            samples[loose], chance[loose] = found.samples, found.chance
-            best[loose], gain[loose] = found.best, found.gain
-        return cls(samples, chance, best, gain)
+            samples[open_rows], probability[open_rows] = found.samples, found.probability
+            best[open_rows], gain[open_rows] = found.best, found.gain
+        return cls(samples, probability, best, gain)
 
     @classmethod
-    def _found(cls, rows: Hypotheses, noise: Noise) -> Onsets:
-        stretches = _stretches(rows)
-        count, parts = len(stretches), stretches.shape[1]
+    def _inferred(cls, rows: Hypotheses, noise: Noise) -> Onsets:
+        spans = _spans(rows)
+        count, parts = len(spans), spans.shape[1]
         each = torch.arange(count).repeat_interleave(parts)
-        samples, weight, best, evidence = _explained(rows[each], stretches.flatten(0, 1), noise)
+        samples, weight, best, evidence = _explained(rows[each], spans.flatten(0, 1), noise)
         first, last = rows.onsets.unbind(dim=1)
         weight = weight - (last - first + 1).log()[each, None]
         shape = (count, parts)
@@ -78,8 +81,8 @@ class Onsets:
         return cls(samples, weight.softmax(dim=1), best, weight.logsumexp(dim=1) - own)
 
 
-def _stretches(rows: Hypotheses) -> Tensor:
-    """First and last onset (R, K, 2) of what is taken together: a movement and the rest after it.
+def _spans(rows: Hypotheses) -> Tensor:
+    """First and last onset (R, K, 2) of what is taken together: a segment and the rest after it.
 
     Those that the fault does not allow are empty: the last is before the first.
     """
@@ -110,38 +113,37 @@ def _explained(
     last = last.maximum(first)
     share = torch.linspace(0, 1, COARSE, dtype=torch.float64)
     samples = coarse = (first + (last - first) * share).round().long()
-    x = rows.start()
-    misfit = _misfits(rows, samples, x, None, noise)
+    x = rows.start
+    objective = _objectives(rows, samples, x, None, noise)
     for _ in range(PASSES):
-        at = misfit.argmin(dim=1, keepdim=True)
+        at = objective.argmin(dim=1, keepdim=True)
         best = samples.gather(1, at)
         problem = rows.held(best[:, 0]).problem
-        fit = solve(problem, x, torch.zeros_like(x[..., 1:]), rows.belief, noise)
+        fit = fitted(problem, rows.prior, noise, x)
         x = fit.x
         fine = (best + torch.arange(-FINE, FINE + 1)).maximum(first).minimum(last)
         samples = torch.cat([coarse, fine], dim=1).sort(dim=1).values
-        misfit = _misfits(rows, samples, x, problem.linearised(x, fit.missed)[1], noise)
-    # None is explained better than the one that was solved for: slopes reach only so far.
-    own = misfit.gather(1, (samples - best).abs().argmin(dim=1, keepdim=True))
-    weight = fit.evidence[:, None] - (misfit - own).clamp_min(0) + _cells(samples).log()
+        objective = _objectives(rows, samples, x, problem.linearised(x)[1], noise)
+    # None is explained better than the one that was solved for: linearisation is local.
+    own = objective.gather(1, (samples - best).abs().argmin(dim=1, keepdim=True))
+    weight = fit.evidence[:, None] - (objective - own).clamp_min(0) + _cells(samples).log()
     weight = weight.masked_fill(empty, -torch.inf)
     return samples, weight, best[:, 0], fit.evidence.masked_fill(empty[:, 0], -torch.inf)
 
 
-def _misfits(
+def _objectives(
     rows: Hypotheses, samples: Tensor, x: Tensor, jacobian: Tensor | None, noise: Noise
 ) -> Tensor:
-    """Minus the log posterior (R, G) for every onset: at x, or, with its slopes, near it."""
+    """Minus the log posterior (R, G) for every onset: at x, or, with its Jacobian, near it."""
     columns = []
-    missed = torch.zeros_like(x[..., 1:])
-    damping = torch.zeros(len(x), dtype=torch.float64)
+    prior = rows.prior.gaussian
     for onset in samples.unbind(dim=1):
         problem = rows.held(onset).problem
-        residual, near = problem.residual(x, missed), x
-        if jacobian is not None:
-            move, _ = reach(problem, x, residual, jacobian, rows.belief, noise, damping)
-            residual = residual - torch.einsum("nsyp,np->nsy", jacobian, move)
-            near = x + move.unflatten(1, x.shape[1:])
-        misfit = noise.misfit(problem, residual).sum(dim=1)
-        columns.append(misfit + rows.belief.energy(near))
+        residual = problem.residual(x)
+        if jacobian is None:
+            misfit = noise.misfit(problem, residual).sum(dim=1)
+            columns.append(misfit + prior.energy(x))
+        else:
+            step = gauss_newton_step(problem, prior, noise, x, (residual, jacobian))
+            columns.append(step.objective)
     return torch.stack(columns, dim=1)

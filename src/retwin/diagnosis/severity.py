@@ -1,9 +1,9 @@
-"""How far an actuator errs, where its error is one of two intervals: ±(least … greatest).
+"""The severity of a fault: the bias of an actuator in every segment, or where it is stuck.
 
-The outputs tell a Gaussian over the biases of all movements together. The fault says that the size
-of each lies between two limits, whatever its sign: 2^M boxes. Their mass is integrated one
-movement after the other on a fixed low-discrepancy set (Genz, J. Comput. Graph. Stat. 1, 1992);
-the points, weighted, are draws of the severity.
+A bias has one of two intervals: ±(smallest … largest). The outputs give a Gaussian over the biases
+of all segments together; the fault limits the size of each, whatever its sign: 2^M boxes. Their
+probability is integrated one segment after the other on a fixed low-discrepancy set (Genz, J.
+Comput. Graph. Stat. 1, 1992); the points, weighted, are draws of the severity.
 """
 
 from __future__ import annotations
@@ -13,23 +13,95 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["BiasDraws", "draw_biases"]
+from retwin.diagnosis.hypotheses import Hypotheses
+from retwin.diagnosis.missed_segments import Fit
+from retwin.inference.noise import Noise
+from retwin.update.corrections.effective_commands import effective_commands
+
+__all__ = ["BiasDraws", "biases", "draw_biases", "stuck_level"]
 
 POINTS = 512
-"""Of the low-discrepancy set."""
-LEAST = 1e-300
-"""Mass below which an interval counts as empty."""
+"""Points of the low-discrepancy set."""
+SMALLEST = 1e-300
+"""Probability below which an interval counts as empty."""
+
+
+def biases(rows: Hypotheses, fit: Fit, coverage: float) -> tuple[Tensor, Tensor]:
+    """Mean and central interval of each segment's bias, and the log evidence that its limits add.
+
+    Parameters
+    ----------
+    coverage : float
+        Of the interval.
+
+    Returns
+    -------
+    tuple of Tensor
+        (R, M, 3), NaN where there is no bias; and (R,).
+
+    """
+    place = rows.offset_index
+    summary = torch.full((*place.shape, 3), torch.nan, dtype=torch.float64)
+    gain = torch.zeros(len(place), dtype=torch.float64)
+    biased = (rows.width > 0).nonzero()[:, 0]
+    if not len(biased):
+        return summary, gain
+    prior, width = rows.prior[biased].gaussian, rows.width[biased]
+    square = width.square()[:, None, None]
+    pick = torch.nn.functional.one_hot(place[biased], prior.mean.shape[1]).double()
+    # The conditional mean of the bias, given an actuator's whole error.
+    share = square * pick @ prior.precision
+    rest = square * (torch.eye(place.shape[1], dtype=torch.float64) - share @ pick.mT)
+    drawn = draw_biases(
+        (share @ (fit.x[biased] - prior.mean)[..., None])[..., 0],
+        share @ fit[biased].solution.covariance @ share.mT + rest,
+        width=width,
+        size=rows.size[biased],
+    )
+    summary[biased], gain[biased] = drawn.summary(coverage), drawn.gain
+    return summary, gain
+
+
+def stuck_level(rows: Hypotheses, fit: Fit, onset: Tensor, noise: Noise) -> tuple[Tensor, Tensor]:
+    """Where the faulty actuator is in the end (R,), in its command's unit, and the deviation.
+
+    Parameters
+    ----------
+    onset : Tensor
+        (R,), the sample from which it is stuck.
+
+    """
+    problem = rows.problem.with_missed(fit.missed)
+    x = fit.x.clone().requires_grad_()
+    last = onset.clamp_max(problem.reference.shape[1] - 1)[:, None]
+    with torch.enable_grad():
+        z = torch.cat([problem.per_segment(x), problem.missed], dim=-1)
+        reached = effective_commands(problem.reference, problem.segments, z, last)
+        level = reached[:, 0].gather(1, rows.actuator[:, None])[:, 0]
+        slope = torch.autograd.grad(level.sum(), x, allow_unused=True)[0]
+    slope = torch.zeros_like(x) if slope is None else slope
+    variance = torch.einsum("np,npq,nq->n", slope, fit.solution.covariance, slope).clamp_min(0)
+    # At rest the errors of all samples are common: they are worth one sample.
+    commands = problem.commands(fit.x)
+    step = torch.nn.functional.one_hot(rows.actuator, commands.shape[2])[:, None]
+    change = problem.predicted(commands + step) - problem.predicted(commands)
+    square = (change.double() / noise.scale[0]).square().sum(dim=-1) * problem.measured
+    variance = variance + problem.measured.sum(dim=1) / square.sum(dim=1).clamp_min(1e-12)
+    return level.detach(), variance.sqrt()
 
 
 @dataclass(frozen=True, eq=False)
 class BiasDraws:
-    """Biases that explain the outputs.
+    """Draws of the biases from their posterior.
 
     Attributes
     ----------
-    values: (R, K, M).
-    weights: (R, K), sum to one.
-    gain: (R,), log evidence that the limits add to what a Gaussian bias had.
+    values : Tensor
+        (R, K, M), in the command's unit.
+    weights : Tensor
+        (R, K), sum to one.
+    gain : Tensor
+        (R,), log evidence that the limits add to that of a Gaussian bias.
 
     """
 
@@ -37,8 +109,8 @@ class BiasDraws:
     weights: Tensor
     gain: Tensor
 
-    def summary(self, cover: float) -> Tensor:
-        """Mean, and the ends of the central interval that holds `cover`, (R, M, 3)."""
+    def summary(self, coverage: float) -> Tensor:
+        """Mean, and the ends of the central interval of that coverage, (R, M, 3)."""
         order = self.values.argsort(dim=1)
         sorted_values = self.values.gather(1, order)
         weights = self.weights[..., None].expand_as(self.values).gather(1, order)
@@ -46,33 +118,37 @@ class BiasDraws:
         mean = (weights * sorted_values).sum(dim=1)
         ends = [
             sorted_values.gather(1, (below < level).sum(dim=1, keepdim=True).clamp_max(POINTS - 1))
-            for level in ((1 - cover) / 2, (1 + cover) / 2)
+            for level in ((1 - coverage) / 2, (1 + coverage) / 2)
         ]
         return torch.stack([mean, *(end[:, 0] for end in ends)], dim=-1)
 
 
 def draw_biases(mean: Tensor, covariance: Tensor, *, width: Tensor, size: Tensor) -> BiasDraws:
-    """From a Gaussian belief about biases to one with limits.
+    """The posterior of biases with limits, from that of Gaussian ones.
 
     Parameters
     ----------
-    mean, covariance: (R, M) and (R, M, M), what is known of the biases if each is believed to be
-        Gaussian with mean 0 and standard deviation `width` (R,) beforehand.
-    size: least and greatest size (R, 2) of every bias; uniform in between, the sign is random.
+    mean, covariance : Tensor
+        (R, M) and (R, M, M), the posterior of the biases if each is Gaussian beforehand, with mean
+        0 and standard deviation `width`.
+    width : Tensor
+        (R,).
+    size : Tensor
+        (R, 2), smallest and largest size of every bias; uniform in between, the sign is random.
 
     """
-    rows, movements = mean.shape
-    engine = torch.quasirandom.SobolEngine(max(movements, 1), scramble=True, seed=0)
+    rows, segments = mean.shape
+    engine = torch.quasirandom.SobolEngine(max(segments, 1), scramble=True, seed=0)
     uniform = engine.draw(POINTS, dtype=torch.float64)
-    ridge = 1e-9 * width.square()[:, None, None] * torch.eye(movements, dtype=mean.dtype)
+    ridge = 1e-9 * width.square()[:, None, None] * torch.eye(segments, dtype=mean.dtype)
     factor = torch.linalg.cholesky(covariance + ridge)
     low, high = size.unbind(dim=1)
     # A bias of a known size is an interval as well, a narrow one.
     high = torch.maximum(high, low + 1e-5 * (low + 1e-6 * width))
-    noise = mean.new_zeros(rows, POINTS, movements)
+    noise = mean.new_zeros(rows, POINTS, segments)
     values = torch.zeros_like(noise)
     log_mass = mean.new_zeros(rows, POINTS)
-    for m in range(movements):
+    for m in range(segments):
         centre = mean[:, m, None] + (noise[..., :m] @ factor[:, m, :m, None])[..., 0]
         scale = factor[:, m, m, None]
         noise[..., m], mass = _inside(centre, scale, low[:, None], high[:, None], uniform[:, m])
@@ -100,7 +176,7 @@ def _inside(
         # The upper tail is turned over: far out, only the lower one has digits left.
         upper = begin > 0
         left, right = torch.where(upper, -end, begin), torch.where(upper, -begin, end)
-        masses.append((ndtr(right) - ndtr(left)).clamp_min(LEAST))
+        masses.append((ndtr(right) - ndtr(left)).clamp_min(SMALLEST))
         shares.append((left, right, upper))
     total = masses[0] + masses[1]
     split = masses[0] / total

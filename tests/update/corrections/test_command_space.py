@@ -16,8 +16,8 @@ from retwin.errors import InputError
 from retwin.serialisation.configs import from_config, to_config
 from retwin.twins.faults import draw_faults, faulty_commands, frozen_from
 from retwin.update.corrections import OPERATORS
-from retwin.update.corrections.command_effect import effective
-from retwin.update.corrections.command_problem import Problem
+from retwin.update.corrections.command_problem import CommandProblem
+from retwin.update.corrections.effective_commands import effective_commands
 
 UNIT = 0.24  # degrees per command unit
 
@@ -63,7 +63,7 @@ def test_it_does_what_the_emulated_arm_does(commands: np.ndarray) -> None:
     segments = rt.Segments.from_commands(commands)
     z = drawn(segments.start.shape, missed=0.2)
     when = torch.arange(1000.0, dtype=torch.float64)
-    ours = effective(torch.tensor(commands, dtype=torch.float64), segments, z, when)
+    ours = effective_commands(torch.tensor(commands, dtype=torch.float64), segments, z, when)
     parts = z.numpy()
     truth = {"delay": parts[..., 0], "offset": parts[..., 1:5], "missed": parts[..., 5:] > 0}
     np.testing.assert_allclose(ours.numpy(), _effective(commands, segments, truth), atol=1e-3)
@@ -77,7 +77,7 @@ def test_a_missed_movement_is_caught_up_with_the_next(exact) -> None:
     z[0, 0, 5 + 1] = 1.0
     when = torch.tensor([0.0, 100, 300, 380, 500], dtype=torch.float64)
     segments = rt.Segments.from_commands(commands)
-    told = effective(torch.tensor(commands), segments, z, when)
+    told = effective_commands(torch.tensor(commands), segments, z, when)
     np.testing.assert_allclose(told[0, :, 1], [500, 500, 500, 590, 680], atol=1e-6)
     assert (told[0, :, [0, 2, 3]] == 500).all()
 
@@ -251,7 +251,7 @@ def test_a_surrogate_with_memory_gives_the_same(exact, commands: np.ndarray) -> 
 
 PERIOD, SHIFT = 6, 3
 """Polling period and the second polling phase, in samples. There are 167 polls of 1000 samples, so
-that only two phases together exceed `CommandSpace.most`."""
+that only two phases together exceed `CommandSpace.max_samples`."""
 
 
 @pytest.fixture(scope="module")
@@ -271,27 +271,27 @@ def two_phases(exact, commands: np.ndarray) -> tuple[rt.Context, Tensor, Tensor]
     return context_of(exact, both), torch.tensor(observed), mask
 
 
-@pytest.mark.parametrize("most", [200, 50])
+@pytest.mark.parametrize("max_samples", [200, 50])
 def test_polling_phases_do_not_compete_for_samples(
-    two_phases: tuple[rt.Context, Tensor, Tensor], most: int
+    two_phases: tuple[rt.Context, Tensor, Tensor], max_samples: int
 ) -> None:
     """Of a batch, each trajectory contributes the very samples that it contributes alone."""
     context, observed, mask = two_phases
-    operator = rt.CommandSpace(most=most)
-    batch = Problem(operator, context, observed, mask)
-    assert (batch.seen.sum(dim=1) <= most).all()
+    settings = {"delay_range": (-5.0, 30.0), "max_samples": max_samples}
+    batch = CommandProblem.of(context, observed, mask, **settings)
+    assert (batch.measured.sum(dim=1) <= max_samples).all()
     for i in range(12):
         one = slice(i, i + 1)
-        alone = Problem(operator, context[one], observed[one], mask[one])
-        used = batch.at[i, batch.seen[i] > 0]
-        assert len(used) > most / 2
-        assert used.equal(alone.at[0])
+        alone = CommandProblem.of(context[one], observed[one], mask[one], **settings)
+        used = batch.sample[i, batch.measured[i] > 0]
+        assert len(used) > max_samples / 2
+        assert used.equal(alone.sample[0])
         assert mask[i, used].all()
 
 
-@pytest.mark.parametrize("most", [200, 50])
+@pytest.mark.parametrize("max_samples", [200, 50])
 def test_the_polling_phase_does_not_change_z(
-    two_phases: tuple[rt.Context, Tensor, Tensor], most: int
+    two_phases: tuple[rt.Context, Tensor, Tensor], max_samples: int
 ) -> None:
     """The same trajectory, earlier or later, has the same z*; so it has with one phase only.
 
@@ -299,7 +299,7 @@ def test_the_polling_phase_does_not_change_z(
     the pseudo-observations of the prior make a difference to one half alone.
     """
     context, observed, mask = two_phases
-    operator = rt.CommandSpace(most=most)
+    operator = rt.CommandSpace(max_samples=max_samples)
     z = operator.infer(context, observed, mask).z
     torch.testing.assert_close(z[6:], z[:6], rtol=0, atol=1e-3)
     for half in (slice(0, 6), slice(6, 12)):
@@ -315,11 +315,11 @@ def test_rows_with_fewer_samples_are_not_filled_with_evidence(exact, commands: n
     mask = polled(2)
     mask[1, 300:] = False
     observed = context.path.double()
-    batch = Problem(rt.CommandSpace(), context, observed, mask)
-    assert batch.seen.sum(dim=1).tolist() == [100, 30]
-    assert batch.at[1, :30].tolist() == list(range(0, 300, POLL))
-    assert (batch.at[1, 30:] == 290).all()
-    assert (batch.inside()[1, :, 30:] == 0).all()
+    batch = CommandProblem.of(context, observed, mask, delay_range=(-5.0, 30.0), max_samples=200)
+    assert batch.measured.sum(dim=1).tolist() == [100, 30]
+    assert batch.sample[1, :30].tolist() == list(range(0, 300, POLL))
+    assert (batch.sample[1, 30:] == 290).all()
+    assert (batch.inside[1, :, 30:] == 0).all()
 
 
 @pytest.mark.parametrize("split", [False, True])
@@ -352,3 +352,8 @@ def test_names_units_and_config() -> None:
     ]
     assert from_config(to_config(operator, OPERATORS), OPERATORS) == operator
     assert isinstance(operator, rt.Correction)
+
+
+def test_settings_of_earlier_versions_load() -> None:
+    before = {"kind": "CommandSpace", "delay_range": [0.0, 4.0], "most": 50, "known": 0.5}
+    assert from_config(before, OPERATORS) == rt.CommandSpace((0.0, 4.0), 50, 0.5)

@@ -17,9 +17,9 @@ __all__ = ["Additive"]
 class Additive:
     """ỹ_t = ŷ_t + z_t: one z per output and sample, so M is T.
 
-    It can express any gap, and explains none: what is measured and what is noise is all one z. For
-    systems whose gap goes on all the time, such as hidden dynamics that the twin lacks; where
-    movements err one by one, other operators say more with less.
+    It can express any discrepancy, and explains none: z contains the noise of the measurement. It
+    suits systems with a permanent discrepancy, such as hidden dynamics that the twin lacks; where
+    each segment has an error of its own, other operators explain more with fewer parameters.
     """
 
     @property

@@ -18,21 +18,23 @@ __all__ = ["Chain", "fit_sensor", "measured_outputs", "sample_mask"]
 
 @dataclass(frozen=True)
 class Chain:
-    """What `first` leaves is corrected, or recorded, by `second`; chains may be chained again.
+    """The output of `first` is corrected, or recorded, by `second`; chains may be chained again.
 
-    z is that of the first operator, then that of the second; a sensor has none: its errors are
-    reading by reading, and drawn when a record is made (`recorded`). z of the first is inferred as
-    if it were alone, z of the second from what then is left; of a sensor's record only the readings
-    count.
+    z is that of the first operator, then that of the second; a sensor has none: the errors of its
+    samples are drawn when a record is made. z of the first is inferred as if it were alone, z of
+    the second from what the first leaves; of a sensor's record only the sampled values count.
 
     Parameters
     ----------
-    first: the operator that acts on the system.
-    second: one that acts on what comes out, or a sensor that records it.
+    first : Correction
+        The operator that acts on the system.
+    second : Correction or SampledSensor
+        The operator that acts on its output, or the sensor that records it.
 
     Raises
     ------
-    InputError: operators that do not have one z for the same, or an operator behind a sensor.
+    InputError
+        The operators have a different resolution, or one stands behind a sensor.
 
     """
 
@@ -64,12 +66,12 @@ class Chain:
 
     @property
     def pools(self) -> bool:
-        """Whether what is inferred of one trajectory leans on those beside it."""
+        """Whether `infer` of an operator learns from all trajectories together."""
         return any(getattr(each, "pools", False) for each in self._operators)
 
     @property
     def severities(self) -> bool:
-        """Whether `infer` tells how severe a known fault is."""
+        """Whether `infer` of an operator estimates the severity of a known fault."""
         return any(getattr(each, "severities", False) for each in self._operators)
 
     @property
@@ -79,7 +81,7 @@ class Chain:
         return (self.first,) if sensor else (self.first, self.second)  # type: ignore[return-value]
 
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:
-        """Components of the first, then of the second; what both have gets the operator's name."""
+        """Components of the first, then of the second; names of both get the operator's."""
         parts = [(each, each.latent(inputs, outputs)) for each in self._operators]
         once = Counter(name for _, part in parts for name in part.names)
         names = [
@@ -112,8 +114,8 @@ class Chain:
             return self.first.infer(context, observed, sample_mask(self, observed, mask))
         one = self.first.infer(context, observed, mask)
         with torch.no_grad():
-            left = replace(context, corrected=self.first.apply(context, one.z))
-        other = self.second.infer(left, observed, mask)
+            after = replace(context, corrected=self.first.apply(context, one.z))
+        other = self.second.infer(after, observed, mask)
         width = one.z.shape[-1] + other.z.shape[-1]
         covariance = one.covariance.new_zeros(*one.z.shape[:2], width, width)
         covariance[..., : one.z.shape[-1], : one.z.shape[-1]] = one.covariance
@@ -159,7 +161,7 @@ def fit_sensor(
 
 
 def sample_mask(correction: Correction, observed: Tensor, mask: Tensor) -> Tensor:
-    """`mask` (n, T, d_y) where a record holds a reading of the operator's sensor, if it has one."""
+    """`mask` (n, T, d_y) where the operator's sensor, if it has one, sampled the outputs."""
     sensor = _sensor(correction)
     return mask if sensor is None else sensor.timed(observed, mask).sample_mask(observed, mask)
 
@@ -169,7 +171,7 @@ def measured_outputs(
 ) -> Tensor:
     """The corrected outputs (n, T, d_y) as the operator's sensor, if it has one, records them.
 
-    Where they are not read they are not computed, if the operator can tell them sample by sample.
+    Outputs that are not sampled are not computed, if the operator has `at`.
     """
     sensor = _sensor(correction)
     if sensor is None or not isinstance(correction, Chain):

@@ -1,67 +1,119 @@
-"""How well `CommandSpace` knows delays: the actuators of one movement are not equally late.
+"""Posterior variance of the delays of `CommandSpace`: actuators have unequal delays.
 
-z has one delay per movement, what its actuators have in common. Each follows in its own time
-besides, by a dead zone or by play, and that errs alike in all readings of a movement. Here every
-actuator has a delay of its own beside z. How widely these scatter, and what noise is left in
-motion, is learned from all trajectories together (type-II maximum likelihood, by
-expectation-maximisation). z* stays as it is; its delays are as wide as all this leaves them.
+z has one delay per segment, common to its actuators. Each has a delay of its own besides, by a dead
+zone or by play, which is common to all samples of a segment. Here every actuator has a delay of its
+own beside z. The variance of these, and that of the noise in motion, are learned from all
+trajectories together (type-II maximum likelihood, by expectation-maximisation). z* stays as it is;
+the variance of its delays accounts for them.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
-from retwin.update.corrections.command_problem import TAILS, Problem
+from retwin.inference.em import expectation_maximisation
+from retwin.inference.noise import Noise
+from retwin.inference.priors import GaussianPrior
+from retwin.update.corrections.command_problem import CommandProblem
 
 __all__ = ["delay_variance"]
 
 ROUNDS = 20
-"""Of expectation and maximisation."""
-WIDE = 1.0
-"""Standard deviation of an actuator's own delay to begin with, in samples."""
+"""Rounds of expectation-maximisation."""
+FIRST = 1.0
+"""Variance of an actuator's own delay to begin with, in samples squared."""
 
 
 def delay_variance(
-    problem: Problem, x: Tensor, missed: Tensor, *, precision: Tensor, pull: Tensor, rest: Tensor
+    problem: CommandProblem, prior: GaussianPrior, noise: Noise, x: Tensor
 ) -> Tensor:
-    """Variance (n, M) of the delays in x.
+    """Variance (n, M) of the delays in the most probable x (n, P), in samples squared."""
+    model = _OwnDelays.of(problem, prior, noise, x)
+    count = len(model.identified[0])
+    first = x.new_zeros(len(x), count), x.new_zeros(len(x), count, count)
+    square = (model.residual.square() * model.motion[..., None]).sum()
+    scale = (square / model.motion.sum().clamp_min(1) / model.residual.shape[-1]).clamp_min(1e-12)
+    widths = _Widths(scale, x.new_tensor(FIRST), torch.ones_like(model.motion))
+    (_, covariance), _ = expectation_maximisation(
+        first, widths, infer=model.posterior, learn=model.learned, rounds=ROUNDS
+    )
+    variance = covariance.diagonal(dim1=1, dim2=2)[:, : x.shape[1]]
+    return problem.per_segment(variance)[..., 0]
 
-    Parameters
-    ----------
-    x, missed: the most probable ones, see `Problem`.
-    precision, pull: curvature and slope of minus the log prior there, (n, M, 1 + d_u).
-    rest: (n, S), one over the variance that each sample at rest stands for, 0 in motion.
 
-    """
-    motion = problem.moving * problem.seen
-    residual, jacobian = problem.linearised(x, missed)
-    apart = problem.apart(x, missed)
-    turns = torch.cat([jacobian, apart], dim=-1)
-    heard = (apart != 0).any(dim=1).any(dim=1)  # (n, M d_u), actuators that move
-    known = jacobian.shape[-1]
-    size, count = residual.shape[-1], motion.sum().clamp_min(1)
-    own = torch.tensor(WIDE, dtype=x.dtype).square()
-    share = torch.ones_like(motion)
-    noise = (residual.square().sum(dim=-1) * motion).sum() / count / size
-    noise = noise.clamp_min(1e-12)
-    for _ in range(ROUNDS):
-        weight = rest + motion * share / noise
-        weighted = turns * weight[..., None, None]
-        prior = torch.cat([precision.flatten(1), (1 / own).expand(heard.shape)], dim=1)
-        normal = torch.einsum("nsyp,nsyq->npq", weighted, turns) + torch.diag_embed(prior)
-        right = torch.einsum("nsyp,nsy->np", weighted, residual)
-        right[:, :known] -= pull.flatten(1)
+@dataclass(frozen=True, eq=False)
+class _Widths:
+    """Hyperparameters, and the robust weights that go with them."""
+
+    noise: Tensor  # () variance of the residual in motion
+    own: Tensor  # () variance of an actuator's own delay
+    weights: Tensor  # (n, S)
+
+
+@dataclass(frozen=True, eq=False)
+class _OwnDelays:
+    """The linearised problem in (x, own delays): P + M d_u variables."""
+
+    residual: Tensor  # (n, S, d_y)
+    jacobian: Tensor  # (n, S, d_y, P + M d_u)
+    precision: Tensor  # (n, P, P), of the prior of x
+    gradient: Tensor  # (n, P), of minus its log density
+    rest: Tensor  # (n, S), inverse variance of a sample at rest, 0 in motion
+    motion: Tensor  # (n, S), 1 for measured samples in motion
+    identified: Tensor  # (n, M d_u), whether the actuator moves
+    noise: Noise
+
+    @classmethod
+    def of(
+        cls, problem: CommandProblem, prior: GaussianPrior, noise: Noise, x: Tensor
+    ) -> _OwnDelays:
+        residual, jacobian = problem.linearised(x)
+        own = problem.actuator_delay_jacobian(x)
+        precision = noise.precision(problem, residual)[..., 0]
+        return cls(
+            residual,
+            torch.cat([jacobian, own], dim=-1),
+            prior.precision,
+            prior.gradient(x),
+            rest=torch.where(problem.group == 0, precision, 0.0),
+            motion=problem.measured * problem.group,
+            identified=(own != 0).any(dim=1).any(dim=1),
+            noise=noise,
+        )
+
+    def posterior(self, before: object, widths: _Widths) -> tuple[Tensor, Tensor]:
+        """Mean and covariance of (move of x, own delays)."""
+        weight = self.rest + self.motion * widths.weights / widths.noise
+        weight = weight[..., None].expand_as(self.residual).flatten(1)
+        flat = self.jacobian.flatten(1, 2)
+        weighted = flat * weight[..., None]
+        own = torch.diag_embed((1 / widths.own).expand(self.identified.shape))
+        normal = weighted.mT @ flat
+        size = self.gradient.shape[1]
+        normal[:, :size, :size] += self.precision
+        normal[:, size:, size:] += own
+        right = (weighted.mT @ self.residual.flatten(1)[..., None])[..., 0]
+        right[:, :size] -= self.gradient
         covariance = torch.linalg.inv(normal)
-        mean = (covariance @ right[..., None])[..., 0]
-        left = residual - torch.einsum("nsyp,np->nsy", turns, mean)
-        # What stays unexplained, and what may still be explained in another way.
-        unsure = torch.einsum("nsyp,npq,nsyq->ns", turns, covariance, turns)
-        square = left.square().sum(dim=-1) + unsure
-        share = (TAILS + size) / (TAILS + square / noise)
-        noise = ((share * square * motion).sum() / count / size).clamp_min(1e-12)
-        # Two pseudo-observations, as for every width: with few movements none shrinks to nothing.
+        return (covariance @ right[..., None])[..., 0], covariance
+
+    def learned(self, found: tuple[Tensor, Tensor], widths: _Widths) -> _Widths:
+        """The most probable hyperparameters, given the posterior."""
+        mean, covariance = found
+        size = self.residual.shape[-1]
+        left = self.residual - torch.einsum("nsyp,np->nsy", self.jacobian, mean)
+        # The variance of the predicted outputs adds to what stays unexplained.
+        flat = self.jacobian.flatten(1, 2)
+        variance = ((flat @ covariance) * flat).sum(dim=-1).view_as(left)
+        square = (left.square() + variance).sum(dim=-1)
+        weights = self.noise.loss.weight(square / widths.noise, size)
+        total = self.motion.sum().clamp_min(1) * size
+        noise = ((weights * square * self.motion).sum() / total).clamp_min(1e-12)
+        # Two pseudo-observations, as for every width: with few segments none shrinks to nothing.
         second = mean.square() + covariance.diagonal(dim1=1, dim2=2)
-        own = ((second[:, known:] * heard).sum() + 2 * own) / (heard.sum() + 2)
-    variance = covariance.diagonal(dim1=1, dim2=2)[:, :known]
-    return variance.unflatten(1, x.shape[1:])[..., 0]
+        own = (second[:, self.gradient.shape[1] :] * self.identified).sum()
+        own = (own + 2 * widths.own) / (self.identified.sum() + 2)
+        return _Widths(noise, own, weights)

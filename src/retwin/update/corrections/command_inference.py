@@ -1,66 +1,81 @@
 """z* of `CommandSpace` from outputs alone: maximum a posteriori, evidence, empirical Bayes.
 
-Outputs seldom tell all actuators apart; where they do not, a prior decides. Its widths, the noise
-and the rate of missed movements are not set by hand but learned from all trajectories together
-(type-II maximum likelihood, by expectation-maximisation with Laplace's approximation). Whether a
-movement was missed is decided by comparing evidence.
+Outputs seldom identify the errors of all actuators; where they do not, a prior decides. Its widths,
+the noise and the probability of a missed segment are not set by hand but learned from all
+trajectories together (type-II maximum likelihood, by expectation-maximisation with Laplace's
+approximation). Whether an actuator missed a segment is decided by comparing evidence.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from retwin.errors import InputError
+from retwin.checks import require
+from retwin.inference.em import expectation_maximisation
+from retwin.inference.evidence import best_per_row
+from retwin.inference.noise import Noise
+from retwin.inference.priors import GaussianPrior
+from retwin.inference.solver import Solution, solve
 from retwin.update.corrections.command_delays import delay_variance
-from retwin.update.corrections.command_problem import TAILS, Problem
+from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.correction import Context, Discrepancy
-from retwin.update.corrections.warp import gather_samples, read
-
-if TYPE_CHECKING:
-    from retwin.update.corrections.command_space import CommandSpace
+from retwin.update.corrections.warp import gather_samples
 
 __all__ = ["infer_commands"]
 
 ROUNDS = 5
-"""Of expectation and maximisation, with a search for missed movements in each."""
-STEPS = 12
-"""Of Gauss-Newton at most in each round."""
-TURNS = 3
-"""Missed movements per trajectory that one round may find."""
-LOOKS = (6.0, 1.0)
-"""Independent looks that a movement's readings at rest, and in motion, are worth at most."""
+"""Rounds of expectation-maximisation, with a search for missed segments in each."""
+SEARCHES = 3
+"""Missed segments per trajectory that one round may find."""
 SUSPECT = 2.5
-"""Standard deviations of the prior beyond which an offset makes a movement suspect."""
-FREE = 30.0
-"""Width of the prior, in widths of a healthy one, where a fault may be anything."""
+"""Standard deviations of the prior beyond which an offset makes a segment suspect."""
+OUTLYING = 3.0
+"""Noise scales beyond which a sample is an outlier."""
+OUTLYING_SHARE = 0.3
+"""Share of outliers above which a segment is suspect."""
+FLAT = 30.0
+"""Standard deviation of the prior, in that of a healthy offset, where a fault may be anything."""
+FLOOR = 1e-6
+"""Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
 
 def infer_commands(
-    operator: CommandSpace, context: Context, observed: Tensor, mask: Tensor
+    context: Context,
+    observed: Tensor,
+    mask: Tensor,
+    *,
+    delay_range: tuple[float, float],
+    max_samples: int,
+    identified_below: float,
 ) -> Discrepancy:
-    """z* (n, M, 1 + 2 d_u) for measured outputs (n, T, d_y), see `CommandSpace.infer`."""
+    """z* (n, M, 1 + 2 d_u) for measured outputs (n, T, d_y), see `CommandSpace`.
+
+    Raises
+    ------
+    InputError
+        A trajectory has no sample at which all outputs are measured, while another has one.
+
+    """
     _require_samples(mask)
-    problem = Problem(operator, context, observed, mask)
-    x, missed = problem.nothing()
-    if not x.shape[1]:
-        empty = torch.cat([x, missed], dim=-1)
-        matrix = empty[..., None] * empty[..., None, :]
-        noise = torch.zeros(len(x), dtype=torch.float64)
-        return Discrepancy(empty, matrix, empty > 0, noise, severity=missed, posterior=True)
-    x[..., 0] = problem.first_delays()
-    prior = _Prior.first(problem, x)
-    chance = missed
-    for _ in range(ROUNDS):
-        fit = _solve(problem, x, missed, prior, STEPS)
-        fit, missed, chance = _find_missed(problem, fit, missed, prior)
-        x = fit.x
-        prior = prior.learned(problem, fit, missed)
-    fit = _solve(problem, x, missed, prior, STEPS)
-    return _told(problem, fit, missed, chance, prior)
+    problem = CommandProblem.of(
+        context, observed, mask, delay_range=delay_range, max_samples=max_samples
+    )
+    if not problem.valid.shape[1]:
+        return _empty(problem)
+    start = problem.zero
+    problem.per_segment(start)[..., 0] = problem.first_delays()
+    first = _Belief.of(problem, start)
+    state, belief = expectation_maximisation(
+        _State(problem, Solution.of_prior(first.prior(problem), start), problem.missed),
+        first,
+        infer=_State.improved,
+        learn=_Belief.learned,
+        rounds=ROUNDS,
+    )
+    return _discrepancy(state.solved(belief), belief, identified_below)
 
 
 def _require_samples(mask: Tensor) -> None:
@@ -70,11 +85,10 @@ def _require_samples(mask: Tensor) -> None:
     identified: that is what `Correction` requires.
     """
     empty = ~mask.all(dim=-1).any(dim=1)
-    if not mask.any() or not empty.any():
-        return
     index = empty.nonzero()[:, 0].tolist()
     several = len(index) > 1
-    raise InputError(
+    require(
+        not index or not mask.any(),
         "mask",
         expected="in every trajectory at least one sample at which all outputs are measured",
         got=f"none in {'trajectories' if several else 'trajectory'} {', '.join(map(str, index))}",
@@ -82,271 +96,182 @@ def _require_samples(mask: Tensor) -> None:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """The most probable x, minus its log posterior, and the curvature there."""
-
-    x: Tensor  # (n, M, 1 + d_u)
-    energy: Tensor  # (n,)
-    curvature: Tensor  # (n, P, P)
-
-    def evidence(self) -> Tensor:
-        """Laplace's log evidence (n,), up to what all patterns of missed movements share."""
-        return -self.energy - 0.5 * torch.linalg.slogdet(self.curvature)[1]
-
-    def covariance(self) -> Tensor:
-        """(n, P, P)."""
-        return torch.linalg.inv(self.curvature)
-
-    def variance(self) -> Tensor:
-        """(n, M, 1 + d_u)."""
-        return self.covariance().diagonal(dim1=-2, dim2=-1).unflatten(1, self.x.shape[1:])
-
-    def replaced(self, row: int, other: _Fit, at: int) -> _Fit:
-        """The same with one trajectory from another fit."""
-        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
-        return _Fit(*(_with(mine, row, theirs[at]) for mine, theirs in pairs))
+def _empty(problem: CommandProblem) -> Discrepancy:
+    """The discrepancy of trajectories without any segment."""
+    n, _, width = problem.missed.shape
+    z = problem.missed.new_zeros(n, 0, 1 + 2 * width)
+    matrix = z[..., None] * z[..., None, :]
+    noise = z.new_zeros(n)
+    return Discrepancy(z, matrix, z > 0, noise, severity=problem.missed, posterior=True)
 
 
 @dataclass(frozen=True, eq=False)
-class _Prior:
-    """What is believed before an output is seen, learned from all trajectories together."""
+class _State:
+    """What was inferred of every trajectory."""
 
-    late: Tensor  # () mean delay in samples
+    problem: CommandProblem
+    solution: Solution
+    probability: Tensor  # (n, M, d_u), that an actuator missed a segment
+
+    def solved(self, belief: _Belief) -> _State:
+        """The most probable x for the same missed segments."""
+        problem = self.problem
+        x, bounds = self.solution.x, problem.bounds
+        solution = solve(problem, belief.prior(problem), belief.noise, x, bounds=bounds)
+        return replace(self, solution=solution)
+
+    def improved(self, belief: _Belief) -> _State:
+        """The most probable x; missed segments flipped where that has the greater evidence.
+
+        Of each trajectory one is flipped at a time, the one that gains most.
+        """
+        state = self.solved(belief)
+        probability = state.problem.missed
+        for _ in range(SEARCHES):
+            rows, segment, actuator = state._suspects(belief)
+            if not len(rows):
+                break
+            each = torch.arange(len(rows))
+            pattern = state.problem.missed[rows].clone()
+            pattern[each, segment, actuator] = 1 - pattern[each, segment, actuator]
+            sign = 2 * pattern[each, segment, actuator] - 1
+            tried = state._tried(belief, rows, segment, pattern)
+            gain = tried.evidence - state.solution.evidence[rows] + belief.odds * sign
+            probability = probability.index_put(
+                (rows, segment, actuator), torch.sigmoid(gain * sign)
+            )
+            _, best = best_per_row(gain, rows)
+            best = best[gain[best] > 0]
+            if not len(best):
+                break
+            missed = state.problem.missed.index_copy(0, rows[best], pattern[best])
+            state = _State(
+                state.problem.with_missed(missed),
+                state.solution.put(rows[best], tried[best]),
+                probability,
+            )
+        return replace(state, probability=probability)
+
+    def _tried(self, belief: _Belief, rows: Tensor, segment: Tensor, missed: Tensor) -> Solution:
+        """The solution of some trajectories if other segments were missed."""
+        problem = self.problem[rows].with_missed(missed)
+        start = self.solution.x[rows].clone()
+        problem.per_segment(start)[torch.arange(len(rows)), segment, 1:] = 0.0
+        prior = belief.prior(problem)
+        return solve(problem, prior, belief.noise, start, bounds=problem.bounds)
+
+    def _suspects(self, belief: _Belief) -> tuple[Tensor, Tensor, Tensor]:
+        """Trajectory, segment and actuator of every flip worth a try.
+
+        A segment is suspect if an offset is far beyond its prior, or if many of its samples are
+        outliers; then every actuator that was to move is. What is missed may always turn out not to
+        be.
+        """
+        problem = self.problem
+        offset = problem.per_segment(self.solution.x)[..., 1:]
+        far = (offset.abs() > SUSPECT * belief.offset) & problem.healthy
+        residual = problem.residual(self.solution.x)
+        square = belief.noise.square(problem, residual)
+        outlying = (square > OUTLYING**2) * problem.measured
+        inside = problem.inside
+        share = (inside * outlying[:, None]).sum(dim=-1) / inside.sum(dim=-1).clamp_min(1)
+        moving = problem.distance > 3 * belief.offset
+        suspect = far.any(dim=-1) | (share > OUTLYING_SHARE)
+        flips = suspect[..., None] & moving & problem.healthy | (problem.missed > 0.5)
+        rows, segment, actuator = flips.nonzero().unbind(dim=1)
+        return rows, segment, actuator
+
+
+@dataclass(frozen=True, eq=False)
+class _Belief:
+    """Hyperparameters, learned from all trajectories together."""
+
+    delay: Tensor  # () mean, in samples
     jitter: Tensor  # () standard deviation of a delay
     offset: Tensor  # (d_u,) standard deviation of an offset, in the commands' units
-    odds: Tensor  # () log odds that an actuator misses a movement
-    noise: Tensor  # (2,) scale of an output's error at rest and in motion, in `Problem.unit`
-    thinning: Tensor  # (2,) samples per independent one, at rest and in motion
+    odds: Tensor  # () log odds that an actuator misses a segment
+    noise: Noise  # one scale for all outputs, in `CommandProblem.unit`
 
     @classmethod
-    def first(cls, problem: Problem, x: Tensor) -> _Prior:
-        """Wide, from nothing but delays."""
-        late = x[..., 0][problem.valid]
-        spread = 1.4826 * (late - late.median()).abs().median() + 1.0
-        residual = problem.residual(x, torch.zeros_like(x[..., 1:]))
-        seen = problem.seen > 0
-        # Of nothing at all, the median and the spread are NaN.
-        noise = residual.norm(dim=-1)[seen].median().nan_to_num(1.0).clamp_min(1e-6).repeat(2)
-        told = gather_samples(problem.told, problem.at)[seen]
-        extent = (told - told.mean(dim=0)).square().mean(dim=0).sqrt()
-        width = 0.05 * extent.nan_to_num(1.0).clamp_min(1e-9)
-        one = torch.ones((), dtype=torch.float64)
-        return cls(late.median(), spread, width, -4.0 * one, noise, one.repeat(2))
+    def of(cls, problem: CommandProblem, start: Tensor) -> _Belief:
+        """Wide, from first delays only."""
+        delay = problem.per_segment(start)[..., 0][problem.valid]
+        jitter = 1.4826 * (delay - delay.median()).abs().median() + 1.0
+        measured = problem.measured > 0
+        # The median and the spread of nothing are NaN.
+        length = problem.residual(start).norm(dim=-1)[measured].median().nan_to_num(1.0)
+        scale = length.clamp_min(FLOOR).expand(2, 1)
+        commands = gather_samples(problem.reference, problem.sample)[measured]
+        extent = (commands - commands.mean(dim=0)).square().mean(dim=0).sqrt()
+        offset = 0.05 * extent.nan_to_num(1.0).clamp_min(1e-9)
+        one = torch.ones(2, dtype=torch.float64)
+        return cls(delay.median(), jitter, offset, -4.0 * one[0], Noise(scale, one))
 
-    def centre(self, problem: Problem) -> Tensor:
-        """The mean of x, (n, M, 1 + d_u)."""
-        x, _ = problem.nothing()
-        x[..., 0] = self.late
-        return x
+    def deviation(self, problem: CommandProblem) -> Tensor:
+        """Standard deviation of x before an output is measured, (n, M, 1 + d_u)."""
+        offset = torch.where(problem.faulty, FLAT * self.offset, self.offset)
+        return torch.cat([self.jitter.expand_as(offset[..., :1]), offset], dim=-1)
 
-    def precision(self, problem: Problem) -> Tensor:
-        """One over the variance of each component of x, (n, M, 1 + d_u)."""
-        x, _ = problem.nothing()
-        x[..., 0] = self.jitter.square().reciprocal()
-        wide = torch.where(problem.faulty, FREE * self.offset, self.offset)
-        x[..., 1:] = wide.square().reciprocal()
-        return x
+    def prior(self, problem: CommandProblem) -> GaussianPrior:
+        """The distribution of x before an output is measured."""
+        mean = problem.zero
+        problem.per_segment(mean)[..., 0] = self.delay
+        return GaussianPrior.independent(mean, self.deviation(problem).flatten(1).square())
 
-    def learned(self, problem: Problem, fit: _Fit, missed: Tensor) -> _Prior:
-        """The most likely prior, given what was found and how sure that is."""
-        variance = fit.variance()
-        used = (problem.healthy & (missed < 0.5)).double()
-        second = ((fit.x[..., 1:].square() + variance[..., 1:]) * used).sum(dim=(0, 1))
-        # A few pseudo-observations: with few movements no width shrinks to nothing.
-        offset = (second + 2 * self.offset.square()) / (used.sum(dim=(0, 1)) + 2)
-        late, weight = fit.x[..., 0], problem.valid.double()
-        mean = (late * weight).sum() / weight.sum()
-        spread = (((late - mean).square() + variance[..., 0]) * weight).sum() / weight.sum()
-        chance = ((missed * problem.healthy).sum() + 0.5) / (problem.healthy.sum() + 20.0)
-        residual = problem.residual(fit.x, missed)
-        weights = self.weights(problem, residual)
-        square = weights * residual.square().sum(dim=-1)
-        noise, thinning = [], []
-        rest, motion = problem.seen * (1 - problem.moving), problem.seen * problem.moving
-        for part, looks in zip((rest, motion), LOOKS, strict=True):
-            total = part.sum().clamp_min(1)
-            noise.append(((square * part).sum() / total / residual.shape[-1]).sqrt())
-            kept = residual * (weights * part).sqrt()[..., None]
-            power = (kept[:, 1:].square() * part[:, :-1, None]).sum().clamp_min(1e-30)
-            alike = ((kept[:, 1:] * kept[:, :-1]).sum() / power).clamp(0, 0.95)
-            # Readings of one part of a movement err together: by rounding, by friction.
-            crowd = total / (looks * problem.valid.sum())
-            thinning.append(((1 + alike) / (1 - alike)).maximum(crowd))
-        return _Prior(
-            late=mean,
+    @staticmethod
+    def learned(state: _State, belief: _Belief) -> _Belief:
+        """The most probable hyperparameters, given what was inferred and how certain that is."""
+        problem, x = state.problem, state.solution.x
+        delay, offset = problem.per_segment(x).split([1, problem.missed.shape[2]], dim=-1)
+        variance = problem.per_segment(state.solution.covariance.diagonal(dim1=1, dim2=2))
+        used = (problem.healthy & (problem.missed < 0.5)).double()
+        second = ((offset.square() + variance[..., 1:]) * used).sum(dim=(0, 1))
+        weight = problem.valid.double() / problem.valid.sum()
+        mean = (delay[..., 0] * weight).sum()
+        spread = (((delay[..., 0] - mean).square() + variance[..., 0]) * weight).sum()
+        # Pseudo-observations: with few segments no width shrinks to nothing.
+        scatter = (second + 2 * belief.offset.square()) / (used.sum(dim=(0, 1)) + 2)
+        missed = (problem.missed * problem.healthy).sum()
+        return _Belief(
+            delay=mean,
             jitter=spread.sqrt().clamp_min(0.1),
-            offset=offset.sqrt(),
-            odds=chance.logit(),
-            noise=torch.stack(noise).clamp_min(1e-6),
-            thinning=torch.stack(thinning),
+            offset=scatter.sqrt(),
+            odds=((missed + 0.5) / (problem.healthy.sum() + 20.0)).logit(),
+            noise=belief.noise.learned(
+                problem, problem.residual(x), max_effective=problem.max_effective, floor=FLOOR
+            ),
         )
 
-    def scale(self, problem: Problem) -> tuple[Tensor, Tensor]:
-        """Noise and thinning of every sample, (n, S) each."""
-        part = problem.moving.long()
-        return self.noise[part], self.thinning[part]
 
-    def weights(self, problem: Problem, residual: Tensor) -> Tensor:
-        """How much each sample (n, S) counts under Student's t: 1 or so, less for glitches."""
-        square = residual.square().sum(dim=-1) / self.scale(problem)[0].square()
-        return (TAILS + residual.shape[-1]) / (TAILS + square)
-
-    def energy(self, problem: Problem, x: Tensor, residual: Tensor) -> Tensor:
-        """Minus the log posterior (n,) of x, up to a constant."""
-        noise, thinning = self.scale(problem)
-        square = residual.square().sum(dim=-1) / noise.square()
-        size = residual.shape[-1]
-        misfit = 0.5 * (TAILS + size) * torch.log1p(square / TAILS) * problem.seen / thinning
-        away = (x - self.centre(problem)).square() * self.precision(problem)
-        return misfit.sum(dim=1) + 0.5 * away.sum(dim=(1, 2))
-
-
-def _solve(problem: Problem, x: Tensor, missed: Tensor, prior: _Prior, steps: int) -> _Fit:
-    """Gauss-Newton with Levenberg's damping and reweighting, until no trajectory gains."""
-    x = x.clone()
-    energy = prior.energy(problem, x, problem.residual(x, missed))
-    damping = torch.full((len(x),), 1e-3, dtype=torch.float64)
-    low, high = problem.operator.delay_range
-    active = torch.arange(len(x))
-    for _ in range(steps):
-        part, told = problem[active], missed[active]
-        normal, right = _normal(part, x[active], told, prior)
-        raised = damping[active, None] * normal.diagonal(dim1=1, dim2=2)
-        move = torch.linalg.solve(normal + torch.diag_embed(raised), right)
-        trial = x[active] + move.unflatten(1, x.shape[1:])
-        trial[..., 0] = trial[..., 0].clamp(low, high)
-        there = prior.energy(part, trial, part.residual(trial, told))
-        gain = energy[active] - there
-        better = gain >= 0
-        x[active] = torch.where(better[:, None, None], trial, x[active])
-        energy[active] = torch.where(better, there, energy[active])
-        factor = torch.where(better, 0.25, 8.0)
-        damping[active] = (damping[active] * factor).clamp(1e-9, 1e6)
-        active = active[~(better & (gain < 1e-2))]
-        if not len(active):
-            break
-    return _Fit(x, energy, _normal(problem, x, missed, prior)[0])
-
-
-def _normal(problem: Problem, x: Tensor, missed: Tensor, prior: _Prior) -> tuple[Tensor, Tensor]:
-    """Curvature (n, P, P) of the log posterior, and its slope (n, P)."""
-    noise, thinning = prior.scale(problem)
-    residual, jacobian = problem.linearised(x, missed)
-    weight = prior.weights(problem, residual) * problem.seen / noise.square() / thinning
-    weighted = jacobian * weight[..., None, None]
-    precision = prior.precision(problem)
-    ridge = torch.diag_embed(precision.flatten(1))
-    normal = torch.einsum("nsyp,nsyq->npq", weighted, jacobian) + ridge
-    right = torch.einsum("nsyp,nsy->np", weighted, residual)
-    return normal, right - ((x - prior.centre(problem)) * precision).flatten(1)
-
-
-def _find_missed(
-    problem: Problem, fit: _Fit, missed: Tensor, prior: _Prior
-) -> tuple[_Fit, Tensor, Tensor]:
-    """Flip what was missed where that has the greater evidence, one per trajectory and turn.
-
-    Returns the fit, what was missed (n, M, d_u), and how probable each of it is.
-    """
-    chance = missed
-    for _ in range(TURNS):
-        rows, movement, actuator = _suspects(problem, fit, missed, prior)
-        if not len(rows):
-            break
-        each = torch.arange(len(rows))
-        pattern = missed[rows].clone()
-        pattern[each, movement, actuator] = 1 - pattern[each, movement, actuator]
-        now = pattern[each, movement, actuator]
-        begin = fit.x[rows].clone()
-        begin[each, movement, 1:] = 0.0
-        tried = _solve(problem[rows], begin, pattern, prior, STEPS)
-        gain = tried.evidence() - fit.evidence()[rows] + prior.odds * (2 * now - 1)
-        chance = chance.clone()
-        chance[rows, movement, actuator] = torch.sigmoid(gain * (2 * now - 1))
-        flipped = False
-        for row in rows.unique().tolist():
-            mine = (rows == row).nonzero()[:, 0]
-            best = int(mine[gain[mine].argmax()])
-            if gain[best] > 0:
-                flipped = True
-                missed = _with(missed, row, pattern[best])
-                fit = fit.replaced(row, tried, best)
-        if not flipped:
-            break
-    return fit, missed, chance
-
-
-def _suspects(
-    problem: Problem, fit: _Fit, missed: Tensor, prior: _Prior
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Trajectory, movement and actuator of every flip worth a try.
-
-    A movement is suspect when an offset is far beyond its prior, or when much of what was seen of
-    it passes for glitches; then every actuator that was to move is. What is missed may always
-    turn out not to be.
-    """
-    far = (fit.x[..., 1:].abs() > SUSPECT * prior.offset) & problem.healthy
-    residual = problem.residual(fit.x, missed)
-    strange = (residual.norm(dim=-1) > 3 * prior.scale(problem)[0]) * problem.seen
-    inside = problem.inside()
-    share = (inside * strange[:, None]).sum(dim=-1) / inside.sum(dim=-1).clamp_min(1)
-    first = read(problem.told, torch.as_tensor(problem.segments.start))
-    last = read(problem.told, torch.as_tensor(problem.segments.settle))
-    moving = (last - first).abs() > 3 * prior.offset
-    suspect = (far.any(dim=-1) | (share > 0.3))[..., None] & moving & problem.healthy
-    rows, movement, actuator = (suspect | (missed > 0.5)).nonzero().unbind(dim=1)
-    return rows, movement, actuator
-
-
-def _with(values: Tensor, row: int, value: Tensor) -> Tensor:
-    changed = values.clone()
-    changed[row] = value
-    return changed
-
-
-def _delay_variance(problem: Problem, fit: _Fit, missed: Tensor, prior: _Prior) -> Tensor:
-    """(n, M), actuators that are unevenly late accounted for."""
-    noise, thinning = prior.scale(problem)
-    weights = prior.weights(problem, problem.residual(fit.x, missed)) * problem.seen
-    precision = prior.precision(problem)
-    return delay_variance(
-        problem,
-        fit.x,
-        missed,
-        precision=precision,
-        pull=(fit.x - prior.centre(problem)) * precision,
-        rest=weights * (1 - problem.moving) / noise.square() / thinning,
-    )
-
-
-def _told(
-    problem: Problem, fit: _Fit, missed: Tensor, chance: Tensor, prior: _Prior
-) -> Discrepancy:
-    """z*, each movement's covariance, and which components the outputs tell."""
-    n, most, size = fit.x.shape
-    whole = fit.covariance().reshape(n, most, size, most, size)
-    index = torch.arange(most)
+def _discrepancy(state: _State, belief: _Belief, identified_below: float) -> Discrepancy:
+    """z*, each segment's covariance, and which components the outputs identify."""
+    problem, solution = state.problem, state.solution
+    x, missed = problem.per_segment(solution.x), problem.missed
+    n, segments, size = x.shape
+    whole = solution.covariance.reshape(n, segments, size, segments, size)
+    index = torch.arange(segments)
     inner = whole[:, index, :, index].transpose(0, 1).clone()
-    wide = prior.precision(problem).reciprocal()
+    wide = belief.deviation(problem).square()
     left = inner.diagonal(dim1=-2, dim2=-1) / wide
-    severity = torch.where(problem.faulty, fit.x[..., 1:], 0.0)
-    # Where a fault is in its place nothing was learned of the discrepancy: the prior stands.
-    told = torch.cat([problem.valid[..., None], problem.healthy], dim=-1).double()
-    own = torch.cat([wide[..., :1], prior.offset.square().expand_as(severity)], dim=-1)
-    inner = inner * told[..., None] * told[..., None, :] + torch.diag_embed(own * (1 - told))
+    severity = torch.where(problem.faulty, x[..., 1:], 0.0)
+    # Under a fault nothing was learned of the discrepancy: the prior stands.
+    learned = torch.cat([problem.valid[..., None], problem.healthy], dim=-1).double()
+    own = torch.cat([wide[..., :1], belief.offset.square().expand_as(severity)], dim=-1)
+    inner = inner * learned[..., None] * learned[..., None, :]
+    inner = inner + torch.diag_embed(own * (1 - learned))
     # Offsets stay as they are, and as much correlated with the delay.
+    delays = delay_variance(problem, belief.prior(problem), belief.noise, solution.x)
     stretch = torch.ones_like(wide)
-    stretch[..., 0] = (_delay_variance(problem, fit, missed, prior) / inner[..., 0, 0]).sqrt()
+    stretch[..., 0] = (delays / inner[..., 0, 0]).sqrt()
     inner = inner * stretch[..., None] * stretch[..., None, :]
     width = size + missed.shape[-1]
-    covariance = torch.zeros(n, most, width, width, dtype=torch.float64)
+    covariance = torch.zeros(n, segments, width, width, dtype=torch.float64)
     covariance[..., :size, :size] = inner
-    covariance[..., size:, size:] = torch.diag_embed(chance * (1 - chance))
-    known = (left < problem.operator.known) & (told > 0)
+    covariance[..., size:, size:] = torch.diag_embed(state.probability * (1 - state.probability))
+    known = (left < identified_below) & (learned > 0)
     known[..., 1:] &= missed < 0.5
-    watched = problem.inside().any(dim=-1)[..., None] & problem.healthy
-    identified = torch.cat([known, watched], dim=-1) & problem.valid[..., None]
-    z = torch.cat([fit.x * told, missed], dim=-1) * problem.valid[..., None]
-    noise = (prior.noise[0] * problem.unit.mean()).expand(n)
+    seen = problem.inside.any(dim=-1)[..., None] & problem.healthy
+    identified = torch.cat([known, seen], dim=-1) & problem.valid[..., None]
+    z = torch.cat([x * learned, missed], dim=-1) * problem.valid[..., None]
+    noise = (belief.noise.scale[0, 0] * problem.unit.mean()).expand(n)
     return Discrepancy(z, covariance, identified, noise, severity=severity, posterior=True)

@@ -1,256 +1,367 @@
-"""What `CommandSpace` is inferred from: measured outputs, and what a surrogate says for any z."""
+"""The problem of `CommandSpace`: measured outputs, and the surrogate's outputs for any z."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
-from retwin.update.corrections.command_effect import effective
-from retwin.update.corrections.correction import Context
-from retwin.update.corrections.warp import gather_samples
+from retwin.data.segments import Segments
+from retwin.inference.solver import Bounds
+from retwin.update.corrections.correction import Context, DifferentiableTwin
+from retwin.update.corrections.effective_commands import effective_commands
+from retwin.update.corrections.warp import gather_samples, interpolate
 from retwin.update.piecewise_linear import distinct
 
-if TYPE_CHECKING:
-    from retwin.update.corrections.command_space import CommandSpace
+__all__ = ["EFFECTIVE_SAMPLES", "CommandProblem"]
 
-__all__ = ["TAILS", "Problem"]
+SURROGATE_STEP = 0.05
+"""Step of finite differences through a surrogate with memory, in samples and in the commands'
+units: larger than the rounding of single precision."""
+COMMAND_STEP = 1e-4
+"""Step of finite differences through the effective commands, which are piecewise linear in x."""
+SETTLING = 15
+"""Samples after the end of a command's ramp in which an output may still be in motion."""
+EFFECTIVE_SAMPLES = (6.0, 1.0)
+"""Largest effective sample size of a segment's part at rest and in motion: rounding and friction
+are common to all its samples."""
+TRAJECTORIES_PER_BATCH = 64
+"""Trajectories linearised together, which bounds memory."""
+COMMON = ("surrogate", "unit", "delay_range")
+"""Fields of `CommandProblem` that all trajectories share."""
 
-NUDGE = 0.05
-"""Step of the finite differences through a surrogate with memory, in samples and units."""
-TURN = 1e-4
-"""The same through the commands alone, which follow x piece by piece in a straight line."""
-MARGIN = 15
-"""Samples after the command has settled in which an output may still be on its way."""
-TAILS = 4.0
-"""Degrees of freedom of the noise (Student's t): glitches do not count."""
-CHUNK = 64
-"""Trajectories linearised together."""
-ROWS = ("told", "at", "seen", "moving", "observed", "valid", "healthy", "faulty", "frozen")
-"""Attributes of `Problem` that have one row per trajectory."""
 
+@dataclass(frozen=True, eq=False)
+class CommandProblem:
+    """Residual and Jacobian for x = (delay, offsets) of every segment, given what was missed.
 
-class Problem:
-    """Residual and derivative for x = (delay, offsets) per movement (n, M, 1 + d_u) and for what
-    was missed (n, M, d_u).
+    The engine's rows are trajectories, its latent variables x (n, P), P = M (1 + d_u).
 
     Attributes
     ----------
-    told: (n, T, d_u), the reference, faults included.
-    at: (n, S), the samples used of each trajectory, in order. A trajectory that has fewer than S
+    surrogate : DifferentiableTwin
+        Commands to outputs.
+    segments : Segments
+        M at most.
+    reference : Tensor
+        (n, T, d_u), the commands that were sent, faults on them included.
+    frozen : Tensor
+        (n, d_u), the sample from which a fault holds an actuator, T for never.
+    sample : Tensor
+        (n, S), the samples used of each trajectory, in order. A trajectory that has fewer than S
         repeats its last one.
-    seen: (n, S), 1 where `at` is a measured sample, 0 where it only fills the row.
-    moving: (n, S), 1 where a movement may be under way: there the surrogate is told less exactly.
-    observed: (n, S, d_y), in `unit` (d_y,), the standard deviation of the outputs.
-    valid: (n, M) bool, movements that exist.
-    healthy: (n, M, d_u) bool, where z is a discrepancy: no fault bends or holds the actuator.
-    faulty: (n, M, d_u) bool, where a fault bends the reference: how far off the actuator ends is
-        the fault's severity, of which nothing is believed beforehand.
+    measured : Tensor
+        (n, S), 1 where `sample` was measured, 0 where it only fills the row.
+    group : Tensor
+        (n, S) long, 1 where a segment may be in motion, where the surrogate is less accurate; 0 at
+        rest.
+    observed : Tensor
+        (n, S, d_y), in `unit`.
+    unit : Tensor
+        (d_y,), the unit of the residual in that of the outputs.
+    valid : Tensor
+        (n, M) bool, segments that exist.
+    healthy : Tensor
+        (n, M, d_u) bool, where z is a discrepancy: no fault bends or holds the actuator.
+    faulty : Tensor
+        (n, M, d_u) bool, where a fault bends the reference: the error of the actuator is the
+        fault's severity, about which the prior is nearly flat.
+    missed : Tensor
+        (n, M, d_u), 1 where an actuator missed a segment.
+    delay_range : tuple of float
+        Smallest and largest delay, in samples.
 
     """
 
-    def __init__(
-        self, operator: CommandSpace, context: Context, observed: Tensor, mask: Tensor
-    ) -> None:
-        self.operator = operator
-        self.surrogate = context.surrogate
-        self.segments = context.segments
-        self.told = context.faulty_commands.double()
-        start = torch.as_tensor(context.segments.start)[..., None]
-        bent = (context.faulty_commands != context.commands).any(dim=1)[:, None]
-        self.valid = torch.as_tensor(context.segments.valid)
-        self.faulty = bent & self.valid[..., None]
-        self.healthy = self.valid[..., None] & ~bent & (start < context.frozen[:, None])
+    surrogate: DifferentiableTwin
+    segments: Segments
+    reference: Tensor
+    frozen: Tensor
+    sample: Tensor
+    measured: Tensor
+    group: Tensor
+    observed: Tensor
+    unit: Tensor
+    valid: Tensor
+    healthy: Tensor
+    faulty: Tensor
+    missed: Tensor
+    delay_range: tuple[float, float]
 
-        seen = mask.all(dim=-1)
-        self.at, used = _thinned(seen, operator.most)
-        self.seen = used.double()
-        told = observed.double()[seen]
-        unit = context.unit.double()
-        spread = told.std(dim=0, correction=0) / unit if len(told) else torch.ones_like(unit)
-        self.unit = unit * spread.mean().clamp_min(1e-12)
-        values = torch.where(seen[..., None], observed.double(), 0.0)
-        self.observed = gather_samples(values, self.at) / self.unit
-        begin = start + operator.delay_range[0]
-        end = torch.as_tensor(context.segments.settle)[..., None] + MARGIN
-        at = self.at[:, None]
-        near = (at >= begin) & (at <= end) & self.valid[..., None]
-        self.moving = near.any(dim=1).double()
-        # A surrogate with memory must be told everything that came before.
-        self.memory = not getattr(context.surrogate, "memoryless", False)
-        self.frozen = context.frozen.double()
+    @classmethod
+    def of(
+        cls,
+        context: Context,
+        observed: Tensor,
+        mask: Tensor,
+        *,
+        delay_range: tuple[float, float],
+        max_samples: int,
+        unit: Tensor | None = None,
+    ) -> CommandProblem:
+        """The problem of outputs (n, T, d_y) that were measured where `mask` is True.
+
+        Only samples at which all outputs were measured are used, `max_samples` of each trajectory
+        at most. By default the unit is that in which the outputs' standard deviation is 1.
+        """
+        segments = context.segments
+        start, settle = (torch.as_tensor(t)[..., None] for t in (segments.start, segments.settle))
+        valid = torch.as_tensor(segments.valid)
+        bent = (context.faulty_commands != context.commands).any(dim=1)[:, None]
+        whole = mask.all(dim=-1)
+        sample, used = _thinned(whole, max_samples)
+        unit = _unit(context, observed.double()[whole]) if unit is None else unit
+        values = torch.where(whole[..., None], observed.double(), 0.0)
+        here = sample[:, None]
+        near = (here >= start + delay_range[0]) & (here <= settle + SETTLING)
+        healthy = valid[..., None] & ~bent & (start < context.frozen[:, None])
+        return cls(
+            surrogate=context.surrogate,
+            segments=segments,
+            reference=context.faulty_commands.double(),
+            frozen=context.frozen.double(),
+            sample=sample,
+            measured=used.double(),
+            group=(near & valid[..., None]).any(dim=1).long(),
+            observed=gather_samples(values, sample) / unit,
+            unit=unit,
+            valid=valid,
+            healthy=healthy,
+            faulty=bent & valid[..., None],
+            missed=torch.zeros(healthy.shape, dtype=torch.float64),
+            delay_range=delay_range,
+        )
 
     def __len__(self) -> int:
-        return len(self.told)
+        return len(self.reference)
 
-    def __getitem__(self, rows: Tensor) -> Problem:
-        """The problem of some of the trajectories."""
-        part = object.__new__(Problem)
-        part.__dict__.update(self.__dict__)
-        part.segments = self.segments[rows.numpy()]
-        for name in ROWS:
-            setattr(part, name, getattr(self, name)[rows])
-        return part
+    def __getitem__(self, rows: Tensor) -> CommandProblem:
+        """The problem of some trajectories."""
+        own = {each.name: getattr(self, each.name) for each in fields(self)}
+        parts = {name: value[rows] for name, value in own.items() if name not in COMMON}
+        return replace(self, **parts)
+
+    def with_missed(self, missed: Tensor) -> CommandProblem:
+        """The same if the actuators missed other segments, (n, M, d_u)."""
+        return replace(self, missed=missed)
+
+    def held_from(self, frozen: Tensor) -> CommandProblem:
+        """The same if faults hold the actuators from other samples (n, d_u) on."""
+        start = torch.as_tensor(self.segments.start)[..., None]
+        frozen = frozen.double()
+        return replace(
+            self, frozen=frozen, healthy=self.valid[..., None] & (start < frozen[:, None])
+        )
 
     @property
-    def when(self) -> Tensor:
-        """Samples (n, ·) at which the surrogate needs commands: with memory, all of them."""
-        if self.memory:
-            return torch.arange(self.told.shape[1]).expand(len(self), -1)
-        return self.at
+    def memory(self) -> bool:
+        """Whether the surrogate's outputs depend on earlier commands."""
+        return not getattr(self.surrogate, "memoryless", False)
+
+    @property
+    def zero(self) -> Tensor:
+        """The x (n, P) of trajectories without any discrepancy."""
+        n, movements, width = self.missed.shape
+        return self.observed.new_zeros(n, movements * (1 + width))
+
+    @property
+    def bounds(self) -> Bounds:
+        """The delay range as limits of x."""
+        low = torch.full(self.zero.shape[1:], -torch.inf, dtype=torch.float64)
+        high, step = -low, -low
+        delays = slice(None, None, 1 + self.missed.shape[2])
+        low, high = low.clone(), high.clone()
+        low[delays], high[delays] = self.delay_range
+        return Bounds(low, high, step)
+
+    def per_segment(self, x: Tensor) -> Tensor:
+        """Values (n, P) or (n, P, …) by segment, (n, M, 1 + d_u, …)."""
+        return x.unflatten(1, (self.missed.shape[1], -1))
+
+    @property
+    def max_effective(self) -> Tensor:
+        """Largest effective sample size (2,) at rest and in motion of all trajectories together."""
+        return torch.tensor(EFFECTIVE_SAMPLES, dtype=torch.float64) * self.valid.sum().clamp_min(1)
+
+    @property
+    def inside(self) -> Tensor:
+        """(n, M, S), 1 where a measured sample belongs to a segment."""
+        start, stop = (
+            torch.as_tensor(t)[..., None] for t in (self.segments.start, self.segments.stop)
+        )
+        here = self.sample[:, None]
+        return ((here >= start) & (here < stop)).double() * self.measured[:, None]
+
+    @property
+    def distance(self) -> Tensor:
+        """How far each actuator was to move in each segment, (n, M, d_u)."""
+        first, last = (
+            interpolate(self.reference, torch.as_tensor(t))
+            for t in (self.segments.start, self.segments.settle)
+        )
+        return (last - first).abs()
+
+    def commands(self, x: Tensor) -> Tensor:
+        """Effective commands, single precision, at `sample`; with memory, at every sample."""
+        z = torch.cat([self.per_segment(x), self.missed], dim=-1)
+        return effective_commands(
+            self.reference, self.segments, z, self._times, self.frozen
+        ).float()
 
     def predicted(self, commands: Tensor) -> Tensor:
-        """The surrogate's outputs (n, S, d_y) at `at` for commands at `when`."""
+        """The surrogate's outputs (n, S, d_y) at `sample` for such commands."""
         outputs = self.surrogate(commands)
-        return gather_samples(outputs, self.at) if self.memory else outputs
-
-    def nothing(self) -> tuple[Tensor, Tensor]:
-        """What x and missed are of trajectories without any discrepancy."""
-        shape = (*self.valid.shape, self.told.shape[2])
-        x = torch.zeros(*shape[:2], 1 + shape[2], dtype=torch.float64)
-        return x, torch.zeros(shape, dtype=torch.float64)
-
-    def commands(self, x: Tensor, missed: Tensor) -> Tensor:
-        """What the actuators are effectively told, single precision."""
-        z = torch.cat([x, missed], dim=-1)
-        return effective(self.told, self.segments, z, self.when, self.frozen).float()
+        return gather_samples(outputs, self.sample) if self.memory else outputs
 
     @torch.no_grad()
-    def residual(self, x: Tensor, missed: Tensor) -> Tensor:
-        """Observed minus said (n, S, d_y)."""
-        return torch.cat([part._residual(*given) for part, given in self._parts(x, missed)])
+    def residual(self, x: Tensor) -> Tensor:
+        """Measured minus predicted outputs (n, S, d_y) for x (n, P), in `unit`."""
+        return torch.cat([part._residual(some) for part, some in self._batches(x)])
 
     @torch.no_grad()
-    def linearised(self, x: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
-        """The residual, and how the outputs turn with x: (n, S, d_y, P)."""
-        parts = [part._linearised(*given) for part, given in self._parts(x, missed)]
+    def linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The residual, and the Jacobian (n, S, d_y, P) of the predicted outputs."""
+        parts = [part._linearised(some) for part, some in self._batches(x)]
         residual, jacobian = zip(*parts, strict=True)
         return torch.cat(residual), torch.cat(jacobian)
 
     @torch.no_grad()
-    def apart(self, x: Tensor, missed: Tensor) -> Tensor:
-        """How the outputs turn with a delay of each actuator's own: (n, S, d_y, M d_u)."""
-        return torch.cat([part._apart(*given) for part, given in self._parts(x, missed)])
+    def actuator_delay_jacobian(self, x: Tensor) -> Tensor:
+        """Jacobian (n, S, d_y, M d_u) of the outputs by a delay of every actuator of its own."""
+        parts = [part._actuator_delay_jacobian(some) for part, some in self._batches(x)]
+        return torch.cat(parts)
 
     def first_delays(self) -> Tensor:
-        """The delay (n, M) in whole samples that fits each movement best, nothing else being off.
+        """The delay (n, M) in whole samples that fits each segment best, all offsets being 0.
 
-        Where all fit alike, the smallest.
+        Where all fit equally well, the smallest.
         """
-        low, high = self.operator.delay_range
+        low, high = self.delay_range
         grid = torch.arange(low, high + 1.0, dtype=torch.float64)
         grid = grid[grid.abs().argsort(stable=True)]
         start, settle = (
-            torch.as_tensor(times)[..., None]
-            for times in (self.segments.start, self.segments.settle)
+            torch.as_tensor(t)[..., None] for t in (self.segments.start, self.segments.settle)
         )
-        at = self.at[:, None]
-        near = ((at >= start + low) & (at <= settle + high)).double()
-        x, missed = self.nothing()
-        costs = []
+        here = self.sample[:, None]
+        near = ((here >= start + low) & (here <= settle + high)).double()
+        x, costs = self.zero, []
         for delay in grid:
-            x[..., 0] = delay
-            error = self.residual(x, missed).norm(dim=-1) * self.seen
+            self.per_segment(x)[..., 0] = delay
+            error = self.residual(x).norm(dim=-1) * self.measured
             costs.append((near * error[:, None]).sum(dim=-1))
         return grid[torch.stack(costs).argmin(dim=0)]
 
-    def inside(self) -> Tensor:
-        """(n, M, S), 1 where a measured sample belongs to a movement."""
-        start, stop = (
-            torch.as_tensor(times)[..., None] for times in (self.segments.start, self.segments.stop)
-        )
-        at = self.at[:, None]
-        return ((at >= start) & (at < stop)).double() * self.seen[:, None]
-
-    def _parts(self, *given: Tensor) -> Iterator[tuple[Problem, tuple[Tensor, ...]]]:
-        for rows in torch.arange(len(self)).split(CHUNK):
-            yield self[rows], tuple(each[rows] for each in given)
-
-    def _residual(self, x: Tensor, missed: Tensor) -> Tensor:
-        told = self.commands(x, missed)
+    @property
+    def _times(self) -> Tensor:
+        """Samples (n, ·) at which the surrogate needs commands: with memory, all of them."""
         if self.memory:
-            return self.observed - self.predicted(told).double() / self.unit
-        rows, place = distinct(told)
-        return self.observed - self.surrogate(rows[None])[0, place].double() / self.unit
+            return torch.arange(self.reference.shape[1]).expand(len(self), -1)
+        return self.sample
 
-    def _linearised(self, x: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
+    def _batches(self, x: Tensor) -> Iterator[tuple[CommandProblem, Tensor]]:
+        if len(self) <= TRAJECTORIES_PER_BATCH:
+            yield self, x
+            return
+        for rows in torch.arange(len(self)).split(TRAJECTORIES_PER_BATCH):
+            yield self[rows], x[rows]
+
+    def _residual(self, x: Tensor) -> Tensor:
+        commands = self.commands(x)
         if self.memory:
-            residual = self._residual(x, missed)
-            basis = torch.eye(x[0].numel(), dtype=x.dtype).unflatten(1, x.shape[1:])
-            moved = [self._residual(x + NUDGE * each, missed) for each in basis]
-            return residual, torch.stack([(residual - each) / NUDGE for each in moved], dim=-1)
-        # Without memory the chain rule is local: the surrogate's slope, sample by sample.
-        residual, slope = self._slope(x, missed)
-        late, off = self._turns(x, missed)
-        by_delay = torch.einsum("nsyu,nmsu->nsym", slope, late)[..., None]
-        by_offset = torch.einsum("nsyu,nmsu->nsymu", slope, off)
+            return self.observed - self.predicted(commands).double() / self.unit
+        different, place = distinct(commands)
+        return self.observed - self.surrogate(different[None])[0, place].double() / self.unit
+
+    def _linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        if self.memory:
+            residual = self._residual(x)
+            moved = [
+                self._residual(x + SURROGATE_STEP * each)
+                for each in torch.eye(x.shape[1], dtype=x.dtype)
+            ]
+            columns = [(residual - each) / SURROGATE_STEP for each in moved]
+            return residual, torch.stack(columns, dim=-1)
+        # Without memory the chain rule is local: the surrogate's Jacobian, sample by sample.
+        residual, by_command = self._by_command(x)
+        delay, offset = self._command_jacobians(x)
+        by_delay = torch.einsum("nsyu,nmsu->nsym", by_command, delay)[..., None]
+        by_offset = torch.einsum("nsyu,nmsu->nsymu", by_command, offset)
         return residual, torch.cat([by_delay, by_offset], dim=-1).flatten(3)
 
-    def _slope(self, x: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
-        """The residual (n, S, d_y), and how outputs turn with commands (n, S, d_y, d_u)."""
-        rows, place = distinct(self.commands(x, missed))
+    def _by_command(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The residual (n, S, d_y), and the surrogate's Jacobian (n, S, d_y, d_u)."""
+        different, place = distinct(self.commands(x))
         with torch.enable_grad():
-            asked = rows[None].requires_grad_()
-            said = self.surrogate(asked)
-            slopes = torch.cat(
-                [
-                    torch.autograd.grad(each.sum(), asked, retain_graph=True)[0]
-                    for each in said.unbind(dim=-1)
-                ]
-            )
-        residual = self.observed - said.detach()[0, place].double() / self.unit
-        return residual, slopes.movedim(0, 1)[place].double() / self.unit[..., None]
+            inputs = different[None].requires_grad_()
+            outputs = self.surrogate(inputs)
+            rows = [
+                torch.autograd.grad(each.sum(), inputs, retain_graph=True)[0]
+                for each in outputs.unbind(dim=-1)
+            ]
+        jacobian = torch.cat(rows).movedim(0, 1)[place].double() / self.unit[..., None]
+        return self.observed - outputs.detach()[0, place].double() / self.unit, jacobian
 
-    def _apart(self, x: Tensor, missed: Tensor) -> Tensor:
-        late = self._turns(x, missed)[0]
+    def _actuator_delay_jacobian(self, x: Tensor) -> Tensor:
+        delay = self._command_jacobians(x)[0]
         if not self.memory:
-            return torch.einsum("nsyu,nmsu->nsymu", self._slope(x, missed)[1], late).flatten(3)
-        told = self.commands(x, missed)
-        said = self.predicted(told)
+            by_command = self._by_command(x)[1]
+            return torch.einsum("nsyu,nmsu->nsymu", by_command, delay).flatten(3)
+        commands = self.commands(x)
+        outputs = self.predicted(commands)
         columns = []
-        for movement, actuator in itertools.product(*map(range, missed.shape[1:])):
-            moved = told.clone()
-            moved[..., actuator] += (NUDGE * late[:, movement, :, actuator]).to(told)
-            columns.append((self.predicted(moved) - said).double() / NUDGE)
+        for segment, actuator in itertools.product(*map(range, self.missed.shape[1:])):
+            moved = commands.clone()
+            moved[..., actuator] += (SURROGATE_STEP * delay[:, segment, :, actuator]).to(moved)
+            columns.append((self.predicted(moved) - outputs).double() / SURROGATE_STEP)
         return torch.stack(columns, dim=-1) / self.unit[..., None]
 
-    def _turns(self, x: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
-        """How the commands turn with each movement's delay, and with its offsets, (n, M, S, d_u).
+    def _command_jacobians(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Jacobians (n, M, S, d_u) of the commands by each segment's delay, and by its offsets.
 
-        An actuator's command turns with its own offset only, so all are moved at once.
+        An actuator's command depends on its own offset only, so all are moved at once.
         """
-        movements, width = x.shape[1:]
-        step = torch.zeros(2, movements, movements, width, dtype=x.dtype)
-        index = torch.arange(movements)
-        step[0, index, index, 0] = TURN
-        step[1, index, index, 1:] = TURN
-        moved = torch.cat([torch.zeros_like(step[0, :1]), step.flatten(0, 1)])
-        count = len(moved)
-        rows = torch.arange(len(x)).repeat_interleave(count)
-        z = torch.cat([(x[:, None] + moved).flatten(0, 1), missed[rows]], dim=-1)
-        segments, frozen = self.segments[rows.numpy()], self.frozen[rows]
-        told = effective(self.told[rows], segments, z, self.when[rows], frozen)
-        told = told.unflatten(0, (len(x), count))
-        late, off = ((told[:, 1:] - told[:, :1]) / TURN).split(movements, dim=1)
-        return late, off
+        n, segments, width = self.missed.shape
+        step = torch.zeros(2, segments, segments, 1 + width, dtype=x.dtype)
+        index = torch.arange(segments)
+        step[0, index, index, 0] = COMMAND_STEP
+        step[1, index, index, 1:] = COMMAND_STEP
+        moves = torch.cat([torch.zeros_like(step[0, :1]), step.flatten(0, 1)])
+        rows = torch.arange(n).repeat_interleave(len(moves))
+        x = (self.per_segment(x)[:, None] + moves).flatten(0, 1)
+        commands = effective_commands(
+            self.reference,
+            self.segments[rows.numpy()],
+            torch.cat([x, self.missed[rows]], dim=-1),
+            self._times[rows],
+            self.frozen[rows],
+        ).unflatten(0, (n, len(moves)))
+        delay, offset = ((commands[:, 1:] - commands[:, :1]) / COMMAND_STEP).split(segments, dim=1)
+        return delay, offset
 
 
-def _thinned(measured: Tensor, most: int) -> tuple[Tensor, Tensor]:
-    """At most `most` evenly chosen samples of each row of `measured` (n, T) bool.
+def _unit(context: Context, measured: Tensor) -> Tensor:
+    """`context.unit` times a number for which the standard deviation of (k, d_y) is about 1."""
+    unit = context.unit.double()
+    if not len(measured):
+        return unit
+    return unit * (measured.std(dim=0, correction=0) / unit).mean().clamp_min(1e-12)
+
+
+def _thinned(measured: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """At most `count` evenly chosen samples of each row of `measured` (n, T) bool.
 
     Each trajectory is thinned by itself: trajectories may be polled at different phases.
 
     Returns the samples (n, S), where shorter rows repeat their last one, and which of them are no
     such repetition (n, S) bool. A row without any measurement has only False.
-
     """
     rank = measured.cumsum(dim=1)
-    every = (-(-rank[:, -1:] // most)).clamp_min(1)
+    every = (-(-rank[:, -1:] // count)).clamp_min(1)
     used = measured & ((rank - 1) % every == 0)
-    count = used.sum(dim=1, keepdim=True)
-    column = torch.arange(int(count.amax()) if len(count) else 0)
+    kept = used.sum(dim=1, keepdim=True)
+    column = torch.arange(int(kept.amax()) if len(kept) else 0)
     order = used.byte().argsort(dim=1, descending=True, stable=True)
-    return order.gather(1, column.minimum((count - 1).clamp_min(0))), column < count
+    return order.gather(1, column.minimum((kept - 1).clamp_min(0))), column < kept

@@ -1,9 +1,9 @@
-"""`CommandSpace`: what the actuators were effectively told, pushed through the surrogate.
+"""`CommandSpace`: the effective commands of the actuators, pushed through the surrogate.
 
-An output offset may leave what the system can reach, and cannot say which actuator errs. Here z
-changes the commands, ỹ = G_φ(T_z(u)), so every corrected output is one that the twin can give. A
-movement of an actuator may come late, end off its target, or not take place at all; then the
-actuator stays where it is and catches up with the next command.
+An output offset may leave what the system can reach, and does not show which actuator errs. Here z
+changes the commands, ỹ = G_φ(T_z(u)), so that every corrected output is one that the twin can give.
+In a segment actuators may respond with a delay and end off their targets, and one may miss the
+segment altogether: it stays where it is and catches up with the next command.
 """
 
 from __future__ import annotations
@@ -14,49 +14,54 @@ import torch
 from torch import Tensor
 
 from retwin.data.trajectories import Channels
-from retwin.update.corrections.command_effect import effective
 from retwin.update.corrections.command_inference import infer_commands
 from retwin.update.corrections.correction import Context, Discrepancy, Head
+from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.warp import gather_samples
 from retwin.update.piecewise_linear import distinct
 
 __all__ = ["CommandSpace"]
 
+KINDS = ("offset", "missed")
+
 
 @dataclass(frozen=True)
 class CommandSpace:
-    """z = delay, offset and missed per movement and actuator, in command space.
+    """z = delay, offsets and missed segments of the actuators, in command space.
 
-    Per movement: the delay in samples, one for all actuators; then for every actuator the offset of
-    the level that is reached, in its command's unit; then for every actuator whether it missed the
-    movement, 0 or 1.
+    Of each segment: the delay in samples, one for all actuators; then for every actuator the offset
+    of the level that it reaches, in its command's unit; then for every actuator whether it missed
+    the segment, 0 or 1.
 
     Parameters
     ----------
-    delay_range: least and greatest delay that `infer` looks for, in samples.
-    most: samples per trajectory that `infer` looks at, at most; more tell little.
-    known: share of the prior's variance that the outputs must leave at most for a component of z to
-        count as identified.
+    delay_range : tuple of float
+        Smallest and largest delay that `infer` considers, in samples.
+    max_samples : int
+        Samples per trajectory that `infer` uses at most: more add little information.
+    identified_below : float
+        A component of z is identified if its posterior variance is below this share of its prior
+        variance, from 0 to 1.
 
     """
 
     delay_range: tuple[float, float] = (-5.0, 30.0)
-    most: int = 200
-    known: float = 0.7
+    max_samples: int = 200
+    identified_below: float = 0.7
 
     @property
     def resolution(self) -> str:
-        """One z per movement."""
+        """One z per segment."""
         return "segment"
 
     @property
     def pools(self) -> bool:
-        """What `infer` finds of one trajectory leans on what it learns from those beside it."""
+        """`infer` learns its priors from all trajectories together."""
         return True
 
     @property
     def severities(self) -> bool:
-        """`infer` tells how severe a known fault is, apart from z."""
+        """`infer` estimates the severity of a known fault apart from z."""
         return True
 
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:
@@ -65,7 +70,7 @@ class CommandSpace:
         return Channels(names, ("samples", *inputs.units, *("1" for _ in inputs.names)))
 
     def heads(self, inputs: Channels, outputs: Channels) -> tuple[Head, ...]:
-        """A mixture for the delay, one for all offsets together, and what is missed."""
+        """A mixture for the delay, one for all offsets together, and missed segments."""
         return (
             Head("delay", 1),
             Head("offset", len(inputs)),
@@ -74,24 +79,32 @@ class CommandSpace:
 
     def apply(self, context: Context, z: Tensor) -> Tensor:
         """ỹ = G_φ(T_z(u)), differentiable in z; a frozen actuator stays where z had brought it."""
-        return context.surrogate(_told(context, z, torch.arange(context.faulty_commands.shape[1])))
+        times = torch.arange(context.faulty_commands.shape[1])
+        return context.surrogate(_commands(context, z, times))
 
     def at(self, context: Context, z: Tensor, when: Tensor) -> Tensor:
         """The same (n, S, d_y) at the samples `when` (n, S) only."""
         if not getattr(context.surrogate, "memoryless", False):
             return gather_samples(self.apply(context, z), when)
-        rows, place = distinct(_told(context, z, when))
-        return context.surrogate(rows[None])[0, place]
+        different, place = distinct(_commands(context, z, when))
+        return context.surrogate(different[None])[0, place]
 
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """z* and its covariance from outputs alone; see `command_inference`."""
-        return infer_commands(self, context, observed, mask)
+        return infer_commands(
+            context,
+            observed,
+            mask,
+            delay_range=self.delay_range,
+            max_samples=self.max_samples,
+            identified_below=self.identified_below,
+        )
 
 
-KINDS = ("offset", "missed")
-
-
-def _told(context: Context, z: Tensor, when: Tensor) -> Tensor:
-    """T_z(u) at the samples `when`, (n, S) or (S,)."""
-    told = effective(context.faulty_commands.to(z.dtype), context.segments, z, when, context.frozen)
-    return told.to(context.faulty_commands.dtype)
+def _commands(context: Context, z: Tensor, times: Tensor) -> Tensor:
+    """T_z(u) at `times`, (n, S) or (S,), in the precision of the commands."""
+    reference = context.faulty_commands
+    effective = effective_commands(
+        reference.to(z.dtype), context.segments, z, times, context.frozen
+    )
+    return effective.to(reference.dtype)

@@ -1,8 +1,9 @@
-"""What every correction operator g offers: apply z to a path, infer z from a measured one."""
+"""The `Correction` protocol: apply z to a path, infer z from a measured one."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, Protocol, runtime_checkable
 
 import torch
@@ -16,10 +17,10 @@ __all__ = ["Context", "Correction", "DifferentiableTwin", "Discrepancy", "Head"]
 
 
 class DifferentiableTwin(Protocol):
-    """What a correction needs of a surrogate: a differentiable call, and a fast one without.
+    """The part of a surrogate that corrections use: a call with gradient, and one without.
 
-    One may also have `memoryless`, whether an output depends on the command of its own sample only,
-    and `unit`, what outputs are divided by to be compared with each other.
+    Optional attributes are `memoryless`, whether an output depends on the command of its own sample
+    only, and `unit`, (d_y,), by which outputs are divided to be compared with each other.
     """
 
     def __call__(self, commands: Tensor) -> Tensor:
@@ -33,12 +34,16 @@ class DifferentiableTwin(Protocol):
 
 @dataclass(frozen=True)
 class Head:
-    """A block of z that the residual model draws on its own.
+    """A block of z that the residual model draws independently of the others.
 
     Attributes
     ----------
-    name, width: what it is, and how many components of z it has.
-    kind: "mixture", a Gaussian mixture with full covariance; or "bernoulli", 0 or 1 each.
+    name : str
+        Of the block.
+    width : int
+        Number of its components of z.
+    kind : {"mixture", "bernoulli"}
+        A Gaussian mixture with full covariance, or components that are 0 or 1.
 
     """
 
@@ -49,18 +54,26 @@ class Head:
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """All that a correction may look at; an operator takes what it needs.
+    """The inputs of a correction for n trajectories; an operator takes what it needs.
 
     Attributes
     ----------
-    surrogate: commands (n, T, d_u) to outputs (n, T, d_y), differentiable.
-    commands: (n, T, d_u), clean.
-    faulty_commands: (n, T, d_u), the commands with the effect of the faults on the reference.
-    frozen: (n, d_u), the sample from which a fault holds an actuator's response; T for never.
-    nominal: (n, T, d_y), the surrogate's output for the clean commands.
-    segments: movements of the clean commands or of the nominal path.
-    rate: samples per second.
-    corrected: (n, T, d_y), what operators before this one have left; None for the first.
+    surrogate : DifferentiableTwin
+        Commands (n, T, d_u) to outputs (n, T, d_y).
+    commands : Tensor
+        (n, T, d_u), without faults.
+    faulty_commands : Tensor
+        (n, T, d_u), the commands with the effect of the faults on the reference.
+    frozen : Tensor
+        (n, d_u), the sample from which a fault holds an actuator's response; T for never.
+    nominal : Tensor
+        (n, T, d_y), the surrogate's output for `commands`.
+    segments : Segments
+        Of the commands or of the nominal path.
+    rate : float
+        In Hz.
+    corrected : Tensor, optional
+        (n, T, d_y), the output of the operators before this one; None for the first.
 
     """
 
@@ -72,31 +85,28 @@ class Context:
     segments: Segments
     rate: float
     corrected: Tensor | None = None
-    _found: list[Tensor] = field(default_factory=list, init=False, repr=False)
 
     def __len__(self) -> int:
         return len(self.commands)
 
-    @property
+    @cached_property
     def path(self) -> Tensor:
-        """(n, T, d_y), what is corrected: what operators before have left, else the surrogate's
-        output for what the actuators are told, held where they are frozen.
+        """The uncorrected outputs (n, T, d_y): those of the operators before, else the surrogate's.
 
-        Asked of the surrogate when it is first needed: an operator on commands needs it not.
+        These are for the faulty commands, held where an actuator is frozen. They are computed when
+        they are first needed: an operator on commands does not need them.
         """
         if self.corrected is not None:
             return self.corrected
-        if not self._found:
-            time = torch.arange(self.faulty_commands.shape[1])[:, None]
-            held = self.faulty_commands.gather(1, torch.minimum(time, self.frozen[:, None]))
-            clean = held.equal(self.commands)
-            said = self.nominal if clean else torch.as_tensor(self.surrogate.predict(held.numpy()))
-            self._found.append(said)
-        return self._found[0]
+        time = torch.arange(self.faulty_commands.shape[1])[:, None]
+        held = self.faulty_commands.gather(1, torch.minimum(time, self.frozen[:, None]))
+        if held.equal(self.commands):
+            return self.nominal
+        return torch.as_tensor(self.surrogate.predict(held.numpy()))
 
     @property
     def unit(self) -> Tensor:
-        """(d_y,) what outputs are divided by to be compared with each other; 1 if not known."""
+        """Unit (d_y,) by which outputs are divided to be compared; 1 if not known."""
         return getattr(self.surrogate, "unit", self.nominal.new_ones(self.nominal.shape[2]))
 
     def __getitem__(self, index: slice | NDArray) -> Context:
@@ -141,18 +151,24 @@ class Context:
 
 @dataclass(frozen=True, eq=False)
 class Discrepancy:
-    """The z that explains a measured output best, and how well it is known.
+    """The most probable z of measured outputs, and its uncertainty.
 
     Attributes
     ----------
-    z: (n, M, d_z), 0 where a movement does not exist.
-    covariance: (n, M, d_z, d_z), of each movement's z, correlated noise accounted for.
-    identified: (n, M, d_z) bool, False where the outputs do not tell that component.
-    noise: (n,) scale of what z leaves unexplained, in the output's unit.
-    severity: (n, M, d_u), how far a fault left an actuator off its command; None where the operator
-        cannot tell.
-    posterior: whether z and covariance are a whole posterior: what the outputs do not tell is then
-        as wide as what is believed of it beforehand, and draws stand for z everywhere.
+    z : Tensor
+        (n, M, d_z), 0 where a segment does not exist.
+    covariance : Tensor
+        (n, M, d_z, d_z), of each segment's z, correlated noise accounted for.
+    identified : Tensor
+        (n, M, d_z) bool, False where the outputs do not identify that component.
+    noise : Tensor
+        (n,), scale of the residual that z leaves unexplained, in the output's unit.
+    severity : Tensor, optional
+        (n, M, d_u), the error of an actuator by a fault, in its command's unit; None where the
+        operator does not estimate it.
+    posterior : bool
+        Whether z and covariance are a whole posterior: what the outputs do not identify then has
+        the variance of its prior, and draws stand for z everywhere.
 
     """
 
@@ -168,14 +184,14 @@ class Discrepancy:
 class Correction(Protocol):
     """An operator g with its inverse; holds settings, no data.
 
-    One may also have `pools`, true if what it infers of a trajectory leans on those beside it;
-    `severities`, true if it tells how severe a known fault is apart from z; and
-    `at(context, z, when)`, what `apply` gives at some samples (n, S) only, if that costs less.
+    Optional members are `pools`, true if `infer` learns from all trajectories together;
+    `severities`, true if it estimates the severity of a known fault apart from z; and
+    `at(context, z, when)`, the result of `apply` at some samples (n, S) only, if that costs less.
     """
 
     @property
     def resolution(self) -> str:
-        """What z has one value for: "segment" or "step"."""
+        """What has a z of its own: a "segment", or a "step" (a sample)."""
         ...
 
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:

@@ -1,8 +1,8 @@
 """`SampledSensor`: what lies between a system's outputs and their record.
 
-Outputs are read every so many samples, each reading errs a little and now and then grossly, is
-rounded, and the record joins the readings by straight lines. Only readings tell something: between
-them a record has no information, however many samples it holds.
+Outputs are sampled every so many time steps, each sampled value has an error, now and then a gross
+one, is rounded, and the record joins the values linearly. Only sampled values are informative:
+between them a record has no information, however long it is.
 """
 
 from __future__ import annotations
@@ -21,38 +21,46 @@ from retwin.update.corrections.warp import gather_samples
 
 __all__ = ["SampledSensor"]
 
-SLOWEST = 50
-"""Most samples between two readings that are looked for."""
-FEW = 20
-"""Least readings of a record from which their period is told."""
+LONGEST_PERIOD = 50
+"""Longest sampling period that is searched for, in time steps of the record."""
+FEWEST = 20
+"""Fewest sampled values of a record from which their period is estimated."""
 PLAIN = 0.2
-"""At readings a record must bend so much more than the next most bent phase: 1 to this."""
+"""Largest bend at the next most bent phase, relative to that at the sampling phase."""
 SMOOTH = 1e-6
-"""Bends, in standard deviations of an output, that are nothing but the precision of a number."""
-USUAL, GROSS = 0.9, 30.0
-"""A reading is a glitch when it is so many times further off than this share of readings."""
+"""Largest bend, in standard deviations of an output, that is only the rounding of numbers."""
+REGULAR, GROSS = 0.9, 30.0
+"""A value is a glitch if its error is `GROSS` times this quantile of all errors."""
 LEVELS = np.linspace(0, 1, 33)
-"""Of the quantiles by which the law of a reading's error is told."""
+"""Levels of the quantiles by which the distribution of an error is described."""
 
 
 @dataclass(frozen=True)
 class SampledSensor:
-    """Polling, reading errors, glitches and rounding; what is left out is fitted from data.
+    """Sampling, errors, glitches and rounding; what is left out is fitted from data.
 
     Parameters
     ----------
-    every: samples from one reading to the next.
-    phases: sample of the first reading; where there are several, each trajectory has one of them.
-    noise: quantiles of a reading's error at levels evenly from 0 to 1, per output in its unit; no
-        law's shape is presumed, since rounding may leave most readings without any error.
-    steps: distance of the values that a reading can take, per output; 0 for any.
-    glitch_rate: share of readings that are glitches.
-    glitch_size: standard deviation of their errors, per output.
+    every : int, optional
+        Sampling period in time steps, at least 1.
+    phases : tuple of int, optional
+        Time step of the first sampled value; where there are several, each trajectory has one of
+        them.
+    noise : tuple of tuple of float, optional
+        Quantiles of an error at levels evenly from 0 to 1, per output in its unit. No shape of its
+        distribution is assumed, since rounding may leave most values without any error.
+    steps : tuple of float, optional
+        Distance of the values that an output can take, per output; 0 for any value.
+    glitch_rate : float, optional
+        Share of sampled values that are glitches, 0 to 1.
+    glitch_size : tuple of float, optional
+        Standard deviation of their errors, per output.
 
     Raises
     ------
-    InputError: a period below one sample, a first reading outside the first period, a negative
-        size, quantiles that do not rise, a rate outside 0 to 1.
+    InputError
+        The period is below one time step, a phase is outside the first period, a size is negative,
+        quantiles do not rise, or the rate is outside 0 to 1.
 
     """
 
@@ -72,7 +80,7 @@ class SampledSensor:
             and all(0 <= phase < every for phase in self.phases or ())
             and all(np.isfinite(size) and size >= 0 for size in sizes)
             and 0 <= (self.glitch_rate or 0.0) <= 1
-            and all(len(law) > 1 and sorted(law) == list(law) for law in self.noise or ())
+            and all(len(q) > 1 and sorted(q) == list(q) for q in self.noise or ())
         )
         if not sound:
             raise InputError(
@@ -103,17 +111,17 @@ class SampledSensor:
     ) -> SampledSensor:
         """Everything that is not given, from a record and the outputs that explain it.
 
-        A reading's error is seen where the system rests: in the second half of each steady part,
-        about that part's median.
+        Errors are measured where the system rests: in the second half of each steady part, about
+        that part's median.
         """
         made = self.timed(observed, mask)
         errors = _at_rest(observed - explained, made.sample_mask(observed, mask), segments)
         size = np.abs(errors)
-        usual = np.quantile(size, USUAL, axis=0) if len(errors) else np.zeros(errors.shape[1])
-        gross = (size > GROSS * np.where(usual > 0, usual, np.inf)).any(axis=1)
+        regular = np.quantile(size, REGULAR, axis=0) if len(errors) else np.zeros(errors.shape[1])
+        gross = (size > GROSS * np.where(regular > 0, regular, np.inf)).any(axis=1)
         # An error is as likely as its opposite.
-        plain = np.concatenate([errors[~gross], -errors[~gross], np.zeros((1, len(usual)))])
-        strong = np.sqrt(np.square(errors[gross]).mean(axis=0)) if gross.any() else 0 * usual
+        plain = np.concatenate([errors[~gross], -errors[~gross], np.zeros((1, len(regular)))])
+        strong = np.sqrt(np.square(errors[gross]).mean(axis=0)) if gross.any() else 0 * regular
         return made._filled(
             noise=tuple(tuple(np.quantile(each, LEVELS).tolist()) for each in plain.T),
             glitch_rate=float(gross.mean()) if len(gross) else 0.0,
@@ -125,7 +133,7 @@ class SampledSensor:
         return replace(self, **{k: v for k, v in found.items() if getattr(self, k) is None})
 
     def sample_mask(self, observed: Tensor, mask: Tensor) -> Tensor:
-        """`mask` (n, T, d_y) where a record was read; in between, it tells nothing."""
+        """`mask` (n, T, d_y) where a record was sampled; in between it has no information."""
         if self.every is None:
             raise InputError(
                 "sensor",
@@ -152,7 +160,7 @@ class SampledSensor:
         return self.record(gather_samples(outputs, when), when, steps, generator)
 
     def polls(self, count: int, steps: int, generator: torch.Generator) -> Tensor:
-        """When records of so many samples are read, (count, R); at the last one if beyond it."""
+        """Time steps (count, R) at which records of that length are sampled, within the record."""
         every = self.every or 1
         choice = torch.tensor(self.phases or range(every))
         phase = choice[torch.randint(len(choice), (count,), generator=generator)]
@@ -174,33 +182,33 @@ class SampledSensor:
         last = (steps - 1 - phase) // every
         following = (torch.arange(values.shape[1]) + 1).minimum(last)
         ends = torch.stack([values, gather_samples(values, following) - values])
-        # A line from each reading to the next, all at once: as a product of matrices it is quick.
+        # Linear interpolation between sampled values; as a matrix product it is fast.
         share = torch.arange(every).to(values) / every
         join = torch.stack([torch.ones_like(share), share], dim=1)
         lines = torch.einsum("ek,knrd->nred", join, ends).flatten(1, 2)
         return gather_samples(lines, (torch.arange(steps) - phase).clamp_min(0))
 
     def _errors(self, like: Tensor, generator: torch.Generator) -> Tensor:
-        """Errors of readings (n, R, d_y)."""
-        wrong = torch.zeros_like(like)
+        """Errors of sampled values (n, R, d_y)."""
+        error = torch.zeros_like(like)
         if self.noise is not None:
-            chance = torch.rand(like.shape, generator=generator, dtype=torch.float64)
-            for j, law in enumerate(self.noise):
-                quantile = chance.new_tensor(law)
-                place = chance[..., j] * (len(law) - 1)
-                left = place.long().clamp_max(len(law) - 2)
-                wrong[..., j] = torch.lerp(quantile[left], quantile[left + 1], place - left)
+            level = torch.rand(like.shape, generator=generator, dtype=torch.float64)
+            for j, quantiles in enumerate(self.noise):
+                quantile = level.new_tensor(quantiles)
+                place = level[..., j] * (len(quantile) - 1)
+                left = place.long().clamp_max(len(quantile) - 2)
+                error[..., j] = torch.lerp(quantile[left], quantile[left + 1], place - left)
         if self.glitch_rate and self.glitch_size is not None:
             hit = torch.rand(like.shape[:2], generator=generator) < self.glitch_rate
             size = torch.randn(like.shape, generator=generator).to(like)
-            wrong = wrong + hit[..., None] * like.new_tensor(self.glitch_size) * size
-        return wrong
+            error = error + hit[..., None] * like.new_tensor(self.glitch_size) * size
+        return error
 
 
 def _timing(observed: Tensor, mask: Tensor) -> tuple[int, tuple[int, ...]]:
-    """Samples between readings, and the first one's: the longest period with plain kinks."""
+    """Sampling period and phases: the longest period with plain kinks."""
     measured = int(mask.any(dim=-1).any(dim=0).sum())
-    for every in range(min(SLOWEST, measured // FEW), 1, -1):
+    for every in range(min(LONGEST_PERIOD, measured // FEWEST), 1, -1):
         kinks = _kinks(observed, mask, every)
         plain = _plain(kinks)
         if 2 * plain.sum() > (kinks.amax(dim=1) > 0).sum():
@@ -209,31 +217,31 @@ def _timing(observed: Tensor, mask: Tensor) -> tuple[int, tuple[int, ...]]:
 
 
 def _kinks(observed: Tensor, mask: Tensor, every: int) -> Tensor:
-    """How far a record bends at the samples of each phase, (n, every).
+    """Mean bend of a record at each phase, (n, every).
 
-    Straight lines bend at readings only; a little elsewhere too, in motion, where what was read was
-    turned into outputs after it had been joined.
+    A piecewise-linear record bends at sampled values only; a little elsewhere too, in motion, where
+    outputs were computed from values after these had been joined.
     """
     seen = mask.all(dim=-1)
     values = observed.double()
     bend = torch.zeros_like(values)
     bend[:, 1:-1] = values[:, 2:] - 2 * values[:, 1:-1] + values[:, :-2]
     unit = values[seen].std(dim=0).clamp_min(1e-12) if seen.any() else 1.0
-    told = torch.zeros_like(seen)
-    told[:, 1:-1] = seen[:, 2:] & seen[:, 1:-1] & seen[:, :-2]
-    size = torch.where(told, (bend / unit).norm(dim=-1), torch.nan)
+    whole_bend = torch.zeros_like(seen)
+    whole_bend[:, 1:-1] = seen[:, 2:] & seen[:, 1:-1] & seen[:, :-2]
+    size = torch.where(whole_bend, (bend / unit).norm(dim=-1), torch.nan)
     whole = nn.functional.pad(size, (0, -size.shape[1] % every), value=torch.nan)
     return whole.unflatten(1, (-1, every)).nanmean(dim=1).nan_to_num(0.0)
 
 
 def _plain(kinks: Tensor) -> Tensor:
     """Whether a record (n,) bends at one phase and hardly at others."""
-    most, next_to_it = kinks.topk(2, dim=1).values.unbind(dim=1)
-    return (most > SMOOTH) & (next_to_it < PLAIN * most)
+    largest, second = kinks.topk(2, dim=1).values.unbind(dim=1)
+    return (largest > SMOOTH) & (second < PLAIN * largest)
 
 
 def _phases(kinks: Tensor) -> Tensor:
-    """The first reading (n,) of each trajectory, the most common one where it is not plain."""
+    """The phase (n,) of each trajectory, the most common one where it is not plain."""
     own = kinks.argmax(dim=1)
     plain = _plain(kinks)
     return own if not plain.any() else torch.where(plain, own, own[plain].mode().values)
@@ -244,21 +252,23 @@ def _step(readings: NDArray) -> float:
     values = np.unique(readings)
     if len(values) < 3 or 4 * len(values) > len(readings):
         return 0.0
-    gaps = np.diff(values)
-    step = float(gaps[gaps > 1e-6 * np.abs(values).max()].min(initial=np.inf))
-    off = (values - values[0]) / step
-    return step if np.isfinite(step) and np.abs(off - np.round(off)).max() < 0.05 else 0.0
+    distances = np.diff(values)
+    step = float(distances[distances > 1e-6 * np.abs(values).max()].min(initial=np.inf))
+    multiples = (values - values[0]) / step
+    return (
+        step if np.isfinite(step) and np.abs(multiples - np.round(multiples)).max() < 0.05 else 0.0
+    )
 
 
 def _at_rest(errors: Tensor, read: Tensor, segments: Segments) -> NDArray:
-    """Deviations (k, d_y) of readings at rest from the median of their steady part."""
+    """Deviations (k, d_y) of sampled values at rest from the median of their steady part."""
     kept = []
-    told = read.all(dim=-1).numpy()
+    sampled = read.all(dim=-1).numpy()
     values = errors.detach().double().numpy()
     for i, m in np.argwhere(segments.valid):
         settle, stop = segments.settle[i, m], segments.stop[i, m]
         part = slice(int(np.ceil((settle + stop) / 2)), int(stop))
-        rest = values[i, part][told[i, part]]
+        rest = values[i, part][sampled[i, part]]
         if len(rest) > 2:
             # A median takes one degree of freedom.
             spread = np.sqrt(len(rest) / (len(rest) - 1))

@@ -1,0 +1,43 @@
+"""Expectation-maximisation: latent variables and hyperparameters in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+__all__ = ["expectation_maximisation"]
+
+State = TypeVar("State")
+Hyper = TypeVar("Hyper")
+
+
+def expectation_maximisation(
+    state: State,
+    hyper: Hyper,
+    *,
+    infer: Callable[[State, Hyper], State],
+    learn: Callable[[State, Hyper], Hyper],
+    rounds: int,
+) -> tuple[State, Hyper]:
+    """Type-II maximum likelihood of hyperparameters (empirical Bayes).
+
+    Parameters
+    ----------
+    state, hyper
+        Latent variables and hyperparameters to begin with, of any type.
+    infer : callable
+        The latent variables for some hyperparameters, from the previous ones on.
+    learn : callable
+        The most probable hyperparameters for some latent variables, from the previous ones on.
+    rounds : int
+        Times that both are done.
+
+    References
+    ----------
+    Dempster, Laird and Rubin, J. R. Stat. Soc. B 39, 1 (1977).
+
+    """
+    for _ in range(rounds):
+        state = infer(state, hyper)
+        hyper = learn(state, hyper)
+    return state, hyper

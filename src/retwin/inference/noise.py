@@ -1,0 +1,145 @@
+"""Robust noise: a scale and an effective sample size for each group of samples.
+
+The scale of a group is learned by expectation-maximisation with the weights of the loss (Lange,
+Little and Taylor, J. Am. Stat. Assoc. 84, 881, 1989). Successive samples have correlated errors, so
+that fewer count than were measured: a first-order autoregression of coefficient ρ has (1 + ρ) /
+(1 - ρ) samples per independent one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from retwin.inference.losses import Loss, StudentT
+from retwin.inference.problem import Problem
+
+__all__ = ["Noise", "correlation_time"]
+
+HEAVY_TAILED = StudentT()
+"""The loss of noise by default: glitches hardly count."""
+MAX_CORRELATION = 0.95
+"""Largest lag-one autocorrelation that is learned: beyond it the estimate is too uncertain."""
+SMALLEST_SHARE = 1e-6
+"""Smallest scale relative to the largest one: it keeps exact outputs from infinite weight."""
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Errors of the outputs that the latent variables leave unexplained.
+
+    Attributes
+    ----------
+    scale : Tensor
+        (G, d), the scale of each output's error in every group of samples, in the residual's unit;
+        (G, 1) if the outputs share one.
+    thinning : Tensor
+        (G,), samples per independent sample, at least 1.
+    loss : Loss
+        Student's t by default.
+
+    """
+
+    scale: Tensor
+    thinning: Tensor
+    loss: Loss = HEAVY_TAILED
+
+    def square(self, problem: Problem, residual: Tensor) -> Tensor:
+        """Squared length (R, K) of the residual (R, K, d) in scales."""
+        return (residual / self.scale[problem.group]).square().sum(dim=-1)
+
+    def count(self, problem: Problem) -> Tensor:
+        """Independent samples (R, K) that each sample is worth; 0 where nothing was measured."""
+        return problem.measured / self.thinning[problem.group]
+
+    def weights(self, problem: Problem, residual: Tensor) -> Tensor:
+        """Robust weight (R, K) of each sample: about 1, less for outliers."""
+        return self.loss.weight(self.square(problem, residual), residual.shape[-1])
+
+    def misfit(self, problem: Problem, residual: Tensor) -> Tensor:
+        """Minus the log likelihood (R, K) of each sample, 0 for a residual of 0."""
+        loss = self.loss.value(self.square(problem, residual), residual.shape[-1])
+        return loss * self.count(problem)
+
+    def precision(self, problem: Problem, residual: Tensor) -> Tensor:
+        """Weight (R, K, d) of each output in reweighted least squares."""
+        weight = self.weights(problem, residual) * self.count(problem)
+        return (weight[..., None] / self.scale[problem.group].square()).expand_as(residual)
+
+    @classmethod
+    def from_median(cls, problem: Problem, residual: Tensor, *, groups: int) -> Noise:
+        """A first guess: the median absolute residual of each output, the same in all groups."""
+        errors = residual[problem.measured > 0].abs()
+        scale = residual.new_ones(residual.shape[-1])
+        if len(errors):
+            scale = 1.4826 * errors.median(dim=0).values
+        return cls(scale.clamp_min(1e-12).repeat(groups, 1), residual.new_ones(groups))
+
+    def learned(
+        self,
+        problem: Problem,
+        residual: Tensor,
+        *,
+        max_effective: Tensor,
+        variance: Tensor | float = 0.0,
+        floor: float = 1e-18,
+    ) -> Noise:
+        """The noise that makes residuals most probable: one step of maximisation.
+
+        A group without any measured sample keeps its scale.
+
+        Parameters
+        ----------
+        problem : Problem
+            Of all rows that share the noise.
+        residual : Tensor
+            (R, K, d), at the most probable latent variables.
+        max_effective : Tensor
+            (G,), the effective sample size of each group at most.
+        variance : Tensor | float
+            (R, K, d), the posterior variance of the predicted outputs.
+        floor : float
+            Smallest scale, in the residual's unit.
+
+        """
+        weights = self.weights(problem, residual)[..., None]
+        square = weights * (residual.square() + variance)
+        scale, thinning = [], []
+        for k in range(len(self.scale)):
+            part = (problem.measured * (problem.group == k))[..., None]
+            count = part.sum()
+            if not count:
+                scale.append(self.scale[k])
+                thinning.append(self.thinning[k])
+                continue
+            variances = (square * part).sum(dim=(0, 1)) / count
+            scale.append((variances if len(self.scale[k]) > 1 else variances.mean(0, True)).sqrt())
+            kept = residual / self.scale[k] * (weights * part).sqrt()
+            time = correlation_time(kept, part[..., 0], rows=False, limit=MAX_CORRELATION)
+            thinning.append(time.maximum(count / max_effective[k].clamp_min(1)))
+        scales = torch.stack(scale)
+        smallest = max(floor, SMALLEST_SHARE * float(scales.amax()))
+        return Noise(scales.clamp_min(smallest), torch.stack(thinning), self.loss)
+
+
+def correlation_time(values: Tensor, counted: Tensor, *, rows: bool, limit: float) -> Tensor:
+    """Samples per independent sample of a first-order autoregression.
+
+    Parameters
+    ----------
+    values : Tensor
+        (R, K, d), weighted residuals; 0 where a sample does not count.
+    counted : Tensor
+        (R, K), above 0 where a sample counts.
+    rows : bool
+        True for one number (R,) for each row, False for a single one () of all rows together.
+    limit : float
+        Largest autocorrelation, below 1.
+
+    """
+    dims = (1, 2) if rows else (0, 1, 2)
+    power = (values[:, 1:].square() * counted[:, :-1, None]).sum(dim=dims).clamp_min(1e-30)
+    correlation = ((values[:, 1:] * values[:, :-1]).sum(dim=dims) / power).clamp(0, limit)
+    return (1 + correlation) / (1 - correlation)

@@ -1,0 +1,269 @@
+"""Maximum a posteriori by damped Gauss-Newton, and Laplace's approximation there.
+
+All rows of a problem are solved together. Robust noise is handled by iteratively reweighted least
+squares, damping follows Levenberg and Marquardt (Nocedal and Wright, Numerical Optimization, 2006,
+chapter 10), and the evidence is Laplace's (Tierney and Kadane, J. Am. Stat. Assoc. 81, 82, 1986):
+a normalised prior makes rows with more freedom pay for it (MacKay, Neural Comput. 4, 415, 1992).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from retwin.inference.noise import Noise
+from retwin.inference.priors import GaussianPrior
+from retwin.inference.problem import Problem
+
+__all__ = ["Bounds", "Solution", "Step", "gauss_newton_step", "solve"]
+
+TOLERANCE = 1e-4
+"""Predicted decrease of the objective, in nats, below which a row has converged."""
+MAX_STEPS = 25
+"""Gauss-Newton steps at most."""
+REWEIGHTINGS = 3
+"""Times that samples are weighted anew within a step: cheap beside a call of the surrogate."""
+DAMPING = 1e-6
+"""Damping to begin with, relative to the diagonal of the curvature: next to none."""
+DAMPING_AFTER_FAILURE = 1e-3
+"""Damping at least, after a step that did not decrease the objective."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Limits of the latent variables and of one step.
+
+    Attributes
+    ----------
+    lower, upper : Tensor
+        (P,), infinite where there is none.
+    step : Tensor
+        (P,), largest change in one step, infinite where there is none.
+
+    """
+
+    lower: Tensor
+    upper: Tensor
+    step: Tensor
+
+    def moved(self, x: Tensor, move: Tensor) -> Tensor:
+        """`x` after the part of `move` that is within the limits, both (R, P)."""
+        return (x + move.clamp(-self.step, self.step)).clamp(self.lower, self.upper)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The most probable latent variables of R rows, and the Gaussian approximation there.
+
+    Attributes
+    ----------
+    x : Tensor
+        (R, P).
+    objective : Tensor
+        (R,), minus the log posterior in nats, up to the density of noise and prior at 0.
+    curvature : Tensor
+        (R, P, P), of the objective; NaN for a row that was given up.
+    evidence : Tensor
+        (R,), Laplace's log evidence, up to the density of the noise at 0; -inf for a row that was
+        given up.
+
+    """
+
+    x: Tensor
+    objective: Tensor
+    curvature: Tensor
+    evidence: Tensor
+
+    @classmethod
+    def of_prior(cls, prior: GaussianPrior, x: Tensor) -> Solution:
+        """At x (R, P), without any measured output."""
+        energy = prior.energy(x)
+        return cls(x, energy, prior.precision, -energy)
+
+    def __getitem__(self, rows: Tensor) -> Solution:
+        """The solution of some rows."""
+        return Solution(*(each[rows] for each in vars(self).values()))
+
+    def put(self, rows: Tensor, other: Solution) -> Solution:
+        """The same with another solution in some rows."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Solution(*(own.index_copy(0, rows, new) for own, new in pairs))
+
+    @property
+    def covariance(self) -> Tensor:
+        """Posterior covariance (R, P, P)."""
+        return torch.linalg.inv(self.curvature)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A damped Gauss-Newton step from x, and what the linearised problem predicts of it.
+
+    Attributes
+    ----------
+    x : Tensor
+        (R, P), after the step.
+    objective : Tensor
+        (R,), predicted there.
+    curvature : Tensor
+        (R, P, P), of the objective before the step, without damping.
+
+    """
+
+    x: Tensor
+    objective: Tensor
+    curvature: Tensor
+
+
+def gauss_newton_step(
+    problem: Problem,
+    prior: GaussianPrior,
+    noise: Noise,
+    x: Tensor,
+    linearised: tuple[Tensor, Tensor],
+    *,
+    damping: Tensor | None = None,
+    bounds: Bounds | None = None,
+    reweightings: int = REWEIGHTINGS,
+) -> Step:
+    """The step from x (R, P) to the optimum of the linearised problem, samples being reweighted.
+
+    Parameters
+    ----------
+    linearised : tuple of Tensor
+        Residual (R, K, d) and Jacobian (R, K, d, P) at x.
+    damping : Tensor, optional
+        (R,), relative to the diagonal of the curvature; 0 by default.
+    bounds : Bounds, optional
+        Limits of x.
+    reweightings : int
+        Times that samples are weighted anew, at least 1.
+
+    """
+    residual, jacobian = linearised
+    # Curvature and slope in one product: what takes time here is to pass through the Jacobian.
+    joined = torch.cat([jacobian, residual[..., None]], dim=-1).flatten(1, 2)
+    gradient, left = prior.gradient(x), residual
+    for count in range(reweightings):
+        weighted = joined * noise.precision(problem, left).flatten(1)[..., None]
+        product = weighted[..., :-1].mT @ joined
+        curvature = product[..., :-1] + prior.precision
+        if not count:
+            undamped = curvature
+        slope = product[..., -1] - gradient
+        if damping is not None:
+            added = damping[:, None] * curvature.diagonal(dim1=1, dim2=2)
+            curvature = curvature + torch.diag_embed(added)
+        move = _solved(curvature, slope)
+        left = _left(joined, move).view_as(residual)
+    there = x + move
+    if bounds is not None:
+        there = bounds.moved(x, move)
+        left = _left(joined, there - x).view_as(residual)
+    predicted = noise.misfit(problem, left).sum(dim=1) + prior.energy(there)
+    return Step(there, predicted, undamped)
+
+
+def solve(
+    problem: Problem,
+    prior: GaussianPrior,
+    noise: Noise,
+    start: Tensor,
+    *,
+    bounds: Bounds | None = None,
+    minimum_evidence: Tensor | None = None,
+    reweightings: int = REWEIGHTINGS,
+) -> Solution:
+    """The most probable latent variables, from `start` (R, P) on.
+
+    Parameters
+    ----------
+    problem : Problem
+        R rows.
+    prior : GaussianPrior
+        Of the same rows.
+    noise : Noise
+        Of all groups of samples.
+    bounds : Bounds, optional
+        Limits of x.
+    minimum_evidence : Tensor, optional
+        (R,), log evidence; a row is given up when its second or a later step is not predicted to
+        reach that much. Steps that are damped more than the first one predict too little to be
+        judged by.
+    reweightings : int
+        Times that samples are weighted anew within a step, at least 1: fewer where the Jacobian
+        costs less than that.
+
+    """
+    x, linearised = start, problem.linearised(start)
+    energy = noise.misfit(problem, linearised[0]).sum(dim=1) + prior.energy(x)
+    size = x.shape[1]
+    found = Solution(
+        x, energy, x.new_full((len(x), size, size), torch.nan), torch.full_like(energy, -torch.inf)
+    )
+    rows, damping = torch.arange(len(x)), torch.full_like(energy, DAMPING)
+    for count in range(MAX_STEPS + 1):
+        step = gauss_newton_step(
+            problem,
+            prior,
+            noise,
+            x,
+            linearised,
+            damping=damping,
+            bounds=bounds,
+            reweightings=reweightings,
+        )
+        occam = 0.5 * (prior.log_determinant - torch.linalg.slogdet(step.curvature)[1])
+        done = (energy - step.objective < TOLERANCE) | (count == MAX_STEPS)
+        if minimum_evidence is not None and count:
+            hopeless = (occam - step.objective <= minimum_evidence[rows]) & (damping <= DAMPING)
+        else:
+            hopeless = torch.zeros_like(done)
+        ended = (done & ~hopeless).nonzero()[:, 0]
+        if len(ended):
+            part = Solution(x, energy, step.curvature, occam - energy)
+            found = found.put(rows[ended], part[ended])
+        going = (~done & ~hopeless).nonzero()[:, 0]
+        if not len(going):
+            break
+        if len(going) < len(rows):
+            problem, prior, rows = problem[going], prior[going], rows[going]
+            x, energy, damping = x[going], energy[going], damping[going]
+            linearised = linearised[0][going], linearised[1][going]
+        trial = step.x[going]
+        tried = problem.linearised(trial)
+        there = noise.misfit(problem, tried[0]).sum(dim=1) + prior.energy(trial)
+        better = there <= energy
+        x = torch.where(better[:, None], trial, x)
+        energy = torch.where(better, there, energy)
+        linearised = _chosen(better, tried, linearised)
+        raised = (8 * damping).clamp(DAMPING_AFTER_FAILURE, 1e6)
+        damping = torch.where(better, (damping / 4).clamp_min(1e-9), raised)
+    return found
+
+
+def _left(joined: Tensor, move: Tensor) -> Tensor:
+    """Residual (R, K d) of the linearised problem after a move (R, P)."""
+    return (joined @ torch.cat([-move, torch.ones_like(move[:, :1])], dim=1)[..., None])[..., 0]
+
+
+def _chosen(
+    better: Tensor, new: tuple[Tensor, Tensor], old: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Residual and Jacobian, new where a step was better."""
+    if better.all():
+        return new
+    worse = (~better).nonzero()[:, 0]
+    return (
+        new[0].index_copy(0, worse, old[0][worse]),
+        new[1].index_copy(0, worse, old[1][worse]),
+    )
+
+
+def _solved(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solution (R, P) of linear equations, scaled to a unit diagonal: units differ by orders."""
+    unit = matrix.diagonal(dim1=1, dim2=2).sqrt()
+    scaled = matrix / unit[:, :, None] / unit[:, None, :]
+    return torch.linalg.solve(scaled, right / unit) / unit

@@ -1,0 +1,182 @@
+"""The problem of `DelayOffset`: measured outputs, and the corrected path for any z."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from retwin.data.segments import Segments
+from retwin.inference.losses import Tukey
+from retwin.inference.noise import Noise, correlation_time
+from retwin.update.corrections.warp import Knots, interpolate
+
+__all__ = ["PathProblem", "path_at"]
+
+MAX_STEP = 5.0
+"""Largest change of a delay in one step, in samples: the path is only piecewise smooth in it."""
+AROUND = (5, 10)
+"""Samples before and after a motion that count as motion: its timing is not exactly known."""
+MAX_CORRELATION = 0.999
+"""Largest lag-one autocorrelation of residuals: slow drift makes nearly all samples one."""
+
+
+def path_at(segments: Segments, path: Tensor, z: Tensor) -> Tensor:
+    """The path (n, T, d_y), delayed and offset by z (n, M, 1 + d_y); continuous whatever z is."""
+    knots = Knots.of(segments, z[..., 0])
+    return interpolate(path, knots.source_time()) + knots.between(knots.spread(z[..., 1:]))
+
+
+@dataclass(frozen=True, eq=False)
+class PathProblem:
+    """Residual and Jacobian for x = (delay, offsets) of every segment.
+
+    The engine's rows are trajectories, its latent variables x (n, P), P = M (1 + d_y). Samples at
+    rest and in motion form groups of each trajectory's own: 2 i and 2 i + 1 of trajectory i. Where
+    some outputs of a sample are missing, the others stand for them: residuals are scaled so that
+    their length is comparable.
+
+    Attributes
+    ----------
+    segments : Segments
+        M at most.
+    path : Tensor
+        (n, T, d_y), uncorrected.
+    observed : Tensor
+        (n, T, d_y), in the same unit.
+    available : Tensor
+        (n, T, d_y) bool, which outputs were measured.
+    measured : Tensor
+        (n, T), share of a sample's outputs that was measured.
+    factor : Tensor
+        (n, T, d_y), what residuals are multiplied by; 0 where nothing was measured.
+    group : Tensor
+        (n, T) long.
+
+    """
+
+    segments: Segments
+    path: Tensor
+    observed: Tensor
+    available: Tensor
+    measured: Tensor
+    factor: Tensor
+    group: Tensor
+
+    @classmethod
+    def of(
+        cls, segments: Segments, path: Tensor, observed: Tensor, available: Tensor
+    ) -> PathProblem:
+        """The problem with all samples at rest."""
+        measured = available.double().mean(dim=-1)
+        factor = available * measured.clamp_min(1e-9).rsqrt()[..., None]
+        group = (2 * torch.arange(len(path)))[:, None].expand(path.shape[:2])
+        # What was not measured may be any number, NaN included.
+        observed = torch.where(available, observed, 0.0)
+        return cls(segments, path, observed, available, measured, factor, group)
+
+    def with_motion(self, delay: Tensor) -> PathProblem:
+        """The same with motion where segments delayed by (n, M) samples are under way."""
+        time = torch.arange(self.segments.steps, dtype=torch.float64)
+        begin = (torch.as_tensor(self.segments.start) + delay - AROUND[0])[..., None]
+        end = (torch.as_tensor(self.segments.settle) + delay + AROUND[1])[..., None]
+        valid = torch.as_tensor(self.segments.valid)[..., None]
+        moving = ((time >= begin) & (time <= end) & valid).any(dim=1)
+        return replace(self, group=2 * (self.group // 2) + moving)
+
+    def __getitem__(self, rows: Tensor) -> PathProblem:
+        """The problem of some trajectories."""
+        return PathProblem(*(each[rows] for each in vars(self).values()))
+
+    @property
+    def motion_measured(self) -> Tensor:
+        """Share (n, M) of the samples of each motion at which any output was measured."""
+        time = torch.arange(self.segments.steps, dtype=torch.float64)
+        start, settle = (
+            torch.as_tensor(t)[..., None] for t in (self.segments.start, self.segments.settle)
+        )
+        inside = (time >= start) & (time <= settle)
+        seen = self.available.any(dim=-1)[:, None]
+        return (inside * seen).sum(dim=-1) / inside.sum(dim=-1).clamp_min(1)
+
+    def per_segment(self, x: Tensor) -> Tensor:
+        """Values (n, P) by segment, (n, M, 1 + d_y)."""
+        return x.unflatten(1, (-1, 1 + self.path.shape[2]))
+
+    def residual(self, x: Tensor) -> Tensor:
+        """Measured minus corrected path (n, T, d_y), 0 where nothing was measured."""
+        return self.factor * (
+            self.observed - path_at(self.segments, self.path, self.per_segment(x))
+        )
+
+    def linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The residual, and the Jacobian (n, T, d_y, P) of the corrected path."""
+        z = self.per_segment(x)
+        n, movements, size = z.shape
+        knots = Knots.of(self.segments, z[..., 0])
+        values, times = knots.spread(z[..., 1:]), knots.source_time()
+        path = interpolate(self.path, times)
+        # The derivative between two samples is exactly their difference.
+        slope = self.path.diff(dim=1, append=self.path[:, -1:])
+        below = times.floor().long().clamp(0, self.path.shape[1] - 1)
+        slope = slope.gather(1, below[..., None].expand_as(path)) + knots.slope(values)
+        unit = torch.eye(movements, dtype=z.dtype).expand(n, -1, -1)
+        of_offset = knots.between(knots.spread(unit))  # (n, T, M)
+        of_delay = knots.between(unit.repeat_interleave(2, dim=1))
+        jacobian = torch.zeros(*path.shape, movements, size, dtype=z.dtype)
+        jacobian[..., 0] = -(self.factor * slope)[..., None] * of_delay[:, :, None]
+        for output in range(size - 1):
+            jacobian[:, :, output, :, 1 + output] = self.factor[:, :, output, None] * of_offset
+        residual = self.factor * (self.observed - path - knots.between(values))
+        return residual, jacobian.flatten(3)
+
+    def first_offset(self, margin: float) -> Tensor:
+        """Median (n, M, d_y) of observed minus path at rest, `margin` samples after the motion.
+
+        Of a short rest its second half is used.
+        """
+        settle, stop = torch.as_tensor(self.segments.settle), torch.as_tensor(self.segments.stop)
+        begin = settle + torch.minimum(torch.full_like(settle, margin), (stop - settle) / 2)
+        time = torch.arange(self.segments.steps, dtype=torch.float64)
+        inside = (time >= begin[..., None]) & (time < stop[..., None])
+        there = inside[..., None] & self.available[:, None]
+        values = torch.where(there, (self.observed - self.path)[:, None], torch.nan)
+        return torch.nan_to_num(torch.nanmedian(values, dim=2).values)
+
+    def first_delay(self, x: Tensor, delay_range: tuple[float, float]) -> Tensor:
+        """The delay (n, M) in whole samples that fits each motion best, by absolute error."""
+        low, high = delay_range
+        grid = torch.arange(low, high + 1.0, 1.0, dtype=torch.float64)
+        # Smallest first: where nothing was measured all fit equally well, and the first is taken.
+        grid = grid[grid.abs().argsort(stable=True)]
+        start, settle = torch.as_tensor(self.segments.start), torch.as_tensor(self.segments.settle)
+        time = torch.arange(self.segments.steps, dtype=torch.float64)
+        near = (time >= (start + low)[..., None]) & (time <= (settle + high)[..., None])
+        x, costs = x.clone(), []
+        for delay in grid:
+            self.per_segment(x)[..., 0] = delay
+            error = self.residual(x).norm(dim=-1)
+            costs.append((near * error[:, None]).sum(dim=-1))
+        best = torch.stack(costs).argmin(dim=0)
+        return grid[best] * torch.as_tensor(self.segments.valid)
+
+    def noise(self, residual: Tensor) -> Noise:
+        """Tukey's noise of every trajectory: its median residual in motion and at rest.
+
+        The model is always worse in motion than at rest; one scale would give motion no weight.
+        """
+        length = residual.norm(dim=-1)
+        extent = length.amax(dim=1).clamp_min(1e-9)
+        moving = self.group % 2 == 1
+        scales = []
+        for part in (moving, ~moving):
+            within = torch.where((self.measured > 0) & part, length, torch.nan)
+            median = 1.4826 * torch.nanmedian(within, dim=1).values
+            scales.append(torch.nan_to_num(median).maximum(1e-4 * extent))
+        rest = scales[1].maximum(0.01 * scales[0])
+        scale = torch.stack([rest, scales[0].maximum(rest)], dim=1).flatten()[:, None]
+        noise = Noise(scale, torch.ones_like(scale[:, 0]), Tukey())
+        kept = residual * noise.precision(self, residual).sqrt()
+        time = correlation_time(kept, self.measured, rows=True, limit=MAX_CORRELATION)
+        return replace(noise, thinning=time.repeat_interleave(2))
