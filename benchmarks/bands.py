@@ -1,8 +1,8 @@
-"""Do the bands of a corrected twin hold, when few trajectories calibrated it?
+"""Coverage of the bands of a corrected twin that few trajectories calibrated.
 
-On the emulated robot, of which there are as many trajectories as are wanted: 4 healthy ones, as
-many as a fold of set A has, calibrate, 20 others are held against the bands; six times. Target:
-90 % bands hold 85 to 95 % of the points.
+The emulated robot gives any number of trajectories: 4 healthy ones, as many as in a fold of set A,
+calibrate, and 20 others are compared with the bands; six times. Target: the 90 % bands contain 85
+to 95 % of the points.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ def main() -> None:
         ("delay and offset", case.output_correction),
         ("command space", case.correction),
     ):
-        found = [held(case, ibg, operator, seed) for seed in range(SETS)]
+        found = [coverage(case, ibg, operator, seed) for seed in range(SETS)]
         columns[name] = {f"set {i + 1}": share for i, share in enumerate(found)}
         columns[name]["mean"] = float(np.mean(found))
         columns[name]["standard error"] = float(np.std(found, ddof=1) / np.sqrt(SETS))
     record("bands", f"points inside the 90 % band, {HELD_OUT} emulated trajectories a set", columns)
 
 
-def held(case: rt.Case, ibg: rt.Surrogate, operator: rt.Correction, seed: int) -> float:
+def coverage(case: rt.Case, ibg: rt.Surrogate, operator: rt.Correction, seed: int) -> float:
     """The share of held-out points inside the 90 % band."""
     commands = case.sampler.sample(CALIBRATE + HELD_OUT, rng=np.random.default_rng(100 + seed))
     real = case.emulator.simulate(commands, seed=200 + seed).with_label(HEALTHY)

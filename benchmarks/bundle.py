@@ -1,13 +1,13 @@
-"""How small, quick and exact is a bundle, and does its guard see what is none of its trajectories?
+"""Size, latency and accuracy of a bundle, and the detection rate of its guard.
 
-A corrected twin of the arm in command space, a CNN and a guard; calibrated on the healthy
-trajectories of a calibration part and held against the other ones: of the emulated robot, and with
-RETWIN_DATA of set A, in 3 folds, where nothing scored was seen by what scores it. Each test
-trajectory is spoilt in ways of which only "another one's outputs" and "random walk" are among what
-the guard's energy learns from. Targets: graphs within 1e-5 of torch, a diagnosis in 5 ms (p99, one
-core), 5 MB, AUROC of 0.95 on shuffled, scaled and foreign trajectories, at most 5 % false flags.
-Latency is told by the wall clock and by processor time: the former counts what else the machine
-does.
+The bundle has a corrected twin of the arm in command space, a CNN and a guard. They are calibrated
+on the healthy trajectories of a calibration part and tested on the other ones: of the emulated
+robot, and with RETWIN_DATA of set A, in 3 folds with disjoint calibration and test parts. Each test
+trajectory is corrupted in several ways, of which the guard's energy learns from two only: outputs
+of another trajectory and random walks. Targets: graphs within 1e-5 of torch, a diagnosis in 5 ms
+(p99, one core), 5 MB, AUROC of 0.95 on shuffled, scaled and foreign trajectories, at most 5 % false
+flags. Latency is measured as wall-clock time, which includes the machine's other work, and as
+processor time.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from retwin.deploy.onnx.portable import Portable
 
 CALLS = 500
 FOLDS = 3
-Spoil = Callable[[rt.Trajectories, np.random.Generator], np.ndarray]
+Corruption = Callable[[rt.Trajectories, np.random.Generator], np.ndarray]
 
 
 def main() -> None:
@@ -47,13 +47,13 @@ def main() -> None:
         sets["set A"] = rt.load(Path(os.environ["RETWIN_DATA"], "armpi", "real_a.mat"), case=case)
     columns = {}
     for name, real in sets.items():
-        judged = []
+        guarded = []
         for fold, (calibration, test) in enumerate(real.folds(FOLDS, seed=0)):
             rg = rt.fit_residual(ibg, real[calibration], case.correction, seed=fold)
             twin = rt.CorrectedTwin(ibg, rg, case=case.name)
             guard = fit_guard(twin, case, real[calibration], seed=fold)
-            judged.append((guard, real[test]))
-        columns[name] = flags(ibg, judged)
+            guarded.append((guard, real[test]))
+        columns[name] = flags(ibg, guarded)
     record("bundle_guard", "the guard, per kind of trajectory", transposed(columns))
     cnn = rt.fit_diagnoser(
         rt.generate(twin, case, per_class=40, seed=1), seed=0, classes=case.classes
@@ -63,29 +63,29 @@ def main() -> None:
 
 
 def transposed(columns: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Rows of what was measured, a column per set."""
+    """The same figures with a row per figure and a column per set."""
     rows = next(iter(columns.values()))
     return {row: {name: each[row] for name, each in columns.items()} for row in rows}
 
 
-def flags(ibg: rt.Surrogate, judged: list[tuple[Guard, rt.Trajectories]]) -> dict[str, float]:
-    """False flags on test parts, and AUROC and flags of what they are spoilt to."""
-    good = [guard.assess(ibg, test) for guard, test in judged]
-    usual = np.concatenate([each.max_score for each in good])
+def flags(ibg: rt.Surrogate, guarded: list[tuple[Guard, rt.Trajectories]]) -> dict[str, float]:
+    """False flags on the test parts; AUROC and share of flags for each kind of corruption."""
+    good = [guard.assess(ibg, test) for guard, test in guarded]
+    clean = np.concatenate([each.max_score for each in good])
     rows = {
-        "trajectories": float(len(usual)),
-        "false flags": float((usual > 1).mean()),
-        "false flags, outside": float((usual > OUTSIDE).mean()),
+        "trajectories": float(len(clean)),
+        "false flags": float((clean > 1).mean()),
+        "false flags, outside": float((clean > OUTSIDE).mean()),
     }
-    for name, spoil in KINDS.items():
+    for name, corrupt in KINDS.items():
         rng = np.random.default_rng(0)
-        odd = [
-            guard.assess(ibg, test.replace(observed=spoil(test, rng).astype(np.float32)))
-            for guard, test in judged
+        corrupted = [
+            guard.assess(ibg, test.replace(observed=corrupt(test, rng).astype(np.float32)))
+            for guard, test in guarded
         ]
-        scores = np.concatenate([each.max_score for each in odd])
-        truth = np.repeat([0, 1], [len(usual), len(scores)])
-        rows[f"AUROC, {name}"] = float(roc_auc_score(truth, np.concatenate([usual, scores])))
+        scores = np.concatenate([each.max_score for each in corrupted])
+        truth = np.repeat([0, 1], [len(clean), len(scores)])
+        rows[f"AUROC, {name}"] = float(roc_auc_score(truth, np.concatenate([clean, scores])))
         rows[f"flagged, {name}"] = float((scores > 1).mean())
     return rows
 
@@ -129,29 +129,29 @@ def latency(
     }
 
 
-def joined(readings: np.ndarray, steps: int) -> np.ndarray:
-    """A record (n, steps, d) of readings (n, R, d), joined by straight lines."""
-    place = np.linspace(0, readings.shape[1] - 1, steps)
-    below = np.minimum(place.astype(int), readings.shape[1] - 2)
+def interpolated(samples: np.ndarray, steps: int) -> np.ndarray:
+    """Sensor samples (n, R, d), linearly interpolated to a record (n, steps, d)."""
+    place = np.linspace(0, samples.shape[1] - 1, steps)
+    below = np.minimum(place.astype(int), samples.shape[1] - 2)
     share = (place - below)[:, None]
-    return (1 - share) * readings[:, below] + share * readings[:, below + 1]
+    return (1 - share) * samples[:, below] + share * samples[:, below + 1]
 
 
 def in_time(real: rt.Trajectories, rng: np.random.Generator) -> np.ndarray:
-    readings = real.observed[:, ::10]
-    return joined(rng.permuted(readings, axis=1), real.steps)
+    samples = real.observed[:, ::10]
+    return interpolated(rng.permuted(samples, axis=1), real.steps)
 
 
 def in_blocks(real: rt.Trajectories, rng: np.random.Generator) -> np.ndarray:
     blocks = np.split(real.observed[:, ::10], 5, axis=1)
-    return joined(np.concatenate([blocks[i] for i in (2, 4, 1, 0, 3)], axis=1), real.steps)
+    return interpolated(np.concatenate([blocks[i] for i in (2, 4, 1, 0, 3)], axis=1), real.steps)
 
 
 def walking(real: rt.Trajectories, rng: np.random.Generator) -> np.ndarray:
-    readings = real.observed[:, ::10]
-    walk = rng.normal(size=readings.shape).cumsum(axis=1)
-    walk *= readings.std(axis=(0, 1)) / walk.std(axis=(0, 1))
-    return joined(readings.mean(axis=(0, 1)) + walk, real.steps)
+    samples = real.observed[:, ::10]
+    walk = rng.normal(size=samples.shape).cumsum(axis=1)
+    walk *= samples.std(axis=(0, 1)) / walk.std(axis=(0, 1))
+    return interpolated(samples.mean(axis=(0, 1)) + walk, real.steps)
 
 
 def swinging(real: rt.Trajectories, rng: np.random.Generator) -> np.ndarray:
@@ -162,16 +162,16 @@ def swinging(real: rt.Trajectories, rng: np.random.Generator) -> np.ndarray:
 
 
 def other_arm(real: rt.Trajectories, rng: np.random.Generator) -> np.ndarray:
-    """The same commands, carried out by an arm whose links are a fifth longer."""
+    """Outputs of an arm with links that are a fifth longer, for the same commands."""
     links = tuple(1.2 * link for link in KINEMATIC.arm.links)
     arm = replace(KINEMATIC, arm=replace(KINEMATIC.arm, links=links))
     return arm.position(real.commands.astype(np.float64))
 
 
-KINDS: dict[str, Spoil] = {
+KINDS: dict[str, Corruption] = {
     "shuffled: samples": in_time,
     "shuffled: blocks of 2 s": in_blocks,
-    "shuffled: another one's outputs": lambda real, _: np.roll(real.observed, 1, axis=0),
+    "shuffled: outputs of another trajectory": lambda real, _: np.roll(real.observed, 1, axis=0),
     "shuffled: channels": lambda real, _: np.roll(real.observed, 1, axis=2),
     "reversed": lambda real, _: real.observed[:, ::-1],
     **{

@@ -1,8 +1,8 @@
-"""Does the emulated arm err as the real one does? Its healthy trajectories beside those of set A.
+"""Errors of the emulated arm compared with those of the real one: healthy trajectories of set A.
 
-For delay (TDe), offset (TPE) and plateau noise of every movement: mean, spread and tail of 200
-emulated trajectories, and the bootstrap interval of the same figure over the real ones. Movements
-that a joint missed, and glitches, are counted apart.
+The figures are mean, standard deviation and 90 % quantile of delay (TDe), offset (TPE) and noise at
+rest over all segments of 200 emulated trajectories, and the bootstrap interval of the same figures
+over the real ones. Missed segments and glitches are counted separately.
 
 Needs RETWIN_DATA.
 """
@@ -26,26 +26,26 @@ from retwin.update.corrections import Context
 COUNT = 200
 DRAWS = 2000
 MISSED = 0.02
-"""An offset (m) that only a missed movement explains."""
+"""Offset (m) above which a segment counts as missed."""
 GLITCH = 0.01
-"""A deviation (m) of one or two readings from the plateau's median that is no noise."""
+"""Deviation (m) of a sample from the median at rest above which it counts as a glitch."""
 FIGURES = {
     "mean": np.mean,
-    "spread": np.std,
-    "tail": lambda values: np.quantile(values, 0.9),
+    "standard deviation": np.std,
+    "90 % quantile": lambda values: np.quantile(values, 0.9),
 }
 
 
 class Exact:
-    """The arm's kinematics as the twin that is to be corrected."""
+    """The kinematics of the arm, as the twin that is corrected."""
 
     def predict(self, commands: NDArray) -> NDArray:
-        """Outputs for commands, both as everywhere."""
+        """Outputs (n, T, 3) for commands (n, T, 4)."""
         return KINEMATIC.position(np.asarray(commands, dtype=float)).astype(np.float32)
 
 
-def movements(trajectories: rt.Trajectories) -> dict[str, NDArray]:
-    """Per movement (n, M): TDe in samples, TPE and noise in mm; NaN where missed or not there."""
+def segment_errors(trajectories: rt.Trajectories) -> dict[str, NDArray]:
+    """TDe in samples, TPE and noise in mm, each (n, M), NaN where missed; counts (n,)."""
     segments = rt.Segments.from_commands(trajectories.commands)
     context = Context.of(Exact(), trajectories.commands, segments, rate=trajectories.rate)
     found = rt.DelayOffset().infer(
@@ -59,28 +59,28 @@ def movements(trajectories: rt.Trajectories) -> dict[str, NDArray]:
     glitches = np.zeros(len(trajectories), dtype=int)
     polls = np.arange(0, trajectories.steps, POLL)
     for i, m in np.argwhere(segments.valid):
-        # Half a second after the command has settled, whatever the delay, all is still.
+        # 0.3 s after the command has settled the arm is at rest, whatever the delay.
         steady = (polls >= segments.settle[i, m] + 30) & (polls < segments.stop[i, m])
-        readings = trajectories.observed[i, polls[steady]]
-        away = np.linalg.norm(readings - np.median(readings, axis=0), axis=1)
-        glitches[i] += int((away > GLITCH).any())
-        noise[i, m] = 1e3 * np.sqrt(np.mean(away[away <= GLITCH] ** 2))
+        samples = trajectories.observed[i, polls[steady]]
+        deviation = np.linalg.norm(samples - np.median(samples, axis=0), axis=1)
+        glitches[i] += int((deviation > GLITCH).any())
+        noise[i, m] = 1e3 * np.sqrt(np.mean(deviation[deviation <= GLITCH] ** 2))
     missed = (offset > MISSED) & segments.valid
-    # The movement after a missed one catches up: its delay and offset mean something else.
-    apart = missed | np.pad(missed, ((0, 0), (1, 0)))[:, :-1] | ~segments.valid
+    # The segment after a missed one catches up, so that its delay and offset are no errors.
+    excluded = missed | np.pad(missed, ((0, 0), (1, 0)))[:, :-1] | ~segments.valid
     return {
-        "TDe (samples)": np.where(apart, np.nan, delay),
-        "TPE (mm)": np.where(apart, np.nan, 1e3 * offset),
-        "plateau noise (mm)": np.where(apart, np.nan, noise),
+        "TDe (samples)": np.where(excluded, np.nan, delay),
+        "TPE (mm)": np.where(excluded, np.nan, 1e3 * offset),
+        "noise at rest (mm)": np.where(excluded, np.nan, noise),
         "missed": missed.sum(axis=1).astype(float),
         "glitches": glitches.astype(float),
     }
 
 
 def figures(values: NDArray) -> dict[str, float]:
-    """The figures of all movements of some trajectories."""
-    known = values[np.isfinite(values)]
-    return {name: float(figure(known)) for name, figure in FIGURES.items()}
+    """The figures over all segments that are not excluded."""
+    finite = values[np.isfinite(values)]
+    return {name: float(figure(finite)) for name, figure in FIGURES.items()}
 
 
 def interval(values: NDArray, rng: np.random.Generator) -> dict[str, tuple[float, float]]:
@@ -101,33 +101,34 @@ def main() -> None:
     real = rt.load(Path(folder) / "armpi" / "real_a.mat", case=case).with_label("Healthy")
     onsets = rt.Segments.from_commands(real.commands).start
     commands = case.sampler.sample(COUNT, rng=np.random.default_rng(0), timing=onsets)
-    truth, made = movements(real), movements(case.emulator.simulate(commands, seed=0))
+    truth, made = segment_errors(real), segment_errors(case.emulator.simulate(commands, seed=0))
     rng = np.random.default_rng(0)
     rows = {}
-    for name in ("TDe (samples)", "TPE (mm)", "plateau noise (mm)"):
-        here, there, between = figures(truth[name]), figures(made[name]), interval(truth[name], rng)
+    for name in ("TDe (samples)", "TPE (mm)", "noise at rest (mm)"):
+        of_real, of_emulated = figures(truth[name]), figures(made[name])
+        bounds = interval(truth[name], rng)
         for figure in FIGURES:
-            low, high = between[figure]
+            low, high = bounds[figure]
             rows[f"{name}, {figure}"] = {
-                "real": here[figure],
+                "real": of_real[figure],
                 "low": low,
                 "high": high,
-                "emulated": there[figure],
-                "inside": float(low <= there[figure] <= high),
+                "emulated": of_emulated[figure],
+                "inside": float(low <= of_emulated[figure] <= high),
             }
     for name in ("missed", "glitches"):
-        count, there = truth[name].sum(), made[name].mean()
-        # Counts this small are compared as such: the exact interval of a Poisson rate.
+        count, mean = truth[name].sum(), made[name].mean()
+        # The bootstrap fails for counts this small; this is the exact interval of a Poisson rate.
         low = chi2.ppf(0.025, 2 * count) / 2 / len(real) if count else 0.0
         high = chi2.ppf(0.975, 2 * count + 2) / 2 / len(real)
         rows[f"{name} per trajectory"] = {
             "real": count / len(real),
             "low": low,
             "high": high,
-            "emulated": there,
-            "inside": float(low <= there <= high),
+            "emulated": mean,
+            "inside": float(low <= mean <= high),
         }
-    record("emulation", f"{COUNT} emulated beside {len(real)} real healthy trajectories", rows)
+    record("emulation", f"{COUNT} emulated and {len(real)} real healthy trajectories", rows)
 
 
 if __name__ == "__main__":

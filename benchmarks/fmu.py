@@ -1,7 +1,7 @@
-"""How long does one run of a trivial FMU of 1000 steps take?
+"""Time of one run of a trivial FMU with 1000 steps.
 
-Target: at most 20 ms on one core; FMPy alone, with an instance that is reset, is beside it. The FMU
-is the one of the tests, compiled from C.
+Target: at most 20 ms on one core. The table also shows FMPy alone, with an instance that is reset.
+The FMU is that of the tests, compiled from C.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from record import record
 
 from retwin.twins.fmu import FMUTwin
 
-sys.path.append(str(Path(__file__).parents[1] / "tests" / "twins"))
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
 STEPS = 1000
 RATE = 100.0
 RUNS = 400
@@ -40,11 +40,11 @@ def ms_with_fmpy_alone(path: Path) -> float:
     instance = instantiate_fmu(folder, description, "CoSimulation")
     grid = np.zeros(STEPS, dtype=[("time", "f8"), ("u", "f8")])
     grid["time"], grid["u"] = np.arange(STEPS) / RATE, 1.0
-    took = []
+    times = []
     for _ in range(20):
         started = time.perf_counter()
         instance.reset()
-        with redirect_stdout(StringIO()):  # it warns of inputs that are left alone
+        with redirect_stdout(StringIO()):  # it warns of inputs that are not set
             fmpy.simulate_fmu(
                 folder,
                 model_description=description,
@@ -55,8 +55,8 @@ def ms_with_fmpy_alone(path: Path) -> float:
                 output=["x"],
                 terminate=False,
             )
-        took.append(time.perf_counter() - started)
-    return 1000 * float(np.median(took))
+        times.append(time.perf_counter() - started)
+    return 1000 * float(np.median(times))
 
 
 def main() -> None:

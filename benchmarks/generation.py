@@ -1,9 +1,9 @@
-"""How long does a balanced set of 3600 corrected, labelled trajectories take, beside other ways?
+"""Time of a balanced set of 3600 corrected, labelled trajectories, and of other sources.
 
-Targets on two cores: at most 2 % of the time of the MuJoCo twin at steps of 1 ms, better 1 %; in
-command space, with the sensor, at most 15 s; 2 GB of memory. All in one run; what is slow is
-measured on fewer trajectories and scaled. No way of making a set can be faster than writing as many
-bytes. Another number of trajectories can be given as the argument.
+Targets on two cores: at most 2 % of the time of the MuJoCo twin with steps of 1 ms, preferably 1 %;
+in command space, with the sensor, at most 15 s; 2 GB of memory. All times are from one run; slow
+sources generate fewer trajectories, and the time is scaled. Writing as many bytes to memory is the
+lower bound. The argument is another number of trajectories.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from retwin.twins.fmu import FMUTwin
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 COUNT = 3600
 FEW = 0.05
-"""Share of the trajectories that is made by what is slow."""
+"""Share of the trajectories that slow twins generate."""
 REPEATS = 9
-"""What takes a second is told by the median of so many: a machine has other things to do."""
+"""Runs of which the median time is taken, because other work disturbs times of a second."""
 
 
 def fmu_seconds(count: int) -> float:
-    """As many runs of a trivial compiled FMU, on all cores."""
+    """Time in s of `count` runs of a trivial compiled FMU, on all cores."""
     from fmus import c_fmu
 
     with tempfile.TemporaryDirectory() as folder:
@@ -49,38 +49,38 @@ def main(count: int) -> None:
     )
     slow = "MuJoCo, steps of 1 ms"
     closed = "closed form: kinematics behind a servo lag"
-    making = partial(generating, case=case, count=count, repeats=REPEATS)
+    measure = partial(generating, case=case, count=count, repeats=REPEATS)
     before = peak_memory_gb()
     seconds = {
-        slow: making(ArmPiTwin(step=0.001), share=FEW)[0],
+        slow: measure(ArmPiTwin(step=0.001), share=FEW)[0],
         "an FMU of one first-order lag": fmu_seconds(count),
-        "corrected, CommandSpace and SampledSensor": making(in_commands)[0],
-        "corrected, DelayOffset": making(at_outputs)[0],
-        "surrogate alone": making(ibg)[0],
-        closed: making(KINEMATIC)[0],
+        "corrected, CommandSpace and SampledSensor": measure(in_commands)[0],
+        "corrected, DelayOffset": measure(at_outputs)[0],
+        "surrogate alone": measure(ibg)[0],
+        closed: measure(KINEMATIC)[0],
     }
     made = rt.generate(in_commands, case, per_class=max(1, count // len(case.classes)), seed=2)
     size = sum(each.nbytes for each in (made.commands, made.nominal, made.observed, made.mask))
     bound = size / memory_bandwidth()
     rows = {
         name: {
-            "seconds": took,
-            "% of MuJoCo": 100 * took / seconds[slow],
-            "times closed form": took / seconds[closed],
-            "times memory": took / bound,
+            "seconds": time,
+            "% of MuJoCo": 100 * time / seconds[slow],
+            "multiple of closed form": time / seconds[closed],
+            "multiple of memory": time / bound,
         }
-        for name, took in {**seconds, "writing its bytes to memory": bound}.items()
+        for name, time in {**seconds, "writing its bytes to memory": bound}.items()
     }
     record("generation", f"{count} labelled trajectories of 10 s at 100 Hz, medians", rows)
     errors = ibg.fitted.figures if ibg.fitted else {}
     about = {
         "bytes of the set (GB)": size / 1e9,
         "memory bandwidth, one core (GB/s)": size / bound / 1e9,
-        "memory, highest before generating (GB)": before,
-        "memory, highest (GB)": peak_memory_gb(),
+        "peak memory before generating (GB)": before,
+        "peak memory (GB)": peak_memory_gb(),
         **{f"error of the surrogate, {k} (mm RMS)": 1e3 * errors[f"rmse_{k}"] for k in "xyz"},
     }
-    record("generation_set", "the set, and what made it", about)
+    record("generation_set", "size of the set, and error of its surrogate", about)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How long does `import retwin` take? At most 1.5 s."""
+"""Time of `import retwin`. Target: at most 1.5 s."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from record import record
 
 
 def seconds(code: str) -> float:
-    took = []
+    times = []
     for _ in range(5):
         started = time.perf_counter()
         subprocess.run([sys.executable, "-c", code], check=True)
-        took.append(time.perf_counter() - started)
-    return statistics.median(took)
+        times.append(time.perf_counter() - started)
+    return statistics.median(times)
 
 
 def main() -> None:
     bare = seconds("pass")
     rows = {
         "import retwin (s)": seconds("import retwin") - bare,
-        "import retwin, then ask for fit_surrogate (s)": seconds(
+        "import retwin, then access fit_surrogate (s)": seconds(
             "import retwin; retwin.fit_surrogate"
         )
         - bare,
     }
-    record("importing", "median of five processes, Python's own start taken off", rows)
+    record("importing", "median of five processes, without Python's own start", rows)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""Print a benchmark's table, and keep its last figures with the machine in results.json.
+"""Print the table of a benchmark, and store its last figures with the machine in results.json.
 
-Another file, if RETWIN_RESULTS names one.
+RETWIN_RESULTS may name another file.
 """
 
 from __future__ import annotations
@@ -26,23 +26,22 @@ def peak_memory_gb() -> float:
 
 
 def record(name: str, title: str, rows: dict[str, float] | dict[str, dict[str, float]]) -> None:
-    """Print `rows`, of one value or of a value per column, and keep them.
+    """Print `rows`, of one value or of a value per column, and store them with four digits.
 
-    They take the place of the earlier figures of the benchmark `name` in benchmarks/results.json,
-    to four digits.
+    They replace the earlier figures of the benchmark `name`.
     """
     several = {what: row if isinstance(row, dict) else {"value": row} for what, row in rows.items()}
-    table = Table("what", *next(iter(several.values())), title=title)
+    table = Table("", *next(iter(several.values())), title=title)
     for what, row in several.items():
         table.add_row(what, *(f"{value:.3g}" for value in row.values()))
     Console().print(table)
-    keep(name, {"title": title, "machine": machine(), "rows": _rounded(rows)})
+    store(name, {"title": title, "machine": machine(), "rows": _rounded(rows)})
 
 
-def keep(name: str, told: dict[str, Any]) -> None:
-    """Put the figures of one benchmark beside those of the others."""
+def store(name: str, result: dict[str, Any]) -> None:
+    """Replace the figures of one benchmark, and keep those of the others."""
     every = json.loads(RESULTS.read_text("utf-8")) if RESULTS.exists() else {}
-    every = dict(sorted({**every, name: told}.items()))
+    every = dict(sorted({**every, name: result}.items()))
     with write_atomically(RESULTS) as part:
         part.write_text(json.dumps(every, indent=1) + "\n", encoding="utf-8")
 

@@ -1,4 +1,4 @@
-"""How long does command recovery take, and how exact is it?
+"""Time and accuracy of command recovery.
 
 Needs RETWIN_DATA. Targets: forward kinematics of the recovered commands within 0.05 mm RMS of the
 desired path for at least 99 % of trajectories, and at most 60 s for 3600 trajectories.
@@ -30,7 +30,7 @@ def main() -> None:
         rows[f"{name}: trajectories"] = len(path)
         rows[f"{name}: seconds"] = time.perf_counter() - started
         rows[f"{name}: share within 0.05 mm RMS"] = float((found.rms <= 5e-5).mean())
-        rows[f"{name}: movements that stay ambiguous"] = float(found.ambiguous.sum())
+        rows[f"{name}: ambiguous segments"] = float(found.ambiguous.sum())
     record("recovery", "command recovery", rows)
 
 

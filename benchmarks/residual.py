@@ -1,13 +1,13 @@
-"""Which shape of the residual model generates the most real trajectories?
+"""Fidelity of residual models with several densities.
 
-The healthy trajectories of one real set (set A, in `RETWIN_DATA`), over three folds: the RG is
-fitted to the folds' calibration trajectories, and its draws are held against healthy ones that it
-never saw. `healthy`: fitted to healthy trajectories alone; `all`: to those of all classes, the
-severity of each fault inferred apart. Shapes: mixtures of one, two and three Gaussians, a
-normalising flow, and the mixture refined on outputs by the energy score. Scores are averaged over
-trajectories; `below single` is by which share the CRPS lies below that of one Gaussian, with its
-95 % bootstrap interval over trajectories, and `below mean` the same against the mean correction
-alone.
+The data are the healthy trajectories of one real set (set A, in `RETWIN_DATA`), in three folds: the
+RG is fitted to the calibration trajectories of a fold, and its samples are compared with held-out
+healthy ones. `healthy`: fitted to healthy trajectories alone; `all`: to those of all classes, with
+the severity of each fault inferred in addition. Densities: mixtures of one, two and three
+Gaussians, a normalising flow, and the mixture refined on outputs by the energy score. Scores are
+averaged over trajectories. `below single` is the relative reduction of the CRPS against that of one
+Gaussian, with its 95 % bootstrap interval over trajectories, and `below mean` the same against the
+mean correction.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from retwin.evaluation.fidelity import Fidelity, measure_fidelity
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.residual import Flow, Mixture, Refinement, fit_residual
 
-SHAPES = {
+DENSITIES = {
     "one Gaussian": Mixture(components=1),
     "two": Mixture(components=2),
     "three": Mixture(components=3),
@@ -50,15 +50,15 @@ def main() -> None:
         ("commands, healthy", case.correction, "healthy"),
         ("commands, all", case.correction, case.faults),
     ):
-        found: dict[str, list[Fidelity]] = {name: [] for name in SHAPES}
-        seconds = dict.fromkeys(SHAPES, 0.0)
+        found: dict[str, list[Fidelity]] = {name: [] for name in DENSITIES}
+        seconds = dict.fromkeys(DENSITIES, 0.0)
         for calibration, test in real.folds(3, seed=0):
             held_out = real[test].with_label("Healthy")
             twins = {}
-            for name, shape in SHAPES.items():
+            for name, density in DENSITIES.items():
                 begin = time.perf_counter()
                 residual = fit_residual(
-                    surrogate, real[calibration], correction, shape, seed=0, calibrate_on=on
+                    surrogate, real[calibration], correction, density, seed=0, calibrate_on=on
                 )
                 seconds[name] += (time.perf_counter() - begin) / 3
                 twins[name] = CorrectedTwin(surrogate, residual)

@@ -1,11 +1,11 @@
-"""How fast are labelled trajectories written to Zarr and read again, in how much memory and space?
+"""Time, memory and disk space of labelled trajectories that are written to Zarr and read again.
 
-Target: at most 2 GB for parent and workers together, whatever the number of trajectories. The
-closed-form arm, 1000 samples, all nine classes. What reading is for is timed too: features for a
-classifier, and the samples that a surrogate learns from (it trains for one epoch, which takes the
-same time for any number of trajectories). Then, for docs/scaling.md, what several twins take of
-one processor core, in its own seconds, which other work on the machine does not count into. A
-number of trajectories can be given as the argument; 0 leaves the first part out.
+Target: at most 2 GB for parent and workers together, whatever the number of trajectories. The twin
+is the closed-form arm, 1000 samples, all nine classes. The uses of the data are timed too: features
+for a classifier, and the samples from which a surrogate learns (it trains for one epoch, which
+takes the same time for any number of trajectories). For docs/scaling.md, several twins are timed on
+one core in processor time, which excludes other work of the machine. The argument is the number of
+trajectories; 0 skips the first part.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from retwin.deploy.simulations import SimulationPlan, simulate_to
 from retwin.diagnosis.features import Features
 
 MILLION = 1_000_000
-ENOUGH = 1024
+COUNT = 1024
 
 
 class PeakMemory:
-    """The highest resident memory of this process and its children, watched ten times a second."""
+    """The highest resident memory of this process and its children, sampled ten times a second."""
 
     def __init__(self) -> None:
         self.gb = 0.0
@@ -93,10 +93,10 @@ def whole(case: rt.Case, n: int) -> None:
 def per_core(case: rt.Case) -> None:
     simulator = replace(case.twin, threads=1)
     real = rt.generate(case.emulator, case, per_class=6, seed=1)
-    # What generating takes does not depend on how good the models are.
+    # The time to generate does not depend on the quality of the models.
     brief = rt.Training(max_epochs=1, batch_size=256, learning_rate=5e-3)
-    said = rt.generate(simulator, case, per_class=20, seed=0)
-    ibg = rt.fit_surrogate(said, seed=0, training=brief)
+    simulated = rt.generate(simulator, case, per_class=20, seed=0)
+    ibg = rt.fit_surrogate(simulated, seed=0, training=brief)
     ways = {
         "closed form": twins.get("armpi-kinematic"),
         "MuJoCo, 5 ms": simulator,
@@ -107,18 +107,18 @@ def per_core(case: rt.Case) -> None:
     }
     rows, clock = {}, time.process_time
     for name, twin in ways.items():
-        plan = SimulationPlan(twin, case.sampler, seed=0, n=ENOUGH, faults=case.faults)
+        plan = SimulationPlan(twin, case.sampler, seed=0, n=COUNT, faults=case.faults)
         with tempfile.TemporaryDirectory() as folder:
             target = Path(folder) / "made.zarr"
             made, _ = timed(lambda to=target, of=plan: simulate_to(to, of, workers=1), clock)
             read, found = timed(lambda of=target: rt.load(of), clock)
-            looked, _ = timed(lambda of=found: Features.at(of)(of), clock)
+            extracted, _ = timed(lambda of=found: Features.at(of)(of), clock)
             size = sum(file.stat().st_size for file in target.rglob("*") if file.is_file())
         rows[name] = {
-            "made/s": ENOUGH / made,
-            "read/s": ENOUGH / read,
-            "features/s": ENOUGH / looked,
-            "kB": size / ENOUGH / 1e3,
+            "generated/s": COUNT / made,
+            "read/s": COUNT / read,
+            "features/s": COUNT / extracted,
+            "kB": size / COUNT / 1e3,
         }
     record("scale_per_core", "Trajectories per second of one core, and bytes on disk", rows)
 

@@ -1,19 +1,19 @@
-"""How well does each source simulate the cascaded tanks? Everything is fitted to one record.
+"""Simulation error of each source on the cascaded tanks. All models are fitted to one record.
 
     python benchmarks/tanks.py DATA.csv [--base plain|overflow] [--final]
 
-The benchmark's protocol: fit to the estimation record, simulate the validation record from the
-system's start state, which both records share; no measured level of the validation record is used.
-`base` is the twin that the surrogate stands for and the residual model corrects: the simple one, or
-the one that knows of overflow and of outlets that are not quite Torricelli's. `twin` is fitted by
-its parameters alone (Eq. 2, so it is `pi_ls` too): the simple one by least squares, the other with
-the robust loss of `identify`. `ibg` is its surrogate, `mean_corrected` the surrogate plus the mean
-of the RG, `ibg_rg` the mean of samples.
+The protocol is that of the benchmark: fit to the estimation record, simulate the validation record
+from the system's initial state, which both records share; no measured level of the validation
+record is used. `base` is the twin that the surrogate approximates and the residual model corrects:
+the simple one, or the one with overflow and free exponents of the outflows. `twin` is fitted by its
+parameters alone (Eq. 2, so it is `pi_ls` too): the simple one by least squares, the other with the
+robust loss of `identify`. `ibg` is its surrogate, `mean_corrected` the surrogate plus the mean of
+the RG, `ibg_rg` the mean of samples.
 
-Without `--final` only the estimation record is looked at: the RG's figures are those of blocks held
-out with a gap. Choices were made on these, two of them after a first look at the validation record
-(docs/tanks.md). With it, the validation record is scored: RMSE in V;
-the share of samples within the 5 and 95 % quantiles of 500 samples, with its 95 % interval from a
+Without `--final` only the estimation record is used: the figures of the RG are those of held-out
+blocks with a margin. Choices were made on these, two of them after a first score on the validation
+record (docs/tanks.md). With `--final` the validation record is scored: RMSE in V; the share of
+measured points within the 5 and 95 % quantiles of 500 samples, with its 95 % interval from a
 circular block bootstrap over time; and CRPS in V.
 """
 
@@ -39,13 +39,13 @@ from retwin.update.identification import LeastSquares, identify
 
 DRAWS = 500
 BLOCK = 64
-"""Samples of a block: beyond, errors of the twin are hardly alike any more."""
+"""Length of a block in samples: errors of the twin are hardly correlated beyond it."""
 SIMULATED = 800
-"""Simulations that the surrogate learns from."""
+"""Simulations from which the surrogate learns."""
 
 
 def scored(values: NDArray, measured: NDArray) -> dict[str, float]:
-    """Scores of simulations (draws, T), one if nothing is random, of a measured level (T,)."""
+    """Scores of simulations (draws, T) of a measured level (T,); one draw if deterministic."""
     error = values.mean(axis=0) - measured
     made = {"rmse": float(np.sqrt(np.mean(error**2)))}
     made["crps"] = float(scoringrules.crps_ensemble(measured, values, m_axis=0).mean())
@@ -60,9 +60,9 @@ def scored(values: NDArray, measured: NDArray) -> dict[str, float]:
 
 
 def fitted(estimation: rt.Trajectories, base: str) -> tuple[rt.Twin, CorrectedTwin, dict]:
-    """The identified twin, the corrected one, and what the estimation record tells of them."""
+    """The identified twin, the corrected one, and their figures on the estimation record."""
     case = tanks()
-    told: dict[str, float] = {}
+    figures: dict[str, float] = {}
     began = time.perf_counter()
     twin: rt.Twin = case.twin
     if base == "overflow":
@@ -72,14 +72,14 @@ def fitted(estimation: rt.Trajectories, base: str) -> tuple[rt.Twin, CorrectedTw
             found = identify(free, estimation, seed=0, method=LeastSquares(starts=2))
         twin = found.twin
         print(found.values)
-    told["twin: s"] = time.perf_counter() - began
+    figures["twin: s"] = time.perf_counter() - began
     simulated = twin.simulate(estimation.commands, seed=0).observed
-    told["twin: rmse, V"] = float(np.sqrt(np.mean((simulated - estimation.observed) ** 2)))
+    figures["twin: rmse, V"] = float(np.sqrt(np.mean((simulated - estimation.observed) ** 2)))
     began = time.perf_counter()
     rng = np.random.default_rng(1)
     made = twin.simulate(case.sampler.sample(SIMULATED, rng=rng), seed=0)
     ibg = rt.fit_surrogate(made, case.network, seed=0, training=case.training)
-    told["surrogate: s"] = time.perf_counter() - began
+    figures["surrogate: s"] = time.perf_counter() - began
     whole = replace(VOLTAGES, steps=estimation.steps)
     fresh = twin.simulate(whole.sample(50, rng=np.random.default_rng(99)), seed=0)
     error = np.square(ibg.predict(fresh.commands) - fresh.nominal)
@@ -88,15 +88,15 @@ def fitted(estimation: rt.Trajectories, base: str) -> tuple[rt.Twin, CorrectedTw
         (" first quarter", slice(256)),
         (" last quarter", slice(-256, None)),
     ):
-        told[f"surrogate: nrmse{name}"] = float(
+        figures[f"surrogate: nrmse{name}"] = float(
             np.sqrt(error[:, part].mean()) / fresh.nominal.std()
         )
     began = time.perf_counter()
     rg = rt.fit_residual(ibg, estimation, case.correction, case.density, seed=0)
-    told["residual: s"] = time.perf_counter() - began
-    told |= {f"residual, held out: {name}": value for name, value in rg.fitted.figures.items()}
+    figures["residual: s"] = time.perf_counter() - began
+    figures |= {f"residual, held out: {name}": value for name, value in rg.fitted.figures.items()}
     print(rg.fitted.reason)
-    return twin, CorrectedTwin(ibg, rg, "tanks"), told
+    return twin, CorrectedTwin(ibg, rg, "tanks"), figures
 
 
 def main() -> None:
@@ -104,12 +104,12 @@ def main() -> None:
     parser.add_argument("file", type=Path)
     parser.add_argument("--base", choices=["plain", "overflow"], default="plain")
     parser.add_argument("--final", action="store_true")
-    parser.add_argument("--model", type=Path, help="where to keep the corrected twin")
+    parser.add_argument("--model", type=Path, help="folder in which the corrected twin is saved")
     options = parser.parse_args()
     torch.set_num_threads(1)
     estimation, validation = benchmark(tanks().twin)(options.file)
-    twin, updated, told = fitted(estimation, options.base)
-    record(f"tanks_{options.base}_estimation", "Estimation record", told)
+    twin, updated, figures = fitted(estimation, options.base)
+    record(f"tanks_{options.base}_estimation", "Estimation record", figures)
     if options.model:
         updated.save(options.model)
     if not options.final:

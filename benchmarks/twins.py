@@ -1,10 +1,10 @@
-"""How near are our twins of the arm to the published one, and how fast are they?
+"""Agreement of the built-in twins of the arm with the published one, and their speed.
 
-Agreement with the recorded Simscape twin (needs RETWIN_DATA; only the servos' stiffness, damping
-and delay are fitted). Targets for the MuJoCo arm: healthy paths within 0.5 mm RMS per axis over
-400 trajectories, plateaus with a steady-state error within 1.0 mm RMS, plateaus with a stuck joint
-within 2.0 mm RMS. Speed: 3600 trajectories of 10 s, at several integration steps, beside the
-kinematics in closed form.
+Agreement is with the recorded Simscape twin (needs RETWIN_DATA; only the servos' stiffness, damping
+and delay are fitted). Targets for the MuJoCo arm: healthy paths within 0.5 mm RMS per axis over 400
+trajectories, steady parts with a biased actuator within 1.0 mm RMS, steady parts with a stuck joint
+within 2.0 mm RMS. Speed is that of 3600 trajectories of 10 s at several integration steps, compared
+with the kinematics in closed form.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from retwin.cases.armpi_fpv.twin import KINEMATIC, ArmPiTwin
 
 STEPS = (0.001, 0.002, 0.005, 0.01)
 SETTLED = 50
-"""Samples at the end of a movement that are its plateau."""
+"""Samples at the end of a segment that are its steady part."""
 
 
-def plateaus(trajectories: rt.Trajectories) -> NDArray:
-    """The end of every movement, (n, M, SETTLED) sample numbers."""
+def steady_parts(trajectories: rt.Trajectories) -> NDArray:
+    """Sample numbers (n, M, SETTLED) of the steady part of every segment."""
     stop = rt.Segments.from_commands(trajectories.commands).stop.astype(int)
     return stop[..., None] - 1 - np.arange(SETTLED)
 
 
 def biases(published: rt.Trajectories, actuator: int) -> NDArray:
-    """The bias (n, M) of one motor, in units, that explains where each movement ended."""
-    each, at = np.arange(len(published))[:, None], plateaus(published)[:, :, 0]
-    told = published.commands[each, at].astype(float)
-    seen = published.observed[each, at]
+    """The bias (n, M) of one motor, in units, that explains the end of each segment."""
+    each, at = np.arange(len(published))[:, None], steady_parts(published)[:, :, 0]
+    reference = published.commands[each, at].astype(float)
+    measured = published.observed[each, at]
     bias = np.zeros(at.shape)
     for _ in range(30):
-        trial = told.copy()
+        trial = reference.copy()
         trial[..., actuator] += bias
-        slope = KINEMATIC.arm.jacobian(KINEMATIC.angles(trial))[..., actuator] * KINEMATIC.scale
-        gap = seen - KINEMATIC.position(trial)
-        bias += (slope * gap).sum(axis=-1) / ((slope**2).sum(axis=-1) + 1e-12)
+        jacobian = KINEMATIC.arm.jacobian(KINEMATIC.angles(trial))[..., actuator] * KINEMATIC.scale
+        residual = measured - KINEMATIC.position(trial)
+        bias += (jacobian * residual).sum(axis=-1) / ((jacobian**2).sum(axis=-1) + 1e-12)
         bias = np.clip(bias, -60, 60)
     return bias
 
@@ -59,7 +59,7 @@ def agreement(published: rt.Trajectories, twin: rt.Twin) -> dict[str, float]:
     axes = rms_mm(made.observed - healthy.observed, (0, 1))
     rows = {f"healthy paths, {name} (mm RMS)": v for name, v in zip("xyz", axes, strict=True)}
     for kind in ("Steady_state_error", "Stuck"):
-        gaps = []
+        differences = []
         for actuator in range(4):
             those = published.with_label(f"Motor_{actuator + 1}_{kind}")
             if kind == "Stuck":
@@ -68,11 +68,11 @@ def agreement(published: rt.Trajectories, twin: rt.Twin) -> dict[str, float]:
                 found = biases(those, actuator)
                 faults = [rt.ActuatorBias(actuator, bias=tuple(b)) for b in found.tolist()]
             made = twin.simulate(those.commands, faults=faults, seed=0)
-            each, at = np.arange(len(those))[:, None, None], plateaus(those)
-            gaps.append(made.observed[each, at] - those.observed[each, at])
-        every = np.concatenate(gaps)
-        rows[f"{kind} plateaus, distance (mm RMS)"] = float(rms_mm(every))
-        rows[f"{kind} plateaus, worst axis (mm RMS)"] = float(rms_mm(every, (0, 1, 2)).max())
+            each, at = np.arange(len(those))[:, None, None], steady_parts(those)
+            differences.append(made.observed[each, at] - those.observed[each, at])
+        every = np.concatenate(differences)
+        rows[f"{kind}, steady parts, distance (mm RMS)"] = float(rms_mm(every))
+        rows[f"{kind}, steady parts, worst axis (mm RMS)"] = float(rms_mm(every, (0, 1, 2)).max())
     return rows
 
 
@@ -85,7 +85,7 @@ def speed(twin: rt.Twin, commands: NDArray, threads: int) -> dict[str, float]:
         "seconds": took,
         "trajectories per s": len(commands) / took,
         "threads": threads,
-        "times real time": len(commands) * seconds / took,
+        "multiple of real time": len(commands) * seconds / took,
     }
 
 

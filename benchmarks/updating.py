@@ -1,14 +1,14 @@
-"""What does it cost to update the MuJoCo arm, and how good is it then? All costs counted, one run.
+"""Cost of updating the MuJoCo arm, and accuracy of the updated twins.
 
-The healthy trajectories of set A (needs RETWIN_DATA): a third of them is held out, the others
-calibrate; `python benchmarks/updating.py 3` holds out every third in turn. The rivals: the residual
-generator, without its surrogate, which serves for ever, and with it, its twin data and its
-training; least squares on the twin's own parameters (Eq. 2), and their posterior by a network
-(Eq. 3), with default settings. Accuracy on what was held out, at the sensor's rate: CRPS (for a
-twin without randomness the mean absolute error), energy score, and how much 90 % bands hold.
-Expected was: RG at least 10 times faster than least squares, and 100 times than Bayes.
+Of the healthy trajectories of set A (needs RETWIN_DATA) a third is held out, and the others
+calibrate; `python benchmarks/updating.py 3` holds out every third in turn. Compared are the
+residual model without its surrogate, which is fitted once, and with it, including its twin data and
+its training; least squares on the twin's own parameters (Eq. 2); and their posterior by a network
+(Eq. 3), with default settings. Accuracy on the held-out trajectories, at the sensor's rate: CRPS
+(the mean absolute error of a deterministic twin), energy score, and coverage of the 90 % bands.
+Expectation: the RG is at least 10 times faster than least squares, and 100 times than Bayes.
 
-Seconds are of the processor, so other work on the machine does not count; one thread.
+Seconds are processor time of one thread, which excludes other work of the machine.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ DRAWS = 50
 ARM = rt.ArmPiTwin(threads=1)
 
 Found = tuple[rt.Twin, int]
-"""A twin that was updated, and how often the MuJoCo arm was run for it."""
+"""An updated twin, and the number of runs of the MuJoCo arm that it took."""
 Score = tuple[float, int, rt.Fidelity]
-"""Seconds, runs, and what the twin says of what was held out."""
+"""Seconds, runs, and fidelity on the held-out trajectories."""
 
 
 def rivals(case: rt.Case, ibg: rt.Surrogate) -> dict[str, Callable[[rt.Trajectories], Found]]:
-    """Name to what updates the twin, given calibration trajectories."""
+    """Functions from calibration trajectories to an updated twin, by name."""
     twin, rate = armpi_parametric(ARM), case.sensor_rate
 
     def corrected(correction: rt.Correction) -> Callable[[rt.Trajectories], Found]:
@@ -58,7 +58,7 @@ def rivals(case: rt.Case, ibg: rt.Surrogate) -> dict[str, Callable[[rt.Trajector
         return found.twin, found.twin_runs
 
     return {
-        "twin as it was": lambda data: (twin, 0),
+        "original twin": lambda data: (twin, 0),
         "RG, delay and offset": corrected(case.output_correction),
         "RG, command space": corrected(case.correction),
         "pi_ls": least_squares,
@@ -72,7 +72,7 @@ def accuracy(fidelity: rt.Fidelity) -> dict[str, float]:
     return {
         "CRPS (mm)": 1e3 * float(np.mean(crps)),
         "energy score (mm)": 1e3 * figures["energy"].value,
-        "90 % bands hold": figures["coverage90"].value,
+        "coverage of the 90 % bands": figures["coverage90"].value,
     }
 
 
@@ -81,14 +81,14 @@ def main(folds: int) -> None:
     if not folder:
         print("updating: set RETWIN_DATA to the folder of the public data")
         return
-    import sbi.neural_nets  # noqa: F401 - importing is no part of updating
+    import sbi.neural_nets  # noqa: F401 - the import is not timed
 
     case = rt.cases.armpi()
     real = rt.load(Path(folder) / "armpi" / "real_a.mat", case=case).with_label("Healthy")
     started = time.process_time()
-    told = rt.generate(ARM, case, per_class=PER_CLASS, seed=0)
-    simulated = time.process_time() - started
-    ibg = rt.fit_surrogate(told, seed=0)
+    twin_data = rt.generate(ARM, case, per_class=PER_CLASS, seed=0)
+    simulation = time.process_time() - started
+    ibg = rt.fit_surrogate(twin_data, seed=0)
     once = time.process_time() - started
     scored: dict[str, list[Score]] = {}
     for calibration, held_out in islice(real.folds(FOLDS, seed=0), folds):
@@ -100,12 +100,17 @@ def main(folds: int) -> None:
                 twin, real[held_out], draws=DRAWS, seed=0, rate=case.sensor_rate, against={}
             )
             scored.setdefault(name, []).append((took, runs, fidelity))
-        # Fold by fold, so that a run that is stopped has told something.
-        tell(scored, once, simulated, len(told))
+        # After every fold, so that an interrupted run has results.
+        publish(scored, once, simulation, len(twin_data))
 
 
-def tell(scored: dict[str, list[Score]], once: float, simulated: float, simulations: int) -> None:
-    """The tables for the folds so far; `once` and `simulations` are the surrogate's costs."""
+def publish(
+    scored: dict[str, list[Score]], once: float, simulation: float, simulations: int
+) -> None:
+    """Record the tables for the folds so far, with the costs of the surrogate.
+
+    The costs are `once`, in s, its part `simulation`, and the number of runs, `simulations`.
+    """
     rows, seconds = {}, {}
     for name, folds in scored.items():
         seconds[name] = float(np.mean([took for took, _, _ in folds]))
@@ -118,7 +123,7 @@ def tell(scored: dict[str, list[Score]], once: float, simulated: float, simulati
         }
     held_out = sum(len(fidelity) for _, _, fidelity in next(iter(scored.values())))
     record("updating", f"updating the MuJoCo arm, {held_out} trajectories held out", rows)
-    speed = {"surrogate, once (s)": once, "of this, twin runs (s)": simulated}
+    speed = {"surrogate, once (s)": once, "of this, twin runs (s)": simulation}
     for rg in ("RG, delay and offset", "RG, command space"):
         for name in ("pi_ls", "pi_bayes"):
             speed[f"{rg}: times faster than {name}"] = seconds[name] / seconds[rg]
@@ -129,5 +134,6 @@ def tell(scored: dict[str, list[Score]], once: float, simulated: float, simulati
 
 if __name__ == "__main__":
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # doubts on parameters: docs/updating.md
+        # They name parameters that are not identified, see docs/updating.md.
+        warnings.simplefilter("ignore", UserWarning)
         main(int(sys.argv[1]) if len(sys.argv) > 1 else 1)

@@ -119,7 +119,7 @@ def test_the_drawing_lists_the_rooms_in_their_order() -> None:
         block for block in blocks(ROOT / "docs" / "architecture.md", "") if "src/retwin/" in block
     )
     source = ROOT / "src" / "retwin"
-    built = {path.stem for path in source.iterdir() if not path.name.startswith("_")}
+    built = {path.stem for path in source.iterdir() if not path.name.startswith("__")}
     drawn = re.findall(r"^  (\w+)(?:\.py|/) ", house, re.M)
     assert drawn == [module for room in ROOMS for module in room if module in built]
 

@@ -1,5 +1,5 @@
 """Small neural networks, their training, and conditional distributions.
 
-Belongs here: architectures, the training loop, mixtures and flows. Does not belong here: the
+Belongs here: architectures, the training loop, mixtures and flows. Not here: the
 method, twins, or a robot.
 """
