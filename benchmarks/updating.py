@@ -26,7 +26,7 @@ from record import record
 
 import retwin as rt
 from retwin.cases.armpi_fpv.parameters import armpi_parametric
-from retwin.update.identification import NPE, identify, identify_bayes
+from retwin.update.identification import NPE, identify
 
 FOLDS = 3
 PER_CLASS = 100
@@ -54,7 +54,7 @@ def rivals(case: rt.Case, ibg: rt.Surrogate) -> dict[str, Callable[[rt.Trajector
         return found.twin, found.twin_runs
 
     def network(data: rt.Trajectories) -> Found:
-        found = identify_bayes(twin, data, seed=0, method=NPE(), rate=rate)
+        found = identify(twin, data, NPE(), seed=0, rate=rate)
         return found.twin, found.twin_runs
 
     return {

@@ -162,3 +162,17 @@ def test_every_public_name_is_there() -> None:
         assert getattr(retwin, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         _ = retwin.nonsense
+
+
+def test_the_table_of_public_names_is_sorted_and_agrees_with_the_static_imports() -> None:
+    assert list(retwin._HOME) == sorted(retwin._HOME)
+    assert list(retwin._ROOMS) == sorted(retwin._ROOMS)
+    tree = ast.parse((ROOT / "__init__.py").read_text("utf-8"))
+    (static,) = (node for node in tree.body if isinstance(node, ast.If))
+    homes = {
+        alias.name: node.module.removeprefix("retwin").removeprefix(".")
+        for node in static.body
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
+    }
+    assert homes == {**retwin._HOME, **dict.fromkeys(retwin._ROOMS, "")}

@@ -108,7 +108,7 @@ def modules() -> dict[str, list[str]]:
     for page in (ROOT / "docs").glob("*.md"):
         for home, imported in IMPORT.findall(page.read_text("utf-8")):
             names |= {f"{home}.{name.strip(' ()')}" for name in imported.split(",")}
-    for room in retwin._MODULES:
+    for room in retwin._ROOMS:
         names |= {f"{room}.{name}" for name in getattr(_module(room), "__all__", ())}
     drawn = (ROOT / "docs" / "architecture.md").read_text("utf-8")
     rooms = re.findall(r"^  (\w+)(?:\.py|/) ", drawn, re.M)

@@ -1,8 +1,51 @@
 """retwin updates digital twins so that they behave like the real machine.
 
-Only the real machine's outputs need to be measured. Five nouns, a verb each: `Trajectories`
-(`load`, `save`), `Twin` (`simulate`), `Surrogate` (`fit_surrogate`), `ResidualModel` with its
-`Correction` (`fit_residual`), `Diagnoser` (`fit_diagnoser`).
+Only the real machine's outputs need to be measured. Five nouns, each with its verbs:
+
+| noun | is | verb |
+|---|---|---|
+| `Trajectories` | commands and outputs of many runs | `load`, `save`, `fetch` |
+| `Twin` (a protocol) | a simulator | `simulate`, `generate`, `identify` |
+| `Surrogate` | a neural network that replaces a twin | `fit_surrogate` |
+| `ResidualModel` with its `Correction` | the distribution of the discrepancy | `fit_residual` |
+| `Diagnoser` (a protocol) | class probabilities of trajectories | `fit_diagnoser`, `evaluate` |
+
+`CorrectedTwin` is a surrogate with its residual model, and a `Twin` again:
+
+    import retwin as rt
+
+    case = rt.cases.armpi()
+    simulated = rt.generate(case.twin, case, per_class=12, seed=0)
+    real = rt.generate(case.emulator, case, per_class=10, seed=1)  # or rt.load("real.npz")
+    calibration, test = real.split(0.6, seed=0)
+    surrogate = rt.fit_surrogate(simulated, rt.MLP(), seed=0)
+    residual = rt.fit_residual(surrogate, calibration, rt.DelayOffset(), rt.Mixture(), seed=0)
+    twin = rt.CorrectedTwin(surrogate, residual, case=case.name)
+    diagnoser = rt.fit_diagnoser(rt.generate(twin, case, per_class=40, seed=1), rt.CNN(), seed=0)
+    print(rt.evaluate(diagnoser, test))
+
+A verb takes its method as a config object: `fit_surrogate` a network (`MLP`, `LSTM`, `TCN`,
+`StateSpace`), `fit_residual` a correction (`Additive`, `Chain`, `CommandSpace`, `DelayOffset`,
+`SampledSensor`) and a density (`Flow`, `Mixture`, `SequenceMixture`), `fit_diagnoser` a classifier
+(`CNN`, `LSTMClassifier`, `Rocket`, `DANN`, `FineTune`), `identify` a method (`LeastSquares`,
+`Evolution`, `MCMC`, `NPE`). `Training` has the epochs, the batch size and the learning rate.
+
+What fewer users need is in its room, a package of its own that `rt.<room>` imports on first use:
+
+| room | holds |
+|---|---|
+| `rt.data` | trajectories, segments, file formats, downloads |
+| `rt.scores` | pure functions of arrays that score predictions and simulations |
+| `rt.twins` | the kinds of twins, faults, command samplers, limits |
+| `rt.nets` | networks, their training, mixtures and flows |
+| `rt.update` | surrogate, corrections, residual models, corrected twin, identification |
+| `rt.diagnosis` | the kinds of diagnosers |
+| `rt.evaluation` | scores of diagnosers, fidelity of twins |
+| `rt.cases` | the built-in systems, and case.toml |
+| `rt.study` | comparison of sources over runs |
+| `rt.report` | the report of a study |
+| `rt.deploy` | bundles, ONNX, large simulations |
+| `rt.testing` | contract suites for twins, corrections and diagnosers of your own |
 """
 
 from __future__ import annotations
@@ -12,8 +55,9 @@ from typing import TYPE_CHECKING, Any
 
 from retwin._version import __version__
 
-# Name to module, loaded when first asked for: `import retwin` must not wait for torch.
+# Name to module, which is imported when the name is first used: `import retwin` loads no torch.
 _HOME = {
+    "ActuatorBias": "twins.faults",
     "Additive": "update.corrections",
     "ArmPiTwin": "cases.armpi_fpv.twin",
     "CNN": "nets.networks",
@@ -28,6 +72,7 @@ _HOME = {
     "DelayOffset": "update.corrections",
     "Diagnoser": "diagnosis",
     "Discrepancy": "update.corrections",
+    "Evolution": "update.identification",
     "FMUTwin": "twins.fmu",
     "Fault": "twins.faults",
     "Fidelity": "evaluation.fidelity",
@@ -36,14 +81,17 @@ _HOME = {
     "FunctionTwin": "twins.function",
     "InputError": "errors",
     "InversionDiagnoser": "diagnosis",
-    "KinematicTwin": "cases.armpi_fpv.closed_form",
     "LSTM": "nets.networks",
     "LSTMClassifier": "nets.networks",
-    "Limits": "twins.twin",
+    "LeastSquares": "update.identification",
+    "Limits": "twins.limits",
+    "MCMC": "update.identification",
     "MLP": "nets.networks",
     "Mixture": "update.residual",
     "MuJoCoTwin": "twins.mujoco",
+    "NPE": "update.identification",
     "NetworkDiagnoser": "diagnosis",
+    "Noise": "update.identification",
     "NoisyTwin": "twins.noisy",
     "Parameter": "twins.parametric",
     "ParametricTwin": "twins.parametric",
@@ -56,11 +104,9 @@ _HOME = {
     "Scores": "scores.classification",
     "Segments": "data.segments",
     "SequenceMixture": "update.residual",
-    "SequenceResidual": "update.residual",
     "SimulationError": "twins.twin",
     "SimulationPlan": "deploy.simulations",
     "StateSpace": "nets.networks",
-    "ActuatorBias": "twins.faults",
     "Stuck": "twins.faults",
     "StudyData": "study",
     "StudyPlan": "study",
@@ -78,26 +124,37 @@ _HOME = {
     "fit_surrogate": "update.surrogate",
     "generate": "update.corrected",
     "identify": "update.identification",
-    "identify_bayes": "update.identification",
     "infer_discrepancy": "update.residual",
     "load": "data.io",
     "load_diagnoser": "diagnosis",
     "measure_fidelity": "evaluation.fidelity",
-    "measure_widening": "evaluation.fidelity",
     "run_study": "study",
     "save": "data.io",
     "simulate_to": "deploy.simulations",
     "write_report": "report",
 }
 
-# Modules of which users take several things.
-_MODULES = ("cases", "testing", "twins")
+# The rooms that users reach as `rt.<room>`.
+_ROOMS = (
+    "cases",
+    "data",
+    "deploy",
+    "diagnosis",
+    "evaluation",
+    "nets",
+    "report",
+    "scores",
+    "study",
+    "testing",
+    "twins",
+    "update",
+)
 
-__all__ = ["__version__", *_MODULES, *sorted(_HOME)]
+__all__ = ["__version__", *_ROOMS, *sorted(_HOME)]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _MODULES:
+    if name in _ROOMS:
         return importlib.import_module(f"retwin.{name}")
     if name in _HOME:
         return getattr(importlib.import_module(f"retwin.{_HOME[name]}"), name)
@@ -109,9 +166,21 @@ def __dir__() -> list[str]:
 
 
 if TYPE_CHECKING:
-    from retwin import cases, testing, twins
+    from retwin import (
+        cases,
+        data,
+        deploy,
+        diagnosis,
+        evaluation,
+        nets,
+        report,
+        scores,
+        study,
+        testing,
+        twins,
+        update,
+    )
     from retwin.cases.animation import animate
-    from retwin.cases.armpi_fpv.closed_form import KinematicTwin
     from retwin.cases.armpi_fpv.twin import ArmPiTwin
     from retwin.cases.case import Case
     from retwin.data.download import fetch
@@ -133,7 +202,7 @@ if TYPE_CHECKING:
     )
     from retwin.errors import InputError
     from retwin.evaluation.evaluate import evaluate
-    from retwin.evaluation.fidelity import Fidelity, measure_fidelity, measure_widening
+    from retwin.evaluation.fidelity import Fidelity, measure_fidelity
     from retwin.nets.networks import CNN, LSTM, MLP, TCN, LSTMClassifier, StateSpace
     from retwin.nets.training import Training
     from retwin.report import write_report
@@ -159,14 +228,20 @@ if TYPE_CHECKING:
         Discrepancy,
         SampledSensor,
     )
-    from retwin.update.identification import identify, identify_bayes
+    from retwin.update.identification import (
+        MCMC,
+        NPE,
+        Evolution,
+        LeastSquares,
+        Noise,
+        identify,
+    )
     from retwin.update.residual import (
         Flow,
         Mixture,
         Refinement,
         ResidualModel,
         SequenceMixture,
-        SequenceResidual,
         fit_residual,
         infer_discrepancy,
     )

@@ -214,7 +214,7 @@ class Trial:
 
     @property
     def updating(self) -> dict[str, Any]:
-        """Arguments of `identify` and `identify_bayes` that all sources share."""
+        """Arguments of `identify` that all sources share."""
         return {
             "seed": self.seed("update"),
             "rate": self.case.sensor_rate,

@@ -39,7 +39,7 @@ from retwin.study.trial import Trial
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin, generate
-from retwin.update.identification import NPE, Posterior, Updated, identify, identify_bayes
+from retwin.update.identification import NPE, Posterior, Updated, identify
 from retwin.update.residual import Density, Mixture, Residual, SequenceMixture, fit_residual
 from retwin.update.surrogate import Surrogate, fit_surrogate
 
@@ -367,6 +367,6 @@ def _least_squares(trial: Trial, path: Path) -> Updated:
 
 
 def _bayes(trial: Trial, path: Path) -> Posterior:
-    found = identify_bayes(trial.parametric, trial.healthy, method=NPE(), **trial.updating)
+    found = identify(trial.parametric, trial.healthy, NPE(), **trial.updating)
     found.twin.save(path)
     return found

@@ -1,4 +1,4 @@
-"""Eq. 2: known parameters are found again, and what cannot be found is said to be so."""
+"""Eq. 2: known parameters are found again, and those that are not identified are named."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_standard_errors_are_those_of_the_linear_model() -> None:
 
 
 @pytest.mark.parametrize("loss", ["linear", "soft_l1"])
-def test_errors_cover_the_truth_as_often_as_they_say(loss: Loss) -> None:
+def test_standard_errors_cover_the_truth_as_often_as_they_should(loss: Loss) -> None:
     inside = []
     for seed in range(40):
         observed = measured(LINE, 0.5, seed=seed, count=2, a=1.0, b=-0.5)
@@ -64,7 +64,7 @@ def test_a_product_of_two_parameters_is_not_identified() -> None:
     assert "not identified" in updated.reason
 
 
-def test_a_best_value_on_a_bound_is_told() -> None:
+def test_a_best_value_on_a_bound_is_reported() -> None:
     narrow = parametric(lag, gain=(0.1, 1.0), share=(0.1, 0.98))
     observed = measured(LAG, 0.05, seed=4, gain=GAIN, share=SHARE)
     with pytest.warns(UserWarning, match="at a bound: gain"):
@@ -106,13 +106,13 @@ def test_profile_is_the_parabola_of_the_linear_model(loss: Loss, exact: float) -
 def test_the_same_seed_gives_the_same_result_over_processes() -> None:
     observed = measured(LAG, 0.05, seed=7, gain=GAIN, share=SHARE)
     method = LeastSquares(starts=2)
-    told: list[float] = []
-    alone = identify(LAG, observed, seed=3, method=method, progress=told.append)
+    progress: list[float] = []
+    alone = identify(LAG, observed, seed=3, method=method, progress=progress.append)
     spread = identify(LAG, observed, seed=3, method=method, processes=2)
     assert alone.values == spread.values
     assert alone.twin_runs == spread.twin_runs > 0
-    assert told[-1] == 1.0
-    assert told == sorted(told)
+    assert progress[-1] == 1.0
+    assert progress == sorted(progress)
 
 
 def test_bad_input_is_named() -> None:
@@ -149,16 +149,16 @@ def test_the_updated_twin_keeps_the_contract(updated_twin: rt.Twin, check: Calla
 
 
 def test_delay_and_joint_offsets_of_the_emulated_robot(case: rt.Case) -> None:
-    told = case.sampler.sample(6, rng=np.random.default_rng(0))
+    some = case.sampler.sample(6, rng=np.random.default_rng(0))
     hidden: dict[str, np.ndarray] = {}
-    observed = case.emulator.simulate(told, seed=1, hidden=hidden)
-    assert hidden["missed"].any()  # one movement of joint 2: the plain norm is led astray by it
+    observed = case.emulator.simulate(some, seed=1, hidden=hidden)
+    assert hidden["missed"].any()  # a movement of joint 2, an outlier that biases the plain norm
     twin = armpi_parametric(rt.ArmPiTwin(step=0.01)).holding("stiffness", "damping")
     method = LeastSquares(starts=1, loss="cauchy")
     updated = identify(twin, observed, seed=0, rate=case.sensor_rate, method=method)
-    late = hidden["delay"].mean()
+    delay = hidden["delay"].mean()
     assert updated.errors["delay"] < 1
-    assert abs(updated.values["delay"] - late) < 2 * updated.errors["delay"]
-    for joint, off in enumerate(hidden["offset"].mean(axis=(0, 1)), 1):
+    assert abs(updated.values["delay"] - delay) < 2 * updated.errors["delay"]
+    for joint, offset in enumerate(hidden["offset"].mean(axis=(0, 1)), 1):
         name = f"offset.motor_{joint}"
-        assert abs(updated.values[name] - off) < 2 * updated.errors[name]
+        assert abs(updated.values[name] - offset) < 2 * updated.errors[name]

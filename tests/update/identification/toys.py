@@ -60,8 +60,9 @@ class Batched:
 
         def run(chunk: Chunk) -> tuple[np.ndarray, np.ndarray]:
             some = chunk.index
-            told = (line(each, a[some], b[some]) for each in (chunk.commands, chunk.held_commands))
-            nominal, observed = told
+            nominal, observed = (
+                line(each, a[some], b[some]) for each in (chunk.commands, chunk.held_commands)
+            )
             return nominal, observed
 
         return simulate_in_chunks(

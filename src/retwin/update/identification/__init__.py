@@ -3,7 +3,7 @@
 These are the baselines that a corrected twin is compared with.
 """
 
-from retwin.update.identification.bayes import calibration_ranks, identify_bayes
+from retwin.update.identification.bayes import calibration_ranks
 from retwin.update.identification.identify import Updated, identify
 from retwin.update.identification.mcmc import MCMC
 from retwin.update.identification.noise import Noise
@@ -25,6 +25,5 @@ __all__ = [
     "Updated",
     "calibration_ranks",
     "identify",
-    "identify_bayes",
     "profile",
 ]

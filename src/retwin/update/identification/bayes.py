@@ -1,4 +1,4 @@
-"""Bayesian identification (Eq. 3): the posterior distribution of a twin's parameters."""
+"""Bayesian identification (Eq. 3): the posterior of a twin's parameters, and its calibration."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
 from retwin.update.identification.mcmc import MCMC
 from retwin.update.identification.misfit import misfit_of
-from retwin.update.identification.noise import Noise
 from retwin.update.identification.npe import NPE
 from retwin.update.identification.posterior import Posterior, PosteriorTwin
 from retwin.update.identification.problem import Problem
 from retwin.update.identification.summaries import Summaries, outlyingness
 
-__all__ = ["calibration_ranks", "identify_bayes"]
+__all__ = ["calibration_ranks", "infer_posterior"]
 
 MAX_DRAWS = 4000
 """Largest number of draws of the posterior that are kept."""
@@ -27,55 +26,26 @@ SIGNIFICANCE = 0.02
 """Prior predictive p-value of the measured data below which the twin counts as misspecified."""
 
 
-def identify_bayes(
+def infer_posterior(
     twin: ParametricTwin,
     observed: Trajectories,
+    method: MCMC | NPE,
     *,
     seed: int,
-    method: MCMC | NPE = MCMC(),  # noqa: B008 - a frozen config
-    noise: Noise = Noise(),  # noqa: B008 - a frozen config
-    rate: float | None = None,
-    progress: Progress | None = None,
+    rate: float | None,
+    processes: int,
+    progress: Progress | None,
 ) -> Posterior:
     """The posterior of a twin's parameters given measured outputs, p(θ | y_obs, u) (Eq. 3).
 
     A warning is given where the data lie outside the prior predictive distribution of the twin with
-    noise, and where chains are short.
-
-    Parameters
-    ----------
-    twin : ParametricTwin
-        Declares the free parameters; the prior is uniform within their bounds.
-    observed : Trajectories
-        Healthy calibration trajectories with commands; masked samples are not used.
-    seed : int
-        The same seed gives the same result on the same machine.
-    method : MCMC or NPE
-        `MCMC` for fast twins such as surrogates; `NPE` needs few simulations.
-    noise : Noise
-        Distribution of the output error, whose scales are inferred too.
-    rate : float, optional
-        Sample rate of the residuals in Hz, a whole part of the data's, which is the default. Give
-        the sensor's true rate: interpolated samples are no measurements, and without a
-        discrepancy the posterior is too narrow if they count.
-    progress : callable, optional
-        Called with the share of the method's steps that are done.
-
-    Returns
-    -------
-    Posterior
-
-    Raises
-    ------
-    InputError
-        As `identify`; or too few walkers; or a package of the extra `bayes` is missing.
-
+    noise, and where chains are short. Arguments and errors are those of `identify`.
     """
     began = time.perf_counter()
-    with misfit_of(twin, observed, seed=seed, rate=rate, processes=1) as misfit:
+    with misfit_of(twin, observed, seed=seed, rate=rate, processes=processes) as misfit:
         seeds = np.random.SeedSequence(seed).generate_state(4).tolist()
         for_method, for_check, for_kept, for_prior = seeds
-        problem = Problem(misfit, noise, for_prior)
+        problem = Problem(misfit, method.noise, for_prior)
         points, figures, warning = method.sample(problem, seed=for_method, progress=progress)
         p_value = _prior_predictive(problem, np.random.default_rng(for_check))
         order = np.random.default_rng(for_kept).permutation(len(points))[:MAX_DRAWS]
@@ -90,15 +60,21 @@ def identify_bayes(
             "parameters and noise from the prior"
         )
     if found:
-        warnings.warn("; ".join(found), stacklevel=2)
+        warnings.warn("; ".join(found), stacklevel=3)
     updated = PosteriorTwin(
-        twin.with_values(mean), noise, samples, logs, misfit.unit, misfit.stride, observed.emulated
+        twin.with_values(mean),
+        method.noise,
+        samples,
+        logs,
+        misfit.unit,
+        misfit.stride,
+        observed.emulated,
     )
     return Posterior(
         twin=updated,
         names=twin.names,
         samples=samples,
-        scales=dict(zip(noise.names, np.exp(logs).T, strict=True)),
+        scales=dict(zip(method.noise.names, np.exp(logs).T, strict=True)),
         misspecified=p_value,
         twin_runs=misfit.twin_runs,
         seconds=time.perf_counter() - began,
@@ -124,7 +100,6 @@ def calibration_ranks(
     *,
     count: int,
     seed: int,
-    noise: Noise = Noise(),  # noqa: B008 - a frozen config
     rate: float | None = None,
 ) -> NDArray:
     """Simulation-based calibration (Talts et al. 2018): ranks (count, k) from 0 to 1.
@@ -136,8 +111,8 @@ def calibration_ranks(
 
     Parameters
     ----------
-    twin, method, noise, rate
-        As in `identify_bayes`.
+    twin, method, rate
+        As in `identify`.
     commands : NDArray
         (n, T, d_u), commands of each data set.
     count : int
@@ -158,12 +133,12 @@ def calibration_ranks(
     """
     blank = twin.simulate(commands, seed=0)
     with misfit_of(twin, blank, seed=0, rate=rate, processes=1) as misfit:
-        problem = Problem(misfit, noise, 0)
+        problem = Problem(misfit, method.noise, 0)
     ranks = np.empty((count, len(twin.names)))
     for i, sequence in enumerate(np.random.SeedSequence(seed).spawn(count)):
         rng = np.random.default_rng(sequence)
         theta, logs = problem.physical(rng.random((1, problem.size)))
-        truth = PosteriorTwin(twin, noise, theta, logs, misfit.unit, misfit.stride)
+        truth = PosteriorTwin(twin, method.noise, theta, logs, misfit.unit, misfit.stride)
         made = truth.simulate(commands, seed=int(rng.integers(2**31)))
         data = made.replace(nominal=blank.nominal)
         drawn = _posterior(twin, data, method, problem, int(rng.integers(2**31)), rate)

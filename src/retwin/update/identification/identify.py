@@ -1,24 +1,30 @@
-"""Deterministic identification (Eq. 2): the parameters that fit measured outputs best."""
+"""`identify`: a twin's own parameters from measured outputs, by Eq. 2 or Eq. 3."""
 
 from __future__ import annotations
 
 import time
 import warnings
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
+from retwin.update.identification.bayes import infer_posterior
 from retwin.update.identification.identifiability import (
     CHI2_95,
     Identifiability,
     identifiability,
     noise_of,
 )
+from retwin.update.identification.mcmc import MCMC
 from retwin.update.identification.misfit import misfit_of
+from retwin.update.identification.npe import NPE
+from retwin.update.identification.posterior import Posterior
 from retwin.update.identification.search import (
     AT_BOUND,
     Evolution,
@@ -79,51 +85,118 @@ class Updated:
     scale: float
 
 
+@overload
 def identify(
     twin: ParametricTwin,
     observed: Trajectories,
+    method: LeastSquares | Evolution = ...,
     *,
     seed: int,
-    method: LeastSquares | Evolution = LeastSquares(),  # noqa: B008 - a frozen config
+    rate: float | None = ...,
+    processes: int = ...,
+    progress: Progress | None = ...,
+) -> Updated: ...
+
+
+@overload
+def identify(
+    twin: ParametricTwin,
+    observed: Trajectories,
+    method: MCMC | NPE,
+    *,
+    seed: int,
+    rate: float | None = ...,
+    processes: int = ...,
+    progress: Progress | None = ...,
+) -> Posterior: ...
+
+
+def identify(
+    twin: ParametricTwin,
+    observed: Trajectories,
+    method: LeastSquares | Evolution | MCMC | NPE = LeastSquares(),  # noqa: B008 - a frozen config
+    *,
+    seed: int,
     rate: float | None = None,
     processes: int = 1,
     progress: Progress | None = None,
-) -> Updated:
-    """The parameters that fit measured outputs best, θ̂ = argmin ‖y_obs − f(θ, u)‖ (Eq. 2).
+) -> Updated | Posterior:
+    """Estimate a twin's own parameters from measured outputs.
 
-    A warning names parameters that are not identified or whose best value lies on a bound.
+    `LeastSquares` and `Evolution` find the parameters that fit best, θ̂ = argmin ‖y_obs − f(θ, u)‖
+    (Eq. 2). `MCMC` and `NPE` draw from the posterior p(θ | y_obs, u) (Eq. 3).
 
     Parameters
     ----------
     twin : ParametricTwin
-        Declares the free parameters, their bounds, and the first start.
+        Declares the free parameters, their bounds, and the first start. The prior of Eq. 3 is
+        uniform within the bounds.
     observed : Trajectories
         Healthy calibration trajectories with commands; masked samples are not used.
+    method : LeastSquares, Evolution, MCMC or NPE
+        Local searches from several starts, a global search, Markov chains for fast twins such as
+        surrogates, or a network that needs few simulations. The loss of the searches is robust by
+        default; loss="linear" is the norm of Eq. 2.
     seed : int
-        Seed of the starts; the same seed gives the same result.
-    method : LeastSquares or Evolution
-        Local searches from several starts, or a global search. Their loss is robust by default;
-        loss="linear" is the norm of Eq. 2.
+        Seed of starts, draws and simulations; the same seed gives the same result on the same
+        machine.
     rate : float, optional
         Sample rate of the residuals in Hz, a whole part of the data's, which is the default. The
-        sensor's true rate is best: interpolated samples hold no information.
+        sensor's true rate is best: interpolated samples hold no information, and without a
+        discrepancy the posterior is too narrow if they count.
     processes : int
         Worker processes over which values of the parameters are distributed; 1 for twins that use
         all cores.
     progress : callable, optional
-        Called with the share of the search that is done.
+        Called with the share of the work that is done.
 
     Returns
     -------
-    Updated
+    Updated or Posterior
+        The best fit with standard errors, or draws from the posterior; `twin` of either is the
+        updated twin.
 
     Raises
     ------
     InputError
-        A twin without declared parameters, no healthy trajectory, channels or a rate that differ
-        from the twin's, or not more measurements than parameters.
+        An unknown method, a twin without declared parameters, no healthy trajectory, channels or a
+        rate that differ from the twin's, not more measurements than parameters, too few walkers,
+        or a package of the extra `bayes` that is missing.
+
+    Warns
+    -----
+    UserWarning
+        Parameters are not identified, or their best value lies on a bound (Eq. 2); chains are
+        short, or the data lie outside the prior predictive distribution (Eq. 3).
 
     """
+    require(
+        isinstance(method, LeastSquares | Evolution | MCMC | NPE),
+        "method",
+        expected="LeastSquares(), Evolution(), MCMC() or NPE()",
+        got=repr(method),
+        remedy="give the settings of one of these methods",
+    )
+    if isinstance(method, MCMC | NPE):
+        return infer_posterior(
+            twin, observed, method, seed=seed, rate=rate, processes=processes, progress=progress
+        )
+    return _fit(
+        twin, observed, method, seed=seed, rate=rate, processes=processes, progress=progress
+    )
+
+
+def _fit(
+    twin: ParametricTwin,
+    observed: Trajectories,
+    method: LeastSquares | Evolution,
+    *,
+    seed: int,
+    rate: float | None,
+    processes: int,
+    progress: Progress | None,
+) -> Updated:
+    """The parameters that fit best; arguments are those of `identify`."""
     began = time.perf_counter()
     with misfit_of(twin, observed, seed=seed, rate=rate, processes=processes) as misfit:
         search = Search(misfit, method, progress)
@@ -133,7 +206,7 @@ def identify(
         residual = misfit.residuals(np.array([best.values]))[0]
         found, agreeing = _identifiability(search, optima, point, residual)
     if found.warning:
-        warnings.warn(found.warning, stacklevel=2)
+        warnings.warn(found.warning, stacklevel=3)
     return Updated(
         twin=twin.with_values(best.values),
         values=dict(zip(twin.names, best.values, strict=True)),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import needs_extra, require, whole
 from retwin.progress import Progress
+from retwin.update.identification.noise import Noise
 from retwin.update.identification.problem import Problem
 from retwin.update.identification.search import LeastSquares, Search
 
@@ -35,6 +36,8 @@ class MCMC:
         Steps per walker that are kept, and those before them that are discarded.
     starts : int
         Starts of the least squares.
+    noise : Noise
+        Distribution of the output error, whose scales are inferred too.
 
     Raises
     ------
@@ -47,10 +50,11 @@ class MCMC:
     steps: int = 600
     warm_up: int = 300
     starts: int = 3
+    noise: Noise = field(default_factory=Noise)
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            whole(name, value, least=1)
+        for name in ("walkers", "steps", "warm_up", "starts"):
+            whole(name, getattr(self, name), least=1)
 
     def sample(
         self, problem: Problem, *, seed: int, progress: Progress | None

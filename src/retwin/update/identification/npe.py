@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import needs_extra, whole
 from retwin.progress import Progress
+from retwin.update.identification.noise import Noise
 from retwin.update.identification.problem import Problem
 from retwin.update.identification.summaries import Summaries
 
@@ -53,6 +54,8 @@ class NPE:
     max_epochs : int
         Epochs of the network's training per round, at least 1. An epoch has every path with
         `problem.NOISES` draws of noise.
+    noise : Noise
+        Distribution of the output error, whose scales are inferred too.
 
     Raises
     ------
@@ -70,6 +73,7 @@ class NPE:
     rounds: int = 2
     samples: int = 4000
     max_epochs: int = 20
+    noise: Noise = field(default_factory=Noise)
 
     def __post_init__(self) -> None:
         whole("simulations", self.simulations, least=50)
