@@ -19,6 +19,7 @@ ROOT = Path(retwin.__file__).parent
 ROOMS = (
     (
         "_version",
+        "_lazy",
         "errors",
         "checks",
         "progress",
@@ -176,3 +177,15 @@ def test_the_table_of_public_names_is_sorted_and_agrees_with_the_static_imports(
         for alias in node.names
     }
     assert homes == {**retwin._HOME, **dict.fromkeys(retwin._ROOMS, "")}
+
+
+def test_rooms_open_their_modules_when_used() -> None:
+    code = (
+        "import sys, retwin as rt\n"
+        "assert rt.update.identification.identify is rt.identify\n"
+        "assert rt.scores.energy.energy_score\n"
+        "try: rt.update.nonsense\n"
+        "except AttributeError: pass\n"
+        "else: raise AssertionError"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

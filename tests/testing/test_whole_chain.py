@@ -375,7 +375,7 @@ def test_lengths_tell_padding_from_what_is_missing(data: st.DataObject) -> None:
     assert longer.lengths.tolist() == one.lengths.tolist()
     assert not longer.mask[:, steps:].any()
     assert (longer.commands[:, steps:] == column[:, -1:]).all()
-    with pytest.raises(rt.InputError, match="padding only makes"):
+    with pytest.raises(rt.InputError, match="padding makes them longer"):
         one.padded(steps - 1)
 
 

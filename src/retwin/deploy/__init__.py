@@ -2,3 +2,9 @@
 
 Belongs here: bundles, exports, and simulations of any size into Zarr folders. Not here: fitting.
 """
+
+from __future__ import annotations
+
+from retwin._lazy import submodules
+
+__getattr__ = submodules(__name__)

@@ -3,3 +3,9 @@
 Belongs here: what runs a model and passes its outputs to `scores`. Not here: formulas of scores,
 and the choice of what is compared (see `study`).
 """
+
+from __future__ import annotations
+
+from retwin._lazy import submodules
+
+__getattr__ = submodules(__name__)

@@ -3,3 +3,9 @@
 Belongs here: architectures, the training loop, mixtures and flows. Not here: the
 method, twins, or a robot.
 """
+
+from __future__ import annotations
+
+from retwin._lazy import submodules
+
+__getattr__ = submodules(__name__)
