@@ -89,15 +89,17 @@ class Context:
     def __len__(self) -> int:
         return len(self.commands)
 
-    @cached_property
+    @property
     def path(self) -> Tensor:
         """The uncorrected outputs (n, T, d_y): those of the operators before, else the surrogate's.
 
-        These are for the faulty commands, held where an actuator is frozen. They are computed when
-        they are first needed: an operator on commands does not need them.
+        These are for the faulty commands, held where an actuator is frozen.
         """
-        if self.corrected is not None:
-            return self.corrected
+        return self._uncorrected if self.corrected is None else self.corrected
+
+    @cached_property
+    def _uncorrected(self) -> Tensor:
+        """The surrogate's outputs, computed once and only if an operator on outputs needs them."""
         time = torch.arange(self.faulty_commands.shape[1])[:, None]
         held = self.faulty_commands.gather(1, torch.minimum(time, self.frozen[:, None]))
         if held.equal(self.commands):
