@@ -71,6 +71,7 @@ def write_mat(path: Path, made: rt.Trajectories) -> None:
     savemat(path, {"X_array": cells, "y_array": labels})
 
 
+@pytest.mark.slow
 def test_the_code_of_the_readme_runs(
     case: rt.Case,
     twin_set: rt.Trajectories,

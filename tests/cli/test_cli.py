@@ -13,6 +13,7 @@ from scipy.io import savemat
 import retwin as rt
 
 
+@pytest.mark.slow
 def test_the_steps_one_by_one(call, files: Path, tmp_path: Path) -> None:
     code, out, err = call(
         "fit",

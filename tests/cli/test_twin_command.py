@@ -397,6 +397,7 @@ def test_words_that_are_no_command_are_one_line(
     assert "Usage" in out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_says_how_to_go_on(
     call, start, tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch

@@ -68,7 +68,7 @@ def test_ignores_a_difference_that_only_the_twin_has(
 def test_the_critic_s_accuracy_is_balanced() -> None:
     """One that takes all for real is right about none of a twin's and all of the real ones."""
     features = Features.at(toy(2, seed=0, real=True))
-    pair = _Pair(rt.NetworkDiagnoser(SMALL, features, classes=("a", "b")))
+    pair = _Pair(rt.NetworkDiagnoser(SMALL, features, classes=("a", "b")), hidden=4)
     twin, real = torch.zeros(6, 15, 4), torch.ones(2, 15, 4)
     pair.represent = lambda values: values[:, 0, :1]
     pair.critic = torch.nn.Linear(1, 1)

@@ -171,6 +171,7 @@ def test_hypotheses_have_the_same_optimum(exact, case: rt.Case, value, noise) ->
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("onset", ["known", "open"])
 def test_hypotheses_have_the_same_evidence_and_severity(
     exact, case: rt.Case, value, noise, onset: str

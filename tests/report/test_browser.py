@@ -22,6 +22,7 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 import retwin as rt
 from retwin.report.style import CHROME
 
+pytestmark = pytest.mark.slow
 PATIENCE = 120_000  # ms, for machines that are busy
 # The last one draws in space without a graphics card.
 OPTIONS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]

@@ -88,6 +88,7 @@ def test_figures(study: Study, write: Write) -> None:
     assert all(each.startswith(PNG) for each in made.values())
 
 
+@pytest.mark.slow
 def test_same_results_give_same_bytes(study: Study, write: Write) -> None:
     folder = write(study)
     first = write_report(folder).read_bytes()
@@ -324,6 +325,7 @@ def test_sections_without_data_disappear(
     assert f"#{section}" not in reader.addresses
 
 
+@pytest.mark.slow
 def test_without_arrays_and_stale_figures(study: Study, write: Write) -> None:
     folder = write(study)
     write_report(folder)

@@ -35,6 +35,7 @@ def test_one_run_has_no_welch() -> None:
     }
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=8))
 @settings(max_examples=25, deadline=None)
 def test_holm_is_statsmodels_s(p: list[float]) -> None:

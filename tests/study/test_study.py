@@ -21,6 +21,7 @@ from retwin.study.files import Files, Job, Roles
 from retwin.study.trial import SEES, Trial
 from retwin.study.work import Work
 
+pytestmark = pytest.mark.slow
 PLAN = rt.StudyPlan(runs=2, per_class=10, folds=2, seed=3)
 COMMAND = "study armpi --runs 2 --per-class 10 --folds 2 --seed 3 --processes 2 --out".split()  # noqa: SIM905
 

@@ -16,6 +16,8 @@ from retwin.study import possible_sources
 from retwin.twins.command_side import CommandSide, command_side_parameters
 from retwin.twins.parametric import ParametricTwin
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.slow
 def test_every_source_is_made(

@@ -352,6 +352,7 @@ def test_a_function_that_the_workers_cannot_find_is_refused(
         twin(gone, vectorised=False, workers=2).simulate(trajectories(), seed=0)
 
 
+@pytest.mark.slow
 def test_the_how_to_is_true(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs" / "function.md").read_text("utf-8")
     blocks = re.findall(r"^```python\n(# (\S+\.py)\n.*?)^```", page, re.M | re.S)

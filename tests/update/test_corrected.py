@@ -35,6 +35,7 @@ def test_sources_share_commands_and_faults(
     assert 0 < np.median(discrepancy[:, 150:190]) < 0.02
 
 
+@pytest.mark.slow
 def test_healthy_ones_are_distributed_like_the_robot_s(ibg: rt.Surrogate, case: rt.Case) -> None:
     """Median distance from nominal, in steady parts and in motion, within a factor of two.
 

@@ -10,6 +10,7 @@ import retwin as rt
 from retwin.nets.training import Training
 
 
+@pytest.mark.slow
 def test_default_reaches_a_third_of_a_millimetre(case: rt.Case) -> None:
     """RMSE <= 0.3 mm per axis on held-out trajectories, for the default network and training."""
     twin = rt.generate(case.twin, case, per_class=400, seed=0)

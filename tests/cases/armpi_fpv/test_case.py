@@ -82,6 +82,7 @@ def real_set() -> rt.Trajectories:
     return rt.load(file, case=rt.cases.armpi())
 
 
+@pytest.mark.slow
 @needs_data
 @pytest.mark.real_data
 def test_the_real_robot_is_as_described() -> None:
@@ -104,6 +105,7 @@ def test_the_real_robot_is_as_described() -> None:
     assert 0.001 < size.median() < 0.012
 
 
+@pytest.mark.slow
 @needs_data
 @pytest.mark.real_data
 def test_a_corrected_twin_is_nearer_to_the_real_robot() -> None:

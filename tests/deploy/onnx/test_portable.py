@@ -28,6 +28,7 @@ from retwin.update.corrected import CorrectedTwin
 
 Exported = tuple[Path, dict[str, float]]
 
+pytestmark = pytest.mark.slow
 WITHOUT_TORCH = """
 import sys
 import numpy as np

@@ -29,6 +29,7 @@ def command(model: Path, out: Path, per_class: int, *more: str) -> list[str]:
     return [sys.executable, "-m", "retwin", "generate", *map(str, words)]
 
 
+@pytest.mark.slow
 def test_balanced_and_the_same_with_any_number_of_workers(
     model: Path, updated: rt.CorrectedTwin, case: rt.Case, tmp_path: Path
 ) -> None:
@@ -45,6 +46,7 @@ def test_balanced_and_the_same_with_any_number_of_workers(
     np.testing.assert_array_equal(rt.load(tmp_path / "here.zarr").observed, made.observed)
 
 
+@pytest.mark.slow
 def test_killed_and_given_again(
     model: Path, updated: rt.CorrectedTwin, case: rt.Case, tmp_path: Path
 ) -> None:

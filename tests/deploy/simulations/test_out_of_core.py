@@ -78,7 +78,7 @@ def test_blocks_change_nothing(sets: dict[str, Path], monkeypatch: pytest.Monkey
     made = rt.load(sets["small"]).replace(rate=160.0)[::2]
     found = []
     for block in (2**24, 10**5):
-        monkeypatch.setattr(arrays, "BLOCK", block)
+        monkeypatch.setattr(arrays, "BYTES_PER_BLOCK", block)
         monkeypatch.setattr(surrogate, "MAX_SAMPLES", 5000)
         network = rt.fit_surrogate(made, rt.MLP((4,)), seed=0, training=plant.BRIEF)
         diagnoser = rt.fit_diagnoser(made, seed=0, rate=1.0, training=plant.BRIEF)
@@ -93,7 +93,7 @@ def test_a_network_with_memory_learns_from_a_part(
 ) -> None:
     made = rt.load(sets["small"])
     monkeypatch.setattr(surrogate, "MAX_SEQUENCE_SAMPLES", 3 * plant.STEPS + 1)
-    commands, nominal, there = surrogate._windows(made, np.array([5, 3, 8, 1]), 0)
+    commands, nominal, there = surrogate._sequences(made, np.array([5, 3, 8, 1]), 0)
     np.testing.assert_array_equal(commands, made.commands[[5, 3, 8]])
     np.testing.assert_array_equal(nominal, made.nominal[[5, 3, 8]])
     assert there.shape == (3, plant.STEPS)

@@ -227,6 +227,7 @@ def test_killed_and_resumed(tmp_path: Path, whole: dict[str, Any]) -> None:
     assert result.failed
 
 
+@pytest.mark.slow
 def test_on_a_cluster_with_a_worker_killed(tmp_path: Path, whole: dict[str, Any]) -> None:
     from distributed import LocalCluster
 
@@ -667,6 +668,7 @@ def test_a_mujoco_twin_is_known_by_all_its_files(tmp_path: Path) -> None:
     assert identity_of(ARM, 1) == made[0]
 
 
+@pytest.mark.slow
 def test_identity_is_the_same_in_another_process(tmp_path: Path, network: rt.Surrogate) -> None:
     network.save(tmp_path / "model")
     code = (

@@ -29,6 +29,7 @@ def arrays(made: rt.Trajectories) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.tensor(made.observed), torch.tensor(made.mask)
 
 
+@pytest.mark.slow
 def test_between_readings_a_record_tells_nothing(exact, measured: rt.Trajectories) -> None:
     """The chain finds the samples itself: the same as if their places were given."""
     context = context_of(exact, measured)
@@ -45,6 +46,7 @@ def test_between_readings_a_record_tells_nothing(exact, measured: rt.Trajectorie
     assert sample_mask(ROBOT, observed, mask).equal(sampled)
 
 
+@pytest.mark.slow
 def test_the_sensor_is_fitted_with_z(exact, measured: rt.Trajectories) -> None:
     """Real noise is a unit or so of a joint, tenths of a millimetre; a glitch is much more."""
     context = context_of(exact, measured)
@@ -74,6 +76,7 @@ def test_an_operator_without_a_sensor_is_recorded_as_it_is(
     assert generator.get_state().equal(torch.Generator().manual_seed(0).get_state())
 
 
+@pytest.mark.slow
 def test_the_second_operator_explains_what_the_first_leaves(exact, case: rt.Case) -> None:
     """An error off what the arm can reach: the joints cannot explain it, an offset can."""
     commands = case.sampler.sample(10, rng=np.random.default_rng(5))

@@ -113,6 +113,7 @@ def test_noise_is_drawn_as_it_is_scored() -> None:
     assert np.cov(drawn.T) == pytest.approx(kernel, abs=0.06)
 
 
+@pytest.mark.slow
 def test_student_noise_forgives_outliers() -> None:
     clean = measured(LINE, 0.1, seed=2, count=2, a=A, b=B)
     spoilt = clean.observed.copy()

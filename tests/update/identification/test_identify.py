@@ -103,6 +103,7 @@ def test_profile_is_the_parabola_of_the_linear_model(loss: Loss, exact: float) -
     assert (high - low) / 2 == pytest.approx(half, rel=0.15)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_result_over_processes() -> None:
     observed = measured(LAG, 0.05, seed=7, gain=GAIN, share=SHARE)
     method = LeastSquares(starts=2)
