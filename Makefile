@@ -51,15 +51,18 @@ bench: install
 	for name in generation training fitting command_space bands inversion updating residual \
 		importing twins fmu scale bundle; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 
-# Wheel and source distribution in dist/; the wheel is tried in an empty environment.
+# Wheel and source distribution in dist/. The wheel, with its mandatory dependencies alone, runs the
+# demo in an empty environment; the source distribution, with all extras, passes the fast tests.
 package: install
 	rm -rf dist .package
 	$(BIN)/python -m build --outdir dist
 	$(PYTHON) -m venv .package
 	.package/bin/pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl
-	cd dist && ../.package/bin/retwin doctor && ../.package/bin/retwin twin list
+	cd .package && bin/retwin doctor && env -u RETWIN_DATA bin/retwin demo --out demo
 	.package/bin/pip install --quiet --disable-pip-version-check -c constraints.txt \
-		"$$(echo dist/*.whl)[$(EXTRAS)]"
+		--force-reinstall --no-deps dist/*.tar.gz
+	.package/bin/pip install --quiet --disable-pip-version-check -c constraints.txt \
+		"retwin[$(EXTRAS)]"
 	OMP_NUM_THREADS=1 .package/bin/python -m pytest -n 2 -m "not slow and not long" -p no:cacheprovider
 
 clean:
