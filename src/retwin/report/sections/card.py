@@ -60,13 +60,13 @@ def _scope(study: Study, source: str) -> dict[str, str]:
     facts = {
         "system": results.title or results.case,
         "updated twin": source_name(source),
-        f"{word} data it saw": real_data(results.sources[source].real_data),
+        f"{word} data used": real_data(results.sources[source].real_data),
         "commands": _channels(results.inputs),
         "outputs": _channels(results.outputs),
         "classes": ", ".join(map(class_name, results.classes)),
         "calibrated on": counted(used, f"{word} trajectory") if used else "",
         "tested on": tested or (counted(test.n, "trajectory") if test.n else ""),
-        "a trajectory": _length(study),
+        "trajectory length": _length(study),
     }
     return {term: text for term, text in facts.items() if text}
 
