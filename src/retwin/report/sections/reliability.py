@@ -25,7 +25,7 @@ def reliability(study: Study) -> Section | None:
     keys = [
         Key("diagnoses, in the colour of their source", "ink", "circle"),
         Key("90 % range of perfectly calibrated classifiers", "observed", "bar"),
-        Key("as sure as right", "muted", "dot"),
+        Key("perfect calibration", "muted", "dot"),
     ]
     figure = Figure("reliability", [_panel(study, name) for name in sources], keys)
     errors = [
@@ -43,7 +43,7 @@ def _panel(study: Study, source: str) -> Panel:
     bars = np.stack([found.low, found.high, breaks], axis=1).ravel()
     share: dict[str, Any] = {"limits": (-0.03, 1.05), "kind": "share", "step": 0.2}
     marks: list[Mark] = [
-        Line([0, 1], [0, 1], "as sure as right", "muted", "dot", width=1, hover=False),
+        Line([0, 1], [0, 1], "perfect calibration", "muted", "dot", width=1, hover=False),
         Line(
             np.repeat(found.confidence, 3),
             bars,
