@@ -31,13 +31,13 @@ COLOURS = {"CommandSpace": BLUE, "DelayOffset": ORANGE, "Additive": GREEN}
 STYLES = {"CommandSpace": "-", "DelayOffset": "--", "Additive": ":"}
 MM, RATE = 1000.0, KINEMATIC.rate
 COUNT, DRAWS = 40, 150
-SURE = 2.146
-"""Radius, in standard deviations, of the ellipse that holds nine in ten draws of a plane."""
+RADIUS_90 = 2.146
+"""Radius, in standard deviations, of the ellipse that contains 90 % of a bivariate normal."""
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """The emulated robot and a surrogate of its twin; what it did, and why, while healthy."""
+    """The emulated robot, a surrogate of its twin, and healthy trajectories with hidden states."""
 
     case: rt.Case
     surrogate: rt.Surrogate
@@ -48,7 +48,7 @@ class Robot:
 
     @classmethod
     def emulated(cls) -> Robot:
-        """The same one every time."""
+        """The robot of all figures, from fixed seeds."""
         case = rt.cases.armpi()
         twin = rt.generate(case.twin, case, per_class=40, seed=1)
         surrogate = rt.fit_surrogate(
@@ -62,8 +62,8 @@ class Robot:
         return cls(case, surrogate, operators, made, hidden, segments)
 
     @property
-    def reached(self) -> NDArray:
-        """How far off its target every actuator stopped, (n, M, 4) in degrees."""
+    def errors(self) -> NDArray:
+        """The steady-state error of every actuator, (n, M, 4) in degrees."""
         each = np.arange(COUNT)[:, None]
         last = np.ceil(self.segments.stop).astype(int) - 1
         settled = np.ceil(self.segments.settle).astype(int).clip(max=self.made.steps - 1)
@@ -71,16 +71,16 @@ class Robot:
 
 
 def main() -> None:
-    """Draw them all."""
+    """Draw all figures."""
     robot = Robot.emulated()
     found = {
         name: rt.infer_discrepancy(robot.surrogate, robot.made, operator)
         for name, operator in robot.operators.items()
     }
-    paths = {name: explained(robot.operators[name], *each) for name, each in found.items()}
-    said = found["DelayOffset"][0].path.numpy()
+    paths = {name: best_fit(robot.operators[name], *each) for name, each in found.items()}
+    predicted = found["DelayOffset"][0].path.numpy()
     healthy = found["CommandSpace"][1]
-    save("corrections-movements", movements(robot, said, paths), EMULATED)
+    save("corrections-movements", movements(robot, predicted, paths), EMULATED)
     save("corrections-unidentified", unidentified(robot, healthy), EMULATED)
     save("corrections-generated", generated(robot), EMULATED)
     save("corrections-severity", severity(robot, healthy), EMULATED)
@@ -89,37 +89,39 @@ def main() -> None:
 
 
 @torch.no_grad()
-def explained(operator: rt.Correction, context: rt.Context, found: rt.Discrepancy) -> NDArray:
-    """The best that an operator can do, (n, T, d_y)."""
+def best_fit(operator: rt.Correction, context: rt.Context, found: rt.Discrepancy) -> NDArray:
+    """The best fit of an operator, (n, T, d_y)."""
     return operator.apply(context, found.z.to(context.path.dtype)).numpy()
 
 
-def movements(robot: Robot, said: NDArray, paths: Mapping[str, NDArray]) -> Figure:
-    """A movement that is late and off, and one that an actuator missed, by both operators."""
+def movements(robot: Robot, predicted: NDArray, paths: Mapping[str, NDArray]) -> Figure:
+    """A segment with a delay and an offset, and one that an actuator missed, by both operators."""
     figure = blank(7.2, 5.4)
     grid = figure.subplots(2, 2, sharey="row", sharex="row")
-    names = ("late, and off its target", "a motor misses it")
-    for row, (what, (i, m)) in enumerate(zip(names, examples(robot, said), strict=True)):
+    names = ("delay and offset", "missed by one motor")
+    for row, (what, (i, m)) in enumerate(zip(names, examples(robot, predicted), strict=True)):
         start = robot.segments.start[i]
         last = m + 1 + row
         end = int(start[last]) - 5 if last < len(start) else robot.made.steps
         window = np.arange(int(start[m]) - 15, end)
         time, read = (window - start[m]) / RATE, window % POLL == 0
         observed = robot.made.observed[i, window]
-        output = int(np.ptp(observed - said[i, window], axis=0).argmax())
+        output = int(np.ptp(observed - predicted[i, window], axis=0).argmax())
         for axes, (name, path) in zip(grid[row], paths.items(), strict=True):
-            twin, told, best = (
-                MM * each[:, output] for each in (said[i, window], observed, path[i, window])
+            twin, measured, best = (
+                MM * each[:, output] for each in (predicted[i, window], observed, path[i, window])
             )
-            axes.plot(time, twin, "--", color=MUTED, label="the twin")
-            axes.plot(time[read], told[read], "o", color=INK, markersize=3.2, label="readings")
-            best_name = f"the best of {name}"
+            axes.plot(time, twin, "--", color=MUTED, label="twin")
+            axes.plot(
+                time[read], measured[read], "o", color=INK, markersize=3.2, label="sensor samples"
+            )
+            best_name = f"best fit of {name}"
             axes.plot(time, best, color=COLOURS[name], linewidth=2.4, label=best_name, zorder=1.9)
             title(axes, f"{name}: {what}")
             dress(axes, "time since the command, s", f"{'xyz'[output]}, mm")
-            left = np.linalg.norm(observed - path[i, window], axis=-1)[read]
-            off = MM * np.sqrt(np.square(left).mean())
-            note(axes, f"left over: {off:.1f} mm RMS", low=True, left=True)
+            residual = np.linalg.norm(observed - path[i, window], axis=-1)[read]
+            rms = MM * np.sqrt(np.square(residual).mean())
+            note(axes, f"residual: {rms:.1f} mm RMS", low=True, left=True)
             axes.margins(y=0.2)
     handles, labels = grid[0, 0].get_legend_handles_labels()
     other = grid[0, 1].get_legend_handles_labels()
@@ -135,49 +137,49 @@ def movements(robot: Robot, said: NDArray, paths: Mapping[str, NDArray]) -> Figu
     return figure
 
 
-def examples(robot: Robot, said: NDArray) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Trajectory and movement: one that is clearly off, and the gravest that was missed."""
+def examples(robot: Robot, predicted: NDArray) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Trajectory and segment: one with a large error, and the missed one with the largest error."""
     missed = robot.hidden["missed"]
     each = np.arange(COUNT)[:, None]
     settled = np.ceil(robot.segments.settle).astype(int).clip(max=robot.made.steps - 30) + 25
-    gap = np.linalg.norm(robot.made.observed - said, axis=-1)[each, settled]
-    inner = np.zeros(gap.shape, dtype=bool)
+    error = np.linalg.norm(robot.made.observed - predicted, axis=-1)[each, settled]
+    inner = np.zeros(error.shape, dtype=bool)
     inner[:, 1:-2] = True
-    usual = inner & ~(missed.any(axis=-1).cumsum(axis=1) > 0)
-    order = np.argsort(np.where(usual, gap, np.inf), axis=None)[: usual.sum()]
-    off = np.unravel_index(order[int(0.9 * len(order))], gap.shape)
+    regular = inner & ~(missed.any(axis=-1).cumsum(axis=1) > 0)
+    order = np.argsort(np.where(regular, error, np.inf), axis=None)[: regular.sum()]
+    large = np.unravel_index(order[int(0.9 * len(order))], error.shape)
     worst = np.unravel_index(
-        np.where(inner & (missed.sum(axis=-1) == 1), gap, 0).argmax(), gap.shape
+        np.where(inner & (missed.sum(axis=-1) == 1), error, 0).argmax(), error.shape
     )
-    return (int(off[0]), int(off[1])), (int(worst[0]), int(worst[1]))
+    return (int(large[0]), int(large[1])), (int(worst[0]), int(worst[1]))
 
 
 def unidentified(robot: Robot, found: rt.Discrepancy) -> Figure:
-    """What three outputs tell of four joints: ellipses before and after they were seen."""
+    """Which offsets of four joints three outputs identify: ellipses of prior and posterior."""
     z, covariance = found.z.numpy(), found.covariance.numpy()
     seen = ~robot.hidden["missed"].any(axis=-1) & ~(z[..., 5:] > 0.5).any(axis=-1)
-    # A movement like most: of all, the motors 3 and 4 of half of them are told apart better.
+    # The segment with the median correlation of the offsets of motors 3 and 4.
     inner = covariance[..., 1:5, 1:5]
     spread = np.sqrt(np.diagonal(inner, axis1=-2, axis2=-1))
-    alike = np.abs(inner[..., 2, 3] / spread[..., 2] / spread[..., 3])
-    order = np.argsort(np.where(seen, alike, np.inf), axis=None)[: seen.sum()]
-    i, m = np.unravel_index(order[len(order) // 2], alike.shape)
+    correlation = np.abs(inner[..., 2, 3] / spread[..., 2] / spread[..., 3])
+    order = np.argsort(np.where(seen, correlation, np.inf), axis=None)[: seen.sum()]
+    i, m = np.unravel_index(order[len(order) // 2], correlation.shape)
     before = np.diag((np.square(z[..., 1:5]) + np.square(spread))[seen].mean(axis=0))
     figure = blank(7.2, 3.7)
-    pairs = {"1 and 2: told": (0, 1), "3 and 4: told together, not apart": (3, 2)}
+    pairs = {"1 and 2: both identified": (0, 1), "3 and 4: only their sum": (3, 2)}
     for axes, (what, (a, b)) in zip(figure.subplots(1, 2), pairs.items(), strict=True):
         pair = np.ix_((a, b), (a, b))
-        ellipse(axes, (0, 0), before[pair], color=MUTED, name="before: 90 % of all movements")
+        ellipse(axes, (0, 0), before[pair], color=MUTED, name="prior: 90 % of all segments")
         centre = UNIT * z[i, m, 1:5][[a, b]]
-        name = "after: 90 %, from three outputs"
+        name = "posterior: 90 %, from three outputs"
         ellipse(axes, centre, inner[i, m][pair], color=COLOURS["CommandSpace"], name=name)
         axes.plot(
-            *robot.reached[i, m][[a, b]],
+            *robot.errors[i, m][[a, b]],
             "x",
             color=INK,
             markersize=8,
             markeredgewidth=2,
-            label="the truth",
+            label="true offsets",
         )
         axes.set_aspect("equal")
         axes.set_xlim(-3.1, 3.1)
@@ -192,17 +194,17 @@ def unidentified(robot: Robot, found: rt.Discrepancy) -> Figure:
 def ellipse(
     axes: Axes, centre: tuple[float, float] | NDArray, covariance: NDArray, *, color: str, name: str
 ) -> None:
-    """The ellipse that holds nine in ten draws; the covariance is in command units."""
+    """The ellipse that contains 90 % of samples; the covariance is in command units."""
     values, vectors = np.linalg.eigh(covariance)
-    width, height = 2 * SURE * UNIT * np.sqrt(values)
-    turn = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
+    width, height = 2 * RADIUS_90 * UNIT * np.sqrt(values)
+    angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
     for alpha, edge in ((0.15, 0.0), (1.0, 2.0)):
         axes.add_patch(
             Ellipse(
                 (float(centre[0]), float(centre[1])),
                 width,
                 height,
-                angle=turn,
+                angle=angle,
                 facecolor=color if edge == 0 else "none",
                 edgecolor=color,
                 linewidth=edge,
@@ -213,7 +215,7 @@ def ellipse(
 
 
 def generated(robot: Robot) -> Figure:
-    """Draws of the corrected twin: a stuck motor, and the reach of the arm."""
+    """Samples of the corrected twin: a stuck motor, and the workspace of the arm."""
     figure = blank(7.2, 5.4)
     grid = figure.subplots(2, 2, sharex="row", sharey="row")
     operators = {"DelayOffset": rt.DelayOffset(), "CommandSpace": rt.CommandSpace()}
@@ -229,15 +231,15 @@ def generated(robot: Robot) -> Figure:
         )
         column[0].margins(y=0.15)
         title(column[0], f"{name}: motor 1 is stuck")
-        dress(column[0], "time, s", "tip beside the plane of\nthe stuck arm, mm")
-        note(column[0], f"{MM * np.sqrt(np.square(still).mean()):.1f} mm RMS in 12 draws")
+        dress(column[0], "time, s", "distance of the tip from the\nplane of the stuck arm, mm")
+        note(column[0], f"{MM * np.sqrt(np.square(still).mean()):.1f} mm RMS in 12 samples")
         free = updated.simulate(commands, seed=4)
         tips = MM * free.observed[:, 180::200].reshape(-1, 3)
         across, up = np.hypot(tips[:, 0], tips[:, 1]), tips[:, 2] - MM * ARM.base
         beyond = np.hypot(across, up) - MM * sum(ARM.links)
-        reach(column[1], across, up, out=beyond > 2.0, color=COLOURS[name])
-        title(column[1], f"{name}: where the tip rests")
-        note(column[1], f"{np.mean(beyond > 2.0):.1%} out of reach", low=True, left=True)
+        workspace(column[1], across, up, out=beyond > 2.0, color=COLOURS[name])
+        title(column[1], f"{name}: tip at rest")
+        note(column[1], f"{np.mean(beyond > 2.0):.1%} outside the workspace", low=True, left=True)
     return figure
 
 
@@ -248,13 +250,13 @@ def out_of_plane(path: NDArray) -> NDArray:
     return np.einsum("nta,na->nt", flat, vectors[:, :, 0])
 
 
-def reach(axes: Axes, across: NDArray, up: NDArray, *, out: NDArray, color: str) -> None:
-    """Resting points seen from the side, and the circle that the arm cannot leave."""
+def workspace(axes: Axes, across: NDArray, up: NDArray, *, out: NDArray, color: str) -> None:
+    """Tips at rest in the vertical plane, and the circle that limits the workspace."""
     angle = np.linspace(0, np.pi / 2, 100)
     length = MM * sum(ARM.links)
     axes.plot(length * np.sin(angle), length * np.cos(angle), color=INK, linewidth=1.2)
     axes.annotate(
-        "reach of the arm",
+        "workspace limit",
         (length * 0.62, length * 0.785),
         (165, 245),
         color=INK,
@@ -270,7 +272,7 @@ def reach(axes: Axes, across: NDArray, up: NDArray, *, out: NDArray, color: str)
 
 
 def severity(robot: Robot, healthy: rt.Discrepancy) -> Figure:
-    """A motor with a bias, its label told: how severe it is; and what is left for the RG."""
+    """The severity of a labelled bias, and the offsets that remain for the RG."""
     rng = np.random.default_rng(21)
     motors = np.repeat(np.arange(4), 8)
     shape = (len(motors), robot.segments.max_count)
@@ -279,26 +281,36 @@ def severity(robot: Robot, healthy: rt.Discrepancy) -> Figure:
     faults = [rt.ActuatorBias(j, bias=tuple(b)) for j, b in zip(motors, bias, strict=True)]
     made = robot.case.emulator.simulate(commands, faults=faults, seed=6)
     operator = robot.operators["CommandSpace"]
-    # Which motor is told, and not how far off it is: one unit stands for any bias.
+    # The label names the motor but not its bias: one unit stands for any bias.
     labels = [rt.ActuatorBias(j, bias=(1.0,) * shape[1]) for j in motors]
-    _, told = rt.infer_discrepancy(robot.surrogate, made, operator, faults=labels)
-    _, untold = rt.infer_discrepancy(robot.surrogate, made, operator)
+    _, labelled = rt.infer_discrepancy(robot.surrogate, made, operator, faults=labels)
+    _, unlabelled = rt.infer_discrepancy(robot.surrogate, made, operator)
     own = np.broadcast_to(np.eye(4, dtype=bool)[motors][:, None], (*shape, 4))
     figure = blank(7.2, 3.7)
     left, right = figure.subplots(1, 2)
-    assert told.severity is not None
-    found = UNIT * (1.0 + told.severity.numpy()[own])
-    put = UNIT * bias.ravel()
+    assert labelled.severity is not None
+    found = UNIT * (1.0 + labelled.severity.numpy()[own])
+    true = UNIT * bias.ravel()
     left.plot([-13, 13], [-13, 13], color=RULE, linewidth=1)
-    left.plot(put, found, "o", color=COLOURS["CommandSpace"], markersize=3.5, alpha=0.7)
-    dress(left, "bias put in, degrees", "bias found, degrees")
-    title(left, "How severe the fault is")
-    note(left, f"{np.abs(found - put).mean():.2f}° off in mean", low=True)
+    left.plot(true, found, "o", color=COLOURS["CommandSpace"], markersize=3.5, alpha=0.7)
+    dress(left, "true bias, degrees", "estimated bias, degrees")
+    title(left, "Severity of the fault")
+    note(left, f"mean error {np.abs(found - true).mean():.2f}°", low=True)
     edges = np.linspace(-12, 12, 49)
     for name, discrepancy, kept, style in (
         ("healthy", healthy, None, {"color": INK, "linestyle": "-"}),
-        ("biased, told", told, ~own, {"color": COLOURS["CommandSpace"], "linestyle": "--"}),
-        ("biased, not told", untold, None, {"color": COLOURS["DelayOffset"], "linestyle": "-."}),
+        (
+            "biased, labelled",
+            labelled,
+            ~own,
+            {"color": COLOURS["CommandSpace"], "linestyle": "--"},
+        ),
+        (
+            "biased, no label",
+            unlabelled,
+            None,
+            {"color": COLOURS["DelayOffset"], "linestyle": "-."},
+        ),
     ):
         offsets = UNIT * discrepancy.z[..., 1:5].numpy()
         offsets = offsets[kept] if kept is not None else offsets.ravel()
@@ -306,17 +318,17 @@ def severity(robot: Robot, healthy: rt.Discrepancy) -> Figure:
         right.stairs(share / len(offsets), edges, label=name, linewidth=1.8, **style)
     right.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
     right.legend(frameon=False, fontsize=9, loc="upper left", handlelength=1.4, borderaxespad=0.2)
-    dress(right, "offset taken for discrepancy, degrees", "share of offsets")
-    title(right, "What is left for the residual model")
+    dress(right, "offset attributed to discrepancy, degrees", "share of offsets")
+    title(right, "Offsets for the residual model")
     return figure
 
 
 def polled(robot: Robot, path: NDArray) -> Figure:
-    """What the sensor makes of a movement, and of rest; `path` explains what was measured."""
+    """Records of the sensor in motion and at rest; `path` is the best fit to what was measured."""
     observed, mask = torch.tensor(robot.made.observed), torch.tensor(robot.made.mask)
-    told = torch.tensor(path)
-    sensor = rt.SampledSensor().fitted(observed, mask, told, robot.segments)
-    drawn = sensor.read(told, torch.Generator().manual_seed(2)).numpy()
+    predicted = torch.tensor(path)
+    sensor = rt.SampledSensor().fitted(observed, mask, predicted, robot.segments)
+    drawn = sensor.read(predicted, torch.Generator().manual_seed(2)).numpy()
     true = KINEMATIC.position(robot.hidden["angles"])
     figure = blank(7.2, 3.7)
     left, right = figure.subplots(1, 2)
@@ -324,24 +336,24 @@ def polled(robot: Robot, path: NDArray) -> Figure:
     begin = int(robot.segments.start[i, m])
     window = np.arange(begin - 20, begin + 60)
     time, read = (window - begin) / RATE, list(np.flatnonzero(window % POLL == 0))
-    left.plot(time, MM * true[i, window, output], color=RULE, linewidth=5, label="the arm itself")
+    left.plot(time, MM * true[i, window, output], color=RULE, linewidth=5, label="true position")
     seen = MM * robot.made.observed[i, window, output]
-    left.plot(time, seen, "o-", color=INK, label="its record", markevery=read, markersize=4)
+    left.plot(time, seen, "o-", color=INK, label="record", markevery=read, markersize=4)
     left.legend(frameon=False, fontsize=9)
     dress(left, "time since the command, s", "x, mm")
-    title(left, "In motion: readings, and straight lines")
+    title(left, "In motion: interpolated samples")
     window = np.arange(begin + 110, begin + 195)
     time, read = (window - begin) / RATE, list(np.flatnonzero(window % POLL == 0))
     for name, paths, style in (
         ("measured", robot.made.observed, {"color": INK, "marker": "o"}),
         ("CommandSpace alone", path, {"color": COLOURS["CommandSpace"], "linestyle": "--"}),
-        ("with SampledSensor, a draw", drawn, {"color": PINK, "marker": "s"}),
+        ("with SampledSensor, a sample", drawn, {"color": PINK, "marker": "s"}),
     ):
         values = MM * (paths[i, window, output] - np.median(paths[i, window, output]))
         right.plot(time, values, label=name, markevery=read, markersize=4, **style)
     right.legend(frameon=False, fontsize=9)
     dress(right, "time since the command, s", "x about its median, mm")
-    title(right, "At rest: errors of readings")
+    title(right, "At rest: measurement errors")
     return figure
 
 
@@ -360,19 +372,19 @@ class Identity:
 
 
 def additive() -> Figure:
-    """A twin that does not ring, and a system that does, by three operators."""
+    """An oscillating system and a twin that does not oscillate, by three operators."""
     ramp = np.array([1.0, -0.6, 0.8])[:, None] * np.clip((np.arange(500) - 50) / 60, 0, 1)
     time = np.arange(500) / RATE
-    ringing = signal.TransferFunction([80.0], [1.0, 2.5, 80.0])
+    oscillator = signal.TransferFunction([80.0], [1.0, 2.5, 80.0])
     noise = np.random.default_rng(0).normal(0, 0.003, (3, 500))
-    true = np.stack([signal.lsim(ringing, each, time)[1] for each in ramp]) + noise
+    true = np.stack([signal.lsim(oscillator, each, time)[1] for each in ramp]) + noise
     commands = ramp[..., None].astype(np.float32)
     segments = rt.Segments.from_commands(commands)
     context = rt.Context.of(Identity(), commands, segments, rate=RATE)
     observed = torch.tensor(true[..., None], dtype=torch.float32)
     figure = blank(7.2, 3.7)
     left, right = figure.subplots(1, 2)
-    left.plot(time, ramp[0], "--", color=MUTED, label="the twin")
+    left.plot(time, ramp[0], "--", color=MUTED, label="twin")
     left.plot(time, true[0], color=INK, linewidth=3.5, alpha=0.35, label="measured")
     for name, operator in (
         ("CommandSpace", rt.CommandSpace()),
@@ -380,17 +392,17 @@ def additive() -> Figure:
         ("Additive", rt.Additive()),
     ):
         z = operator.infer(context, observed, torch.ones_like(observed, dtype=torch.bool)).z
-        said = operator.apply(context, z.float())[0, :, 0].numpy()
+        predicted = operator.apply(context, z.float())[0, :, 0].numpy()
         style = {"color": COLOURS[name], "linestyle": STYLES[name], "linewidth": 1.6}
-        left.plot(time, said, label=f"the best of {name}", **style)
-        right.plot(time, true[0] - said, **style)
+        left.plot(time, predicted, label=f"best fit of {name}", **style)
+        right.plot(time, true[0] - predicted, **style)
     for axes in (left, right):
         axes.set_xlim(0.2, 4.2)
     left.legend(frameon=False, fontsize=9, loc="lower right")
     dress(left, "time, s", "output")
-    dress(right, "time, s", "measured minus the best")
-    title(left, "A system that rings, and its twin")
-    title(right, "What is left over")
+    dress(right, "time, s", "measured minus best fit")
+    title(left, "An oscillating system and its twin")
+    title(right, "Residual")
     return figure
 
 

@@ -195,7 +195,7 @@ def test_a_rate_of_ones_own(desk: Opened) -> None:
     page.fill("#calculate-faulty", "10")
     assert "300" in page.inner_text("#calculate-result")
     page.fill("#calculate-rate", "20")
-    assert "it takes 4 of them at least" in page.inner_text("#calculate-best")
+    assert "it requires at least 4 of them" in page.inner_text("#calculate-best")
     page.fill("#calculate-missed", "0")
     assert "never to raise an alarm (cost 0)" in page.inner_text("#calculate-best")
 

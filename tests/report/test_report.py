@@ -132,7 +132,7 @@ def test_many_sources_are_summarised(study: Study, write: Write) -> None:
     text = read(write(study)).text
     assert "IBG + RG, command space minus Domain-adversarial" in text
     assert "Fault inversion minus Domain-adversarial" not in text
-    assert "Who is better than whom in macro-F1" in text
+    assert "Pairwise differences in macro-F1" in text
     assert text.count("On 90 test trajectories, training on IBG + RG, command space") == 1
 
 
@@ -205,9 +205,9 @@ def test_the_model_card_knows_what_went_wrong(study: Study, write: Write) -> Non
         "2 s at 10 Hz",
         "10 Healthy",
         "10 real trajectories",
-        "Healthy taken for M1 stuck real_a/003",
+        "Healthy diagnosed as M1 stuck real_a/003",
         "M4 bias recognised in 40%",
-        "Noise x is not generated as it was observed KS distance 0.98, p 0.05",
+        "Noise x: generated and observed distributions differ KS distance 0.98, p 0.05",
         "one chain did not mix",
         "which would not be known in the field",
     ):
@@ -216,7 +216,7 @@ def test_the_model_card_knows_what_went_wrong(study: Study, write: Write) -> Non
     for name in [each for each in arrays if each.startswith("portrait/")]:
         del arrays[name]
     reader = read(write(study))
-    assert "Healthy taken for M1 stuck real_a/003" in reader.text
+    assert "Healthy diagnosed as M1 stuck real_a/003" in reader.text
     assert "#trajectory=real_a%2F003" not in reader.addresses
 
 
@@ -232,7 +232,7 @@ def test_verdict_follows_the_interval_and_not_the_sign(study: Study, write: Writ
     for each in study[0]["comparisons"]:
         each["bootstrap_ci95"] = [-0.01, each["mean_diff"] + 0.1]
     text = read(write(study)).text
-    assert "cannot be told apart" in text
+    assert "cannot be distinguished from" in text
     assert "it is not shown that the residual model itself helps" in text
     assert "is better than" not in text
     assert "undecided" in text
@@ -263,7 +263,7 @@ def test_emulated(study: Study, write: Write) -> None:
     text = read(write(study)).text
     assert "EMULATED data: no real measurements" in text
     assert text.count("Emulated data, no real measurements.") >= len(FIGURES)
-    assert "says nothing about the real one" in text
+    assert "no conclusion about the real one is possible" in text
 
 
 def test_no_paper_columns_without_a_paper(study: Study, write: Write) -> None:

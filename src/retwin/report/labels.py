@@ -114,7 +114,7 @@ def counted(count: int, what: str) -> str:
 
 def real_data(text: str | None) -> str:
     """The real data that a source learns from."""
-    return "not said" if text is None else REAL_DATA.get(text, text)
+    return "not stated" if text is None else REAL_DATA.get(text, text)
 
 
 def number(value: float | None, digits: int = 3) -> str:

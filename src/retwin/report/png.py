@@ -236,7 +236,7 @@ def _matrices(shown: Matrices) -> Canvas:
         axes.set_title(matrix.title, fontsize=11, color=hexadecimal("ink"), loc="left")
         axes.set_xticks(ticks, shown.classes, rotation=90)
         axes.set_yticks(ticks, shown.classes if first else [])
-        dress(axes, "answer", "true class" if first else "")
+        dress(axes, "diagnosis", "true class" if first else "")
         axes.grid(visible=False)
         axes.tick_params(length=0, labelsize=8)
     return canvas

@@ -53,8 +53,8 @@ def write_results(
     test = real[sorted(work.roles.tested)]
     found = answers(work)
     drawn = {name: found.drawn(name) for name in work.plan.sources}
-    judged = {name: _judged(work, name) for name in work.plan.sources}
-    fidelity = {name: each for name, each in judged.items() if each is not None}
+    scored = {name: _fidelity_of(work, name) for name in work.plan.sources}
+    fidelity = {name: each for name, each in scored.items() if each is not None}
     sources = {name: _source(work, found, name, drawn[name]) for name in work.plan.sources}
     arrays = found.arrays()
     for name, each in fidelity.items():
@@ -185,9 +185,9 @@ def _learning_curve(work: Work, found: Answers) -> list[CurvePoint]:
             values, drawn = found.scores(source, healthy), found.drawn(source, healthy)
             scores: dict[str, Any] = {metric: values[metric] for metric in found.curved}
             intervals = {metric: _interval(drawn[metric]) for metric in found.curved}
-            judged = _judged(work, source, healthy)
-            if judged is not None:
-                covered = judged.figures["coverage90"]
+            fidelity = _fidelity_of(work, source, healthy)
+            if fidelity is not None:
+                covered = fidelity.figures["coverage90"]
                 scores["coverage90"], intervals["coverage90"] = covered.value, covered.interval
             count = healthy or work.healthy
             points.append(
@@ -260,7 +260,7 @@ def _surrogate(work: Work) -> dict[str, Any]:
     }
 
 
-def _judged(work: Work, source: str, healthy: int = 0) -> Fidelity | None:
+def _fidelity_of(work: Work, source: str, healthy: int = 0) -> Fidelity | None:
     """The fidelity of a source over all folds; None if no healthy trajectory is held out."""
     labels = work.files.real_data().labels
     parts = [

@@ -60,13 +60,13 @@ def _scope(study: Study, source: str) -> dict[str, str]:
     facts = {
         "system": results.title or results.case,
         "updated twin": source_name(source),
-        f"{word} data it saw": real_data(results.sources[source].real_data),
+        f"{word} data used": real_data(results.sources[source].real_data),
         "commands": _channels(results.inputs),
         "outputs": _channels(results.outputs),
         "classes": ", ".join(map(class_name, results.classes)),
         "calibrated on": counted(used, f"{word} trajectory") if used else "",
         "tested on": tested or (counted(test.n, "trajectory") if test.n else ""),
-        "a trajectory": _length(study),
+        "trajectory length": _length(study),
     }
     return {term: text for term, text in facts.items() if text}
 
@@ -94,16 +94,16 @@ def _confused(study: Study, source: str) -> list[tuple[str, str, Cell]]:
     """
     if source not in study.diagnosing:
         return []
-    answers = study.probabilities(source).mean(axis=0).argmax(axis=1).tolist()
+    diagnoses = study.probabilities(source).mean(axis=0).argmax(axis=1).tolist()
     wrong: dict[tuple[int, int], list[str]] = {}
     ids = study.results.data.test.ids
-    for name, true, answer in zip(ids, study.truth.tolist(), answers, strict=False):
-        if true != answer:
-            wrong.setdefault((true, answer), []).append(name)
+    for name, true, diagnosis in zip(ids, study.truth.tolist(), diagnoses, strict=False):
+        if true != diagnosis:
+            wrong.setdefault((true, diagnosis), []).append(name)
     names = [class_name(name) for name in study.results.classes]
     return [
-        (names[true], names[answer], _trajectories(study, found))
-        for (true, answer), found in sorted(wrong.items())
+        (names[true], names[diagnosis], _trajectories(study, found))
+        for (true, diagnosis), found in sorted(wrong.items())
     ]
 
 

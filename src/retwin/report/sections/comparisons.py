@@ -59,14 +59,14 @@ def _matrix(study: Study, found: Sequence[Comparison], metric: str) -> Table:
         name = Cell(f"{place + 1}. {source_name(source)}", source=source)
         rows.append([name, *(cells.get(other, Cell("")) for other in study.sources)])
     others = [Column(str(place + 1), group="minus") for place in range(len(study.sources))]
-    title = f"Who is better than whom in {in_sentence(metric_name(metric))}"
+    title = f"Pairwise differences in {in_sentence(metric_name(metric))}"
     return Table(title, [Column("Source", numeric=False), *others], rows)
 
 
 def _pairs(found: Sequence[Comparison]) -> Table:
     columns = [
         Column("Score", numeric=False),
-        Column("Reading", numeric=False),
+        Column("Outcome", numeric=False),
         Column("Difference"),
         Column("95 % interval"),
         Column("", numeric=False),

@@ -50,17 +50,17 @@ def _decide(study: Study, source: str, rate: float) -> Decision:
 def _table(found: list[Decision]) -> Table:
     group = f"Of {TRAJECTORIES}, {FAULTY:.0%} faulty"
     columns = [
-        Column("False alarms asked for", numeric=False),
-        Column("Alarm above"),
+        Column("Requested false-alarm rate", numeric=False),
+        Column("Alarm threshold"),
         Column("Faults detected"),
-        Column("of these named rightly"),
-        Column("Missed most", numeric=False),
-        Column("Confused most", numeric=False),
+        Column("of these, correct class"),
+        Column("Most often missed", numeric=False),
+        Column("Most often confused", numeric=False),
         Column("false alarms", group=group),
         Column("missed faults", group=group),
         Column(f"cost, 1 : {MISSED}", group=group),
     ]
-    return Table("What a rate of false alarms costs", columns, [_row(each) for each in found])
+    return Table("Cost of a false-alarm rate", columns, [_row(each) for each in found])
 
 
 def _row(each: Decision) -> list[Cell]:
@@ -74,7 +74,7 @@ def _row(each: Decision) -> list[Cell]:
         Cell(number(each.detected, 2), f"[{span(each.interval, 2)}]"),
         Cell(number(each.identified, 2)),
         Cell(class_name(each.most_missed) or "none"),
-        Cell(" for ".join(map(class_name, each.most_confused)) or "none"),
+        Cell(" as ".join(map(class_name, each.most_confused)) or "none"),
         Cell(number(cost.false_alarms, 0)),
         Cell(number(cost.missed_faults, 1)),
         Cell(number(cost.total, 0)),

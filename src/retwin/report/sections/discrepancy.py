@@ -159,5 +159,5 @@ def _agreement(study: Study, source: str) -> Table | None:
         ]
         for name, distance in fidelity.agreement.items()
     ]
-    heads = columns("Per movement", "KS distance", "p", "in the 90 % range")
-    return Table(titled(study, source, "Agreement per movement"), heads, rows) if rows else None
+    heads = columns("Per segment", "KS distance", "p", "in the 90 % range")
+    return Table(titled(study, source, "Agreement per segment"), heads, rows) if rows else None

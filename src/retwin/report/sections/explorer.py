@@ -28,7 +28,7 @@ def explorer(study: Study) -> Section | None:
     overlay = study.results.overlay
     if overlay is None or not study.explorable:
         return None
-    healthy = f"90 % and 50 % of what a healthy twin would do: {source_name(overlay.source)}"
+    healthy = f"90 % and 50 % bands of the healthy twin: {source_name(overlay.source)}"
     keys = [
         Key("measured", "ink"),
         Key("nominal", "muted", "dot"),

@@ -42,7 +42,7 @@ SHARES = {
 def fidelity(study: Study) -> Section | None:
     """Scores of the draws beside those of simpler generators, and their calibration."""
     known = {name: study.results.fidelity[name] for name in order(study.results.fidelity)}
-    judged = [name for name, each in known.items() if each.figures]
+    scored = [name for name, each in known.items() if each.figures]
     figures = {name: _figures(study, name) for name in known}
     details: list[dict[str, Any]] = [
         {
@@ -53,13 +53,13 @@ def fidelity(study: Study) -> Section | None:
             "figures": figures[name],
         }
         for name in detailed(study)
-        if name in judged
+        if name in scored
     ]
-    if not details and len(judged) < 2:
+    if not details and len(scored) < 2:
         return None
     values: dict[str, Any] = {
-        "overview": _overview(study, judged) if len(judged) > 1 else None,
-        "partial": set(judged) > set(detailed(study)),
+        "overview": _overview(study, scored) if len(scored) > 1 else None,
+        "partial": set(scored) > set(detailed(study)),
         "details": details,
         "several": len(known) > 1,
         "fewest": min(each.trajectories or 0 for each in known.values()),
@@ -94,7 +94,7 @@ def _overview(study: Study, sources: list[str]) -> Table:
         ]
         for name, figures in known.items()
     ]
-    return Table("How real, source by source", heads, rows)
+    return Table("Fidelity of all sources", heads, rows)
 
 
 def _scores(study: Study, source: str) -> Table:
@@ -103,7 +103,7 @@ def _scores(study: Study, source: str) -> Table:
     heads = columns("Score", source_name(source))
     for rival in each.rivals:
         name = RIVALS.get(rival, rival)
-        heads += [Column("score", group=name), Column("ours below by, %", group=name)]
+        heads += [Column("score", group=name), Column("this twin lower by, %", group=name)]
     rows = []
     for key, title, factor, unit in _lengths(each, "CRPS, mean over outputs"):
         kind, *output = key.split("/", 1)
@@ -119,7 +119,7 @@ def _scores(study: Study, source: str) -> Table:
 def _calibration(study: Study, source: str) -> Table:
     each = study.results.fidelity[source]
     widened = f"90 % band, widened × {number(each.widening, 2)}"
-    lines = {
+    titles = {
         "coverage50": ("Points inside the 50 % band", "0.50"),
         "coverage90": ("Points inside the 90 % band", "0.90"),
         "coverage90_widened": (f"Points inside the {widened}", "0.90"),
@@ -134,7 +134,7 @@ def _calibration(study: Study, source: str) -> Table:
             Cell(number(each.figures[key].p, 2)),
             Cell(ideal),
         ]
-        for key, (title, ideal) in lines.items()
+        for key, (title, ideal) in titles.items()
         if key in each.figures
     ]
     heads = columns("Calibration", "Value", "95 % interval", "p", "Ideal")
@@ -169,7 +169,7 @@ def _pit(source: str, name: str, pit: NDArray) -> Figure:
     )
     keys = [
         Key("measured", "ink"),
-        Key("where 90 % of perfect generators lie", colour, "bar"),
+        Key("90 % range of perfect generators", colour, "bar"),
         Key("uniform", "muted", "dot"),
     ]
     return Figure(name, [panel], keys, source, narrow=True)

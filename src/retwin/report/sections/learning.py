@@ -26,7 +26,7 @@ def learning(study: Study) -> Section | None:
     keys = [Key(source_name(name), colour_of(name), dash(name)) for name in first]
     panels = [_panel(metric, found) for metric, found in curves.items()]
     figure = Figure("learning", panels, keys)
-    return Section("learning", "How much real data", {"figure": figure}, [figure])
+    return Section("learning", "Learning curve", {"figure": figure}, [figure])
 
 
 def _curves(study: Study, metric: str) -> Curves:

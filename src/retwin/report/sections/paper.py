@@ -29,7 +29,7 @@ def paper(study: Study) -> Section | None:
     if not known:
         return None
     columns = [
-        Column("Of the paper", numeric=False),
+        Column("Item of the paper", numeric=False),
         *(Column(source_name(name), group=PAPER, paper=True) for name in known),
         *(Column(source_name(name), group=HERE) for name in known),
         Column("on this page", numeric=False),
@@ -47,7 +47,7 @@ def paper(study: Study) -> Section | None:
         ),
         _row("Figure 2: segments, TDe, TPE", dashes, dashes, Link("Discrepancy", "discrepancy")),
         _row(
-            "Figure 3: confusions, share right",
+            "Figure 3: confusions, accuracy",
             dashes,
             _means(study, known, "accuracy"),
             Link("Confusions", "confusion"),

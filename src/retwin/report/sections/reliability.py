@@ -23,9 +23,9 @@ def reliability(study: Study) -> Section | None:
     if not sources:
         return None
     keys = [
-        Key("answers, in the colour of their source", "ink", "circle"),
-        Key("where 90 % of perfectly calibrated classifiers lie", "observed", "bar"),
-        Key("as sure as right", "muted", "dot"),
+        Key("diagnoses, in the colour of their source", "ink", "circle"),
+        Key("90 % range of perfectly calibrated classifiers", "observed", "bar"),
+        Key("perfect calibration", "muted", "dot"),
     ]
     figure = Figure("reliability", [_panel(study, name) for name in sources], keys)
     errors = [
@@ -39,11 +39,11 @@ def reliability(study: Study) -> Section | None:
 def _panel(study: Study, source: str) -> Panel:
     found = calibration.reliability(study.probabilities(source), study.truth)
     title, colour = source_name(source), colour_of(source)
-    gaps = np.full(len(found.confidence), np.nan)
-    bars = np.stack([found.low, found.high, gaps], axis=1).ravel()
+    breaks = np.full(len(found.confidence), np.nan)
+    bars = np.stack([found.low, found.high, breaks], axis=1).ravel()
     share: dict[str, Any] = {"limits": (-0.03, 1.05), "kind": "share", "step": 0.2}
     marks: list[Mark] = [
-        Line([0, 1], [0, 1], "as sure as right", "muted", "dot", width=1, hover=False),
+        Line([0, 1], [0, 1], "perfect calibration", "muted", "dot", width=1, hover=False),
         Line(
             np.repeat(found.confidence, 3),
             bars,
@@ -57,8 +57,8 @@ def _panel(study: Study, source: str) -> Panel:
     ]
     return Panel(
         Axis("confidence", **share),
-        [Row(Axis("share that is right", **share), marks)],
-        f"{title}: share of right answers against their confidence",
+        [Row(Axis("share of correct diagnoses", **share), marks)],
+        f"{title}: share of correct diagnoses against their confidence",
         title,
         height=300,
     )

@@ -19,7 +19,7 @@ def roc(study: Study) -> Section | None:
     sources = selected(study)
     if not sources:
         return None
-    marks: list[Mark] = [Line([0, 1], [0, 1], "chance", "rule", width=1, hover=False)]
+    marks: list[Mark] = [Line([0, 1], [0, 1], "random classifier", "rule", width=1, hover=False)]
     keys = []
     for name in sources:
         curve = micro_roc(study.probabilities(name), study.truth)

@@ -106,23 +106,23 @@ def segment_figure(found: Segment) -> Figure:
                 {"nominal": found.nominal, "measured": found.observed},
                 [],
                 f"{found.output} over the whole trajectory",
-                "All movements",
+                "Whole trajectory",
             ),
             (
                 window,
                 found.output,
                 {"nominal": found.nominal, "measured": found.observed},
                 [delay] if math.isfinite(error.delay) else [],
-                f"{found.output} over one movement, {tde}",
-                f"One movement: {tde}",
+                f"{found.output} in one segment, {tde}",
+                f"One segment: {tde}",
             ),
             (
                 window,
                 f"{found.output} minus nominal",
                 {"measured": difference},
                 [offset],
-                f"Gap over the same movement, {tpe}",
-                f"The gap in it: {tpe}",
+                f"Residual in the same segment, {tpe}",
+                f"Residual in this segment: {tpe}",
             ),
         )
     ]
@@ -141,6 +141,6 @@ def _lines(
         for onset, settle in found.motions.tolist()
         if settle > start and onset < end
     ]
-    looks = {"nominal": ("muted", "dot", 1.6), "measured": ("ink", "solid", 1.8)}
-    lines = [Line(found.time[inside], y[inside], name, *looks[name]) for name, y in values.items()]
+    styles = {"nominal": ("muted", "dot", 1.6), "measured": ("ink", "solid", 1.8)}
+    lines = [Line(found.time[inside], y[inside], name, *styles[name]) for name, y in values.items()]
     return [Spans(motions), *lines]

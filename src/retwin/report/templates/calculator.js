@@ -4,9 +4,9 @@
   const content = JSON.parse(document.getElementById("calculator-content").textContent);
   const at = (name) => document.getElementById("calculate-" + name);
   const fields = ["source", "rate", "faulty", "missed"];
-  const terms = ["threshold: alarm above", "faults detected", "of these named rightly", "missed most", "confused most"];
+  const terms = ["alarm threshold", "faults detected", "of these, correct class", "most often missed", "most often confused"];
 
-  // Of so many trajectories: false alarms, missed faults, and what both cost; never to alarm is rate 0.
+  // False alarms, missed faults and their total cost among `content.trajectories`; rate 0 means no alarm at all.
   const costs = (decision, faulty, missed) => {
     const alarms = decision.rate * content.trajectories * (1 - faulty);
     const unseen = (1 - decision.detected) * content.trajectories * faulty;
@@ -31,7 +31,7 @@
     }
     const silent = { rate: 0, detected: 0 };
     const among = (decisions) => decisions.map((each) => [each, costs(each, faulty / 100, missed)]);
-    // The last rate that does not exceed the one asked for; a hair more for thirds and the like.
+    // The last rate that does not exceed the requested one; the margin allows for rounding.
     const allowed = source.decisions.filter((each) => each.rate <= rate / 100 + 1e-9);
     const decision = allowed[allowed.length - 1];
     const best = among([silent, ...source.decisions]).reduce((a, b) => (b[1].cost < a[1].cost ? b : a));
@@ -46,10 +46,10 @@
     } else {
       at("result").replaceChildren();
     }
-    const few = `${content.healthy} healthy trajectories cannot promise ${rate} %: it takes ${Math.ceil(100 / rate) - 1} of them at least. `;
-    const cheapest = best[0].rate ? `${percent(best[0].rate)} of false alarms` : "never to raise an alarm";
+    const few = `${content.healthy} healthy trajectories cannot guarantee ${rate} %: it requires at least ${Math.ceil(100 / rate) - 1} of them. `;
+    const cheapest = best[0].rate ? `a false-alarm rate of ${percent(best[0].rate)}` : "never to raise an alarm";
     at("best").textContent = (decision ? "" : rate ? few : "") +
-      `Cheapest with these costs: ${cheapest} (cost ${best[1].cost.toFixed(0)}).`;
+      `The lowest cost with these settings: ${cheapest} (cost ${best[1].cost.toFixed(0)}).`;
   };
 
   at("source").append(...content.sources.map((source, i) => new Option(source.name, String(i))));

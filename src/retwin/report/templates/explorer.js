@@ -131,7 +131,7 @@
   };
   const infer = () => {
     if (!latent) return;
-    const head = ["Movement", ...latent.names.map((name, k) => titled(name, latent.units[k]))];
+    const head = ["Segment", ...latent.names.map((name, k) => titled(name, latent.units[k]))];
     const there = data.times[picked].map((each, m) => [each, m]).filter(([each]) => each[0] !== null);
     fill(at("z"), head, there.map(([each, m]) => row([
       cell("th", `${m + 1}: from ${each[0].toFixed(1)} s`, { scope: "row" }),
@@ -143,11 +143,11 @@
     const wrong = content.sources.map((source, s) => {
       const values = shares[s][picked];
       const best = values.indexOf(Math.max(...values));
-      return best === truth ? null : `${source.name} says ${content.classes[best]}`;
+      return best === truth ? null : `${source.name} diagnoses ${content.classes[best]}`;
     }).filter(Boolean);
     const all = content.sources.length;
     const which = wrong.length > 3 ? "" : `; ${wrong.join(", ")}`;
-    const verdict = !all ? "" : wrong.length ? `${all - wrong.length} of ${all} sources are right${which}.` : `All ${all} sources are right.`;
+    const verdict = !all ? "" : wrong.length ? `${all - wrong.length} of ${all} sources are correct${which}.` : `All ${all} sources are correct.`;
     at("answer").textContent = `True class: ${content.classes[truth]}. ${verdict}`;
   };
 
