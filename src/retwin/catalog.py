@@ -35,6 +35,7 @@ __all__ = [
     "Metric",
     "PublicFile",
     "SourceEntry",
+    "classes",
     "lookup",
     "make",
     "resolve",
@@ -55,12 +56,15 @@ class Entry:
         What it is, in a few words.
     extra : str
         The extra of the package that it needs; "" if it needs none.
+    kinds : sequence of str
+        The classes of the config objects that a target which is a function makes.
 
     """
 
     target: str
     title: str
     extra: str = ""
+    kinds: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -249,6 +253,21 @@ def make(entries: Mapping[str, Entry], name: str, argument: str) -> Any:
     return resolve(lookup(entries, name, argument).target)()
 
 
+def classes(entries: Mapping[str, Entry], base: type = object) -> tuple[type, ...]:
+    """The config classes of all entries: the kinds that a saved model may name.
+
+    Parameters
+    ----------
+    entries : mapping of str to Entry
+        Entries whose targets are config classes, or functions with `kinds`.
+    base : type
+        Only subclasses of this class, or classes with the methods of this protocol, are returned.
+
+    """
+    targets = [target for each in entries.values() for target in each.kinds or (each.target,)]
+    return tuple(kind for kind in map(resolve, targets) if issubclass(kind, base))
+
+
 CASES: Mapping[str, CaseEntry] = {
     "armpi": CaseEntry(
         "retwin.cases.armpi_fpv.case:armpi",
@@ -291,6 +310,11 @@ CORRECTIONS: Mapping[str, Entry] = {
     "command_space": Entry(
         "retwin.update.corrections:command_space",
         "effective commands per segment and actuator, behind a sampled sensor",
+        kinds=(
+            "retwin.update.corrections:CommandSpace",
+            "retwin.update.corrections:SampledSensor",
+            "retwin.update.corrections:Chain",
+        ),
     ),
 }
 
