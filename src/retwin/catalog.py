@@ -23,6 +23,7 @@ __all__ = [
     "DENSITIES",
     "DIAGNOSERS",
     "DOWNLOADS",
+    "EXTRAS",
     "FORMATS",
     "METRICS",
     "NETWORKS",
@@ -31,6 +32,7 @@ __all__ = [
     "TWINS",
     "CaseEntry",
     "Entry",
+    "Extra",
     "FormatEntry",
     "Metric",
     "PublicFile",
@@ -194,6 +196,23 @@ class FormatEntry:
     writer: str = ""
     extra: str = ""
     folder: bool = False
+
+
+@dataclass(frozen=True)
+class Extra:
+    """An extra of the package, which installs optional packages.
+
+    Parameters
+    ----------
+    purpose : str
+        What it is needed for.
+    module : str
+        A module by which its installation is recognised.
+
+    """
+
+    purpose: str
+    module: str
 
 
 @dataclass(frozen=True)
@@ -372,6 +391,18 @@ FORMATS: Mapping[str, FormatEntry] = {
     ),
 }
 """By the suffix of the name; "" is any other folder."""
+
+EXTRAS: Mapping[str, Extra] = {
+    "bayes": Extra("Bayesian updating, the source pi_bayes", "sbi"),
+    "fetch": Extra("downloads of public data", "pooch"),
+    "flows": Extra("normalising flows as the distribution of the discrepancy", "zuko"),
+    "fmu": Extra("twins that are FMUs", "fmpy"),
+    "onnx": Extra("bundles that need no torch", "onnxruntime"),
+    "render": Extra("films drawn by MuJoCo, and MP4", "imageio_ffmpeg"),
+    "rocket": Extra("the classifier rocket", "sktime"),
+    "scale": Extra("Zarr folders, and Dask", "zarr"),
+}
+"""The extras that users may need."""
 
 DOWNLOADS: Mapping[str, PublicFile] = {
     "armpi": PublicFile(

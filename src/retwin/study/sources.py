@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from importlib.util import find_spec
 
 from retwin.cases.case import Case
-from retwin.catalog import SOURCES, SourceEntry
+from retwin.catalog import EXTRAS, SOURCES, SourceEntry
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis import DANN, FineTune, FittedDiagnoser, Rocket, fit_diagnoser, fit_inversion
 from retwin.study.plan import StudyPlan
@@ -37,9 +37,6 @@ NEEDS: Mapping[Need, tuple[Need, ...]] = {
     ("residual", "pi_ls"): (("surrogate", "pi_ls"),),
 }
 """The results that are needed to make those that sources need."""
-
-EXTRAS = {"bayes": "sbi", "rocket": "sktime"}
-"""Extras of the package, and for each a module by which its installation is recognised."""
 
 
 def recorded_twin(trial: Trial) -> FittedDiagnoser:
@@ -166,7 +163,7 @@ def lacking(name: str, case: Case, plan: StudyPlan) -> str:
 
 def not_installed(extra: str) -> str:
     """The package that an extra lacks, with the command that installs it; "" if none."""
-    package = EXTRAS.get(extra)
+    package = EXTRAS[extra].module if extra else ""
     if package and find_spec(package) is None:
         return f"the package {package}; install it: pip install 'retwin[{extra}]'"
     return ""
