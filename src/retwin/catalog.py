@@ -26,6 +26,7 @@ __all__ = [
     "EXTRAS",
     "FORMATS",
     "METRICS",
+    "NEEDS",
     "NETWORKS",
     "PRESETS",
     "SOURCES",
@@ -35,6 +36,7 @@ __all__ = [
     "Extra",
     "FormatEntry",
     "Metric",
+    "Need",
     "PublicFile",
     "SourceEntry",
     "classes",
@@ -44,6 +46,9 @@ __all__ = [
 ]
 
 T = TypeVar("T")
+
+Need = tuple[str, str]
+"""Kind and name of a job of a study whose result is needed."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +108,8 @@ class SourceEntry:
     real_data : str
         What it may learn from: "none", "timing" (of commands), "healthy", "unlabelled",
         "transductive" (outputs of the test set without labels) or "labelled".
-    needs : sequence of (str, str)
-        Kind and name of the jobs that must be done first.
+    needs : sequence of Need
+        The jobs that must be done first.
     twin : str
         A function of a `Trial` that returns the twin on whose trajectories the study's classifier
         is trained, or that simulates the test records.
@@ -128,7 +133,7 @@ class SourceEntry:
 
     title: str
     real_data: str
-    needs: Sequence[tuple[str, str]] = ()
+    needs: Sequence[Need] = ()
     twin: str = ""
     diagnoser: str = ""
     pool: Sequence[str] = ()
@@ -420,6 +425,14 @@ _LEAST_SQUARES = ("update", "pi_ls")
 _BAYES = ("update", "pi_bayes")
 _IDENTIFIED = ("surrogate", "pi_ls")
 _IDENTIFIED_OUTPUT = ("residual", "pi_ls")
+
+NEEDS: Mapping[Need, Sequence[Need]] = {
+    _OUTPUT: (_SURROGATE,),
+    _COMMAND: (_SURROGATE,),
+    _IDENTIFIED: (_LEAST_SQUARES,),
+    _IDENTIFIED_OUTPUT: (_IDENTIFIED,),
+}
+"""The jobs that must be done before those that sources need."""
 
 SOURCES: Mapping[str, SourceEntry] = {
     "dt": SourceEntry(
