@@ -43,6 +43,7 @@ __all__ = [
     "lookup",
     "make",
     "resolve",
+    "selected_metrics",
 ]
 
 T = TypeVar("T")
@@ -168,6 +169,12 @@ class Metric:
         Whether a study is summarised by it.
     unit : str
         "output" for the unit of the outputs; "1" for numbers without a unit.
+    head : str
+        The head of its column in a terminal; "" if it is not shown there.
+    selected : bool
+        Whether it is shown where there is room for few metrics only, as learning curves are.
+    simulated : bool
+        Whether it scores simulations, and no diagnoses.
 
     """
 
@@ -175,6 +182,9 @@ class Metric:
     better: int = 1
     headline: bool = False
     unit: str = "1"
+    head: str = ""
+    selected: bool = False
+    simulated: bool = False
 
 
 @dataclass(frozen=True)
@@ -542,17 +552,30 @@ PRESETS: Mapping[str, Entry] = {
 """Classifier, training and number of runs of a study."""
 
 METRICS: Mapping[str, Metric] = {
-    "macro_f1": Metric("Macro-F1", headline=True),
-    "balanced_accuracy": Metric("Balanced accuracy", headline=True),
-    "auroc": Metric("AUROC", headline=True),
-    "healthy_recall": Metric("Healthy recall", headline=True),
+    "macro_f1": Metric("Macro-F1", headline=True, head="macro-F1", selected=True),
+    "balanced_accuracy": Metric("Balanced accuracy", headline=True, head="balanced\nacc."),
+    "auroc": Metric("AUROC", headline=True, head="AUROC"),
+    "healthy_recall": Metric(
+        "Healthy recall", headline=True, head="healthy\nrecall", selected=True
+    ),
     "accuracy": Metric("Accuracy"),
     "auroc_micro": Metric("Micro AUROC"),
     "ece": Metric("ECE", -1),
     "ece_classwise": Metric("Class-wise ECE", -1),
-    "rmse": Metric("RMSE", -1, headline=True, unit="output"),
-    "nrmse": Metric("NRMSE", -1, headline=True),
-    "crps": Metric("CRPS", -1, headline=True, unit="output"),
-    "coverage50": Metric("Coverage of the 50 % band", 0),
-    "coverage90": Metric("Coverage of the 90 % band", 0),
+    "rmse": Metric(
+        "RMSE", -1, headline=True, unit="output", head="RMSE", selected=True, simulated=True
+    ),
+    "nrmse": Metric("NRMSE", -1, headline=True, head="NRMSE", simulated=True),
+    "crps": Metric("CRPS", -1, headline=True, unit="output", head="CRPS", simulated=True),
+    "coverage50": Metric("Coverage of the 50 % band", 0, simulated=True),
+    "coverage90": Metric(
+        "Coverage of the 90 % band", 0, head="in 90 %\nband", selected=True, simulated=True
+    ),
 }
+
+
+def selected_metrics(*, simulated: bool) -> tuple[str, ...]:
+    """The names of the selected metrics of simulations, or of those of diagnoses."""
+    return tuple(
+        name for name, each in METRICS.items() if each.selected and each.simulated == simulated
+    )
