@@ -142,7 +142,8 @@ def targets() -> list[str]:
         for entry in value.values()
         if is_dataclass(entry)
     ]
-    texts = [getattr(entry, each.name) for entry in entries for each in fields(entry)]
+    values = [getattr(entry, each.name) for entry in entries for each in fields(entry)]
+    texts = [part for each in values for part in (each if isinstance(each, tuple) else (each,))]
     return [text for text in texts if isinstance(text, str) and re.match(r"retwin\.\S+:", text)]
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import sys
+from abc import ABC
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -11,12 +15,16 @@ import numpy as np
 import pytest
 
 from retwin.catalog import (
+    CLASSIFIERS,
     CORRECTIONS,
+    DENSITIES,
     DOWNLOADS,
     FORMATS,
+    NETWORKS,
     SOURCES,
     Entry,
     FormatEntry,
+    classes,
     lookup,
     make,
     resolve,
@@ -24,6 +32,8 @@ from retwin.catalog import (
 from retwin.data.io import load, save
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
+from retwin.nets.networks import Network
+from retwin.serialisation.configs import from_config, to_config
 
 
 def example() -> Trajectories:
@@ -60,6 +70,41 @@ def test_a_new_format_is_one_module_and_one_entry(tmp_path: Path) -> None:
     (tmp_path / "a.csv").touch()
     with pytest.raises(InputError, match=r"a file \*\.mat or \*\.npz or \*\.txt, a folder"):
         load(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(
+    ("entries", "name"),
+    [
+        *((CORRECTIONS, name) for name in CORRECTIONS),
+        *((DENSITIES, name) for name in DENSITIES),
+        *((NETWORKS, name) for name in NETWORKS),
+        *((CLASSIFIERS, name) for name in CLASSIFIERS),
+    ],
+)
+def test_what_an_entry_makes_survives_a_saved_model(
+    entries: Mapping[str, Entry], name: str
+) -> None:
+    kinds = (*classes(entries), *classes(NETWORKS))
+    made = make(entries, name, "name")
+    assert from_config(json.loads(json.dumps(to_config(made, kinds))), kinds) == made
+
+
+def test_a_new_correction_is_one_class_and_one_entry(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass(frozen=True)
+    class Scaled:
+        factor: float = 1.0
+
+    module = ModuleType("scaled")
+    module.Scaled = Scaled  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "scaled", module)
+    monkeypatch.setitem(CORRECTIONS, "scaled", Entry("scaled:Scaled", "a factor"))  # type: ignore[arg-type]
+    assert classes(CORRECTIONS)[-1] is Scaled
+    assert classes(CORRECTIONS, ABC) == ()
+
+
+def test_a_classifier_without_a_network_is_no_network() -> None:
+    names = [kind.__name__ for kind in classes(CLASSIFIERS, Network)]
+    assert names == ["CNN", "LSTMClassifier"]
 
 
 def test_an_entry_is_found_by_its_name() -> None:

@@ -23,24 +23,33 @@ __all__ = [
     "DENSITIES",
     "DIAGNOSERS",
     "DOWNLOADS",
+    "EXTRAS",
     "FORMATS",
     "METRICS",
+    "NEEDS",
     "NETWORKS",
     "PRESETS",
     "SOURCES",
     "TWINS",
     "CaseEntry",
     "Entry",
+    "Extra",
     "FormatEntry",
     "Metric",
+    "Need",
     "PublicFile",
     "SourceEntry",
+    "classes",
     "lookup",
     "make",
     "resolve",
+    "selected_metrics",
 ]
 
 T = TypeVar("T")
+
+Need = tuple[str, str]
+"""Kind and name of a job of a study whose result is needed."""
 
 
 @dataclass(frozen=True)
@@ -55,12 +64,15 @@ class Entry:
         What it is, in a few words.
     extra : str
         The extra of the package that it needs; "" if it needs none.
+    kinds : sequence of str
+        The classes of the config objects that a target which is a function makes.
 
     """
 
     target: str
     title: str
     extra: str = ""
+    kinds: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -97,8 +109,8 @@ class SourceEntry:
     real_data : str
         What it may learn from: "none", "timing" (of commands), "healthy", "unlabelled",
         "transductive" (outputs of the test set without labels) or "labelled".
-    needs : sequence of (str, str)
-        Kind and name of the jobs that must be done first.
+    needs : sequence of Need
+        The jobs that must be done first.
     twin : str
         A function of a `Trial` that returns the twin on whose trajectories the study's classifier
         is trained, or that simulates the test records.
@@ -122,7 +134,7 @@ class SourceEntry:
 
     title: str
     real_data: str
-    needs: Sequence[tuple[str, str]] = ()
+    needs: Sequence[Need] = ()
     twin: str = ""
     diagnoser: str = ""
     pool: Sequence[str] = ()
@@ -157,6 +169,12 @@ class Metric:
         Whether a study is summarised by it.
     unit : str
         "output" for the unit of the outputs; "1" for numbers without a unit.
+    head : str
+        The head of its column in a terminal; "" if it is not shown there.
+    selected : bool
+        Whether it is shown where there is room for few metrics only, as learning curves are.
+    simulated : bool
+        Whether it scores simulations, and no diagnoses.
 
     """
 
@@ -164,6 +182,9 @@ class Metric:
     better: int = 1
     headline: bool = False
     unit: str = "1"
+    head: str = ""
+    selected: bool = False
+    simulated: bool = False
 
 
 @dataclass(frozen=True)
@@ -190,6 +211,23 @@ class FormatEntry:
     writer: str = ""
     extra: str = ""
     folder: bool = False
+
+
+@dataclass(frozen=True)
+class Extra:
+    """An extra of the package, which installs optional packages.
+
+    Parameters
+    ----------
+    purpose : str
+        What it is needed for.
+    module : str
+        A module by which its installation is recognised.
+
+    """
+
+    purpose: str
+    module: str
 
 
 @dataclass(frozen=True)
@@ -249,6 +287,21 @@ def make(entries: Mapping[str, Entry], name: str, argument: str) -> Any:
     return resolve(lookup(entries, name, argument).target)()
 
 
+def classes(entries: Mapping[str, Entry], base: type = object) -> tuple[type, ...]:
+    """The config classes of all entries: the kinds that a saved model may name.
+
+    Parameters
+    ----------
+    entries : mapping of str to Entry
+        Entries whose targets are config classes, or functions with `kinds`.
+    base : type
+        Only subclasses of this class, or classes with the methods of this protocol, are returned.
+
+    """
+    targets = [target for each in entries.values() for target in each.kinds or (each.target,)]
+    return tuple(kind for kind in map(resolve, targets) if issubclass(kind, base))
+
+
 CASES: Mapping[str, CaseEntry] = {
     "armpi": CaseEntry(
         "retwin.cases.armpi_fpv.case:armpi",
@@ -291,6 +344,11 @@ CORRECTIONS: Mapping[str, Entry] = {
     "command_space": Entry(
         "retwin.update.corrections:command_space",
         "effective commands per segment and actuator, behind a sampled sensor",
+        kinds=(
+            "retwin.update.corrections:CommandSpace",
+            "retwin.update.corrections:SampledSensor",
+            "retwin.update.corrections:Chain",
+        ),
     ),
 }
 
@@ -349,6 +407,18 @@ FORMATS: Mapping[str, FormatEntry] = {
 }
 """By the suffix of the name; "" is any other folder."""
 
+EXTRAS: Mapping[str, Extra] = {
+    "bayes": Extra("Bayesian updating, the source pi_bayes", "sbi"),
+    "fetch": Extra("downloads of public data", "pooch"),
+    "flows": Extra("normalising flows as the distribution of the discrepancy", "zuko"),
+    "fmu": Extra("twins that are FMUs", "fmpy"),
+    "onnx": Extra("bundles that need no torch", "onnxruntime"),
+    "render": Extra("films drawn by MuJoCo, and MP4", "imageio_ffmpeg"),
+    "rocket": Extra("the classifier rocket", "sktime"),
+    "scale": Extra("Zarr folders, and Dask", "zarr"),
+}
+"""The extras that users may need."""
+
 DOWNLOADS: Mapping[str, PublicFile] = {
     "armpi": PublicFile(
         url="https://raw.githubusercontent.com/JialingRichard/Digital-Twin-Fault-Diagnosis/"
@@ -365,6 +435,14 @@ _LEAST_SQUARES = ("update", "pi_ls")
 _BAYES = ("update", "pi_bayes")
 _IDENTIFIED = ("surrogate", "pi_ls")
 _IDENTIFIED_OUTPUT = ("residual", "pi_ls")
+
+NEEDS: Mapping[Need, Sequence[Need]] = {
+    _OUTPUT: (_SURROGATE,),
+    _COMMAND: (_SURROGATE,),
+    _IDENTIFIED: (_LEAST_SQUARES,),
+    _IDENTIFIED_OUTPUT: (_IDENTIFIED,),
+}
+"""The jobs that must be done before those that sources need."""
 
 SOURCES: Mapping[str, SourceEntry] = {
     "dt": SourceEntry(
@@ -474,17 +552,30 @@ PRESETS: Mapping[str, Entry] = {
 """Classifier, training and number of runs of a study."""
 
 METRICS: Mapping[str, Metric] = {
-    "macro_f1": Metric("Macro-F1", headline=True),
-    "balanced_accuracy": Metric("Balanced accuracy", headline=True),
-    "auroc": Metric("AUROC", headline=True),
-    "healthy_recall": Metric("Healthy recall", headline=True),
+    "macro_f1": Metric("Macro-F1", headline=True, head="macro-F1", selected=True),
+    "balanced_accuracy": Metric("Balanced accuracy", headline=True, head="balanced\nacc."),
+    "auroc": Metric("AUROC", headline=True, head="AUROC"),
+    "healthy_recall": Metric(
+        "Healthy recall", headline=True, head="healthy\nrecall", selected=True
+    ),
     "accuracy": Metric("Accuracy"),
     "auroc_micro": Metric("Micro AUROC"),
     "ece": Metric("ECE", -1),
     "ece_classwise": Metric("Class-wise ECE", -1),
-    "rmse": Metric("RMSE", -1, headline=True, unit="output"),
-    "nrmse": Metric("NRMSE", -1, headline=True),
-    "crps": Metric("CRPS", -1, headline=True, unit="output"),
-    "coverage50": Metric("Coverage of the 50 % band", 0),
-    "coverage90": Metric("Coverage of the 90 % band", 0),
+    "rmse": Metric(
+        "RMSE", -1, headline=True, unit="output", head="RMSE", selected=True, simulated=True
+    ),
+    "nrmse": Metric("NRMSE", -1, headline=True, head="NRMSE", simulated=True),
+    "crps": Metric("CRPS", -1, headline=True, unit="output", head="CRPS", simulated=True),
+    "coverage50": Metric("Coverage of the 50 % band", 0, simulated=True),
+    "coverage90": Metric(
+        "Coverage of the 90 % band", 0, head="in 90 %\nband", selected=True, simulated=True
+    ),
 }
+
+
+def selected_metrics(*, simulated: bool) -> tuple[str, ...]:
+    """The names of the selected metrics of simulations, or of those of diagnoses."""
+    return tuple(
+        name for name, each in METRICS.items() if each.selected and each.simulated == simulated
+    )

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from retwin.catalog import EXTRAS
 from retwin.cli import doctor
-from retwin.cli.doctor import EXTRAS, FOR_DEVELOPERS, Check, examine
+from retwin.cli.doctor import FOR_DEVELOPERS, Check, examine
 from retwin.errors import InputError
 from retwin.serialisation.files import sha256
 

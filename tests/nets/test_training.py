@@ -5,9 +5,12 @@ import pytest
 import torch
 from torch import nn
 
-from retwin.nets.networks import CNN, LSTM, MLP, NETWORKS, TCN, LSTMClassifier, Standardise
+from retwin.catalog import CLASSIFIERS, NETWORKS, classes
+from retwin.nets.networks import CNN, LSTM, MLP, TCN, LSTMClassifier, Network, Standardise
 from retwin.nets.training import Training, isolated, train
 from retwin.serialisation.configs import from_config, to_config
+
+KINDS = (*classes(NETWORKS), *classes(CLASSIFIERS, Network))
 
 
 def line(n: int = 200, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -113,7 +116,7 @@ def test_classifiers_take_any_length(config: CNN | LSTMClassifier, steps: int) -
 def test_configs_survive_json(config: object) -> None:
     import json
 
-    assert from_config(json.loads(json.dumps(to_config(config, NETWORKS))), NETWORKS) == config
+    assert from_config(json.loads(json.dumps(to_config(config, KINDS))), KINDS) == config
 
 
 def test_standardise_and_back() -> None:
@@ -145,7 +148,7 @@ def test_a_network_that_could_not_be_loaded_is_not_saved() -> None:
         pass
 
     with pytest.raises(InputError, match=r"expected one of MLP, .* got Mine"):
-        to_config(Mine(), NETWORKS)
+        to_config(Mine(), KINDS)
 
 
 @pytest.mark.parametrize("epochs", [1, 2, 5, 10])

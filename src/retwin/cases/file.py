@@ -34,19 +34,13 @@ from retwin.twins.samplers import (
     RecordedSampler,
 )
 from retwin.twins.twin import Twin
-from retwin.update.corrections import OPERATORS, Correction, DelayOffset
+from retwin.update.corrections import Correction, DelayOffset
 from retwin.update.residual import Density, Mixture, SequenceMixture
 
 __all__ = ["check_density", "read_case"]
 
 SAMPLERS: tuple[type, ...] = (RampSampler, HoldSampler, MultisineSampler, RecordedSampler)
 FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
-MODELS: tuple[type, ...] = (
-    *OPERATORS,
-    *(catalog.resolve(each.target) for each in catalog.DENSITIES.values()),
-    *(catalog.resolve(each.target) for each in catalog.NETWORKS.values()),
-)
-"""The classes that a case.toml may name, beside the user's own code."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +85,9 @@ def read_case(path: str | Path) -> Case:
     """
     path, place = Path(path), f"{path}:"
     folder = path.parent
-    keys = from_settings(CaseFile, _read(path), MODELS, place=place)
+    named = (catalog.CORRECTIONS, catalog.DENSITIES, catalog.NETWORKS)
+    kinds = [kind for entries in named for kind in catalog.classes(entries)]
+    keys = from_settings(CaseFile, _read(path), kinds, place=place)
     twin = read_twin(keys.twin, keys.inputs, keys.outputs, keys.rate, folder, place)
     parametric = None
     if keys.parameters:

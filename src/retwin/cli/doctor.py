@@ -29,30 +29,19 @@ from rich.markup import escape
 from rich.table import Table
 
 from retwin._version import __version__
-from retwin.catalog import DOWNLOADS
+from retwin.catalog import DOWNLOADS, EXTRAS
 from retwin.cli.options import Json
 from retwin.cli.terminal import FAILED, answer, bar
 from retwin.data.download import cache_folder
 from retwin.errors import InputError
 from retwin.serialisation.files import sha256
 
-__all__ = ["EXTRAS", "FOR_DEVELOPERS", "Check", "State", "doctor", "examine"]
+__all__ = ["FOR_DEVELOPERS", "Check", "State", "doctor", "examine"]
 
 State = Literal["ok", "warning", "missing", "broken"]
 """As it should be; works with a drawback; absent and optional; absent and required."""
 COLOURS = {"ok": "green", "warning": "yellow", "missing": "cyan", "broken": "bold red"}
 
-EXTRAS = {
-    "bayes": "Bayesian updating, the source pi_bayes",
-    "fetch": "downloads of public data",
-    "flows": "normalising flows as the distribution of the discrepancy",
-    "fmu": "twins that are FMUs",
-    "onnx": "bundles that need no torch",
-    "render": "films drawn by MuJoCo, and MP4",
-    "rocket": "the classifier rocket",
-    "scale": "Zarr folders, and Dask",
-}
-"""Purpose of each extra."""
 FOR_DEVELOPERS = ("dev", "docs")
 """Extras that users do not need."""
 COMPILED = {"numpy": "numpy", "scipy": "scipy", "torch": "torch", "mujoco": "mujoco-core"}
@@ -218,7 +207,7 @@ def _run(code: str) -> subprocess.CompletedProcess[str]:
 
 
 def _extras() -> Iterator[Check]:
-    for extra, purpose in EXTRAS.items():
+    for extra, purpose in ((name, each.purpose) for name, each in EXTRAS.items()):
         required = _requirements(extra)
         absent = [each for each in required if not _version(each.name)]
         wrong = [each for each in required if not _satisfied(each)]

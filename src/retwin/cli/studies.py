@@ -24,16 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["demo", "report", "study"]
 
-COLUMNS = {
-    "macro_f1": "macro-F1",
-    "balanced_accuracy": "balanced\nacc.",
-    "auroc": "AUROC",
-    "healthy_recall": "healthy\nrecall",
-    "rmse": "RMSE",
-    "nrmse": "NRMSE",
-    "crps": "CRPS",
-    "coverage90": "in 90 %\nband",
-}
+COLUMNS = {name: metric.head for name, metric in catalog.METRICS.items() if metric.head}
 """Scores that are shown, and the heads of their columns."""
 data_option, compared_option = (
     partial(typer.Option, rich_help_panel=panel)

@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from retwin.catalog import CLASSIFIERS, classes
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.features import Features, class_index, class_order
-from retwin.nets.networks import NETWORKS, Network, Standardise
+from retwin.nets.networks import Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
@@ -22,12 +23,6 @@ __all__ = ["NetworkDiagnoser", "fit_network", "training_for"]
 
 TRAJECTORIES_PER_BATCH = 256
 """Trajectories that are classified together: activations of more would leave the cache."""
-
-DEFAULTS = {
-    "CNN": Training(max_epochs=25, batch_size=64, learning_rate=3e-3, weight_decay=1e-2),
-    "LSTMClassifier": Training(max_epochs=30, batch_size=32, learning_rate=1e-3, decay="step"),
-}
-"""The training of each network by the name of its config; that of the LSTM is the paper's."""
 
 
 class NetworkDiagnoser(nn.Module):
@@ -77,7 +72,7 @@ class NetworkDiagnoser(nn.Module):
     def save(self, folder: str | Path) -> None:
         """Write weights and description, see `retwin.serialisation.models`."""
         about = {
-            "network": to_config(self.config, NETWORKS),
+            "network": to_config(self.config, classes(CLASSIFIERS, Network)),
             "classes": self.classes,
             **self.features.about(),
             "fitted": None if self.fitted is None else asdict(self.fitted),
@@ -97,7 +92,7 @@ class NetworkDiagnoser(nn.Module):
         """
         about, weights = read_model(folder, "diagnoser")
         model = cls(
-            from_config(about["network"], NETWORKS),
+            from_config(about["network"], classes(CLASSIFIERS, Network)),
             Features.of(about),
             classes=tuple(about["classes"]),
         )
@@ -107,8 +102,9 @@ class NetworkDiagnoser(nn.Module):
 
 
 def training_for(network: Network) -> Training:
-    """The training that suits a network, see `DEFAULTS`."""
-    return DEFAULTS.get(type(network).__name__, Training())
+    """The training that suits a network: its `default_training`, if it has one."""
+    training: Training = getattr(network, "default_training", Training())
+    return training
 
 
 def fit_network(

@@ -2,26 +2,27 @@
 
 `config.build(inputs, outputs)` makes the torch module. Sequence networks map (n, T, inputs) to
 (n, T, outputs). Classifiers map (n, T, inputs) to logits (n, outputs): `represent` gives the
-features of a sequence, `readout` the logits of the features.
+features of a sequence, `readout` the logits of the features, and `config.default_training` is the
+training that suits them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from retwin.nets.state_space import StateSpace
+from retwin.nets.training import Training
 
 __all__ = [
     "CNN",
     "LSTM",
     "MLP",
-    "NETWORKS",
     "TCN",
     "LSTMClassifier",
     "Network",
@@ -34,6 +35,7 @@ ROWS_PER_BLOCK = 2**22
 channel."""
 
 
+@runtime_checkable
 class Network(Protocol):
     """The interface of a network's config object."""
 
@@ -213,6 +215,10 @@ class LSTMClassifier:
     hidden: int = 100
     layers: int = 2
     dropout: float = 0.1
+    default_training: ClassVar[Training] = Training(
+        max_epochs=30, batch_size=32, learning_rate=1e-3, decay="step"
+    )
+    """That of the paper."""
 
     def build(self, inputs: int, outputs: int) -> nn.Module:
         """A classifier with `outputs` classes."""
@@ -255,6 +261,9 @@ class CNN:
     channels: tuple[int, ...] = (32, 64, 128)
     kernel: int = 5
     dropout: float = 0.2
+    default_training: ClassVar[Training] = Training(
+        max_epochs=25, batch_size=64, learning_rate=3e-3, weight_decay=1e-2
+    )
 
     def build(self, inputs: int, outputs: int) -> nn.Module:
         """A classifier with `outputs` classes."""
@@ -286,7 +295,3 @@ class _Pooled(nn.Module):
 
     def forward(self, values: Tensor) -> Tensor:
         return self.readout(self.dropout(self.represent(values)))
-
-
-NETWORKS: tuple[type, ...] = (MLP, LSTM, TCN, StateSpace, LSTMClassifier, CNN)
-"""The kinds of network that a saved model may name."""

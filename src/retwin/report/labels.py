@@ -10,11 +10,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.catalog import METRICS, SOURCES
+from retwin.catalog import METRICS, SOURCES, selected_metrics
 
 __all__ = [
     "MAIN",
     "MANY",
+    "SELECTED",
     "class_name",
     "counted",
     "duration",
@@ -40,6 +41,8 @@ MANY = 5
 """Number of sources beyond which figures and tables show a selection."""
 MAIN = tuple(name for name, metric in METRICS.items() if metric.headline)
 """The metrics that summarise a study."""
+SELECTED = selected_metrics(simulated=False)
+"""The metrics of diagnoses that are shown of many sources."""
 REAL_DATA = {
     "none": "none",
     "timing": "timing of commands",

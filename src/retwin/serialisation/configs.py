@@ -38,10 +38,13 @@ RENAMED_SETTINGS = {
 def to_config(value: Any, kinds: Sequence[type]) -> dict[str, Any]:
     """The settings of a frozen dataclass and of the config objects inside it, as plain values.
 
+    Config objects among its parameters are of `kinds`, or of a class that the type of the
+    parameter names.
+
     Raises
     ------
     InputError
-        The object, or one inside it, is of no class of `kinds` and could not be read again.
+        The object, or one inside it, is of no such class and could not be read again.
 
     """
     if type(value) not in kinds:
@@ -51,8 +54,14 @@ def to_config(value: Any, kinds: Sequence[type]) -> dict[str, Any]:
             got=type(value).__name__,
             remedy="use the model without saving it: loading runs no code that a file names",
         )
+    hints = get_type_hints(type(value))
     parts = {each.name: getattr(value, each.name) for each in fields(value)}
-    inside = {k: to_config(v, kinds) if is_dataclass(v) else v for k, v in parts.items()}
+    inside = {
+        name: to_config(part, (*_classes(_configs(hints[name])), *kinds))
+        if is_dataclass(part)
+        else part
+        for name, part in parts.items()
+    }
     return {"kind": type(value).__name__, **inside}
 
 
@@ -197,19 +206,32 @@ def _model(
 
 def _setting(hint: Any, kinds: tuple[type, ...]) -> Any:
     """The type of a parameter, in which config objects are read from tables."""
-    union = isinstance(hint, UnionType) or get_origin(hint) is Union
-    arms = get_args(hint) if union else (hint,)
-    configs = tuple(arm for arm in arms if is_dataclass(arm) or _is_protocol(arm))
+    configs = _configs(hint)
     if not configs:
         return hint
     table = Annotated[Any, PlainValidator(partial(_config, configs, kinds))]
-    return Union[(table, *(arm for arm in arms if arm not in configs))]
+    return Union[(table, *(arm for arm in _arms(hint) if arm not in configs))]
+
+
+def _arms(hint: Any) -> tuple[Any, ...]:
+    """The types of a union, or the one type."""
+    union = isinstance(hint, UnionType) or get_origin(hint) is Union
+    return get_args(hint) if union else (hint,)
+
+
+def _configs(hint: Any) -> tuple[Any, ...]:
+    """The config classes and protocols of config objects among the types of a parameter."""
+    return tuple(arm for arm in _arms(hint) if is_dataclass(arm) or _is_protocol(arm))
+
+
+def _classes(configs: tuple[Any, ...]) -> tuple[type, ...]:
+    return tuple(each for each in configs if not _is_protocol(each))
 
 
 def _config(hints: tuple[Any, ...], kinds: tuple[type, ...], value: Any) -> Any:
     """The config object of one of `hints` that a table describes; messages begin with its keys."""
     if isinstance(value, Mapping):
-        classes = tuple(hint for hint in hints if not _is_protocol(hint))
+        classes = _classes(hints)
         if "kind" not in value and len(hints) == len(classes) == 1:
             return from_settings(classes[0], value, kinds, place="")
         made = from_config(value, (*classes, *kinds), place="")

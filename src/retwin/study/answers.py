@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.catalog import SOURCES
+from retwin.catalog import SOURCES, selected_metrics
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.pooled import pool_probabilities
 from retwin.evaluation.fidelity import Simulation, record_means, simulation_scores
@@ -74,7 +74,7 @@ class Diagnoses:
     work: Work
     family: ClassVar[tuple[str, ...]] = ("macro_f1", "balanced_accuracy", "auroc")
     compared: ClassVar[tuple[str, ...]] = (*family, "accuracy", "healthy_recall")
-    curved: ClassVar[tuple[str, ...]] = ("macro_f1", "healthy_recall")
+    curved: ClassVar[tuple[str, ...]] = selected_metrics(simulated=False)
 
     @cached_property
     def _tested(self) -> list[int]:
@@ -142,7 +142,7 @@ class Simulations:
     work: Work
     family: ClassVar[tuple[str, ...]] = ("rmse", "crps")
     compared: ClassVar[tuple[str, ...]] = (*family, "nrmse")
-    curved: ClassVar[tuple[str, ...]] = ("rmse", "coverage90")
+    curved: ClassVar[tuple[str, ...]] = selected_metrics(simulated=True)
 
     @cached_property
     def _records(self) -> Trajectories:

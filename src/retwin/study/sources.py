@@ -7,11 +7,10 @@ case has classes, else simulations of the test records.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from importlib.util import find_spec
 
 from retwin.cases.case import Case
-from retwin.catalog import SOURCES, SourceEntry
+from retwin.catalog import EXTRAS, SOURCES, SourceEntry
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis import DANN, FineTune, FittedDiagnoser, Rocket, fit_diagnoser, fit_inversion
 from retwin.study.plan import StudyPlan
@@ -22,24 +21,7 @@ from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.residual import ResidualModel, SequenceMixture
 
-__all__ = ["NEEDS", "Need", "lacking", "not_installed"]
-
-Need = tuple[str, str]
-"""Kind and name of a job whose result is needed."""
-
-SURROGATE: Need = ("surrogate", "")
-COMMAND: Need = ("residual", "command")
-
-NEEDS: Mapping[Need, tuple[Need, ...]] = {
-    ("residual", "output"): (SURROGATE,),
-    COMMAND: (SURROGATE,),
-    ("surrogate", "pi_ls"): (("update", "pi_ls"),),
-    ("residual", "pi_ls"): (("surrogate", "pi_ls"),),
-}
-"""The results that are needed to make those that sources need."""
-
-EXTRAS = {"bayes": "sbi", "rocket": "sktime"}
-"""Extras of the package, and for each a module by which its installation is recognised."""
+__all__ = ["lacking", "not_installed"]
 
 
 def recorded_twin(trial: Trial) -> FittedDiagnoser:
@@ -153,7 +135,7 @@ def lacking(name: str, case: Case, plan: StudyPlan) -> str:
         return "a case without classes, where twins simulate"
     if not case.diagnosed and not source.twin:
         return f"a case with classes; {case.name!r} has none"
-    if COMMAND in source.needs and case.correction == case.output_correction:
+    if ("residual", "command") in source.needs and case.correction == case.output_correction:
         return f"a case with a correction besides the one at its outputs; {case.name!r} has none"
     if name == "inversion" and isinstance(case.density, SequenceMixture):
         return "a correction per segment"
@@ -166,7 +148,7 @@ def lacking(name: str, case: Case, plan: StudyPlan) -> str:
 
 def not_installed(extra: str) -> str:
     """The package that an extra lacks, with the command that installs it; "" if none."""
-    package = EXTRAS.get(extra)
+    package = EXTRAS[extra].module if extra else ""
     if package and find_spec(package) is None:
         return f"the package {package}; install it: pip install 'retwin[{extra}]'"
     return ""

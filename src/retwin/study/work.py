@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.cases.case import Case
-from retwin.catalog import SOURCES, resolve
+from retwin.catalog import NEEDS, SOURCES, resolve
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis import FittedDiagnoser
 from retwin.evaluation.evaluate import finite_probabilities
@@ -34,7 +34,6 @@ from retwin.serialisation.files import write_atomically
 from retwin.serialisation.models import write_model
 from retwin.study.files import Files, Job, Roles
 from retwin.study.plan import StudyPlan
-from retwin.study.sources import NEEDS
 from retwin.study.trial import Trial
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Twin
@@ -49,9 +48,6 @@ MIN_HEALTHY = 5
 """Least number of healthy calibration trajectories of which two can be held out to widen bands."""
 CURVE = (1, 2, 4, 6, 8, 12, 16, 24, 32)
 """Healthy calibration trajectories of the points of a learning curve, if there are more."""
-
-OVERLAID = ("ibg_rg_command", "ibg_rg")
-"""Sources whose twin may give the predictive overlay; the first that the plan holds does."""
 DRAWS = 500
 """Simulations of a test record: quantiles of 5 and 95 % vary by 0.01 in their level."""
 
@@ -138,11 +134,15 @@ class Work:
         return [Job("fidelity", 0, fold, source, healthy) for fold in folds]
 
     def overlay_jobs(self) -> list[Job]:
-        """The jobs of the predictive overlay of the test trajectories, for a corrected twin."""
-        corrected = [name for name in OVERLAID if name in self.plan.sources]
+        """The jobs of the predictive overlay of the test trajectories, for a corrected twin.
+
+        It is that of the last updated twin of the catalog that the plan holds.
+        """
+        updated = [name for name, source in SOURCES.items() if source.role == "updated"]
+        corrected = [name for name in updated if name in self.plan.sources]
         if not corrected or not self.case.diagnosed:
             return []
-        return [Job("portrait", 0, fold, corrected[0]) for fold in range(len(self.roles.folds))]
+        return [Job("portrait", 0, fold, corrected[-1]) for fold in range(len(self.roles.folds))]
 
     def needed(self, job: Job) -> tuple[Job, ...]:
         """The jobs whose results a job needs."""
@@ -298,7 +298,7 @@ class Work:
         """The predictive overlay of the fold's test trajectories, for display and no score."""
         make = resolve(SOURCES[trial.job.name].twin)
         twin, test = make(trial), self.files.real_data()[list(trial.fold[1])]
-        assert isinstance(twin, CorrectedTwin), "as all in OVERLAID"
+        assert isinstance(twin, CorrectedTwin), 'as all whose role is "updated"'
         seed, rate = trial.seed("portrait"), self.case.sensor_rate
         predictive_overlay(twin, test, seed=seed, rate=rate, progress=trial.progress).save(path)
         return {}

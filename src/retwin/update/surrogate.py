@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retwin.arrays import row_blocks
+from retwin.catalog import NETWORKS, classes
 from retwin.checks import require
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.nets.networks import MLP, NETWORKS, Network, Standardise
+from retwin.nets.networks import MLP, Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
@@ -149,7 +150,7 @@ class Surrogate(nn.Module):
     def save(self, folder: str | Path) -> None:
         """Write the weights and the description; see `read_model` for the layout."""
         about = {
-            "network": to_config(self.config, NETWORKS),
+            "network": to_config(self.config, classes(NETWORKS)),
             "inputs": vars(self.inputs),
             "outputs": vars(self.outputs),
             "rate": self.rate,
@@ -166,7 +167,7 @@ class Surrogate(nn.Module):
         """
         about, weights = read_model(folder, "surrogate")
         surrogate = cls(
-            from_config(about["network"], NETWORKS),
+            from_config(about["network"], classes(NETWORKS)),
             inputs=Channels.of(about["inputs"]),
             outputs=Channels.of(about["outputs"]),
             rate=about["rate"],

@@ -8,7 +8,9 @@ import retwin as rt
 from retwin import catalog
 from retwin.serialisation.configs import from_config, to_config
 from retwin.testing import check_correction
-from retwin.update.corrections import OPERATORS, Additive
+from retwin.update.corrections import Additive
+
+KINDS = catalog.classes(catalog.CORRECTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -35,5 +37,5 @@ def test_z_is_what_is_measured_beyond_the_path(context: rt.Context) -> None:
 
 
 def test_it_may_stand_in_a_model_folder_and_has_a_name() -> None:
-    assert from_config(to_config(Additive(), OPERATORS), OPERATORS) == Additive()
+    assert from_config(to_config(Additive(), KINDS), KINDS) == Additive()
     assert catalog.make(catalog.CORRECTIONS, "additive", "correction") == Additive()

@@ -7,9 +7,12 @@ import pytest
 import torch
 
 import retwin as rt
+from retwin import catalog
 from retwin.cases.armpi_fpv.twin import POLL
 from retwin.serialisation.configs import from_config, to_config
-from retwin.update.corrections import OPERATORS, fit_sensor, measured_outputs, sample_mask
+from retwin.update.corrections import fit_sensor, measured_outputs, sample_mask
+
+KINDS = catalog.classes(catalog.CORRECTIONS)
 
 ROBOT = rt.Chain(rt.CommandSpace(), rt.SampledSensor())
 
@@ -98,9 +101,9 @@ def test_the_second_operator_explains_what_the_first_leaves(exact, case: rt.Case
 
 
 def test_chains_are_checked_and_survive_json() -> None:
-    assert from_config(to_config(ROBOT, OPERATORS), OPERATORS) == ROBOT
+    assert from_config(to_config(ROBOT, KINDS), KINDS) == ROBOT
     nested = rt.Chain(rt.Chain(rt.CommandSpace(), rt.DelayOffset()), rt.SampledSensor(every=4))
-    assert from_config(to_config(nested, OPERATORS), OPERATORS) == nested
+    assert from_config(to_config(nested, KINDS), KINDS) == nested
     assert nested.pools
     assert nested.severities
     for bad in ((rt.SampledSensor(), rt.DelayOffset()), (ROBOT, rt.SampledSensor())):

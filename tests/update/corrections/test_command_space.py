@@ -10,14 +10,16 @@ import torch
 from torch import Tensor
 
 import retwin as rt
+from retwin import catalog
 from retwin.cases.armpi_fpv.emulator import _effective
 from retwin.cases.armpi_fpv.twin import KINEMATIC, POLL
 from retwin.errors import InputError
 from retwin.serialisation.configs import from_config, to_config
 from retwin.twins.faults import draw_faults, faulty_commands, frozen_from
-from retwin.update.corrections import OPERATORS
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import effective_commands
+
+KINDS = catalog.classes(catalog.CORRECTIONS)
 
 UNIT = 0.24  # degrees per command unit
 
@@ -352,10 +354,10 @@ def test_names_units_and_config() -> None:
         "mixture",
         "bernoulli",
     ]
-    assert from_config(to_config(operator, OPERATORS), OPERATORS) == operator
+    assert from_config(to_config(operator, KINDS), KINDS) == operator
     assert isinstance(operator, rt.Correction)
 
 
 def test_settings_of_earlier_versions_load() -> None:
     before = {"kind": "CommandSpace", "delay_range": [0.0, 4.0], "most": 50, "known": 0.5}
-    assert from_config(before, OPERATORS) == rt.CommandSpace((0.0, 4.0), 50, 0.5)
+    assert from_config(before, KINDS) == rt.CommandSpace((0.0, 4.0), 50, 0.5)

@@ -5,9 +5,11 @@ import pytest
 import torch
 
 import retwin as rt
+from retwin import catalog
 from retwin.cases.armpi_fpv.twin import KINEMATIC
 from retwin.serialisation.configs import from_config, to_config
-from retwin.update.corrections import OPERATORS
+
+KINDS = catalog.classes(catalog.CORRECTIONS)
 
 
 def context_of(exact, commands: np.ndarray) -> rt.Context:
@@ -155,7 +157,7 @@ def test_names_units_and_config() -> None:
     latent = operator.latent(rt.Channels(("u",), ("V",)), plane)
     assert latent.names == ("delay", "offset_x", "offset_y")
     assert latent.units == ("samples", "m", "m")
-    assert from_config(to_config(operator, OPERATORS), OPERATORS) == operator
+    assert from_config(to_config(operator, KINDS), KINDS) == operator
     assert isinstance(operator, rt.Correction)
 
 

@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 
 import retwin as rt
+from retwin import catalog
 from retwin.serialisation.configs import from_config, to_config
-from retwin.update.corrections import OPERATORS
+
+KINDS = catalog.classes(catalog.CORRECTIONS)
 
 STEPS = 600
 ERRORS = tuple(np.linspace(-0.004, 0.004, 33).tolist())
@@ -125,7 +127,7 @@ def test_gradients_pass_through_rounding() -> None:
 
 def test_settings_survive_json_and_bad_ones_are_refused() -> None:
     sensor = rt.SampledSensor(every=5, phases=(2,), noise=(ERRORS, ERRORS), glitch_rate=0.1)
-    assert from_config(to_config(sensor, OPERATORS), OPERATORS) == sensor
+    assert from_config(to_config(sensor, KINDS), KINDS) == sensor
     for bad in (
         {"every": 0},
         {"every": 5, "phases": (5,)},

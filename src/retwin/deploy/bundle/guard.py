@@ -25,11 +25,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retwin.cases.case import Case
+from retwin.catalog import CLASSIFIERS, classes
 from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.deploy.bundle.verdicts import Domain, Verdicts, check_channels
 from retwin.diagnosis.features import Features
-from retwin.nets.networks import CNN, NETWORKS, Network, Standardise
+from retwin.nets.networks import CNN, Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
@@ -142,7 +143,7 @@ class Guard(nn.Module):
     def about(self) -> dict[str, Any]:
         """Everything but the weights, as JSON values."""
         return {
-            "network": to_config(self.config, NETWORKS),
+            "network": to_config(self.config, classes(CLASSIFIERS, Network)),
             **self.features.about(),
             "domain": asdict(self.domain),
             "fitted": None if self.fitted is None else asdict(self.fitted),
@@ -151,7 +152,7 @@ class Guard(nn.Module):
     @classmethod
     def of(cls, about: dict[str, Any], weights: dict[str, Tensor]) -> Guard:
         """The guard from the JSON values of `about` and the weights."""
-        network = from_config(about["network"], NETWORKS)
+        network = from_config(about["network"], classes(CLASSIFIERS, Network))
         guard = cls(network, Features.of(about), Domain.of(about["domain"]))
         guard.load_state_dict(weights)
         guard.fitted = Fit.of(about["fitted"])

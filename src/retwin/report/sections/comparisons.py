@@ -10,6 +10,7 @@ from retwin.catalog import METRICS
 from retwin.report.blocks import Cell, Column, Forest, Section, Table
 from retwin.report.labels import (
     MANY,
+    SELECTED,
     in_sentence,
     metric_name,
     number,
@@ -24,9 +25,6 @@ from retwin.report.verdict import headline, outcome_of
 from retwin.results import Comparison
 
 __all__ = ["comparisons"]
-
-SELECTED = ("macro_f1", "healthy_recall")
-"""The metrics that the table of pairs shows of many sources."""
 
 
 def comparisons(study: Study) -> Section | None:

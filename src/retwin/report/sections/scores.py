@@ -14,6 +14,7 @@ from retwin.report.figure import Axis, Figure, Heading, Key, Mark, Panel, Points
 from retwin.report.labels import (
     MAIN,
     MANY,
+    SELECTED,
     mean_and_deviation,
     metric_name,
     number,
@@ -33,8 +34,6 @@ FURTHER = tuple(
     name for name, metric in METRICS.items() if not metric.headline and metric.unit == "1"
 )
 """The metrics of the second table."""
-FEW = ("macro_f1", "healthy_recall")
-"""The metrics of diagnoses that the figure shows of many sources."""
 
 
 def scores(study: Study) -> Section | None:
@@ -44,7 +43,7 @@ def scores(study: Study) -> Section | None:
         return None
     values = _table_values(study, shown, "Scores of all sources")
     many = len(study.sources) > MANY
-    drawn = [name for name in shown if not (many and study.results.classes) or name in FEW]
+    drawn = [name for name in shown if not (many and study.results.classes) or name in SELECTED]
     drawn = [name for name in drawn if METRICS[name].better > 0]
     figures = [_figure(study, drawn)] if drawn else []
     published = any(key.mark == "diamond" for figure in figures for key in figure.keys)

@@ -10,7 +10,6 @@ from retwin.update.corrections.delay_offset import DelayOffset
 from retwin.update.corrections.sampled_sensor import SampledSensor
 
 __all__ = [
-    "OPERATORS",
     "Additive",
     "Chain",
     "CommandSpace",
@@ -25,9 +24,6 @@ __all__ = [
     "measured_outputs",
     "sample_mask",
 ]
-
-OPERATORS: tuple[type, ...] = (Additive, DelayOffset, CommandSpace, SampledSensor, Chain)
-"""The kinds that a saved model may name."""
 
 
 def command_space() -> Chain:

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from retwin.catalog import CORRECTIONS, DENSITIES, classes
 from retwin.checks import one_of, require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
@@ -20,8 +21,8 @@ from retwin.nets.networks import Standardise
 from retwin.nets.training import Fit
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
-from retwin.update.corrections import OPERATORS, Context, Correction
-from retwin.update.residual.settings import DENSITIES, Density
+from retwin.update.corrections import Context, Correction
+from retwin.update.residual.settings import Density
 from retwin.update.surrogate import Surrogate
 
 __all__ = ["ResidualModel", "describe", "segment"]
@@ -176,8 +177,8 @@ class ResidualModel(nn.Module):
     def save(self, folder: str | Path) -> None:
         """Write the weights and the description, see `retwin.serialisation.models`."""
         about = {
-            "correction": to_config(self.correction, OPERATORS),
-            "density": to_config(self.density, DENSITIES),
+            "correction": to_config(self.correction, classes(CORRECTIONS)),
+            "density": to_config(self.density, classes(DENSITIES, Density)),
             "inputs": vars(self.inputs),
             "outputs": vars(self.outputs),
             "segmentation": self.segmentation,
@@ -196,8 +197,8 @@ class ResidualModel(nn.Module):
         """
         about, weights = read_model(folder, "residual")
         model = cls(
-            from_config(about["correction"], OPERATORS),
-            from_config(about["density"], DENSITIES),
+            from_config(about["correction"], classes(CORRECTIONS)),
+            from_config(about["density"], classes(DENSITIES, Density)),
             inputs=Channels.of(about["inputs"]),
             outputs=Channels.of(about["outputs"]),
             segmentation=about["segmentation"],

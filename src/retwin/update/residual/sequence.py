@@ -19,15 +19,16 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from torch import Tensor, nn
 
+from retwin.catalog import CORRECTIONS, NETWORKS, classes
 from retwin.checks import require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import Blocks, GaussianMixture, MixtureHead
-from retwin.nets.networks import LSTM, NETWORKS, Network, Standardise
+from retwin.nets.networks import LSTM, Network, Standardise
 from retwin.nets.training import Fit, Training
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
-from retwin.update.corrections import OPERATORS, Context, Correction
+from retwin.update.corrections import Context, Correction
 from retwin.update.surrogate import Surrogate
 
 __all__ = ["Member", "SequenceMixture", "SequenceResidual", "past", "shrunk", "widened"]
@@ -117,10 +118,6 @@ class SequenceMixture:
             got=repr(self),
             remedy="leave out what you do not need to change",
         )
-
-
-CONFIGS: tuple[type, ...] = (SequenceMixture, Training, *NETWORKS)
-"""The kinds of settings that a saved model may name."""
 
 
 class Member(nn.Module):
@@ -304,8 +301,8 @@ class SequenceResidual(nn.Module):
     def save(self, folder: str | Path) -> None:
         """Write the weights and the description, see `retwin.serialisation.models`."""
         about = {
-            "correction": to_config(self.correction, OPERATORS),
-            "density": to_config(self.density, CONFIGS),
+            "correction": to_config(self.correction, classes(CORRECTIONS)),
+            "density": to_config(self.density, (SequenceMixture, *classes(NETWORKS))),
             "inputs": vars(self.inputs),
             "outputs": vars(self.outputs),
             "emulated": self.emulated,
@@ -322,8 +319,8 @@ class SequenceResidual(nn.Module):
         """
         about, weights = read_model(folder, "sequence residual")
         model = cls(
-            from_config(about["correction"], OPERATORS),
-            from_config(about["density"], CONFIGS),
+            from_config(about["correction"], classes(CORRECTIONS)),
+            from_config(about["density"], (SequenceMixture, *classes(NETWORKS))),
             inputs=Channels.of(about["inputs"]),
             outputs=Channels.of(about["outputs"]),
         )

@@ -12,7 +12,7 @@ from retwin.nets.flows import FlowHead
 from retwin.nets.mixtures import MixtureHead
 from retwin.nets.training import Training
 
-__all__ = ["DENSITIES", "Density", "Flow", "Mixture", "Refinement"]
+__all__ = ["Density", "Flow", "Mixture", "Refinement"]
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,3 @@ class Flow(Density):
     def head(self, features: int, width: int) -> FlowHead:
         """The last layer of a network that predicts a neural spline flow."""
         return FlowHead(features, width, transforms=self.transforms, bins=self.bins)
-
-
-DENSITIES: tuple[type, ...] = (Mixture, Flow, Refinement, Training)
-"""The kinds of settings that a saved residual model may name."""
