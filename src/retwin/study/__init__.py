@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from retwin._version import __version__
 from retwin.cases.case import Case
 from retwin.catalog import CLASSIFIERS, SOURCES
 from retwin.checks import at_least, require, whole
@@ -167,25 +168,30 @@ def _identity(case: Case, plan: StudyPlan, digests: Mapping[str, Any]) -> dict[s
 
 
 def _check_free(out: Path, expected: Mapping[str, Any]) -> None:
-    """Require that `out` is new or holds the study of this identity."""
+    """Require that `out` is new or holds the study of this identity.
+
+    The identity has the names of classes and functions, which differ between versions of retwin.
+    """
     file = out / "study.json"
+    remedy = "give another folder, or remove this one"
     if file.exists():
         try:
             present = json.loads(file.read_text("utf-8"))
         except ValueError:
             present = None
+        version = present.pop("retwin", "") if isinstance(present, dict) else __version__
         if present == expected:
             return
         got = f"{out}, which holds a study with another plan or other data"
+        if version != __version__:
+            got = f"{out}, which holds a study begun by another version of retwin {version}".strip()
+            remedy = "give a new folder, or finish the study with that version"
     elif out.exists() and (not out.is_dir() or any(out.iterdir())):
         got = f"{out}, which holds other files"
     else:
         return
     raise InputError(
-        "out",
-        expected="a new folder, or the folder of the same study",
-        got=got,
-        remedy="give another folder, or remove this one",
+        "out", expected="a new folder, or the folder of the same study", got=got, remedy=remedy
     )
 
 
@@ -255,7 +261,8 @@ def _prepare(
     remedy = "give more of them, or a larger per_class"
     at_least("twin-data", twin, MIN_TRAJECTORIES, "trajectories of the twin", remedy=remedy)
     with write_atomically(out / "study.json") as part:
-        part.write_text(json.dumps(found, indent=1), encoding="utf-8")
+        text = json.dumps({"retwin": __version__, **found}, indent=1)
+        part.write_text(text, encoding="utf-8")
     save(real, out / "work" / "real.npz")
     # A set that may not fit into memory stays in Zarr, which is read in chunks.
     large = data.twin is not None and (data.twin / "zarr.json").exists()

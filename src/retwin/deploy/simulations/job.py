@@ -37,6 +37,8 @@ from retwin.serialisation.identity import identity
 
 __all__ = ["Simulated", "simulate_to"]
 
+SCHEMA = 2
+"""The version of the plan's identity. Digests of the first, which has no such key, differ."""
 MAX_NPZ_BYTES = 2**29
 """Greatest size of an NPZ's arrays, which are held in memory."""
 
@@ -269,6 +271,7 @@ def _about(plan: SimulationPlan) -> dict[str, Any]:
         "chunk": int(plan.chunk),
         "dtype": plan.dtype,
         "retwin": __version__,
+        "schema": SCHEMA,
     }
 
 
@@ -292,13 +295,19 @@ def _finished(target: Path, plan: SimulationPlan, about: dict[str, Any]) -> Simu
 
 
 def _check_same(where: Path, written: dict[str, Any], given: dict[str, Any]) -> None:
+    """Require the same plan, by the same version, on whose names of classes the digests depend."""
     other = sorted(name for name in given if written.get(name) != given[name])
+    versions = {"retwin", "schema"} & set(other)
+    got = "one begun by another version of retwin" if versions else f"another {', '.join(other)}"
+    remedy = "give the same plan again, another name, or remove that folder"
+    if versions:
+        remedy = "give another name, remove that folder, or finish it with that version"
     require(
         not other,
         "plan",
         expected=f"the plan that {where} was begun with",
-        got=f"another {', '.join(other)}",
-        remedy="give the same plan again, another name, or remove that folder",
+        got=got,
+        remedy=remedy,
     )
 
 
