@@ -166,6 +166,29 @@ def test_every_public_name_is_there() -> None:
         _ = retwin.nonsense
 
 
+@pytest.mark.parametrize("name", retwin._ROOMS)
+def test_every_name_of_a_room_is_there(name: str) -> None:
+    room = getattr(retwin, name)
+    assert room.__all__
+    assert len(room.__all__) == len(set(room.__all__))
+    assert set(room.__all__) <= set(dir(room))
+    for each in room.__all__:
+        assert getattr(room, each) is not None
+        assert f"{name}.{each}" not in FILES, "also the name of a module"
+        assert f"{name}.{each}.__init__" not in FILES, "also the name of a package"
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        _ = room.nonsense
+    homes = getattr(room, "_HOME", {})
+    assert list(homes) == sorted(homes)
+
+
+def test_a_room_holds_the_names_of_the_package_that_are_defined_there() -> None:
+    for name, home in retwin._HOME.items():
+        room = home.split(".")[0]
+        if room in retwin._ROOMS:
+            assert getattr(getattr(retwin, room), name) is getattr(retwin, name), name
+
+
 def test_the_table_of_public_names_is_sorted_and_agrees_with_the_static_imports() -> None:
     assert list(retwin._HOME) == sorted(retwin._HOME)
     assert list(retwin._ROOMS) == sorted(retwin._ROOMS)

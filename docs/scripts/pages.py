@@ -35,8 +35,6 @@ goes on. `retwin --install-completion` lets bash, zsh, fish or PowerShell comple
 and names: cases, twins, sources, faults, classifiers. Exit codes: 0 done, 1 failed, 2 bad input,
 130 interrupted.
 """
-IMPORT = re.compile(r"^from retwin\.([\w.]+) import (\([^)]*\)|[^\n(]*)", re.M)
-"""An import on a page: the module below `retwin`, and what is imported from it."""
 LANGUAGES = {".py": "python", ".toml": "toml"}
 
 
@@ -102,12 +100,9 @@ def _say_whole_lines(command: Any) -> None:
 def modules() -> dict[str, list[str]]:
     """Room to the dotted names of its public objects, rooms in the order of the architecture page.
 
-    An object is public if `retwin` has it, or if a page of the documentation imports it.
+    An object is public if `retwin` or its room has it.
     """
     names = {f"{home}.{name}" for name, home in retwin._HOME.items()}
-    for page in (ROOT / "docs").glob("*.md"):
-        for home, imported in IMPORT.findall(page.read_text("utf-8")):
-            names |= {f"{home}.{name.strip(' ()')}" for name in imported.split(",")}
     for room in retwin._ROOMS:
         names |= {f"{room}.{name}" for name in getattr(_module(room), "__all__", ())}
     drawn = (ROOT / "docs" / "architecture.md").read_text("utf-8")
@@ -151,7 +146,9 @@ def _path(name: str) -> str:
     found = _found(name)
     if inspect.isclass(found) or inspect.isfunction(found):
         return f"{found.__module__}.{found.__qualname__}"
-    return f"retwin.{name}"
+    room, _, last = name.rpartition(".")
+    home = getattr(_module(room), "_HOME", {}).get(last)
+    return f"retwin.{room}.{home}.{last}" if home else f"retwin.{name}"
 
 
 def _found(name: str) -> Any:

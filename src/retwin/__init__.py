@@ -30,7 +30,8 @@ A verb takes its method as a config object: `fit_surrogate` a network (`MLP`, `L
 (`CNN`, `LSTMClassifier`, `Rocket`, `DANN`, `FineTune`), `identify` a method (`LeastSquares`,
 `Evolution`, `MCMC`, `NPE`). `Training` has the epochs, the batch size and the learning rate.
 
-What fewer users need is in its room, a package of its own that `rt.<room>` imports on first use:
+What fewer users need is in its room, a package of its own that `rt.<room>` imports on first use,
+as in `rt.twins.HoldSampler` or `from retwin.deploy import Bundle`:
 
 | room | holds |
 |---|---|
@@ -116,7 +117,7 @@ _HOME = {
     "Trajectories": "data.trajectories",
     "Twin": "twins.twin",
     "animate": "cases.animation",
-    "evaluate": "evaluation.evaluate",
+    "evaluate": "evaluation.diagnosers",
     "fetch": "data.download",
     "fit_diagnoser": "diagnosis",
     "fit_inversion": "diagnosis",
@@ -201,7 +202,7 @@ if TYPE_CHECKING:
         load_diagnoser,
     )
     from retwin.errors import InputError
-    from retwin.evaluation.evaluate import evaluate
+    from retwin.evaluation.diagnosers import evaluate
     from retwin.evaluation.fidelity import Fidelity, measure_fidelity
     from retwin.nets.networks import CNN, LSTM, MLP, TCN, LSTMClassifier, StateSpace
     from retwin.nets.training import Training

@@ -1,21 +1,38 @@
-"""Submodules of a package that are imported when they are first used."""
+"""Names of a package whose modules are imported when they are first used."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping
 from importlib.util import find_spec
-from types import ModuleType
+from typing import Any
 
-__all__ = ["submodules"]
+__all__ = ["names"]
 
 
-def submodules(package: str) -> Callable[[str], ModuleType]:
-    """A module's `__getattr__` that imports the submodules of `package`."""
+def names(
+    package: str, homes: Mapping[str, str]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """A module's `__getattr__`, `__dir__` and `__all__`.
 
-    def attribute(name: str) -> ModuleType:
+    Parameters
+    ----------
+    package : str
+        The package; its submodules are attributes too.
+    homes : mapping
+        Public name to the module that defines it, below the package.
+
+    """
+
+    def attribute(name: str) -> Any:
+        if name in homes:
+            return getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
         if name.startswith("_") or find_spec(f"{package}.{name}") is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         return importlib.import_module(f"{package}.{name}")
 
-    return attribute
+    def listing() -> list[str]:
+        return sorted({*vars(sys.modules[package]), *homes})
+
+    return attribute, listing, sorted(homes)

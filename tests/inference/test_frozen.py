@@ -61,11 +61,13 @@ def test_command_space_at_fixed_hyperparameters(exact, value) -> None:
     problem = CommandProblem.of(
         context, value("observed"), polled(8), delay_range=(-5.0, 30.0), max_samples=200
     ).with_missed(value("command_space_missed"))
-    part = {name: value(f"command_space_prior_{name}") for name in ("late", "jitter", "offset")}
+    delay, jitter, offset = (
+        value(f"command_space_prior_{name}") for name in ("late", "jitter", "offset")
+    )
     noise = Noise(
         value("command_space_prior_noise")[:, None], value("command_space_prior_thinning")
     )
-    belief = _Belief(part["late"], part["jitter"], part["offset"], torch.zeros(()), noise)
+    belief = _Belief(delay, jitter, offset, torch.zeros(()), noise)
 
     def solved(start: Tensor) -> Solution:
         prior = belief.prior(problem)

@@ -7,31 +7,36 @@ method, which takes any system. `get` finds a case by its name.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from retwin import catalog
+from retwin._lazy import names
 from retwin.errors import InputError
 
 if TYPE_CHECKING:
-    from retwin.cases.armpi_fpv.case import armpi
-    from retwin.cases.cascaded_tanks.case import tanks, tanks_overflow
     from retwin.cases.case import Case
-    from retwin.cases.columns import ColumnRecords
-    from retwin.cases.file import read_case
 
-__all__ = ["ColumnRecords", "armpi", "get", "read_case", "tanks", "tanks_overflow"]
-
-_TARGETS = {
-    "ColumnRecords": "retwin.cases.columns:ColumnRecords",
-    "read_case": "retwin.cases.file:read_case",
-    **{name: entry.target for name, entry in catalog.CASES.items()},
+_HOME = {
+    "ArmPiTwin": "armpi_fpv.twin",
+    "Body": "case",
+    "Case": "case",
+    "ColumnRecords": "columns",
+    "EmulatedArmPi": "armpi_fpv.emulator",
+    "KinematicTwin": "armpi_fpv.closed_form",
+    "TanksTwin": "cascaded_tanks.twin",
+    "animate": "animation",
+    "armpi_parametric": "armpi_fpv.parameters",
+    "read_case": "file",
+    "recover_commands": "armpi_fpv.recovery",
+    "tanks_parametric": "cascaded_tanks.twin",
+}
+_CASES = {
+    name: entry.target.removeprefix(f"{__name__}.").partition(":")[0]
+    for name, entry in catalog.CASES.items()
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name in _TARGETS:
-        return catalog.resolve(_TARGETS[name])
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__, __all__ = names(__name__, _HOME | _CASES)
+__all__ += ["get"]
 
 
 def get(name: str) -> Case:

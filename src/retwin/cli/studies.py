@@ -192,11 +192,11 @@ def _run(
     from retwin.report import write_report
     from retwin.study import run_study
 
-    with resumable(), bar("study") as tell:
+    with resumable(), bar("study") as show:
         results = run_study(
-            case, plan, data, out, processes=processes, report=tell, command=command_given()
+            case, plan, data, out, processes=processes, report=show, command=command_given()
         )
-        tell("report", 1.0)
+        show("report", 1.0)
         page = write_report(out)
     answer(
         _summary(results, page),

@@ -6,6 +6,21 @@ scores.
 
 from __future__ import annotations
 
-from retwin._lazy import submodules
+from retwin._lazy import names
 
-__getattr__ = submodules(__name__)
+_HOME = {
+    "Channels": "trajectories",
+    "DataCase": "io",
+    "HEALTHY": "trajectories",
+    "Provenance": "trajectories",
+    "Segments": "segments",
+    "Trajectories": "trajectories",
+    "UNLABELLED": "trajectories",
+    "cache_folder": "download",
+    "fetch": "download",
+    "load": "io",
+    "read_zarr": "io.zarr_folder",
+    "save": "io",
+}
+
+__getattr__, __dir__, __all__ = names(__name__, _HOME)

@@ -5,6 +5,20 @@ Belongs here: bundles, exports, and simulations of any size into Zarr folders. N
 
 from __future__ import annotations
 
-from retwin._lazy import submodules
+from retwin._lazy import names
 
-__getattr__ = submodules(__name__)
+_HOME = {
+    "Bundle": "bundle.bundle",
+    "Domain": "bundle.verdicts",
+    "Guard": "bundle.guard",
+    "Portable": "onnx.portable",
+    "Prediction": "bundle.verdicts",
+    "Simulated": "simulations",
+    "SimulationPlan": "simulations",
+    "Verdicts": "bundle.verdicts",
+    "export_onnx": "onnx.export",
+    "fit_guard": "bundle.guard",
+    "simulate_to": "simulations",
+}
+
+__getattr__, __dir__, __all__ = names(__name__, _HOME)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from retwin.diagnosis.adversarial import DANN
 from retwin.diagnosis.diagnoser import Diagnoser, FittedDiagnoser, load_diagnoser
+from retwin.diagnosis.features import Features
 from retwin.diagnosis.fine_tuning import FineTune
 from retwin.diagnosis.fitting import Classifier, fit_diagnoser
 from retwin.diagnosis.inversion import Diagnosis, Estimate, InversionDiagnoser, fit_inversion
@@ -21,6 +22,7 @@ __all__ = [
     "Diagnoser",
     "Diagnosis",
     "Estimate",
+    "Features",
     "FineTune",
     "FittedDiagnoser",
     "InversionDiagnoser",

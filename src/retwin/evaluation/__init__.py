@@ -6,6 +6,20 @@ and the choice of what is compared (see `study`).
 
 from __future__ import annotations
 
-from retwin._lazy import submodules
+from retwin._lazy import names
 
-__getattr__ = submodules(__name__)
+_HOME = {
+    "Fidelity": "fidelity",
+    "Figure": "fidelity",
+    "Overlay": "fidelity",
+    "Simulation": "fidelity",
+    "evaluate": "diagnosers",
+    "measure_fidelity": "fidelity",
+    "measure_widening": "fidelity",
+    "predictive_overlay": "fidelity",
+    "record_means": "fidelity",
+    "simulate_records": "fidelity",
+    "simulation_scores": "fidelity",
+}
+
+__getattr__, __dir__, __all__ = names(__name__, _HOME)

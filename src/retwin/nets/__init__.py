@@ -6,6 +6,27 @@ method, twins, or a robot.
 
 from __future__ import annotations
 
-from retwin._lazy import submodules
+from retwin._lazy import names
 
-__getattr__ = submodules(__name__)
+_HOME = {
+    "BernoulliHead": "mixtures",
+    "Bernoullis": "mixtures",
+    "CNN": "networks",
+    "Fit": "training",
+    "FlowDistribution": "flows",
+    "FlowHead": "flows",
+    "GaussianMixture": "mixtures",
+    "LSTM": "networks",
+    "LSTMClassifier": "networks",
+    "MLP": "networks",
+    "MixtureHead": "mixtures",
+    "Network": "networks",
+    "Standardise": "networks",
+    "StateSpace": "networks",
+    "TCN": "networks",
+    "Training": "training",
+    "isolated": "training",
+    "train": "training",
+}
+
+__getattr__, __dir__, __all__ = names(__name__, _HOME)

@@ -6,6 +6,45 @@ anything that runs a twin or a network (see `evaluation`), or draws.
 
 from __future__ import annotations
 
-from retwin._lazy import submodules
+from retwin._lazy import names
 
-__getattr__ = submodules(__name__)
+_HOME = {
+    "Cost": "decisions",
+    "Decision": "decisions",
+    "Histogram": "histograms",
+    "Reliability": "calibration",
+    "Roc": "roc",
+    "Scores": "classification",
+    "SegmentError": "segments",
+    "bootstrap_means": "bootstrap",
+    "bootstrap_weights": "bootstrap",
+    "calibration_error": "calibration",
+    "calibration_floor": "calibration",
+    "central_band": "distributions",
+    "clearest_segment": "segments",
+    "common_histogram": "histograms",
+    "compare_runs": "comparison",
+    "compliance": "comparison",
+    "confusion": "classification",
+    "crps": "distributions",
+    "cumulative_counts": "distributions",
+    "decide": "decisions",
+    "energy_score": "energy",
+    "grouped_quantile": "distributions",
+    "holm": "comparison",
+    "inside": "distributions",
+    "ks_distance": "distributions",
+    "median_error_trajectory": "segments",
+    "micro_roc": "roc",
+    "outcome": "comparison",
+    "pit_histograms": "distributions",
+    "quantiles": "distributions",
+    "reliability": "calibration",
+    "row_shares": "classification",
+    "score": "classification",
+    "share_as_far": "distributions",
+    "share_interval": "intervals",
+    "weighted_score": "classification",
+}
+
+__getattr__, __dir__, __all__ = names(__name__, _HOME)

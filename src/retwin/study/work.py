@@ -22,7 +22,7 @@ from retwin.cases.case import Case
 from retwin.catalog import NEEDS, SOURCES, resolve
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis import FittedDiagnoser
-from retwin.evaluation.evaluate import finite_probabilities
+from retwin.evaluation.diagnosers import finite_probabilities
 from retwin.evaluation.fidelity import (
     measure_fidelity,
     measure_widening,

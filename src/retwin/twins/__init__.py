@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from retwin._lazy import names
 from retwin.catalog import TWINS, resolve
 from retwin.checks import require
 from retwin.data.trajectories import Channels
@@ -19,7 +20,42 @@ from retwin.errors import InputError
 if TYPE_CHECKING:  # one kind of twin does not load what another kind needs
     from retwin.twins.twin import Twin
 
-__all__ = ["get"]
+_HOME = {
+    "ActuatorBias": "faults",
+    "Chunk": "twin",
+    "CommandSampler": "samplers",
+    "CommandSide": "command_side",
+    "FMUTwin": "fmu",
+    "Fault": "faults",
+    "FunctionTwin": "function",
+    "HoldSampler": "samplers",
+    "Limits": "limits",
+    "MuJoCoTwin": "mujoco",
+    "MultisineSampler": "samplers",
+    "NoisyTwin": "noisy",
+    "Parameter": "parametric",
+    "ParametricTwin": "parametric",
+    "RampSampler": "samplers",
+    "RandomisedTwin": "randomised",
+    "RecordedSampler": "samplers",
+    "Servo": "mujoco",
+    "SimulationError": "twin",
+    "Stuck": "faults",
+    "System": "system",
+    "Twin": "twin",
+    "TwinWrapper": "wrapper",
+    "command_side_parameters": "command_side",
+    "draw_faults": "faults",
+    "faulty_commands": "faults",
+    "frozen_response": "faults",
+    "keep_workers": "workers",
+    "ramps_and_holds": "ramps",
+    "residual_scale": "noisy",
+    "simulate_in_chunks": "twin",
+}
+
+__getattr__, __dir__, __all__ = names(__name__, _HOME)
+__all__ += ["get"]
 
 FORMS = "package.module:object, *.fmu, *.xml or *.urdf"
 FILES = (".fmu", ".xml", ".urdf")

@@ -385,7 +385,7 @@ def frozen_from(faults: Sequence[Fault | None], steps: int, actuators: int) -> N
             "faults",
             expected="faults that hold an actuator's response or leave it as it is",
             got=fault,
-            remedy="use a twin whose actuators' response can be accessed, such as KinematicTwin",
+            remedy="use a twin that computes its actuators' response, or faults of the command",
         )
         onsets[i] = np.where(onset < steps - 1, onset, steps)
     return onsets

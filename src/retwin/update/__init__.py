@@ -6,6 +6,50 @@ here: diagnosers, scores, and systems.
 
 from __future__ import annotations
 
-from retwin._lazy import submodules
+from retwin._lazy import names
 
-__getattr__ = submodules(__name__)
+_HOME = {
+    "Additive": "corrections",
+    "Chain": "corrections",
+    "CommandSpace": "corrections",
+    "Context": "corrections",
+    "CorrectedTwin": "corrected",
+    "Correction": "corrections",
+    "DelayOffset": "corrections",
+    "Density": "residual",
+    "Discrepancy": "corrections",
+    "Evolution": "identification",
+    "Flow": "residual",
+    "Head": "corrections",
+    "LeastSquares": "identification",
+    "MCMC": "identification",
+    "Mixture": "residual",
+    "NPE": "identification",
+    "Noise": "identification",
+    "Optimum": "identification",
+    "Posterior": "identification",
+    "PosteriorTwin": "identification",
+    "Profile": "identification",
+    "Refinement": "residual",
+    "Residual": "residual",
+    "ResidualModel": "residual",
+    "SampledSensor": "corrections",
+    "SequenceMixture": "residual",
+    "SequenceResidual": "residual",
+    "Surrogate": "surrogate",
+    "Updated": "identification",
+    "calibration_ranks": "identification",
+    "command_space": "corrections",
+    "fit_residual": "residual",
+    "fit_sensor": "corrections",
+    "fit_surrogate": "surrogate",
+    "generate": "corrected",
+    "identify": "identification",
+    "infer_discrepancy": "residual",
+    "load_residual": "residual",
+    "measured_outputs": "corrections",
+    "profile": "identification",
+    "sample_mask": "corrections",
+}
+
+__getattr__, __dir__, __all__ = names(__name__, _HOME)

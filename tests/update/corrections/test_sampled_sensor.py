@@ -82,17 +82,17 @@ def test_what_is_given_is_kept() -> None:
     assert kept == (3, (1,), 0.25, (ERRORS, ERRORS))
 
 
-def test_a_record_joins_readings_by_straight_lines() -> None:
+def test_a_record_joins_samples_by_straight_lines() -> None:
     path = torch.arange(23.0)[None, :, None] ** 2
     record = rt.SampledSensor(every=5, phases=(2,)).read(path, generator())
     at = [2, 7, 12, 17, 22]
     expected = np.interp(np.arange(23), at, np.square(at))
     np.testing.assert_allclose(record[0, :, 0], expected, atol=1e-4)
     cut = rt.SampledSensor(every=5, phases=(2,)).read(path[:, :21], generator())
-    assert (cut[0, 17:, 0] == 17.0**2).all(), "after its last reading a record stays"
+    assert (cut[0, 17:, 0] == 17.0**2).all(), "after its last sample a record stays"
 
 
-def test_only_readings_count() -> None:
+def test_only_samples_of_the_sensor_count() -> None:
     path = paths()
     mask = everything(path)
     mask[0, :100] = False
@@ -107,13 +107,13 @@ def test_only_readings_count() -> None:
     assert set(first.tolist()) == {2, 5}
 
 
-def test_errors_are_those_of_a_reading_and_drawn_from_their_law() -> None:
+def test_errors_are_those_of_a_sample_and_drawn_from_their_distribution() -> None:
     still = torch.zeros(400, 100, 1, dtype=torch.float64)
     sensor = rt.SampledSensor(every=10, phases=(0,), noise=((-1.0, 0.0, 0.0, 0.0, 1.0),))
     record = sensor.read(still, generator())
-    readings = record[:, ::10].flatten()
-    assert (readings == 0).double().mean() == pytest.approx(0.5, abs=0.03)
-    assert readings.abs().max() <= 1
+    samples = record[:, ::10].flatten()
+    assert (samples == 0).double().mean() == pytest.approx(0.5, abs=0.03)
+    assert samples.abs().max() <= 1
     torch.testing.assert_close(record, sensor.read(still, generator()), rtol=0, atol=0)
 
 

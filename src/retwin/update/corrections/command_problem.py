@@ -164,8 +164,8 @@ class CommandProblem:
     @property
     def zero(self) -> Tensor:
         """The x (n, P) of trajectories without any discrepancy."""
-        n, movements, width = self.missed.shape
-        return self.observed.new_zeros(n, movements * (1 + width))
+        n, segments, width = self.missed.shape
+        return self.observed.new_zeros(n, segments * (1 + width))
 
     @property
     def bounds(self) -> Bounds:

@@ -113,7 +113,7 @@ class PathProblem:
     def linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residual, and the Jacobian (n, T, d_y, P) of the corrected path."""
         z = self.per_segment(x)
-        n, movements, size = z.shape
+        n, segments, size = z.shape
         knots = Knots.of(self.segments, z[..., 0])
         values, times = knots.spread(z[..., 1:]), knots.source_time()
         path = interpolate(self.path, times)
@@ -121,10 +121,10 @@ class PathProblem:
         slope = self.path.diff(dim=1, append=self.path[:, -1:])
         below = times.floor().long().clamp(0, self.path.shape[1] - 1)
         slope = slope.gather(1, below[..., None].expand_as(path)) + knots.slope(values)
-        unit = torch.eye(movements, dtype=z.dtype).expand(n, -1, -1)
+        unit = torch.eye(segments, dtype=z.dtype).expand(n, -1, -1)
         of_offset = knots.between(knots.spread(unit))  # (n, T, M)
         of_delay = knots.between(unit.repeat_interleave(2, dim=1))
-        jacobian = torch.zeros(*path.shape, movements, size, dtype=z.dtype)
+        jacobian = torch.zeros(*path.shape, segments, size, dtype=z.dtype)
         jacobian[..., 0] = -(self.factor * slope)[..., None] * of_delay[:, :, None]
         for output in range(size - 1):
             jacobian[:, :, output, :, 1 + output] = self.factor[:, :, output, None] * of_offset

@@ -103,8 +103,8 @@ class SampledSensor:
         made = replace(self, every=every, phases=self.phases or phases)
         if made.steps is not None:
             return made
-        readings = observed[made.sample_mask(observed, mask).all(dim=-1)].double().numpy()
-        return replace(made, steps=tuple(_step(values) for values in readings.T))
+        sampled = observed[made.sample_mask(observed, mask).all(dim=-1)].double().numpy()
+        return replace(made, steps=tuple(_step(values) for values in sampled.T))
 
     def fitted(
         self, observed: Tensor, mask: Tensor, explained: Tensor, segments: Segments
@@ -164,8 +164,8 @@ class SampledSensor:
         every = self.every or 1
         choice = torch.tensor(self.phases or range(every))
         phase = choice[torch.randint(len(choice), (count,), generator=generator)]
-        readings = -(-steps // every)
-        return (phase[:, None] + every * torch.arange(readings)).clamp_max(steps - 1)
+        samples = -(-steps // every)
+        return (phase[:, None] + every * torch.arange(samples)).clamp_max(steps - 1)
 
     def record(
         self, values: Tensor, when: Tensor, steps: int, generator: torch.Generator
@@ -247,10 +247,10 @@ def _phases(kinks: Tensor) -> Tensor:
     return own if not plain.any() else torch.where(plain, own, own[plain].mode().values)
 
 
-def _step(readings: NDArray) -> float:
+def _step(samples: NDArray) -> float:
     """The distance of neighbouring values of one output, 0 where there is no lattice."""
-    values = np.unique(readings)
-    if len(values) < 3 or 4 * len(values) > len(readings):
+    values = np.unique(samples)
+    if len(values) < 3 or 4 * len(values) > len(samples):
         return 0.0
     distances = np.diff(values)
     step = float(distances[distances > 1e-6 * np.abs(values).max()].min(initial=np.inf))
