@@ -9,6 +9,8 @@ from retwin.nets.networks import CNN, LSTM, MLP, NETWORKS, TCN, LSTMClassifier, 
 from retwin.nets.training import Training, isolated, train
 from retwin.serialisation.configs import from_config, to_config
 
+pytestmark = pytest.mark.numerical
+
 
 def line(n: int = 200, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     x = torch.randn(n, 2, generator=torch.Generator().manual_seed(seed))

@@ -10,6 +10,8 @@ from retwin.serialisation.configs import from_config, to_config
 from retwin.testing import check_correction
 from retwin.update.corrections import OPERATORS, Additive
 
+pytestmark = pytest.mark.numerical
+
 
 @pytest.fixture(scope="module")
 def context(exact, case: rt.Case) -> rt.Context:

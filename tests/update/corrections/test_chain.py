@@ -11,6 +11,8 @@ from retwin.cases.armpi_fpv.twin import POLL
 from retwin.serialisation.configs import from_config, to_config
 from retwin.update.corrections import OPERATORS, fit_sensor, measured_outputs, sample_mask
 
+pytestmark = pytest.mark.numerical
+
 ROBOT = rt.Chain(rt.CommandSpace(), rt.SampledSensor())
 
 

@@ -19,6 +19,8 @@ from retwin.update.corrections import OPERATORS
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import effective_commands
 
+pytestmark = pytest.mark.numerical
+
 UNIT = 0.24  # degrees per command unit
 
 

@@ -9,6 +9,8 @@ from retwin.cases.armpi_fpv.twin import KINEMATIC
 from retwin.serialisation.configs import from_config, to_config
 from retwin.update.corrections import OPERATORS
 
+pytestmark = pytest.mark.numerical
+
 
 def context_of(exact, commands: np.ndarray) -> rt.Context:
     return rt.Context.of(exact, commands, rt.Segments.from_commands(commands), rate=100.0)

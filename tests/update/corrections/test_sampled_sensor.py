@@ -11,6 +11,8 @@ import retwin as rt
 from retwin.serialisation.configs import from_config, to_config
 from retwin.update.corrections import OPERATORS
 
+pytestmark = pytest.mark.numerical
+
 STEPS = 600
 ERRORS = tuple(np.linspace(-0.004, 0.004, 33).tolist())
 
