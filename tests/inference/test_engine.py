@@ -18,6 +18,8 @@ from retwin.inference.noise import Noise, correlation_time
 from retwin.inference.priors import GaussianPrior
 from retwin.inference.solver import Bounds, Solution, solve
 
+pytestmark = pytest.mark.numerical
+
 GAUSSIAN = StudentT(1e9)
 """So many degrees of freedom that nothing is an outlier."""
 

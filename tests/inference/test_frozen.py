@@ -30,6 +30,8 @@ from retwin.update.corrections.command_inference import _Belief
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.path_problem import PathProblem
 
+pytestmark = pytest.mark.numerical
+
 NATS, DEVIATIONS = 1e-3, 0.05
 MARGIN = 20.0
 """Nats behind the best class of a trajectory at which a hypothesis has probability 0: such a one

@@ -10,6 +10,8 @@ from retwin.nets.networks import CNN, LSTM, MLP, TCN, LSTMClassifier, Network, S
 from retwin.nets.training import Training, isolated, train
 from retwin.serialisation.configs import from_config, to_config
 
+pytestmark = pytest.mark.numerical
+
 KINDS = (*classes(NETWORKS), *classes(CLASSIFIERS, Network))
 
 

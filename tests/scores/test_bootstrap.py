@@ -8,6 +8,8 @@ import pytest
 from retwin.scores.bootstrap import bootstrap, bootstrap_means, bootstrap_weights
 from retwin.scores.classification import score
 
+pytestmark = pytest.mark.numerical
+
 CLASSES = ("Healthy", "a", "b", "c")
 
 

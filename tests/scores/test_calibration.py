@@ -8,6 +8,8 @@ from scipy.stats import binom
 
 from retwin.scores.calibration import calibration_floor, reliability
 
+pytestmark = pytest.mark.numerical
+
 
 def test_the_floor_falls_with_the_root_of_the_count() -> None:
     few, many = (np.full((1, count, 2), [0.8, 0.2]) for count in (100, 10_000))

@@ -11,6 +11,8 @@ from sklearn import metrics
 from retwin.errors import InputError
 from retwin.scores.classification import confusion, row_shares, score, weighted_score
 
+pytestmark = pytest.mark.numerical
+
 CLASSES = ("Healthy", "a", "b", "c")
 
 

@@ -10,6 +10,8 @@ from statsmodels.stats.multitest import multipletests
 
 from retwin.scores.comparison import compare_runs, compliance, holm, outcome
 
+pytestmark = pytest.mark.numerical
+
 
 def test_welch_reproduces_the_paper_s_table() -> None:
     """Table 1, macro-F1: 0.753 ± 0.026 against 0.644 ± 0.036 over 10 runs."""

@@ -9,6 +9,8 @@ from scipy.stats import binomtest
 from retwin.scores.decisions import decide
 from retwin.scores.intervals import share_interval
 
+pytestmark = pytest.mark.numerical
+
 CLASSES = ["Healthy", "stuck", "bias"]
 
 

@@ -21,6 +21,8 @@ from retwin.scores.distributions import (
     share_as_far,
 )
 
+pytestmark = pytest.mark.numerical
+
 RNG = np.random.default_rng(0)
 
 

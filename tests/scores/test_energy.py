@@ -7,6 +7,8 @@ import torch
 
 from retwin.scores.energy import energy_score
 
+pytestmark = pytest.mark.numerical
+
 
 @pytest.fixture
 def ensemble() -> tuple[np.ndarray, np.ndarray]:

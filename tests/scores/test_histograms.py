@@ -7,6 +7,8 @@ import pytest
 
 from retwin.scores.histograms import common_histogram
 
+pytestmark = pytest.mark.numerical
+
 
 def test_outliers_are_counted_and_lie_outside() -> None:
     rng = np.random.default_rng(0)

@@ -8,6 +8,8 @@ from sklearn.metrics import roc_auc_score, roc_curve
 
 from retwin.scores.roc import micro_roc
 
+pytestmark = pytest.mark.numerical
+
 
 def test_micro_roc_is_scikit_learns() -> None:
     rng = np.random.default_rng(7)

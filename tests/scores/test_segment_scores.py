@@ -7,6 +7,8 @@ import pytest
 
 from retwin.scores.segments import clearest_segment, median_error_trajectory
 
+pytestmark = pytest.mark.numerical
+
 TIME = np.arange(21) / 10
 TIMES = np.array([[0.1, 0.7, 1.0], [1.0, 1.7, 2.0]])
 

@@ -14,6 +14,8 @@ from torch import Tensor
 from retwin.twins.samplers import HoldSampler, MultisineSampler, RampSampler
 from retwin.update.piecewise_linear import evaluate_piecewise_linear
 
+pytestmark = pytest.mark.numerical
+
 LOW, HIGH = (100.0, -3.0), (900.0, 2.0)
 SMALL = 5e-6
 """For outputs of size 1: a few roundings of commands and outputs in single precision."""

@@ -47,6 +47,7 @@ def portable(exported: Exported) -> Portable:
     return Portable.load(exported[0])
 
 
+@pytest.mark.numerical
 def test_every_graph_agrees_with_torch(exported: Exported) -> None:
     folder, parity = exported
     names = {"surrogate", "residual", "correction", "sensor", "guard", "features", "diagnoser"}
@@ -57,6 +58,7 @@ def test_every_graph_agrees_with_torch(exported: Exported) -> None:
     assert all(b"/retwin/" not in file.read_bytes() for file in folder.glob("*.onnx"))
 
 
+@pytest.mark.numerical
 def test_it_predicts_the_same_in_a_process_without_torch(
     exported: Exported, bundle: Bundle, emulated: rt.Trajectories, tmp_path: Path
 ) -> None:
@@ -113,6 +115,7 @@ def noise_of_torch(twin: CorrectedTwin, count: int, movements: int, steps: int, 
     return {name: values.numpy() for name, values in noise.items()}
 
 
+@pytest.mark.numerical
 def test_the_same_noise_gives_the_same_outputs(
     portable: Portable,
     exportable: CorrectedTwin,
@@ -143,6 +146,7 @@ def test_the_same_noise_gives_the_same_outputs(
     assert np.abs(made.residual).max(axis=(1, 2)).min() > 1e-4
 
 
+@pytest.mark.numerical
 def test_its_noise_is_uniform_and_normal(portable: Portable) -> None:
     """All of it at once, by Kolmogorov and Smirnov; numpy's draws are the same on any machine."""
     noise, again, other = (portable._noise(100, np.random.default_rng(seed)) for seed in (0, 0, 1))
@@ -156,6 +160,7 @@ def test_its_noise_is_uniform_and_normal(portable: Portable) -> None:
         assert kstest(noise[name].ravel(), distribution).pvalue > 1e-3, name
 
 
+@pytest.mark.numerical
 def test_the_same_seed_simulates_the_same(portable: Portable, emulated: rt.Trajectories) -> None:
     made, again, other = (
         portable.simulate(emulated.commands[:3], seed=seed).observed for seed in (9, 9, 10)
@@ -164,6 +169,7 @@ def test_the_same_seed_simulates_the_same(portable: Portable, emulated: rt.Traje
     assert np.abs(made - other).max(axis=(1, 2)).min() > 0
 
 
+@pytest.mark.numerical
 def test_the_sensor_records_as_the_operator_does(bundle: Bundle) -> None:
     fitted = bundle.twin.residual.correction.second
     sensor = replace(fitted, steps=(0.001, 0.0, 0.002), glitch_rate=0.3)
@@ -181,6 +187,7 @@ def test_the_sensor_records_as_the_operator_does(bundle: Bundle) -> None:
     torch.testing.assert_close(made, expected, atol=2e-5, rtol=0)
 
 
+@pytest.mark.numerical
 @pytest.mark.parametrize("hidden", [False, True])
 def test_features_are_those_of_the_diagnoser(emulated: rt.Trajectories, hidden: bool) -> None:
     seen = emulated.replace(mask=np.random.default_rng(0).random(emulated.mask.shape) < 0.8)

@@ -12,6 +12,8 @@ from retwin.update.corrections import Additive
 
 KINDS = catalog.classes(catalog.CORRECTIONS)
 
+pytestmark = pytest.mark.numerical
+
 
 @pytest.fixture(scope="module")
 def context(exact, case: rt.Case) -> rt.Context:

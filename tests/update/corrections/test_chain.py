@@ -14,6 +14,8 @@ from retwin.update.corrections import fit_sensor, measured_outputs, sample_mask
 
 KINDS = catalog.classes(catalog.CORRECTIONS)
 
+pytestmark = pytest.mark.numerical
+
 ROBOT = rt.Chain(rt.CommandSpace(), rt.SampledSensor())
 
 

@@ -19,6 +19,8 @@ from retwin.twins.faults import draw_faults, faulty_commands, frozen_from
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import effective_commands
 
+pytestmark = pytest.mark.numerical
+
 KINDS = catalog.classes(catalog.CORRECTIONS)
 
 UNIT = 0.24  # degrees per command unit

@@ -11,6 +11,8 @@ from retwin.serialisation.configs import from_config, to_config
 
 KINDS = catalog.classes(catalog.CORRECTIONS)
 
+pytestmark = pytest.mark.numerical
+
 
 def context_of(exact, commands: np.ndarray) -> rt.Context:
     return rt.Context.of(exact, commands, rt.Segments.from_commands(commands), rate=100.0)

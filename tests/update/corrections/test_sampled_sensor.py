@@ -13,6 +13,8 @@ from retwin.serialisation.configs import from_config, to_config
 
 KINDS = catalog.classes(catalog.CORRECTIONS)
 
+pytestmark = pytest.mark.numerical
+
 STEPS = 600
 ERRORS = tuple(np.linspace(-0.004, 0.004, 33).tolist())
 

@@ -17,6 +17,8 @@ from retwin.nets.training import Training, isolated
 from retwin.scores.energy import energy_score
 from retwin.update.residual.refining import refine
 
+pytestmark = pytest.mark.numerical
+
 STEPS = 60
 
 
