@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from retwin.catalog import DIAGNOSERS, resolve
 from retwin.data.trajectories import Trajectories
-from retwin.serialisation.models import kind_of
+from retwin.serialisation.models import kind_of, refusing
 
 __all__ = ["Diagnoser", "FittedDiagnoser", "load_diagnoser"]
 
@@ -74,5 +74,6 @@ def load_diagnoser(folder: str | Path) -> FittedDiagnoser:
     """
     # A folder of no known kind is refused by this class, with a message that states what it lacks.
     entry = DIAGNOSERS.get(kind_of(folder), DIAGNOSERS["diagnoser"])
-    found: FittedDiagnoser = resolve(entry.target).load(folder)
+    with refusing(folder, expected="a diagnoser"):
+        found: FittedDiagnoser = resolve(entry.target).load(folder)
     return found

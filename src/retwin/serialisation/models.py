@@ -15,10 +15,11 @@ from retwin.serialisation.files import write_atomically
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["kind_of", "read_about", "read_model", "write_model"]
+__all__ = ["kind_of", "read_about", "read_model", "refusing", "write_model"]
 
 SCHEMA = 1
 """The version of the layout of model folders."""
+REMEDY = "give the folder of a saved model, or save it again"
 
 
 @contextmanager
@@ -71,7 +72,6 @@ def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str,
     from safetensors.torch import load_file
 
     folder = Path(folder)
-    remedy = "give the folder of a saved model, or save it again"
     try:
         about = json.loads((folder / "model.json").read_text(encoding="utf-8"))
         file = folder / "weights.safetensors"
@@ -81,7 +81,7 @@ def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str,
             str(folder),
             expected=f"a {kind} model (model.json and weights.safetensors)",
             got=f"{type(error).__name__}: {str(error).splitlines()[0]}",
-            remedy=remedy,
+            remedy=REMEDY,
         ) from None
     found = (about.get("schema"), about.get("kind")) if isinstance(about, dict) else (None, None)
     require(
@@ -89,9 +89,24 @@ def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str,
         str(folder),
         expected=f"a {kind} model of schema {SCHEMA}",
         got=f"kind {found[1]!r}, schema {found[0]!r}",
-        remedy=remedy,
+        remedy=REMEDY,
     )
     return about, weights
+
+
+@contextmanager
+def refusing(folder: str | Path, *, expected: str, remedy: str = REMEDY) -> Iterator[None]:
+    """Turn every exception that reading untrusted contents raises into an InputError.
+
+    A sealed folder is untrusted too although its seal is intact, since anyone can seal a folder.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        got = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:100]}"
+        raise InputError(str(folder), expected=expected, got=got, remedy=remedy) from None
 
 
 def read_about(folder: str | Path, kind: str) -> dict[str, Any]:

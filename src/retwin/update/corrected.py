@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from retwin.checks import whole
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
-from retwin.serialisation.models import read_about, write_model
+from retwin.serialisation.models import read_about, refusing, write_model
 from retwin.twins.faults import Fault
 from retwin.twins.system import System
 from retwin.twins.twin import (
@@ -130,7 +130,8 @@ class CorrectedTwin:
         folder = Path(folder)
         surrogate = Surrogate.load(folder / "surrogate")
         residual = load_residual(folder / "residual")
-        return cls(surrogate, residual, about["case"], about["random"])
+        with refusing(folder, expected="a corrected twin"):
+            return cls(surrogate, residual, about["case"], about["random"])
 
 
 def generate(

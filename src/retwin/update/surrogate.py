@@ -14,13 +14,13 @@ from torch import Tensor, nn
 
 from retwin.arrays import row_blocks
 from retwin.catalog import NETWORKS, classes
-from retwin.checks import require
+from retwin.checks import positive, require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.nets.networks import MLP, Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
-from retwin.serialisation.models import read_model, write_model
+from retwin.serialisation.models import read_model, refusing, write_model
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
 from retwin.update.piecewise_linear import evaluate_piecewise_linear
@@ -166,14 +166,16 @@ class Surrogate(nn.Module):
         Raises InputError if the folder holds no surrogate or is damaged.
         """
         about, weights = read_model(folder, "surrogate")
-        surrogate = cls(
-            from_config(about["network"], classes(NETWORKS)),
-            inputs=Channels.of(about["inputs"]),
-            outputs=Channels.of(about["outputs"]),
-            rate=about["rate"],
-        )
-        surrogate.load_state_dict(weights)
-        surrogate.fitted = Fit.of(about["fitted"])
+        with refusing(folder, expected="a surrogate model"):
+            positive("rate", about["rate"])
+            surrogate = cls(
+                from_config(about["network"], classes(NETWORKS)),
+                inputs=Channels.of(about["inputs"]),
+                outputs=Channels.of(about["outputs"]),
+                rate=about["rate"],
+            )
+            surrogate.load_state_dict(weights)
+            surrogate.fitted = Fit.of(about["fitted"])
         return surrogate.eval()
 
 

@@ -16,8 +16,9 @@ from typing import Any
 from retwin.checks import require
 from retwin.errors import InputError
 from retwin.serialisation.files import sha256
+from retwin.serialisation.models import refusing
 
-__all__ = ["SCHEMAS", "SUMS", "open_sealed", "read_sealed", "refusing", "seal", "verify_seal"]
+__all__ = ["SCHEMAS", "SUMS", "open_sealed", "read_sealed", "seal", "verify_seal"]
 
 SUMS = "SHA256SUMS"
 """Name of the file with the checksums, in the format of `sha256sum`."""
@@ -33,21 +34,6 @@ REMEDIES = {
 EXPECTED = {"bundle": "a bundle", "portable": "the ONNX export of a bundle"}
 MAX_DESCRIPTION_BYTES = 2**20
 """Greatest size of model.json; that of a bundle is some kilobytes."""
-
-
-@contextmanager
-def refusing(folder: str | Path, *, expected: str, remedy: str) -> Iterator[None]:
-    """Turn every exception that reading untrusted contents raises into an InputError.
-
-    The contents are untrusted although the seal is intact, since anyone can seal a folder.
-    """
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:
-        got = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:100]}"
-        raise InputError(str(folder), expected=expected, got=got, remedy=remedy) from None
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from retwin.checks import needs_extra, require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.deploy.bundle.facts import Facts
-from retwin.deploy.bundle.seal import open_sealed, refusing
+from retwin.deploy.bundle.seal import open_sealed
 from retwin.deploy.bundle.verdicts import (
     Domain,
     Prediction,
@@ -25,6 +25,7 @@ from retwin.deploy.bundle.verdicts import (
 )
 from retwin.errors import InputError
 from retwin.progress import Progress
+from retwin.serialisation.models import refusing
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, checked_seed, simulate_in_chunks
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from retwin.data.segments import Segments
 from retwin.nets.training import Fit
-from retwin.serialisation.models import kind_of
+from retwin.serialisation.models import kind_of, refusing
 from retwin.update.corrections import Context, Correction
 from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.sequence import SequenceResidual
@@ -71,6 +71,7 @@ class Residual(Protocol):
 
 def load_residual(folder: str | Path) -> ResidualModel | SequenceResidual:
     """The residual model that `folder` holds, of either kind; InputError if it holds none."""
-    if kind_of(folder) == "sequence residual":
-        return SequenceResidual.load(folder)
-    return ResidualModel.load(folder)
+    with refusing(folder, expected="a residual model"):
+        if kind_of(folder) == "sequence residual":
+            return SequenceResidual.load(folder)
+        return ResidualModel.load(folder)
