@@ -8,7 +8,6 @@ import subprocess
 import sys
 from copy import deepcopy
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -80,13 +79,26 @@ def test_a_diagnosis_runs_each_graph_once(portable: Portable, emulated: rt.Traje
     runs: list[str] = []
     lengths: list[int] = []
 
-    def counted(name: str, **arrays: np.ndarray) -> np.ndarray:
-        runs.append(name)
-        if name == "surrogate":
-            lengths.append(arrays["commands"].shape[1])
-        return portable.graphs[name](**arrays)
+    class Counted:
+        """A graph whose runs are counted."""
 
-    graphs = {name: partial(counted, name) for name in portable.graphs}
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def __call__(self, **arrays: np.ndarray) -> np.ndarray:
+            self.count(arrays)
+            return portable.graphs[self.name](**arrays)
+
+        def checked(self, shape: tuple[int, ...], **arrays: np.ndarray) -> np.ndarray:
+            self.count(arrays)
+            return portable.graphs[self.name].checked(shape, **arrays)
+
+        def count(self, arrays: dict[str, np.ndarray]) -> None:
+            runs.append(self.name)
+            if self.name == "surrogate":
+                lengths.append(arrays["commands"].shape[1])
+
+    graphs = {name: Counted(name) for name in portable.graphs}
     replace(portable, graphs=graphs).predict(emulated[:1])
     assert sorted(runs) == ["diagnoser", "features", "guard", "surrogate"]
     assert lengths == [emulated.steps // 10]
