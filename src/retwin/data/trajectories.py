@@ -44,10 +44,13 @@ class Channels:
     units: tuple[str, ...]
 
     def __post_init__(self) -> None:
+        texts = all(isinstance(text, str) for text in (*self.names, *self.units))
         require(
-            len(self.names) == len(self.units) and len(set(self.names)) == len(self.names),
+            texts
+            and len(self.names) == len(self.units)
+            and len(set(self.names)) == len(self.names),
             "channels",
-            expected="one unit per name and no name twice",
+            expected="texts, one unit per name and no name twice",
             got=f"names {list(self.names)}, units {list(self.units)}",
             remedy="name every channel once and give each a unit ('1' when it has none)",
         )

@@ -16,7 +16,7 @@ from retwin.checks import require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 
-__all__ = ["SETTLED", "Features", "class_index", "class_order", "random_phase"]
+__all__ = ["SETTLED", "Features", "class_index", "class_names", "class_order", "random_phase"]
 
 SETTLED = 2
 """Samples of the features, from the end of the first motion on, that are still hidden: one for the
@@ -186,6 +186,18 @@ def random_phase(phases: Tensor, generator: torch.Generator) -> Tensor:
     """One random phase of each example: (b, stride, T', d) in, (b, T', d) out."""
     phase = torch.randint(phases.shape[1], (len(phases),), generator=generator)
     return phases[torch.arange(len(phases)), phase]
+
+
+def class_names(values: Sequence[object]) -> tuple[str, ...]:
+    """Class names as a model folder holds them; InputError unless they are texts."""
+    require(
+        all(isinstance(value, str) for value in values),
+        "classes",
+        expected="names of classes",
+        got=repr(values),
+        remedy="save the model again",
+    )
+    return tuple(map(str, values))
 
 
 def class_order(

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from retwin.catalog import CLASSIFIERS, classes
 from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.features import Features, class_index, class_order
+from retwin.diagnosis.features import Features, class_index, class_names, class_order
 from retwin.nets.networks import Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress
@@ -94,7 +94,7 @@ class NetworkDiagnoser(nn.Module):
         model = cls(
             from_config(about["network"], classes(CLASSIFIERS, Network)),
             Features.of(about),
-            classes=tuple(about["classes"]),
+            classes=class_names(about["classes"]),
         )
         model.load_state_dict(weights)
         model.fitted = Fit.of(about["fitted"])

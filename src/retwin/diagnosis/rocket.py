@@ -22,7 +22,7 @@ from torch import Tensor
 
 from retwin.checks import needs_extra, require, whole
 from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.features import Features, class_index, class_order
+from retwin.diagnosis.features import Features, class_index, class_names, class_order
 from retwin.nets.networks import Standardise
 from retwin.nets.training import Fit
 from retwin.progress import Progress
@@ -168,7 +168,7 @@ class RocketDiagnoser:
         about, weights = read_model(folder, "rocket")
         return cls(
             Features.of(about),
-            classes=tuple(about["classes"]),
+            classes=class_names(about["classes"]),
             samples=about["samples"],
             weights=weights,
             figures=about["figures"],
