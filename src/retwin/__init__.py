@@ -51,9 +51,9 @@ as in `rt.twins.HoldSampler` or `from retwin.deploy import Bundle`:
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from retwin._lazy import names
 from retwin._version import __version__
 
 # Name to module, which is imported when the name is first used: `import retwin` loads no torch.
@@ -152,19 +152,7 @@ _ROOMS = (
 )
 
 __all__ = ["__version__", *_ROOMS, *sorted(_HOME)]
-
-
-def __getattr__(name: str) -> Any:
-    if name in _ROOMS:
-        return importlib.import_module(f"retwin.{name}")
-    if name in _HOME:
-        return getattr(importlib.import_module(f"retwin.{_HOME[name]}"), name)
-    raise AttributeError(f"module 'retwin' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
-
+__getattr__, __dir__, _ = names("retwin", _HOME)
 
 if TYPE_CHECKING:
     from retwin import (
