@@ -20,7 +20,7 @@ from record import record
 from scipy.stats import chi2
 
 import retwin as rt
-from retwin.cases.armpi_fpv.twin import KINEMATIC, POLL
+from retwin.cases.armpi_fpv.twin import KINEMATIC, RATE, SENSOR_RATE
 from retwin.update.corrections import Context
 
 COUNT = 200
@@ -57,7 +57,7 @@ def segment_errors(trajectories: rt.Trajectories) -> dict[str, NDArray]:
     offset = found.z[..., 1:].norm(dim=-1).numpy()
     noise = np.full(offset.shape, np.nan)
     glitches = np.zeros(len(trajectories), dtype=int)
-    polls = np.arange(0, trajectories.steps, POLL)
+    polls = np.arange(0, trajectories.steps, round(RATE / SENSOR_RATE))
     for i, m in np.argwhere(segments.valid):
         # 0.3 s after the command has settled the arm is at rest, whatever the delay.
         steady = (polls >= segments.settle[i, m] + 30) & (polls < segments.stop[i, m])
@@ -99,8 +99,8 @@ def main() -> None:
     case = rt.cases.armpi()
     assert case.emulator is not None
     real = rt.load(Path(folder) / "armpi" / "real_a.mat", case=case).with_label("Healthy")
-    onsets = rt.Segments.from_commands(real.commands).start
-    commands = case.sampler.sample(COUNT, rng=np.random.default_rng(0), timing=onsets)
+    onsets = rt.Segments.from_commands(real.commands).start / real.rate
+    commands = case.sampler.sample(COUNT, rng=np.random.default_rng(0), onsets=onsets)
     truth, made = segment_errors(real), segment_errors(case.emulator.simulate(commands, seed=0))
     rng = np.random.default_rng(0)
     rows = {}

@@ -55,7 +55,7 @@ def measured(
     commands = case.sampler.sample(len(drawn), rng=np.random.default_rng(seed))
     hidden: dict[str, np.ndarray] = {}
     made = case.emulator.simulate(commands, faults=drawn, seed=seed, hidden=hidden)
-    faults = draw_faults(drawn, rt.Segments.from_commands(commands), seed)
+    faults = draw_faults(drawn, rt.Segments.from_commands(commands), seed, rate=case.rate)
     started = time.perf_counter()
     found = diagnoser.diagnose(made)
     seconds = time.perf_counter() - started
@@ -86,7 +86,7 @@ def severities(
         "level MAE (deg)": UNIT * error(found.level, stuck, truth, level).mean(),
         "level, median error (deg)": UNIT * np.median(error(found.level, stuck, truth, level)),
         "level, 90 % intervals, coverage": covered(found.level, stuck, truth, level).mean(),
-        "onset, median error (samples)": np.median(error(found.onset, stuck, truth, onset)),
+        "onset, median error (s)": np.median(error(found.onset, stuck, truth, onset)),
         "onset, 90 % intervals, coverage": covered(found.onset, stuck, truth, onset).mean(),
     }
 

@@ -22,6 +22,7 @@ ROOMS = (
         "_lazy",
         "errors",
         "checks",
+        "times",
         "progress",
         "arrays",
         "processes",

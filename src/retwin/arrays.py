@@ -10,7 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.checks import require
 from retwin.errors import InputError
 
-__all__ = ["check_finite", "check_shapes", "floating", "measured", "named", "row_blocks"]
+__all__ = [
+    "check_finite",
+    "check_shapes",
+    "floating",
+    "interpolated",
+    "measured",
+    "named",
+    "row_blocks",
+]
 
 BYTES_PER_BLOCK = 2**22
 """The size of a block of rows in bytes: it fits the cache of a processor."""
@@ -177,6 +185,38 @@ def named(name: str, given: ArrayLike | None, default: list[str]) -> NDArray:
         remedy="give one name per trajectory",
     )
     return texts
+
+
+def interpolated(values: NDArray, at: ArrayLike, stride: int = 1) -> NDArray:
+    """`values`, linear in between and constant beyond the first and the last.
+
+    Parameters
+    ----------
+    values : ndarray, shape (..., r, d)
+        Values `stride` samples apart, the first one at sample 0.
+    at : array_like, shape (T) or (..., T)
+        Samples, fractions allowed.
+    stride : int, default 1
+        Samples from one value to the next.
+
+    Returns
+    -------
+    ndarray, shape (..., T, d)
+        The values at those samples.
+
+    """
+    at = np.asarray(at)
+    last = values.shape[-2] - 1
+    before = np.clip((at // stride).astype(int), 0, max(last - 1, 0))
+    fraction = np.clip((at - stride * before) / stride, 0.0, 1.0)[..., None]
+    after = np.minimum(before + 1, last)
+    if at.ndim == 1:
+        left, right = values[..., before, :], values[..., after, :]
+    else:
+        left, right = (
+            np.take_along_axis(values, index[..., None], axis=-2) for index in (before, after)
+        )
+    return (1 - fraction) * left + fraction * right
 
 
 def _is_finite(values: NDArray) -> bool:

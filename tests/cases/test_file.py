@@ -39,9 +39,10 @@ def noisy(commands, rng):
 
 
 class Late:
+    rate = 10.0
     steps = 30
 
-    def sample(self, count, *, rng, timing=None):
+    def sample(self, count, *, rng, onsets=None):
         return rng.uniform(size=(count, 30, 2))
 
 
@@ -53,7 +54,7 @@ leak = rt.ActuatorBias(1, (1.0, 2.0))
 TWIN = rt.FunctionTwin(turned, rt.Channels(("a", "b"), ("V", "V")), rt.Channels(("y",), ("m",)), 10)
 """
 
-BASE = """
+BODY = """
 name = "toy"
 twin = "toy_module:turned"
 rate = 10
@@ -65,16 +66,24 @@ b = { unit = "V", low = 0, high = 4 }
 [outputs]
 y = { unit = "m" }
 """
+BASE = (
+    BODY
+    + """
+[commands]
+duration = 100
+segments = 5
+"""
+)
 
 EVERYTHING = """
 title = "A toy"
 sensor_rate = 5
 network = "tcn"
-""" + BASE + """
+""" + BODY + """
 [commands]
 kind = "HoldSampler"
-steps = 50
-hold = [5, 9]
+duration = 5
+hold_durations = [0.5, 0.9]
 [correction]
 kind = "Chain"
 first = { kind = "CommandSpace", delay_range = [0, 4] }
@@ -100,7 +109,7 @@ low = -1
 high = 1
 start = 0.5
 [faults]
-b_stuck = { kind = "Stuck", actuator = "b", onset = [3, 9] }
+b_stuck = { kind = "Stuck", actuator = "b", onset = [0.3, 0.9] }
 a_off = { kind = "ActuatorBias", actuator = 0, size = [0.5, 1] }
 leak = "toy_module:leak"
 [records]
@@ -148,7 +157,7 @@ def test_few_keys_are_needed(read: Callable[..., rt.Case]) -> None:
     assert case.outputs == rt.Channels(("y",), ("m",))
     assert case.twin.limits == rt.Limits((-1.0, 0.0), (1.0, 4.0))
     assert case.classes == ("Healthy",)
-    assert case.sampler == RampSampler((-1.0, 0.0), (1.0, 4.0))
+    assert case.sampler == RampSampler((-1.0, 0.0), (1.0, 4.0), 10.0, 100, 5)
     assert case.correction == case.output_correction == rt.DelayOffset()
     assert (case.density, case.network, case.training) == (rt.Mixture(), rt.MLP(), None)
     assert case.parametric is case.records is None
@@ -162,7 +171,7 @@ def test_few_keys_are_needed(read: Callable[..., rt.Case]) -> None:
 def test_every_key_has_its_effect(read: Callable[..., rt.Case]) -> None:
     case = read(EVERYTHING)
     assert (case.title, case.sensor_rate, case.network) == ("A toy", 5.0, rt.TCN())
-    assert case.sampler == HoldSampler((-1.0, 0.0), (1.0, 4.0), 50, (5, 9))
+    assert case.sampler == HoldSampler((-1.0, 0.0), (1.0, 4.0), 10.0, 5, (0.5, 0.9))
     space = rt.CommandSpace(delay_range=(0, 4))
     assert case.correction == rt.Chain(space, rt.SampledSensor(every=2))
     assert case.output_correction == rt.DelayOffset(known_delay=1)
@@ -172,7 +181,7 @@ def test_every_key_has_its_effect(read: Callable[..., rt.Case]) -> None:
     assert case.training == rt.Training(max_epochs=3, decay="step")
     assert dict(case.faults) == {
         "Healthy": None,
-        "b_stuck": rt.Stuck(1, (3, 9)),
+        "b_stuck": rt.Stuck(1, (0.3, 0.9)),
         "a_off": rt.ActuatorBias(0, (0.5, 1.0)),
         "leak": rt.ActuatorBias(1, (1.0, 2.0)),
     }
@@ -186,10 +195,10 @@ def test_every_key_has_its_effect(read: Callable[..., rt.Case]) -> None:
 
 def test_parameters_are_arguments_of_the_function(read: Callable[..., rt.Case]) -> None:
     case = read(
-        BASE + "[parameters]\n"
+        BODY + "[parameters]\n"
         'gain = { unit = "m/V", low = 1, high = 3 }\n'
         'offset = { unit = "m", low = -1, high = 1, start = 0.5 }\n'
-        "[commands]\nsteps = 40\nmovements = 2\nramps = [5]\n"
+        "[commands]\nduration = 4\nsegments = 2\nramp_durations = [0.5]\n"
     )
     drawn = commands(case)
     np.testing.assert_allclose(
@@ -217,14 +226,20 @@ density = { kind = "SequenceMixture", members = 3, network = { kind = "LSTM", hi
 @pytest.mark.parametrize(
     ("keys", "wanted"),
     [
-        ('kind = "MultisineSampler"\nmean = [0.1, 1]', {"steps": 1000, "mean": (0.1, 1.0)}),
-        ("low = [0, 1]\nhigh = [1, 2]\nmovements = 3", {"low": (0.0, 1.0), "segments": 3}),
+        (
+            'kind = "MultisineSampler"\nmean = [0.1, 1]\nduration = 50\nband = [0.1, 2]',
+            {"steps": 500, "mean": (0.1, 1.0), "corner": 2},
+        ),
+        (
+            "low = [0, 1]\nhigh = [1, 2]\nmovements = 3\nsteps = 60\nramps = [8, 12]",
+            {"low": (0.0, 1.0), "segments": 3, "duration": 6.0, "ramp_durations": (0.8, 1.2)},
+        ),
     ],
 )
 def test_commands_are_drawn_as_described(
     read: Callable[..., rt.Case], keys: str, wanted: dict[str, Any]
 ) -> None:
-    sampler = read(BASE + "[commands]\n" + keys).sampler
+    sampler = read(BODY + "[commands]\n" + keys).sampler
     assert isinstance(sampler, MultisineSampler | RampSampler)
     assert {name: getattr(sampler, name) for name in wanted} == wanted
 
@@ -234,12 +249,12 @@ def test_commands_may_be_recorded_or_of_ones_own(
 ) -> None:
     case = read(BASE)
     rt.save(case.twin.simulate(commands(case), seed=0), tmp_path / "recorded.npz")
-    keys = 'commands = { kind = "RecordedSampler", file = "recorded.npz", length = 90 }\n'
-    sampler = read(keys + BASE).sampler
+    keys = 'commands = { kind = "RecordedSampler", file = "recorded.npz", duration = 90 }\n'
+    sampler = read(keys + BODY).sampler
     assert isinstance(sampler, RecordedSampler)
     np.testing.assert_array_equal(sampler.commands, commands(case))
-    assert sampler.steps == 90
-    own = read('commands = "toy_module:Late"\n' + BASE).sampler
+    assert sampler.steps == 900
+    own = read('commands = "toy_module:Late"\n' + BODY).sampler
     assert own.sample(2, rng=np.random.default_rng(0)).shape == (2, 30, 2)
 
 
@@ -254,12 +269,15 @@ def test_a_random_function_names_its_nominal(read: Callable[..., rt.Case]) -> No
 
 def test_a_twin_object_has_its_own_channels(read: Callable[..., rt.Case]) -> None:
     case = read('name = "toy"\ntwin = "toy_module:TWIN"\ncommands.low = [0, 0]\n'
-                "commands.high = [1, 1]\n")  # fmt: skip
+                "commands.high = [1, 1]\ncommands.duration = 9\n"
+                "commands.segments = 3\n")  # fmt: skip
     assert case.inputs.names == ("a", "b")
     assert case.rate == 10
-    assert read('name = "arm"\ntwin = "armpi-kinematic"\n').inputs.names[0] == "motor_1"
+    times = "commands = { duration = 9, segments = 3 }\n"
+    arm = read('name = "arm"\ntwin = "armpi-kinematic"\n' + times)
+    assert arm.inputs.names[0] == "motor_1"
     with pytest.raises(rt.InputError, match=r"case\.toml: low: expected a value|commands\.low"):
-        read('name = "toy"\ntwin = "toy_module:TWIN"\n')
+        read('name = "toy"\ntwin = "toy_module:TWIN"\n' + times)
 
 
 def test_a_model_and_an_fmu_lie_beside_the_file(
@@ -267,23 +285,24 @@ def test_a_model_and_an_fmu_lie_beside_the_file(
 ) -> None:
     (tmp_path / "pendulum.xml").write_text(PENDULUM)
     keys = 'twin = { name = "pendulum.xml", settle = 0.5, interpolate = false }\n'
-    case = read('name = "p"\nrate = 50\noutputs = ["tip"]\n' + keys)
+    times = "commands = { duration = 8, segments = 4 }\n"
+    case = read('name = "p"\nrate = 50\noutputs = ["tip"]\n' + keys + times)
     assert case.outputs.names == ("tip_x", "tip_y", "tip_z")
     assert (case.twin.settle, case.twin.interpolate, case.rate) == (0.5, False, 50.0)
-    assert case.sampler == RampSampler((-1.0,), (1.0,))
+    assert case.sampler == RampSampler((-1.0,), (1.0,), 50.0, 8, 4)
     heavy = '[parameters]\n"body.arm.mass" = { unit = "kg", low = 0.5, high = 2 }\n'
-    case = read('name = "p"\noutputs = ["tip"]\ntwin = "pendulum.xml"\n' + heavy)
+    case = read('name = "p"\noutputs = ["tip"]\ntwin = "pendulum.xml"\n' + times + heavy)
     assert case.parametric.simulate(np.ones((1, 5, 1)), seed=0).observed.shape == (1, 5, 3)
     python_fmu(tmp_path)
     keys = 'twin = { name = "PyLag.fmu", start = { gain = 3.0 }, step = 0.05 }\n'
     case = read('name = "lag"\nrate = 10\ninputs = ["u"]\noutputs = ["x"]\n' + keys +
-                "commands = { low = [0], high = [1] }\n")  # fmt: skip
+                "commands = { low = [0], high = [1], duration = 8, segments = 4 }\n")  # fmt: skip
     assert (case.inputs.names, case.outputs.names) == (("u",), ("x",))
     assert (dict(case.twin.start), case.twin.substeps) == ({"gain": 3.0}, 2)
 
 
 def test_worker_processes_find_the_module(read: Callable[..., rt.Case], tmp_path: Path) -> None:
-    case = read(BASE + "[commands]\nsteps = 20\nmovements = 1\nramps = [5]\n")
+    case = read(BODY + "[commands]\nduration = 2\nsegments = 1\nramp_durations = [0.5]\n")
     plan = rt.SimulationPlan(case.twin, case.sampler, 0, 6, chunk=3)
     rt.simulate_to(tmp_path / "made.zarr", plan, workers=2)
     made = rt.load(tmp_path / "made.zarr")
@@ -445,12 +464,12 @@ WRONG = [
     ),
     (
         BASE,
-        "commands = 'toy_module:split'\n" + BASE,
+        "commands = 'toy_module:split'\n" + BODY,
         r"case\.toml: commands: expected a CommandSampler, got 'toy_module:split', a function",
     ),
     (
         BASE,
-        BASE + "[commands]\nkind = 'RecordedSampler'\nfile = 'gone.npz'\n",
+        BODY + "[commands]\nkind = 'RecordedSampler'\nfile = 'gone.npz'\n",
         r"case\.toml: commands\.file\.path: expected an existing file",
     ),
     (

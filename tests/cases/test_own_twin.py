@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.twins.samplers import MultisineSampler
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "two_tanks"
@@ -34,7 +34,7 @@ def test_the_page_shows_the_files_of_the_example() -> None:
 
 def write_record(file: Path, case: rt.Case) -> None:
     """A record in the benchmark's layout, made by the example's own function with other numbers."""
-    sampler = MultisineSampler((0.0,), (10.0,), 1024, mean=(2.8,), deviation=(1.0,))
+    sampler = replace(case.sampler, duration=4096.0)
     rng = np.random.default_rng(1)
     pump = sampler.sample(2, rng=rng).astype(float)
     other = {"edge": 7.0, "spill": 0.6, "upper": 0.045}

@@ -40,12 +40,12 @@ twin = "own_module:reach"
 rate = 10
 inputs = { first = { unit = "rad", low = -1, high = 1 }, second = { low = -1, high = 1 } }
 outputs = { far = { unit = "m" }, high = { unit = "m" } }
-commands = { steps = 90, movements = 3, ramps = [8, 10] }
+commands = { duration = 9, segments = 3, ramp_durations = [0.8, 1.0] }
 network = { kind = "MLP", hidden = [32] }
 training = { max_epochs = 20, batch = 64, rate = 1e-2 }
 density = { kind = "Mixture", training = { max_epochs = 10, decay = "step" } }
 [faults]
-stuck = { kind = "Stuck", actuator = "second", onset = 12 }
+stuck = { kind = "Stuck", actuator = "second", onset = 1.2 }
 """
 
 TANK = """
@@ -54,7 +54,7 @@ twin = "own_module:filled"
 rate = 1
 inputs = { valve = { unit = "1", low = 0, high = 1 } }
 outputs = { level = { unit = "m" } }
-commands = { kind = "HoldSampler", steps = 100, hold = [5, 30] }
+commands = { kind = "HoldSampler", duration = 100, hold_durations = [5, 30] }
 correction = "additive"
 network = { kind = "StateSpace", states = 2, hidden = 8 }
 training = { max_epochs = 10, batch = 4, rate = 1e-2 }

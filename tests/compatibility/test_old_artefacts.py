@@ -61,8 +61,24 @@ def test_a_case_has_its_former_settings(case: rt.Case) -> None:
     assert case.training == rt.Training(max_epochs=20, batch_size=256, learning_rate=0.01)
     brief = rt.Training(max_epochs=20, batch_size=32, learning_rate=0.01)
     assert case.density == rt.Mixture(components=2, hidden=(8,), training=brief)
-    assert case.sampler == RampSampler((-1, -1), (1, 1), segments=3, steps=200, ramps=(10, 15))
+    assert case.sampler == RampSampler((-1, -1), (1, 1), 50, 4, 3, ramp_durations=(0.2, 0.3))
+    assert case.faults["v_stuck"] == rt.Stuck(1, 1.4)
     assert case.faults["u_biased"] == rt.ActuatorBias(0, (0.3, 0.6))
+
+
+def test_an_onset_in_samples_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A case cannot tell them from seconds, so that one beyond the end names the unit."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    shutil.copy(FILES / "plant_of_case.py", tmp_path / "plant_in_samples.py")
+    text = (FILES / "case.toml").read_text("utf-8").replace("onset = 1.4", "onset = 70")
+    text = text.replace("plant_of_case", "plant_in_samples")
+    (tmp_path / "case.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(rt.InputError) as refusal:
+        rt.cases.get(str(tmp_path / "case.toml"))
+    assert str(refusal.value) == (
+        f"{tmp_path / 'case.toml'}: onset: expected a time in s within the trajectory, which lasts "
+        "4 s, got 70 s; give an earlier one, in seconds and not in samples"
+    )
 
 
 def test_sets_open(case: rt.Case, measured: rt.Trajectories) -> None:

@@ -70,19 +70,19 @@ def test_the_path_tells_movements_where_commands_do_not() -> None:
 
 
 def test_steady_parts_end_with_the_trajectory_and_not_with_its_padding() -> None:
-    found = Segments.given([[0, 100], [5, np.nan]], [[50, 150], [60, np.nan]], steps=200)
+    found = Segments.given([[0, 2], [0.1, np.nan]], [[1, 3], [1.2, np.nan]], steps=200, rate=50.0)
     assert found.until([200, 200]).stop.tolist() == found.stop.tolist()
     assert found.until([180, 150]).stop.tolist() == [[100, 180], [150, 200]]
     assert found.until([120, 200]).stop[0, 1] == 150, "a commanded segment stays"
 
 
 def test_given_segments_are_checked() -> None:
-    found = Segments.given([[0, 100], [5, np.nan]], [[50, 150], [60, np.nan]], steps=200)
+    found = Segments.given([[0, 2], [0.1, np.nan]], [[1, 3], [1.2, np.nan]], steps=200, rate=50.0)
     assert found.valid.tolist() == [[True, True], [True, False]]
     assert found.stop.tolist() == [[100, 200], [200, 200]]
     with pytest.raises(InputError, match="out of order"):
-        Segments.given([[100, 0]], [[150, 50]], steps=200)
-    with pytest.raises(InputError, match="in samples, not seconds"):
-        Segments.given([[0.0]], [[500]], steps=200)
+        Segments.given([[2, 0]], [[3, 1]], steps=200, rate=50.0)
+    with pytest.raises(InputError, match=r"0 and 4 s, got 0 to 10 s; .* not samples"):
+        Segments.given([[0.0]], [[10]], steps=200, rate=50.0)
     with pytest.raises(InputError, match="as many settle times"):
-        Segments.given([[0.0, 1.0]], [[500]], steps=200)
+        Segments.given([[0.0, 1.0]], [[2]], steps=200, rate=50.0)

@@ -29,7 +29,7 @@ from retwin.update.corrections.effective_commands import effective_commands
 
 CHAIN = rt.Chain(rt.CommandSpace(), rt.SampledSensor())
 MAP = np.array([[1.0, 0.5], [-0.3, 0.8], [0.2, -1.0]])
-SAMPLER = RampSampler((-1.0, -1.0), (1.0, 1.0), segments=4, steps=400, ramps=(30, 40))
+SAMPLER = RampSampler((-1.0, -1.0), (1.0, 1.0), 100.0, 4.0, segments=4, ramp_durations=(0.3, 0.4))
 
 
 class Linear:
@@ -147,7 +147,7 @@ def test_limits_of_a_bias_are_integrated(mean: tuple[float, float]) -> None:
 
 TOY: dict[str, rt.Fault | None] = {
     "Healthy": None,
-    "First stuck": rt.Stuck(0, onset=(0, 320)),
+    "First stuck": rt.Stuck(0, onset=(0.0, 3.2)),
     "Second biased": rt.ActuatorBias(1, size=(0.2, 0.5)),
 }
 
@@ -157,11 +157,13 @@ def toy(count: int, label: str, seed: int) -> tuple[rt.Trajectories, list, np.nd
     rng = np.random.default_rng(seed)
     commands = SAMPLER.sample(count, rng=rng)
     segments = rt.Segments.from_commands(commands)
-    faults = draw_faults([TOY[label]] * count, segments, seed)
-    faulty = torch.tensor(faulty_commands(commands, faults, segments), dtype=torch.float64)
+    faults = draw_faults([TOY[label]] * count, segments, seed, rate=100.0)
+    faulty = torch.tensor(
+        faulty_commands(commands, faults, segments, rate=100.0), dtype=torch.float64
+    )
     shape = segments.start.shape
     z = [rng.normal(4, 0.5, (*shape, 1)), rng.normal(0, 0.02, (*shape, 2)), np.zeros((*shape, 2))]
-    frozen = torch.tensor(frozen_from(faults, *commands.shape[1:]))
+    frozen = torch.tensor(frozen_from(faults, *commands.shape[1:], rate=100.0))
     latent = torch.tensor(np.concatenate(z, axis=2))
     done = effective_commands(faulty, segments, latent, torch.arange(400), frozen).numpy()
     outputs = (done @ MAP.T)[:, np.arange(400) // 10 * 10]
@@ -232,7 +234,7 @@ def arm(case: rt.Case) -> tuple[rt.Trajectories, list, dict[str, np.ndarray]]:
     commands = case.sampler.sample(len(faults), rng=np.random.default_rng(8))
     hidden: dict[str, np.ndarray] = {}
     made = case.emulator.simulate(commands, faults=faults, seed=8, hidden=hidden)
-    drawn = draw_faults(faults, rt.Segments.from_commands(commands), 8)
+    drawn = draw_faults(faults, rt.Segments.from_commands(commands), 8, rate=100.0)
     return made.replace(labels=np.repeat(case.classes, 4)), drawn, hidden
 
 
@@ -269,7 +271,7 @@ def test_intervals_of_severities_cover(diagnosis: Diagnosis, arm: tuple) -> None
     estimate = [part[each, truth][stuck] for part in vars(diagnosis.level).values()]
     assert np.abs(estimate[0] - level).mean() < 4.0
     assert ((estimate[1] <= level) & (level <= estimate[2])).mean() >= 0.7
-    assert (diagnosis.onset.value[stuck, truth[stuck]] == 49).all()
+    assert (diagnosis.onset.value[stuck, truth[stuck]] == 0.49).all()
 
 
 def played(inversion: InversionDiagnoser, case: rt.Case, z: Tensor) -> rt.Trajectories:

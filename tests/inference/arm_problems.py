@@ -17,8 +17,8 @@ FROZEN = Path(__file__).with_name("frozen.npz")
 """Results of the three solvers that the engine replaced, with their inputs."""
 HEALTHY = 6
 """The first so many trajectories are healthy."""
-FAULTS = [*[None] * HEALTHY, rt.Stuck(1, onset=49), rt.ActuatorBias(2, size=(10.0, 50.0))]
-KNOWN = [*[None] * HEALTHY, rt.Stuck(1, onset=49), rt.ActuatorBias(2, bias=(1.0,) * 5)]
+FAULTS = [*[None] * HEALTHY, rt.Stuck(1, onset=0.49), rt.ActuatorBias(2, size=(10.0, 50.0))]
+KNOWN = [*[None] * HEALTHY, rt.Stuck(1, onset=0.49), rt.ActuatorBias(2, bias=(1.0,) * 5)]
 """What `CommandSpace` is given: the class of each fault, not its severity."""
 POLL = 10
 
@@ -27,14 +27,14 @@ def context_of(exact, commands: NDArray, faults: list | None = None) -> rt.Conte
     segments = rt.Segments.from_commands(commands)
     if faults is None:
         return rt.Context.of(exact, commands, segments, rate=100.0)
-    drawn = draw_faults(faults, segments, 0)
+    drawn = draw_faults(faults, segments, 0, rate=100.0)
     return rt.Context.of(
         exact,
         commands,
         segments,
         rate=100.0,
-        faulty_commands=faulty_commands(commands, drawn, segments),
-        frozen=frozen_from(drawn, *commands.shape[1:]),
+        faulty_commands=faulty_commands(commands, drawn, segments, rate=100.0),
+        frozen=frozen_from(drawn, *commands.shape[1:], rate=100.0),
     )
 
 

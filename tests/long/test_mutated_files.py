@@ -33,12 +33,12 @@ twin = "own_of_mutations:reach"
 rate = 10
 inputs = { first = { unit = "rad", low = -1, high = 1 }, second = { low = -1, high = 1 } }
 outputs = { far = { unit = "m" }, high = { unit = "m" } }
-commands = { steps = 60, movements = 2, ramps = [8, 10] }
+commands = { duration = 6, segments = 2, ramp_durations = [0.8, 1.0] }
 network = { kind = "MLP", hidden = [8] }
 training = { max_epochs = 2, batch = 64, rate = 1e-2 }
 density = { kind = "Mixture", training = { max_epochs = 2, decay = "step" } }
 [faults]
-stuck = { kind = "Stuck", actuator = "second", onset = 12 }
+stuck = { kind = "Stuck", actuator = "second", onset = 1.2 }
 """
 BRIEF = Training(max_epochs=1, batch_size=32, learning_rate=1e-3)
 STUDY = Path(__file__).parents[1] / "report" / "schema_1" / "arm.json"

@@ -58,8 +58,9 @@ class Steps:
     """Commands that are constant for ten samples each."""
 
     steps: int = STEPS
+    rate = RATE
 
-    def sample(self, count, *, rng, timing=None):
+    def sample(self, count, *, rng, onsets=None):
         return np.repeat(rng.uniform(0, 1, (count, self.steps // 10, 1)), 10, axis=1)
 
 

@@ -24,7 +24,7 @@ def test_every_source_is_made(
     emulated: rt.Trajectories, twin_set: rt.Trajectories, case: rt.Case, tmp_path: Path
 ) -> None:
     """All fourteen, small: each predicts every trajectory and reports its costs."""
-    free = command_side_parameters(KINEMATIC.inputs, delay=(0.0, 20.0), offset=25.0)
+    free = command_side_parameters(KINEMATIC.inputs, delay=(0.0, 0.2), offset=25.0)
     quick = ParametricTwin(CommandSide(KINEMATIC, nominal=KINEMATIC.position), free)
     case = replace(case, parametric=quick)
     place = np.array([np.flatnonzero(emulated.labels == name)[:5] for name in case.classes])

@@ -49,9 +49,9 @@ def of_arm(part: Callable[[pytest.FixtureRequest], rt.Twin]) -> Subject:
 
     def subject(request: pytest.FixtureRequest) -> TwinSubject:
         sampler = request.getfixturevalue("case").sampler
-        sampler = replace(sampler, movements=2, steps=300, period=150)
+        sampler = replace(sampler, movements=2, duration=3.0, period=1.5)
         commands = sampler.sample(3, rng=np.random.default_rng(0))
-        faults = (None, rt.Stuck(1, onset=(20, 80)), rt.ActuatorBias(2))
+        faults = (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2))
         return TwinSubject(part(request), commands, faults)
 
     return subject
@@ -67,7 +67,7 @@ def of_crane(**options: Any) -> Subject:
     path = Path(__file__).with_name("crane.xml")
     twin = MuJoCoTwin.from_file(path, rate=50.0, **options)
     pushes = ramps()[:, :, :1] - 0.4
-    faults = (None, rt.ActuatorBias(0, size=(0.5, 1.0)), rt.Stuck(0, onset=30))
+    faults = (None, rt.ActuatorBias(0, size=(0.5, 1.0)), rt.Stuck(0, onset=0.6))
     return lambda request: TwinSubject(twin, pushes, faults)
 
 
@@ -312,7 +312,7 @@ def test_a_twin_need_not_know_stuck_actuators(tmp_path: Path) -> None:
     twin = MuJoCoTwin.from_file(tmp_path / "tendon.xml", rate=50.0, inputs=("free",))
     pushes = ramps()[:, :, :1] - 0.4
     with pytest.raises(rt.InputError, match="hinge or slide"):
-        twin.simulate(pushes, faults=[rt.Stuck(0, 5)] * 3, seed=0)
+        twin.simulate(pushes, faults=[rt.Stuck(0, 0.1)] * 3, seed=0)
     check_twin(twin, pushes, [None, *[rt.ActuatorBias(0, size=(0.5, 1.0))] * 2])
 
 

@@ -82,7 +82,7 @@ class Toy:
         return rt.Case(
             name="toy",
             title="Toy",
-            faults={HEALTHY: None, "Stuck": rt.Stuck(0, onset=self.steps // 10)},
+            faults={HEALTHY: None, "Stuck": rt.Stuck(0, onset=self.steps // 10 / self.rate)},
             twin=twin,
             emulator=None,
             sampler=self.sampler,
@@ -101,13 +101,19 @@ class Toy:
 
     @property
     def sampler(self) -> RampSampler:
-        ramps = (self.steps // (4 * self.movements), self.steps // (3 * self.movements))
-        limits = (-1.0,) * self.inputs, (1.0,) * self.inputs
-        return RampSampler(*limits, segments=self.movements, steps=self.steps, ramps=ramps)
+        ramps = [self.steps // (share * self.movements) / self.rate for share in (4, 3)]
+        return RampSampler(
+            (-1.0,) * self.inputs,
+            (1.0,) * self.inputs,
+            self.rate,
+            self.steps / self.rate,
+            segments=self.movements,
+            ramp_durations=tuple(ramps),
+        )
 
     def commands(self, count: int, seed: int) -> NDArray:
         onset = np.linspace(0, self.steps, self.movements, endpoint=False)[None] + 2.0
-        return self.sampler.sample(count, rng=np.random.default_rng(seed), timing=onset)
+        return self.sampler.sample(count, rng=np.random.default_rng(seed), onsets=onset / self.rate)
 
     @cached_property
     def surrogate(self) -> rt.Surrogate:

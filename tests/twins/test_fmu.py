@@ -132,7 +132,7 @@ def test_faults_hold_the_command(lag: Path) -> None:
     ramp = np.linspace(0, 6, 60)
     commands = np.tile(ramp[:, None], (3, 1, 1))
     twin = FMUTwin.from_file(lag, RATE, ["u"], ["x", "runs"], workers=1)
-    made = twin.simulate(commands, faults=[None, rt.Stuck(0, onset=20), None], seed=0)
+    made = twin.simulate(commands, faults=[None, rt.Stuck(0, onset=0.2), None], seed=0)
     assert made.labels.tolist() == ["Healthy", "Stuck", "Healthy"]
     stuck = np.minimum(ramp, ramp[20])
     np.testing.assert_allclose(made.observed[1, :, 0], lagged(stuck, 1 / RATE), atol=1e-12)
@@ -193,7 +193,7 @@ def test_the_failure_of_a_healthy_run_is_named_as_such(lag: Path) -> None:
     commands[0, 10:, 1] = 3
     twin = FMUTwin.from_file(lag, RATE, ["u", "trouble"], ["x"], workers=1)
     with pytest.raises(rt.SimulationError, match="trajectory 0: without its fault: FMI status"):
-        twin.simulate(commands, faults=[rt.Stuck(1, onset=5)], seed=0)
+        twin.simulate(commands, faults=[rt.Stuck(1, onset=0.05)], seed=0)
 
 
 @pytest.mark.parametrize(("reset", "reuse"), [(1, True), (2, False)], ids=["refused", "idle"])
@@ -211,7 +211,7 @@ def test_an_fmu_without_a_reset_is_instantiated_anew(
 
 def test_same_bytes_whatever_the_workers(lag: Path) -> None:
     commands = np.random.default_rng(1).uniform(-3, 3, size=(300, 10, 1))
-    faults = [rt.Stuck(0, onset=(2, 8)) if i % 3 else None for i in range(300)]
+    faults = [rt.Stuck(0, onset=(0.02, 0.08)) if i % 3 else None for i in range(300)]
     made = []
     for workers in (1, 2):
         twin = FMUTwin.from_file(lag, RATE, ["u"], ["x"], workers=workers)

@@ -74,9 +74,9 @@ def trajectories(count: int = 5, steps: int = 40) -> np.ndarray:
 
 def test_says_what_the_function_says() -> None:
     commands = trajectories()
-    faults = [None, rt.Stuck(0, onset=12), None, None, rt.ActuatorBias(1, bias=(4.0,))]
-    effective = faulty_commands(commands, faults, rt.Segments.from_commands(commands))
-    held = frozen_response(effective, faults)
+    faults = [None, rt.Stuck(0, onset=1.2), None, None, rt.ActuatorBias(1, bias=(4.0,))]
+    effective = faulty_commands(commands, faults, rt.Segments.from_commands(commands), rate=10.0)
+    held = frozen_response(effective, faults, rate=10.0)
     for each in (twin(), twin(vectorised=False)):
         made = each.simulate(commands, faults=faults, seed=0)
         np.testing.assert_array_equal(made.nominal, level(commands))
@@ -92,7 +92,7 @@ def test_nothing_is_computed_twice() -> None:
         calls.append(len(commands))
         return level(commands)
 
-    faults = [None, rt.Stuck(0, onset=12), None, rt.Stuck(1, onset=39), None]
+    faults = [None, rt.Stuck(0, onset=1.2), None, rt.Stuck(1, onset=3.9), None]
     twin(counted).simulate(trajectories(), faults=faults, seed=0)
     assert calls == [5, 1], "the fault after the last sample changes nothing"
     calls.clear()
@@ -129,7 +129,7 @@ def test_noise_is_in_the_residual(settings: dict) -> None:
 
 def test_same_bytes_whatever_the_workers() -> None:
     commands = trajectories(TRAJECTORIES_PER_CHUNK + 3)
-    faults = [rt.Stuck(0, onset=(5, 20)), None, rt.ActuatorBias(1)] * TRAJECTORIES_PER_CHUNK
+    faults = [rt.Stuck(0, onset=(0.5, 2.0)), None, rt.ActuatorBias(1)] * TRAJECTORIES_PER_CHUNK
     made = [
         twin(noisy, nominal=level, vectorised=False, workers=workers).simulate(
             commands, faults=faults[: len(commands)], seed=8
@@ -258,7 +258,7 @@ def test_a_function_may_change_or_keep_what_it_gets_and_gives() -> None:
         return reused[: len(commands)]
 
     commands = trajectories()
-    faults = [rt.Stuck(0, onset=12)] * 5
+    faults = [rt.Stuck(0, onset=1.2)] * 5
     made = twin(rough).simulate(commands, faults=faults, seed=0)
     wanted = twin().simulate(commands, faults=faults, seed=0)
     np.testing.assert_array_equal(commands, trajectories())

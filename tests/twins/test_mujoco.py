@@ -159,7 +159,7 @@ def test_a_stuck_joint_stays_where_it_was_at_the_onset(make, onset: int) -> None
     twin = make(SERVO)
     hidden: dict[str, np.ndarray] = {}
     free = twin.simulate(commands, seed=0).observed[0, :, 0]
-    made = twin.simulate(commands, faults=[rt.Stuck(0, onset)], seed=0, hidden=hidden)
+    made = twin.simulate(commands, faults=[rt.Stuck(0, onset / twin.rate)], seed=0, hidden=hidden)
     stuck = made.observed[0, :, 0]
     np.testing.assert_array_equal(stuck[: onset + 1], free[: onset + 1])
     np.testing.assert_allclose(stuck[onset:], free[onset], atol=1e-5)
@@ -170,7 +170,7 @@ def test_a_stuck_joint_stays_where_it_was_at_the_onset(make, onset: int) -> None
 
 def test_a_heavy_load_does_not_creep(make) -> None:
     twin = make(joint='armature="1e5"', keyframe="raised")
-    made = twin.simulate(np.full((1, 1000, 1), 1e5), faults=[rt.Stuck(0, 20)], seed=0)
+    made = twin.simulate(np.full((1, 1000, 1), 1e5), faults=[rt.Stuck(0, 0.2)], seed=0)
     assert np.ptp(made.observed[0, 21:, 0]) < 1e-5
     assert made.nominal[0, -1, 0] > 10
 
@@ -178,7 +178,7 @@ def test_a_heavy_load_does_not_creep(make) -> None:
 def test_onsets_of_a_batch_do_not_disturb_each_other(make) -> None:
     commands = np.tile(0.8 * np.sin(np.arange(80) / 15)[None, :, None], (4, 1, 1))
     twin = make(SERVO)
-    faults = [rt.Stuck(0, 50), None, rt.Stuck(0, 10), rt.Stuck(0, 50)]
+    faults = [rt.Stuck(0, 0.5), None, rt.Stuck(0, 0.1), rt.Stuck(0, 0.5)]
     together = twin.simulate(commands, faults=faults, seed=0)
     for i, fault in enumerate(faults):
         alone = twin.simulate(commands[:1], faults=[fault], seed=0)

@@ -76,7 +76,7 @@ def test_a_mujoco_twin_takes_parameters_as_it_is() -> None:
 def test_command_side_delays_by_fractions_and_shifts() -> None:
     twin = CommandSide(GAIN)
     made = twin.simulate(
-        RAMP, seed=0, parameters={"delay": [0.0, 2.0, 2.5], "offset.u": 0.25, "gain": 1.0}
+        RAMP, seed=0, parameters={"delay": [0.0, 0.2, 0.25], "offset.u": 0.25, "gain": 1.0}
     )
     assert made.observed[0] == pytest.approx(RAMP[0] + 0.25)
     assert made.observed[1, 2:] == pytest.approx(RAMP[0, :-2] + 0.25)
@@ -87,7 +87,7 @@ def test_command_side_delays_by_fractions_and_shifts() -> None:
 
 def test_command_side_at_rest_is_the_twin_itself(case: rt.Case) -> None:
     commands = arm_commands(case)
-    faults = (None, rt.Stuck(1, onset=(20, 80)), rt.ActuatorBias(2))
+    faults = (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2))
     for plain, sided in ((KINEMATIC, CommandSide(KINEMATIC)), (case.twin, armpi_parametric())):
         for name in ("nominal", "observed"):
             wanted = getattr(plain.simulate(commands, faults=faults, seed=0), name)
@@ -115,7 +115,7 @@ def test_stiffness_and_damping_act_on_the_arm(case: rt.Case) -> None:
 
 
 def test_holding_keeps_the_value() -> None:
-    twin = armpi_parametric().with_values({"damping": 9.0, "delay": 3.0})
+    twin = armpi_parametric().with_values({"damping": 9.0, "delay": 0.03})
     held = twin.holding("stiffness", "damping")
     assert held.names == twin.names[2:]
     commands = np.full((1, 60, 4), 500.0)
@@ -159,16 +159,16 @@ SUBJECTS = {
     "command side": lambda case: TwinSubject(
         ParametricTwin(
             CommandSide(KINEMATIC),
-            command_side_parameters(KINEMATIC.inputs, delay=(0.0, 9.0), offset=9.0),
+            command_side_parameters(KINEMATIC.inputs, delay=(0.0, 0.09), offset=9.0),
             (2.5, 1.0, -2.0, 3.0, -4.0),
         ),
         arm_commands(case),
-        (None, rt.Stuck(1, onset=(20, 80)), rt.ActuatorBias(2)),
+        (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2)),
     ),
     "arm": lambda case: TwinSubject(
         armpi_parametric(rt.ArmPiTwin(step=0.01)),
         arm_commands(case),
-        (None, rt.Stuck(1, onset=(20, 80)), rt.ActuatorBias(2)),
+        (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2)),
     ),
 }
 

@@ -29,7 +29,7 @@ def both(commands: np.ndarray) -> np.ndarray:
 
 PLAIN = FunctionTwin(both, CHANNEL, LEVELS, 10.0)
 SHIFTED = ParametricTwin(
-    CommandSide(PLAIN), command_side_parameters(CHANNEL, delay=(0.0, 5.0), offset=2.0)
+    CommandSide(PLAIN), command_side_parameters(CHANNEL, delay=(0.0, 0.5), offset=2.0)
 )
 
 
@@ -44,7 +44,7 @@ def test_parameters_are_uniform_within_their_bounds_and_one_per_trajectory() -> 
 
 def test_noise_has_its_scale_at_readings_and_is_linear_between() -> None:
     still = np.zeros((200, 41, 1))
-    made = NoisyTwin(PLAIN, np.array([0.5, 2.0]), stride=10).simulate(still, seed=0)
+    made = NoisyTwin(PLAIN, np.array([0.5, 2.0]), sensor_rate=1.0).simulate(still, seed=0)
     read = made.observed[:, ::10]
     assert read.std(axis=(0, 1)) == pytest.approx([0.5, 2.0], rel=0.06)
     assert np.corrcoef(read[:, 0, 0], read[:, 1, 0])[0, 1] == pytest.approx(0, abs=0.2)
@@ -76,7 +76,8 @@ def test_bad_input_is_named() -> None:
     for match, call in {
         "scale: expected 2": lambda: NoisyTwin(PLAIN, np.ones(3)),
         "of at least 0": lambda: NoisyTwin(PLAIN, np.array([1.0, -1.0])),
-        "stride": lambda: NoisyTwin(PLAIN, np.ones(2), stride=0),
+        "sensor_rate": lambda: NoisyTwin(PLAIN, np.ones(2), sensor_rate=3.0),
+        "sensor_rate: expected 10": lambda: NoisyTwin(PLAIN, np.ones(2), sensor_rate=0.0),
         "calibration: expected healthy": lambda: residual_scale(faulty),
         "every output": lambda: residual_scale(made.replace(mask=unseen)),
     }.items():
@@ -100,14 +101,14 @@ def arm_commands(case: rt.Case) -> np.ndarray:
 
 SUBJECTS = {
     "randomised": RandomisedTwin(armpi_parametric()),
-    "noisy": NoisyTwin(KINEMATIC, np.full(3, 0.01), stride=10),
+    "noisy": NoisyTwin(KINEMATIC, np.full(3, 0.01), sensor_rate=10.0),
 }
 
 
 @pytest.mark.parametrize("check", TWIN_CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("kind", SUBJECTS)
 def test_contract(case: rt.Case, kind: str, check: Callable) -> None:
-    faults = (None, rt.Stuck(1, onset=(20, 80)), rt.ActuatorBias(2))
+    faults = (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2))
     check(TwinSubject(SUBJECTS[kind], arm_commands(case), faults))
 
 

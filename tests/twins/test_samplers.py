@@ -14,11 +14,12 @@ from retwin.twins.samplers import (
     RecordedSampler,
 )
 
-SAMPLER = RampSampler(low=(0.0, -2.0), high=(10.0, -1.0), segments=4, steps=400, ramps=(10, 30))
+RATE = 50.0
+SAMPLER = RampSampler((0.0, -2.0), (10.0, -1.0), RATE, 8.0, segments=4, ramp_durations=(0.2, 0.6))
 
 
-def draw(count: int = 50, seed: int = 0, timing: np.ndarray | None = None) -> np.ndarray:
-    return SAMPLER.sample(count, rng=np.random.default_rng(seed), timing=timing)
+def draw(count: int = 50, seed: int = 0, onsets: np.ndarray | None = None) -> np.ndarray:
+    return SAMPLER.sample(count, rng=np.random.default_rng(seed), onsets=onsets)
 
 
 def test_commands_ramp_and_hold_within_the_limits() -> None:
@@ -70,14 +71,35 @@ def test_the_segments_are_those_that_were_drawn() -> None:
     np.testing.assert_allclose(segments.start, [[0, 100, 200, 300]] * 50, atol=1e-3)
 
 
-def test_timing_is_drawn_from_what_was_seen_and_continued() -> None:
-    seen = np.array([[7.0, 120.0, np.nan]])
-    segments = rt.Segments.from_commands(draw(timing=seen))
+def test_onsets_are_drawn_from_what_was_seen_and_continued() -> None:
+    seen = np.array([[7.0, 120.0, np.nan]]) / RATE
+    segments = rt.Segments.from_commands(draw(onsets=seen))
     np.testing.assert_allclose(segments.start, [[7, 120, 220, 320]] * 50, atol=1e-3)
-    assert np.array_equal(draw(timing=np.empty((0, 4))), draw())
-    overlapping = draw(timing=np.array([[0.0, 1.0, 2.0, 3.0]]))
+    assert np.array_equal(draw(onsets=np.empty((0, 4))), draw())
+    overlapping = draw(onsets=np.array([[0.0, 1.0, 2.0, 3.0]]) / RATE)
     assert (overlapping >= SAMPLER.low).all()
     assert (overlapping <= SAMPLER.high).all()
+
+
+@pytest.mark.parametrize("rate", [2.5, 50.0, 4096.0])
+def test_the_same_times_at_every_rate(rate: float) -> None:
+    ramps = RampSampler((0.0,), (1.0,), rate, 16.0, segments=2, ramp_durations=(4.0,))
+    made = ramps.sample(3, rng=np.random.default_rng(0), onsets=np.array([[2.0, 9.2]]))
+    segments = rt.Segments.from_commands(made)
+    np.testing.assert_allclose(segments.start / rate, [[2.0, 9.2]] * 3, atol=1e-3)
+    np.testing.assert_allclose(segments.settle / rate, [[6.0, 13.2]] * 3, atol=1e-3)
+    assert ramps.steps == 16 * rate
+
+
+def test_defaults_are_shares_of_the_duration() -> None:
+    """The same share of a trajectory that lasts a second or a day."""
+    for rate, duration in ((1000.0, 1.0), (1 / 60, 86_400.0)):
+        ramps = RampSampler((0.0,), (1.0,), rate, duration, segments=4)
+        moving = np.diff(ramps.sample(99, rng=np.random.default_rng(0)), axis=1) != 0
+        assert 0.25 < moving.mean() < 0.55
+        holds = HoldSampler((0.0,), (1.0,), rate, duration)
+        changes = np.diff(holds.sample(99, rng=np.random.default_rng(0)), axis=1) != 0
+        assert 5 < changes.sum(axis=1).mean() < 15
 
 
 def test_same_seed_same_commands() -> None:
@@ -95,33 +117,38 @@ def test_same_seed_same_commands() -> None:
         ("start", {"start": (5.0, 0.0)}),
         ("start", {"start": (5.0,)}),
         ("segments", {"segments": 0}),
-        ("ramps: expected durations from 1 to 100", {"ramps": (10, 101)}),
-        ("ramps", {"ramps": ()}),
-        ("ramps", {"ramps": (0,)}),
+        ("ramp_durations: expected from 0.02 s, a sample, to 2 s", {"ramp_durations": (0.2, 2.1)}),
+        ("ramp_durations", {"ramp_durations": (0.0,)}),
+        ("ramp_durations", {"ramp_durations": (np.nan,)}),
+        ("rate", {"rate": 0.0}),
+        ("duration: expected at least two samples, 0.04 s", {"duration": 0.02}),
+        ("duration", {"duration": np.inf}),
     ],
 )
 def test_settings_that_cannot_be_are_refused(match: str, changes: dict) -> None:
-    settings = {"low": (0.0, -2.0), "high": (10.0, -1.0), "segments": 4, "steps": 400}
+    settings = {"low": (0.0, -2.0), "high": (10.0, -1.0), "rate": RATE, "duration": 8.0}
     with pytest.raises(rt.InputError, match=match) as caught:
-        RampSampler(**{**settings, "ramps": (10, 30), **changes})
+        RampSampler(**{**settings, "segments": 4, "ramp_durations": (0.2, 0.6), **changes})
     assert "\n" not in str(caught.value)
 
 
 LOW, HIGH = (0.0, -2.0), (10.0, -1.0)
-HOLDS = HoldSampler(LOW, HIGH, steps=400, hold=(10, 30))
-SINES = MultisineSampler(LOW, HIGH, steps=500, period=500, slow=5, fast=20, weak=0.2)
+HOLDS = HoldSampler(LOW, HIGH, RATE, 8.0, hold_durations=(0.2, 0.6))
+SINES = MultisineSampler(LOW, HIGH, RATE, 10.0, band=(0.1, 2.0), corner=0.5, weak=0.2)
 RECORD = np.arange(2 * 50 * 3, dtype=float).reshape(2, 50, 3)
 
 
 @pytest.mark.parametrize(
-    "sampler", [HOLDS, SINES, RecordedSampler(RECORD, 20)], ids=lambda each: type(each).__name__
+    "sampler",
+    [HOLDS, SINES, RecordedSampler(RECORD, RATE, 0.4)],
+    ids=lambda each: type(each).__name__,
 )
 def test_every_sampler_draws_what_it_is_asked_for(sampler) -> None:
     made = sampler.sample(7, rng=np.random.default_rng(3))
     width = 3 if isinstance(sampler, RecordedSampler) else 2
     assert made.shape == (7, sampler.steps, width)
     assert made.dtype == np.float32
-    again = sampler.sample(7, rng=np.random.default_rng(3), timing=np.array([[1.0]]))
+    again = sampler.sample(7, rng=np.random.default_rng(3), onsets=np.array([[1.0]]))
     assert made.tobytes() == again.tobytes()
     assert made.tobytes() != sampler.sample(7, rng=np.random.default_rng(4)).tobytes()
 
@@ -159,33 +186,40 @@ def test_a_multisine_has_the_spectrum_asked_for() -> None:
 
 
 def test_pieces_of_records_come_from_everywhere() -> None:
-    made = RecordedSampler(RECORD, 20).sample(2000, rng=np.random.default_rng(0))
+    made = RecordedSampler(RECORD, RATE, 0.4).sample(2000, rng=np.random.default_rng(0))
     np.testing.assert_array_equal(np.diff(made, axis=1), 3)
     begins, counts = np.unique(made[:, 0, 0] // 3, return_counts=True)
     assert set(begins) == {*range(31), *range(50, 81)}, "every piece that fits into a record"
     assert counts.min() > 10
-    whole = RecordedSampler(RECORD).sample(10, rng=np.random.default_rng(0))
+    whole = RecordedSampler(RECORD, RATE).sample(10, rng=np.random.default_rng(0))
     assert {row.tobytes() for row in whole} == {row.tobytes() for row in RECORD.astype(np.float32)}
+
+
+def sines(**changes: object) -> MultisineSampler:
+    settings = {"low": (0.0,), "high": (1.0,), "rate": RATE, "duration": 8.0, "band": (0.1, 2.0)}
+    return MultisineSampler(**{**settings, **changes})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: HoldSampler((0.0,), (0.0,)), "limits"),
-        (lambda: HoldSampler((0.0,), (1.0,), steps=1), "steps"),
-        (lambda: HoldSampler((0.0,), (1.0,), hold=(0, 5)), "hold"),
-        (lambda: HoldSampler((0.0,), (1.0,), hold=(6, 5)), "hold"),
-        (lambda: MultisineSampler((0.0,), (np.inf,)), "limits"),
-        (lambda: MultisineSampler((0.0,), (1.0,), steps=0), "steps"),
-        (lambda: MultisineSampler((0.0,), (1.0,), mean=(2.0,)), "mean"),
-        (lambda: MultisineSampler((0.0,), (1.0,), deviation=(-1.0,)), "mean"),
-        (lambda: MultisineSampler((0.0,), (1.0,), mean=(0.5, 0.5)), "mean"),
-        (lambda: MultisineSampler((0.0,), (1.0,), slow=9, fast=5), "slow"),
-        (lambda: MultisineSampler((0.0,), (1.0,), period=0), "period"),
-        (lambda: RecordedSampler(RECORD[0]), r"shape \(50, 3\)"),
-        (lambda: RecordedSampler(RECORD[:0]), "shape"),
-        (lambda: RecordedSampler(RECORD * np.nan), "NaN"),
-        (lambda: RecordedSampler(RECORD, 51), "length: expected from 1 to 50"),
+        (lambda: HoldSampler((0.0,), (0.0,), RATE, 8.0), "limits"),
+        (lambda: HoldSampler((0.0,), (1.0,), RATE, 0.02), "duration"),
+        (lambda: HoldSampler((0.0,), (1.0,), RATE, 8.0, (0.0, 0.1)), "hold_durations"),
+        (lambda: HoldSampler((0.0,), (1.0,), RATE, 8.0, (0.6, 0.5)), "hold_durations"),
+        (lambda: sines(high=(np.inf,)), "limits"),
+        (lambda: sines(duration=0.0), "duration"),
+        (lambda: sines(mean=(2.0,)), "mean"),
+        (lambda: sines(deviation=(-1.0,)), "mean"),
+        (lambda: sines(mean=(0.5, 0.5)), "mean"),
+        (lambda: sines(band=(2.0, 0.1)), "band"),
+        (lambda: sines(band=(0.0, 2.0)), "band"),
+        (lambda: sines(band=(0.1, 25.1)), "band: .* to 25 Hz"),
+        (lambda: sines(corner=2.1), "corner"),
+        (lambda: RecordedSampler(RECORD[0], RATE), r"shape \(50, 3\)"),
+        (lambda: RecordedSampler(RECORD[:0], RATE), "shape"),
+        (lambda: RecordedSampler(RECORD * np.nan, RATE), "NaN"),
+        (lambda: RecordedSampler(RECORD, RATE, 1.02), "duration: expected at most 1 s"),
     ],
 )
 def test_samplers_that_cannot_be_are_refused(make, match: str) -> None:

@@ -26,7 +26,7 @@ def test_same_seed_same_bytes(updated: rt.CorrectedTwin, case: rt.Case, tmp_path
 def test_sources_share_commands_and_faults(
     ibg: rt.Surrogate, updated: rt.CorrectedTwin, case: rt.Case
 ) -> None:
-    alone = rt.generate(ibg, case, per_class=2, seed=5, timing=updated.timing)
+    alone = rt.generate(ibg, case, per_class=2, seed=5, onsets=updated.onsets)
     both = rt.generate(updated, case, per_class=2, seed=5)
     np.testing.assert_array_equal(alone.commands, both.commands)
     np.testing.assert_array_equal(alone.nominal, both.nominal)
@@ -56,10 +56,10 @@ def test_healthy_ones_are_distributed_like_the_robot_s(ibg: rt.Surrogate, case: 
 def test_onsets_come_from_the_calibration_set(
     ibg: rt.Surrogate, emulated: rt.Trajectories, case: rt.Case
 ) -> None:
-    timing = np.array([[3.25, 205.5, 411.0, 612.0, 815.0]])
-    made = rt.generate(ibg, case, per_class=1, seed=0, timing=timing)
+    onsets = np.array([[0.0325, 2.055, 4.11, 6.12, 8.15]])
+    made = rt.generate(ibg, case, per_class=1, seed=0, onsets=onsets)
     found = rt.Segments.from_commands(made.commands)
-    np.testing.assert_allclose(found.start, np.tile(timing, (9, 1)), atol=0.05)
+    np.testing.assert_allclose(found.start, np.tile(100 * onsets, (9, 1)), atol=0.05)
 
 
 def test_saved_and_loaded_generates_the_same(

@@ -17,6 +17,8 @@ from retwin.update.piecewise_linear import evaluate_piecewise_linear
 pytestmark = pytest.mark.numerical
 
 LOW, HIGH = (100.0, -3.0), (900.0, 2.0)
+TIMES = (100.0, 10.0)
+"""Rate in Hz and duration in s of commands."""
 SMALL = 5e-6
 """For outputs of size 1: a few roundings of commands and outputs in single precision."""
 
@@ -53,22 +55,24 @@ def both(
 @pytest.mark.parametrize("jitter", [False, True])
 def test_ramps_take_a_part_of_the_evaluations(jitter: bool) -> None:
     rng = np.random.default_rng(0)
-    timing = np.sort(rng.uniform(0, 900, (20, 5)), axis=1) if jitter else None
-    commands = RampSampler(LOW, HIGH).sample(50, rng=rng, timing=timing)
+    onsets = np.sort(rng.uniform(0, 9, (20, 5)), axis=1) if jitter else None
+    commands = RampSampler(LOW, HIGH, *TIMES, 5).sample(50, rng=rng, onsets=onsets)
     error, share = both(smooth, commands)
     assert error < SMALL
     assert share < 0.2
 
 
 def test_a_hold_takes_one_evaluation() -> None:
-    commands = HoldSampler(LOW, HIGH, hold=(50, 200)).sample(20, rng=np.random.default_rng(0))
+    commands = HoldSampler(LOW, HIGH, *TIMES, (0.5, 2.0)).sample(20, rng=np.random.default_rng(0))
     error, share = both(smooth, commands)
     assert error < SMALL
     assert share < 0.1
 
 
 def test_curves_are_evaluated_sample_by_sample() -> None:
-    commands = MultisineSampler(LOW, HIGH).sample(5, rng=np.random.default_rng(0))
+    commands = MultisineSampler(LOW, HIGH, *TIMES, (0.1, 6.0), 2.0).sample(
+        5, rng=np.random.default_rng(0)
+    )
     error, share = both(smooth, commands)
     assert error < SMALL
     assert share == pytest.approx(1, abs=0.1)
@@ -91,7 +95,7 @@ def test_a_curve_so_slow_that_no_single_sample_shows_it() -> None:
 
 
 def test_a_function_with_a_corner_is_evaluated_sample_by_sample() -> None:
-    commands = RampSampler(LOW, HIGH).sample(20, rng=np.random.default_rng(0))
+    commands = RampSampler(LOW, HIGH, *TIMES, 5).sample(20, rng=np.random.default_rng(0))
 
     def corner(rows: Tensor) -> Tensor:
         return (rows[:, :1] / 400 - 1.2).abs() + (rows[:, 1:] > 0)
@@ -116,7 +120,7 @@ def test_short(steps: int) -> None:
 
 
 def test_each_trajectory_for_itself() -> None:
-    commands = RampSampler(LOW, HIGH).sample(8, rng=np.random.default_rng(1))
+    commands = RampSampler(LOW, HIGH, *TIMES, 5).sample(8, rng=np.random.default_rng(1))
     commands[3:] *= 1e3  # others of another size must not change what counts as straight
     together = evaluate_piecewise_linear(smooth, torch.as_tensor(commands))
     apart = torch.cat(

@@ -9,6 +9,7 @@ from typing import Protocol
 
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.nets.networks import MLP, Network
 from retwin.nets.training import Training
@@ -104,6 +105,12 @@ class Case:
         Splits a file into the calibration set and the test set of a benchmark; None if a file holds
         one set.
 
+    Raises
+    ------
+    InputError
+        The sampler has another rate than the twin, or an actuator would be stuck from after the end
+        of a trajectory only.
+
     """
 
     name: str
@@ -125,6 +132,18 @@ class Case:
     per_class: int = 400
     density: Density | SequenceMixture = Mixture()  # noqa: RUF009 - frozen
     records: Callable[[Path], tuple[Trajectories, Trajectories]] | None = None
+
+    def __post_init__(self) -> None:
+        require(
+            self.sampler.rate == self.rate,
+            "sampler",
+            expected=f"commands at the rate of the twin, {self.rate:g} Hz",
+            got=f"{self.sampler.rate:g} Hz",
+            remedy="give both the same rate",
+        )
+        for fault in self.faults.values():
+            if isinstance(fault, Stuck):
+                fault.onset_range(self.sampler.steps, self.rate)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -153,7 +172,7 @@ class Case:
 
     def with_random_onset(self) -> Case:
         """The same case with stuck actuators whose onset is uniform in the first 4/5 of a run."""
-        onset = (0, 4 * self.sampler.steps // 5)
+        onset = (0.0, 0.8 * self.sampler.steps / self.rate)
         faults = {
             name: replace(fault, onset=onset) if isinstance(fault, Stuck) else fault
             for name, fault in self.faults.items()

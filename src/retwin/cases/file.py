@@ -87,7 +87,10 @@ def read_case(path: str | Path) -> Case:
     folder = path.parent
     named = (catalog.CORRECTIONS, catalog.DENSITIES, catalog.NETWORKS)
     kinds = [kind for entries in named for kind in catalog.classes(entries)]
-    keys = from_settings(CaseFile, _read(path), kinds, place=place)
+    settings = _read(path)
+    rate = settings.get("rate")
+    rate = rate if isinstance(rate, int | float) else None
+    keys = from_settings(CaseFile, settings, kinds, place=place, rate=rate)
     twin = read_twin(keys.twin, keys.inputs, keys.outputs, keys.rate, folder, place)
     parametric = None
     if keys.parameters:
@@ -106,22 +109,28 @@ def read_case(path: str | Path) -> Case:
     for operator in (correction, at_outputs):
         check_density(operator, density, key(place, "density"))
     sensor_rate = twin.rate if keys.sensor_rate is None else keys.sensor_rate
-    return Case(
-        name=keys.name,
-        title=keys.title or keys.name,
-        faults=_faults(keys.faults, twin.inputs, folder, key(place, "faults")),
-        twin=twin,
-        emulator=None,
-        sampler=_sampler(keys.commands, twin, folder, key(place, "commands")),
-        correction=correction,
-        output_correction=at_outputs,
-        sensor_rate=positive(key(place, "sensor_rate"), sensor_rate, unit="Hz"),
-        parametric=parametric,
-        network=_chosen(keys.network, catalog.NETWORKS, key(place, "network")),
-        training=keys.training,
-        density=density,
-        records=_records(keys.records, twin, folder, key(place, "records")),
-    )
+    faults = _faults(keys.faults, twin.inputs, folder, key(place, "faults"))
+    sampler = _sampler(keys.commands, twin, folder, key(place, "commands"))
+    network = _chosen(keys.network, catalog.NETWORKS, key(place, "network"))
+    records = _records(keys.records, twin, folder, key(place, "records"))
+    sensor_rate = positive(key(place, "sensor_rate"), sensor_rate, unit="Hz")
+    with at(place):
+        return Case(
+            name=keys.name,
+            title=keys.title or keys.name,
+            faults=faults,
+            twin=twin,
+            emulator=None,
+            sampler=sampler,
+            correction=correction,
+            output_correction=at_outputs,
+            sensor_rate=sensor_rate,
+            parametric=parametric,
+            network=network,
+            training=keys.training,
+            density=density,
+            records=records,
+        )
 
 
 def check_density(
@@ -197,13 +206,13 @@ def _sampler(value: Any, twin: Twin, folder: Path, place: str) -> CommandSampler
     if isinstance(value, str):
         own: CommandSampler = _own(value, folder, place, CommandSampler)
         return own
-    settings = {"kind": RampSampler.__name__, **value}
+    settings = {"kind": RampSampler.__name__, "rate": twin.rate, **value}
     if settings["kind"] == RecordedSampler.__name__:
         return _recorded(settings, twin, folder, place)
     limits: Limits | None = getattr(twin, "limits", None)
     if limits is not None:
         settings = {"low": limits.low, "high": limits.high, **settings}
-    made: CommandSampler = from_config(settings, SAMPLERS, place=place)
+    made: CommandSampler = from_config(settings, SAMPLERS, place=place, rate=twin.rate)
     return made
 
 
@@ -227,7 +236,7 @@ def _recorded(settings: dict[str, Any], twin: Twin, folder: Path, place: str) ->
         got=f"{', '.join(found.inputs.names) or 'none'} at {found.rate:g} Hz",
         remedy="take data of this system",
     )
-    own = checked(RecordedSampler, options, place=place, besides=("commands",))
+    own = checked(RecordedSampler, options, place=place, besides=("commands",), rate=twin.rate)
     with at(place):
         return RecordedSampler(found.commands, **own)
 

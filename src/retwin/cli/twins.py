@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from retwin.cases.case import Case
     from retwin.data.trajectories import Channels
     from retwin.twins.limits import Limits
+    from retwin.twins.samplers import CommandSampler
     from retwin.twins.twin import Twin
 
 __all__ = ["app"]
@@ -47,6 +48,8 @@ Inputs = Annotated[str, typer.Option(metavar="NAMES", help="Of the inputs, joine
 Outputs = Annotated[str, typer.Option(metavar="NAMES", help="Of the outputs, joined by commas.")]
 Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Samples per second.", min=1e-9)]
 
+RAMPS = 5
+"""Ramps in a trajectory whose commands no case draws: enough to reach levels far apart."""
 OTHERS = {
     "FILE.fmu": "an FMU for co-simulation (FMI 2 or 3)",
     "FILE.xml, FILE.urdf": "a MuJoCo model",
@@ -145,6 +148,10 @@ def simulate(
             autocompletion=complete_faults,
         ),
     ] = "none",
+    duration: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", help="Of commands that no case draws.", min=1e-9),
+    ] = None,
     inputs: Inputs = "",
     outputs: Outputs = "",
     rate: Rate = None,
@@ -163,7 +170,7 @@ def simulate(
     found = _twin(twin, inputs, outputs, rate)
     system = _case(case, twin, found)
     faults = _faults(system, fault)
-    drawn = _sampler(system, found) if commands is None else read(commands, system)
+    drawn = _sampler(system, found, duration) if commands is None else read(commands, system)
     if commands is None and n is None:
         n = len(faults)
     plan = SimulationPlan(found, drawn, seed, n, faults, clip=clip, chunk=chunk)
@@ -261,7 +268,8 @@ def _faults(system: Case | None, fault: str) -> dict[str, Any]:
     )
 
 
-def _sampler(system: Case | None, found: Twin) -> Any:
+def _sampler(system: Case | None, found: Twin, duration: float | None) -> CommandSampler:
+    """The sampler of the case, or ramps within the limits of the twin."""
     if system is not None:
         return system.sampler
     from retwin.twins.samplers import RampSampler
@@ -274,4 +282,11 @@ def _sampler(system: Case | None, found: Twin) -> Any:
             got="none",
             remedy="give --commands FILE, or --case NAME",
         )
-    return RampSampler(limits.low, limits.high)
+    if duration is None:
+        raise InputError(
+            "--duration",
+            expected="the duration of a trajectory in seconds, since no case draws commands",
+            got="none",
+            remedy="give --duration SECONDS, --commands FILE, or --case NAME",
+        )
+    return RampSampler(limits.low, limits.high, found.rate, duration, RAMPS)

@@ -1,8 +1,7 @@
 """`Segments`: the segments of each trajectory, a motion part and then a steady part.
 
 They are found from changes of the commands, from the speed of the nominal outputs if commands do
-not change by steps, or given by the user. Onsets are in samples and may be fractions; no period is
-assumed.
+not change by steps, or given by the user. No period is assumed.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from functools import reduce
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import require
+from retwin.checks import positive, require
 from retwin.errors import InputError
 
 __all__ = ["Segments"]
@@ -27,12 +26,15 @@ TRAJECTORIES_PER_BLOCK = 32
 class Segments:
     """Segments of n trajectories, at most M each.
 
+    Positions are in samples, counted from 0, and may be fractions: divided by the sample rate they
+    are times in seconds. `given` makes them from times in seconds.
+
     Attributes
     ----------
     start : (n, M) array
-        The onset of the motion part, in samples.
+        The onset of the motion part.
     settle : (n, M) array
-        The end of the motion part and the beginning of the steady part, in samples.
+        The end of the motion part and the beginning of the steady part.
     stop : (n, M) array
         The end of the steady part: the next onset, or the end of the trajectory.
     valid : (n, M) array of bool
@@ -89,24 +91,27 @@ class Segments:
         return replace(self, stop=stop)
 
     @classmethod
-    def given(cls, start: ArrayLike, settle: ArrayLike, *, steps: int) -> Segments:
+    def given(cls, start: ArrayLike, settle: ArrayLike, *, steps: int, rate: float) -> Segments:
         """Segments that the user gives; each steady part lasts until the next start.
 
         Parameters
         ----------
         start, settle : (n, M) array
-            Onsets and settle times in samples, NaN where there is no segment.
+            Onsets and settle times in s, NaN where there is no segment.
         steps : int
             Samples per trajectory.
+        rate : float
+            Sample rate in Hz.
 
         Raises
         ------
         InputError
-            Shapes differ, or times are out of order or not between 0 and `steps`.
+            Shapes differ, or times are out of order, before 0 or after the end.
 
         """
-        start = np.atleast_2d(np.asarray(start, dtype=float))
-        settle = np.atleast_2d(np.asarray(settle, dtype=float))
+        rate = positive("rate", rate, unit="Hz")
+        start = np.atleast_2d(np.asarray(start, dtype=float)) * rate
+        settle = np.atleast_2d(np.asarray(settle, dtype=float)) * rate
         require(
             start.shape == settle.shape,
             "segments",
@@ -119,9 +124,9 @@ class Segments:
         if outside.any():
             raise InputError(
                 "segments",
-                expected=f"times between 0 and {steps} samples",
-                got=f"{start[outside][0]:g} to {settle[outside][0]:g}",
-                remedy="give onsets and settle times in samples, not seconds",
+                expected=f"times between 0 and {steps / rate:g} s",
+                got=f"{start[outside][0] / rate:g} to {settle[outside][0] / rate:g} s",
+                remedy="give onsets and settle times in seconds, not samples",
             )
         start = np.where(valid, start, steps)
         settle = np.where(valid, settle, steps)

@@ -15,6 +15,7 @@ from retwin.arrays import row_blocks
 from retwin.checks import require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
+from retwin.times import stride_of
 
 __all__ = ["SETTLED", "Features", "class_index", "class_names", "class_order", "random_phase"]
 
@@ -77,7 +78,8 @@ class Features:
             If the rate of the trajectories is no whole multiple of `rate`.
 
         """
-        stride = _stride(trajectories.rate, min(10.0, trajectories.rate) if rate is None else rate)
+        lower = min(10.0, trajectories.rate) if rate is None else rate
+        stride = stride_of(trajectories.rate, lower)
         return cls(trajectories.outputs, trajectories.rate, stride, hide_start)
 
     @classmethod
@@ -230,16 +232,3 @@ def class_order(
 def class_index(trajectories: Trajectories, order: Sequence[str]) -> Tensor:
     """The labels (n,) as indices into `order`."""
     return torch.tensor([list(order).index(label) for label in trajectories.labels])
-
-
-def _stride(given: float, wanted: float) -> int:
-    """The stride that reduces `given` Hz to `wanted` Hz."""
-    stride = given / wanted if wanted > 0 else 0.0
-    require(
-        stride >= 1 and abs(stride - round(stride)) <= 1e-6,
-        "rate",
-        expected=f"{given:g} Hz, the data's rate, or a whole part of it",
-        got=f"{wanted:g} Hz",
-        remedy="choose the rate of the data divided by a whole number",
-    )
-    return round(stride)

@@ -42,7 +42,7 @@ def checked(faults: Mapping[str, Fault | None]) -> dict[str, Fault | None]:
         remedy="give the faults of a case",
     )
     for fault in faults.values():
-        _limits(fault, 1)
+        _actuator_and_size(fault)
     return dict(faults)
 
 
@@ -86,7 +86,7 @@ class Hypotheses:
         """Every fault about every trajectory; `mask` is True where the sensor was sampled."""
         n, steps, _ = context.commands.shape
         rows = torch.arange(n).repeat_interleave(len(faults))
-        limits = [_limits(fault, steps) for fault in faults]
+        limits = [_limits(fault, steps, context.rate) for fault in faults]
         actuator, size, onsets = (
             torch.tensor(column).repeat(n, *[1] * np.ndim(column[0]))
             for column in zip(*limits, strict=True)
@@ -139,19 +139,26 @@ class Hypotheses:
         return replace(self, problem=self.problem.held_from(frozen))
 
 
-def _limits(fault: Fault | None, steps: int) -> tuple[int, tuple[float, float], tuple[int, int]]:
-    """Actuator, limits of the size of a bias, and of the onset of standing still."""
+def _actuator_and_size(fault: Fault | None) -> tuple[int, tuple[float, float]]:
+    """Actuator, and limits of the size of a bias; InputError for a fault of another kind."""
     match fault:
         case None:
-            return 0, (0.0, 0.0), (steps, steps)
-        case Stuck(actuator=actuator, onset=onset):
-            low, high = (onset, onset) if isinstance(onset, int) else onset
-            return actuator, (0.0, 0.0), (min(low, steps - 1), min(high, steps - 1))
+            return 0, (0.0, 0.0)
+        case Stuck(actuator=actuator):
+            return actuator, (0.0, 0.0)
         case ActuatorBias(actuator=actuator, size=size, bias=()):
-            return actuator, size, (steps, steps)
+            return actuator, size
     raise InputError(
         "faults",
         expected="None, Stuck, or ActuatorBias with its bias open",
         got=repr(fault),
         remedy="leave out what cannot be inverted, or train a diagnoser",
     )
+
+
+def _limits(
+    fault: Fault | None, steps: int, rate: float
+) -> tuple[int, tuple[float, float], tuple[int, int]]:
+    """Actuator, limits of the size of a bias, and of the sample at which it is stuck."""
+    onsets = fault.onset_range(steps, rate) if isinstance(fault, Stuck) else (steps, steps)
+    return *_actuator_and_size(fault), onsets

@@ -70,7 +70,7 @@ class Diagnosis:
     level : Estimate
         (n, C), where a stuck actuator stands, in its command's unit.
     onset : Estimate
-        (n, C), the sample from which it is stuck.
+        (n, C), the time in s from which it is stuck.
     bias : Estimate
         (n, C, M), error of a biased actuator in each segment, in its command's unit.
 
@@ -194,7 +194,10 @@ class InversionDiagnoser:
             self.classes,
             share / share.sum(axis=1, keepdims=True),
             evidence,
-            *(Estimate(*np.moveaxis(each, -1, 0)) for each in (level, onset, bias)),
+            *(
+                Estimate(*np.moveaxis(each, -1, 0))
+                for each in (level, onset / trajectories.rate, bias)
+            ),
         )
 
     def save(self, folder: str | Path) -> None:
@@ -214,12 +217,13 @@ class InversionDiagnoser:
         """Read what `save` wrote; InputError when it is not an inversion or damaged."""
         about, weights = read_model(folder, "inversion")
         folder = Path(folder)
+        surrogate = Surrogate.load(folder / "surrogate")
         faults = {
-            name: None if config is None else from_config(config, FAULTS)
+            name: None if config is None else from_config(config, FAULTS, rate=surrogate.rate)
             for name, config in about["faults"]
         }
         return cls(
-            Surrogate.load(folder / "surrogate"),
+            surrogate,
             ResidualModel.load(folder / "residual"),
             faults,
             noise=Noise(weights["scale"], weights["thinning"]),

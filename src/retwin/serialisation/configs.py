@@ -72,7 +72,15 @@ class Converted:
 RENAMED_KINDS = {"SteadyStateError": "ActuatorBias"}
 """Kinds in files of versions before 0.1.0, and their present names."""
 RENAMED_SETTINGS: dict[str, dict[str, str | Converted]] = {
-    "RampSampler": {"movements": "segments"},
+    "RampSampler": {
+        "movements": "segments",
+        "steps": Converted("duration"),
+        "ramps": Converted("ramp_durations"),
+    },
+    "HoldSampler": {"steps": Converted("duration"), "hold": Converted("hold_durations")},
+    "MultisineSampler": {"steps": Converted("duration")},
+    "RecordedSampler": {"length": Converted("duration")},
+    "Stuck": {"onset": Converted("onset")},
     "Training": {"epochs": "max_epochs", "batch": "batch_size", "rate": "learning_rate"},
     "CommandSpace": {"most": "max_samples", "known": "identified_below"},
 }

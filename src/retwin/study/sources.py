@@ -48,7 +48,8 @@ def noisy_surrogate(trial: Trial) -> Twin:
     """The IBG with white output noise of the residual's standard deviation."""
     healthy = trial.healthy
     scale = residual_scale(healthy)
-    return NoisyTwin(trial.surrogate(), scale, stride=trial.stride, emulated=healthy.emulated)
+    rate = trial.case.sensor_rate
+    return NoisyTwin(trial.surrogate(), scale, sensor_rate=rate, emulated=healthy.emulated)
 
 
 def least_squares_twin(trial: Trial) -> Twin:

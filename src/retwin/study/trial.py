@@ -112,11 +112,6 @@ class Trial:
         """The case's own correction for "command", else the one at the outputs (the paper's)."""
         return self.case.correction if name == "command" else self.case.output_correction
 
-    @property
-    def stride(self) -> int:
-        """Samples of the data per sample of the sensor."""
-        return max(1, round(self.case.rate / self.case.sensor_rate))
-
     # Data.
 
     @property
@@ -126,13 +121,13 @@ class Trial:
         return self._noisy(self.files.twin_data(), seed)
 
     @property
-    def timing(self) -> NDArray | None:
-        """Onsets (k, M) of segments in the calibration set, in samples; NaN for none."""
+    def onsets(self) -> NDArray | None:
+        """Onsets (k, M) of segments in the calibration set, in s; NaN for none."""
         if "timing" not in SEES[self.sees]:
             return None
         seen = self.files.real_data()[list(self.fold[0])]
         segments = Segments.from_commands(seen.commands).until(seen.lengths)
-        return np.where(segments.valid, segments.start, np.nan)
+        return np.where(segments.valid, segments.start / seen.rate, np.nan)
 
     @property
     def healthy(self) -> Trajectories:
@@ -197,7 +192,7 @@ class Trial:
             self.case,
             per_class=self.plan.generated(self.case),
             seed=self.seed("generate"),
-            timing=self.timing,
+            onsets=self.onsets,
         )
         return self._noisy(made, self.seed("encoder noise in training"))
 

@@ -54,7 +54,8 @@ class TwinSubject:
             remedy="give a few short trajectories that the twin can follow",
         )
         if not self.faults:
-            stuck = [_stuck(each, number) for number, each in enumerate(self.commands[1:])]
+            rate = self.twin.rate
+            stuck = [_stuck(each, number, rate) for number, each in enumerate(self.commands[1:])]
             object.__setattr__(self, "faults", (None, *stuck))
         healthy = sum(fault is None for fault in self.faults)
         require(
@@ -104,7 +105,8 @@ class TwinSubject:
             One per trajectory.
 
         """
-        return draw_faults(self.faults, Segments.from_commands(self.commands), seed)
+        segments = Segments.from_commands(self.commands)
+        return draw_faults(self.faults, segments, seed, rate=self.twin.rate)
 
     def affected(self, seed: int) -> NDArray:
         """Whether the faults change the reference or the response of the actuators.
@@ -120,16 +122,17 @@ class TwinSubject:
             One per trajectory.
 
         """
-        drawn = self.drawn(seed)
-        effective = faulty_commands(self.commands, drawn, Segments.from_commands(self.commands))
-        return (frozen_response(effective, drawn) != self.commands).any(axis=(1, 2))
+        drawn, rate = self.drawn(seed), self.twin.rate
+        segments = Segments.from_commands(self.commands)
+        effective = faulty_commands(self.commands, drawn, segments, rate=rate)
+        return (frozen_response(effective, drawn, rate=rate) != self.commands).any(axis=(1, 2))
 
 
-def _stuck(commands: NDArray, number: int) -> Stuck:
+def _stuck(commands: NDArray, number: int, rate: float) -> Stuck:
     """A fault of an actuator that moves in (T, d_u), another actuator for each number."""
     moving = np.diff(commands, axis=0) != 0
     actuators = np.flatnonzero(moving.any(axis=0))
     if len(actuators) == 0:
-        return Stuck(0, onset=0)
+        return Stuck(0, onset=0.0)
     actuator = int(actuators[number % len(actuators)])
-    return Stuck(actuator, onset=(0, int(np.flatnonzero(moving[:, actuator])[-1])))
+    return Stuck(actuator, onset=(0.0, np.flatnonzero(moving[:, actuator])[-1] / rate))

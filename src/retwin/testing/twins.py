@@ -223,8 +223,8 @@ def check_bad_faults(subject: TwinSubject) -> None:
     bad: dict[str, list[Fault | None]] = {
         "a fault too few": rest,
         "a fault too many": [None, None, *rest],
-        "an actuator that is not there": [Stuck(width, onset=1), *rest],
-        "an actuator below 0": [Stuck(-1, onset=1), *rest],
+        "an actuator that is not there": [Stuck(width, onset=0.0), *rest],
+        "an actuator below 0": [Stuck(-1, onset=0.0), *rest],
     }
     for what, faults in bad.items():
         require_refused(lambda f=faults: subject.simulate(faults=f), "faults", what)  # type: ignore[misc]

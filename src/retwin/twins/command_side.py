@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from retwin.arrays import interpolated
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
@@ -24,9 +25,10 @@ from retwin.twins.twin import (
 )
 from retwin.twins.wrapper import TwinWrapper, simulate_chunk
 
-__all__ = ["CommandSide", "command_side_parameters"]
+__all__ = ["DELAY", "CommandSide", "command_side_parameters"]
 
 DELAY = "delay"
+"""Name of the parameter that is the delay."""
 OFFSET = "offset"
 
 
@@ -34,8 +36,8 @@ OFFSET = "offset"
 class CommandSide(TwinWrapper):
     """Any twin whose commands are delayed and offset: parameters `delay` and `offset.CHANNEL`.
 
-    The transport delay, in samples with fractions allowed, is the same for all actuators. Each
-    actuator has an offset in its command unit, constant from the first sample on. Both act after
+    The transport delay in s is the same for all actuators. Each actuator has an offset in its
+    command unit, constant from the first sample on. Both act after
     the faults of the reference and before a stuck actuator is held; the result is clipped to the
     twin's limits. Other parameters are passed to the wrapped twin.
 
@@ -75,7 +77,8 @@ class CommandSide(TwinWrapper):
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             rows = np.arange(len(chunk.commands))
             options = {name: each[chunk.index] for name, each in inner_values.items()}
-            delayed = _delayed(chunk.faulty_commands, delay[chunk.index])
+            late = delay[chunk.index, None] * self.rate
+            delayed = interpolated(chunk.faulty_commands, np.arange(commands.shape[1]) - late)
             effective = self._clipped(delayed + offset[chunk.index][:, None])
             responses: list[Fault | None] = [
                 None if fault is None else _ResponseOnly(fault) for fault in chunk.faults
@@ -111,7 +114,7 @@ def command_side_parameters(
     inputs : Channels
         The d_u command channels.
     delay : (float, float)
-        Lowest and highest delay in samples; the start is the value nearest to 0.
+        Lowest and highest delay in s; the start is the value nearest to 0.
     offset : float
         Highest magnitude of an offset in command units; the start is 0.
 
@@ -126,7 +129,7 @@ def command_side_parameters(
         for name, unit in zip(inputs.names, inputs.units, strict=True)
     )
     start = min(max(0.0, delay[0]), delay[1])
-    return Parameter(DELAY, "samples", *delay, start), *offsets
+    return Parameter(DELAY, "s", *delay, start), *offsets
 
 
 @dataclass(frozen=True)
@@ -140,24 +143,16 @@ class _ResponseOnly:
         """Class name of the fault."""
         return self.fault.label
 
-    def drawn(self, rng: np.random.Generator, *, steps: int, segments: int) -> _ResponseOnly:
+    def drawn(
+        self, rng: np.random.Generator, *, steps: int, segments: int, rate: float
+    ) -> _ResponseOnly:
         """The fault itself: its severity is fixed already."""
         return self
 
-    def command(self, commands: NDArray, segments: Segments) -> NDArray:
+    def command(self, commands: NDArray, segments: Segments, rate: float) -> NDArray:
         """The commands unchanged."""
         return commands
 
-    def response(self, response: NDArray) -> NDArray:
+    def response(self, response: NDArray, rate: float) -> NDArray:
         """The response with the fault."""
-        return self.fault.response(response)
-
-
-def _delayed(commands: NDArray, delay: NDArray) -> NDArray:
-    """Commands (n, T, d_u) delayed by `delay` (n,) samples, linear between samples."""
-    last = commands.shape[1] - 1
-    times = np.clip(np.arange(last + 1) - delay[:, None], 0, last)
-    below = np.minimum(times.astype(int), last - 1)
-    fraction = (times - below)[..., None]
-    row = np.arange(len(commands))[:, None]
-    return (1 - fraction) * commands[row, below] + fraction * commands[row, below + 1]
+        return self.fault.response(response, rate)

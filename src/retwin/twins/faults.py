@@ -1,6 +1,7 @@
 """Faults of actuators: their effect on the reference, and on the response.
 
-A fault whose severity is open stands for a class of faults; `drawn` draws the severity.
+A fault whose severity is open stands for a class of faults; `drawn` draws the severity. A fault
+holds times in seconds, and gets the sample rate of the arrays that it changes.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 from retwin.checks import one_per, require
 from retwin.data.segments import Segments
 from retwin.errors import InputError
+from retwin.times import to_samples
 
 __all__ = [
     "ActuatorBias",
@@ -37,7 +40,7 @@ class Fault(Protocol):
         """Class name of the fault."""
         ...
 
-    def drawn(self, rng: np.random.Generator, *, steps: int, segments: int) -> Fault:
+    def drawn(self, rng: np.random.Generator, *, steps: int, segments: int, rate: float) -> Fault:
         """Draw every open severity.
 
         Parameters
@@ -48,6 +51,8 @@ class Fault(Protocol):
             Samples of the trajectory.
         segments : int
             Segments of the trajectory.
+        rate : float
+            Sample rate in Hz.
 
         Returns
         -------
@@ -57,7 +62,7 @@ class Fault(Protocol):
         """
         ...
 
-    def command(self, commands: NDArray, segments: Segments) -> NDArray:
+    def command(self, commands: NDArray, segments: Segments, rate: float) -> NDArray:
         """Reference that the actuators follow under the fault.
 
         Parameters
@@ -66,6 +71,8 @@ class Fault(Protocol):
             Clean commands of one trajectory.
         segments : Segments
             Its segments.
+        rate : float
+            Sample rate in Hz.
 
         Returns
         -------
@@ -75,13 +82,15 @@ class Fault(Protocol):
         """
         ...
 
-    def response(self, response: NDArray) -> NDArray:
+    def response(self, response: NDArray, rate: float) -> NDArray:
         """Response of the actuators under the fault.
 
         Parameters
         ----------
         response : ndarray, shape (T, d_u)
             Response to the effective commands, in command units.
+        rate : float
+            Sample rate in Hz.
 
         Returns
         -------
@@ -100,53 +109,75 @@ class Stuck:
     ----------
     actuator : int
         The actuator, counted from 0.
-    onset : int or (int, int), default 49
-        Sample, counted from 0, from which the response is held, at least 0. A pair (low, high) is
-        the range of a uniform draw. The published protocol holds from sample 49 on.
+    onset : float or (float, float), default 0.49
+        Time in s from which the response is held, at least 0. A pair (low, high) is the range of a
+        uniform draw of whole samples. The published protocol holds from 0.49 s on.
     label : str
         Class name.
 
     Raises
     ------
     InputError
-        An onset that is negative or not a whole number, or a pair out of order.
+        An onset that is negative, infinite or no number, or a pair out of order. When drawn: an
+        onset after the end of the trajectory.
 
     """
 
     actuator: int
-    onset: int | tuple[int, int] = 49
+    onset: float | tuple[float, float] = 0.49
     label: str = "Stuck"
 
     def __post_init__(self) -> None:
-        pair = isinstance(self.onset, Sequence)
-        ends: Sequence = self.onset if isinstance(self.onset, Sequence) else (self.onset,) * 2
-        whole = all(isinstance(end, int | np.integer) for end in ends)
+        low, high = self._range
         require(
-            whole and len(ends) == 2 and 0 <= ends[0] <= ends[1],
+            0 <= low <= high < math.inf,
             "onset",
-            expected="a sample from 0 on, or a pair (low, high) of them, in order",
+            expected="a time in s from 0 on, or a pair (low, high) of them, in order",
             got=repr(self.onset),
-            remedy="count the samples from 0",
+            remedy="count the seconds from the first sample",
         )
-        low, high = map(int, ends)
-        object.__setattr__(self, "onset", (low, high) if pair else low)
+        # Decimals: in files a whole number is an onset in samples, as before version 0.1.0.
+        onset = (low, high) if isinstance(self.onset, Sequence) else low
+        object.__setattr__(self, "onset", onset)
 
-    def drawn(self, rng: np.random.Generator, *, steps: int, segments: int) -> Stuck:
+    @property
+    def _range(self) -> tuple[float, float]:
+        """Earliest and latest onset in s; NaN for anything else."""
+        ends = self.onset if isinstance(self.onset, Sequence) else (self.onset,) * 2
+        numbers = len(ends) == 2 and all(isinstance(end, Real) for end in ends)
+        return (float(ends[0]), float(ends[1])) if numbers else (math.nan, math.nan)
+
+    def onset_range(self, steps: int, rate: float) -> tuple[int, int]:
+        """First and last sample at which it can begin in a trajectory of so many samples.
+
+        Raises InputError if the earliest onset is after the end.
+        """
+        low, high = (to_samples(each, rate) for each in self._range)
+        require(
+            low < steps,
+            "onset",
+            expected=f"a time in s within the trajectory, which lasts {steps / rate:g} s",
+            got=f"{self._range[0]:g} s",
+            remedy="give an earlier one, in seconds and not in samples",
+        )
+        return low, min(high, steps - 1)
+
+    def drawn(self, rng: np.random.Generator, *, steps: int, segments: int, rate: float) -> Stuck:
         """The same fault with its onset drawn; see `Fault.drawn`."""
-        if isinstance(self.onset, int):
+        low, high = self.onset_range(steps, rate)
+        if not isinstance(self.onset, tuple):
             return self
-        low, high = (min(onset, steps - 1) for onset in self.onset)
-        return replace(self, onset=int(rng.integers(low, high + 1)))
+        return replace(self, onset=int(rng.integers(low, high + 1)) / rate)
 
-    def command(self, commands: NDArray, segments: Segments) -> NDArray:
+    def command(self, commands: NDArray, segments: Segments, rate: float) -> NDArray:
         """The clean commands: the fault acts on the response. See `Fault.command`."""
         return commands
 
-    def response(self, response: NDArray) -> NDArray:
+    def response(self, response: NDArray, rate: float) -> NDArray:
         """The response, constant from the onset on; see `Fault.response`."""
-        onset = self.onset
-        if not isinstance(onset, int):
+        if isinstance(self.onset, tuple):
             raise _open(self)
+        onset = to_samples(self.onset, rate)
         held = response.copy()
         held[onset:, self.actuator] = held[min(onset, len(held) - 1), self.actuator]
         return held
@@ -192,7 +223,9 @@ class ActuatorBias:
             remedy="leave the sign out, it is drawn",
         )
 
-    def drawn(self, rng: np.random.Generator, *, steps: int, segments: int) -> ActuatorBias:
+    def drawn(
+        self, rng: np.random.Generator, *, steps: int, segments: int, rate: float
+    ) -> ActuatorBias:
         """The same fault with one bias per segment drawn; see `Fault.drawn`."""
         if self.bias:
             return self
@@ -200,7 +233,7 @@ class ActuatorBias:
         drawn = rng.uniform(*self.size, size=count) * (2.0 * rng.integers(2, size=count) - 1.0)
         return replace(self, bias=tuple(drawn.tolist()))
 
-    def command(self, commands: NDArray, segments: Segments) -> NDArray:
+    def command(self, commands: NDArray, segments: Segments, rate: float) -> NDArray:
         """The commands with the biased reference of one actuator; see `Fault.command`."""
         if not self.bias:
             raise _open(self)
@@ -215,7 +248,7 @@ class ActuatorBias:
         biased[:, self.actuator] += bias
         return biased
 
-    def response(self, response: NDArray) -> NDArray:
+    def response(self, response: NDArray, rate: float) -> NDArray:
         """The response unchanged: it follows the biased reference. See `Fault.response`."""
         return response
 
@@ -225,7 +258,8 @@ def _along(clean: NDArray, start: NDArray, settle: NDArray, levels: NDArray) -> 
     clean = clean.astype(np.float64)
     bias = np.zeros(len(clean))
     before = 0.0
-    segments = (start, settle, _interpolated(clean, start), _interpolated(clean, settle), levels)
+    ends = (np.interp(each, np.arange(len(clean)), clean) for each in (start, settle))
+    segments = (start, settle, *ends, levels)
     # Python numbers: for single values they are faster than numpy's.
     for begin, end, first, last, level in zip(*(each.tolist() for each in segments), strict=True):
         if first != last:
@@ -241,13 +275,6 @@ def _along(clean: NDArray, start: NDArray, settle: NDArray, levels: NDArray) -> 
     return bias
 
 
-def _interpolated(values: NDArray, times: NDArray) -> NDArray:
-    """Values (T,) at times in samples, linear between samples."""
-    left = np.minimum(times.astype(int), len(values) - 2)
-    fraction = np.minimum(times - left, 1.0)
-    return values[left] + fraction * (values[left + 1] - values[left])
-
-
 def _open(fault: Fault) -> InputError:
     """The error for a fault that must have a fixed severity and has none."""
     return InputError(
@@ -259,7 +286,7 @@ def _open(fault: Fault) -> InputError:
 
 
 def draw_faults(
-    faults: Sequence[Fault | None], segments: Segments, seed: int
+    faults: Sequence[Fault | None], segments: Segments, seed: int, *, rate: float
 ) -> list[Fault | None]:
     """Draw the severity of every fault.
 
@@ -271,6 +298,8 @@ def draw_faults(
         Segments of the n trajectories.
     seed : int
         The same seed gives the same severities with every twin, so that twins can be compared.
+    rate : float
+        Sample rate in Hz.
 
     Returns
     -------
@@ -280,7 +309,7 @@ def draw_faults(
     Raises
     ------
     InputError
-        Not one fault per trajectory.
+        Not one fault per trajectory, or one that would begin after the end of its trajectory.
 
     """
     remedy = "give None for a healthy trajectory"
@@ -288,13 +317,15 @@ def draw_faults(
     rng = np.random.default_rng(seed)
     counts = segments.valid.sum(axis=1)
     return [
-        None if fault is None else fault.drawn(rng, steps=segments.steps, segments=int(count))
+        None
+        if fault is None
+        else fault.drawn(rng, steps=segments.steps, segments=int(count), rate=rate)
         for fault, count in zip(faults, counts, strict=True)
     ]
 
 
 def faulty_commands(
-    commands: NDArray, faults: Sequence[Fault | None], segments: Segments
+    commands: NDArray, faults: Sequence[Fault | None], segments: Segments, *, rate: float
 ) -> NDArray:
     """Commands with the effect of every fault on the reference.
 
@@ -306,6 +337,8 @@ def faulty_commands(
         One per trajectory, with fixed severities.
     segments : Segments
         Segments of the commands.
+    rate : float
+        Sample rate in Hz.
 
     Returns
     -------
@@ -316,11 +349,11 @@ def faulty_commands(
     out = commands.copy()
     for i, fault in enumerate(faults):
         if fault is not None:
-            out[i] = fault.command(commands[i], segments[i : i + 1])
+            out[i] = fault.command(commands[i], segments[i : i + 1], rate)
     return out
 
 
-def frozen_response(response: NDArray, faults: Sequence[Fault | None]) -> NDArray:
+def frozen_response(response: NDArray, faults: Sequence[Fault | None], *, rate: float) -> NDArray:
     """Response of the actuators with the effect of every fault on it.
 
     A twin whose actuators cannot be accessed applies this to its commands, which are then held.
@@ -331,6 +364,8 @@ def frozen_response(response: NDArray, faults: Sequence[Fault | None]) -> NDArra
         Response without faults, in command units.
     faults : sequence of Fault or None
         One per trajectory, with fixed severities.
+    rate : float
+        Sample rate in Hz.
 
     Returns
     -------
@@ -341,11 +376,13 @@ def frozen_response(response: NDArray, faults: Sequence[Fault | None]) -> NDArra
     out = response.copy()
     for i, fault in enumerate(faults):
         if fault is not None:
-            out[i] = fault.response(response[i])
+            out[i] = fault.response(response[i], rate)
     return out
 
 
-def frozen_from(faults: Sequence[Fault | None], steps: int, actuators: int) -> NDArray:
+def frozen_from(
+    faults: Sequence[Fault | None], steps: int, actuators: int, *, rate: float
+) -> NDArray:
     """Sample from which every actuator is held.
 
     For twins that integrate their dynamics and must hold an actuator meanwhile. The sample is
@@ -359,6 +396,8 @@ def frozen_from(faults: Sequence[Fault | None], steps: int, actuators: int) -> N
         Samples per trajectory, T.
     actuators : int
         The number of actuators, d_u.
+    rate : float
+        Sample rate in Hz.
 
     Returns
     -------
@@ -376,7 +415,7 @@ def frozen_from(faults: Sequence[Fault | None], steps: int, actuators: int) -> N
     for i, fault in enumerate(faults):
         if fault is None:
             continue
-        response = fault.response(rising)
+        response = fault.response(rising, rate)
         if response is rising:
             continue
         onset = response[-1].astype(int)

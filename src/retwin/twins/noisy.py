@@ -8,14 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require, whole
+from retwin.arrays import interpolated
+from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
 from retwin.progress import Progress
+from retwin.times import stride_of
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, Twin, simulate_in_chunks
 from retwin.twins.wrapper import TwinWrapper, chunk_generator, simulate_chunk
 
-__all__ = ["NoisyTwin", "interpolate_samples", "residual_scale", "sensor_sample_count"]
+__all__ = ["NoisyTwin", "residual_scale", "sensor_sample_count"]
 
 OUTPUT_NOISE = 4
 """The purpose of the random numbers that are the noise, see `chunk_generator`."""
@@ -34,21 +36,23 @@ class NoisyTwin(TwinWrapper):
         The wrapped twin.
     scale : ndarray, shape (d_y,)
         Standard deviation of a sensor sample, in output units, at least 0; see `residual_scale`.
-    stride : int, default 1
-        Data samples per sensor sample, at least 1; in between the noise is interpolated linearly.
+    sensor_rate : float, optional
+        Rate of the sensor in Hz, by which the rate of the data can be divided; by default that of
+        the data. In between the noise is interpolated linearly.
     emulated : bool, default False
         Whether the data from which the scale was estimated are emulated.
 
     Raises
     ------
     InputError
-        Not one finite scale of at least 0 per output, or a stride below 1.
+        Not one finite scale of at least 0 per output, or a sensor's rate that does not divide the
+        rate of the data.
 
     """
 
     twin: Twin
     scale: NDArray
-    stride: int = 1
+    sensor_rate: float | None = None
     emulated: bool = False
 
     def __post_init__(self) -> None:
@@ -60,8 +64,8 @@ class NoisyTwin(TwinWrapper):
             got=scale.tolist(),
             remedy="estimate it by residual_scale(calibration trajectories)",
         )
-        whole("stride", self.stride, least=1, remedy="divide the data's rate by the sensor's")
         object.__setattr__(self, "scale", scale)
+        stride_of(self.rate, self.sensor_rate, argument="sensor_rate")
 
     def simulate(
         self,
@@ -72,14 +76,15 @@ class NoisyTwin(TwinWrapper):
         progress: Progress | None = None,
     ) -> Trajectories:
         """See `Twin.simulate`; noise is added last, to faulty trajectories too."""
+        every = stride_of(self.rate, self.sensor_rate)
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             rows = np.arange(len(chunk.commands))
             nominal, observed = simulate_chunk(self.twin, chunk, rows, seed=seed)
             count, steps, width = observed.shape
-            shape = (count, sensor_sample_count(steps, self.stride), width)
+            shape = (count, sensor_sample_count(steps, every), width)
             noise = self.scale * chunk_generator(seed, chunk, OUTPUT_NOISE).normal(size=shape)
-            return nominal, observed + interpolate_samples(noise, self.stride, steps)
+            return nominal, observed + interpolated(noise, np.arange(steps), every)
 
         return simulate_in_chunks(
             self, run, commands, faults, seed=seed, progress=progress, emulated=self.emulated
@@ -141,26 +146,3 @@ def sensor_sample_count(steps: int, stride: int) -> int:
 
     """
     return (steps - 1) // stride + 2
-
-
-def interpolate_samples(samples: NDArray, stride: int, steps: int) -> NDArray:
-    """Interpolate sensor samples linearly.
-
-    Parameters
-    ----------
-    samples : ndarray, shape (n, r, d)
-        Sensor samples, r of `sensor_sample_count`.
-    stride : int
-        Data samples per sensor sample.
-    steps : int
-        Data samples to compute.
-
-    Returns
-    -------
-    ndarray, shape (n, steps, d)
-        Values at the data samples, the first at the first sensor sample.
-
-    """
-    time = np.arange(steps)
-    before, fraction = time // stride, (time % stride / stride)[:, None]
-    return (1 - fraction) * samples[:, before] + fraction * samples[:, before + 1]

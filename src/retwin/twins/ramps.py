@@ -80,7 +80,7 @@ def draw_onsets(
     period: float,
     *,
     rng: np.random.Generator,
-    timing: NDArray | None = None,
+    given: NDArray | None = None,
 ) -> NDArray:
     """Draw the onsets of segments.
 
@@ -94,7 +94,7 @@ def draw_onsets(
         Samples from one onset to the next.
     rng : numpy.random.Generator
         Source of the draw.
-    timing : ndarray, shape (k, m), optional
+    given : ndarray, shape (k, m), optional
         Onsets in samples of k real trajectories, of which each trajectory gets one at random.
         Where that has no onset (NaN, or m below M), the segment begins a period after the segment
         before. Without it, onsets are evenly spaced from sample 0 on.
@@ -105,9 +105,9 @@ def draw_onsets(
         Onsets in samples.
 
     """
-    if timing is None or len(timing) == 0:
+    if given is None or len(given) == 0:
         return np.tile(period * np.arange(segments, dtype=float), (count, 1))
-    drawn = timing[rng.integers(len(timing), size=count), :segments]
+    drawn = given[rng.integers(len(given), size=count), :segments]
     onsets = np.full((count, segments), np.nan)
     onsets[:, : drawn.shape[1]] = drawn
     for segment in range(segments):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import positive, require
+from retwin.times import to_samples
 from retwin.twins.ramps import draw_onsets, ramps_and_holds
 
 __all__ = [
@@ -19,9 +21,19 @@ __all__ = [
     "RecordedSampler",
 ]
 
+RAMP_SHARES = (0.3, 0.4, 0.5)
+"""Default durations of ramps, as shares of a segment: half of it and more is left to settle."""
+HOLD_SHARES = (0.02, 0.2)
+"""Shortest and longest default hold, as shares of a trajectory, which has ten levels or so."""
+
 
 class CommandSampler(Protocol):
     """A distribution of commands such as an operator gives."""
+
+    @property
+    def rate(self) -> float:
+        """Sample rate in Hz."""
+        ...
 
     @property
     def steps(self) -> int:
@@ -29,7 +41,7 @@ class CommandSampler(Protocol):
         ...
 
     def sample(
-        self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
+        self, count: int, *, rng: np.random.Generator, onsets: NDArray | None = None
     ) -> NDArray:
         """Draw commands.
 
@@ -39,9 +51,9 @@ class CommandSampler(Protocol):
             Trajectories to draw, n.
         rng : numpy.random.Generator
             Source of the draw.
-        timing : ndarray, shape (k, M), optional
-            Onsets of k real trajectories in samples, NaN where one has fewer segments; onsets of
-            the commands are drawn from them. A sampler without segments ignores it.
+        onsets : ndarray, shape (k, M), optional
+            Onsets of k real trajectories in s, NaN where one has fewer segments; onsets of the
+            commands are drawn from them. A sampler without segments ignores it.
 
         Returns
         -------
@@ -52,21 +64,48 @@ class CommandSampler(Protocol):
         ...
 
 
+class _Timed:
+    """The number of samples of a sampler with a rate and a duration."""
+
+    if TYPE_CHECKING:
+        rate: float
+        duration: float
+
+    @property
+    def steps(self) -> int:
+        """Samples per trajectory."""
+        return to_samples(self.duration, self.rate)
+
+    def _check_steps(self) -> None:
+        """Refuse a rate that is not positive, and fewer than two samples."""
+        positive("rate", self.rate, unit="Hz")
+        least = 2 / self.rate
+        require(
+            0 < self.duration < np.inf and self.steps >= 2,
+            "duration",
+            expected=f"at least two samples, {least:g} s",
+            got=f"{self.duration!r} s",
+            remedy="give the duration of a trajectory in seconds",
+        )
+
+
 @dataclass(frozen=True)
-class RampSampler:
+class RampSampler(_Timed):
     """Commands that ramp to a random level, hold it, and ramp to the next.
 
     Parameters
     ----------
     low, high : tuple of float
         Range of the levels of each input channel, in its unit.
-    segments : int, default 5
-        Segments per trajectory, at least 1; onsets are evenly spaced from sample 0 on.
-    steps : int, default 1000
-        Samples per trajectory, at least 2.
-    ramps : tuple of int
-        Possible durations of a ramp in samples, from 1 to the spacing of the onsets. Each channel
-        draws one in each segment.
+    rate : float
+        Sample rate in Hz.
+    duration : float
+        Duration of a trajectory in s, at least two samples.
+    segments : int
+        Segments per trajectory, at least 1; onsets are evenly spaced from 0 s on.
+    ramp_durations : tuple of float, optional
+        Possible durations of a ramp in s, from one sample to the spacing of the onsets; by default
+        0.3, 0.4 and 0.5 of that spacing. Each channel draws one in each segment.
     start : tuple of float, optional
         Level of each channel before the first segment, within its range; by default the middle.
 
@@ -80,9 +119,10 @@ class RampSampler:
 
     low: tuple[float, ...]
     high: tuple[float, ...]
-    segments: int = 5
-    steps: int = 1000
-    ramps: tuple[int, ...] = (60, 80, 100)
+    rate: float
+    duration: float
+    segments: int
+    ramp_durations: tuple[float, ...] = ()
     start: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -95,21 +135,29 @@ class RampSampler:
             got=self.start,
             remedy="leave start out to begin in the middle of the limits",
         )
+        self._check_steps()
         require(
-            self.segments >= 1 and self.steps >= 2,
+            1 <= self.segments <= self.steps,
             "segments",
-            expected="at least one segment and two samples",
-            got=f"{self.segments} segments in {self.steps} samples",
-            remedy="give more",
+            expected=f"from 1 to {self.steps}, the samples of a trajectory",
+            got=self.segments,
+            remedy="give the number of levels that a trajectory goes to",
         )
         longest = self.steps // self.segments
         require(
-            self.ramps and all(1 <= ramp <= longest for ramp in self.ramps),
-            "ramps",
-            expected=f"durations from 1 to {longest} samples, the duration of a segment",
-            got=self.ramps,
-            remedy="give shorter ramps, fewer segments or more samples",
+            np.isfinite(self.ramp_durations).all()
+            and all(1 <= ramp <= longest for ramp in self._ramps),
+            "ramp_durations",
+            expected=f"from {1 / self.rate:g} s, a sample, to {longest / self.rate:g} s, a segment",
+            got=self.ramp_durations,
+            remedy="give shorter ramps in seconds, fewer segments or a longer duration",
         )
+
+    @property
+    def _ramps(self) -> list[int]:
+        """Possible durations of a ramp in samples."""
+        segment = self.duration / self.segments
+        return _in_samples(self.ramp_durations, RAMP_SHARES, segment, self.rate)
 
     @property
     def rest(self) -> tuple[float, ...]:
@@ -118,26 +166,27 @@ class RampSampler:
         return self.start or tuple(middle)
 
     def sample(
-        self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
+        self, count: int, *, rng: np.random.Generator, onsets: NDArray | None = None
     ) -> NDArray:
         """Draw commands (count, steps, d_u), float32; see `CommandSampler.sample`.
 
-        Where a row of `timing` has no onset, the segment begins one mean spacing after the
+        Where a row of `onsets` has no onset, the segment begins one mean spacing after the
         segment before.
         """
         shape = (count, self.segments, len(self.low))
         levels = rng.uniform(self.low, self.high, size=shape)
-        ramps = rng.choice(self.ramps, size=shape)
+        ramps = rng.choice(self._ramps, size=shape)
         period = self.steps / self.segments
-        onsets = draw_onsets(count, self.segments, period, rng=rng, timing=timing)
+        given = None if onsets is None else onsets * self.rate
+        begins = draw_onsets(count, self.segments, period, rng=rng, given=given)
         rest = np.broadcast_to(np.array(self.rest), (count, len(self.low)))
-        commands = ramps_and_holds(rest, levels, ramps, onsets, self.steps)
+        commands = ramps_and_holds(rest, levels, ramps, begins, self.steps)
         # Sums round, and segments that are shorter than their ramps overshoot.
         return np.clip(commands, self.low, self.high).astype(np.float32)
 
 
 @dataclass(frozen=True)
-class HoldSampler:
+class HoldSampler(_Timed):
     """Random levels, each held for a random time, independently in every channel.
 
     This is an amplitude-modulated pseudo-random binary signal (APRBS): steps of all sizes and of
@@ -147,10 +196,13 @@ class HoldSampler:
     ----------
     low, high : tuple of float
         Range of the levels of each input channel, in its unit.
-    steps : int, default 1000
-        Samples per trajectory, at least 2.
-    hold : (int, int), default (20, 200)
-        Shortest and longest hold in samples, at least 1.
+    rate : float
+        Sample rate in Hz.
+    duration : float
+        Duration of a trajectory in s, at least two samples.
+    hold_durations : (float, float), optional
+        Shortest and longest hold in s, at least one sample; by default 1/50 and 1/5 of the
+        duration of a trajectory.
 
     Raises
     ------
@@ -162,25 +214,33 @@ class HoldSampler:
 
     low: tuple[float, ...]
     high: tuple[float, ...]
-    steps: int = 1000
-    hold: tuple[int, int] = (20, 200)
+    rate: float
+    duration: float
+    hold_durations: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         _checked_limits(self.low, self.high)
-        _check_steps(self.steps)
+        self._check_steps()
         require(
-            len(self.hold) == 2 and 1 <= self.hold[0] <= self.hold[1],
-            "hold",
-            expected="a pair (shortest, longest) of samples, at least 1 and in order",
-            got=self.hold,
+            np.isfinite(self.hold_durations).all()
+            and len(self._hold) == 2
+            and 1 <= self._hold[0] <= self._hold[1],
+            "hold_durations",
+            expected="a pair (shortest, longest) in s, at least a sample and in order",
+            got=self.hold_durations,
             remedy="make the longest hold longer than the slowest state takes to settle",
         )
 
+    @property
+    def _hold(self) -> list[int]:
+        """Shortest and longest hold in samples."""
+        return _in_samples(self.hold_durations, HOLD_SHARES, self.duration, self.rate)
+
     def sample(
-        self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
+        self, count: int, *, rng: np.random.Generator, onsets: NDArray | None = None
     ) -> NDArray:
-        """Draw commands, float32, without use of `timing`; see `CommandSampler.sample`."""
-        shortest, longest = self.hold
+        """Draw commands, float32, without use of `onsets`; see `CommandSampler.sample`."""
+        shortest, longest = self._hold
         shape = (count, len(self.low), 1 + self.steps // shortest)
         ends = rng.integers(shortest, longest, size=shape, endpoint=True).cumsum(axis=2)
         levels = rng.uniform(self.low, self.high, size=(count, shape[2], len(self.low)))
@@ -191,49 +251,50 @@ class HoldSampler:
 
 
 @dataclass(frozen=True)
-class MultisineSampler:
+class MultisineSampler(_Timed):
     """Multisines of random phases about a mean, independently in every channel.
 
     Parameters
     ----------
     low, high : tuple of float
         Range of each input channel, in its unit; the signal is clipped to it.
-    steps : int, default 1000
-        Samples per trajectory, at least 2.
-    period : int, default 1000
-        Period of the slowest sine in samples, at least 2.
+    rate : float
+        Sample rate in Hz.
+    duration : float
+        Duration of a trajectory in s, at least two samples.
+    band : (float, float)
+        Lowest and highest frequency in Hz, at most half the rate. There is a sine at each multiple
+        of the lowest, which the signal repeats with.
+    corner : float, optional
+        Highest frequency of full amplitude in Hz, within the band; by default the highest of all.
+    weak : float, default 0.1
+        Ratio of the amplitude of the sines above `corner` to the full amplitude, at least 0.
     mean : tuple of float, optional
         Mean of each channel; by default the middle of its range.
     deviation : tuple of float, optional
         Standard deviation of each channel, at least 0; by default a sixth of its range.
-    slow : int, default 20
-        Number of sines of full amplitude, at least 1; they are the slowest.
-    fast : int, default 60
-        Number of all sines, at least `slow`; their frequencies are evenly spaced.
-    weak : float, default 0.1
-        Ratio of the amplitude of the other sines to the full amplitude, at least 0.
 
     Raises
     ------
     InputError
         Limits that are not finite or not in order, fewer than two samples, a mean outside the
-        limits, a negative deviation, numbers of sines out of order.
+        limits, a negative deviation, frequencies out of order or above half the rate.
 
     """
 
     low: tuple[float, ...]
     high: tuple[float, ...]
-    steps: int = 1000
-    period: int = 1000
+    rate: float
+    duration: float
+    band: tuple[float, float]
+    corner: float | None = None
+    weak: float = 0.1
     mean: tuple[float, ...] = ()
     deviation: tuple[float, ...] = ()
-    slow: int = 20
-    fast: int = 60
-    weak: float = 0.1
 
     def __post_init__(self) -> None:
         low, high = _checked_limits(self.low, self.high)
-        _check_steps(self.steps)
+        self._check_steps()
         mean, deviation = self.mean or (low + high) / 2, self.deviation or (high - low) / 6
         fits = np.shape(mean) == np.shape(deviation) == low.shape
         require(
@@ -244,24 +305,36 @@ class MultisineSampler:
             remedy="leave them out for the middle of the limits and a sixth of their distance",
         )
         require(
-            self.period >= 2 and 1 <= self.slow <= self.fast and self.weak >= 0,
-            "slow",
-            expected="slow from 1, fast from slow on, weak from 0, a period from 2 samples on",
-            got=f"slow {self.slow}, fast {self.fast}, weak {self.weak}, period {self.period}",
+            len(self.band) == 2 and 0 < self.band[0] <= self.band[1] <= self.rate / 2,
+            "band",
+            expected=f"a pair (lowest, highest) in Hz, above 0, in order, to {self.rate / 2:g} Hz",
+            got=self.band,
+            remedy="give the frequencies that real commands have",
+        )
+        corner = self.band[1] if self.corner is None else self.corner
+        require(
+            self.band[0] <= corner <= self.band[1] and self.weak >= 0,
+            "corner",
+            expected=f"from {self.band[0]:g} to {self.band[1]:g} Hz, and weak from 0",
+            got=f"corner {self.corner}, weak {self.weak}",
             remedy="leave them out for the default",
         )
+        object.__setattr__(self, "corner", corner)
         object.__setattr__(self, "mean", tuple(map(float, mean)))
         object.__setattr__(self, "deviation", tuple(map(float, deviation)))
 
     def sample(
-        self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
+        self, count: int, *, rng: np.random.Generator, onsets: NDArray | None = None
     ) -> NDArray:
-        """Draw commands, float32, without use of `timing`; see `CommandSampler.sample`."""
-        number = np.arange(1, self.fast + 1)
-        amplitude = np.where(number <= self.slow, 1.0, self.weak)
+        """Draw commands, float32, without use of `onsets`; see `CommandSampler.sample`."""
+        assert self.corner is not None
+        # Rounding must not lose a sine at the end of the band.
+        sines, full = (int(each / self.band[0] + 1e-6) for each in (self.band[1], self.corner))
+        number = np.arange(1, sines + 1)
+        amplitude = np.where(number <= full, 1.0, self.weak)
         amplitude = amplitude * np.sqrt(2 / np.sum(amplitude**2))
-        phases = rng.uniform(0, 2 * np.pi, size=(count, self.fast, len(self.low)))
-        angle = 2 * np.pi * number[:, None] * np.arange(self.steps) / self.period
+        phases = rng.uniform(0, 2 * np.pi, size=(count, sines, len(self.low)))
+        angle = 2 * np.pi * number[:, None] * np.arange(self.steps) / (self.rate / self.band[0])
         commands = np.empty((count, self.steps, len(self.low)), np.float32)
         # One trajectory at a time: all sines of all trajectories would take much memory.
         for trajectory, phase in zip(commands, phases, strict=True):
@@ -274,25 +347,28 @@ class MultisineSampler:
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedSampler:
+class RecordedSampler(_Timed):
     """Recorded commands, or pieces of them, drawn with replacement.
 
     Parameters
     ----------
     commands : ndarray, shape (k, T, d_u)
         Recorded commands, finite.
-    length : int, default 0
-        Samples of a piece, which begins at a random sample, at most T; 0 takes whole records.
+    rate : float
+        Sample rate in Hz.
+    duration : float, optional
+        Duration of a piece in s, which begins at a random sample; by default whole records.
 
     Raises
     ------
     InputError
-        Commands of another shape, none, or not finite; a length beyond that of the records.
+        Commands of another shape, none, or not finite; a duration beyond that of the records.
 
     """
 
     commands: NDArray
-    length: int = 0
+    rate: float
+    duration: float = 0.0
 
     def __post_init__(self) -> None:
         shape = np.shape(self.commands)
@@ -304,23 +380,21 @@ class RecordedSampler:
             got="NaN or infinite ones" if shaped else f"shape {shape}",
             remedy="give Trajectories.commands of a set that has some",
         )
+        longest = shape[1] / positive("rate", self.rate, unit="Hz")
+        object.__setattr__(self, "duration", float(self.duration or longest))
+        self._check_steps()
         require(
-            0 <= self.length <= shape[1],
-            "length",
-            expected=f"from 1 to {shape[1]} samples, as the records have, or 0 for all",
-            got=repr(self.length),
+            self.steps <= shape[1],
+            "duration",
+            expected=f"at most {longest:g} s, the duration of the records",
+            got=f"{self.duration:g} s",
             remedy="give shorter pieces",
         )
 
-    @property
-    def steps(self) -> int:
-        """Samples per trajectory."""
-        return self.length or self.commands.shape[1]
-
     def sample(
-        self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
+        self, count: int, *, rng: np.random.Generator, onsets: NDArray | None = None
     ) -> NDArray:
-        """Draw commands, float32, without use of `timing`; see `CommandSampler.sample`."""
+        """Draw commands, float32, without use of `onsets`; see `CommandSampler.sample`."""
         records, samples, _ = self.commands.shape
         row = rng.integers(records, size=(count, 1))
         begin = rng.integers(samples - self.steps, size=(count, 1), endpoint=True)
@@ -341,8 +415,10 @@ def _checked_limits(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[ND
     return lower, upper
 
 
-def _check_steps(steps: int) -> None:
-    """Refuse fewer than two samples."""
-    require(
-        steps >= 2, "steps", expected="at least two samples", got=repr(steps), remedy="give more"
-    )
+def _in_samples(
+    given: Sequence[float], shares: Sequence[float], whole: float, rate: float
+) -> list[int]:
+    """Durations in samples: those given in s, or shares of a `whole` that last one at least."""
+    if given:
+        return [to_samples(each, rate) for each in given]
+    return [max(1, to_samples(share * whole, rate)) for share in shares]

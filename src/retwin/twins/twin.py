@@ -239,6 +239,8 @@ class Chunk:
         One per trajectory, their severities drawn.
     segments : Segments
         Segments of the clean commands.
+    rate : float
+        Sample rate in Hz.
     failed : dict of int to str
         Filled in by the simulation: the trajectories of this chunk, counted from 0, that could
         not be simulated, and the reasons. Their outputs are ignored.
@@ -250,12 +252,13 @@ class Chunk:
     faulty_commands: NDArray
     faults: Sequence[Fault | None]
     segments: Segments
+    rate: float
     failed: dict[int, str] = field(default_factory=dict)
 
     @property
     def frozen(self) -> NDArray:
         """Sample (n, d_u) from which an actuator is held; T where it never is."""
-        return frozen_from(self.faults, *self.commands.shape[1:])
+        return frozen_from(self.faults, *self.commands.shape[1:], rate=self.rate)
 
     @property
     def held_commands(self) -> NDArray:
@@ -264,7 +267,7 @@ class Chunk:
         For twins whose actuators cannot be accessed: a held command stands in for a frozen
         response.
         """
-        return frozen_response(self.faulty_commands, self.faults)
+        return frozen_response(self.faulty_commands, self.faults, rate=self.rate)
 
 
 def simulate_in_chunks(
@@ -315,15 +318,16 @@ def simulate_in_chunks(
     seed = checked_seed(seed)
     _check_actuators(faults or (), twin.inputs)
     segments = Segments.from_commands(commands)
-    drawn = draw_faults([None] * len(commands) if faults is None else faults, segments, seed)
+    faults = [None] * len(commands) if faults is None else faults
+    drawn = draw_faults(faults, segments, seed, rate=twin.rate)
     nominal = np.empty((*commands.shape[:2], len(twin.outputs)), dtype=commands.dtype)
     observed = np.empty_like(nominal)
     failed: dict[int, str] = {}
     for begin in range(0, len(commands), size):
         index = slice(begin, begin + size)
         own_commands, own_faults, own_segments = commands[index], drawn[index], segments[index]
-        effective = faulty_commands(own_commands, own_faults, own_segments)
-        chunk = Chunk(index, own_commands, effective, own_faults, own_segments)
+        effective = faulty_commands(own_commands, own_faults, own_segments, rate=twin.rate)
+        chunk = Chunk(index, own_commands, effective, own_faults, own_segments, twin.rate)
         nominal[index], observed[index] = run(chunk)
         reasons = _not_finite(twin, nominal[index], observed[index]) | chunk.failed
         failed |= {begin + i: reason for i, reason in sorted(reasons.items())}

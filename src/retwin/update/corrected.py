@@ -68,9 +68,9 @@ class CorrectedTwin:
         return self.surrogate.rate
 
     @property
-    def timing(self) -> NDArray:
-        """(k, M) onsets, in samples, of the segments of the calibration trajectories."""
-        return self.residual.timing
+    def onsets(self) -> NDArray:
+        """(k, M) onsets, in s, of the segments of the calibration trajectories."""
+        return self.residual.timing / self.rate
 
     def simulate(
         self,
@@ -140,7 +140,7 @@ def generate(
     *,
     per_class: int,
     seed: int,
-    timing: NDArray | None = None,
+    onsets: NDArray | None = None,
     progress: Progress | None = None,
 ) -> Trajectories:
     """A labelled set of any size with as many trajectories of each class, from any twin.
@@ -155,9 +155,9 @@ def generate(
         Trajectories per class, at least 1.
     seed : int
         The same seed gives the same bytes on the same machine.
-    timing : NDArray, optional
-        (k, M) onsets in samples, from which those of the commands are drawn. The default is the
-        onsets of the calibration trajectories for a corrected twin, and otherwise the sampler's.
+    onsets : NDArray, optional
+        (k, M) onsets in s, from which those of the commands are drawn. The default is the onsets of
+        the calibration trajectories for a corrected twin, and otherwise the sampler's.
     progress : callable, optional
         Called with the share of the simulations that are done.
 
@@ -173,12 +173,12 @@ def generate(
 
     """
     whole("per_class", per_class, least=1)
-    if timing is None and isinstance(twin, CorrectedTwin):
-        timing = twin.timing
+    if onsets is None and isinstance(twin, CorrectedTwin):
+        onsets = twin.onsets
     for_commands, for_twin = np.random.SeedSequence(seed).spawn(2)
     faults = [fault for fault in case.faults.values() for _ in range(per_class)]
     commands = case.sampler.sample(
-        len(faults), rng=np.random.default_rng(for_commands), timing=timing
+        len(faults), rng=np.random.default_rng(for_commands), onsets=onsets
     )
     made = twin.simulate(
         commands, faults=faults, seed=int(for_twin.generate_state(1)[0]), progress=progress

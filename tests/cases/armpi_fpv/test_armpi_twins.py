@@ -104,13 +104,19 @@ def test_the_emulated_arm_tells_what_went_wrong(commands: np.ndarray) -> None:
 
 PERFECT = EmulatedArmPi(
     delay=0.0, jitter=0.0, offset=0.0, bias=0.0, missed=0.0, dead_zone=0.0, backlash=0.0,
-    poll=1, noise=0.0, resolution=0.0, glitch=0.0,
+    sensor_rate=100.0, noise=0.0, resolution=0.0, glitch=0.0,
 )  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("poll", 0), ("poll", 2.5), ("missed", 1.1), ("jitter", -1.0), ("noise", float("nan"))],
+    [
+        ("sensor_rate", 0.0),
+        ("sensor_rate", 30.0),
+        ("missed", 1.1),
+        ("jitter", -1.0),
+        ("noise", float("nan")),
+    ],
 )
 def test_effects_that_cannot_be_are_refused(name: str, value: float) -> None:
     with pytest.raises(rt.InputError, match=f"^{name}: expected .*, got {value};"):
@@ -133,7 +139,7 @@ def test_every_effect_does_what_it_says(commands: np.ndarray) -> None:
         replace(PERFECT, **effect).simulate(commands, seed=0, hidden=found)
         return found["angles"]
 
-    delayed = angles(delay=4.0, jitter=1e-6)
+    delayed = angles(delay=0.04, jitter=1e-8)
     np.testing.assert_allclose(delayed[:, 4:], plain[:, :-4], atol=0.5)
     steady = np.abs(angles(dead_zone=2.0) - plain)[:, 190]
     assert steady.max() == pytest.approx(2.0, abs=0.05)
@@ -152,13 +158,13 @@ def test_every_effect_does_what_it_says(commands: np.ndarray) -> None:
 
 
 def test_readings_are_polled_rounded_and_spiked(commands: np.ndarray) -> None:
-    rounded = replace(PERFECT, poll=10, resolution=1.0).simulate(commands, seed=0)
+    rounded = replace(PERFECT, sensor_rate=10.0, resolution=1.0).simulate(commands, seed=0)
     yaw = np.arctan2(rounded.observed[:, ::10, 0], -rounded.observed[:, ::10, 1])
     far = np.hypot(rounded.observed[:, ::10, 0], rounded.observed[:, ::10, 1]) > 0.05
     units = np.degrees(yaw[far].astype(float)) / 0.24
     assert np.abs(units - np.round(units)).max() < 0.01
-    spiked = replace(PERFECT, poll=10, glitch=1.0).simulate(commands, seed=0)
-    clean = replace(PERFECT, poll=10).simulate(commands, seed=0)
+    spiked = replace(PERFECT, sensor_rate=10.0, glitch=1.0).simulate(commands, seed=0)
+    clean = replace(PERFECT, sensor_rate=10.0).simulate(commands, seed=0)
     away = np.linalg.norm(spiked.observed - clean.observed, axis=2)[:, ::10] > 1e-4
     assert set(away.sum(axis=1).tolist()) <= {0, 1, 2}
     assert away.sum(axis=1).max() >= 1

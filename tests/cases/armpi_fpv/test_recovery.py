@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
-from retwin.cases.armpi_fpv.ramps import unit_angles
-from retwin.cases.armpi_fpv.recovery import RAMPS, Recovery, ramp_commands, recover_commands
+from retwin.cases.armpi_fpv.recovery import Recovery, recover_commands
+from retwin.cases.armpi_fpv.twin import KINEMATIC, RAMPS
 from retwin.errors import InputError
+from retwin.twins.ramps import ramps_and_holds
 
 ARM = YawPitchArm(base=0.028505 + 0.0361, links=(0.10048, 0.094714, 0.05071))
 DATA = os.environ.get("RETWIN_DATA")
@@ -52,10 +53,10 @@ class Made:
             now = np.rint(now) if whole else now
             self.targets[:, move] = now
         length = 200 * moves + 20 * real
-        self.commands = ramp_commands(
-            self.start, self.targets, self.ramps, self.onsets, length, closed=not real
-        )
-        self.path = ARM.position(unit_angles(self.commands))
+        # A ramp of the simulated paths counts both its ends.
+        spans = self.ramps - (not real)
+        self.commands = ramps_and_holds(self.start, self.targets, spans, self.onsets, length)
+        self.path = ARM.position(KINEMATIC.angles(self.commands))
         if digits is not None:
             self.path = np.round(self.path, digits)
 
@@ -104,9 +105,8 @@ def test_length_and_number_of_movements_are_free() -> None:
     assert np.isnan(found.onsets[6:, 2:]).all()
     np.testing.assert_array_equal(found.targets[6:, 2:], np.repeat(other.targets[:, 1:], 5, 1))
     assert not found.ambiguous.any()
-    again = ramp_commands(
-        found.start, found.targets, found.ramps, found.onsets, path.shape[1], closed=found.closed
-    )
+    spans = found.ramps - found.closed[:, None, None]
+    again = ramps_and_holds(found.start, found.targets, spans, found.onsets, path.shape[1])
     np.testing.assert_array_equal(again, found.commands)
     assert done == sorted(done)
     assert done[-1] == 1
@@ -116,8 +116,8 @@ def test_a_motor_that_stays_is_not_ambiguous() -> None:
     start = np.array([[510.0, 480, 530, 470]])
     targets = np.array([[[600.0, 480, 530, 400], [600, 350, 530, 400]]])
     ramps = np.array([[[60, 60, 60, 100], [60, 80, 60, 60]]])
-    commands = ramp_commands(start, targets, ramps, [[3.25, 205.5]], 400)
-    found = recover_commands(ARM.position(unit_angles(commands)), arm=ARM)
+    commands = ramps_and_holds(start, targets, ramps, np.array([[3.25, 205.5]]), 400)
+    found = recover_commands(ARM.position(KINEMATIC.angles(commands)), arm=ARM)
     np.testing.assert_array_equal(found.targets, targets)
     np.testing.assert_array_equal(found.ramps, ramps)
     np.testing.assert_array_equal(found.start, start)
@@ -134,8 +134,8 @@ def test_a_cut_movement_is_ambiguous() -> None:
 def test_the_mirrored_posture_is_ambiguous_where_the_yaw_could_reach_it() -> None:
     start = np.array([[800.0, 480, 530, 470]])
     targets = np.array([[[790.0, 430, 600, 400]]])
-    commands = ramp_commands(start, targets, np.full((1, 1, 4), 80), [[3.25]], 200)
-    found = recover_commands(ARM.position(unit_angles(commands)), arm=ARM)
+    commands = ramps_and_holds(start, targets, np.full((1, 1, 4), 80), np.array([[3.25]]), 200)
+    found = recover_commands(ARM.position(KINEMATIC.angles(commands)), arm=ARM)
     np.testing.assert_array_equal(found.targets, targets)
     assert found.ambiguous.all()
 

@@ -219,7 +219,7 @@ def test_a_bundle_generates_without_its_case_where_it_can(bundle: Bundle) -> Non
         sensor_rate=10.0,
         steps=200,
         max_segments=2,
-        sampler=RampSampler((400.0,) * 4, (600.0,) * 4, 2, 200),
+        sampler=RampSampler((400.0,) * 4, (600.0,) * 4, 100.0, 2.0, 2, (0.6, 0.8, 1.0)),
     )
     alone = Bundle(bundle.twin, bundle.guard, Facts.of(json.loads(json.dumps(facts.about()))))
     assert len(alone.generate(per_class=1, seed=0)) == 9

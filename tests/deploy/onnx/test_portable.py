@@ -142,7 +142,7 @@ def test_the_same_noise_gives_the_same_outputs(
     fails, have a probability of 1e-7.
     """
     assert isinstance(portable, rt.Twin)
-    commands = case.sampler.sample(100, rng=np.random.default_rng(3), timing=exportable.timing)
+    commands = case.sampler.sample(100, rng=np.random.default_rng(3), onsets=exportable.onsets)
     faults = [case.faults["Motor_2_Stuck"], None] * 50
     noise = noise_of_torch(exportable, 100, portable.facts.max_segments, commands.shape[1], seed=9)
     monkeypatch.setattr(Portable, "_noise", lambda *_: noise)

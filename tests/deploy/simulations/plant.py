@@ -41,12 +41,12 @@ def level(commands: NDArray) -> NDArray:
 CASE = rt.Case(
     name="plant",
     title="A plant",
-    faults={"Healthy": None, "Stuck": rt.Stuck(0, 3000), "Biased": rt.ActuatorBias(1)},
+    faults={"Healthy": None, "Stuck": rt.Stuck(0, 3000 / RATE), "Biased": rt.ActuatorBias(1)},
     twin=FunctionTwin(
         level, rt.Channels.numbered("u", 4, "%"), rt.Channels.numbered("y", 1, "m"), RATE
     ),
     emulator=None,
-    sampler=RampSampler((0.0,) * 4, (100.0,) * 4, segments=3, steps=STEPS, ramps=(800, 1600)),
+    sampler=RampSampler((0.0,) * 4, (100.0,) * 4, RATE, STEPS / RATE, 3, (0.5, 1.0)),
     correction=Additive(),
     output_correction=Additive(),
     sensor_rate=10.0,

@@ -32,8 +32,8 @@ from retwin.serialisation.identity import identity
 from retwin.twins.samplers import RampSampler
 from retwin.twins.twin import Chunk, SimulationError, simulate_in_chunks
 
-FAULTS = {"Healthy": None, "Stuck": rt.Stuck(0, 3), "Biased": rt.ActuatorBias(1)}
-SAMPLER = RampSampler((0.0, 0.0), (100.0, 100.0), segments=2, steps=30, ramps=(3, 5))
+FAULTS = {"Healthy": None, "Stuck": rt.Stuck(0, 0.3), "Biased": rt.ActuatorBias(1)}
+SAMPLER = RampSampler((0.0, 0.0), (100.0, 100.0), 10.0, 3.0, segments=2, ramp_durations=(0.3, 0.5))
 
 
 VOLTAGES = rt.Channels(("a", "b"), ("V", "V"))
@@ -151,10 +151,10 @@ def test_an_emulated_twin_says_so(tmp_path: Path, case: rt.Case) -> None:
 class Timed(Toy):
     """Has seen when movements begin, as a corrected twin has."""
 
-    timing = np.array([[4.0, 17.0]])
+    onsets = np.array([[0.4, 1.7]])
 
 
-def test_a_twin_with_timing_hands_it_to_the_sampler(tmp_path: Path) -> None:
+def test_a_twin_with_onsets_hands_them_to_the_sampler(tmp_path: Path) -> None:
     simulate_to(tmp_path / "a.zarr", plan(twin=Timed(), n=9))
     starts = rt.Segments.from_commands(rt.load(tmp_path / "a.zarr").commands).start
     np.testing.assert_allclose(starts, [[4, 17]] * 9, atol=1e-2)

@@ -12,12 +12,14 @@ from torch import Tensor
 import retwin as rt
 from retwin import catalog
 from retwin.cases.armpi_fpv.emulator import _effective
-from retwin.cases.armpi_fpv.twin import KINEMATIC, POLL
+from retwin.cases.armpi_fpv.twin import KINEMATIC, RATE, SENSOR_RATE
 from retwin.errors import InputError
 from retwin.serialisation.configs import from_config, to_config
 from retwin.twins.faults import draw_faults, faulty_commands, frozen_from
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import effective_commands
+
+POLL = round(RATE / SENSOR_RATE)
 
 pytestmark = pytest.mark.numerical
 
@@ -30,9 +32,9 @@ def context_of(exact, commands: np.ndarray, faults: list | None = None) -> rt.Co
     segments = rt.Segments.from_commands(commands)
     if faults is None:
         return rt.Context.of(exact, commands, segments, rate=100.0)
-    drawn = draw_faults(faults, segments, 0)
-    faulty = faulty_commands(commands, drawn, segments)
-    frozen = frozen_from(drawn, *commands.shape[1:])
+    drawn = draw_faults(faults, segments, 0, rate=RATE)
+    faulty = faulty_commands(commands, drawn, segments, rate=RATE)
+    frozen = frozen_from(drawn, *commands.shape[1:], rate=RATE)
     return rt.Context.of(
         exact, commands, segments, rate=100.0, faulty_commands=faulty, frozen=frozen
     )
@@ -148,7 +150,7 @@ def test_the_ruler_of_delays_is_straight(case: rt.Case, commands: np.ndarray) ->
     tight = replace(case.emulator, dead_zone=0.0, backlash=0.0, missed=0.0)
     tight.simulate(commands, seed=3, hidden=hidden)
     delay = joint_delay(hidden["angles"], commands, rt.Segments.from_commands(commands))
-    drawn_delay = hidden["delay"] + 100 * KINEMATIC.lag.seconds
+    drawn_delay = RATE * (hidden["delay"] + KINEMATIC.lag.seconds)
     np.testing.assert_allclose(delay, drawn_delay, atol=0.05)
 
 
@@ -174,7 +176,7 @@ def understood(exact, case: rt.Case) -> dict[str, np.ndarray]:
         "offset": (reached - targets)[good],
         "offset deviation": deviation[..., 1:5][good],
         "delay error": z[..., 0] - joint_delay(hidden["angles"], commands, segments),
-        "delay": hidden["delay"],
+        "delay": RATE * hidden["delay"],
         "delay deviation": deviation[..., 0],
     }
 

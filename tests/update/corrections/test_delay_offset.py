@@ -134,7 +134,7 @@ def test_emulated_robot_is_understood(exact, case: rt.Case) -> None:
     reached = hidden["angles"][each, np.ceil(parts.stop).astype(int) - 1]
     offset = KINEMATIC.position(reached) - KINEMATIC.position(targets)
     # On top of a movement's delay comes the servo's own, about two samples.
-    delay = hidden["delay"] + 100 * KINEMATIC.lag.seconds
+    delay = 100 * (hidden["delay"] + KINEMATIC.lag.seconds)
     missed = hidden["missed"].any(axis=2)
     beside = missed.copy()
     beside[:, 1:] |= missed[:, :-1]

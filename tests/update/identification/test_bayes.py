@@ -223,7 +223,7 @@ def stochastic() -> dict[str, PosteriorTwin]:
 def test_the_updated_twin_keeps_the_contract(
     stochastic: dict[str, PosteriorTwin], noise: str, check: Callable
 ) -> None:
-    faults = (None, rt.Stuck(0, onset=12), rt.Stuck(0, onset=25))
+    faults = (None, rt.Stuck(0, onset=1.2), rt.Stuck(0, onset=2.5))
     check(TwinSubject(stochastic[noise], commands(3, 40), faults))
 
 

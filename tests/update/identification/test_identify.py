@@ -145,7 +145,7 @@ def updated_twin() -> rt.Twin:
 
 @pytest.mark.parametrize("check", TWIN_CHECKS, ids=lambda check: check.__name__)
 def test_the_updated_twin_keeps_the_contract(updated_twin: rt.Twin, check: Callable) -> None:
-    faults = (None, rt.Stuck(0, onset=12), rt.Stuck(0, onset=25))
+    faults = (None, rt.Stuck(0, onset=1.2), rt.Stuck(0, onset=2.5))
     check(TwinSubject(updated_twin, commands(3, 40), faults))
 
 
@@ -158,7 +158,7 @@ def test_delay_and_joint_offsets_of_the_emulated_robot(case: rt.Case) -> None:
     method = LeastSquares(starts=1, loss="cauchy")
     updated = identify(twin, observed, seed=0, rate=case.sensor_rate, method=method)
     delay = hidden["delay"].mean()
-    assert updated.errors["delay"] < 1
+    assert updated.errors["delay"] < 0.01
     assert abs(updated.values["delay"] - delay) < 2 * updated.errors["delay"]
     for joint, offset in enumerate(hidden["offset"].mean(axis=(0, 1)), 1):
         name = f"offset.motor_{joint}"

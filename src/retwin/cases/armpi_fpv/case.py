@@ -12,13 +12,23 @@ from retwin.cases.armpi_fpv.body import ArmBody
 from retwin.cases.armpi_fpv.classes import BIASED, STUCK
 from retwin.cases.armpi_fpv.emulator import EmulatedArmPi
 from retwin.cases.armpi_fpv.parameters import armpi_parametric
-from retwin.cases.armpi_fpv.recovery import RAMPS, ramp_commands, recover_commands
-from retwin.cases.armpi_fpv.twin import ARM, KINEMATIC, POLL, STRAIGHT, UNIT, ArmPiTwin
+from retwin.cases.armpi_fpv.recovery import recover_commands
+from retwin.cases.armpi_fpv.twin import (
+    ARM,
+    KINEMATIC,
+    RAMPS,
+    RATE,
+    SENSOR_RATE,
+    STRAIGHT,
+    UNIT,
+    ArmPiTwin,
+)
 from retwin.cases.case import Case
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.progress import Progress
+from retwin.times import stride_of, to_samples
 from retwin.twins.faults import ActuatorBias, Fault, Stuck, frozen_response
-from retwin.twins.ramps import draw_onsets
+from retwin.twins.ramps import draw_onsets, ramps_and_holds
 from retwin.update.corrections import Chain, CommandSpace, DelayOffset, SampledSensor
 
 __all__ = ["ArmSampler", "armpi"]
@@ -50,25 +60,35 @@ class ArmSampler:
     ----------
     movements : int, default 5
         Movements per trajectory.
-    steps : int, default 1000
-        Samples per trajectory.
-    period : int, default 200
-        Samples from one onset to the next.
+    duration : float, default 10.0
+        Duration of a trajectory in s.
+    period : float, default 2.0
+        Time in s from one onset to the next.
     amplitude : tuple of float
         Largest angle of a target from straight in degrees, one per motor.
-    speed : float, default 2.72
-        Largest speed of a motor in degrees per sample.
+    speed : float, default 272.0
+        Largest speed of a motor in degrees per s.
 
     """
 
     movements: int = 5
-    steps: int = 1000
-    period: int = 200
+    duration: float = 10.0
+    period: float = 2.0
     amplitude: tuple[float, ...] = (80.0, 50.0, 50.0, 50.0)
-    speed: float = 2.72
+    speed: float = 272.0
+
+    @property
+    def rate(self) -> float:
+        """Sample rate in Hz."""
+        return RATE
+
+    @property
+    def steps(self) -> int:
+        """Samples per trajectory."""
+        return to_samples(self.duration, RATE)
 
     def sample(
-        self, count: int, *, rng: np.random.Generator, timing: NDArray | None = None
+        self, count: int, *, rng: np.random.Generator, onsets: NDArray | None = None
     ) -> NDArray:
         """Draw commands (count, steps, 4) in units of 0.24 degrees; see `CommandSampler.sample`."""
         shape = (count, self.movements, len(self.amplitude))
@@ -77,13 +97,14 @@ class ArmSampler:
         targets = np.empty(shape)
         now = np.zeros((count, len(self.amplitude)))
         for movement in range(self.movements):
-            largest = self.speed * ramps[:, movement]
+            largest = self.speed / RATE * ramps[:, movement]
             now = now + np.clip(goals[:, movement] - now, -largest, largest)
             now = UNIT * np.round(now / UNIT)
             targets[:, movement] = STRAIGHT - now / UNIT
-        onsets = draw_onsets(count, self.movements, self.period, rng=rng, timing=timing)
+        given = None if onsets is None else onsets * RATE
+        begins = draw_onsets(count, self.movements, self.period * RATE, rng=rng, given=given)
         start = np.full((count, len(self.amplitude)), STRAIGHT)
-        return ramp_commands(start, targets, ramps, onsets, self.steps, dtype=np.float32)
+        return ramps_and_holds(start, targets, ramps, begins, self.steps, dtype=np.float32)
 
 
 def recover(trajectories: Trajectories, progress: Progress | None = None) -> Trajectories:
@@ -117,8 +138,8 @@ def recover(trajectories: Trajectories, progress: Progress | None = None) -> Tra
     )
 
 
-ONSET = 49
-"""Sample, counted from 0, from which a stuck motor is held in the published protocol."""
+ONSET = 0.49
+"""Time in s from which a stuck motor is held in the published protocol."""
 FAULTS: dict[str, Fault | None] = {
     HEALTHY: None,
     **{label: Stuck(i, ONSET) for i, label in enumerate(STUCK)},
@@ -150,15 +171,16 @@ def encoder_noise(trajectories: Trajectories, units: float, seed: int) -> Trajec
     """
     rng = np.random.default_rng(seed)
     observed = trajectories.observed.copy()
-    polls = np.arange(0, trajectories.steps + POLL, POLL)
     time = np.arange(trajectories.steps)
+    every = stride_of(RATE, SENSOR_RATE)
+    polls = np.arange(0, trajectories.steps + every, every)
     for i, label in enumerate(trajectories.labels):
         fault = FAULTS.get(str(label))
         noise = np.interp(time, polls, units * rng.integers(-1, 2, size=len(polls)))
         if isinstance(fault, Stuck):
-            held = frozen_response(trajectories.commands[i : i + 1], [fault])[0]
+            held = frozen_response(trajectories.commands[i : i + 1], [fault], rate=RATE)[0]
             effect = ARM.jacobian(KINEMATIC.angles(held))[:, :, fault.actuator] * KINEMATIC.scale
-            observed[i] += np.where(time > ONSET, noise, 0.0)[:, None] * effect
+            observed[i] += np.where(time > to_samples(ONSET, RATE), noise, 0.0)[:, None] * effect
     return trajectories.replace(observed=observed)
 
 
@@ -180,7 +202,7 @@ def armpi() -> Case:
         sampler=ArmSampler(),
         correction=Chain(CommandSpace(), SampledSensor()),
         output_correction=DelayOffset(),
-        sensor_rate=KINEMATIC.rate / POLL,
+        sensor_rate=SENSOR_RATE,
         recover=recover,
         encoder_noise=encoder_noise,
         published=PUBLISHED,

@@ -156,5 +156,7 @@ class KinematicTwin:
 
     def _run(self, chunk: Chunk) -> tuple[NDArray, NDArray]:
         """Nominal and observed outputs of a chunk."""
-        response = frozen_response(self.respond(chunk.faulty_commands), chunk.faults)
+        response = frozen_response(
+            self.respond(chunk.faulty_commands), chunk.faults, rate=self.rate
+        )
         return self.position(chunk.commands), self.position(response)

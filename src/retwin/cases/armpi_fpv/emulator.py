@@ -15,11 +15,13 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.cases.armpi_fpv.twin import KINEMATIC, POLL, ArmPiTwin
-from retwin.checks import finite, whole
+from retwin.arrays import interpolated
+from retwin.cases.armpi_fpv.twin import KINEMATIC, SENSOR_RATE, ArmPiTwin
+from retwin.checks import finite
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
+from retwin.times import stride_of
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, Twin, simulate_in_chunks
 from retwin.twins.wrapper import TwinWrapper
@@ -35,14 +37,14 @@ PROBABILITIES = ("missed", "glitch")
 class EmulatedArmPi(TwinWrapper):
     """The arm as the real one behaves; the defaults are fitted to set A (docs/results.md).
 
-    A command unit is 0.24 degrees, a sample 10 ms.
+    A command unit is 0.24 degrees.
 
     Parameters
     ----------
     delay : float
-        Mean transport delay of a movement in samples, beyond the servo's own.
+        Mean transport delay of a movement in s, beyond the servo's own.
     jitter : float
-        Standard deviation of that delay between movements in samples (gamma distribution).
+        Standard deviation of that delay between movements in s (gamma distribution).
     offset : float
         Scale of the error of a joint's final position in command units, one per movement
         (Student's t distribution with 8 degrees of freedom, heavier tails than a Gaussian).
@@ -54,8 +56,9 @@ class EmulatedArmPi(TwinWrapper):
         Largest error that the servo leaves uncorrected, in command units.
     backlash : float
         Backlash between gear and joint in command units.
-    poll : int
-        Data samples per sensor sample, at least 1; sensor samples are interpolated linearly.
+    sensor_rate : float
+        Rate of the sensor in Hz, the rate of the data divided by a whole number; sensor samples are
+        interpolated linearly.
     noise : float
         Scale of the error of a sensor sample before rounding, in command units (Student's t
         distribution with 3 degrees of freedom).
@@ -71,18 +74,19 @@ class EmulatedArmPi(TwinWrapper):
     Raises
     ------
     InputError
-        A negative or infinite setting, a probability above 1, or `poll` below 1.
+        A negative or infinite setting, a probability above 1, or a sensor's rate that does not
+        divide that of the data.
 
     """
 
-    delay: float = 2.2
-    jitter: float = 1.1
+    delay: float = 0.022
+    jitter: float = 0.011
     offset: float = 3.4
     bias: float = 0.8
     missed: float = 0.015
     dead_zone: float = 1.0
     backlash: float = 0.5
-    poll: int = POLL
+    sensor_rate: float = SENSOR_RATE
     noise: float = 0.25
     resolution: float = 1.0
     glitch: float = 0.06
@@ -91,11 +95,11 @@ class EmulatedArmPi(TwinWrapper):
 
     def __post_init__(self) -> None:
         remedy = "leave it out to have it as in the real arm"
-        whole("poll", self.poll, least=1, remedy=remedy)
         for each in fields(self):
-            if each.name not in ("arm", "poll"):
+            if each.name != "arm":
                 most = 1.0 if each.name in PROBABILITIES else math.inf
                 finite(each.name, getattr(self, each.name), least=0.0, most=most, remedy=remedy)
+        stride_of(self.rate, self.sensor_rate, argument="sensor_rate")
 
     @property
     def twin(self) -> Twin:
@@ -118,7 +122,7 @@ class EmulatedArmPi(TwinWrapper):
         commands, faults, seed, progress
             See `Twin.simulate`.
         hidden : dict, optional
-            For tests, filled with the discrepancy: "delay" (n, M) in samples, "offset"
+            For tests, filled with the discrepancy: "delay" (n, M) in s, "offset"
             (n, M, d_u) in command units, which includes the trajectory's bias, and "missed"
             (n, M, d_u) bool; and with "angles" (n, T, d_u), the joint angles in command units.
 
@@ -133,7 +137,7 @@ class EmulatedArmPi(TwinWrapper):
             frozen = chunk.frozen
             driven = self.arm.respond(effective, frozen, chunk.failed)
             angles = _with_play(driven, self.backlash / 2)
-            drawn.append(z | {"angles": angles})
+            drawn.append(z | {"delay": z["delay"] / self.rate, "angles": angles})
             observed = KINEMATIC.position(self._read(angles, frozen, rng))
             return KINEMATIC.position(chunk.commands), observed
 
@@ -145,11 +149,11 @@ class EmulatedArmPi(TwinWrapper):
         return made
 
     def _draw(self, segments: Segments, rng: np.random.Generator) -> dict[str, NDArray]:
-        """Draw the discrepancy of each movement."""
+        """Draw the discrepancy of each movement; delays in samples."""
         shape = segments.start.shape
         joints = (*shape, len(self.inputs))
-        spread = max(self.jitter, 1e-9)
-        delay = rng.gamma((self.delay / spread) ** 2, spread**2 / max(self.delay, 1e-9), size=shape)
+        mean, spread = self.delay * self.rate, max(self.jitter * self.rate, 1e-9)
+        delay = rng.gamma((mean / spread) ** 2, spread**2 / max(mean, 1e-9), size=shape)
         constant = self.bias * rng.normal(size=(len(segments), 1, len(self.inputs)))
         return {
             "delay": delay,
@@ -160,7 +164,8 @@ class EmulatedArmPi(TwinWrapper):
     def _read(self, angles: NDArray, frozen: NDArray, rng: np.random.Generator) -> NDArray:
         """Sensor data (n, T, d_u): sampled, rounded, with glitches, and interpolated."""
         n, steps, width = angles.shape
-        polls = np.arange(0, steps, self.poll)
+        every = stride_of(self.rate, self.sensor_rate)
+        polls = np.arange(0, steps, every)
         noise = self.noise * rng.standard_t(3, size=(n, len(polls), width))
         # A frozen joint is held in software: its sensor samples are constant.
         noise[polls[None, :, None] >= frozen[:, None, :]] = 0.0
@@ -172,13 +177,7 @@ class EmulatedArmPi(TwinWrapper):
             at, joint = rng.integers(1, len(polls) - 2), rng.integers(width)
             size = rng.uniform(0.1, 1.0) * self.glitch_size * rng.choice([-1.0, 1.0])
             samples[i, at : at + rng.integers(1, 3), joint] += size
-        time = np.arange(steps)
-        right = np.searchsorted(polls, time, side="right").clip(1, max(len(polls) - 1, 1))
-        right = np.minimum(right, len(polls) - 1)
-        left = np.maximum(right - 1, 0)
-        span = np.maximum(polls[right] - polls[left], 1)
-        fraction = ((time - polls[left]) / span).clip(0, 1)[:, None]
-        return samples[:, left] * (1 - fraction) + samples[:, right] * fraction
+        return interpolated(samples, np.arange(steps), every)
 
 
 def _with_play(path: NDArray, half: float) -> NDArray:
@@ -199,10 +198,10 @@ def _effective(commands: NDArray, segments: Segments, z: dict[str, NDArray]) -> 
         before = out[i, 0].copy()
         for m in np.flatnonzero(segments.valid[i]):
             begin, end = segments.start[i, m], segments.settle[i, m]
-            first, last = (_interpolated(commands[i], when) for when in (begin, end))
+            first, last = interpolated(commands[i], [begin, end])
             goal = np.where(z["missed"][i, m], before, last + z["offset"][i, m])
             delayed = np.clip(time - z["delay"][i, m], begin, end)
-            moved = _interpolated(commands[i], delayed) - first
+            moved = interpolated(commands[i], delayed) - first
             extent = last - first
             # A joint without a new command drifts to its offset while the others move.
             ramp = ((delayed - begin) / max(end - begin, 1e-9))[:, None]
@@ -211,12 +210,3 @@ def _effective(commands: NDArray, segments: Segments, z: dict[str, NDArray]) -> 
             out[i, inside] = (before + fraction * (goal - before))[inside]
             before = goal
     return out
-
-
-def _interpolated(values: NDArray, when: NDArray | float) -> NDArray:
-    """Values (T, d) at times in samples, linear between samples."""
-    when = np.asarray(when, dtype=float)
-    below = np.clip(np.floor(when).astype(int), 0, max(len(values) - 2, 0))
-    above = np.minimum(below + 1, len(values) - 1)
-    fraction = (when - below)[..., None]
-    return values[below] * (1 - fraction) + values[above] * fraction

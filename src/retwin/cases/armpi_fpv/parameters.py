@@ -22,7 +22,7 @@ def armpi_parametric(arm: ArmPiTwin | None = None) -> ParametricTwin:
     |---|---|---|
     | `stiffness`, of all servos | N m/rad | 150 to 900 |
     | `damping`, of all servos | N m s/rad | 1 to 40 |
-    | `delay`, beyond the servos' own | samples of 10 ms | 0 to 20 |
+    | `delay`, beyond the servos' own | s | 0 to 0.2 |
     | `offset.motor_1` … `offset.motor_4` | command units of 0.24 degrees | -25 to 25 |
 
     Parameters
@@ -63,5 +63,5 @@ def armpi_parametric(arm: ArmPiTwin | None = None) -> ParametricTwin:
         DAMPING / PER_RAD,
         {f"{servo}.biasprm[2]": -PER_RAD for servo in SERVOS},
     )
-    free = command_side_parameters(KINEMATIC.inputs, delay=(0.0, 20.0), offset=25.0)
+    free = command_side_parameters(KINEMATIC.inputs, delay=(0.0, 0.2), offset=25.0)
     return ParametricTwin(CommandSide(arm, nominal=KINEMATIC.position), (stiffness, damping, *free))

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.cases.armpi_fpv.plane import FLOOR, LIMIT, STEP, TIE, TURN, Plane, grid_chain
-from retwin.cases.armpi_fpv.ramps import RAMPS, STRAIGHT, ramp_commands, unit_angles
 from retwin.cases.armpi_fpv.search import free_chain
+from retwin.cases.armpi_fpv.twin import KINEMATIC, RAMPS, STRAIGHT
+from retwin.twins.ramps import ramps_and_holds
 
 __all__ = ["PathFit", "path_noise"]
 
@@ -272,13 +273,13 @@ class PathFit:
     def commands(self, onsets: NDArray) -> NDArray:
         """Commands (n, T, 4) in units for onsets (n, M) in samples."""
         units = STRAIGHT - self.steps
-        return ramp_commands(
-            units[:, 0], units[:, 1:], self.ramps, onsets, self.length, closed=self.closed
-        )
+        # A closed ramp of L samples lasts L - 1 intervals.
+        spans = self.ramps - self.closed[:, None, None]
+        return ramps_and_holds(units[:, 0], units[:, 1:], spans, onsets, self.length)
 
     def _error(self, onsets: NDArray) -> NDArray:
         """Error (n, T, 3) in m of the forward kinematics."""
-        return self.arm.position(unit_angles(self.commands(onsets))) - self.path
+        return self.arm.position(KINEMATIC.angles(self.commands(onsets))) - self.path
 
     def _refine(self) -> None:
         """Gauss-Newton on the onsets; movements do not overlap, so their equations are separate."""

@@ -12,7 +12,8 @@ Postures are in command steps of 0.24 deg from straight, with the signs of `YawP
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,29 @@ COMBINATIONS = np.stack([axis.ravel() for axis in np.indices((3, 3, 3))], axis=1
 
 
 @dataclass(frozen=True)
-class Plane:
+class _Paths:
+    """Arrays with one row per path, and perhaps the links, which all paths share."""
+
+    def rows(self, rows: NDArray) -> Self:
+        """Select paths.
+
+        Parameters
+        ----------
+        rows : ndarray of int or bool
+            Index of the paths.
+
+        Returns
+        -------
+        Self
+            The same quantities of these paths.
+
+        """
+        arrays = {name: each for name, each in vars(self).items() if name != "links"}
+        return replace(self, **{name: each[rows] for name, each in arrays.items()})
+
+
+@dataclass(frozen=True)
+class Plane(_Paths):
     """n paths of M movements in the arm's plane.
 
     Attributes
@@ -83,28 +106,9 @@ class Plane:
     kinks: NDArray
     noise: NDArray
 
-    def rows(self, rows: NDArray) -> Plane:
-        """Select paths.
-
-        Parameters
-        ----------
-        rows : ndarray of int or bool
-            Index of the paths.
-
-        Returns
-        -------
-        Plane
-            The same quantities of these paths.
-
-        """
-        return Plane(
-            self.links,
-            *(getattr(self, name)[rows] for name in list(self.__dataclass_fields__)[1:]),
-        )
-
 
 @dataclass(frozen=True)
-class Solution:
+class Solution(_Paths):
     """Postures and ramps that explain n paths of M movements.
 
     Attributes
@@ -124,22 +128,6 @@ class Solution:
     lengths: NDArray
     cost: NDArray
     tied: NDArray
-
-    def rows(self, rows: NDArray) -> Solution:
-        """Select paths.
-
-        Parameters
-        ----------
-        rows : ndarray of int or bool
-            Index of the paths.
-
-        Returns
-        -------
-        Solution
-            The same quantities of these paths.
-
-        """
-        return Solution(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
     def join(self, other: Solution) -> Solution:
         """Concatenate the paths of two solutions.

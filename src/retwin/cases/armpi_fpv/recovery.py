@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.cases.armpi_fpv.path_fit import PathFit, path_noise
-from retwin.cases.armpi_fpv.ramps import RAMPS, STRAIGHT, ramp_commands, unit_angles
+from retwin.cases.armpi_fpv.twin import RAMPS, STRAIGHT
 from retwin.checks import require
 
-__all__ = ["RAMPS", "Recovery", "ramp_commands", "recover_commands", "unit_angles"]
+__all__ = ["Recovery", "recover_commands"]
 
 PATHS_PER_BATCH = 32
 """Number of paths that are solved together: they fit the cache, and every core has work."""
@@ -110,11 +110,11 @@ def recover_commands(
     counts = np.array([len(each) for each in spans], dtype=int)
     largest = int(counts.max(initial=0))
     result = Recovery(
-        commands=np.full((count, length, 4), float(STRAIGHT)),
+        commands=np.full((count, length, 4), STRAIGHT),
         onsets=np.full((count, largest), np.nan),
         ramps=np.full((count, largest, 4), RAMPS[0]),
-        targets=np.full((count, largest, 4), float(STRAIGHT)),
-        start=np.full((count, 4), float(STRAIGHT)),
+        targets=np.full((count, largest, 4), STRAIGHT),
+        start=np.full((count, 4), STRAIGHT),
         closed=np.zeros(count, dtype=bool),
         whole=np.ones(count, dtype=bool),
         rms=np.zeros(count),

@@ -21,7 +21,17 @@ from retwin.twins.limits import Limits
 if TYPE_CHECKING:
     from retwin.twins.mujoco import MuJoCoTwin
 
-__all__ = ["ARM", "KINEMATIC", "MODEL", "POLL", "STRAIGHT", "UNIT", "ArmPiTwin"]
+__all__ = [
+    "ARM",
+    "KINEMATIC",
+    "MODEL",
+    "RAMPS",
+    "RATE",
+    "SENSOR_RATE",
+    "STRAIGHT",
+    "UNIT",
+    "ArmPiTwin",
+]
 
 ARM = YawPitchArm(base=0.028505 + 0.0361, links=(0.10048, 0.094714, 0.05071))
 """Kinematics of the arm, with the lengths of its URDF."""
@@ -33,8 +43,10 @@ UNIT = 0.24
 """Degrees per command unit; a motor's angle in degrees is 120 - 0.24 units."""
 RATE = 100.0
 """Sample rate in Hz of the published data."""
-POLL = 10
-"""Data samples per sensor sample of the real arm, whose data are linear in between."""
+SENSOR_RATE = 10.0
+"""Rate in Hz of the sensor of the real arm, whose data are linear between its samples."""
+RAMPS = (60, 80, 100)
+"""Possible durations of a motor's ramp in samples at `RATE`, as in the published data."""
 
 KINEMATIC = KinematicTwin(
     ARM,

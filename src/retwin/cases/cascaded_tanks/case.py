@@ -42,7 +42,18 @@ OVERFLOWING = TanksTwin(
 )
 """The complete physics, with parameters identified on the estimation record (docs/tanks.md)."""
 
-VOLTAGES = MultisineSampler((0.0,), (10.0,), 320, 1024, (2.8,), (1.0,), slow=19, fast=59)
+PERIOD = 1024 / RATE
+"""Period of the benchmark's voltage in s."""
+VOLTAGES = MultisineSampler(
+    (0.0,),
+    (10.0,),
+    RATE,
+    320 / RATE,
+    band=(1 / PERIOD, 59 / PERIOD),
+    corner=19 / PERIOD,
+    mean=(2.8,),
+    deviation=(1.0,),
+)
 """Voltages like the benchmark's, mostly slow; each trajectory is a third of a period."""
 
 

@@ -218,10 +218,11 @@ class Bundle:
         """
         folder = Path(folder)
         with open_sealed(folder, "bundle") as about:
+            twin = CorrectedTwin.load(folder / "twin")
             return cls(
-                twin=CorrectedTwin.load(folder / "twin"),
+                twin=twin,
                 guard=Guard.of(*read_model(folder / "guard", "guard")),
-                facts=Facts.of(about),
+                facts=Facts.of(about, twin.rate),
                 diagnoser=load_diagnoser(folder / "diagnoser") if about["diagnoser"] else None,
                 provenance=dict(about["provenance"]),
             )

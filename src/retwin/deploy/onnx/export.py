@@ -248,8 +248,9 @@ def _example_commands(bundle: Bundle) -> Tensor:
     """Commands (EXAMPLES, T, d_u) with the greatest number of segments of the bundle."""
     facts, domain = bundle.facts, bundle.guard.domain
     count = max(facts.max_segments, 1)
-    longest = max(1, facts.steps // (2 * count))
-    sampler = RampSampler(domain.low, domain.high, count, facts.steps, (longest,))
+    rate, duration = bundle.twin.rate, facts.steps / bundle.twin.rate
+    longest = max(1, facts.steps // (2 * count)) / rate
+    sampler = RampSampler(domain.low, domain.high, rate, duration, count, (longest,))
     return torch.as_tensor(sampler.sample(EXAMPLES, rng=np.random.default_rng(0)))
 
 

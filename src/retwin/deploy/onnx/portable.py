@@ -171,7 +171,7 @@ class Portable:
                     )
                     for name, file in files.items()
                 },
-                facts=Facts.of(about),
+                facts=Facts.of(about, float(about["rate"])),
                 inputs=Channels.of(about["inputs"]),
                 outputs=Channels.of(about["outputs"]),
                 rate=float(about["rate"]),

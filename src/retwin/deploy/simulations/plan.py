@@ -64,7 +64,7 @@ class SimulationPlan:
     Parameters
     ----------
     twin : Twin
-        The twin. A corrected twin has `timing` (k, M) in samples, which the sampler gets.
+        The twin. A corrected twin has `onsets` (k, M) in s, which the sampler gets.
     commands : CommandSampler, Trajectories or ndarray
         A sampler; or commands of shape (k, T, d_u), or trajectories with such commands, where
         trajectory i gets row i mod k.
@@ -102,8 +102,10 @@ class SimulationPlan:
 
     def __post_init__(self) -> None:
         one_of("dtype", self.dtype, ("float32", "float64"))
+        if not isinstance(self.commands, np.ndarray | Recorded):
+            _check_rate(self.commands.rate, self.twin)
         if isinstance(self.commands, Trajectories):
-            _check_compatible(self.commands, self.twin)
+            _check_channels(self.commands, self.twin)
             object.__setattr__(self, "commands", self.commands.commands)
         if isinstance(self.commands, np.ndarray):
             array = self._within(checked_commands(self.commands, self.twin.inputs))
@@ -158,8 +160,8 @@ class SimulationPlan:
             given = self.commands.array
             return np.ascontiguousarray(given[rows % len(given)])
         assert not isinstance(self.commands, Trajectories | np.ndarray)
-        timing = getattr(self.twin, "timing", None)
-        drawn = self.commands.sample(len(rows), rng=rng, timing=timing)
+        onsets = getattr(self.twin, "onsets", None)
+        drawn = self.commands.sample(len(rows), rng=rng, onsets=onsets)
         drawn = checked_commands(drawn, self.twin.inputs)
         require(
             drawn.shape[:2] == (len(rows), self.steps),
@@ -318,15 +320,19 @@ def _stored(
     return SimulatedChunk(arrays, reasons, made.emulated)
 
 
-def _check_compatible(trajectories: Trajectories, twin: Twin) -> None:
-    """Refuse commands that were recorded at another rate or on other channels than the twin's."""
+def _check_rate(rate: float, twin: Twin) -> None:
+    """Refuse commands at another rate than the twin's."""
     require(
-        trajectories.rate == twin.rate,
+        rate == twin.rate,
         "commands",
         expected=f"the rate of the twin, {twin.rate:g} Hz",
-        got=f"{trajectories.rate:g} Hz",
+        got=f"{rate:g} Hz",
         remedy="resample them, or have the twin run at their rate",
     )
+
+
+def _check_channels(trajectories: Trajectories, twin: Twin) -> None:
+    """Refuse commands on other channels than the twin's."""
     # Channels without names of their own are those of the twin.
     require(
         trajectories.inputs in (twin.inputs, Channels.numbered("u", len(twin.inputs))),

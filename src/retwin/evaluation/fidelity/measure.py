@@ -24,6 +24,7 @@ from retwin.scores.distributions import (
     quantiles,
 )
 from retwin.scores.energy import energy_score
+from retwin.times import stride_of
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import DelayOffset
@@ -212,15 +213,7 @@ def _checked(twin: Twin, trajectories: Trajectories, rate: float | None, draws: 
             remedy="load the file with its case, or convert it",
         )
     whole("draws", draws, least=INFERRED, remedy="take the default of 200")
-    stride = 1 if rate is None else round(trajectories.rate / rate) if rate > 0 else 0
-    require(
-        stride >= 1 and (rate is None or abs(stride * rate - trajectories.rate) <= 1e-6),
-        "rate",
-        expected=f"{trajectories.rate:g} Hz, the data's rate, or a whole part of it",
-        got=rate,
-        remedy="choose the rate of the data divided by a whole number",
-    )
-    return stride
+    return stride_of(trajectories.rate, rate)
 
 
 @dataclass(frozen=True)

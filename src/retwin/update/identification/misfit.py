@@ -12,6 +12,7 @@ from pebble import ProcessPool
 from retwin.checks import require, whole
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
 from retwin.processes import sendable_errors, worker_pool
+from retwin.times import stride_of
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import SimulationError, checked_seed
 
@@ -200,14 +201,7 @@ def _checked(twin: ParametricTwin, observed: Trajectories, rate: float | None) -
             got=got,
             remedy="load the file with its case, or convert it",
         )
-    stride = 1 if rate is None else round(observed.rate / rate) if rate > 0 else 0
-    require(
-        stride >= 1 and (rate is None or abs(stride * rate - observed.rate) <= 1e-6),
-        "rate",
-        expected=f"{observed.rate:g} Hz, the data's rate, or a whole part of it",
-        got=rate,
-        remedy="give the sensor's true rate",
-    )
+    stride = stride_of(observed.rate, rate, remedy="give the sensor's true rate")
     count = int(observed.mask[:, ::stride].sum())
     require(
         count > len(twin.parameters),

@@ -10,13 +10,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from retwin.arrays import interpolated
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
+from retwin.twins.command_side import DELAY, CommandSide
 from retwin.twins.faults import Fault
-from retwin.twins.noisy import interpolate_samples, sensor_sample_count
+from retwin.twins.noisy import sensor_sample_count
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.randomised import simulate_with_parameters
 from retwin.twins.twin import Chunk, simulate_in_chunks
@@ -87,13 +89,14 @@ class PosteriorTwin(TwinWrapper):
         """Errors (n, steps, d_y) in output units, drawn at the sensor's rate and interpolated."""
         count = sensor_sample_count(steps, self.stride)
         read = self.noise.draw(rng, logs, count, len(self.outputs), self.stride / self.rate)
-        return self.unit * interpolate_samples(read, self.stride, steps)
+        return self.unit * interpolated(read, np.arange(steps), self.stride)
 
     def save(self, folder: str | Path) -> None:
         """Write the draws and the names of the parameters; the twin itself is not written."""
         about = {
             "names": self.twin.names,
             "values": self.twin.values,
+            "units": [each.unit for each in self.twin.parameters],
             "noise": to_config(self.noise, (Noise,)),
             "stride": int(self.stride),
             "emulated": self.emulated,
@@ -116,10 +119,17 @@ class PosteriorTwin(TwinWrapper):
             got=", ".join(twin.names),
             remedy="give the twin whose posterior it is",
         )
+        samples, values = drawn["samples"].numpy(), np.array(about["values"])
+        if "units" not in about and isinstance(twin.twin, CommandSide) and DELAY in twin.names:
+            # Before version 0.1.0, when units were not written, delays were in samples.
+            delay = twin.names.index(DELAY)
+            samples[:, delay] /= twin.rate
+            values[delay] /= twin.rate
         return cls(
-            twin.with_values(about["values"]),
+            twin.with_values(values),
             from_config(about["noise"], (Noise,)),
-            **{name: drawn[name].numpy() for name in ("samples", "logs", "unit")},
+            samples=samples,
+            **{name: drawn[name].numpy() for name in ("logs", "unit")},
             stride=about["stride"],
             emulated=about["emulated"],
         )

@@ -238,14 +238,15 @@ def _context(
     parts = parts.until(trajectories.lengths)
     if faults is None:
         return Context.of(surrogate, commands, parts, rate=trajectories.rate)
-    drawn = draw_faults(faults, parts, seed=0)
+    rate = trajectories.rate
+    drawn = draw_faults(faults, parts, seed=0, rate=rate)
     return Context.of(
         surrogate,
         commands,
         parts,
-        rate=trajectories.rate,
-        faulty_commands=faulty_commands(commands, drawn, parts),
-        frozen=frozen_from(drawn, *commands.shape[1:]),
+        rate=rate,
+        faulty_commands=faulty_commands(commands, drawn, parts, rate=rate),
+        frozen=frozen_from(drawn, *commands.shape[1:], rate=rate),
     )
 
 
