@@ -182,7 +182,7 @@ def test_seeds_differ_by_run_fold_and_stage_and_not_by_the_sources_chosen(case: 
 
 
 REAL = {
-    "timing": lambda trial: trial.timing,
+    "timing": lambda trial: trial.onsets,
     "healthy": lambda trial: trial.healthy,
     "unlabelled": lambda trial: trial.unlabelled,
     "test outputs": lambda trial: trial.test_outputs,

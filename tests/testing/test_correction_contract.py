@@ -20,7 +20,7 @@ from retwin.update.corrections import Head
 
 
 def short(exact, case: rt.Case, count: int) -> rt.Context:
-    sampler = replace(case.sampler, movements=2, steps=400, period=200)
+    sampler = replace(case.sampler, movements=2, duration=4.0, period=2.0)
     commands = sampler.sample(count, rng=np.random.default_rng(0))
     return rt.Context.of(exact, commands, rt.Segments.from_commands(commands), rate=100.0)
 

@@ -51,7 +51,7 @@ def of_arm(part: Callable[[pytest.FixtureRequest], rt.Twin]) -> Subject:
         sampler = request.getfixturevalue("case").sampler
         sampler = replace(sampler, movements=2, duration=3.0, period=1.5)
         commands = sampler.sample(3, rng=np.random.default_rng(0))
-        faults = (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2))
+        faults = (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2, (10.0, 50.0)))
         return TwinSubject(part(request), commands, faults)
 
     return subject

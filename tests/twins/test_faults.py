@@ -73,7 +73,7 @@ def test_an_actuator_without_a_new_command_is_biased_too(commands: np.ndarray) -
 
 def test_drawn_biases_follow_the_protocol(commands: np.ndarray) -> None:
     segments = Segments.from_commands(np.repeat(commands, 500, axis=0))
-    drawn = draw_faults([ActuatorBias(0)] * 500, segments, seed=1, rate=RATE)
+    drawn = draw_faults([ActuatorBias(0, (10.0, 50.0))] * 500, segments, seed=1, rate=RATE)
     biases = np.array([fault.bias for fault in drawn])
     assert biases.shape == (500, 2), "one bias per segment"
     assert (np.abs(biases) >= 10).all()
@@ -85,7 +85,8 @@ def test_drawn_biases_follow_the_protocol(commands: np.ndarray) -> None:
 def test_the_same_seed_gives_the_same_severity(commands: np.ndarray) -> None:
     segments = Segments.from_commands(commands)
     one, two, other = (
-        draw_faults([ActuatorBias(0)], segments, seed=seed, rate=RATE) for seed in (3, 3, 4)
+        draw_faults([ActuatorBias(0, (10.0, 50.0))], segments, seed=seed, rate=RATE)
+        for seed in (3, 3, 4)
     )
     assert one == two
     assert one != other
@@ -94,7 +95,7 @@ def test_the_same_seed_gives_the_same_severity(commands: np.ndarray) -> None:
 def test_an_open_severity_is_refused(commands: np.ndarray) -> None:
     segments = Segments.from_commands(commands)
     with pytest.raises(InputError, match="draw_faults first"):
-        faulty_commands(commands, [ActuatorBias(0)], segments, rate=RATE)
+        faulty_commands(commands, [ActuatorBias(0, (10.0, 50.0))], segments, rate=RATE)
     with pytest.raises(InputError, match="draw_faults first"):
         frozen_response(commands, [Stuck(0, onset=(0.0, 0.2))], rate=RATE)
     with pytest.raises(InputError, match="one per trajectory"):
@@ -119,3 +120,10 @@ def test_onsets_may_be_numpys_and_listed() -> None:
 def test_sizes_that_cannot_be_are_refused(size: tuple) -> None:
     with pytest.raises(InputError, match="size: expected a pair"):
         ActuatorBias(0, size=size)
+
+
+def test_a_bias_needs_a_size_or_is_given() -> None:
+    """What is small for one machine breaks another: no size suits all units."""
+    with pytest.raises(InputError, match=r"size: expected a pair .* in command units, .* got none"):
+        ActuatorBias(0)
+    assert ActuatorBias(0, bias=(1.0,)).bias == (1.0,)

@@ -161,7 +161,7 @@ TROUBLES = {
     1: "hung for more than 1.5 s",
     2: "its process died (signal 11)",
     3: "FMI status error in fmi3DoStep (trouble was requested)",
-    4: "x is nan from sample 6 on",
+    4: "x is nan from 0.06 s on",
     5: "FMI status fatal in fmi3DoStep",
     6: "its process ended (exit code 3)",
     7: "the FMU ended its simulation at 0.06 s",

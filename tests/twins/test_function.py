@@ -129,7 +129,11 @@ def test_noise_is_in_the_residual(settings: dict) -> None:
 
 def test_same_bytes_whatever_the_workers() -> None:
     commands = trajectories(TRAJECTORIES_PER_CHUNK + 3)
-    faults = [rt.Stuck(0, onset=(0.5, 2.0)), None, rt.ActuatorBias(1)] * TRAJECTORIES_PER_CHUNK
+    faults = [
+        rt.Stuck(0, onset=(0.5, 2.0)),
+        None,
+        rt.ActuatorBias(1, (10.0, 50.0)),
+    ] * TRAJECTORIES_PER_CHUNK
     made = [
         twin(noisy, nominal=level, vectorised=False, workers=workers).simulate(
             commands, faults=faults[: len(commands)], seed=8

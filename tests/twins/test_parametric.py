@@ -36,7 +36,7 @@ RAMP = np.tile(np.arange(10.0)[:, None], (3, 1, 1))
 
 
 def arm_commands(case: rt.Case, count: int = 3) -> np.ndarray:
-    sampler = replace(case.sampler, movements=2, steps=300, period=150)
+    sampler = replace(case.sampler, movements=2, duration=3.0, period=1.5)
     return sampler.sample(count, rng=np.random.default_rng(0)).astype(float)
 
 
@@ -87,7 +87,7 @@ def test_command_side_delays_by_fractions_and_shifts() -> None:
 
 def test_command_side_at_rest_is_the_twin_itself(case: rt.Case) -> None:
     commands = arm_commands(case)
-    faults = (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2))
+    faults = (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2, (10.0, 50.0)))
     for plain, sided in ((KINEMATIC, CommandSide(KINEMATIC)), (case.twin, armpi_parametric())):
         for name in ("nominal", "observed"):
             wanted = getattr(plain.simulate(commands, faults=faults, seed=0), name)
@@ -163,12 +163,12 @@ SUBJECTS = {
             (2.5, 1.0, -2.0, 3.0, -4.0),
         ),
         arm_commands(case),
-        (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2)),
+        (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2, (10.0, 50.0))),
     ),
     "arm": lambda case: TwinSubject(
         armpi_parametric(rt.ArmPiTwin(step=0.01)),
         arm_commands(case),
-        (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2)),
+        (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2, (10.0, 50.0))),
     ),
 }
 

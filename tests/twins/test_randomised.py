@@ -95,7 +95,7 @@ def test_a_simulation_that_fails_inside_is_named() -> None:
 
 
 def arm_commands(case: rt.Case) -> np.ndarray:
-    sampler = replace(case.sampler, movements=2, steps=300, period=150)
+    sampler = replace(case.sampler, movements=2, duration=3.0, period=1.5)
     return sampler.sample(3, rng=np.random.default_rng(0)).astype(float)
 
 
@@ -108,7 +108,7 @@ SUBJECTS = {
 @pytest.mark.parametrize("check", TWIN_CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("kind", SUBJECTS)
 def test_contract(case: rt.Case, kind: str, check: Callable) -> None:
-    faults = (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2))
+    faults = (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2, (10.0, 50.0)))
     check(TwinSubject(SUBJECTS[kind], arm_commands(case), faults))
 
 

@@ -146,8 +146,8 @@ def _actuator_and_size(fault: Fault | None) -> tuple[int, tuple[float, float]]:
             return 0, (0.0, 0.0)
         case Stuck(actuator=actuator):
             return actuator, (0.0, 0.0)
-        case ActuatorBias(actuator=actuator, size=size, bias=()):
-            return actuator, size
+        case ActuatorBias(actuator=actuator, size=(low, high), bias=()):
+            return actuator, (low, high)
     raise InputError(
         "faults",
         expected="None, Stuck, or ActuatorBias with its bias open",

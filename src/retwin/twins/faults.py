@@ -194,9 +194,9 @@ class ActuatorBias:
     ----------
     actuator : int
         The actuator, counted from 0.
-    size : (float, float), default (10.0, 50.0)
+    size : (float, float)
         Lowest and highest magnitude of a drawn bias, in command units, at least 0. The sign is
-        positive or negative with equal probability.
+        positive or negative with equal probability. It may be left out where `bias` is given.
     bias : tuple of float, optional
         One per segment, in command units; empty leaves the severity open.
     label : str
@@ -205,21 +205,22 @@ class ActuatorBias:
     Raises
     ------
     InputError
-        Sizes that are negative, infinite or out of order.
+        Neither sizes nor biases, or sizes that are negative, infinite or out of order.
 
     """
 
     actuator: int
-    size: tuple[float, float] = (10.0, 50.0)
+    size: tuple[float, float] | tuple[()] = ()
     bias: tuple[float, ...] = ()
     label: str = "Steady_state_error"
 
     def __post_init__(self) -> None:
+        drawn = len(self.size) == 2 and 0 <= self.size[0] <= self.size[1] < np.inf
         require(
-            len(self.size) == 2 and 0 <= self.size[0] <= self.size[1] < np.inf,
+            drawn or (self.bias and not self.size),
             "size",
-            expected="a pair (low, high) of magnitudes, at least 0 and in order",
-            got=repr(self.size),
+            expected="a pair (low, high) of magnitudes in command units, at least 0 and in order",
+            got=repr(self.size) if self.size else "none",
             remedy="leave the sign out, it is drawn",
         )
 
@@ -229,6 +230,7 @@ class ActuatorBias:
         """The same fault with one bias per segment drawn; see `Fault.drawn`."""
         if self.bias:
             return self
+        assert self.size, "checked, since no bias is given"
         count = max(segments, 1)
         drawn = rng.uniform(*self.size, size=count) * (2.0 * rng.integers(2, size=count) - 1.0)
         return replace(self, bias=tuple(drawn.tolist()))

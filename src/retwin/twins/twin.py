@@ -360,7 +360,7 @@ def _not_finite(twin: Twin, nominal: NDArray, observed: NDArray) -> dict[int, st
         for i in np.flatnonzero(bad.any(axis=(1, 2))):
             sample, channel = np.argwhere(bad[i])[0]
             reasons[int(i)] = (
-                f"{twin.outputs.names[channel]} is {outputs[i, sample, channel]} from sample "
-                f"{sample} on"
+                f"{twin.outputs.names[channel]} is {outputs[i, sample, channel]} from "
+                f"{sample / twin.rate:g} s on"
             )
     return reasons

@@ -19,7 +19,7 @@ from retwin.update.identification import LeastSquares, identify
 
 
 def voltages(count: int, steps: int = 1024, seed: int = 0) -> np.ndarray:
-    sampler = replace(VOLTAGES, steps=steps)
+    sampler = replace(VOLTAGES, duration=steps / VOLTAGES.rate)
     return sampler.sample(count, rng=np.random.default_rng(seed)).astype(float)
 
 

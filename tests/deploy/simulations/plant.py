@@ -41,7 +41,11 @@ def level(commands: NDArray) -> NDArray:
 CASE = rt.Case(
     name="plant",
     title="A plant",
-    faults={"Healthy": None, "Stuck": rt.Stuck(0, 3000 / RATE), "Biased": rt.ActuatorBias(1)},
+    faults={
+        "Healthy": None,
+        "Stuck": rt.Stuck(0, 3000 / RATE),
+        "Biased": rt.ActuatorBias(1, (10.0, 50.0)),
+    },
     twin=FunctionTwin(
         level, rt.Channels.numbered("u", 4, "%"), rt.Channels.numbered("y", 1, "m"), RATE
     ),

@@ -32,7 +32,7 @@ from retwin.serialisation.identity import identity
 from retwin.twins.samplers import RampSampler
 from retwin.twins.twin import Chunk, SimulationError, simulate_in_chunks
 
-FAULTS = {"Healthy": None, "Stuck": rt.Stuck(0, 0.3), "Biased": rt.ActuatorBias(1)}
+FAULTS = {"Healthy": None, "Stuck": rt.Stuck(0, 0.3), "Biased": rt.ActuatorBias(1, (10.0, 50.0))}
 SAMPLER = RampSampler((0.0, 0.0), (100.0, 100.0), 10.0, 3.0, segments=2, ramp_durations=(0.3, 0.5))
 
 
@@ -324,7 +324,7 @@ def test_a_finished_folder_is_not_made_again(tmp_path: Path, whole: dict[str, An
 def test_memory_does_not_grow_with_the_number(tmp_path: Path) -> None:
     peaks = []
     for n in (512, 4096):
-        long = SimulationPlan(Toy(), replace(SAMPLER, steps=500), seed=0, n=n, chunk=256)
+        long = SimulationPlan(Toy(), replace(SAMPLER, duration=50.0), seed=0, n=n, chunk=256)
         tracemalloc.start()
         simulate_to(tmp_path / f"{n}.zarr", long, workers=1)
         peaks.append(tracemalloc.get_traced_memory()[1])

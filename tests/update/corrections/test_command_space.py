@@ -116,7 +116,7 @@ def test_some_samples_are_those_of_the_whole(exact, commands: np.ndarray, memory
 
     twin = Twin()
     twin.memoryless = memoryless  # type: ignore[attr-defined]
-    context = context_of(twin, commands, [rt.Stuck(1), rt.ActuatorBias(2), None] * 4)
+    context = context_of(twin, commands, [rt.Stuck(1), rt.ActuatorBias(2, (10.0, 50.0)), None] * 4)
     z = drawn(context.segments.start.shape)
     when = torch.randint(1000, (12, 30), generator=torch.Generator().manual_seed(0))
     some = rt.CommandSpace().at(context, z, when)

@@ -140,10 +140,12 @@ def recover(trajectories: Trajectories, progress: Progress | None = None) -> Tra
 
 ONSET = 0.49
 """Time in s from which a stuck motor is held in the published protocol."""
+SIZE = (10.0, 50.0)
+"""Lowest and highest magnitude of a motor's bias in the published protocol, in command units."""
 FAULTS: dict[str, Fault | None] = {
     HEALTHY: None,
     **{label: Stuck(i, ONSET) for i, label in enumerate(STUCK)},
-    **{label: ActuatorBias(i) for i, label in enumerate(BIASED)},
+    **{label: ActuatorBias(i, SIZE) for i, label in enumerate(BIASED)},
 }
 """Faults of the nine classes in their fixed order."""
 
