@@ -250,6 +250,23 @@ def test_concatenate_pads_shorter_sets():
     )
 
 
+@pytest.mark.parametrize("rate", [0.3, 100.0])
+def test_a_stretch_of_time_is_cut_out(rate):
+    whole = make().replace(rate=rate)
+    part = whole.between(2 / rate, 5 / rate)
+    for name in ("commands", "nominal", "observed", "mask"):
+        np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[:, 2:5])
+    assert (part.rate, part.ids.tolist()) == (rate, whole.ids.tolist())
+    np.testing.assert_array_equal(whole.between(3 / rate).nominal, whole.nominal[:, 3:])
+    np.testing.assert_array_equal(whole.between().observed, whole.observed)
+    end = whole.steps / rate
+    for times in ((-1 / rate,), (end,), (0.0, end + 1 / rate), (3 / rate, 2 / rate), (np.nan,)):
+        with pytest.raises(InputError, match=f"in order, from 0 to {end:g}"):
+            whole.between(*times)
+    with pytest.raises(InputError, match="two samples"):
+        whole.between(0.0, 1 / rate)
+
+
 def test_only_channels_of_one_real_unit_compare():
     assert Channels(("x", "y"), ("m", "m")).comparable
     assert not Channels(("x", "a"), ("m", "rad")).comparable

@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 
 from retwin.arrays import check_finite, check_shapes, floating, measured, named, row_blocks
 from retwin.checks import at_least, positive, require, whole
+from retwin.times import to_samples
 
 __all__ = ["HEALTHY", "UNLABELLED", "Channels", "Provenance", "Trajectories"]
 
 PER_TRAJECTORY = ("commands", "nominal", "observed", "mask", "labels", "ids")
 """The fields with one entry per trajectory."""
+PER_SAMPLE = ("commands", "nominal", "observed", "mask")
+"""The fields with one entry per sample."""
 UNLABELLED = ""
 """The label of trajectories whose class is not known."""
 HEALTHY = "Healthy"
@@ -253,6 +256,28 @@ class Trajectories:
             observed=np.pad(self.observed, longer),
             mask=np.pad(self.mask, longer),
         )
+
+    def between(self, start: float = 0.0, stop: float | None = None) -> Trajectories:
+        """The same from `start` to before `stop`, in s; by default until the end.
+
+        Raises
+        ------
+        InputError
+            The times are not in order, not within the trajectories, or less than two samples apart.
+
+        """
+        end = self.steps / self.rate
+        times = (start, end if stop is None else stop)
+        require(
+            0 <= times[0] < times[1] <= end,
+            "start, stop",
+            expected=f"times in s, in order, from 0 to {end:g}",
+            got=f"{start} to {stop}",
+            remedy="count the seconds from the first sample",
+        )
+        span = slice(*(to_samples(each, self.rate) for each in times))
+        arrays = {name: getattr(self, name)[:, span] for name in PER_SAMPLE}
+        return self.replace(**arrays)
 
     def with_label(self, label: str) -> Trajectories:
         """The trajectories of class `label`."""
