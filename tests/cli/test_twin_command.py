@@ -150,7 +150,7 @@ def test_a_mujoco_file(pendulum: Path) -> None:
 def test_a_module_in_the_current_folder(mine: str, tmp_path: Path) -> None:
     """By the command that is installed, which Python runs without the current folder."""
     command = [Path(sys.executable).with_name("retwin"), "twin", "simulate", f"{mine}:LIMITED"]
-    more = ["--n", "6", "--chunk", "2", "--workers", "2", "--out", "a.zarr"]
+    more = ["--n", "6", "--duration", "4", "--chunk", "2", "--workers", "2", "--out", "a.zarr"]
     done = subprocess.run([*command, *more], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     (tmp_path / "numpy.py").write_text("raise SystemExit('not the real one')")
@@ -253,9 +253,13 @@ def test_simulate_a_twin_without_a_case(call, mine: str, pendulum: Path, tmp_pat
     file = tmp_path / "a.npz"
     for twin in (f"{mine}:LIMITED", pendulum):
         more = ("--outputs", "tip") if twin == pendulum else ()
-        code, _, err = call("simulate", twin, *more, "--n", 3, "--out", file)
+        words = ("simulate", twin, *more, "--n", 3, "--out", file)
+        code, _, err = call(*words, "--duration", 8)
         assert code == 0, err
-        assert np.ptp(rt.load(file).commands, axis=1).min() > 0
+        made = rt.load(file)
+        assert np.ptp(made.commands, axis=1).min() > 0
+        assert made.steps == 8 * made.rate
+    refused(call, "--duration: expected the duration of a trajectory in seconds", *words)
     function = ("simulate", f"{mine}:double", "--inputs=u", "--outputs=y", "--rate=50", "--n=3")
     refused(call, "not all inputs have limits", *function, "--out", tmp_path / "b.npz")
     refused(
@@ -295,7 +299,8 @@ def test_failed_trajectories_are_named_and_the_others_written(
     call, mine: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "a.npz"
-    code, _, err = call("simulate", f"{mine}:Fragile", "--n", 40, "--out", file)
+    words = ("simulate", f"{mine}:Fragile", "--duration", 8, "--n", 40, "--out", file)
+    code, _, err = call(*words)
     assert code == 1
     made = rt.load(file)
     assert 20 < len(made) < 40
@@ -334,6 +339,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(
         "--case: expected a case with the twin's inputs, u, at 50 Hz, got armpi with motor_1",
         *("simulate", f"{mine}:LIMITED", "--case", "armpi", "--out", out / "a.npz"),
     )
+    words = ("simulate", "armpi-kinematic", "--duration", 8, "--out", out / "a.npz")
+    refused(call, "--duration: expected none with commands of a file or of a case", *words)
     assert not list(out.iterdir())
     code, _, err = call(*far, "--clip", "--out", out / "a.zarr")
     assert code == 0, err

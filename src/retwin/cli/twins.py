@@ -170,6 +170,13 @@ def simulate(
     found = _twin(twin, inputs, outputs, rate)
     system = _case(case, twin, found)
     faults = _faults(system, fault)
+    require(
+        duration is None or (commands is None and system is None),
+        "--duration",
+        expected="none with commands of a file or of a case",
+        got=duration,
+        remedy="leave it out",
+    )
     drawn = _sampler(system, found, duration) if commands is None else read(commands, system)
     if commands is None and n is None:
         n = len(faults)

@@ -54,7 +54,7 @@ class TwinSubject:
             remedy="give a few short trajectories that the twin can follow",
         )
         if not self.faults:
-            rate = self.twin.rate
+            rate = getattr(self.twin, "rate", 1.0)  # a twin without one fails its first check
             stuck = [_stuck(each, number, rate) for number, each in enumerate(self.commands[1:])]
             object.__setattr__(self, "faults", (None, *stuck))
         healthy = sum(fault is None for fault in self.faults)
