@@ -21,14 +21,16 @@ from torch import Tensor
 import retwin as rt
 from retwin.diagnosis.hypotheses import Hypotheses
 from retwin.diagnosis.inversion import Inversion, invert
-from retwin.diagnosis.latent_prior import LatentPrior, command_problem
-from retwin.diagnosis.missed_segments import fitted, fitted_noise
+from retwin.diagnosis.latent_prior import command_problem, healthy_prior
+from retwin.diagnosis.missed_segments import fitted_noise
 from retwin.inference.losses import Tukey
 from retwin.inference.noise import Noise
 from retwin.inference.solver import Solution, solve
 from retwin.update.corrections.command_inference import _Belief
 from retwin.update.corrections.command_problem import CommandProblem
-from retwin.update.corrections.path_problem import PathProblem
+from retwin.update.corrections.delays import delay_bounds
+from retwin.update.corrections.missed_segments import fitted
+from retwin.update.corrections.path_problem import MAX_STEP, PathProblem
 
 pytestmark = pytest.mark.numerical
 
@@ -72,7 +74,7 @@ def test_command_space_at_fixed_hyperparameters(exact, value) -> None:
     belief = _Belief(delay, jitter, offset, torch.zeros(()), noise)
 
     def solved(start: Tensor) -> Solution:
-        prior = belief.prior(problem)
+        prior = belief.prior(problem).gaussian
         return solve(problem, prior, noise, start.flatten(1), bounds=problem.bounds)
 
     found = solved(value("command_space_start"))
@@ -111,7 +113,7 @@ def test_delay_offset_at_fixed_noise(exact, value) -> None:
     start = torch.cat(
         [value("delay_offset_first_delay")[..., None], problem.first_offset(30.0)], dim=-1
     )
-    bounds = operator._bounds(problem)
+    bounds = delay_bounds(context.segments, 4, operator.delay_range, MAX_STEP)
     found = solve(problem, prior, noise, start.flatten(1), bounds=bounds)
     # There was no prior; this one is so wide that it costs some 1e-3 nats.
     misfit = found.objective - prior.energy(found.x)
@@ -157,7 +159,7 @@ def test_inversion_learns_the_same_noise(exact, value, noise) -> None:
     problem = command_problem(
         KnownResidual(), context, value("observed")[:HEALTHY], polled(HEALTHY)
     )
-    found = fitted_noise(problem, LatentPrior.healthy(KnownResidual(), context), rounds=5)
+    found = fitted_noise(problem, healthy_prior(KnownResidual(), context), rounds=5)
     torch.testing.assert_close(found.scale, noise.scale, rtol=1e-3, atol=0)
     torch.testing.assert_close(found.thinning, noise.thinning, rtol=1e-3, atol=0)
 

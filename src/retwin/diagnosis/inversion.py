@@ -22,8 +22,8 @@ from torch import Tensor
 from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis.hypotheses import Hypotheses, checked
-from retwin.diagnosis.latent_prior import LatentPrior, command_problem, command_space
-from retwin.diagnosis.missed_segments import Fit, best_fit, fitted_noise
+from retwin.diagnosis.latent_prior import command_problem, command_space, healthy_prior
+from retwin.diagnosis.missed_segments import best_fit, fitted_noise
 from retwin.diagnosis.onsets import Onsets
 from retwin.diagnosis.severity import biases, stuck_level
 from retwin.errors import InputError
@@ -33,6 +33,7 @@ from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.update.corrections import Context, sample_mask
+from retwin.update.corrections.missed_segments import Fit
 from retwin.update.residual import Residual, ResidualModel
 from retwin.update.surrogate import Surrogate
 
@@ -115,7 +116,8 @@ def invert(rows: Hypotheses, noise: Noise) -> Inversion:
     """The evidence for every hypothesis, and the severity of its fault."""
     onsets = Onsets.of(rows, noise)
     held = rows.held(onsets.best)
-    fit, evidence = best_fit(held.problem, held.prior, noise, held.start, held.trajectory)
+    found = best_fit(held.problem, held.prior, noise, held.start, held.trajectory)
+    fit, evidence = found.fit, found.evidence
     bias, gain = biases(held, fit, COVERAGE)
     level, deviation = stuck_level(held, fit, onsets.best, noise)
     return Inversion(evidence + onsets.gain + gain, level, deviation, onsets, bias, fit)
@@ -277,7 +279,7 @@ def fit_inversion(
         surrogate,
         residual,
         faults,
-        noise=fitted_noise(problem, LatentPrior.healthy(residual, context), rounds=ROUNDS),
+        noise=fitted_noise(problem, healthy_prior(residual, context), rounds=ROUNDS),
     )
 
 

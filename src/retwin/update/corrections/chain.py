@@ -10,7 +10,13 @@ from torch import Tensor
 
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
-from retwin.update.corrections.correction import Context, Correction, Discrepancy, Head
+from retwin.update.corrections.correction import (
+    Context,
+    Correction,
+    Discrepancy,
+    Head,
+    block_diagonal,
+)
 from retwin.update.corrections.sampled_sensor import SampledSensor
 
 __all__ = ["Chain", "fit_sensor", "measured_outputs", "sample_mask"]
@@ -116,13 +122,9 @@ class Chain:
         with torch.no_grad():
             after = replace(context, corrected=self.first.apply(context, one.z))
         other = self.second.infer(after, observed, mask)
-        width = one.z.shape[-1] + other.z.shape[-1]
-        covariance = one.covariance.new_zeros(*one.z.shape[:2], width, width)
-        covariance[..., : one.z.shape[-1], : one.z.shape[-1]] = one.covariance
-        covariance[..., one.z.shape[-1] :, one.z.shape[-1] :] = other.covariance
         return Discrepancy(
             z=torch.cat([one.z, other.z.to(one.z)], dim=-1),
-            covariance=covariance,
+            covariance=block_diagonal(one.covariance, other.covariance),
             identified=torch.cat([one.identified, other.identified], dim=-1),
             noise=other.noise,
             severity=one.severity,

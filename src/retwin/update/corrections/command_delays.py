@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from retwin.inference.em import expectation_maximisation
-from retwin.inference.noise import Noise
+from retwin.inference.noise import Noise, predicted_variance
 from retwin.inference.priors import GaussianPrior
 from retwin.update.corrections.command_problem import CommandProblem
 
@@ -106,8 +106,7 @@ class _OwnDelays:
         size = self.residual.shape[-1]
         left = self.residual - torch.einsum("nsyp,np->nsy", self.jacobian, mean)
         # The variance of the predicted outputs adds to what stays unexplained.
-        flat = self.jacobian.flatten(1, 2)
-        variance = ((flat @ covariance) * flat).sum(dim=-1).view_as(left)
+        variance = predicted_variance(self.jacobian, covariance)
         square = (left.square() + variance).sum(dim=-1)
         weights = self.noise.loss.weight(square / widths.noise, size)
         total = self.motion.sum().clamp_min(1) * size

@@ -13,7 +13,14 @@ from torch import Tensor
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
 
-__all__ = ["Context", "Correction", "DifferentiableTwin", "Discrepancy", "Head"]
+__all__ = [
+    "Context",
+    "Correction",
+    "DifferentiableTwin",
+    "Discrepancy",
+    "Head",
+    "block_diagonal",
+]
 
 
 class DifferentiableTwin(Protocol):
@@ -211,3 +218,11 @@ class Correction(Protocol):
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """The z for which `apply` comes closest to `observed` (n, T, d_y) where `mask` is True."""
         ...
+
+
+def block_diagonal(one: Tensor, other: Tensor) -> Tensor:
+    """The joint covariance (..., P + Q, P + Q) of independent (..., P, P) and (..., Q, Q)."""
+    size, further = one.shape[-1], other.shape[-1]
+    joint = one.new_zeros(*one.shape[:-2], size + further, size + further)
+    joint[..., :size, :size], joint[..., size:, size:] = one, other
+    return joint

@@ -16,8 +16,9 @@ from retwin.data.trajectories import Channels
 from retwin.inference.em import expectation_maximisation
 from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
-from retwin.inference.solver import Bounds, Solution, solve
+from retwin.inference.solver import Solution, solve
 from retwin.update.corrections.correction import Context, Discrepancy, Head
+from retwin.update.corrections.delays import delay_bounds, first_delays
 from retwin.update.corrections.path_problem import MAX_STEP, PathProblem, path_at
 
 __all__ = ["DelayOffset"]
@@ -102,9 +103,9 @@ class DelayOffset:
             noise = problem.noise(problem.factor * (problem.observed - problem.path))
             return Discrepancy(z, matrix, z > 0, noise.scale[::2, 0] * unit.mean())
         z[..., 1:] = problem.first_offset(self.delay_range[1])
-        z[..., 0] = problem.first_delay(z.flatten(1), self.delay_range)
+        z[..., 0] = first_delays(problem, z.flatten(1), self.delay_range)
         problem = problem.with_motion(z[..., 0])
-        bounds = self._bounds(problem)
+        bounds = delay_bounds(segments, 1 + len(unit), self.delay_range, MAX_STEP)
         belief = self._learned(problem, problem.residual(z.flatten(1)))
         solution, belief = expectation_maximisation(
             Solution.of_prior(belief[1], z.flatten(1)),
@@ -126,14 +127,6 @@ class DelayOffset:
         prior = GaussianPrior.independent(torch.zeros_like(wide), wide.square())
         return problem.noise(residual), prior
 
-    def _bounds(self, problem: PathProblem) -> Bounds:
-        size, segments = 1 + problem.path.shape[2], problem.segments.max_count
-        low, high, step = torch.full((3, segments, size), torch.inf, dtype=torch.float64)
-        low = -low
-        low[:, 0], high[:, 0] = self.delay_range
-        step[:, 0] = MAX_STEP
-        return Bounds(low.flatten(), high.flatten(), step.flatten())
-
     def _discrepancy(
         self,
         problem: PathProblem,
@@ -144,12 +137,9 @@ class DelayOffset:
     ) -> Discrepancy:
         """z, each segment's covariance, and which components the outputs identify."""
         z = problem.per_segment(solution.x)
-        n, segments, size = z.shape
-        whole = solution.covariance.reshape(n, segments, size, segments, size)
-        index = torch.arange(segments)
-        covariance = whole[:, index, :, index].transpose(0, 1)
+        covariance = solution.blocks(z.shape[1])
         deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
-        wide = problem.per_segment(prior.precision.diagonal(dim1=1, dim2=2).rsqrt())
+        wide = problem.per_segment(prior.deviation)
         low, high = self.delay_range
         delay = (deviation[..., 0] <= self.known_delay) & (z[..., 0] > low) & (z[..., 0] < high)
         delay = delay & (problem.motion_measured >= MEASURED_MOTION)
