@@ -23,13 +23,7 @@ from retwin.update.corrections.command_delays import delay_variance
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.correction import Context, Discrepancy, block_diagonal
 from retwin.update.corrections.delays import first_delays
-from retwin.update.corrections.missed_segments import (
-    Fit,
-    LatentPrior,
-    Search,
-    fitted,
-    searched,
-)
+from retwin.update.corrections.missed_segments import Fit, LatentPrior, Search, fitted, searched
 from retwin.update.corrections.warp import gather_samples
 
 __all__ = ["infer_commands"]
