@@ -8,26 +8,70 @@ a file names.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache, partial
+from operator import truediv
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, PlainValidator, ValidationError, create_model
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    PlainValidator,
+    ValidationError,
+    ValidationInfo,
+    create_model,
+)
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from retwin.checks import one_of, require
 from retwin.errors import InputError
 
-__all__ = ["at", "checked", "fits", "from_config", "from_settings", "key", "to_config"]
+__all__ = [
+    "Converted",
+    "at",
+    "checked",
+    "fits",
+    "from_config",
+    "from_settings",
+    "key",
+    "to_config",
+]
 
 T = TypeVar("T")
 
+
+@dataclass(frozen=True)
+class Converted:
+    """A setting that was in samples before version 0.1.0, and is in seconds or in Hz now.
+
+    One that has kept its name was a whole number, and has always been written as a decimal since.
+
+    Parameters
+    ----------
+    name : str
+        Its present name.
+    convert : callable
+        From a number of samples and the sample rate in Hz to the present value; by default to
+        seconds.
+
+    """
+
+    name: str
+    convert: Callable[[float, float], float] = truediv
+
+    def of(self, value: Any, rate: float) -> Any:
+        """The numbers of `value` converted; what is no number stays, to be refused."""
+        if isinstance(value, list | tuple):
+            return [self.of(each, rate) for each in value]
+        return self.convert(value, rate) if type(value) in (int, float) else value
+
+
 RENAMED_KINDS = {"SteadyStateError": "ActuatorBias"}
 """Kinds in files of versions before 0.1.0, and their present names."""
-RENAMED_SETTINGS = {
+RENAMED_SETTINGS: dict[str, dict[str, str | Converted]] = {
     "RampSampler": {"movements": "segments"},
     "Training": {"epochs": "max_epochs", "batch": "batch_size", "rate": "learning_rate"},
     "CommandSpace": {"most": "max_samples", "known": "identified_below"},
@@ -65,7 +109,13 @@ def to_config(value: Any, kinds: Sequence[type]) -> dict[str, Any]:
     return {"kind": type(value).__name__, **inside}
 
 
-def from_config(values: Mapping[str, Any], kinds: Sequence[type], *, place: str = "config") -> Any:
+def from_config(
+    values: Mapping[str, Any],
+    kinds: Sequence[type],
+    *,
+    place: str = "config",
+    rate: float | None = None,
+) -> Any:
     """The object that `to_config` described.
 
     Parameters
@@ -76,12 +126,15 @@ def from_config(values: Mapping[str, Any], kinds: Sequence[type], *, place: str 
         The dataclasses that may be made.
     place : str
         What messages name before the key, such as "case.toml:".
+    rate : float, optional
+        Sample rate in Hz, by which settings of former versions are converted from samples.
 
     Raises
     ------
     InputError
-        The kind is unknown, a parameter is unknown, missing or of another type, or the class
-        refuses its parameters. The message names `place` and the key.
+        The kind is unknown, a parameter is unknown, missing or of another type, the class refuses
+        its parameters, or one is in samples and there is no rate. The message names `place` and
+        the key.
 
     """
     known = {kind.__name__: kind for kind in kinds}
@@ -93,31 +146,42 @@ def from_config(values: Mapping[str, Any], kinds: Sequence[type], *, place: str 
         remedy="check the spelling; a model loads with the version of retwin that wrote it",
     )
     settings = {each: value for each, value in values.items() if each != "kind"}
-    return from_settings(known[name], settings, kinds, place=place)
+    return from_settings(known[name], settings, kinds, place=place, rate=rate)
 
 
 def from_settings(
-    kind: type[T], settings: Mapping[str, Any], kinds: Sequence[type] = (), *, place: str
+    kind: type[T],
+    settings: Mapping[str, Any],
+    kinds: Sequence[type] = (),
+    *,
+    place: str,
+    rate: float | None = None,
 ) -> T:
     """An object of the dataclass `kind` from its parameters by name.
 
     Config objects among the parameters are of `kinds`, or of the one class that the type of the
     parameter names. Raises as `from_config` does.
     """
-    made = _validated(_model(kind, tuple(kinds)), settings, place)  # type: ignore[arg-type]
+    model = _model(kind, tuple(kinds))  # type: ignore[arg-type]
+    made = _validated(model, settings, place, rate)
     with at(place):
         return kind(**made)
 
 
 def checked(
-    kind: type, settings: Mapping[str, Any], *, place: str, besides: Sequence[str]
+    kind: type,
+    settings: Mapping[str, Any],
+    *,
+    place: str,
+    besides: Sequence[str],
+    rate: float | None = None,
 ) -> dict[str, Any]:
     """Some parameters of the dataclass `kind`, lists as tuples, each of the type it should have.
 
     Raises InputError for unknown parameters, for those named in `besides`, and for values of
     another type. The message names `place` and the key.
     """
-    return _validated(_model(kind, (), tuple(besides)), settings, place)
+    return _validated(_model(kind, (), tuple(besides)), settings, place, rate)
 
 
 def key(place: str, name: str) -> str:
@@ -149,7 +213,9 @@ def _is_protocol(hint: Any) -> bool:
     return getattr(hint, "_is_protocol", False)
 
 
-def _validated(model: type[BaseModel], settings: Any, place: str) -> dict[str, Any]:
+def _validated(
+    model: type[BaseModel], settings: Any, place: str, rate: float | None
+) -> dict[str, Any]:
     """The parameters of `model` that `settings` hold; InputError about the first bad key."""
     require(
         isinstance(settings, Mapping),
@@ -158,12 +224,11 @@ def _validated(model: type[BaseModel], settings: Any, place: str) -> dict[str, A
         got=repr(settings),
         remedy="write { key = value, … }",
     )
-    renamed = RENAMED_SETTINGS.get(model.__name__, {})
-    given = {renamed.get(name, name): value for name, value in settings.items()}
+    given = _present(model.__name__, settings, place, rate)
     for name in given:
         one_of(key(place, name), name, model.model_fields, remedy="check the spelling")
     try:
-        made = model.model_validate(_tuples(given))
+        made = model.model_validate(_tuples(given), context=rate)
         return {name: getattr(made, name) for name in made.model_fields_set}
     except ValidationError as error:
         errors = error.errors(include_url=False)
@@ -181,6 +246,35 @@ def _validated(model: type[BaseModel], settings: Any, place: str) -> dict[str, A
         got=repr(given[name]),
         remedy="see what this key may hold",
     )
+
+
+def _present(
+    kind: str, settings: Mapping[str, Any], place: str, rate: float | None
+) -> dict[str, Any]:
+    """The settings under their present names, and in seconds or Hz where they were in samples."""
+    given = {}
+    for former, value in settings.items():
+        present = RENAMED_SETTINGS.get(kind, {}).get(former, former)
+        if isinstance(present, str):
+            given[present] = value
+            continue
+        same = present.name == former
+        require(
+            same or rate is not None,
+            key(place, former),
+            expected=f"{present.name}, in seconds or Hz",
+            got=f"{value!r} in samples, as before version 0.1.0",
+            remedy="convert it by the sample rate",
+        )
+        if rate is not None and (not same or _whole(value)):
+            value = present.of(value, rate)
+        given[present.name] = value
+    return given
+
+
+def _whole(value: Any) -> bool:
+    """Whether a value holds whole numbers only."""
+    return all(map(_whole, value)) if isinstance(value, list | tuple) else type(value) is int
 
 
 def _expected(error: ErrorDetails) -> str:
@@ -228,13 +322,15 @@ def _classes(configs: tuple[Any, ...]) -> tuple[type, ...]:
     return tuple(each for each in configs if not _is_protocol(each))
 
 
-def _config(hints: tuple[Any, ...], kinds: tuple[type, ...], value: Any) -> Any:
+def _config(
+    hints: tuple[Any, ...], kinds: tuple[type, ...], value: Any, info: ValidationInfo
+) -> Any:
     """The config object of one of `hints` that a table describes; messages begin with its keys."""
     if isinstance(value, Mapping):
         classes = _classes(hints)
         if "kind" not in value and len(hints) == len(classes) == 1:
-            return from_settings(classes[0], value, kinds, place="")
-        made = from_config(value, (*classes, *kinds), place="")
+            return from_settings(classes[0], value, kinds, place="", rate=info.context)
+        made = from_config(value, (*classes, *kinds), place="", rate=info.context)
         if any(fits(made, hint) for hint in hints):
             return made
     names = " or ".join(hint.__name__ for hint in hints)
