@@ -54,7 +54,7 @@ def plan(case: rt.Case) -> SimulationPlan:
 
 def test_a_case_has_its_former_settings(case: rt.Case) -> None:
     correction = rt.Chain(
-        rt.CommandSpace(delay_range=(0, 5), max_samples=40, identified_below=0.5),
+        rt.CommandSpace(delay_range=(0, 0.1), max_samples=40, identified_below=0.5),
         rt.SampledSensor(every=5),
     )
     assert case.correction == correction

@@ -87,7 +87,10 @@ def read_case(path: str | Path) -> Case:
     folder = path.parent
     named = (catalog.CORRECTIONS, catalog.DENSITIES, catalog.NETWORKS)
     kinds = [kind for entries in named for kind in catalog.classes(entries)]
-    keys = from_settings(CaseFile, _read(path), kinds, place=place)
+    settings = _read(path)
+    rate = settings.get("rate")
+    rate = rate if isinstance(rate, int | float) else None
+    keys = from_settings(CaseFile, settings, kinds, place=place, rate=rate)
     twin = read_twin(keys.twin, keys.inputs, keys.outputs, keys.rate, folder, place)
     parametric = None
     if keys.parameters:

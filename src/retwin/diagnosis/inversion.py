@@ -216,13 +216,14 @@ class InversionDiagnoser:
         """Read what `save` wrote; InputError when it is not an inversion or damaged."""
         about, weights = read_model(folder, "inversion")
         folder = Path(folder)
+        surrogate = Surrogate.load(folder / "surrogate")
         faults = {
             name: None if config is None else from_config(config, FAULTS)
             for name, config in about["faults"]
         }
         return cls(
-            Surrogate.load(folder / "surrogate"),
-            ResidualModel.load(folder / "residual"),
+            surrogate,
+            ResidualModel.load(folder / "residual", surrogate.rate),
             faults,
             noise=Noise(weights["scale"], weights["thinning"]),
         )

@@ -13,6 +13,7 @@ from retwin.inference.priors import GaussianPrior
 from retwin.nets.mixtures import Bernoullis, GaussianMixture
 from retwin.update.corrections import Chain, CommandSpace, Context, Correction, SampledSensor
 from retwin.update.corrections.command_problem import CommandProblem
+from retwin.update.corrections.delay_range import range_in_samples
 from retwin.update.corrections.missed_segments import LatentPrior
 from retwin.update.residual import ResidualModel
 
@@ -61,7 +62,7 @@ def command_problem(
         context,
         observed,
         mask,
-        delay_range=operator.delay_range,
+        delay_range=range_in_samples(operator.delay_range, context, observed, mask),
         max_samples=operator.max_samples,
         unit=torch.ones(observed.shape[2], dtype=torch.float64),
     )

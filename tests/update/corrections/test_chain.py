@@ -10,7 +10,7 @@ import retwin as rt
 from retwin import catalog
 from retwin.cases.armpi_fpv.twin import POLL
 from retwin.serialisation.configs import from_config, to_config
-from retwin.update.corrections import fit_sensor, measured_outputs, sample_mask
+from retwin.update.corrections import fit_correction, measured_outputs, sample_mask
 
 KINDS = catalog.classes(catalog.CORRECTIONS)
 
@@ -55,7 +55,7 @@ def test_between_readings_a_record_tells_nothing(exact, measured: rt.Trajectorie
 def test_the_sensor_is_fitted_with_z(exact, measured: rt.Trajectories) -> None:
     """Real noise is a unit or so of a joint, tenths of a millimetre; a glitch is much more."""
     context = context_of(exact, measured)
-    chain, found = fit_sensor(ROBOT, context, *arrays(measured))
+    chain, found = fit_correction(ROBOT, context, *arrays(measured))
     sensor = chain.second
     assert (sensor.every, sensor.phases) == (POLL, (0,))
     assert sensor.glitch_rate < 0.02

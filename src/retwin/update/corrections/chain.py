@@ -19,7 +19,7 @@ from retwin.update.corrections.correction import (
 )
 from retwin.update.corrections.sampled_sensor import SampledSensor
 
-__all__ = ["Chain", "fit_sensor", "measured_outputs", "sample_mask"]
+__all__ = ["Chain", "fit_correction", "measured_outputs", "sample_mask"]
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,14 @@ class Chain:
             context = replace(context, corrected=operator.apply(context, part))
         return context.path
 
+    def completed(self, context: Context, observed: Tensor, mask: Tensor) -> Chain:
+        """The same, what each operator leaves open chosen as if it were alone."""
+        seen = sample_mask(self, observed, mask)
+        first = completed(self.first, context, observed, seen)
+        if isinstance(self.second, SampledSensor):
+            return replace(self, first=first)
+        return replace(self, first=first, second=completed(self.second, context, observed, seen))
+
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """z* of one operator after the other, each from what those before it left."""
         if isinstance(self.second, SampledSensor):
@@ -130,6 +138,7 @@ class Chain:
             severity=one.severity,
             # Where one operator can only give points, both do.
             posterior=one.posterior and other.posterior,
+            at_bound=_either(one.at_bound, other.at_bound),
         )
 
     def _split(self, context: Context, z: Tensor) -> tuple[Tensor, ...]:
@@ -141,20 +150,35 @@ class Chain:
         return z.split([len(each.latent(inputs, outputs)) for each in self._operators], dim=-1)
 
 
+def completed(
+    correction: Correction, context: Context, observed: Tensor, mask: Tensor
+) -> Correction:
+    """The operator with the settings that were left open, if it has such."""
+    method = getattr(correction, "completed", None)
+    return correction if method is None else method(context, observed, mask)
+
+
+def _either(one: Tensor | None, other: Tensor | None) -> Tensor | None:
+    """Where one of both is true, if both are known."""
+    return one if other is None else other if one is None else one | other
+
+
 def _sensor(correction: Correction) -> SampledSensor | None:
     """The sensor at the end of a chain, if there is one."""
     last = correction.second if isinstance(correction, Chain) else None
     return last if isinstance(last, SampledSensor) else None
 
 
-def fit_sensor(
+def fit_correction(
     correction: Correction, context: Context, observed: Tensor, mask: Tensor
 ) -> tuple[Correction, Discrepancy]:
-    """The operator, its sensor fitted to measured outputs (n, T, d_y), and their z*."""
+    """The operator with all settings fitted to measured outputs (n, T, d_y), and their z*."""
     sensor = _sensor(correction)
     if sensor is None or not isinstance(correction, Chain):
-        return correction, correction.infer(context, observed, mask)
-    chain = replace(correction, second=sensor.timed(observed, mask))
+        operator = completed(correction, context, observed, mask)
+        return operator, operator.infer(context, observed, mask)
+    timed = replace(correction, second=sensor.timed(observed, mask))
+    chain = timed.completed(context, observed, mask)
     found = chain.infer(context, observed, mask)
     with torch.no_grad():
         explained = chain.apply(context, found.z)

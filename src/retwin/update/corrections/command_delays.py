@@ -23,8 +23,8 @@ __all__ = ["delay_variance"]
 
 ROUNDS = 20
 """Rounds of expectation-maximisation."""
-FIRST = 1.0
-"""Variance of an actuator's own delay to begin with, in samples squared."""
+FIRST = 1 / 35
+"""Standard deviation of an actuator's own delay to begin with, in widths of the range of delays."""
 
 
 def delay_variance(
@@ -36,7 +36,9 @@ def delay_variance(
     first = x.new_zeros(len(x), count), x.new_zeros(len(x), count, count)
     square = (model.residual.square() * model.motion[..., None]).sum()
     scale = (square / model.motion.sum().clamp_min(1) / model.residual.shape[-1]).clamp_min(1e-12)
-    widths = _Widths(scale, x.new_tensor(FIRST), torch.ones_like(model.motion))
+    widths = _Widths(
+        scale, x.new_tensor((FIRST * problem.width) ** 2), torch.ones_like(model.motion)
+    )
     (_, covariance), _ = expectation_maximisation(
         first, widths, infer=model.posterior, learn=model.learned, rounds=ROUNDS
     )

@@ -22,7 +22,7 @@ from retwin.inference.solver import Solution
 from retwin.update.corrections.command_delays import delay_variance
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.correction import Context, Discrepancy, block_diagonal
-from retwin.update.corrections.delays import first_delays
+from retwin.update.corrections.delays import at_bound, first_delays
 from retwin.update.corrections.missed_segments import Fit, LatentPrior, Search, fitted, searched
 from retwin.update.corrections.warp import gather_samples
 
@@ -40,6 +40,9 @@ OUTLYING_SHARE = 0.3
 """Share of outliers above which a segment is suspect."""
 FLAT = 30.0
 """Standard deviation of the prior, in that of a healthy offset, where a fault may be anything."""
+FIRST_JITTER, SMALLEST_JITTER = 1 / 35, 1 / 350
+"""Standard deviations of a delay at first beyond what first delays show, and at least, in widths of
+its range."""
 FLOOR = 1e-6
 """Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
@@ -54,6 +57,8 @@ def infer_commands(
     identified_below: float,
 ) -> Discrepancy:
     """z* (n, M, 1 + 2 d_u) for measured outputs (n, T, d_y), see `CommandSpace`.
+
+    The range of delays is in samples.
 
     Raises
     ------
@@ -148,7 +153,7 @@ class _Belief:
     def of(cls, problem: CommandProblem, start: Tensor) -> _Belief:
         """Wide, from first delays only."""
         delay = problem.per_segment(start)[..., 0][problem.valid]
-        jitter = 1.4826 * (delay - delay.median()).abs().median() + 1.0
+        jitter = 1.4826 * (delay - delay.median()).abs().median() + FIRST_JITTER * problem.width
         measured = problem.measured > 0
         # The median and the spread of nothing are NaN.
         length = problem.residual(start).norm(dim=-1)[measured].median().nan_to_num(1.0)
@@ -185,7 +190,7 @@ class _Belief:
         missed = (problem.missed * problem.healthy).sum()
         return _Belief(
             delay=mean,
-            jitter=spread.sqrt().clamp_min(0.1),
+            jitter=spread.sqrt().clamp_min(SMALLEST_JITTER * problem.width),
             offset=scatter.sqrt(),
             odds=((missed + 0.5) / (problem.healthy.sum() + 20.0)).logit(),
             noise=self.noise.learned(
@@ -220,9 +225,11 @@ def _discrepancy(
     inner = inner * stretch[..., None] * stretch[..., None, :]
     covariance = block_diagonal(inner, torch.diag_embed(probability * (1 - probability)))
     known = (left < identified_below) & (learned > 0)
+    bounded = at_bound(x[..., 0], problem.delay_range) & problem.valid
+    known[..., 0] &= ~bounded
     known[..., 1:] &= missed < 0.5
     seen = problem.inside.any(dim=-1)[..., None] & problem.healthy
     identified = torch.cat([known, seen], dim=-1) & problem.valid[..., None]
     z = torch.cat([x * learned, missed], dim=-1) * problem.valid[..., None]
     noise = (belief.noise.scale[0, 0] * problem.unit.mean()).expand(len(x))
-    return Discrepancy(z, covariance, identified, noise, severity=severity, posterior=True)
+    return Discrepancy(z, covariance, identified, noise, severity, True, bounded)

@@ -25,8 +25,9 @@ SURROGATE_STEP = 0.05
 units: larger than the rounding of single precision."""
 COMMAND_STEP = 1e-4
 """Step of finite differences through the effective commands, which are piecewise linear in x."""
-SETTLING = 15
-"""Samples after the end of a command's ramp in which an output may still be in motion."""
+SETTLING = 0.5
+"""Time after the end of a command's ramp in which an output may still be in motion, in largest
+delays."""
 EFFECTIVE_SAMPLES = (6.0, 1.0)
 """Largest effective sample size of a segment's part at rest and in motion: rounding and friction
 are common to all its samples."""
@@ -117,7 +118,8 @@ class CommandProblem:
         sample, used = _thinned(whole, max_samples)
         unit = _unit(context, observed.double()[whole]) if unit is None else unit
         values = torch.where(whole[..., None], observed.double(), 0.0)
-        near = within(sample, segments.start + delay_range[0], segments.settle + SETTLING)
+        settling = SETTLING * max(delay_range[1], 0.0)
+        near = within(sample, segments.start + delay_range[0], segments.settle + settling)
         healthy = valid[..., None] & ~bent & (start < context.frozen[:, None])
         return cls(
             surrogate=context.surrogate,
@@ -169,8 +171,13 @@ class CommandProblem:
         return self.observed.new_zeros(n, segments * (1 + width))
 
     @property
+    def width(self) -> float:
+        """Of the range of delays, in samples."""
+        return self.delay_range[1] - self.delay_range[0]
+
+    @property
     def bounds(self) -> Bounds:
-        """The delay range as limits of x."""
+        """The range of delays as limits of x."""
         return delay_bounds(self.segments, 1 + self.missed.shape[2], self.delay_range)
 
     def per_segment(self, x: Tensor) -> Tensor:

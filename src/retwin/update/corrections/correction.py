@@ -178,6 +178,9 @@ class Discrepancy:
     posterior : bool
         Whether z and covariance are a whole posterior: what the outputs do not identify then has
         the variance of its prior, and draws stand for z everywhere.
+    at_bound : Tensor, optional
+        (n, M) bool, where the delay is at a bound of its range, so that a better one may lie
+        beyond; None where no component of z is bounded.
 
     """
 
@@ -187,6 +190,7 @@ class Discrepancy:
     noise: Tensor
     severity: Tensor | None = None
     posterior: bool = False
+    at_bound: Tensor | None = None
 
 
 @runtime_checkable
@@ -194,8 +198,10 @@ class Correction(Protocol):
     """An operator g with its inverse; holds settings, no data.
 
     Optional members are `pools`, true if `infer` learns from all trajectories together;
-    `severities`, true if it estimates the severity of a known fault apart from z; and
-    `at(context, z, when)`, the result of `apply` at some samples (n, S) only, if that costs less.
+    `severities`, true if it estimates the severity of a known fault apart from z;
+    `at(context, z, when)`, the result of `apply` at some samples (n, S) only, if that costs less;
+    and `completed(context, observed, mask)`, the operator with the settings that were left open,
+    chosen from measured outputs.
     """
 
     @property
