@@ -323,7 +323,10 @@ class _Samples:
         mask = torch.as_tensor(trajectories.mask.copy())
         # One by one: the timing of a trajectory's samples must not depend on the others.
         one_by_one = [slice(i, i + 1) for i in range(len(mask))]
-        sampled = [sample_mask(residual.correction, observed[i], mask[i]) for i in one_by_one]
+        sampled = [
+            sample_mask(residual.correction, observed[i], mask[i], trajectories.rate)
+            for i in one_by_one
+        ]
         return cls(replace(context, surrogate=_Precise(surrogate)), observed, torch.cat(sampled))
 
     def __getitem__(self, rows: slice) -> tuple[Context, Tensor, Tensor]:

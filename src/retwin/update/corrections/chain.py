@@ -116,7 +116,7 @@ class Chain:
 
     def completed(self, context: Context, observed: Tensor, mask: Tensor) -> Chain:
         """The same, what each operator leaves open chosen as if it were alone."""
-        seen = sample_mask(self, observed, mask)
+        seen = sample_mask(self, observed, mask, context.rate)
         first = completed(self.first, context, observed, seen)
         if isinstance(self.second, SampledSensor):
             return replace(self, first=first)
@@ -125,7 +125,9 @@ class Chain:
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """z* of one operator after the other, each from what those before it left."""
         if isinstance(self.second, SampledSensor):
-            return self.first.infer(context, observed, sample_mask(self, observed, mask))
+            return self.first.infer(
+                context, observed, sample_mask(self, observed, mask, context.rate)
+            )
         one = self.first.infer(context, observed, mask)
         with torch.no_grad():
             after = replace(context, corrected=self.first.apply(context, one.z))
@@ -177,19 +179,24 @@ def fit_correction(
     if sensor is None or not isinstance(correction, Chain):
         operator = completed(correction, context, observed, mask)
         return operator, operator.infer(context, observed, mask)
-    timed = replace(correction, second=sensor.timed(observed, mask))
+    timed = replace(correction, second=sensor.timed(observed, mask, context.rate))
     chain = timed.completed(context, observed, mask)
     found = chain.infer(context, observed, mask)
     with torch.no_grad():
         explained = chain.apply(context, found.z)
-    fitted = sensor.fitted(observed, mask, explained, context.segments)
+    fitted = sensor.fitted(observed, mask, explained, context.segments, context.rate)
     return replace(chain, second=fitted), found
 
 
-def sample_mask(correction: Correction, observed: Tensor, mask: Tensor) -> Tensor:
-    """`mask` (n, T, d_y) where the operator's sensor, if it has one, sampled the outputs."""
+def sample_mask(correction: Correction, observed: Tensor, mask: Tensor, rate: float) -> Tensor:
+    """`mask` (n, T, d_y) where the operator's sensor, if it has one, sampled the outputs.
+
+    `rate` is that of the record, in Hz.
+    """
     sensor = _sensor(correction)
-    return mask if sensor is None else sensor.timed(observed, mask).sample_mask(observed, mask)
+    if sensor is None:
+        return mask
+    return sensor.timed(observed, mask, rate).sample_mask(observed, mask, rate)
 
 
 def measured_outputs(
@@ -202,9 +209,9 @@ def measured_outputs(
     sensor = _sensor(correction)
     if sensor is None or not isinstance(correction, Chain):
         return correction.apply(context, z)
-    at = getattr(correction.first, "at", None)
-    if at is None or sensor.every is None:
-        return sensor.read(correction.apply(context, z), generator)
+    at, rate = getattr(correction.first, "at", None), context.rate
+    if at is None or sensor.period is None:
+        return sensor.read(correction.apply(context, z), generator, rate)
     steps = context.commands.shape[1]
-    when = sensor.polls(len(context), steps, generator)
-    return sensor.record(at(context, z, when), when, steps, generator)
+    when = sensor.polls(len(context), steps, generator, rate)
+    return sensor.record(at(context, z, when), when, steps, generator, rate)

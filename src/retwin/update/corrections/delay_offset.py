@@ -35,9 +35,9 @@ WIDE = 100.0
 measured at all."""
 UNSEEN = 0.1
 """Share of the prior's standard deviation above which an offset was not measured."""
-KNOWN_DELAY = 1 / 12
+KNOWN_DELAY = 1 / 8
 """Standard deviation above which a delay is not identified by default, in widths of its range: less
-than a third of that of a delay of which nothing is known."""
+than half of that of a delay of which nothing is known."""
 MEASURED_MOTION = 0.5
 """Share of a motion that must be measured for its delay to be identified."""
 
@@ -54,8 +54,8 @@ class DelayOffset:
         Smallest and largest delay that `infer` considers, in seconds; by default chosen from the
         measured outputs, see `plausible_delays`.
     known_delay : float, optional
-        Standard deviation in seconds above which a delay counts as not identified; by default a
-        twelfth of the range of delays.
+        Standard deviation in seconds above which a delay counts as not identified; by default an
+        eighth of the range of delays.
 
     Raises
     ------

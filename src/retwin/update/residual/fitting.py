@@ -217,7 +217,7 @@ def fit_residual(
         result = replace(result, reason="; ".join(filter(None, [result.reason, bound_note(share)])))
     if density.refinement is not None and held_out is not None:
         observed, mask = _measured(used)
-        sampled = sample_mask(correction, observed, mask)
+        sampled = sample_mask(correction, observed, mask, used.rate)
         figures |= refine(
             model, context, observed, sampled, fitted=fitted, held_out=held_out,
             how=density.refinement, seed=seed, progress=progress,

@@ -12,8 +12,8 @@ from retwin.update.corrections import Correction
 
 __all__ = ["read_correction", "written_correction"]
 
-DELAYS = ("delay_range", "known_delay")
-"""Settings that were in samples, as decimals, under the names that they have now."""
+TIMES = ("delay_range", "known_delay", "phases")
+"""Settings that were in samples under the names that they have now."""
 
 
 def written_correction(correction: Correction) -> dict[str, Any]:
@@ -47,11 +47,11 @@ def read_correction(about: Mapping[str, Any], rate: float | None) -> Correction:
 
 
 def _in_seconds(config: Mapping[str, Any], rate: float | None) -> dict[str, Any]:
-    """The settings of a correction and of those in it, delays in seconds."""
+    """The settings of a correction and of those in it, times in seconds."""
     made = {}
     for name, value in config.items():
         made[name] = _in_seconds(value, rate) if isinstance(value, Mapping) else value
-        if name in DELAYS:
+        if name in TIMES and value is not None:
             if rate is None:
                 raise InputError(
                     "rate",
