@@ -327,8 +327,8 @@ def polled(robot: Robot, path: NDArray) -> Figure:
     """Records of the sensor in motion and at rest; `path` is the best fit to what was measured."""
     observed, mask = torch.tensor(robot.made.observed), torch.tensor(robot.made.mask)
     predicted = torch.tensor(path)
-    sensor = rt.SampledSensor().fitted(observed, mask, predicted, robot.segments)
-    drawn = sensor.read(predicted, torch.Generator().manual_seed(2)).numpy()
+    sensor = rt.SampledSensor().fitted(observed, mask, predicted, robot.segments, RATE)
+    drawn = sensor.read(predicted, torch.Generator().manual_seed(2), RATE).numpy()
     true = KINEMATIC.position(robot.hidden["angles"])
     figure = blank(7.2, 3.7)
     left, right = figure.subplots(1, 2)

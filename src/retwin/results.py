@@ -299,6 +299,8 @@ class Fidelity(Part):
         The simpler generators beside it.
     widening : float
         The factor by which split conformal prediction widens the 90 % band.
+    at_bound : float
+        The share of the delays at a bound of their range when the twins were calibrated.
     figures : dict of str to FidelityFigure
         By name, see `retwin.evaluation.fidelity.Fidelity`.
 
@@ -314,6 +316,7 @@ class Fidelity(Part):
     segments: int | None = Field(None, alias="movements")
     rivals: list[str] = []
     widening: float | None = None
+    at_bound: float | None = None
     figures: dict[str, FidelityFigure] = {}
 
     @property

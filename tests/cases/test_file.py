@@ -87,7 +87,7 @@ hold_durations = [0.5, 0.9]
 [correction]
 kind = "Chain"
 first = { kind = "CommandSpace", delay_range = [0, 4] }
-second = { kind = "SampledSensor", every = 2 }
+second = { kind = "SampledSensor", period = 0.2 }
 [output_correction]
 kind = "DelayOffset"
 known_delay = 1
@@ -173,7 +173,7 @@ def test_every_key_has_its_effect(read: Callable[..., rt.Case]) -> None:
     assert (case.title, case.sensor_rate, case.network) == ("A toy", 5.0, rt.TCN())
     assert case.sampler == HoldSampler((-1.0, 0.0), (1.0, 4.0), 10.0, 5, (0.5, 0.9))
     space = rt.CommandSpace(delay_range=(0, 4))
-    assert case.correction == rt.Chain(space, rt.SampledSensor(every=2))
+    assert case.correction == rt.Chain(space, rt.SampledSensor(period=0.2))
     assert case.output_correction == rt.DelayOffset(known_delay=1)
     assert case.density == rt.Mixture(
         components=2, training=rt.Training(max_epochs=5), refinement=rt.Refinement(draws=4)

@@ -54,8 +54,8 @@ def plan(case: rt.Case) -> SimulationPlan:
 
 def test_a_case_has_its_former_settings(case: rt.Case) -> None:
     correction = rt.Chain(
-        rt.CommandSpace(delay_range=(0, 5), max_samples=40, identified_below=0.5),
-        rt.SampledSensor(every=5),
+        rt.CommandSpace(delay_range=(0, 0.1), max_samples=40, identified_below=0.5),
+        rt.SampledSensor(period=0.1),
     )
     assert case.correction == correction
     assert case.training == rt.Training(max_epochs=20, batch_size=256, learning_rate=0.01)

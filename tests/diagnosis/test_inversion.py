@@ -14,11 +14,10 @@ from torch import Tensor
 
 import retwin as rt
 from retwin.diagnosis import Diagnosis, InversionDiagnoser, fit_inversion
-from retwin.diagnosis.latent_prior import LatentPrior
-from retwin.diagnosis.missed_segments import fitted
 from retwin.diagnosis.severity import draw_biases
 from retwin.inference.losses import StudentT
 from retwin.inference.noise import Noise
+from retwin.inference.priors import GaussianPrior
 from retwin.nets.training import Training
 from retwin.scores.classification import score
 from retwin.testing import DIAGNOSER_CHECKS, DiagnoserSubject
@@ -26,6 +25,7 @@ from retwin.twins.faults import draw_faults, faulty_commands, frozen_from
 from retwin.twins.samplers import RampSampler
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import effective_commands
+from retwin.update.corrections.missed_segments import LatentPrior, fitted
 
 CHAIN = rt.Chain(rt.CommandSpace(), rt.SampledSensor())
 MAP = np.array([[1.0, 0.5], [-0.3, 0.8], [0.2, -1.0]])
@@ -77,9 +77,10 @@ def test_evidence_is_that_of_a_gaussian() -> None:
     for width in (0.02, 0.5):
         root = rng.normal(0, width, (size, size))
         covariance = root @ root.T + 0.01 * np.eye(size)
-        prior = LatentPrior.of(
-            torch.zeros(1, size, dtype=torch.float64),
-            torch.tensor(covariance)[None],
+        prior = LatentPrior(
+            GaussianPrior.of(
+                torch.zeros(1, size, dtype=torch.float64), torch.tensor(covariance)[None]
+            ),
             torch.full((1, segments, 2), -40.0, dtype=torch.float64),
         )
         found = fitted(problem, prior, noise, problem.zero)

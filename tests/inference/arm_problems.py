@@ -47,7 +47,7 @@ def polled(count: int, steps: int = 1000) -> Tensor:
 class KnownResidual:
     """Stands for a fitted residual model: the same Gaussian z for every segment."""
 
-    correction = rt.CommandSpace()
+    correction = rt.CommandSpace(delay_range=(-0.05, 0.3))
     persistence = torch.full((9,), 0.2)
     fitted = None
 

@@ -21,18 +21,22 @@ from torch import Tensor
 import retwin as rt
 from retwin.diagnosis.hypotheses import Hypotheses
 from retwin.diagnosis.inversion import Inversion, invert
-from retwin.diagnosis.latent_prior import LatentPrior, command_problem
-from retwin.diagnosis.missed_segments import fitted, fitted_noise
+from retwin.diagnosis.latent_prior import command_problem, healthy_prior
+from retwin.diagnosis.missed_segments import fitted_noise
 from retwin.inference.losses import Tukey
 from retwin.inference.noise import Noise
 from retwin.inference.solver import Solution, solve
 from retwin.update.corrections.command_inference import _Belief
 from retwin.update.corrections.command_problem import CommandProblem
+from retwin.update.corrections.delay_offset import _learned
+from retwin.update.corrections.missed_segments import fitted
 from retwin.update.corrections.path_problem import PathProblem
 
 pytestmark = pytest.mark.numerical
 
 NATS, DEVIATIONS = 1e-3, 0.05
+RANGE = (-0.05, 0.3)
+"""The range of delays, in seconds, that was the default."""
 MARGIN = 20.0
 """Nats behind the best class of a trajectory at which a hypothesis has probability 0: such a one
 explains nothing, and has many local optima."""
@@ -72,7 +76,7 @@ def test_command_space_at_fixed_hyperparameters(exact, value) -> None:
     belief = _Belief(delay, jitter, offset, torch.zeros(()), noise)
 
     def solved(start: Tensor) -> Solution:
-        prior = belief.prior(problem)
+        prior = belief.prior(problem).gaussian
         return solve(problem, prior, noise, start.flatten(1), bounds=problem.bounds)
 
     found = solved(value("command_space_start"))
@@ -88,7 +92,7 @@ def test_command_space_at_fixed_hyperparameters(exact, value) -> None:
 
 def test_command_space_with_learned_hyperparameters(exact, value) -> None:
     context = context_of(exact, value("commands").numpy(), KNOWN)
-    found = rt.CommandSpace().infer(context, value("observed"), polled(8))
+    found = rt.CommandSpace(delay_range=RANGE).infer(context, value("observed"), polled(8))
     variance = value("command_space_z_variance")
     before = value("command_space_z")
     assert distance(found.z[..., :5], before[..., :5], variance[..., :5]).max() < DEVIATIONS
@@ -102,17 +106,16 @@ def test_delay_offset_at_fixed_noise(exact, value) -> None:
     context = context_of(exact, value("commands").numpy(), KNOWN)
     observed = value("observed").double()
     mask = torch.ones(observed.shape, dtype=torch.bool)
-    problem = PathProblem.of(context.segments, context.path.double(), observed, mask)
+    problem = PathProblem.of(context.segments, context.path.double(), observed, mask, (-5.0, 30.0))
     problem = problem.with_motion(value("delay_offset_first_delay"))
     scale = value("delay_offset_scale").flatten()[:, None]
     noise = Noise(scale, torch.ones_like(scale[:, 0]), Tukey())
-    operator, before = rt.DelayOffset(), value("delay_offset_z").flatten(1)
-    prior = operator._learned(problem, problem.residual(before))[1]
+    before = value("delay_offset_z").flatten(1)
+    prior = _learned(problem, problem.residual(before))[1]
     start = torch.cat(
         [value("delay_offset_first_delay")[..., None], problem.first_offset(30.0)], dim=-1
     )
-    bounds = operator._bounds(problem)
-    found = solve(problem, prior, noise, start.flatten(1), bounds=bounds)
+    found = solve(problem, prior, noise, start.flatten(1), bounds=problem.bounds)
     # There was no prior; this one is so wide that it costs some 1e-3 nats.
     misfit = found.objective - prior.energy(found.x)
     worse = misfit - value("delay_offset_objective")
@@ -123,7 +126,7 @@ def test_delay_offset_with_learned_noise(exact, value) -> None:
     context = context_of(exact, value("commands").numpy(), KNOWN)
     observed = value("observed")
     mask = torch.ones(observed.shape, dtype=torch.bool)
-    found = rt.DelayOffset().infer(context, observed, mask)
+    found = rt.DelayOffset(delay_range=RANGE, known_delay=0.03).infer(context, observed, mask)
     variance, others = value("delay_offset_variance"), torch.arange(8) != MISSED
     away = distance(found.z, value("delay_offset_z"), variance)
     assert away[others].max() < DEVIATIONS
@@ -157,7 +160,7 @@ def test_inversion_learns_the_same_noise(exact, value, noise) -> None:
     problem = command_problem(
         KnownResidual(), context, value("observed")[:HEALTHY], polled(HEALTHY)
     )
-    found = fitted_noise(problem, LatentPrior.healthy(KnownResidual(), context), rounds=5)
+    found = fitted_noise(problem, healthy_prior(KnownResidual(), context), rounds=5)
     torch.testing.assert_close(found.scale, noise.scale, rtol=1e-3, atol=0)
     torch.testing.assert_close(found.thinning, noise.thinning, rtol=1e-3, atol=0)
 

@@ -142,7 +142,8 @@ class Toy:
         noisy = outputs + rng.normal(0, NOISE, outputs.shape)
         if polled:
             generator = torch.Generator().manual_seed(seed)
-            noisy = EVERY_FOURTH.read(torch.as_tensor(noisy), generator).numpy()
+            every_fourth = rt.SampledSensor(period=4 / self.rate, phases=(0.0,))
+            noisy = every_fourth.read(torch.as_tensor(noisy), generator, self.rate).numpy()
         return made.replace(observed=noisy, labels=np.full(len(commands), HEALTHY))
 
     def begun(self, commands: NDArray) -> NDArray:
@@ -153,14 +154,11 @@ class Toy:
         return np.clip((time - start) / (settle - start), 0, 1)[..., None]
 
 
-EVERY_FOURTH = rt.SampledSensor(every=4, phases=(0,))
-IN_COMMANDS = rt.CommandSpace(delay_range=(-2.0, 8.0))
-POLLED = rt.Chain(IN_COMMANDS, EVERY_FOURTH)
-DELAYED = rt.DelayOffset(delay_range=(-2.0, 8.0))
+FAST_POLLED = rt.Chain(rt.CommandSpace(), rt.SampledSensor(period=0.08, phases=(0.0,)))
 TOYS = {
-    "one output, a sample every 100 s": Toy(1, 1, 0.01, 30, DELAYED),
-    "eight outputs at 1 kHz": Toy(3, 8, 1000.0, 1500, DELAYED, count=10),
-    "command space, polled": Toy(2, 8, 50.0, 400, POLLED, movements=3),
+    "one output, a sample every 100 s": Toy(1, 1, 0.01, 30, rt.DelayOffset()),
+    "eight outputs at 1 kHz": Toy(3, 8, 1000.0, 1500, rt.DelayOffset(), count=10),
+    "command space, polled": Toy(2, 8, 50.0, 400, FAST_POLLED, movements=3),
     "no segments, one output": Toy(1, 1, 1000.0, 5000, Additive(), STEPWISE, count=1),
     "no segments, eight outputs": Toy(3, 8, 0.01, 30, Additive(), STEPWISE, count=24),
 }
@@ -257,6 +255,9 @@ def test_the_known_discrepancy_is_recovered(toy: Toy, updated: rt.CorrectedTwin)
     )
 
 
+IN_COMMANDS = rt.CommandSpace(delay_range=(-0.2, 0.8))
+POLLED = rt.Chain(IN_COMMANDS, rt.SampledSensor(period=0.4, phases=(0.0,)))
+DELAYED = rt.DelayOffset(delay_range=(-0.2, 0.8))
 PADDED = {
     "delay and offset": Toy(1, 2, 10.0, 60, DELAYED),
     "command space": Toy(2, 3, 10.0, 60, IN_COMMANDS, count=8),

@@ -15,11 +15,12 @@ import torch
 from torch import Tensor
 
 from retwin.checks import require
-from retwin.diagnosis.latent_prior import LatentPrior, command_problem
+from retwin.diagnosis.latent_prior import command_problem, healthy_prior
 from retwin.errors import InputError
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.update.corrections import Context
 from retwin.update.corrections.command_problem import CommandProblem
+from retwin.update.corrections.missed_segments import LatentPrior
 from retwin.update.residual import ResidualModel
 
 __all__ = ["Hypotheses", "checked"]
@@ -92,12 +93,13 @@ class Hypotheses:
             for column in zip(*limits, strict=True)
         )
         problem = command_problem(residual, context[rows.numpy()], observed[rows], mask[rows])
-        prior = LatentPrior.healthy(residual, context)[rows]
+        prior = healthy_prior(residual, context)[rows]
         made = cls(problem, prior, len(faults), actuator, size.double(), onsets)
         extra = torch.zeros_like(prior.gaussian.mean)
         place = made.offset_index
         extra.scatter_(1, place, made.width.square()[:, None].expand(place.shape))
-        return replace(made, prior=prior.widened(extra)).held(onsets[:, 0])
+        wide = replace(prior, gaussian=prior.gaussian.widened(extra))
+        return replace(made, prior=wide).held(onsets[:, 0])
 
     def __getitem__(self, rows: Tensor) -> Hypotheses:
         """Some of the rows."""

@@ -22,8 +22,8 @@ from torch import Tensor
 from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis.hypotheses import Hypotheses, checked
-from retwin.diagnosis.latent_prior import LatentPrior, command_problem, command_space
-from retwin.diagnosis.missed_segments import Fit, best_fit, fitted_noise
+from retwin.diagnosis.latent_prior import command_problem, command_space, healthy_prior
+from retwin.diagnosis.missed_segments import best_fit, fitted_noise
 from retwin.diagnosis.onsets import Onsets
 from retwin.diagnosis.severity import biases, stuck_level
 from retwin.errors import InputError
@@ -33,6 +33,7 @@ from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.update.corrections import Context, sample_mask
+from retwin.update.corrections.missed_segments import Fit
 from retwin.update.residual import Residual, ResidualModel
 from retwin.update.surrogate import Surrogate
 
@@ -115,7 +116,8 @@ def invert(rows: Hypotheses, noise: Noise) -> Inversion:
     """The evidence for every hypothesis, and the severity of its fault."""
     onsets = Onsets.of(rows, noise)
     held = rows.held(onsets.best)
-    fit, evidence = best_fit(held.problem, held.prior, noise, held.start, held.trajectory)
+    found = best_fit(held.problem, held.prior, noise, held.start, held.trajectory)
+    fit, evidence = found.fit, found.evidence
     bias, gain = biases(held, fit, COVERAGE)
     level, deviation = stuck_level(held, fit, onsets.best, noise)
     return Inversion(evidence + onsets.gain + gain, level, deviation, onsets, bias, fit)
@@ -224,7 +226,7 @@ class InversionDiagnoser:
         }
         return cls(
             surrogate,
-            ResidualModel.load(folder / "residual"),
+            ResidualModel.load(folder / "residual", surrogate.rate),
             faults,
             noise=Noise(weights["scale"], weights["thinning"]),
         )
@@ -281,7 +283,7 @@ def fit_inversion(
         surrogate,
         residual,
         faults,
-        noise=fitted_noise(problem, LatentPrior.healthy(residual, context), rounds=ROUNDS),
+        noise=fitted_noise(problem, healthy_prior(residual, context), rounds=ROUNDS),
     )
 
 
@@ -324,7 +326,10 @@ class _Samples:
         mask = torch.as_tensor(trajectories.mask.copy())
         # One by one: the timing of a trajectory's samples must not depend on the others.
         one_by_one = [slice(i, i + 1) for i in range(len(mask))]
-        sampled = [sample_mask(residual.correction, observed[i], mask[i]) for i in one_by_one]
+        sampled = [
+            sample_mask(residual.correction, observed[i], mask[i], trajectories.rate)
+            for i in one_by_one
+        ]
         return cls(replace(context, surrogate=_Precise(surrogate)), observed, torch.cat(sampled))
 
     def __getitem__(self, rows: slice) -> tuple[Context, Tensor, Tensor]:

@@ -1,8 +1,7 @@
-"""The prior of `CommandSpace`'s z under each hypothesis, from a fitted residual model."""
+"""The prior of `CommandSpace`'s z in a healthy trajectory, from a fitted residual model."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -14,9 +13,11 @@ from retwin.inference.priors import GaussianPrior
 from retwin.nets.mixtures import Bernoullis, GaussianMixture
 from retwin.update.corrections import Chain, CommandSpace, Context, Correction, SampledSensor
 from retwin.update.corrections.command_problem import CommandProblem
+from retwin.update.corrections.delay_range import range_in_samples
+from retwin.update.corrections.missed_segments import LatentPrior
 from retwin.update.residual import ResidualModel
 
-__all__ = ["LatentPrior", "command_problem", "command_space"]
+__all__ = ["command_problem", "command_space", "healthy_prior"]
 
 EXTRA_VARIANCE = 2.0
 """Trajectories' worth of variance added to the covariance that the residual model has learned.
@@ -61,85 +62,39 @@ def command_problem(
         context,
         observed,
         mask,
-        delay_range=operator.delay_range,
+        delay_range=range_in_samples(operator.delay_range, context, observed, mask),
         max_samples=operator.max_samples,
         unit=torch.ones(observed.shape[2], dtype=torch.float64),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class LatentPrior:
-    """The distribution of (x, missed) before any output is measured.
+@torch.no_grad()
+def healthy_prior(residual: ResidualModel, context: Context) -> LatentPrior:
+    """The prior of a healthy trajectory: the residual model's distribution by its moments.
 
-    Attributes
-    ----------
-    gaussian : GaussianPrior
-        Of x (R, P), see `CommandProblem`.
-    covariance : Tensor
-        (R, P, P), of x.
-    odds : Tensor
-        (R, M, d_u), log odds that an actuator misses a segment.
-
+    Errors of a trajectory's segments are correlated as far as the residual model has learned
+    that they persist.
     """
-
-    gaussian: GaussianPrior
-    covariance: Tensor
-    odds: Tensor
-
-    @classmethod
-    def of(cls, mean: Tensor, covariance: Tensor, odds: Tensor) -> LatentPrior:
-        """The prior with mean (R, P) and that covariance."""
-        return cls(GaussianPrior.of(mean, covariance), covariance, odds)
-
-    @classmethod
-    @torch.no_grad()
-    def healthy(cls, residual: ResidualModel, context: Context) -> LatentPrior:
-        """The residual model's distribution by its moments.
-
-        Errors of a trajectory's segments are correlated as far as the residual model has learned
-        that they persist.
-        """
-        delay, offset, missed = residual(context).blocks
-        mean = torch.cat([delay.mean, offset.mean], dim=-1).double()
-        n, segments, size = mean.shape
-        own = torch.zeros(n, segments, size, size, dtype=torch.float64)
-        own[..., :1, :1] = _covariance(delay)
-        own[..., 1:, 1:] = _covariance(offset)
-        factor = torch.linalg.cholesky(own)
-        common = factor * residual.persistence[:size].double().sqrt()
-        whole = torch.einsum("nmip,nkjp->nmikj", common, common)
-        valid = torch.as_tensor(context.segments.valid).double()
-        whole = whole * valid[:, :, None, None, None] * valid[:, None, None, :, None]
-        index = torch.arange(segments)
-        whole[:, index, :, index] = own.transpose(0, 1)
-        flat = whole.reshape(n, segments * size, segments * size)
-        if residual.fitted is not None:
-            # What was learned from few trajectories is less certain.
-            count = max(1.0, residual.fitted.figures.get("trajectories", np.inf))
-            flat = flat * (1 + EXTRA_VARIANCE / count)
-        return cls.of(mean.flatten(1), flat, cast(Bernoullis, missed).logits.double())
-
-    def __getitem__(self, rows: Tensor) -> LatentPrior:
-        """The prior of some rows."""
-        return LatentPrior(self.gaussian[rows], self.covariance[rows], self.odds[rows])
-
-    def widened(self, variance: Tensor) -> LatentPrior:
-        """The same with more variance (R, P) of x."""
-        covariance = self.covariance + torch.diag_embed(variance)
-        return LatentPrior.of(self.gaussian.mean, covariance, self.odds)
-
-    def log_probability(self, problem: CommandProblem) -> Tensor:
-        """Log probability (R,) of the segments that are missed.
-
-        An actuator that a fault holds can miss nothing.
-        """
-        risk = torch.nn.functional.softplus(self.odds) * problem.healthy
-        return (problem.missed * self.odds - risk).sum(dim=(1, 2))
-
-    @property
-    def deviation(self) -> Tensor:
-        """Standard deviations of x (R, P)."""
-        return self.covariance.diagonal(dim1=1, dim2=2).sqrt()
+    delay, offset, missed = residual(context).blocks
+    mean = torch.cat([delay.mean, offset.mean], dim=-1).double()
+    n, segments, size = mean.shape
+    own = torch.zeros(n, segments, size, size, dtype=torch.float64)
+    own[..., :1, :1] = _covariance(delay)
+    own[..., 1:, 1:] = _covariance(offset)
+    factor = torch.linalg.cholesky(own)
+    common = factor * residual.persistence[:size].double().sqrt()
+    whole = torch.einsum("nmip,nkjp->nmikj", common, common)
+    valid = torch.as_tensor(context.segments.valid).double()
+    whole = whole * valid[:, :, None, None, None] * valid[:, None, None, :, None]
+    index = torch.arange(segments)
+    whole[:, index, :, index] = own.transpose(0, 1)
+    flat = whole.reshape(n, segments * size, segments * size)
+    if residual.fitted is not None:
+        # What was learned from few trajectories is less certain.
+        count = max(1.0, residual.fitted.figures.get("trajectories", np.inf))
+        flat = flat * (1 + EXTRA_VARIANCE / count)
+    gaussian = GaussianPrior.of(mean.flatten(1), flat)
+    return LatentPrior(gaussian, cast(Bernoullis, missed).logits.double())
 
 
 def _covariance(distribution: Any) -> Tensor:

@@ -1,4 +1,4 @@
-"""The most probable x of a hypothesis, and which segments its actuators missed.
+"""The best fit of a hypothesis, with segments missed where they are explained worst.
 
 Rows are hypotheses about trajectories, all solved together. The constants here are numerical: they
 trade time for accuracy.
@@ -6,141 +6,63 @@ trade time for accuracy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import cast
 
 import torch
 from torch import Tensor
 
-from retwin.diagnosis.latent_prior import LatentPrior
 from retwin.inference.em import expectation_maximisation
-from retwin.inference.evidence import added_evidence, best_per_row
 from retwin.inference.losses import StudentT
-from retwin.inference.noise import Noise
-from retwin.inference.solver import Solution, solve
+from retwin.inference.noise import Noise, predicted_variance
 from retwin.update.corrections.command_problem import CommandProblem
+from retwin.update.corrections.missed_segments import (
+    MARGIN,
+    SEARCHES,
+    Fit,
+    LatentPrior,
+    Search,
+    searched,
+)
 
-__all__ = ["Fit", "best_fit", "fitted", "fitted_noise"]
+__all__ = ["best_fit", "fitted_noise"]
 
-SEARCHES = 3
-"""Missed segments per row at most."""
 WORST = 2
 """Segments of a row that one search may try as missed: the worst explained ones."""
-MARGIN = 20.0
-"""Log evidence at which a row is given up: behind the best of its trajectory, or its own best."""
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """The most probable x of every row.
-
-    Attributes
-    ----------
-    solution : Solution
-        For `missed`.
-    missed : Tensor
-        (R, M, d_u), 1 for a segment that an actuator missed.
-    evidence : Tensor
-        (R,), log evidence of these missed segments, their probability included.
-
-    """
-
-    solution: Solution
-    missed: Tensor
-    evidence: Tensor
-
-    @property
-    def x(self) -> Tensor:
-        """(R, P)."""
-        return self.solution.x
-
-    def __getitem__(self, rows: Tensor) -> Fit:
-        """The fit of some rows."""
-        return Fit(self.solution[rows], self.missed[rows], self.evidence[rows])
-
-    def put(self, rows: Tensor, other: Fit) -> Fit:
-        """The same with another fit in some rows."""
-        return Fit(
-            self.solution.put(rows, other.solution),
-            self.missed.index_copy(0, rows, other.missed),
-            self.evidence.index_copy(0, rows, other.evidence),
-        )
-
-
-def fitted(
-    problem: CommandProblem,
-    prior: LatentPrior,
-    noise: Noise,
-    start: Tensor,
-    minimum_evidence: Tensor | None = None,
-) -> Fit:
-    """The most probable x (R, P) if the problem's segments were missed, and no others.
-
-    Rows that are not predicted to reach the log evidence `minimum_evidence` (R,) are given up.
-    """
-    log_probability = prior.log_probability(problem)
-    solution = solve(
-        problem,
-        prior.gaussian,
-        noise,
-        start,
-        bounds=problem.bounds,
-        minimum_evidence=None if minimum_evidence is None else minimum_evidence - log_probability,
-    )
-    return Fit(solution, problem.missed, solution.evidence + log_probability)
 
 
 def best_fit(
     problem: CommandProblem, prior: LatentPrior, noise: Noise, start: Tensor, trajectory: Tensor
-) -> tuple[Fit, Tensor]:
-    """The most probable missed segments, and the log evidence (R,) of all that were tried.
+) -> Search:
+    """The most probable missed segments, from x (R, P) and none missed on.
 
-    `trajectory` (R,) is the trajectory of each row. The search is greedy: each time the segments
-    that are explained worst are tried as missed by every actuator that was to move. Rows that
-    cannot come near the best of their trajectory are left alone.
+    `trajectory` (R,) is the trajectory of each row. Each time the segments that are explained worst
+    are tried as missed by every actuator that was to move. Rows that cannot come near the best of
+    their trajectory are left alone.
     """
-    fit = fitted(problem, prior, noise, start)
-    total = fit.evidence
-    rows = torch.arange(len(start))
-    for _ in range(SEARCHES):
-        tries, segment, actuator = _suspects(problem, fit, prior, noise, trajectory, rows)
-        if not len(tries):
-            break
-        each = torch.arange(len(tries))
-        missed, x = fit.missed[tries].clone(), fit.x[tries].clone()
-        missed[each, segment, actuator] = 1.0
-        problem.per_segment(x)[each, segment, 1:] = 0.0
-        part = problem[tries].with_missed(missed)
-        tried = fitted(part, prior[tries], noise, x, fit.evidence[tries] - MARGIN)
-        total = added_evidence(total, tried.evidence, tries)
-        rows, best = best_per_row(tried.evidence, tries)
-        gains = tried.evidence[best] > fit.evidence[rows]
-        rows, best = rows[gains], best[gains]
-        fit = fit.put(rows, tried[best])
-        if not len(rows):
-            break
-    return fit, total
+
+    def suspects(fit: Fit, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return _suspects(problem, fit, prior, noise, trajectory, rows)
+
+    return searched(problem, prior, noise, Fit.of_prior(problem, prior, start), suspects)
 
 
 def fitted_noise(problem: CommandProblem, prior: LatentPrior, *, rounds: int) -> Noise:
     """The noise of healthy trajectories, by so many rounds of expectation-maximisation."""
     start = prior.gaussian.mean
-    nothing = Solution.of_prior(prior.gaussian, start)
     trajectory = torch.arange(len(start))
 
     def infer(fit: Fit, noise: Noise) -> Fit:
-        return best_fit(problem, prior, noise, fit.x, trajectory)[0]
+        return best_fit(problem, prior, noise, fit.x, trajectory).fit
 
     def learn(fit: Fit, noise: Noise) -> Noise:
         residual, jacobian = problem.with_missed(fit.missed).linearised(fit.x)
-        flat = jacobian.flatten(1, 2)
-        variance = ((flat @ fit.solution.covariance) * flat).sum(dim=-1).view_as(residual)
+        variance = predicted_variance(jacobian, fit.solution.covariance)
         return noise.learned(
             problem, residual, max_effective=problem.max_effective, variance=variance
         )
 
     _, noise = expectation_maximisation(
-        Fit(nothing, problem.missed, nothing.evidence),
+        Fit.of_prior(problem, prior, start),
         Noise.from_median(problem, problem.residual(start), groups=2),
         infer=infer,
         learn=learn,
@@ -172,7 +94,7 @@ def _suspects(
     hopeful = (bound > 0) & (fit.evidence[rows] + bound > best[trajectory[rows]] - MARGIN)
     worst = (gain > 0) & (gain >= gain.topk(min(WORST, gain.shape[1]), dim=1).values[:, -1:])
     # Where next to nothing was to move nothing can be missed.
-    moving = part.distance > 2 * part.per_segment(own.deviation)[..., 1:]
+    moving = part.distance > 2 * part.per_segment(own.gaussian.deviation)[..., 1:]
     chosen = hopeful[:, None, None] & (worst[..., None] | lasting) & moving & part.healthy
     row, segment, actuator = (chosen & (part.missed < 0.5)).nonzero().unbind(dim=1)
     return rows[row], segment, actuator

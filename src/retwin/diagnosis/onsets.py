@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from retwin.diagnosis.hypotheses import Hypotheses
-from retwin.diagnosis.missed_segments import fitted
 from retwin.inference.noise import Noise
 from retwin.inference.solver import gauss_newton_step
+from retwin.update.corrections.missed_segments import fitted
 
 __all__ = ["Onsets"]
 

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from retwin.diagnosis.hypotheses import Hypotheses
-from retwin.diagnosis.missed_segments import Fit
 from retwin.inference.noise import Noise
 from retwin.update.corrections.effective_commands import effective_commands
+from retwin.update.corrections.missed_segments import Fit
 
 __all__ = ["BiasDraws", "biases", "draw_biases", "stuck_level"]
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from retwin.inference.losses import Loss, StudentT
 from retwin.inference.problem import Problem
 
-__all__ = ["Noise", "correlation_time"]
+__all__ = ["Noise", "correlation_time", "predicted_variance"]
 
 HEAVY_TAILED = StudentT()
 """The loss of noise by default: glitches hardly count."""
@@ -143,3 +143,9 @@ def correlation_time(values: Tensor, counted: Tensor, *, rows: bool, limit: floa
     power = (values[:, 1:].square() * counted[:, :-1, None]).sum(dim=dims).clamp_min(1e-30)
     correlation = ((values[:, 1:] * values[:, :-1]).sum(dim=dims) / power).clamp(0, limit)
     return (1 + correlation) / (1 - correlation)
+
+
+def predicted_variance(jacobian: Tensor, covariance: Tensor) -> Tensor:
+    """Variance (R, K, d) of outputs with a Jacobian (R, K, d, P) by x of covariance (R, P, P)."""
+    flat = jacobian.flatten(1, 2)
+    return ((flat @ covariance) * flat).sum(dim=-1).view(jacobian.shape[:3])

@@ -18,6 +18,8 @@ class GaussianPrior:
     ----------
     mean : Tensor
         (R, P).
+    covariance : Tensor
+        (R, P, P).
     precision : Tensor
         (R, P, P), the inverse covariance.
     log_determinant : Tensor
@@ -26,22 +28,34 @@ class GaussianPrior:
     """
 
     mean: Tensor
+    covariance: Tensor
     precision: Tensor
     log_determinant: Tensor
 
     @classmethod
     def of(cls, mean: Tensor, covariance: Tensor) -> GaussianPrior:
         """The Gaussian of mean (R, P) and covariance (R, P, P)."""
-        return cls(mean, torch.linalg.inv(covariance), -torch.linalg.slogdet(covariance)[1])
+        precision = torch.linalg.inv(covariance)
+        return cls(mean, covariance, precision, -torch.linalg.slogdet(covariance)[1])
 
     @classmethod
     def independent(cls, mean: Tensor, variance: Tensor) -> GaussianPrior:
         """The Gaussian of independent variables, mean and variance (R, P)."""
-        return cls(mean, torch.diag_embed(variance.reciprocal()), -variance.log().sum(dim=1))
+        covariance, precision = torch.diag_embed(variance), torch.diag_embed(variance.reciprocal())
+        return cls(mean, covariance, precision, -variance.log().sum(dim=1))
 
     def __getitem__(self, rows: Tensor) -> GaussianPrior:
         """The prior of some rows."""
-        return GaussianPrior(self.mean[rows], self.precision[rows], self.log_determinant[rows])
+        return GaussianPrior(*(each[rows] for each in vars(self).values()))
+
+    def widened(self, variance: Tensor) -> GaussianPrior:
+        """The same with more variance (R, P)."""
+        return GaussianPrior.of(self.mean, self.covariance + torch.diag_embed(variance))
+
+    @property
+    def deviation(self) -> Tensor:
+        """Standard deviations (R, P)."""
+        return self.covariance.diagonal(dim1=1, dim2=2).sqrt()
 
     def gradient(self, x: Tensor) -> Tensor:
         """Gradient (R, P) of minus the log density at x (R, P)."""

@@ -96,6 +96,11 @@ class Solution:
         """Posterior covariance (R, P, P)."""
         return torch.linalg.inv(self.curvature)
 
+    def blocks(self, count: int) -> Tensor:
+        """Posterior covariance of each of `count` parts of x, (R, count, P / count, P / count)."""
+        whole = self.covariance.unflatten(2, (count, -1)).unflatten(1, (count, -1))
+        return whole.diagonal(dim1=1, dim2=3).movedim(-1, 1).clone()
+
 
 @dataclass(frozen=True, eq=False)
 class Step:

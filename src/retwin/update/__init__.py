@@ -41,7 +41,7 @@ _HOME = {
     "calibration_ranks": "identification",
     "command_space": "corrections",
     "fit_residual": "residual",
-    "fit_sensor": "corrections",
+    "fit_correction": "corrections",
     "fit_surrogate": "surrogate",
     "generate": "corrected",
     "identify": "identification",

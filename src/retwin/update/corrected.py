@@ -129,7 +129,7 @@ class CorrectedTwin:
         about = read_about(folder, "corrected")
         folder = Path(folder)
         surrogate = Surrogate.load(folder / "surrogate")
-        residual = load_residual(folder / "residual")
+        residual = load_residual(folder / "residual", surrogate.rate)
         with refusing(folder, expected="a corrected twin"):
             return cls(surrogate, residual, about["case"], about["random"])
 

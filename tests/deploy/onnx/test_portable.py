@@ -116,12 +116,12 @@ def noise_of_torch(twin: CorrectedTwin, count: int, movements: int, steps: int, 
     }
     if residual.persistence.any():
         noise["trajectory_noise"] = torch.randn(count, 1, size, generator=generator)
-    when = sensor.polls(count, steps, generator)
+    when = sensor.polls(count, steps, generator, twin.rate)
     shape = *when.shape, len(twin.outputs)
     level = torch.rand(shape, generator=generator, dtype=torch.float64).float()
     noise |= {"phase": when[:, :1], "error_level": level}
     noise |= {"glitch_level": torch.ones(*when.shape, 1), "glitch_noise": torch.zeros(shape)}
-    if sensor.glitch_rate:
+    if sensor.glitch_probability:
         noise["glitch_level"] = torch.rand(when.shape, generator=generator)[..., None]
         noise["glitch_noise"] = torch.randn(shape, generator=generator)
     return {name: values.numpy() for name, values in noise.items()}
@@ -183,19 +183,20 @@ def test_the_same_seed_simulates_the_same(portable: Portable, emulated: rt.Traje
 
 @pytest.mark.numerical
 def test_the_sensor_records_as_the_operator_does(bundle: Bundle) -> None:
-    fitted = bundle.twin.residual.correction.second
-    sensor = replace(fitted, steps=(0.001, 0.0, 0.002), glitch_rate=0.3)
+    fitted, rate = bundle.twin.residual.correction.second, bundle.twin.rate
+    sensor = replace(fitted, steps=(0.001, 0.0, 0.002), glitch_probability=0.3)
     outputs = torch.randn(6, 1000, 3, generator=torch.Generator().manual_seed(0))
-    expected = sensor.read(outputs, torch.Generator().manual_seed(1))
+    expected = sensor.read(outputs, torch.Generator().manual_seed(1), rate)
     # The same draws, in the operator's order.
     generator = torch.Generator().manual_seed(1)
-    choice = torch.tensor(sensor.phases)
+    every, phases = sensor.timing(rate)
+    choice = torch.tensor(phases)
     phase = choice[torch.randint(len(choice), (6,), generator=generator)][:, None]
-    shape = 6, -(-1000 // sensor.every), 3
+    shape = 6, -(-1000 // every), 3
     level = torch.rand(shape, generator=generator, dtype=torch.float64).float()
     glitch_level = torch.rand(shape[:2], generator=generator)[..., None]
     glitch_noise = torch.randn(shape, generator=generator)
-    made = SensorGraph(sensor, 3)(outputs, phase, level, glitch_level, glitch_noise)
+    made = SensorGraph(sensor, 3, rate)(outputs, phase, level, glitch_level, glitch_noise)
     torch.testing.assert_close(made, expected, atol=2e-5, rtol=0)
 
 

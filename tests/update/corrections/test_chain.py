@@ -10,7 +10,7 @@ import retwin as rt
 from retwin import catalog
 from retwin.cases.armpi_fpv.twin import POLL
 from retwin.serialisation.configs import from_config, to_config
-from retwin.update.corrections import fit_sensor, measured_outputs, sample_mask
+from retwin.update.corrections import fit_correction, measured_outputs, sample_mask
 
 KINDS = catalog.classes(catalog.CORRECTIONS)
 
@@ -48,22 +48,22 @@ def test_between_readings_a_record_tells_nothing(exact, measured: rt.Trajectorie
     )
     torch.testing.assert_close(found.z, truth.z)
     torch.testing.assert_close(found.covariance, truth.covariance)
-    assert sample_mask(ROBOT, observed, mask).equal(sampled)
+    assert sample_mask(ROBOT, observed, mask, context.rate).equal(sampled)
 
 
 @pytest.mark.slow
 def test_the_sensor_is_fitted_with_z(exact, measured: rt.Trajectories) -> None:
     """Real noise is a unit or so of a joint, tenths of a millimetre; a glitch is much more."""
     context = context_of(exact, measured)
-    chain, found = fit_sensor(ROBOT, context, *arrays(measured))
+    chain, found = fit_correction(ROBOT, context, *arrays(measured))
     sensor = chain.second
-    assert (sensor.every, sensor.phases) == (POLL, (0,))
-    assert sensor.glitch_rate < 0.02
+    assert sensor.timing(context.rate) == (POLL, (0,))
+    assert sensor.glitch_probability < 0.02
     assert 1e-5 < sensor.noise[0][-4] < 3e-3
     outputs = chain.apply(context, found.z)
     record = measured_outputs(chain, context, found.z, torch.Generator().manual_seed(0))
     # Between readings nothing was computed, and nothing is missing.
-    whole = sensor.read(outputs, torch.Generator().manual_seed(0))
+    whole = sensor.read(outputs, torch.Generator().manual_seed(0), context.rate)
     torch.testing.assert_close(record, whole, rtol=0, atol=1e-6)
     off = (record - outputs)[:, ::POLL].abs()
     assert 1e-5 < off.mean() < 2e-3
@@ -104,7 +104,7 @@ def test_the_second_operator_explains_what_the_first_leaves(exact, case: rt.Case
 
 def test_chains_are_checked_and_survive_json() -> None:
     assert from_config(to_config(ROBOT, KINDS), KINDS) == ROBOT
-    nested = rt.Chain(rt.Chain(rt.CommandSpace(), rt.DelayOffset()), rt.SampledSensor(every=4))
+    nested = rt.Chain(rt.Chain(rt.CommandSpace(), rt.DelayOffset()), rt.SampledSensor(period=0.04))
     assert from_config(to_config(nested, KINDS), KINDS) == nested
     assert nested.pools
     assert nested.severities

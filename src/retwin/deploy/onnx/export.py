@@ -174,7 +174,7 @@ def _graphs(bundle: Bundle) -> dict[str, Graph]:
     }
     sensor = sensor_of(twin.residual.correction)
     if sensor is not None:
-        graphs["sensor"] = _sensor_graph(sensor, nominal, unit, generator)
+        graphs["sensor"] = _sensor_graph(sensor, nominal, unit, twin.rate, generator)
     return graphs | _assessment_graphs(bundle, nominal, generator)
 
 
@@ -209,19 +209,20 @@ def _correction_graphs(
 
 
 def _sensor_graph(
-    sensor: SampledSensor, outputs: Tensor, unit: Tensor, generator: torch.Generator
+    sensor: SampledSensor, outputs: Tensor, unit: Tensor, rate: float, generator: torch.Generator
 ) -> Graph:
     """The graph of a sensor."""
     count, steps, width = outputs.shape
-    samples = -(-steps // (sensor.every or 1))
+    every, phases = sensor.timing(rate)
+    samples = -(-steps // every)
     inputs = {
         "outputs": outputs,
-        "phase": torch.tensor(sensor.phases or (0,))[:1].expand(count, 1).contiguous(),
+        "phase": torch.tensor(phases or (0,))[:1].expand(count, 1).contiguous(),
         "error_level": torch.rand(count, samples, width, generator=generator),
         "glitch_level": torch.rand(count, samples, 1, generator=generator),
         "glitch_noise": torch.randn(count, samples, width, generator=generator),
     }
-    return Graph(SensorGraph(sensor, width), inputs, unit)
+    return Graph(SensorGraph(sensor, width, rate), inputs, unit)
 
 
 def _assessment_graphs(
@@ -294,6 +295,12 @@ def _difference(graph: Graph, path: Path) -> float:
     return float(((torch.as_tensor(found) - expected) / graph.unit).abs().max())
 
 
+def _timing(sensor: SampledSensor, rate: float) -> dict[str, Any]:
+    """Settings of the sensor's graph, in samples."""
+    every, phases = sensor.timing(rate)
+    return {"every": every, "phases": phases}
+
+
 def _about(bundle: Bundle) -> dict[str, Any]:
     """The description that `Portable` needs beside the graphs."""
     twin, diagnoser = bundle.twin, bundle.diagnoser
@@ -305,7 +312,7 @@ def _about(bundle: Bundle) -> dict[str, Any]:
         "outputs": vars(twin.outputs),
         "rate": twin.rate,
         "emulated": twin.residual.emulated,
-        "sensor": None if sensor is None else {"every": sensor.every, "phases": sensor.phases},
+        "sensor": None if sensor is None else _timing(sensor, twin.rate),
         "domain": asdict(bundle.guard.domain),
         "stride": bundle.guard.stride(twin.surrogate),
         "diagnoser": None

@@ -186,6 +186,8 @@ class SensorGraph(nn.Module):
         The fitted sensor.
     width : int
         Number of outputs, d_y.
+    rate : float
+        Sample rate of the outputs in Hz.
 
     """
 
@@ -193,10 +195,10 @@ class SensorGraph(nn.Module):
     glitch_size: Tensor
     resolution: Tensor
 
-    def __init__(self, sensor: SampledSensor, width: int) -> None:
+    def __init__(self, sensor: SampledSensor, width: int, rate: float) -> None:
         super().__init__()
-        self.every = sensor.every or 1
-        self.glitch_probability = sensor.glitch_rate or 0.0
+        self.every, _ = sensor.timing(rate)
+        self.glitch_probability = sensor.glitch_probability or 0.0
         for name, values in (
             ("error_quantiles", sensor.noise or ((0.0, 0.0),) * width),
             ("glitch_size", sensor.glitch_size or (0.0,) * width),
@@ -263,7 +265,7 @@ class SensorGraph(nn.Module):
 def sensor_of(correction: Correction) -> SampledSensor | None:
     """The sensor at the end of a chain of operators, None if there is none."""
     last = correction.second if isinstance(correction, Chain) else None
-    return last if isinstance(last, SampledSensor) and last.every is not None else None
+    return last if isinstance(last, SampledSensor) and last.period is not None else None
 
 
 class FeaturesGraph(nn.Module):

@@ -51,6 +51,7 @@ _KEYS = {
     "segment_values": "movements",
     "features": "features",
     "widening": "widening",
+    "at_bound": "at_bound",
 }
 """Attributes with one row per trajectory, and their keys in NPZ files."""
 
@@ -115,6 +116,9 @@ class Fidelity:
         (n, 1 + 19, F), measured and drawn: the input of the classifier two-sample test.
     widening : NDArray
         Factor (n,) of the widened bands; NaN for none.
+    at_bound : NDArray
+        Share (n,) of the delays at a bound of their range when the twin was calibrated; NaN where
+        the correction has none.
 
     """
 
@@ -134,6 +138,7 @@ class Fidelity:
     segment_values: NDArray
     features: NDArray
     widening: NDArray
+    at_bound: NDArray
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -235,6 +240,7 @@ class Fidelity:
             "movements": int(known.sum()),
             "rivals": list(self.rivals),
             "widening": float(self.widening.mean()) if np.isfinite(self.widening).all() else None,
+            "at_bound": float(self.at_bound.mean()) if np.isfinite(self.at_bound).all() else None,
             "figures": {
                 name: {
                     "value": each.value,

@@ -15,6 +15,7 @@ from retwin.checks import require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Trajectories
 from retwin.evaluation.fidelity.figures import BINS, Fidelity
+from retwin.evaluation.fidelity.latents import shown_latents
 from retwin.progress import Progress
 from retwin.scores.distributions import (
     LEVELS,
@@ -27,7 +28,7 @@ from retwin.scores.energy import energy_score
 from retwin.times import stride_of
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
-from retwin.update.corrections import DelayOffset
+from retwin.update.corrections import Context, Correction, DelayOffset
 from retwin.update.residual import infer_discrepancy, segment
 
 __all__ = ["measure_fidelity", "measure_widening"]
@@ -97,6 +98,7 @@ def measure_fidelity(
         if isinstance(twin, CorrectedTwin):
             against["mean_only"] = replace(twin, random=False)
     segments = _segments(twin, trajectories)
+    operator = _operator(twin, trajectories, segments)
     seeds = np.random.SeedSequence(seed).generate_state(2 * len(trajectories)).reshape(-1, 2)
     rows: list[dict[str, Any]] = []
     for i, (twin_seed, tie_seed) in enumerate(seeds.tolist()):
@@ -107,7 +109,7 @@ def measure_fidelity(
             other = _Ensemble.simulated(rival, one, draws, twin_seed, stride)
             row[f"rival/{name}"] = other.accuracy()
         members = ensemble.members[: INFERRED + 1]
-        row["segment_values"] = _segment_values(twin, members, segments[[i]], stride)
+        row["segment_values"] = _segment_values(twin, members, segments[[i]], stride, operator)
         rows.append(row)
         if progress is not None:
             progress((i + 1) / len(trajectories))
@@ -124,12 +126,13 @@ def measure_fidelity(
     )
     return Fidelity(
         outputs=trajectories.outputs,
-        segment_channels=_segment_channels(twin),
+        segment_channels=_segment_channels(twin, trajectories.rate),
         rate=trajectories.rate / stride,
         draws=draws,
         ids=trajectories.ids,
         rivals=rivals,
         widening=np.full(len(trajectories), np.nan if widening is None else widening),
+        at_bound=np.full(len(trajectories), _at_bound(twin)),
         **{name: np.stack([row[name] for row in rows]) for name in names},
     )
 
@@ -313,24 +316,42 @@ def _segments(twin: Twin, trajectories: Trajectories) -> Segments:
     return found.until(trajectories.lengths)
 
 
-def _segment_channels(twin: Twin) -> Channels:
+def _operator(twin: Twin, trajectories: Trajectories, segments: Segments) -> Correction:
+    """`DISCREPANCY` with one range of delays for all trajectories and draws."""
+    if not isinstance(twin, CorrectedTwin):
+        return DISCREPANCY
+    context = Context.of(twin.surrogate, trajectories.commands, segments, rate=trajectories.rate)
+    observed, mask = torch.tensor(trajectories.observed), torch.tensor(trajectories.mask)
+    return DISCREPANCY.completed(context, observed, mask)
+
+
+def _at_bound(twin: Twin) -> float:
+    """Share of the delays at a bound of their range when the twin was calibrated; NaN for none."""
+    fitted = twin.residual.fitted if isinstance(twin, CorrectedTwin) else None
+    return np.nan if fitted is None else fitted.figures.get("delays_at_bound", np.nan)
+
+
+def _segment_channels(twin: Twin, rate: float) -> Channels:
     """Names and units of `_segment_values`."""
     noise = tuple(f"noise_{name}" for name in twin.outputs.names)
     if not isinstance(twin, CorrectedTwin):
         return Channels(noise, twin.outputs.units)
-    latent = DISCREPANCY.latent(twin.inputs, twin.outputs)
+    latent, _ = shown_latents(DISCREPANCY.latent(twin.inputs, twin.outputs), rate)
     return Channels(latent.names + noise, latent.units + twin.outputs.units)
 
 
-def _segment_values(twin: Twin, members: Trajectories, segments: Segments, stride: int) -> NDArray:
+def _segment_values(
+    twin: Twin, members: Trajectories, segments: Segments, stride: int, operator: Correction
+) -> NDArray:
     """Delay, offsets and steady-state noise (m, M, k) of all members; NaN if not identified."""
     noise = _steady_noise(members, segments, stride)
     if not isinstance(twin, CorrectedTwin):
         return noise
     repeated = segments[np.zeros(len(members), dtype=int)]
-    _, found = infer_discrepancy(twin.surrogate, members, DISCREPANCY, segments=repeated)
+    _, found = infer_discrepancy(twin.surrogate, members, operator, segments=repeated)
     z = torch.where(found.identified, found.z, torch.nan).numpy()
-    return np.concatenate([z, noise], axis=2)
+    _, factor = shown_latents(operator.latent(twin.inputs, twin.outputs), members.rate)
+    return np.concatenate([factor * z, noise], axis=2)
 
 
 def _steady_noise(members: Trajectories, segments: Segments, stride: int) -> NDArray:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
+from retwin.evaluation.fidelity.latents import shown_latents
 from retwin.progress import Progress
 from retwin.scores.distributions import quantiles
 from retwin.serialisation.files import write_atomically
@@ -132,13 +133,16 @@ def predictive_overlay(
         if progress is not None:
             progress((i + 1) / len(trajectories))
     z, deviation = _discrepancies(twin, trajectories, segments)
+    latent, factor = shown_latents(
+        twin.residual.correction.latent(twin.inputs, twin.outputs), trajectories.rate
+    )
     times = np.stack([segments.start, segments.settle, segments.stop], axis=-1)
     return Overlay(
-        twin.residual.correction.latent(twin.inputs, twin.outputs),
+        latent,
         trajectories.ids,
         np.stack(bands).astype(np.float32),
-        z.astype(np.float32),
-        deviation.astype(np.float32),
+        (factor * z).astype(np.float32),
+        (factor * deviation).astype(np.float32),
         np.where(segments.valid[..., None], times / trajectories.rate, np.nan),
     )
 

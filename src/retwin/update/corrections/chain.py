@@ -10,10 +10,16 @@ from torch import Tensor
 
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
-from retwin.update.corrections.correction import Context, Correction, Discrepancy, Head
+from retwin.update.corrections.correction import (
+    Context,
+    Correction,
+    Discrepancy,
+    Head,
+    block_diagonal,
+)
 from retwin.update.corrections.sampled_sensor import SampledSensor
 
-__all__ = ["Chain", "fit_sensor", "measured_outputs", "sample_mask"]
+__all__ = ["Chain", "fit_correction", "measured_outputs", "sample_mask"]
 
 
 @dataclass(frozen=True)
@@ -108,26 +114,33 @@ class Chain:
             context = replace(context, corrected=operator.apply(context, part))
         return context.path
 
+    def completed(self, context: Context, observed: Tensor, mask: Tensor) -> Chain:
+        """The same, what each operator leaves open chosen as if it were alone."""
+        seen = sample_mask(self, observed, mask, context.rate)
+        first = completed(self.first, context, observed, seen)
+        if isinstance(self.second, SampledSensor):
+            return replace(self, first=first)
+        return replace(self, first=first, second=completed(self.second, context, observed, seen))
+
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """z* of one operator after the other, each from what those before it left."""
         if isinstance(self.second, SampledSensor):
-            return self.first.infer(context, observed, sample_mask(self, observed, mask))
+            return self.first.infer(
+                context, observed, sample_mask(self, observed, mask, context.rate)
+            )
         one = self.first.infer(context, observed, mask)
         with torch.no_grad():
             after = replace(context, corrected=self.first.apply(context, one.z))
         other = self.second.infer(after, observed, mask)
-        width = one.z.shape[-1] + other.z.shape[-1]
-        covariance = one.covariance.new_zeros(*one.z.shape[:2], width, width)
-        covariance[..., : one.z.shape[-1], : one.z.shape[-1]] = one.covariance
-        covariance[..., one.z.shape[-1] :, one.z.shape[-1] :] = other.covariance
         return Discrepancy(
             z=torch.cat([one.z, other.z.to(one.z)], dim=-1),
-            covariance=covariance,
+            covariance=block_diagonal(one.covariance, other.covariance),
             identified=torch.cat([one.identified, other.identified], dim=-1),
             noise=other.noise,
             severity=one.severity,
             # Where one operator can only give points, both do.
             posterior=one.posterior and other.posterior,
+            at_bound=_either(one.at_bound, other.at_bound),
         )
 
     def _split(self, context: Context, z: Tensor) -> tuple[Tensor, ...]:
@@ -139,31 +152,51 @@ class Chain:
         return z.split([len(each.latent(inputs, outputs)) for each in self._operators], dim=-1)
 
 
+def completed(
+    correction: Correction, context: Context, observed: Tensor, mask: Tensor
+) -> Correction:
+    """The operator with the settings that were left open, if it has such."""
+    method = getattr(correction, "completed", None)
+    return correction if method is None else method(context, observed, mask)
+
+
+def _either(one: Tensor | None, other: Tensor | None) -> Tensor | None:
+    """Where one of both is true, if both are known."""
+    return one if other is None else other if one is None else one | other
+
+
 def _sensor(correction: Correction) -> SampledSensor | None:
     """The sensor at the end of a chain, if there is one."""
     last = correction.second if isinstance(correction, Chain) else None
     return last if isinstance(last, SampledSensor) else None
 
 
-def fit_sensor(
+def fit_correction(
     correction: Correction, context: Context, observed: Tensor, mask: Tensor
 ) -> tuple[Correction, Discrepancy]:
-    """The operator, its sensor fitted to measured outputs (n, T, d_y), and their z*."""
+    """The operator with all settings fitted to measured outputs (n, T, d_y), and their z*."""
     sensor = _sensor(correction)
     if sensor is None or not isinstance(correction, Chain):
-        return correction, correction.infer(context, observed, mask)
-    chain = replace(correction, second=sensor.timed(observed, mask))
+        operator = completed(correction, context, observed, mask)
+        return operator, operator.infer(context, observed, mask)
+    timed = replace(correction, second=sensor.timed(observed, mask, context.rate))
+    chain = timed.completed(context, observed, mask)
     found = chain.infer(context, observed, mask)
     with torch.no_grad():
         explained = chain.apply(context, found.z)
-    fitted = sensor.fitted(observed, mask, explained, context.segments)
+    fitted = sensor.fitted(observed, mask, explained, context.segments, context.rate)
     return replace(chain, second=fitted), found
 
 
-def sample_mask(correction: Correction, observed: Tensor, mask: Tensor) -> Tensor:
-    """`mask` (n, T, d_y) where the operator's sensor, if it has one, sampled the outputs."""
+def sample_mask(correction: Correction, observed: Tensor, mask: Tensor, rate: float) -> Tensor:
+    """`mask` (n, T, d_y) where the operator's sensor, if it has one, sampled the outputs.
+
+    `rate` is that of the record, in Hz.
+    """
     sensor = _sensor(correction)
-    return mask if sensor is None else sensor.timed(observed, mask).sample_mask(observed, mask)
+    if sensor is None:
+        return mask
+    return sensor.timed(observed, mask, rate).sample_mask(observed, mask, rate)
 
 
 def measured_outputs(
@@ -176,9 +209,9 @@ def measured_outputs(
     sensor = _sensor(correction)
     if sensor is None or not isinstance(correction, Chain):
         return correction.apply(context, z)
-    at = getattr(correction.first, "at", None)
-    if at is None or sensor.every is None:
-        return sensor.read(correction.apply(context, z), generator)
+    at, rate = getattr(correction.first, "at", None), context.rate
+    if at is None or sensor.period is None:
+        return sensor.read(correction.apply(context, z), generator, rate)
     steps = context.commands.shape[1]
-    when = sensor.polls(len(context), steps, generator)
-    return sensor.record(at(context, z, when), when, steps, generator)
+    when = sensor.polls(len(context), steps, generator, rate)
+    return sensor.record(at(context, z, when), when, steps, generator, rate)

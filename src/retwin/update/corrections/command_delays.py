@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from retwin.inference.em import expectation_maximisation
-from retwin.inference.noise import Noise
+from retwin.inference.noise import Noise, predicted_variance
 from retwin.inference.priors import GaussianPrior
 from retwin.update.corrections.command_problem import CommandProblem
 
@@ -23,8 +23,8 @@ __all__ = ["delay_variance"]
 
 ROUNDS = 20
 """Rounds of expectation-maximisation."""
-FIRST = 1.0
-"""Variance of an actuator's own delay to begin with, in samples squared."""
+FIRST = 1 / 35
+"""Standard deviation of an actuator's own delay to begin with, in widths of the range of delays."""
 
 
 def delay_variance(
@@ -36,7 +36,9 @@ def delay_variance(
     first = x.new_zeros(len(x), count), x.new_zeros(len(x), count, count)
     square = (model.residual.square() * model.motion[..., None]).sum()
     scale = (square / model.motion.sum().clamp_min(1) / model.residual.shape[-1]).clamp_min(1e-12)
-    widths = _Widths(scale, x.new_tensor(FIRST), torch.ones_like(model.motion))
+    widths = _Widths(
+        scale, x.new_tensor((FIRST * problem.width) ** 2), torch.ones_like(model.motion)
+    )
     (_, covariance), _ = expectation_maximisation(
         first, widths, infer=model.posterior, learn=model.learned, rounds=ROUNDS
     )
@@ -106,8 +108,7 @@ class _OwnDelays:
         size = self.residual.shape[-1]
         left = self.residual - torch.einsum("nsyp,np->nsy", self.jacobian, mean)
         # The variance of the predicted outputs adds to what stays unexplained.
-        flat = self.jacobian.flatten(1, 2)
-        variance = ((flat @ covariance) * flat).sum(dim=-1).view_as(left)
+        variance = predicted_variance(self.jacobian, covariance)
         square = (left.square() + variance).sum(dim=-1)
         weights = self.noise.loss.weight(square / widths.noise, size)
         total = self.motion.sum().clamp_min(1) * size

@@ -8,36 +8,41 @@ approximation). Whether an actuator missed a segment is decided by comparing evi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from retwin.checks import require
 from retwin.inference.em import expectation_maximisation
-from retwin.inference.evidence import best_per_row
 from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
-from retwin.inference.solver import Solution, solve
+from retwin.inference.solver import Solution
 from retwin.update.corrections.command_delays import delay_variance
 from retwin.update.corrections.command_problem import CommandProblem
-from retwin.update.corrections.correction import Context, Discrepancy
+from retwin.update.corrections.correction import Context, Discrepancy, block_diagonal
+from retwin.update.corrections.delays import at_bound, first_delays
+from retwin.update.corrections.missed_segments import Fit, LatentPrior, Search, fitted, searched
 from retwin.update.corrections.warp import gather_samples
 
 __all__ = ["infer_commands"]
 
 ROUNDS = 5
 """Rounds of expectation-maximisation, with a search for missed segments in each."""
-SEARCHES = 3
-"""Missed segments per trajectory that one round may find."""
 SUSPECT = 2.5
 """Standard deviations of the prior beyond which an offset makes a segment suspect."""
+MOVING = 3.0
+"""Distance, in standard deviations of an offset, above which an actuator is to move."""
 OUTLYING = 3.0
 """Noise scales beyond which a sample is an outlier."""
 OUTLYING_SHARE = 0.3
 """Share of outliers above which a segment is suspect."""
 FLAT = 30.0
 """Standard deviation of the prior, in that of a healthy offset, where a fault may be anything."""
+FIRST_JITTER, SMALLEST_JITTER = 1 / 35, 1 / 350
+"""Standard deviations of a delay at first beyond what first delays show, and at least, in widths of
+its range."""
 FLOOR = 1e-6
 """Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
@@ -53,6 +58,8 @@ def infer_commands(
 ) -> Discrepancy:
     """z* (n, M, 1 + 2 d_u) for measured outputs (n, T, d_y), see `CommandSpace`.
 
+    The range of delays is in samples.
+
     Raises
     ------
     InputError
@@ -66,16 +73,23 @@ def infer_commands(
     if not problem.valid.shape[1]:
         return _empty(problem)
     start = problem.zero
-    problem.per_segment(start)[..., 0] = problem.first_delays()
+    problem.per_segment(start)[..., 0] = first_delays(problem, start, problem.delay_range)
     first = _Belief.of(problem, start)
-    state, belief = expectation_maximisation(
-        _State(problem, Solution.of_prior(first.prior(problem), start), problem.missed),
-        first,
-        infer=_State.improved,
-        learn=_Belief.learned,
-        rounds=ROUNDS,
+
+    def infer(found: Search, belief: _Belief) -> Search:
+        prior, noise = belief.prior(problem), belief.noise
+        return searched(problem, prior, noise, found.fit, partial(_suspects, problem, prior, noise))
+
+    def learn(found: Search, belief: _Belief) -> _Belief:
+        return belief.learned(problem.with_missed(found.fit.missed), found.fit.solution)
+
+    fit = Fit.of_prior(problem, first.prior(problem), start)
+    found, belief = expectation_maximisation(
+        Search(fit, fit.missed, fit.evidence), first, infer=infer, learn=learn, rounds=ROUNDS
     )
-    return _discrepancy(state.solved(belief), belief, identified_below)
+    problem = problem.with_missed(found.fit.missed)
+    last = fitted(problem, belief.prior(problem), belief.noise, found.fit.x)
+    return _discrepancy(problem, last.solution, found.probability, belief, identified_below)
 
 
 def _require_samples(mask: Tensor) -> None:
@@ -105,81 +119,24 @@ def _empty(problem: CommandProblem) -> Discrepancy:
     return Discrepancy(z, matrix, z > 0, noise, severity=problem.missed, posterior=True)
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
-    """What was inferred of every trajectory."""
+def _suspects(
+    problem: CommandProblem, prior: LatentPrior, noise: Noise, fit: Fit, rows: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Trajectory, segment and actuator of every flip worth a trial.
 
-    problem: CommandProblem
-    solution: Solution
-    probability: Tensor  # (n, M, d_u), that an actuator missed a segment
-
-    def solved(self, belief: _Belief) -> _State:
-        """The most probable x for the same missed segments."""
-        problem = self.problem
-        x, bounds = self.solution.x, problem.bounds
-        solution = solve(problem, belief.prior(problem), belief.noise, x, bounds=bounds)
-        return replace(self, solution=solution)
-
-    def improved(self, belief: _Belief) -> _State:
-        """The most probable x; missed segments flipped where that has the greater evidence.
-
-        Of each trajectory one is flipped at a time, the one that gains most.
-        """
-        state = self.solved(belief)
-        probability = state.problem.missed
-        for _ in range(SEARCHES):
-            rows, segment, actuator = state._suspects(belief)
-            if not len(rows):
-                break
-            each = torch.arange(len(rows))
-            pattern = state.problem.missed[rows].clone()
-            pattern[each, segment, actuator] = 1 - pattern[each, segment, actuator]
-            sign = 2 * pattern[each, segment, actuator] - 1
-            tried = state._tried(belief, rows, segment, pattern)
-            gain = tried.evidence - state.solution.evidence[rows] + belief.odds * sign
-            probability = probability.index_put(
-                (rows, segment, actuator), torch.sigmoid(gain * sign)
-            )
-            _, best = best_per_row(gain, rows)
-            best = best[gain[best] > 0]
-            if not len(best):
-                break
-            missed = state.problem.missed.index_copy(0, rows[best], pattern[best])
-            state = _State(
-                state.problem.with_missed(missed),
-                state.solution.put(rows[best], tried[best]),
-                probability,
-            )
-        return replace(state, probability=probability)
-
-    def _tried(self, belief: _Belief, rows: Tensor, segment: Tensor, missed: Tensor) -> Solution:
-        """The solution of some trajectories if other segments were missed."""
-        problem = self.problem[rows].with_missed(missed)
-        start = self.solution.x[rows].clone()
-        problem.per_segment(start)[torch.arange(len(rows)), segment, 1:] = 0.0
-        prior = belief.prior(problem)
-        return solve(problem, prior, belief.noise, start, bounds=problem.bounds)
-
-    def _suspects(self, belief: _Belief) -> tuple[Tensor, Tensor, Tensor]:
-        """Trajectory, segment and actuator of every flip worth a try.
-
-        A segment is suspect if an offset is far beyond its prior, or if many of its samples are
-        outliers; then every actuator that was to move is. What is missed may always turn out not to
-        be.
-        """
-        problem = self.problem
-        offset = problem.per_segment(self.solution.x)[..., 1:]
-        far = (offset.abs() > SUSPECT * belief.offset) & problem.healthy
-        residual = problem.residual(self.solution.x)
-        square = belief.noise.square(problem, residual)
-        outlying = (square > OUTLYING**2) * problem.measured
-        inside = problem.inside
-        share = (inside * outlying[:, None]).sum(dim=-1) / inside.sum(dim=-1).clamp_min(1)
-        moving = problem.distance > 3 * belief.offset
-        suspect = far.any(dim=-1) | (share > OUTLYING_SHARE)
-        flips = suspect[..., None] & moving & problem.healthy | (problem.missed > 0.5)
-        rows, segment, actuator = flips.nonzero().unbind(dim=1)
-        return rows, segment, actuator
+    A segment is suspect if an offset is far beyond its prior, or if many of its samples are
+    outliers; then every actuator that was to move is. What is missed may always turn out not to be.
+    """
+    part, x = problem[rows].with_missed(fit.missed[rows]), fit.x[rows]
+    width = part.per_segment(prior.gaussian.deviation[rows])[..., 1:]
+    far = (part.per_segment(x)[..., 1:].abs() > SUSPECT * width) & part.healthy
+    outlying = noise.square(part, part.residual(x)) > OUTLYING**2
+    share = (part.inside * outlying[:, None]).sum(dim=-1) / part.inside.sum(dim=-1).clamp_min(1)
+    suspect = far.any(dim=-1) | (share > OUTLYING_SHARE)
+    moving = part.distance > MOVING * width
+    flips = suspect[..., None] & moving & part.healthy | (part.missed > 0.5)
+    row, segment, actuator = flips.nonzero().unbind(dim=1)
+    return rows[row], segment, actuator
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +153,7 @@ class _Belief:
     def of(cls, problem: CommandProblem, start: Tensor) -> _Belief:
         """Wide, from first delays only."""
         delay = problem.per_segment(start)[..., 0][problem.valid]
-        jitter = 1.4826 * (delay - delay.median()).abs().median() + 1.0
+        jitter = 1.4826 * (delay - delay.median()).abs().median() + FIRST_JITTER * problem.width
         measured = problem.measured > 0
         # The median and the spread of nothing are NaN.
         length = problem.residual(start).norm(dim=-1)[measured].median().nan_to_num(1.0)
@@ -207,51 +164,53 @@ class _Belief:
         one = torch.ones(2, dtype=torch.float64)
         return cls(delay.median(), jitter, offset, -4.0 * one[0], Noise(scale, one))
 
-    def deviation(self, problem: CommandProblem) -> Tensor:
-        """Standard deviation of x before an output is measured, (n, M, 1 + d_u)."""
-        offset = torch.where(problem.faulty, FLAT * self.offset, self.offset)
-        return torch.cat([self.jitter.expand_as(offset[..., :1]), offset], dim=-1)
-
-    def prior(self, problem: CommandProblem) -> GaussianPrior:
-        """The distribution of x before an output is measured."""
-        mean = problem.zero
+    def prior(self, problem: CommandProblem) -> LatentPrior:
+        """The distribution of (x, missed) before an output is measured."""
+        mean, variance = problem.zero, problem.zero
         problem.per_segment(mean)[..., 0] = self.delay
-        return GaussianPrior.independent(mean, self.deviation(problem).flatten(1).square())
+        problem.per_segment(variance)[..., 0] = self.jitter.square()
+        wide = torch.where(problem.faulty, FLAT * self.offset, self.offset)
+        problem.per_segment(variance)[..., 1:] = wide.square()
+        return LatentPrior(
+            GaussianPrior.independent(mean, variance), self.odds.expand(problem.missed.shape)
+        )
 
-    @staticmethod
-    def learned(state: _State, belief: _Belief) -> _Belief:
+    def learned(self, problem: CommandProblem, solution: Solution) -> _Belief:
         """The most probable hyperparameters, given what was inferred and how certain that is."""
-        problem, x = state.problem, state.solution.x
+        x = solution.x
         delay, offset = problem.per_segment(x).split([1, problem.missed.shape[2]], dim=-1)
-        variance = problem.per_segment(state.solution.covariance.diagonal(dim1=1, dim2=2))
+        variance = problem.per_segment(solution.covariance.diagonal(dim1=1, dim2=2))
         used = (problem.healthy & (problem.missed < 0.5)).double()
         second = ((offset.square() + variance[..., 1:]) * used).sum(dim=(0, 1))
         weight = problem.valid.double() / problem.valid.sum()
         mean = (delay[..., 0] * weight).sum()
         spread = (((delay[..., 0] - mean).square() + variance[..., 0]) * weight).sum()
         # Pseudo-observations: with few segments no width shrinks to nothing.
-        scatter = (second + 2 * belief.offset.square()) / (used.sum(dim=(0, 1)) + 2)
+        scatter = (second + 2 * self.offset.square()) / (used.sum(dim=(0, 1)) + 2)
         missed = (problem.missed * problem.healthy).sum()
         return _Belief(
             delay=mean,
-            jitter=spread.sqrt().clamp_min(0.1),
+            jitter=spread.sqrt().clamp_min(SMALLEST_JITTER * problem.width),
             offset=scatter.sqrt(),
             odds=((missed + 0.5) / (problem.healthy.sum() + 20.0)).logit(),
-            noise=belief.noise.learned(
+            noise=self.noise.learned(
                 problem, problem.residual(x), max_effective=problem.max_effective, floor=FLOOR
             ),
         )
 
 
-def _discrepancy(state: _State, belief: _Belief, identified_below: float) -> Discrepancy:
+def _discrepancy(
+    problem: CommandProblem,
+    solution: Solution,
+    probability: Tensor,
+    belief: _Belief,
+    identified_below: float,
+) -> Discrepancy:
     """z*, each segment's covariance, and which components the outputs identify."""
-    problem, solution = state.problem, state.solution
     x, missed = problem.per_segment(solution.x), problem.missed
-    n, segments, size = x.shape
-    whole = solution.covariance.reshape(n, segments, size, segments, size)
-    index = torch.arange(segments)
-    inner = whole[:, index, :, index].transpose(0, 1).clone()
-    wide = belief.deviation(problem).square()
+    prior = belief.prior(problem).gaussian
+    inner = solution.blocks(x.shape[1])
+    wide = problem.per_segment(prior.deviation.square())
     left = inner.diagonal(dim1=-2, dim2=-1) / wide
     severity = torch.where(problem.faulty, x[..., 1:], 0.0)
     # Under a fault nothing was learned of the discrepancy: the prior stands.
@@ -260,18 +219,17 @@ def _discrepancy(state: _State, belief: _Belief, identified_below: float) -> Dis
     inner = inner * learned[..., None] * learned[..., None, :]
     inner = inner + torch.diag_embed(own * (1 - learned))
     # Offsets stay as they are, and as much correlated with the delay.
-    delays = delay_variance(problem, belief.prior(problem), belief.noise, solution.x)
+    delays = delay_variance(problem, prior, belief.noise, solution.x)
     stretch = torch.ones_like(wide)
     stretch[..., 0] = (delays / inner[..., 0, 0]).sqrt()
     inner = inner * stretch[..., None] * stretch[..., None, :]
-    width = size + missed.shape[-1]
-    covariance = torch.zeros(n, segments, width, width, dtype=torch.float64)
-    covariance[..., :size, :size] = inner
-    covariance[..., size:, size:] = torch.diag_embed(state.probability * (1 - state.probability))
+    covariance = block_diagonal(inner, torch.diag_embed(probability * (1 - probability)))
     known = (left < identified_below) & (learned > 0)
+    bounded = at_bound(x[..., 0], problem.delay_range) & problem.valid
+    known[..., 0] &= ~bounded
     known[..., 1:] &= missed < 0.5
     seen = problem.inside.any(dim=-1)[..., None] & problem.healthy
     identified = torch.cat([known, seen], dim=-1) & problem.valid[..., None]
     z = torch.cat([x * learned, missed], dim=-1) * problem.valid[..., None]
-    noise = (belief.noise.scale[0, 0] * problem.unit.mean()).expand(n)
-    return Discrepancy(z, covariance, identified, noise, severity=severity, posterior=True)
+    noise = (belief.noise.scale[0, 0] * problem.unit.mean()).expand(len(x))
+    return Discrepancy(z, covariance, identified, noise, severity, True, bounded)

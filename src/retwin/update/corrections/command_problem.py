@@ -6,14 +6,16 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from retwin.data.segments import Segments
 from retwin.inference.solver import Bounds
 from retwin.update.corrections.correction import Context, DifferentiableTwin
+from retwin.update.corrections.delays import delay_bounds
 from retwin.update.corrections.effective_commands import effective_commands
-from retwin.update.corrections.warp import gather_samples, interpolate
+from retwin.update.corrections.warp import gather_samples, interpolate, within
 from retwin.update.piecewise_linear import distinct
 
 __all__ = ["EFFECTIVE_SAMPLES", "CommandProblem"]
@@ -23,8 +25,9 @@ SURROGATE_STEP = 0.05
 units: larger than the rounding of single precision."""
 COMMAND_STEP = 1e-4
 """Step of finite differences through the effective commands, which are piecewise linear in x."""
-SETTLING = 15
-"""Samples after the end of a command's ramp in which an output may still be in motion."""
+SETTLING = 0.5
+"""Time after the end of a command's ramp in which an output may still be in motion, in largest
+delays."""
 EFFECTIVE_SAMPLES = (6.0, 1.0)
 """Largest effective sample size of a segment's part at rest and in motion: rounding and friction
 are common to all its samples."""
@@ -108,15 +111,15 @@ class CommandProblem:
         at most. By default the unit is that in which the outputs' standard deviation is 1.
         """
         segments = context.segments
-        start, settle = (torch.as_tensor(t)[..., None] for t in (segments.start, segments.settle))
+        start = torch.as_tensor(segments.start)[..., None]
         valid = torch.as_tensor(segments.valid)
         bent = (context.faulty_commands != context.commands).any(dim=1)[:, None]
         whole = mask.all(dim=-1)
         sample, used = _thinned(whole, max_samples)
         unit = _unit(context, observed.double()[whole]) if unit is None else unit
         values = torch.where(whole[..., None], observed.double(), 0.0)
-        here = sample[:, None]
-        near = (here >= start + delay_range[0]) & (here <= settle + SETTLING)
+        settling = SETTLING * max(delay_range[1], 0.0)
+        near = within(sample, segments.start + delay_range[0], segments.settle + settling)
         healthy = valid[..., None] & ~bent & (start < context.frozen[:, None])
         return cls(
             surrogate=context.surrogate,
@@ -168,14 +171,14 @@ class CommandProblem:
         return self.observed.new_zeros(n, segments * (1 + width))
 
     @property
+    def width(self) -> float:
+        """Of the range of delays, in samples."""
+        return self.delay_range[1] - self.delay_range[0]
+
+    @property
     def bounds(self) -> Bounds:
-        """The delay range as limits of x."""
-        low = torch.full(self.zero.shape[1:], -torch.inf, dtype=torch.float64)
-        high, step = -low, -low
-        delays = slice(None, None, 1 + self.missed.shape[2])
-        low, high = low.clone(), high.clone()
-        low[delays], high[delays] = self.delay_range
-        return Bounds(low, high, step)
+        """The range of delays as limits of x."""
+        return delay_bounds(self.segments, 1 + self.missed.shape[2], self.delay_range)
 
     def per_segment(self, x: Tensor) -> Tensor:
         """Values (n, P) or (n, P, …) by segment, (n, M, 1 + d_u, …)."""
@@ -189,11 +192,8 @@ class CommandProblem:
     @property
     def inside(self) -> Tensor:
         """(n, M, S), 1 where a measured sample belongs to a segment."""
-        start, stop = (
-            torch.as_tensor(t)[..., None] for t in (self.segments.start, self.segments.stop)
-        )
-        here = self.sample[:, None]
-        return ((here >= start) & (here < stop)).double() * self.measured[:, None]
+        segment = within(self.sample, self.segments.start, np.ceil(self.segments.stop) - 1)
+        return segment.double() * self.measured[:, None]
 
     @property
     def distance(self) -> Tensor:
@@ -233,26 +233,6 @@ class CommandProblem:
         """Jacobian (n, S, d_y, M d_u) of the outputs by a delay of every actuator of its own."""
         parts = [part._actuator_delay_jacobian(some) for part, some in self._batches(x)]
         return torch.cat(parts)
-
-    def first_delays(self) -> Tensor:
-        """The delay (n, M) in whole samples that fits each segment best, all offsets being 0.
-
-        Where all fit equally well, the smallest.
-        """
-        low, high = self.delay_range
-        grid = torch.arange(low, high + 1.0, dtype=torch.float64)
-        grid = grid[grid.abs().argsort(stable=True)]
-        start, settle = (
-            torch.as_tensor(t)[..., None] for t in (self.segments.start, self.segments.settle)
-        )
-        here = self.sample[:, None]
-        near = ((here >= start + low) & (here <= settle + high)).double()
-        x, costs = self.zero, []
-        for delay in grid:
-            self.per_segment(x)[..., 0] = delay
-            error = self.residual(x).norm(dim=-1) * self.measured
-            costs.append((near * error[:, None]).sum(dim=-1))
-        return grid[torch.stack(costs).argmin(dim=0)]
 
     @property
     def _times(self) -> Tensor:

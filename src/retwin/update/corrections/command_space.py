@@ -8,7 +8,7 @@ segment altogether: it stays where it is and catches up with the next command.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from torch import Tensor
 from retwin.data.trajectories import Channels
 from retwin.update.corrections.command_inference import infer_commands
 from retwin.update.corrections.correction import Context, Discrepancy, Head
+from retwin.update.corrections.delay_range import checked_range, range_in_samples
 from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.warp import gather_samples
 from retwin.update.piecewise_linear import distinct
@@ -29,25 +30,34 @@ KINDS = ("offset", "missed")
 class CommandSpace:
     """z = delay, offsets and missed segments of the actuators, in command space.
 
-    Of each segment: the delay in samples, one for all actuators; then for every actuator the offset
-    of the level that it reaches, in its command's unit; then for every actuator whether it missed
-    the segment, 0 or 1.
+    Of each segment: the delay in samples (settings are in seconds), one for all actuators; then for
+    every actuator the offset of the level that it reaches, in its command's unit; then for every
+    actuator whether it missed the segment, 0 or 1.
 
     Parameters
     ----------
-    delay_range : tuple of float
-        Smallest and largest delay that `infer` considers, in samples.
+    delay_range : tuple of float, optional
+        Smallest and largest delay that `infer` considers, in seconds; by default chosen from the
+        measured outputs, see `plausible_delays`.
     max_samples : int
         Samples per trajectory that `infer` uses at most: more add little information.
     identified_below : float
         A component of z is identified if its posterior variance is below this share of its prior
         variance, from 0 to 1.
 
+    Raises
+    ------
+    InputError
+        The range does not rise.
+
     """
 
-    delay_range: tuple[float, float] = (-5.0, 30.0)
+    delay_range: tuple[float, float] | None = None
     max_samples: int = 200
     identified_below: float = 0.7
+
+    def __post_init__(self) -> None:
+        checked_range(self.delay_range)
 
     @property
     def resolution(self) -> str:
@@ -89,13 +99,18 @@ class CommandSpace:
         different, place = distinct(_commands(context, z, when))
         return context.surrogate(different[None])[0, place]
 
+    def completed(self, context: Context, observed: Tensor, mask: Tensor) -> CommandSpace:
+        """The operator with the range of delays that measured outputs show, where none is given."""
+        low, high = range_in_samples(self.delay_range, context, observed, mask)
+        return replace(self, delay_range=(low / context.rate, high / context.rate))
+
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """z* and its covariance from outputs alone; see `command_inference`."""
         return infer_commands(
             context,
             observed,
             mask,
-            delay_range=self.delay_range,
+            delay_range=range_in_samples(self.delay_range, context, observed, mask),
             max_samples=self.max_samples,
             identified_below=self.identified_below,
         )

@@ -13,7 +13,14 @@ from torch import Tensor
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
 
-__all__ = ["Context", "Correction", "DifferentiableTwin", "Discrepancy", "Head"]
+__all__ = [
+    "Context",
+    "Correction",
+    "DifferentiableTwin",
+    "Discrepancy",
+    "Head",
+    "block_diagonal",
+]
 
 
 class DifferentiableTwin(Protocol):
@@ -171,6 +178,9 @@ class Discrepancy:
     posterior : bool
         Whether z and covariance are a whole posterior: what the outputs do not identify then has
         the variance of its prior, and draws stand for z everywhere.
+    at_bound : Tensor, optional
+        (n, M) bool, where the delay is at a bound of its range, so that a better one may lie
+        beyond; None where no component of z is bounded.
 
     """
 
@@ -180,6 +190,7 @@ class Discrepancy:
     noise: Tensor
     severity: Tensor | None = None
     posterior: bool = False
+    at_bound: Tensor | None = None
 
 
 @runtime_checkable
@@ -187,8 +198,10 @@ class Correction(Protocol):
     """An operator g with its inverse; holds settings, no data.
 
     Optional members are `pools`, true if `infer` learns from all trajectories together;
-    `severities`, true if it estimates the severity of a known fault apart from z; and
-    `at(context, z, when)`, the result of `apply` at some samples (n, S) only, if that costs less.
+    `severities`, true if it estimates the severity of a known fault apart from z;
+    `at(context, z, when)`, the result of `apply` at some samples (n, S) only, if that costs less;
+    and `completed(context, observed, mask)`, the operator with the settings that were left open,
+    chosen from measured outputs.
     """
 
     @property
@@ -211,3 +224,11 @@ class Correction(Protocol):
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """The z for which `apply` comes closest to `observed` (n, T, d_y) where `mask` is True."""
         ...
+
+
+def block_diagonal(one: Tensor, other: Tensor) -> Tensor:
+    """The joint covariance (..., P + Q, P + Q) of independent (..., P, P) and (..., Q, Q)."""
+    size, further = one.shape[-1], other.shape[-1]
+    joint = one.new_zeros(*one.shape[:-2], size + further, size + further)
+    joint[..., :size, :size], joint[..., size:, size:] = one, other
+    return joint

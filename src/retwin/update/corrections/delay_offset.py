@@ -7,18 +7,22 @@ motion ends at `settle + TDe` with its own. So the path is continuous whatever z
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from retwin.checks import positive
 from retwin.data.trajectories import Channels
 from retwin.inference.em import expectation_maximisation
 from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
-from retwin.inference.solver import Bounds, Solution, solve
+from retwin.inference.solver import Solution, solve
 from retwin.update.corrections.correction import Context, Discrepancy, Head
-from retwin.update.corrections.path_problem import MAX_STEP, PathProblem, path_at
+from retwin.update.corrections.delay_range import checked_range, range_in_samples
+from retwin.update.corrections.delays import at_bound, first_delays
+from retwin.update.corrections.path_problem import PathProblem, path_at
 
 __all__ = ["DelayOffset"]
 
@@ -31,25 +35,42 @@ WIDE = 100.0
 measured at all."""
 UNSEEN = 0.1
 """Share of the prior's standard deviation above which an offset was not measured."""
+KNOWN_DELAY = 1 / 8
+"""Standard deviation above which a delay is not identified by default, in widths of its range: less
+than half of that of a delay of which nothing is known."""
 MEASURED_MOTION = 0.5
 """Share of a motion that must be measured for its delay to be identified."""
 
 
 @dataclass(frozen=True)
 class DelayOffset:
-    """z = (TDe, TPE) per segment: delay in samples, offset of the steady part in output units.
+    """z = (TDe, TPE) per segment: delay, offset of the steady part in output units.
+
+    Settings are in seconds, delays in z in samples.
 
     Parameters
     ----------
-    delay_range : tuple of float
-        Smallest and largest delay that `infer` considers, in samples.
-    known_delay : float
-        Standard deviation in samples above which a delay counts as not identified.
+    delay_range : tuple of float, optional
+        Smallest and largest delay that `infer` considers, in seconds; by default chosen from the
+        measured outputs, see `plausible_delays`.
+    known_delay : float, optional
+        Standard deviation in seconds above which a delay counts as not identified; by default an
+        eighth of the range of delays.
+
+    Raises
+    ------
+    InputError
+        The range does not rise, or the standard deviation is not positive.
 
     """
 
-    delay_range: tuple[float, float] = (-5.0, 30.0)
-    known_delay: float = 3.0
+    delay_range: tuple[float, float] | None = None
+    known_delay: float | None = None
+
+    def __post_init__(self) -> None:
+        checked_range(self.delay_range)
+        if self.known_delay is not None:
+            positive("known_delay", self.known_delay)
 
     @property
     def resolution(self) -> str:
@@ -72,6 +93,11 @@ class DelayOffset:
             return context.path
         return path_at(context.segments, context.path, z.to(context.path))
 
+    def completed(self, context: Context, observed: Tensor, mask: Tensor) -> DelayOffset:
+        """The operator with the range of delays that measured outputs show, where none is given."""
+        low, high = range_in_samples(self.delay_range, context, observed, mask)
+        return replace(self, delay_range=(low / context.rate, high / context.rate))
+
     @torch.no_grad()
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """The most probable z under heavy-tailed noise.
@@ -81,86 +107,90 @@ class DelayOffset:
         (Tukey), so glitches do not change z. Outputs are compared in `Context.unit`, and of a
         sample the outputs that were measured count.
         """
-        size = TRAJECTORIES_PER_BATCH
+        limits = range_in_samples(self.delay_range, context, observed, mask)
         parts = [
-            self._infer(context[slice(i, i + size)], observed[i : i + size], mask[i : i + size])
-            for i in range(0, len(context), size)
+            self._infer(context[some], observed[some], mask[some], limits)
+            for some in np.split(
+                np.arange(len(context)),
+                np.arange(TRAJECTORIES_PER_BATCH, len(context), TRAJECTORIES_PER_BATCH),
+            )
         ]
         return Discrepancy(
             torch.cat([part.z for part in parts]),
             torch.cat([part.covariance for part in parts]),
             torch.cat([part.identified for part in parts]),
             torch.cat([part.noise for part in parts]),
+            at_bound=torch.cat([part.at_bound for part in parts if part.at_bound is not None]),
         )
 
-    def _infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
+    def _infer(
+        self, context: Context, observed: Tensor, mask: Tensor, limits: tuple[float, float]
+    ) -> Discrepancy:
         unit, segments = context.unit.double(), context.segments
-        problem = PathProblem.of(segments, context.path / unit, observed / unit, mask)
+        problem = PathProblem.of(segments, context.path / unit, observed / unit, mask, limits)
         z = torch.zeros(len(context), segments.max_count, 1 + len(unit), dtype=torch.float64)
         if segments.max_count == 0:
             matrix = z[..., None] * z[..., None, :]
             noise = problem.noise(problem.factor * (problem.observed - problem.path))
-            return Discrepancy(z, matrix, z > 0, noise.scale[::2, 0] * unit.mean())
-        z[..., 1:] = problem.first_offset(self.delay_range[1])
-        z[..., 0] = problem.first_delay(z.flatten(1), self.delay_range)
+            steady = noise.scale[::2, 0] * unit.mean()
+            return Discrepancy(z, matrix, z > 0, steady, at_bound=z[..., 0] > 0)
+        z[..., 1:] = problem.first_offset(limits[1])
+        z[..., 0] = first_delays(problem, z.flatten(1), limits)
         problem = problem.with_motion(z[..., 0])
-        bounds = self._bounds(problem)
-        belief = self._learned(problem, problem.residual(z.flatten(1)))
+        bounds = problem.bounds
+        belief = _learned(problem, problem.residual(z.flatten(1)))
         solution, belief = expectation_maximisation(
             Solution.of_prior(belief[1], z.flatten(1)),
             belief,
             infer=lambda found, belief: solve(
                 problem, belief[1], belief[0], found.x, bounds=bounds, reweightings=1
             ),
-            learn=lambda found, _: self._learned(problem, problem.residual(found.x)),
+            learn=lambda found, _: _learned(problem, problem.residual(found.x)),
             rounds=ROUNDS,
         )
-        return self._discrepancy(problem, solution, belief[0], belief[1], unit)
+        known = KNOWN_DELAY * problem.width
+        if self.known_delay is not None:
+            known = self.known_delay * context.rate
+        return _discrepancy(problem, solution, *belief, unit, known)
 
-    def _learned(self, problem: PathProblem, residual: Tensor) -> tuple[Noise, GaussianPrior]:
-        """The noise, and a prior much wider than anything plausible: what is not seen stays 0."""
-        largest = residual.norm(dim=-1).amax(dim=1)
-        wide = (WIDE * largest + 1e-9)[:, None].repeat(1, 1 + residual.shape[-1])
-        wide[:, 0] = WIDE * (self.delay_range[1] - self.delay_range[0])
-        wide = wide.repeat(1, problem.segments.max_count)
-        prior = GaussianPrior.independent(torch.zeros_like(wide), wide.square())
-        return problem.noise(residual), prior
 
-    def _bounds(self, problem: PathProblem) -> Bounds:
-        size, segments = 1 + problem.path.shape[2], problem.segments.max_count
-        low, high, step = torch.full((3, segments, size), torch.inf, dtype=torch.float64)
-        low = -low
-        low[:, 0], high[:, 0] = self.delay_range
-        step[:, 0] = MAX_STEP
-        return Bounds(low.flatten(), high.flatten(), step.flatten())
+def _learned(problem: PathProblem, residual: Tensor) -> tuple[Noise, GaussianPrior]:
+    """The noise, and a prior much wider than anything plausible: what is not seen stays 0."""
+    largest = residual.norm(dim=-1).amax(dim=1)
+    wide = (WIDE * largest + 1e-9)[:, None].repeat(1, 1 + residual.shape[-1])
+    wide[:, 0] = WIDE * problem.width
+    wide = wide.repeat(1, problem.segments.max_count)
+    prior = GaussianPrior.independent(torch.zeros_like(wide), wide.square())
+    return problem.noise(residual), prior
 
-    def _discrepancy(
-        self,
-        problem: PathProblem,
-        solution: Solution,
-        noise: Noise,
-        prior: GaussianPrior,
-        unit: Tensor,
-    ) -> Discrepancy:
-        """z, each segment's covariance, and which components the outputs identify."""
-        z = problem.per_segment(solution.x)
-        n, segments, size = z.shape
-        whole = solution.covariance.reshape(n, segments, size, segments, size)
-        index = torch.arange(segments)
-        covariance = whole[:, index, :, index].transpose(0, 1)
-        deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
-        wide = problem.per_segment(prior.precision.diagonal(dim1=1, dim2=2).rsqrt())
-        low, high = self.delay_range
-        delay = (deviation[..., 0] <= self.known_delay) & (z[..., 0] > low) & (z[..., 0] < high)
-        delay = delay & (problem.motion_measured >= MEASURED_MOTION)
-        offset = deviation[..., 1:] <= UNSEEN * wide[..., 1:]
-        identified = torch.cat([delay[..., None], offset], dim=-1)
-        identified = identified & torch.as_tensor(problem.segments.valid)[..., None]
-        scale = torch.cat([unit.new_ones(1), unit])
-        steady = torch.where(problem.measured > 0, noise.scale[problem.group][..., 0], torch.inf)
-        return Discrepancy(
-            z * scale,
-            covariance * scale[:, None] * scale,
-            identified,
-            steady.amin(dim=1) * unit.mean(),
-        )
+
+def _discrepancy(
+    problem: PathProblem,
+    solution: Solution,
+    noise: Noise,
+    prior: GaussianPrior,
+    unit: Tensor,
+    known_delay: float,
+) -> Discrepancy:
+    """z, each segment's covariance, and which components the outputs identify."""
+    z = problem.per_segment(solution.x)
+    covariance = solution.blocks(z.shape[1])
+    deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+    wide = problem.per_segment(prior.deviation)
+    valid = torch.as_tensor(problem.segments.valid)
+    bounded = at_bound(z[..., 0], problem.delay_range) & valid
+    delay = (
+        (deviation[..., 0] <= known_delay) & ~bounded & (problem.motion_measured >= MEASURED_MOTION)
+    )
+    offset = deviation[..., 1:] <= UNSEEN * wide[..., 1:]
+    identified = torch.cat([delay[..., None], offset], dim=-1)
+    identified = identified & valid[..., None]
+    scale = torch.cat([unit.new_ones(1), unit])
+    steady = torch.where(problem.measured > 0, noise.scale[problem.group][..., 0], torch.inf)
+    return Discrepancy(
+        z * scale,
+        covariance * scale[:, None] * scale,
+        identified,
+        steady.amin(dim=1) * unit.mean(),
+        at_bound=bounded,
+    )

@@ -10,14 +10,18 @@ from torch import Tensor
 from retwin.data.segments import Segments
 from retwin.inference.losses import Tukey
 from retwin.inference.noise import Noise, correlation_time
-from retwin.update.corrections.warp import Knots, interpolate
+from retwin.inference.solver import Bounds
+from retwin.update.corrections.delays import delay_bounds
+from retwin.update.corrections.warp import Knots, interpolate, within
 
 __all__ = ["PathProblem", "path_at"]
 
-MAX_STEP = 5.0
-"""Largest change of a delay in one step, in samples: the path is only piecewise smooth in it."""
-AROUND = (5, 10)
-"""Samples before and after a motion that count as motion: its timing is not exactly known."""
+MAX_STEP = 1 / 7
+"""Largest change of a delay in one step, in widths of its range: the path is only piecewise smooth
+in it."""
+AROUND = (1 / 7, 2 / 7)
+"""Time before and after a motion that counts as motion, in widths of the range of delays: its
+timing is not exactly known."""
 MAX_CORRELATION = 0.999
 """Largest lag-one autocorrelation of residuals: slow drift makes nearly all samples one."""
 
@@ -53,6 +57,8 @@ class PathProblem:
         (n, T, d_y), what residuals are multiplied by; 0 where nothing was measured.
     group : Tensor
         (n, T) long.
+    delay_range : tuple of float
+        Smallest and largest delay, in samples.
 
     """
 
@@ -63,10 +69,16 @@ class PathProblem:
     measured: Tensor
     factor: Tensor
     group: Tensor
+    delay_range: tuple[float, float]
 
     @classmethod
     def of(
-        cls, segments: Segments, path: Tensor, observed: Tensor, available: Tensor
+        cls,
+        segments: Segments,
+        path: Tensor,
+        observed: Tensor,
+        available: Tensor,
+        delay_range: tuple[float, float],
     ) -> PathProblem:
         """The problem with all samples at rest."""
         measured = available.double().mean(dim=-1)
@@ -74,35 +86,49 @@ class PathProblem:
         group = (2 * torch.arange(len(path)))[:, None].expand(path.shape[:2])
         # What was not measured may be any number, NaN included.
         observed = torch.where(available, observed, 0.0)
-        return cls(segments, path, observed, available, measured, factor, group)
+        return cls(segments, path, observed, available, measured, factor, group, delay_range)
 
     def with_motion(self, delay: Tensor) -> PathProblem:
         """The same with motion where segments delayed by (n, M) samples are under way."""
-        time = torch.arange(self.segments.steps, dtype=torch.float64)
-        begin = (torch.as_tensor(self.segments.start) + delay - AROUND[0])[..., None]
-        end = (torch.as_tensor(self.segments.settle) + delay + AROUND[1])[..., None]
-        valid = torch.as_tensor(self.segments.valid)[..., None]
-        moving = ((time >= begin) & (time <= end) & valid).any(dim=1)
+        start, settle, valid = (
+            torch.as_tensor(getattr(self.segments, name)) for name in ("start", "settle", "valid")
+        )
+        before, after = (self.width * each for each in AROUND)
+        inside = within(self.sample, start + delay - before, settle + delay + after)
+        moving = (inside & valid[..., None]).any(dim=1)
         return replace(self, group=2 * (self.group // 2) + moving)
 
     def __getitem__(self, rows: Tensor) -> PathProblem:
         """The problem of some trajectories."""
-        return PathProblem(*(each[rows] for each in vars(self).values()))
+        parts = {name: each[rows] for name, each in vars(self).items() if name != "delay_range"}
+        return replace(self, **parts)
+
+    @property
+    def width(self) -> float:
+        """Of the range of delays, in samples."""
+        return self.delay_range[1] - self.delay_range[0]
+
+    @property
+    def bounds(self) -> Bounds:
+        """The range of delays, and the largest step, as limits of x."""
+        step = MAX_STEP * self.width
+        return delay_bounds(self.segments, 1 + self.path.shape[2], self.delay_range, step)
+
+    @property
+    def sample(self) -> Tensor:
+        """All samples (T,)."""
+        return torch.arange(self.segments.steps, dtype=torch.float64)
 
     @property
     def motion_measured(self) -> Tensor:
         """Share (n, M) of the samples of each motion at which any output was measured."""
-        time = torch.arange(self.segments.steps, dtype=torch.float64)
-        start, settle = (
-            torch.as_tensor(t)[..., None] for t in (self.segments.start, self.segments.settle)
-        )
-        inside = (time >= start) & (time <= settle)
+        inside = within(self.sample, self.segments.start, self.segments.settle)
         seen = self.available.any(dim=-1)[:, None]
         return (inside * seen).sum(dim=-1) / inside.sum(dim=-1).clamp_min(1)
 
     def per_segment(self, x: Tensor) -> Tensor:
         """Values (n, P) by segment, (n, M, 1 + d_y)."""
-        return x.unflatten(1, (-1, 1 + self.path.shape[2]))
+        return x.unflatten(1, (self.segments.max_count, -1))
 
     def residual(self, x: Tensor) -> Tensor:
         """Measured minus corrected path (n, T, d_y), 0 where nothing was measured."""
@@ -138,28 +164,10 @@ class PathProblem:
         """
         settle, stop = torch.as_tensor(self.segments.settle), torch.as_tensor(self.segments.stop)
         begin = settle + torch.minimum(torch.full_like(settle, margin), (stop - settle) / 2)
-        time = torch.arange(self.segments.steps, dtype=torch.float64)
-        inside = (time >= begin[..., None]) & (time < stop[..., None])
+        inside = within(self.sample, begin, stop.ceil() - 1)
         there = inside[..., None] & self.available[:, None]
         values = torch.where(there, (self.observed - self.path)[:, None], torch.nan)
         return torch.nan_to_num(torch.nanmedian(values, dim=2).values)
-
-    def first_delay(self, x: Tensor, delay_range: tuple[float, float]) -> Tensor:
-        """The delay (n, M) in whole samples that fits each motion best, by absolute error."""
-        low, high = delay_range
-        grid = torch.arange(low, high + 1.0, 1.0, dtype=torch.float64)
-        # Smallest first: where nothing was measured all fit equally well, and the first is taken.
-        grid = grid[grid.abs().argsort(stable=True)]
-        start, settle = torch.as_tensor(self.segments.start), torch.as_tensor(self.segments.settle)
-        time = torch.arange(self.segments.steps, dtype=torch.float64)
-        near = (time >= (start + low)[..., None]) & (time <= (settle + high)[..., None])
-        x, costs = x.clone(), []
-        for delay in grid:
-            self.per_segment(x)[..., 0] = delay
-            error = self.residual(x).norm(dim=-1)
-            costs.append((near * error[:, None]).sum(dim=-1))
-        best = torch.stack(costs).argmin(dim=0)
-        return grid[best] * torch.as_tensor(self.segments.valid)
 
     def noise(self, residual: Tensor) -> Noise:
         """Tukey's noise of every trajectory: its median residual in motion and at rest.

@@ -15,18 +15,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from retwin.checks import require
 from retwin.data.segments import Segments
 from retwin.errors import InputError
 from retwin.update.corrections.warp import gather_samples
 
 __all__ = ["SampledSensor"]
 
-LONGEST_PERIOD = 50
-"""Longest sampling period that is searched for, in time steps of the record."""
+LONGEST_PERIOD = 1000
+"""Longest sampling period that is searched for, in time steps of the record: it bounds the time
+that the search takes. Other limits are shares of the record."""
 FEWEST = 20
 """Fewest sampled values of a record from which their period is estimated."""
 PLAIN = 0.2
 """Largest bend at the next most bent phase, relative to that at the sampling phase."""
+ROUNDING = 1e-6
+"""Difference from a whole number of time steps that is only the rounding of numbers."""
 SMOOTH = 1e-6
 """Largest bend, in standard deviations of an output, that is only the rounding of numbers."""
 REGULAR, GROSS = 0.9, 30.0
@@ -41,81 +45,108 @@ class SampledSensor:
 
     Parameters
     ----------
-    every : int, optional
-        Sampling period in time steps, at least 1.
-    phases : tuple of int, optional
-        Time step of the first sampled value; where there are several, each trajectory has one of
-        them.
+    period : float, optional
+        Sampling period in seconds, a whole number of time steps.
+    phases : tuple of float, optional
+        Time of the first sampled value in seconds, from 0 to below the period; where there are
+        several, each trajectory has one of them.
     noise : tuple of tuple of float, optional
         Quantiles of an error at levels evenly from 0 to 1, per output in its unit. No shape of its
         distribution is assumed, since rounding may leave most values without any error.
     steps : tuple of float, optional
         Distance of the values that an output can take, per output; 0 for any value.
-    glitch_rate : float, optional
-        Share of sampled values that are glitches, 0 to 1.
+    glitch_probability : float, optional
+        Probability that a sampled value is a glitch, 0 to 1.
     glitch_size : tuple of float, optional
         Standard deviation of their errors, per output.
 
     Raises
     ------
     InputError
-        The period is below one time step, a phase is outside the first period, a size is negative,
-        quantiles do not rise, or the rate is outside 0 to 1.
+        The period is not positive, a phase is outside the first period, a size is negative,
+        quantiles do not rise, or the probability is outside 0 to 1.
 
     """
 
-    every: int | None = None
-    phases: tuple[int, ...] | None = None
+    period: float | None = None
+    phases: tuple[float, ...] | None = None
     noise: tuple[tuple[float, ...], ...] | None = None
     steps: tuple[float, ...] | None = None
-    glitch_rate: float | None = None
+    glitch_probability: float | None = None
     glitch_size: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         sizes = [*(self.steps or ()), *(self.glitch_size or ())]
-        every = self.every or 1
         sound = (
-            (self.every is None or self.every >= 1)
-            and (self.phases is None or (self.phases and self.every))
-            and all(0 <= phase < every for phase in self.phases or ())
+            (self.period is None or (self.period > 0 and np.isfinite(self.period)))
+            and (self.phases is None or (self.phases and self.period))
+            and all(0 <= phase < (self.period or 0.0) for phase in self.phases or ())
             and all(np.isfinite(size) and size >= 0 for size in sizes)
-            and 0 <= (self.glitch_rate or 0.0) <= 1
+            and 0 <= (self.glitch_probability or 0.0) <= 1
             and all(len(q) > 1 and sorted(q) == list(q) for q in self.noise or ())
         )
         if not sound:
             raise InputError(
                 "sensor",
-                expected="every of at least 1, phases from 0 to below every, finite sizes of at "
-                "least 0, rising quantiles and a rate from 0 to 1",
+                expected="a period in seconds above 0, phases from 0 to below it, finite sizes of "
+                "at least 0, rising quantiles and a probability from 0 to 1",
                 got=repr(self),
                 remedy="leave out what you do not know: it is fitted from data",
             )
 
-    def timed(self, observed: Tensor, mask: Tensor) -> SampledSensor:
+    def timing(self, rate: float) -> tuple[int, tuple[int, ...] | None]:
+        """Sampling period and phases in time steps at `rate` in Hz, where a period is given.
+
+        Raises
+        ------
+        InputError
+            No period is given, or it is no whole number of time steps.
+
+        """
+        if self.period is None:
+            raise InputError(
+                "sensor",
+                expected="one whose timing is known",
+                got=repr(self),
+                remedy="call timed or fitted first",
+            )
+        every = round(self.period * rate)
+        require(
+            every >= 1 and abs(self.period * rate - every) <= ROUNDING,
+            "sensor.period",
+            expected=f"a whole number of time steps of {1 / rate:g} s",
+            got=f"{self.period:g} s",
+            remedy="leave it out: it is fitted from data",
+        )
+        if self.phases is None:
+            return every, None
+        return every, tuple(round(phase * rate) % every for phase in self.phases)
+
+    def timed(self, observed: Tensor, mask: Tensor, rate: float) -> SampledSensor:
         """Period, phases and rounding as found in a record (n, T, d_y), where not given."""
-        if self.every is None:
+        if self.period is None:
             every, phases = _timing(observed, mask)
         else:
-            every = self.every
-            phases = self.phases or tuple(
-                sorted(set(_phases(_kinks(observed, mask, every)).tolist()))
+            every, given = self.timing(rate)
+            phases = given or tuple(
+                sorted(set(_phases(_kinks(_bends(observed, mask), every)).tolist()))
             )
-        made = replace(self, every=every, phases=self.phases or phases)
+        made = replace(self, period=every / rate, phases=tuple(each / rate for each in phases))
         if made.steps is not None:
             return made
-        sampled = observed[made.sample_mask(observed, mask).all(dim=-1)].double().numpy()
+        sampled = observed[made.sample_mask(observed, mask, rate).all(dim=-1)].double().numpy()
         return replace(made, steps=tuple(_step(values) for values in sampled.T))
 
     def fitted(
-        self, observed: Tensor, mask: Tensor, explained: Tensor, segments: Segments
+        self, observed: Tensor, mask: Tensor, explained: Tensor, segments: Segments, rate: float
     ) -> SampledSensor:
         """Everything that is not given, from a record and the outputs that explain it.
 
         Errors are measured where the system rests: in the second half of each steady part, about
         that part's median.
         """
-        made = self.timed(observed, mask)
-        errors = _at_rest(observed - explained, made.sample_mask(observed, mask), segments)
+        made = self.timed(observed, mask, rate)
+        errors = _at_rest(observed - explained, made.sample_mask(observed, mask, rate), segments)
         size = np.abs(errors)
         regular = np.quantile(size, REGULAR, axis=0) if len(errors) else np.zeros(errors.shape[1])
         gross = (size > GROSS * np.where(regular > 0, regular, np.inf)).any(axis=1)
@@ -124,7 +155,7 @@ class SampledSensor:
         strong = np.sqrt(np.square(errors[gross]).mean(axis=0)) if gross.any() else 0 * regular
         return made._filled(
             noise=tuple(tuple(np.quantile(each, LEVELS).tolist()) for each in plain.T),
-            glitch_rate=float(gross.mean()) if len(gross) else 0.0,
+            glitch_probability=float(gross.mean()) if len(gross) else 0.0,
             glitch_size=tuple(strong.tolist()),
         )
 
@@ -132,43 +163,35 @@ class SampledSensor:
         """Itself, with what was found where nothing was given."""
         return replace(self, **{k: v for k, v in found.items() if getattr(self, k) is None})
 
-    def sample_mask(self, observed: Tensor, mask: Tensor) -> Tensor:
+    def sample_mask(self, observed: Tensor, mask: Tensor, rate: float) -> Tensor:
         """`mask` (n, T, d_y) where a record was sampled; in between it has no information."""
-        if self.every is None:
-            raise InputError(
-                "sensor",
-                expected="one whose timing is known",
-                got=repr(self),
-                remedy="call timed or fitted first",
-            )
-        several = self.phases is None or len(self.phases) > 1
-        phase = (
-            _phases(_kinks(observed, mask, self.every))
-            if several
-            else torch.tensor(self.phases).expand(len(observed))
-        )
+        every, phases = self.timing(rate)
+        if phases is None or len(phases) > 1:
+            phase = _phases(_kinks(_bends(observed, mask), every))
+        else:
+            phase = torch.tensor(phases).expand(len(observed))
         time = torch.arange(observed.shape[1])
-        read = (time - phase[:, None]) % self.every == 0
+        read = (time - phase[:, None]) % every == 0
         return mask & (read & (time >= phase[:, None]))[..., None]
 
-    def read(self, outputs: Tensor, generator: torch.Generator) -> Tensor:
+    def read(self, outputs: Tensor, generator: torch.Generator, rate: float) -> Tensor:
         """The record of outputs (n, T, d_y); differentiable, rounding passed straight through."""
-        if self.every is None:
+        if self.period is None:
             return outputs
         steps = outputs.shape[1]
-        when = self.polls(len(outputs), steps, generator)
-        return self.record(gather_samples(outputs, when), when, steps, generator)
+        when = self.polls(len(outputs), steps, generator, rate)
+        return self.record(gather_samples(outputs, when), when, steps, generator, rate)
 
-    def polls(self, count: int, steps: int, generator: torch.Generator) -> Tensor:
+    def polls(self, count: int, steps: int, generator: torch.Generator, rate: float) -> Tensor:
         """Time steps (count, R) at which records of that length are sampled, within the record."""
-        every = self.every or 1
-        choice = torch.tensor(self.phases or range(every))
+        every, phases = self.timing(rate)
+        choice = torch.tensor(phases or range(every))
         phase = choice[torch.randint(len(choice), (count,), generator=generator)]
         samples = -(-steps // every)
         return (phase[:, None] + every * torch.arange(samples)).clamp_max(steps - 1)
 
     def record(
-        self, values: Tensor, when: Tensor, steps: int, generator: torch.Generator
+        self, values: Tensor, when: Tensor, steps: int, generator: torch.Generator, rate: float
     ) -> Tensor:
         """The record (n, steps, d_y) of outputs (n, R, d_y) at their `polls` (n, R)."""
         values = values + self._errors(values, generator)
@@ -176,7 +199,7 @@ class SampledSensor:
             step = values.new_tensor(self.steps)
             whole = torch.where(step > 0, step * (values / step.clamp_min(1e-30)).round(), values)
             values = values + (whole - values).detach()
-        every, phase = self.every or 1, when[:, :1]
+        every, phase = self.timing(rate)[0], when[:, :1]
         if every == 1:
             return values
         last = (steps - 1 - phase) // every
@@ -198,8 +221,8 @@ class SampledSensor:
                 place = level[..., j] * (len(quantile) - 1)
                 left = place.long().clamp_max(len(quantile) - 2)
                 error[..., j] = torch.lerp(quantile[left], quantile[left + 1], place - left)
-        if self.glitch_rate and self.glitch_size is not None:
-            hit = torch.rand(like.shape[:2], generator=generator) < self.glitch_rate
+        if self.glitch_probability and self.glitch_size is not None:
+            hit = torch.rand(like.shape[:2], generator=generator) < self.glitch_probability
             size = torch.randn(like.shape, generator=generator).to(like)
             error = error + hit[..., None] * like.new_tensor(self.glitch_size) * size
         return error
@@ -208,16 +231,17 @@ class SampledSensor:
 def _timing(observed: Tensor, mask: Tensor) -> tuple[int, tuple[int, ...]]:
     """Sampling period and phases: the longest period with plain kinks."""
     measured = int(mask.any(dim=-1).any(dim=0).sum())
+    bends = _bends(observed, mask)
     for every in range(min(LONGEST_PERIOD, measured // FEWEST), 1, -1):
-        kinks = _kinks(observed, mask, every)
+        kinks = _kinks(bends, every)
         plain = _plain(kinks)
         if 2 * plain.sum() > (kinks.amax(dim=1) > 0).sum():
             return every, tuple(sorted(set(_phases(kinks).tolist())))
     return 1, (0,)
 
 
-def _kinks(observed: Tensor, mask: Tensor, every: int) -> Tensor:
-    """Mean bend of a record at each phase, (n, every).
+def _bends(observed: Tensor, mask: Tensor) -> Tensor:
+    """How much a record (n, T, d_y) bends at each time step, (n, T); NaN where that is not known.
 
     A piecewise-linear record bends at sampled values only; a little elsewhere too, in motion, where
     outputs were computed from values after these had been joined.
@@ -227,10 +251,14 @@ def _kinks(observed: Tensor, mask: Tensor, every: int) -> Tensor:
     bend = torch.zeros_like(values)
     bend[:, 1:-1] = values[:, 2:] - 2 * values[:, 1:-1] + values[:, :-2]
     unit = values[seen].std(dim=0).clamp_min(1e-12) if seen.any() else 1.0
-    whole_bend = torch.zeros_like(seen)
-    whole_bend[:, 1:-1] = seen[:, 2:] & seen[:, 1:-1] & seen[:, :-2]
-    size = torch.where(whole_bend, (bend / unit).norm(dim=-1), torch.nan)
-    whole = nn.functional.pad(size, (0, -size.shape[1] % every), value=torch.nan)
+    known = torch.zeros_like(seen)
+    known[:, 1:-1] = seen[:, 2:] & seen[:, 1:-1] & seen[:, :-2]
+    return torch.where(known, (bend / unit).norm(dim=-1), torch.nan)
+
+
+def _kinks(bends: Tensor, every: int) -> Tensor:
+    """Mean bend (n, every) of a record at each phase."""
+    whole = nn.functional.pad(bends, (0, -bends.shape[1] % every), value=torch.nan)
     return whole.unflatten(1, (-1, every)).nanmean(dim=1).nan_to_num(0.0)
 
 

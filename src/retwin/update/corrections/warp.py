@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from retwin.data.segments import Segments
 
-__all__ = ["Knots", "gather_samples", "interpolate"]
+__all__ = ["Knots", "gather_samples", "interpolate", "within"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,3 +106,10 @@ def interpolate(path: Tensor, times: Tensor) -> Tensor:
     below = times.detach().floor().long().clamp_max(max(path.shape[1] - 2, 0))
     before, after = gather_samples(path, below), gather_samples(path, below + 1)
     return before + (times - below)[..., None] * (after - before)
+
+
+def within(samples: Tensor, begin: Tensor | NDArray, end: Tensor | NDArray) -> Tensor:
+    """Whether samples (S,) or (n, S) are from `begin` to `end` (n, M), ends included: (n, M, S)."""
+    begin, end = (torch.as_tensor(each)[..., None] for each in (begin, end))
+    here = samples[..., None, :]
+    return (here >= begin) & (here <= end)

@@ -25,9 +25,10 @@ from retwin.update.corrections import (
     Correction,
     DelayOffset,
     Discrepancy,
-    fit_sensor,
+    fit_correction,
     sample_mask,
 )
+from retwin.update.corrections.delay_range import bound_note
 from retwin.update.residual.model import ResidualModel, segment
 from retwin.update.residual.penalties import checked_bounds, penalties
 from retwin.update.residual.refining import refine
@@ -180,7 +181,7 @@ def fit_residual(
         remedy="give segments='path', or the segments themselves",
     )
     context = _context(surrogate, used, parts, faults)
-    correction, found = fit_sensor(correction, context, *_measured(used))
+    correction, found = fit_correction(correction, context, *_measured(used))
     require(
         found.identified.any(),
         "calibration",
@@ -211,9 +212,12 @@ def fit_residual(
     if targets.posterior:
         model.persistence.copy_(targets.persistence(model))
     figures = {"trajectories": float(len(used)), "movements": float(parts.valid.sum())}
+    if found.at_bound is not None:
+        figures["delays_at_bound"] = share = float(found.at_bound.double()[parts.valid].mean())
+        result = replace(result, reason="; ".join(filter(None, [result.reason, bound_note(share)])))
     if density.refinement is not None and held_out is not None:
         observed, mask = _measured(used)
-        sampled = sample_mask(correction, observed, mask)
+        sampled = sample_mask(correction, observed, mask, used.rate)
         figures |= refine(
             model, context, observed, sampled, fitted=fitted, held_out=held_out,
             how=density.refinement, seed=seed, progress=progress,

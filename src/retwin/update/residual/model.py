@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retwin.catalog import CORRECTIONS, DENSITIES, classes
+from retwin.catalog import DENSITIES, classes
 from retwin.checks import one_of, require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
@@ -22,6 +22,7 @@ from retwin.nets.training import Fit
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.update.corrections import Context, Correction
+from retwin.update.residual.former import read_correction, written_correction
 from retwin.update.residual.settings import Density
 from retwin.update.surrogate import Surrogate
 
@@ -177,7 +178,7 @@ class ResidualModel(nn.Module):
     def save(self, folder: str | Path) -> None:
         """Write the weights and the description, see `retwin.serialisation.models`."""
         about = {
-            "correction": to_config(self.correction, classes(CORRECTIONS)),
+            **written_correction(self.correction),
             "density": to_config(self.density, classes(DENSITIES, Density)),
             "inputs": vars(self.inputs),
             "outputs": vars(self.outputs),
@@ -190,14 +191,14 @@ class ResidualModel(nn.Module):
             pass
 
     @classmethod
-    def load(cls, folder: str | Path) -> ResidualModel:
-        """Read what `save` wrote.
+    def load(cls, folder: str | Path, rate: float | None = None) -> ResidualModel:
+        """Read what `save` wrote; `rate` in Hz is for files from before version 0.1.0 only.
 
         Raises InputError if the folder holds no residual model or is damaged.
         """
         about, weights = read_model(folder, "residual")
         model = cls(
-            from_config(about["correction"], classes(CORRECTIONS)),
+            read_correction(about, rate),
             from_config(about["density"], classes(DENSITIES, Density)),
             inputs=Channels.of(about["inputs"]),
             outputs=Channels.of(about["outputs"]),

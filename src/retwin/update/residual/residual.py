@@ -69,9 +69,11 @@ class Residual(Protocol):
         ...
 
 
-def load_residual(folder: str | Path) -> ResidualModel | SequenceResidual:
+def load_residual(
+    folder: str | Path, rate: float | None = None
+) -> ResidualModel | SequenceResidual:
     """The residual model that `folder` holds, of either kind; InputError if it holds none."""
     with refusing(folder, expected="a residual model"):
         if kind_of(folder) == "sequence residual":
-            return SequenceResidual.load(folder)
-        return ResidualModel.load(folder)
+            return SequenceResidual.load(folder, rate)
+        return ResidualModel.load(folder, rate)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from torch import Tensor, nn
 
-from retwin.catalog import CORRECTIONS, NETWORKS, classes
+from retwin.catalog import NETWORKS, classes
 from retwin.checks import require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
@@ -29,6 +29,7 @@ from retwin.nets.training import Fit, Training
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.update.corrections import Context, Correction
+from retwin.update.residual.former import read_correction, written_correction
 from retwin.update.surrogate import Surrogate
 
 __all__ = ["Member", "SequenceMixture", "SequenceResidual", "past", "shrunk", "widened"]
@@ -301,7 +302,7 @@ class SequenceResidual(nn.Module):
     def save(self, folder: str | Path) -> None:
         """Write the weights and the description, see `retwin.serialisation.models`."""
         about = {
-            "correction": to_config(self.correction, classes(CORRECTIONS)),
+            **written_correction(self.correction),
             "density": to_config(self.density, (SequenceMixture, *classes(NETWORKS))),
             "inputs": vars(self.inputs),
             "outputs": vars(self.outputs),
@@ -312,14 +313,14 @@ class SequenceResidual(nn.Module):
             pass
 
     @classmethod
-    def load(cls, folder: str | Path) -> SequenceResidual:
-        """Read what `save` wrote.
+    def load(cls, folder: str | Path, rate: float | None = None) -> SequenceResidual:
+        """Read what `save` wrote; `rate` in Hz is for files from before version 0.1.0 only.
 
         Raises InputError if the folder holds no such model or is damaged.
         """
         about, weights = read_model(folder, "sequence residual")
         model = cls(
-            from_config(about["correction"], classes(CORRECTIONS)),
+            read_correction(about, rate),
             from_config(about["density"], (SequenceMixture, *classes(NETWORKS))),
             inputs=Channels.of(about["inputs"]),
             outputs=Channels.of(about["outputs"]),
