@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from retwin.data.segments import Segments
+from retwin.inference.noise import Noise
 from retwin.inference.solver import Bounds
 from retwin.update.corrections.correction import Context, DifferentiableTwin
 from retwin.update.corrections.delays import delay_bounds
@@ -18,18 +19,23 @@ from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.warp import gather_samples, interpolate, within
 from retwin.update.piecewise_linear import distinct
 
-__all__ = ["EFFECTIVE_SAMPLES", "CommandProblem"]
+__all__ = ["CommandProblem"]
 
 SURROGATE_STEP = 0.05
-"""Step of finite differences through a surrogate with memory, in samples and in the commands'
-units: larger than the rounding of single precision."""
+"""Step of finite differences of delays through a surrogate with memory, in samples: larger than the
+rounding of single precision."""
 COMMAND_STEP = 1e-4
 """Step of finite differences through the effective commands, which are piecewise linear in x."""
 SETTLING = 15
 """Samples after the end of a command's ramp in which an output may still be in motion."""
-EFFECTIVE_SAMPLES = (6.0, 1.0)
-"""Largest effective sample size of a segment's part at rest and in motion: rounding and friction
-are common to all its samples."""
+COMMON_ERROR = (0.25, 1.0)
+"""Variance of the error that all samples of a segment have in common, at rest and in motion,
+relative to that of one sample. Outputs cannot tell it from an offset, so it is no estimate. At rest
+it is what rounding leaves, on average over sensors whose noise is a tenth to a quarter of their
+resolution. In motion a deviation from the commanded course, by a dead zone or by play, lasts as
+long as the motion."""
+GAIN_STEP = 5e-3
+"""Step of the finite differences of the gain, in standard deviations of a command."""
 TRAJECTORIES_PER_BATCH = 64
 """Trajectories linearised together, which bounds memory."""
 COMMON = ("surrogate", "unit", "delay_range")
@@ -75,6 +81,9 @@ class CommandProblem:
         (n, M, d_u), 1 where an actuator missed a segment.
     delay_range : tuple of float
         Smallest and largest delay, in samples.
+    whitening : Tensor, optional
+        (n, S, d_y, d_y), the factor by which residuals and Jacobians are multiplied, so that the
+        errors of a sample's outputs are independent and of one size.
 
     """
 
@@ -92,6 +101,7 @@ class CommandProblem:
     faulty: Tensor
     missed: Tensor
     delay_range: tuple[float, float]
+    whitening: Tensor | None = None
 
     @classmethod
     def of(
@@ -142,7 +152,11 @@ class CommandProblem:
     def __getitem__(self, rows: Tensor) -> CommandProblem:
         """The problem of some trajectories."""
         own = {each.name: getattr(self, each.name) for each in fields(self)}
-        parts = {name: value[rows] for name, value in own.items() if name not in COMMON}
+        parts = {
+            name: value[rows]
+            for name, value in own.items()
+            if name not in COMMON and value is not None
+        }
         return replace(self, **parts)
 
     def with_missed(self, missed: Tensor) -> CommandProblem:
@@ -178,9 +192,22 @@ class CommandProblem:
         return x.unflatten(1, (self.missed.shape[1], -1))
 
     @property
-    def max_effective(self) -> Tensor:
-        """Largest effective sample size (2,) at rest and in motion of all trajectories together."""
-        return torch.tensor(EFFECTIVE_SAMPLES, dtype=torch.float64) * self.valid.sum().clamp_min(1)
+    def unwhitened(self) -> CommandProblem:
+        """The same with residuals as they are."""
+        return replace(self, whitening=None)
+
+    def learned_noise(
+        self, noise: Noise, residual: Tensor, variance: Tensor | float = 0.0, floor: float = 1e-18
+    ) -> Noise:
+        """The noise at rest and in motion, see `Noise.learned`: a block of samples is a segment."""
+        return noise.learned(
+            self,
+            residual,
+            common=torch.tensor(COMMON_ERROR, dtype=torch.float64),
+            blocks=max(1.0, float(self.valid.sum())),
+            variance=variance,
+            floor=floor,
+        )
 
     @property
     def inside(self) -> Tensor:
@@ -212,20 +239,25 @@ class CommandProblem:
     @torch.no_grad()
     def residual(self, x: Tensor) -> Tensor:
         """Measured minus predicted outputs (n, S, d_y) for x (n, P), in `unit`."""
-        return torch.cat([part._residual(some) for part, some in self._batches(x)])
+        return torch.cat([part._white(part._residual(some)) for part, some in self._batches(x)])
 
     @torch.no_grad()
     def linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residual, and the Jacobian (n, S, d_y, P) of the predicted outputs."""
-        parts = [part._linearised(some) for part, some in self._batches(x)]
+        parts = [map(part._white, part._linearised(some)) for part, some in self._batches(x)]
         residual, jacobian = zip(*parts, strict=True)
         return torch.cat(residual), torch.cat(jacobian)
 
     @torch.no_grad()
     def actuator_delay_jacobian(self, x: Tensor) -> Tensor:
         """Jacobian (n, S, d_y, M d_u) of the outputs by a delay of every actuator of its own."""
-        parts = [part._actuator_delay_jacobian(some) for part, some in self._batches(x)]
-        return torch.cat(parts)
+        parts = self._batches(x)
+        return torch.cat([part._white(part._actuator_delay_jacobian(some)) for part, some in parts])
+
+    @torch.no_grad()
+    def gain(self) -> Tensor:
+        """Change (n, S, d_y, d_u) of the outputs, in `unit`, by a constant change of a command."""
+        return torch.cat([part._gain() for part, _ in self._batches(self.zero)])
 
     @property
     def _times(self) -> Tensor:
@@ -241,6 +273,32 @@ class CommandProblem:
         for rows in torch.arange(len(self)).split(TRAJECTORIES_PER_BATCH):
             yield self[rows], x[rows]
 
+    def _white(self, values: Tensor) -> Tensor:
+        """Values (n, S, d_y) or (n, S, d_y, P) times `whitening`."""
+        if self.whitening is None:
+            return values
+        return (self.whitening @ values.reshape(*values.shape[:3], -1)).view_as(values)
+
+    def _gain(self) -> Tensor:
+        commands = self.commands(self.zero)
+        columns = []
+        for actuator, step in enumerate((GAIN_STEP * self.spread).tolist()):
+            ends = []
+            for move in (-step, step):
+                moved = commands.clone()
+                moved[..., actuator] += move
+                ends.append(self.predicted(moved).double())
+            columns.append((ends[1] - ends[0]) / (2 * step))
+        return torch.stack(columns, dim=-1) / self.unit[:, None]
+
+    @property
+    def spread(self) -> Tensor:
+        """Standard deviation (d_u,) of the commands; of those that never change, their size."""
+        flat = self.reference.flatten(0, 1)
+        spread, size = flat.std(dim=0, correction=0), flat.abs().amax(dim=0)
+        constant = spread <= 1e-9 * size
+        return torch.where(constant, torch.where(size > 0, size, 1.0), spread)
+
     def _residual(self, x: Tensor) -> Tensor:
         commands = self.commands(x)
         if self.memory:
@@ -251,11 +309,9 @@ class CommandProblem:
     def _linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if self.memory:
             residual = self._residual(x)
-            moved = [
-                self._residual(x + SURROGATE_STEP * each)
-                for each in torch.eye(x.shape[1], dtype=x.dtype)
-            ]
-            columns = [(residual - each) / SURROGATE_STEP for each in moved]
+            step = torch.cat([torch.tensor([SURROGATE_STEP]), GAIN_STEP * self.spread])
+            moves = torch.diag(step.to(x).repeat(self.missed.shape[1]))
+            columns = [(residual - self._residual(x + each)) / each.sum() for each in moves]
             return residual, torch.stack(columns, dim=-1)
         # Without memory the chain rule is local: the surrogate's Jacobian, sample by sample.
         residual, by_command = self._by_command(x)

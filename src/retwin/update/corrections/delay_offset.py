@@ -16,7 +16,7 @@ from retwin.data.trajectories import Channels
 from retwin.inference.em import expectation_maximisation
 from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
-from retwin.inference.solver import Solution, solve
+from retwin.inference.solver import Solution, blocks, solve
 from retwin.update.corrections.correction import Context, Discrepancy, Head
 from retwin.update.corrections.delays import delay_bounds, first_delays
 from retwin.update.corrections.path_problem import MAX_STEP, PathProblem, path_at
@@ -137,7 +137,7 @@ class DelayOffset:
     ) -> Discrepancy:
         """z, each segment's covariance, and which components the outputs identify."""
         z = problem.per_segment(solution.x)
-        covariance = solution.blocks(z.shape[1])
+        covariance = blocks(solution.covariance, z.shape[1])
         deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
         wide = problem.per_segment(prior.deviation)
         low, high = self.delay_range
