@@ -20,7 +20,6 @@ from retwin.inference.em import expectation_maximisation
 from retwin.inference.hierarchy import Hierarchy
 from retwin.inference.noise import Noise
 from retwin.inference.solver import Solution, blocks
-from retwin.update.corrections.command_delays import delay_variance
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.correction import Context, Discrepancy, block_diagonal
 from retwin.update.corrections.delays import first_delays
@@ -70,6 +69,7 @@ def infer_commands(
     problem = CommandProblem.of(
         context, observed, mask, delay_range=delay_range, max_samples=max_samples
     )
+    problem = replace(problem, own_delays=True)
     if not problem.valid.shape[1]:
         return _empty(problem)
     start = problem.zero
@@ -133,8 +133,9 @@ def _suspects(
     outliers; then every actuator that was to move is. What is missed may always turn out not to be.
     """
     part, x = problem[rows].with_missed(fit.missed[rows]), fit.x[rows]
-    width = part.per_segment(prior.gaussian.deviation[rows])[..., 1:]
-    away = part.per_segment(x - prior.gaussian.mean[rows])[..., 1:]
+    offsets = slice(1, 1 + part.missed.shape[2])
+    width = part.per_segment(prior.gaussian.deviation[rows])[..., offsets]
+    away = part.per_segment(x - prior.gaussian.mean[rows])[..., offsets]
     far = (away.abs() > SUSPECT * width) & part.healthy
     outlying = noise.square(part, part.residual(x)) > OUTLYING**2
     share = (part.inside * outlying[:, None]).sum(dim=-1) / part.inside.sum(dim=-1).clamp_min(1)
@@ -169,7 +170,7 @@ class _Belief:
         design = features.design(problem)
         coefficients = torch.zeros(len(design.owner), dtype=torch.float64)
         coefficients[0] = delay.median()
-        variance = torch.cat([jitter[None], offset]).square()
+        variance = torch.cat([jitter[None], offset, jitter[None]]).square()
         one = torch.ones(2, dtype=torch.float64)
         return cls(
             features,
@@ -196,8 +197,8 @@ class _Belief:
         missed = (problem.missed * problem.healthy).sum()
         # Offsets are expected to be a share of what the actuators travel, the same for all.
         spread, variance = self.features.spread.square(), self.hierarchy.variance
-        share = (variance[1:] / spread).mean()
-        expected = torch.cat([variance.new_tensor([DELAY_VARIANCE]), share * spread])
+        share, delay = (variance[1:-1] / spread).mean(), variance.new_tensor([DELAY_VARIANCE])
+        expected = torch.cat([delay, share * spread, delay])
         return _Belief(
             self.features,
             self.hierarchy.learned(self.features.design(problem), solution, expected),
@@ -223,29 +224,45 @@ def _discrepancy(
     identified_below: float,
 ) -> Discrepancy:
     """z*, each segment's covariance, and which components the outputs identify."""
-    x, missed = problem.per_segment(solution.x), problem.missed
+    missed, segments = problem.missed, problem.missed.shape[1]
     prior, design = belief.prior(problem).gaussian, belief.features.design(problem)
-    inner = blocks(belief.hierarchy.posterior_covariance(design, solution), x.shape[1])
-    wide = problem.per_segment(prior.deviation.square())
-    left = inner.diagonal(dim1=-2, dim2=-1) / wide
-    mean = problem.per_segment(prior.mean)
+    common = _common(problem)
+    x, mean = (
+        (common @ problem.per_segment(each)[..., None])[..., 0]
+        for each in (solution.x, prior.mean)
+    )
+    inner, wide = (
+        common @ blocks(each, segments) @ common.mT
+        for each in (belief.hierarchy.posterior_covariance(design, solution), prior.covariance)
+    )
+    left, wide = inner.diagonal(dim1=-2, dim2=-1), wide.diagonal(dim1=-2, dim2=-1)
     severity = torch.where(problem.faulty, (x - mean)[..., 1:], 0.0)
     # Under a fault nothing was learned of the discrepancy: the prior stands.
     learned = torch.cat([problem.valid[..., None], problem.healthy], dim=-1).double()
-    healthy = belief.hierarchy.variance[1:].expand_as(severity)
-    own = torch.cat([wide[..., :1], healthy], dim=-1)
+    known = (left < identified_below * wide) & (learned > 0)
+    known[..., 1:] &= missed < 0.5
+    own = torch.cat(
+        [wide[..., :1], belief.hierarchy.variance[1:-1].expand_as(severity)], dim=-1
+    )
     inner = inner * learned[..., None] * learned[..., None, :]
     inner = inner + torch.diag_embed(own * (1 - learned))
-    # Offsets stay as they are, and as much correlated with the delay.
-    delays = delay_variance(problem, prior, belief.noise, solution.x)
-    stretch = torch.ones_like(wide)
-    stretch[..., 0] = (delays / inner[..., 0, 0]).sqrt()
-    inner = inner * stretch[..., None] * stretch[..., None, :]
     covariance = block_diagonal(inner, torch.diag_embed(probability * (1 - probability)))
-    known = (left < identified_below) & (learned > 0)
-    known[..., 1:] &= missed < 0.5
     seen = problem.inside.any(dim=-1)[..., None] & problem.healthy
     identified = torch.cat([known, seen], dim=-1) & problem.valid[..., None]
     z = torch.cat([torch.where(learned > 0, x, mean), missed], dim=-1) * problem.valid[..., None]
     noise = (belief.noise.scale[0, 0] * problem.unit.mean()).expand(len(x))
     return Discrepancy(z, covariance, identified, noise, severity=severity, posterior=True)
+
+
+def _common(problem: CommandProblem) -> Tensor:
+    """The matrices (n, M, 1 + d_u, P / M) from x to one delay and the offsets of each segment.
+
+    The delay of a segment is the mean of its actuators' delays, weighted as least squares weights
+    them: by the square of the distance, in standard deviations of the commands.
+    """
+    n, segments, width = problem.missed.shape
+    weight = (problem.distance / problem.spread).square()
+    weight = weight / weight.sum(dim=-1, keepdim=True).clamp_min(1e-12)
+    matrix = torch.eye(1 + width, problem.size, dtype=weight.dtype).repeat(n, segments, 1, 1)
+    matrix[:, :, 0, 1 + width :] = weight
+    return matrix

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
@@ -28,17 +27,15 @@ COMMAND_STEP = 1e-4
 """Step of finite differences through the effective commands, which are piecewise linear in x."""
 SETTLING = 15
 """Samples after the end of a command's ramp in which an output may still be in motion."""
-COMMON_ERROR = (0.25, 1.0)
-"""Variance of the error that all samples of a segment have in common, at rest and in motion,
-relative to that of one sample. Outputs cannot tell it from an offset, so it is no estimate. At rest
-it is what rounding leaves, on average over sensors whose noise is a tenth to a quarter of their
-resolution. In motion a deviation from the commanded course, by a dead zone or by play, lasts as
-long as the motion."""
+COMMON_ERROR = 0.25
+"""Variance of the error that all samples of a segment have in common, relative to that of one
+sample: what rounding leaves, on average over sensors whose noise is a tenth to a quarter of their
+resolution. Outputs cannot tell it from an offset, so it is no estimate."""
 GAIN_STEP = 5e-3
 """Step of the finite differences of the gain, in standard deviations of a command."""
 TRAJECTORIES_PER_BATCH = 64
 """Trajectories linearised together, which bounds memory."""
-COMMON = ("surrogate", "unit", "delay_range")
+COMMON = ("surrogate", "unit", "delay_range", "own_delays")
 """Fields of `CommandProblem` that all trajectories share."""
 
 
@@ -46,7 +43,8 @@ COMMON = ("surrogate", "unit", "delay_range")
 class CommandProblem:
     """Residual and Jacobian for x = (delay, offsets) of every segment, given what was missed.
 
-    The engine's rows are trajectories, its latent variables x (n, P), P = M (1 + d_u).
+    The engine's rows are trajectories, its latent variables x (n, P), P = M (1 + d_u). With
+    `own_delays` they end in one more delay for every actuator, P = M (1 + 2 d_u).
 
     Attributes
     ----------
@@ -84,6 +82,8 @@ class CommandProblem:
     whitening : Tensor, optional
         (n, S, d_y, d_y), the factor by which residuals and Jacobians are multiplied, so that the
         errors of a sample's outputs are independent and of one size.
+    own_delays : bool
+        Whether every actuator has a delay of its own besides the common one.
 
     """
 
@@ -102,6 +102,7 @@ class CommandProblem:
     missed: Tensor
     delay_range: tuple[float, float]
     whitening: Tensor | None = None
+    own_delays: bool = False
 
     @classmethod
     def of(
@@ -179,16 +180,21 @@ class CommandProblem:
     @property
     def zero(self) -> Tensor:
         """The x (n, P) of trajectories without any discrepancy."""
-        n, segments, width = self.missed.shape
-        return self.observed.new_zeros(n, segments * (1 + width))
+        n, segments, _ = self.missed.shape
+        return self.observed.new_zeros(n, segments * self.size)
+
+    @property
+    def size(self) -> int:
+        """Latent variables per segment."""
+        return 1 + (1 + self.own_delays) * self.missed.shape[2]
 
     @property
     def bounds(self) -> Bounds:
         """The delay range as limits of x."""
-        return delay_bounds(self.segments, 1 + self.missed.shape[2], self.delay_range)
+        return delay_bounds(self.segments, self.size, self.delay_range)
 
     def per_segment(self, x: Tensor) -> Tensor:
-        """Values (n, P) or (n, P, …) by segment, (n, M, 1 + d_u, …)."""
+        """Values (n, P) or (n, P, …) by segment, (n, M, P / M, …)."""
         return x.unflatten(1, (self.missed.shape[1], -1))
 
     @property
@@ -203,7 +209,7 @@ class CommandProblem:
         return noise.learned(
             self,
             residual,
-            common=torch.tensor(COMMON_ERROR, dtype=torch.float64),
+            common=COMMON_ERROR,
             blocks=max(1.0, float(self.valid.sum())),
             variance=variance,
             floor=floor,
@@ -226,10 +232,7 @@ class CommandProblem:
 
     def commands(self, x: Tensor) -> Tensor:
         """Effective commands, single precision, at `sample`; with memory, at every sample."""
-        z = torch.cat([self.per_segment(x), self.missed], dim=-1)
-        return effective_commands(
-            self.reference, self.segments, z, self._times, self.frozen
-        ).float()
+        return self._effective(self.per_segment(x), torch.arange(len(self))).float()
 
     def predicted(self, commands: Tensor) -> Tensor:
         """The surrogate's outputs (n, S, d_y) at `sample` for such commands."""
@@ -247,12 +250,6 @@ class CommandProblem:
         parts = [map(part._white, part._linearised(some)) for part, some in self._batches(x)]
         residual, jacobian = zip(*parts, strict=True)
         return torch.cat(residual), torch.cat(jacobian)
-
-    @torch.no_grad()
-    def actuator_delay_jacobian(self, x: Tensor) -> Tensor:
-        """Jacobian (n, S, d_y, M d_u) of the outputs by a delay of every actuator of its own."""
-        parts = self._batches(x)
-        return torch.cat([part._white(part._actuator_delay_jacobian(some)) for part, some in parts])
 
     @torch.no_grad()
     def gain(self) -> Tensor:
@@ -309,7 +306,8 @@ class CommandProblem:
     def _linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if self.memory:
             residual = self._residual(x)
-            step = torch.cat([torch.tensor([SURROGATE_STEP]), GAIN_STEP * self.spread])
+            delay = torch.full((self.size - len(self.spread),), SURROGATE_STEP)
+            step = torch.cat([delay[:1], GAIN_STEP * self.spread, delay[1:]])
             moves = torch.diag(step.to(x).repeat(self.missed.shape[1]))
             columns = [(residual - self._residual(x + each)) / each.sum() for each in moves]
             return residual, torch.stack(columns, dim=-1)
@@ -318,7 +316,10 @@ class CommandProblem:
         delay, offset = self._command_jacobians(x)
         by_delay = torch.einsum("nsyu,nmsu->nsym", by_command, delay)[..., None]
         by_offset = torch.einsum("nsyu,nmsu->nsymu", by_command, offset)
-        return residual, torch.cat([by_delay, by_offset], dim=-1).flatten(3)
+        parts = [by_delay, by_offset]
+        if self.own_delays:
+            parts.append(torch.einsum("nsyu,nmsu->nsymu", by_command, delay))
+        return residual, torch.cat(parts, dim=-1).flatten(3)
 
     def _by_command(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residual (n, S, d_y), and the surrogate's Jacobian (n, S, d_y, d_u)."""
@@ -333,42 +334,34 @@ class CommandProblem:
         jacobian = torch.cat(rows).movedim(0, 1)[place].double() / self.unit[..., None]
         return self.observed - outputs.detach()[0, place].double() / self.unit, jacobian
 
-    def _actuator_delay_jacobian(self, x: Tensor) -> Tensor:
-        delay = self._command_jacobians(x)[0]
-        if not self.memory:
-            by_command = self._by_command(x)[1]
-            return torch.einsum("nsyu,nmsu->nsymu", by_command, delay).flatten(3)
-        commands = self.commands(x)
-        outputs = self.predicted(commands)
-        columns = []
-        for segment, actuator in itertools.product(*map(range, self.missed.shape[1:])):
-            moved = commands.clone()
-            moved[..., actuator] += (SURROGATE_STEP * delay[:, segment, :, actuator]).to(moved)
-            columns.append((self.predicted(moved) - outputs).double() / SURROGATE_STEP)
-        return torch.stack(columns, dim=-1) / self.unit[..., None]
-
     def _command_jacobians(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Jacobians (n, M, S, d_u) of the commands by each segment's delay, and by its offsets.
 
         An actuator's command depends on its own offset only, so all are moved at once.
         """
         n, segments, width = self.missed.shape
-        step = torch.zeros(2, segments, segments, 1 + width, dtype=x.dtype)
+        step = torch.zeros(2, segments, segments, self.size, dtype=x.dtype)
         index = torch.arange(segments)
         step[0, index, index, 0] = COMMAND_STEP
-        step[1, index, index, 1:] = COMMAND_STEP
+        step[1, index, index, 1 : 1 + width] = COMMAND_STEP
         moves = torch.cat([torch.zeros_like(step[0, :1]), step.flatten(0, 1)])
         rows = torch.arange(n).repeat_interleave(len(moves))
         x = (self.per_segment(x)[:, None] + moves).flatten(0, 1)
-        commands = effective_commands(
-            self.reference,
-            self.segments[rows.numpy()],
-            torch.cat([x, self.missed[rows]], dim=-1),
-            self._times[rows],
-            self.frozen[rows],
-        ).unflatten(0, (n, len(moves)))
+        commands = self._effective(x, rows).unflatten(0, (n, len(moves)))
         delay, offset = ((commands[:, 1:] - commands[:, :1]) / COMMAND_STEP).split(segments, dim=1)
         return delay, offset
+
+    def _effective(self, x: Tensor, rows: Tensor) -> Tensor:
+        """Effective commands for x (k, M, size) of the trajectories `rows` (k,), in order."""
+        common, own = x.split([1 + self.missed.shape[2], self.size - 1 - self.missed.shape[2]], -1)
+        return effective_commands(
+            self.reference,
+            self.segments[rows.numpy()],
+            torch.cat([common, self.missed[rows]], dim=-1),
+            self._times[rows],
+            self.frozen[rows],
+            own if self.own_delays else None,
+        )
 
 
 def _unit(context: Context, measured: Tensor) -> Tensor:

@@ -55,35 +55,49 @@ class OffsetFeatures:
     def design(self, problem: CommandProblem) -> Design:
         """The regression of x on a common delay, and on the features of the offsets.
 
-        Group 0 are the delays, group 1 + u the offsets of actuator u.
+        Group 0 are the common delays, group 1 + u the offsets of actuator u, and the last group
+        what the delays of the actuators differ.
         """
         n, segments, width = problem.missed.shape
         own = self._features(problem)
         count = own.shape[-1]
-        features = own.new_zeros(n, segments, 1 + width, 1 + width * count)
+        features = own.new_zeros(n, segments, problem.size, 1 + width * count)
         features[:, :, 0, 0] = 1.0
         for u in range(width):
             features[:, :, 1 + u, 1 + u * count : 1 + (u + 1) * count] = own[:, :, u]
         # Where a fault bends the reference, nothing is known of its severity.
-        wider = torch.where(problem.faulty, WIDE, 1.0).double()
-        used = (problem.healthy & (problem.missed < 0.5)).double()
+        wider = features.new_ones(n, segments, problem.size)
+        wider[:, :, 1 : 1 + width] = torch.where(problem.faulty, WIDE, 1.0)
+        moved = problem.healthy & (problem.missed < 0.5)
+        used = torch.zeros_like(wider)
+        used[:, :, 0] = problem.valid
+        used[:, :, 1 : 1 + width] = moved
+        used[:, :, 1 + width :] = (moved & (self._direction(problem) != 0)).repeat(
+            1, 1, int(problem.own_delays)
+        )
         actuators = torch.arange(1, 1 + width)
-        zero = torch.zeros(1, dtype=torch.long)
+        zero, last = torch.tensor([0]), torch.tensor([1 + width])
+        group = torch.cat([zero, actuators, last.expand(problem.size - 1 - width)])
         return Design(
             features.flatten(1, 2),
-            group=torch.cat([zero, actuators]).repeat(segments),
-            wider=torch.cat([torch.ones_like(wider[..., :1]), wider], dim=-1).flatten(1),
-            used=torch.cat([problem.valid[..., None].double(), used], dim=-1).flatten(1),
+            group=group.repeat(segments),
+            wider=wider.flatten(1),
+            used=used.flatten(1),
             owner=torch.cat([zero, actuators.repeat_interleave(count)]),
             kind=torch.cat([zero, torch.arange(1, 1 + count).repeat(width)]),
         )
+
+    def _direction(self, problem: CommandProblem) -> Tensor:
+        """Sign (n, M, d_u) of each actuator's motion, 0 where it stands still."""
+        first, last = _ends(problem)
+        size = problem.reference.abs().amax(dim=(0, 1))
+        return (last - first).sign() * ((last - first).abs() > STILL * size)
 
     def _features(self, problem: CommandProblem) -> Tensor:
         """(n, M, d_u, F), those of every actuator's offset."""
         first, last = _ends(problem)
         distance, width = last - first, last.shape[-1]
-        size = problem.reference.abs().amax(dim=(0, 1))
-        direction = distance.sign() * (distance.abs() > STILL * size)
+        direction = self._direction(problem)
         own = torch.stack([torch.ones_like(last), direction, distance / self.travel], dim=-1)
         pose = (last - self.centre) / self.spread
         if width * (OWN_FEATURES + width) > MAX_COEFFICIENTS:
