@@ -57,9 +57,7 @@ def fitted_noise(problem: CommandProblem, prior: LatentPrior, *, rounds: int) ->
     def learn(fit: Fit, noise: Noise) -> Noise:
         residual, jacobian = problem.with_missed(fit.missed).linearised(fit.x)
         variance = predicted_variance(jacobian, fit.solution.covariance)
-        return noise.learned(
-            problem, residual, max_effective=problem.max_effective, variance=variance
-        )
+        return problem.learned_noise(noise, residual, variance)
 
     _, noise = expectation_maximisation(
         Fit.of_prior(problem, prior, start),

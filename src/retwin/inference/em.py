@@ -18,6 +18,7 @@ def expectation_maximisation(
     infer: Callable[[State, Hyper], State],
     learn: Callable[[State, Hyper], Hyper],
     rounds: int,
+    converged: Callable[[Hyper, Hyper], bool] | None = None,
 ) -> tuple[State, Hyper]:
     """Type-II maximum likelihood of hyperparameters (empirical Bayes).
 
@@ -30,7 +31,9 @@ def expectation_maximisation(
     learn : callable
         The most probable hyperparameters for some latent variables, from the previous ones on.
     rounds : int
-        Times that both are done.
+        Times that both are done, at most.
+    converged : callable, optional
+        Whether hyperparameters are near enough to the previous ones to end.
 
     References
     ----------
@@ -39,5 +42,7 @@ def expectation_maximisation(
     """
     for _ in range(rounds):
         state = infer(state, hyper)
-        hyper = learn(state, hyper)
+        previous, hyper = hyper, learn(state, hyper)
+        if converged is not None and converged(hyper, previous):
+            break
     return state, hyper

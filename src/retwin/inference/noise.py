@@ -82,7 +82,8 @@ class Noise:
         problem: Problem,
         residual: Tensor,
         *,
-        max_effective: Tensor,
+        common: float,
+        blocks: float,
         variance: Tensor | float = 0.0,
         floor: float = 1e-18,
     ) -> Noise:
@@ -96,8 +97,11 @@ class Noise:
             Of all rows that share the noise.
         residual : Tensor
             (R, K, d), at the most probable latent variables.
-        max_effective : Tensor
-            (G,), the effective sample size of each group at most.
+        common : float
+            Variance of the error that is common to a block of successive samples, relative to that
+            of a sample: it does not average out, however many samples a block has.
+        blocks : float
+            The number of blocks in all rows together, at least 1.
         variance : Tensor | float
             (R, K, d), the posterior variance of the predicted outputs.
         floor : float
@@ -118,7 +122,7 @@ class Noise:
             scale.append((variances if len(self.scale[k]) > 1 else variances.mean(0, True)).sqrt())
             kept = residual / self.scale[k] * (weights * part).sqrt()
             time = correlation_time(kept, part[..., 0], rows=False, limit=MAX_CORRELATION)
-            thinning.append(time.maximum(count / max_effective[k].clamp_min(1)))
+            thinning.append(time + common * count / blocks)
         scales = torch.stack(scale)
         smallest = max(floor, SMALLEST_SHARE * float(scales.amax()))
         return Noise(scales.clamp_min(smallest), torch.stack(thinning), self.loss)

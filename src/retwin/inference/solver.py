@@ -17,7 +17,7 @@ from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
 from retwin.inference.problem import Problem
 
-__all__ = ["Bounds", "Solution", "Step", "gauss_newton_step", "solve"]
+__all__ = ["Bounds", "Solution", "Step", "blocks", "gauss_newton_step", "solve"]
 
 TOLERANCE = 1e-4
 """Predicted decrease of the objective, in nats, below which a row has converged."""
@@ -96,10 +96,11 @@ class Solution:
         """Posterior covariance (R, P, P)."""
         return torch.linalg.inv(self.curvature)
 
-    def blocks(self, count: int) -> Tensor:
-        """Posterior covariance of each of `count` parts of x, (R, count, P / count, P / count)."""
-        whole = self.covariance.unflatten(2, (count, -1)).unflatten(1, (count, -1))
-        return whole.diagonal(dim1=1, dim2=3).movedim(-1, 1).clone()
+
+def blocks(covariance: Tensor, count: int) -> Tensor:
+    """Covariance of each of `count` parts of x, (R, count, P / count, P / count), of (R, P, P)."""
+    whole = covariance.unflatten(2, (count, -1)).unflatten(1, (count, -1))
+    return whole.diagonal(dim1=1, dim2=3).movedim(-1, 1).clone()
 
 
 @dataclass(frozen=True, eq=False)

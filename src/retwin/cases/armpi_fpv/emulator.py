@@ -29,8 +29,19 @@ from retwin.twins.wrapper import TwinWrapper
 __all__ = ["EmulatedArmPi"]
 
 
-PROBABILITIES = ("missed", "glitch")
+PROBABILITIES = ("missed", "glitch", "repeatable")
 """Settings whose range is 0 to 1."""
+TRAVEL = np.array([270.0, 170.0, 170.0, 170.0])
+"""Root mean square of the joints' travel in a movement, in command units."""
+REPEATING = np.array(
+    [
+        [0.7, 0.6, 0.5, 0.6],  # stops short
+        [0.5, 0.4, 0.5, -0.4],  # friction
+        [0.0, 0.6, 0.5, 0.4],  # gravity
+        [0.5, -0.4, 0.5, 0.5],  # assembly
+    ]
+)
+"""Weights of the parts of an error that repeats, for each joint."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +59,10 @@ class EmulatedArmPi(TwinWrapper):
     offset : float
         Scale of the error of a joint's final position in command units, one per movement
         (Student's t distribution with 8 degrees of freedom, heavier tails than a Gaussian).
+    repeatable : float
+        Share, from 0 to 1, of the mean square of `offset` that repeats with the pose and the
+        direction of travel: joints stop short of their targets, sag under gravity, stop on the
+        side of friction from which they come, and have an assembly error. 0 draws all of it anew.
     bias : float
         Standard deviation in command units of a joint's error that is constant in a trajectory.
     missed : float
@@ -82,6 +97,7 @@ class EmulatedArmPi(TwinWrapper):
     delay: float = 0.022
     jitter: float = 0.011
     offset: float = 3.4
+    repeatable: float = 0.0
     bias: float = 0.8
     missed: float = 0.015
     dead_zone: float = 1.0
@@ -131,7 +147,7 @@ class EmulatedArmPi(TwinWrapper):
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             rng = np.random.default_rng([seed, 1, chunk.index.start])
-            z = self._draw(chunk.segments, rng)
+            z = self._draw(chunk, rng)
             executed = _effective(chunk.faulty_commands, chunk.segments, z)
             effective = _with_play(executed, self.dead_zone)
             frozen = chunk.frozen
@@ -148,16 +164,22 @@ class EmulatedArmPi(TwinWrapper):
             hidden |= {name: np.concatenate([each[name] for each in drawn]) for name in drawn[0]}
         return made
 
-    def _draw(self, segments: Segments, rng: np.random.Generator) -> dict[str, NDArray]:
+    def _draw(self, chunk: Chunk, rng: np.random.Generator) -> dict[str, NDArray]:
         """Draw the discrepancy of each movement; delays in samples."""
+        segments = chunk.segments
         shape = segments.start.shape
         joints = (*shape, len(self.inputs))
         mean, spread = self.delay * self.rate, max(self.jitter * self.rate, 1e-9)
         delay = rng.gamma((mean / spread) ** 2, spread**2 / max(mean, 1e-9), size=shape)
         constant = self.bias * rng.normal(size=(len(segments), 1, len(self.inputs)))
+        offset = self.offset * rng.standard_t(8, size=joints)
+        if self.repeatable:
+            same = _repeating(chunk.commands, segments) * self.offset * math.sqrt(8 / 6)
+            share = self.repeatable
+            offset = math.sqrt(1 - share) * offset + math.sqrt(share) * same
         return {
             "delay": delay,
-            "offset": constant + self.offset * rng.standard_t(8, size=joints),
+            "offset": constant + offset,
             "missed": rng.random(joints) < self.missed,
         }
 
@@ -178,6 +200,21 @@ class EmulatedArmPi(TwinWrapper):
             size = rng.uniform(0.1, 1.0) * self.glitch_size * rng.choice([-1.0, 1.0])
             samples[i, at : at + rng.integers(1, 3), joint] += size
         return interpolated(samples, np.arange(steps), every)
+
+
+def _repeating(commands: NDArray, segments: Segments) -> NDArray:
+    """Errors (n, M, d_u) that the pose and the direction of travel determine, of unit size."""
+    first, last = (
+        np.stack([interpolated(*pair) for pair in zip(commands, at, strict=True)])
+        for at in (segments.start, segments.settle)
+    )
+    distance = (last - first).astype(float)
+    angles = (last - KINEMATIC.centre) * KINEMATIC.scale
+    pitch = angles[..., 1:].cumsum(axis=-1)
+    reach = (np.sin(pitch) * KINEMATIC.arm.links)[..., ::-1].cumsum(axis=-1)[..., ::-1]
+    sag = np.concatenate([np.zeros_like(reach[..., :1]), reach], axis=-1) / sum(KINEMATIC.arm.links)
+    parts = (-distance / TRAVEL, -np.sign(distance), 2 * sag, np.ones_like(distance))
+    return np.einsum("k...u,ku->...u", np.stack(parts), REPEATING)
 
 
 def _with_play(path: NDArray, half: float) -> NDArray:

@@ -1,14 +1,15 @@
 """z* of `CommandSpace` from outputs alone: maximum a posteriori, evidence, empirical Bayes.
 
-Outputs seldom identify the errors of all actuators; where they do not, a prior decides. Its widths,
-the noise and the probability of a missed segment are not set by hand but learned from all
-trajectories together (type-II maximum likelihood, by expectation-maximisation with Laplace's
-approximation). Whether an actuator missed a segment is decided by comparing evidence.
+Outputs seldom identify the errors of all actuators; where they do not, a prior decides. Its mean,
+which may depend on the pose and on the direction and the distance of the motion, its widths, the
+noise and the probability of a missed segment are not set by hand but learned from all trajectories
+together (type-II maximum likelihood, by expectation-maximisation with Laplace's approximation).
+Whether an actuator missed a segment is decided by comparing evidence.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -16,20 +17,25 @@ from torch import Tensor
 
 from retwin.checks import require
 from retwin.inference.em import expectation_maximisation
+from retwin.inference.hierarchy import Hierarchy
 from retwin.inference.noise import Noise
-from retwin.inference.priors import GaussianPrior
-from retwin.inference.solver import Solution
-from retwin.update.corrections.command_delays import delay_variance
+from retwin.inference.solver import Solution, blocks
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.correction import Context, Discrepancy, block_diagonal
 from retwin.update.corrections.delays import at_bound, first_delays
 from retwin.update.corrections.missed_segments import Fit, LatentPrior, Search, fitted, searched
-from retwin.update.corrections.warp import gather_samples
+from retwin.update.corrections.offset_features import OffsetFeatures
+from retwin.update.corrections.sample_noise import SampleNoise
 
 __all__ = ["infer_commands"]
 
-ROUNDS = 5
-"""Rounds of expectation-maximisation, with a search for missed segments in each."""
+MAX_ROUNDS = 12
+"""Rounds of expectation-maximisation at most, with a search for missed segments in each."""
+TOLERANCE = 0.02
+"""Relative change of all standard deviations below which they have converged."""
+DELAY_VARIANCE = 1 / 12
+"""Variance of the delays that the hyperprior expects, in samples squared: that of the time of an
+event within a sample."""
 SUSPECT = 2.5
 """Standard deviations of the prior beyond which an offset makes a segment suspect."""
 MOVING = 3.0
@@ -38,11 +44,8 @@ OUTLYING = 3.0
 """Noise scales beyond which a sample is an outlier."""
 OUTLYING_SHARE = 0.3
 """Share of outliers above which a segment is suspect."""
-FLAT = 30.0
-"""Standard deviation of the prior, in that of a healthy offset, where a fault may be anything."""
-FIRST_JITTER, SMALLEST_JITTER = 1 / 35, 1 / 350
-"""Standard deviations of a delay at first beyond what first delays show, and at least, in widths of
-its range."""
+FIRST_JITTER = 1 / 35
+"""Standard deviation of a delay at first, beyond what first delays show, in widths of its range."""
 FLOOR = 1e-6
 """Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
@@ -70,6 +73,7 @@ def infer_commands(
     problem = CommandProblem.of(
         context, observed, mask, delay_range=delay_range, max_samples=max_samples
     )
+    problem = replace(problem, own_delays=True)
     if not problem.valid.shape[1]:
         return _empty(problem)
     start = problem.zero
@@ -77,17 +81,22 @@ def infer_commands(
     first = _Belief.of(problem, start)
 
     def infer(found: Search, belief: _Belief) -> Search:
-        prior, noise = belief.prior(problem), belief.noise
-        return searched(problem, prior, noise, found.fit, partial(_suspects, problem, prior, noise))
+        white, prior, noise = belief.whitened(problem), belief.prior(problem), belief.noise
+        return searched(white, prior, noise, found.fit, partial(_suspects, white, prior, noise))
 
     def learn(found: Search, belief: _Belief) -> _Belief:
         return belief.learned(problem.with_missed(found.fit.missed), found.fit.solution)
 
     fit = Fit.of_prior(problem, first.prior(problem), start)
     found, belief = expectation_maximisation(
-        Search(fit, fit.missed, fit.evidence), first, infer=infer, learn=learn, rounds=ROUNDS
+        Search(fit, fit.missed, fit.evidence),
+        first,
+        infer=infer,
+        learn=learn,
+        rounds=MAX_ROUNDS,
+        converged=_Belief.near,
     )
-    problem = problem.with_missed(found.fit.missed)
+    problem = belief.whitened(problem).with_missed(found.fit.missed)
     last = fitted(problem, belief.prior(problem), belief.noise, found.fit.x)
     return _discrepancy(problem, last.solution, found.probability, belief, identified_below)
 
@@ -128,8 +137,10 @@ def _suspects(
     outliers; then every actuator that was to move is. What is missed may always turn out not to be.
     """
     part, x = problem[rows].with_missed(fit.missed[rows]), fit.x[rows]
-    width = part.per_segment(prior.gaussian.deviation[rows])[..., 1:]
-    far = (part.per_segment(x)[..., 1:].abs() > SUSPECT * width) & part.healthy
+    offsets = slice(1, 1 + part.missed.shape[2])
+    width = part.per_segment(prior.gaussian.deviation[rows])[..., offsets]
+    away = part.per_segment(x - prior.gaussian.mean[rows])[..., offsets]
+    far = (away.abs() > SUSPECT * width) & part.healthy
     outlying = noise.square(part, part.residual(x)) > OUTLYING**2
     share = (part.inside * outlying[:, None]).sum(dim=-1) / part.inside.sum(dim=-1).clamp_min(1)
     suspect = far.any(dim=-1) | (share > OUTLYING_SHARE)
@@ -143,11 +154,11 @@ def _suspects(
 class _Belief:
     """Hyperparameters, learned from all trajectories together."""
 
-    delay: Tensor  # () mean, in samples
-    jitter: Tensor  # () standard deviation of a delay
-    offset: Tensor  # (d_u,) standard deviation of an offset, in the commands' units
+    features: OffsetFeatures
+    hierarchy: Hierarchy  # of delays and offsets
     odds: Tensor  # () log odds that an actuator misses a segment
-    noise: Noise  # one scale for all outputs, in `CommandProblem.unit`
+    samples: SampleNoise  # the shape of a sample's error
+    noise: Noise  # its size, in `CommandProblem.unit`
 
     @classmethod
     def of(cls, problem: CommandProblem, start: Tensor) -> _Belief:
@@ -155,48 +166,58 @@ class _Belief:
         delay = problem.per_segment(start)[..., 0][problem.valid]
         jitter = 1.4826 * (delay - delay.median()).abs().median() + FIRST_JITTER * problem.width
         measured = problem.measured > 0
-        # The median and the spread of nothing are NaN.
+        # The median of nothing is NaN.
         length = problem.residual(start).norm(dim=-1)[measured].median().nan_to_num(1.0)
         scale = length.clamp_min(FLOOR).expand(2, 1)
-        commands = gather_samples(problem.reference, problem.sample)[measured]
-        extent = (commands - commands.mean(dim=0)).square().mean(dim=0).sqrt()
-        offset = 0.05 * extent.nan_to_num(1.0).clamp_min(1e-9)
+        features = OffsetFeatures.of(problem)
+        offset = 0.05 * features.spread
+        design = features.design(problem)
+        coefficients = torch.zeros(len(design.owner), dtype=torch.float64)
+        coefficients[0] = delay.median()
+        variance = torch.cat([jitter[None], offset, jitter[None]]).square()
         one = torch.ones(2, dtype=torch.float64)
-        return cls(delay.median(), jitter, offset, -4.0 * one[0], Noise(scale, one))
+        return cls(
+            features,
+            Hierarchy.of(design, variance, coefficients),
+            -4.0 * one[0],
+            SampleNoise.of(problem),
+            Noise(scale, one),
+        )
+
+    def whitened(self, problem: CommandProblem) -> CommandProblem:
+        """The problem in which the errors of a sample's outputs are independent."""
+        return replace(problem, whitening=self.samples.whitening())
 
     def prior(self, problem: CommandProblem) -> LatentPrior:
         """The distribution of (x, missed) before an output is measured."""
-        mean, variance = problem.zero, problem.zero
-        problem.per_segment(mean)[..., 0] = self.delay
-        problem.per_segment(variance)[..., 0] = self.jitter.square()
-        wide = torch.where(problem.faulty, FLAT * self.offset, self.offset)
-        problem.per_segment(variance)[..., 1:] = wide.square()
-        return LatentPrior(
-            GaussianPrior.independent(mean, variance), self.odds.expand(problem.missed.shape)
-        )
+        gaussian = self.hierarchy.prior(self.features.design(problem))
+        return LatentPrior(gaussian, self.odds.expand(problem.missed.shape))
 
     def learned(self, problem: CommandProblem, solution: Solution) -> _Belief:
         """The most probable hyperparameters, given what was inferred and how certain that is."""
-        x = solution.x
-        delay, offset = problem.per_segment(x).split([1, problem.missed.shape[2]], dim=-1)
-        variance = problem.per_segment(solution.covariance.diagonal(dim1=1, dim2=2))
-        used = (problem.healthy & (problem.missed < 0.5)).double()
-        second = ((offset.square() + variance[..., 1:]) * used).sum(dim=(0, 1))
-        weight = problem.valid.double() / problem.valid.sum()
-        mean = (delay[..., 0] * weight).sum()
-        spread = (((delay[..., 0] - mean).square() + variance[..., 0]) * weight).sum()
-        # Pseudo-observations: with few segments no width shrinks to nothing.
-        scatter = (second + 2 * self.offset.square()) / (used.sum(dim=(0, 1)) + 2)
+        white, x = self.whitened(problem), solution.x
+        samples = self.samples.learned(white, self.noise, x)
+        white = replace(white, whitening=samples.whitening())
         missed = (problem.missed * problem.healthy).sum()
+        # Offsets are expected to be a share of what the actuators travel, the same for all.
+        spread, variance = self.features.spread.square(), self.hierarchy.variance
+        share, delay = (variance[1:-1] / spread).mean(), variance.new_tensor([DELAY_VARIANCE])
+        expected = torch.cat([delay, share * spread, delay])
         return _Belief(
-            delay=mean,
-            jitter=spread.sqrt().clamp_min(SMALLEST_JITTER * problem.width),
-            offset=scatter.sqrt(),
-            odds=((missed + 0.5) / (problem.healthy.sum() + 20.0)).logit(),
-            noise=self.noise.learned(
-                problem, problem.residual(x), max_effective=problem.max_effective, floor=FLOOR
-            ),
+            self.features,
+            self.hierarchy.learned(self.features.design(problem), solution, expected),
+            ((missed + 0.5) / (problem.healthy.sum() + 20.0)).logit(),
+            samples,
+            white.learned_noise(self.noise, white.residual(x), floor=FLOOR),
         )
+
+    def near(self, other: _Belief) -> bool:
+        """Whether all standard deviations are about those of `other`."""
+        pairs = (
+            (self.hierarchy.variance.sqrt(), other.hierarchy.variance.sqrt()),
+            (self.noise.scale, other.noise.scale),
+        )
+        return all(bool(((a / b).log().abs() < TOLERANCE).all()) for a, b in pairs)
 
 
 def _discrepancy(
@@ -207,29 +228,49 @@ def _discrepancy(
     identified_below: float,
 ) -> Discrepancy:
     """z*, each segment's covariance, and which components the outputs identify."""
-    x, missed = problem.per_segment(solution.x), problem.missed
-    prior = belief.prior(problem).gaussian
-    inner = solution.blocks(x.shape[1])
-    wide = problem.per_segment(prior.deviation.square())
-    left = inner.diagonal(dim1=-2, dim2=-1) / wide
-    severity = torch.where(problem.faulty, x[..., 1:], 0.0)
+    missed, segments = problem.missed, problem.missed.shape[1]
+    prior, design = belief.prior(problem).gaussian, belief.features.design(problem)
+    common = _common(problem)
+    x, mean = (
+        (common @ problem.per_segment(each)[..., None])[..., 0]
+        for each in (solution.x, prior.mean)
+    )
+    inner, wide = (
+        common @ blocks(each, segments) @ common.mT
+        for each in (belief.hierarchy.posterior_covariance(design, solution), prior.covariance)
+    )
+    left, wide = inner.diagonal(dim1=-2, dim2=-1), wide.diagonal(dim1=-2, dim2=-1)
+    severity = torch.where(problem.faulty, (x - mean)[..., 1:], 0.0)
     # Under a fault nothing was learned of the discrepancy: the prior stands.
     learned = torch.cat([problem.valid[..., None], problem.healthy], dim=-1).double()
-    own = torch.cat([wide[..., :1], belief.offset.square().expand_as(severity)], dim=-1)
-    inner = inner * learned[..., None] * learned[..., None, :]
-    inner = inner + torch.diag_embed(own * (1 - learned))
-    # Offsets stay as they are, and as much correlated with the delay.
-    delays = delay_variance(problem, prior, belief.noise, solution.x)
-    stretch = torch.ones_like(wide)
-    stretch[..., 0] = (delays / inner[..., 0, 0]).sqrt()
-    inner = inner * stretch[..., None] * stretch[..., None, :]
-    covariance = block_diagonal(inner, torch.diag_embed(probability * (1 - probability)))
-    known = (left < identified_below) & (learned > 0)
-    bounded = at_bound(x[..., 0], problem.delay_range) & problem.valid
+    known = (left < identified_below * wide) & (learned > 0)
+    # The common delay is bounded, whatever those of the actuators are.
+    delay = problem.per_segment(solution.x)[..., 0]
+    bounded = at_bound(delay, problem.delay_range) & problem.valid
     known[..., 0] &= ~bounded
     known[..., 1:] &= missed < 0.5
+    own = torch.cat(
+        [wide[..., :1], belief.hierarchy.variance[1:-1].expand_as(severity)], dim=-1
+    )
+    inner = inner * learned[..., None] * learned[..., None, :]
+    inner = inner + torch.diag_embed(own * (1 - learned))
+    covariance = block_diagonal(inner, torch.diag_embed(probability * (1 - probability)))
     seen = problem.inside.any(dim=-1)[..., None] & problem.healthy
     identified = torch.cat([known, seen], dim=-1) & problem.valid[..., None]
-    z = torch.cat([x * learned, missed], dim=-1) * problem.valid[..., None]
+    z = torch.cat([torch.where(learned > 0, x, mean), missed], dim=-1) * problem.valid[..., None]
     noise = (belief.noise.scale[0, 0] * problem.unit.mean()).expand(len(x))
     return Discrepancy(z, covariance, identified, noise, severity, True, bounded)
+
+
+def _common(problem: CommandProblem) -> Tensor:
+    """The matrices (n, M, 1 + d_u, P / M) from x to one delay and the offsets of each segment.
+
+    The delay of a segment is the mean of its actuators' delays, weighted as least squares weights
+    them: by the square of the distance, in standard deviations of the commands.
+    """
+    n, segments, width = problem.missed.shape
+    weight = (problem.distance / problem.spread).square()
+    weight = weight / weight.sum(dim=-1, keepdim=True).clamp_min(1e-12)
+    matrix = torch.eye(1 + width, problem.size, dtype=weight.dtype).repeat(n, segments, 1, 1)
+    matrix[:, :, 0, 1 + width :] = weight
+    return matrix

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 
 from retwin.data.segments import Segments
+from retwin.inference.noise import Noise
 from retwin.inference.solver import Bounds
 from retwin.update.corrections.correction import Context, DifferentiableTwin
 from retwin.update.corrections.delays import delay_bounds
@@ -18,22 +18,25 @@ from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.warp import gather_samples, interpolate, within
 from retwin.update.piecewise_linear import distinct
 
-__all__ = ["EFFECTIVE_SAMPLES", "CommandProblem"]
+__all__ = ["CommandProblem"]
 
 SURROGATE_STEP = 0.05
-"""Step of finite differences through a surrogate with memory, in samples and in the commands'
-units: larger than the rounding of single precision."""
+"""Step of finite differences of delays through a surrogate with memory, in samples: larger than the
+rounding of single precision."""
 COMMAND_STEP = 1e-4
 """Step of finite differences through the effective commands, which are piecewise linear in x."""
 SETTLING = 0.5
 """Time after the end of a command's ramp in which an output may still be in motion, in largest
 delays."""
-EFFECTIVE_SAMPLES = (6.0, 1.0)
-"""Largest effective sample size of a segment's part at rest and in motion: rounding and friction
-are common to all its samples."""
+COMMON_ERROR = 0.25
+"""Variance of the error that all samples of a segment have in common, relative to that of one
+sample: what rounding leaves, on average over sensors whose noise is a tenth to a quarter of their
+resolution. Outputs cannot tell it from an offset, so it is no estimate."""
+GAIN_STEP = 5e-3
+"""Step of the finite differences of the gain, in standard deviations of a command."""
 TRAJECTORIES_PER_BATCH = 64
 """Trajectories linearised together, which bounds memory."""
-COMMON = ("surrogate", "unit", "delay_range")
+COMMON = ("surrogate", "unit", "delay_range", "own_delays")
 """Fields of `CommandProblem` that all trajectories share."""
 
 
@@ -41,7 +44,8 @@ COMMON = ("surrogate", "unit", "delay_range")
 class CommandProblem:
     """Residual and Jacobian for x = (delay, offsets) of every segment, given what was missed.
 
-    The engine's rows are trajectories, its latent variables x (n, P), P = M (1 + d_u).
+    The engine's rows are trajectories, its latent variables x (n, P), P = M (1 + d_u). With
+    `own_delays` they end in one more delay for every actuator, P = M (1 + 2 d_u).
 
     Attributes
     ----------
@@ -76,6 +80,11 @@ class CommandProblem:
         (n, M, d_u), 1 where an actuator missed a segment.
     delay_range : tuple of float
         Smallest and largest delay, in samples.
+    whitening : Tensor, optional
+        (n, S, d_y, d_y), the factor by which residuals and Jacobians are multiplied, so that the
+        errors of a sample's outputs are independent and of one size.
+    own_delays : bool
+        Whether every actuator has a delay of its own besides the common one.
 
     """
 
@@ -93,6 +102,8 @@ class CommandProblem:
     faulty: Tensor
     missed: Tensor
     delay_range: tuple[float, float]
+    whitening: Tensor | None = None
+    own_delays: bool = False
 
     @classmethod
     def of(
@@ -144,7 +155,11 @@ class CommandProblem:
     def __getitem__(self, rows: Tensor) -> CommandProblem:
         """The problem of some trajectories."""
         own = {each.name: getattr(self, each.name) for each in fields(self)}
-        parts = {name: value[rows] for name, value in own.items() if name not in COMMON}
+        parts = {
+            name: value[rows]
+            for name, value in own.items()
+            if name not in COMMON and value is not None
+        }
         return replace(self, **parts)
 
     def with_missed(self, missed: Tensor) -> CommandProblem:
@@ -167,8 +182,13 @@ class CommandProblem:
     @property
     def zero(self) -> Tensor:
         """The x (n, P) of trajectories without any discrepancy."""
-        n, segments, width = self.missed.shape
-        return self.observed.new_zeros(n, segments * (1 + width))
+        n, segments, _ = self.missed.shape
+        return self.observed.new_zeros(n, segments * self.size)
+
+    @property
+    def size(self) -> int:
+        """Latent variables per segment."""
+        return 1 + (1 + self.own_delays) * self.missed.shape[2]
 
     @property
     def width(self) -> float:
@@ -178,16 +198,29 @@ class CommandProblem:
     @property
     def bounds(self) -> Bounds:
         """The range of delays as limits of x."""
-        return delay_bounds(self.segments, 1 + self.missed.shape[2], self.delay_range)
+        return delay_bounds(self.segments, self.size, self.delay_range)
 
     def per_segment(self, x: Tensor) -> Tensor:
-        """Values (n, P) or (n, P, …) by segment, (n, M, 1 + d_u, …)."""
+        """Values (n, P) or (n, P, …) by segment, (n, M, P / M, …)."""
         return x.unflatten(1, (self.missed.shape[1], -1))
 
     @property
-    def max_effective(self) -> Tensor:
-        """Largest effective sample size (2,) at rest and in motion of all trajectories together."""
-        return torch.tensor(EFFECTIVE_SAMPLES, dtype=torch.float64) * self.valid.sum().clamp_min(1)
+    def unwhitened(self) -> CommandProblem:
+        """The same with residuals as they are."""
+        return replace(self, whitening=None)
+
+    def learned_noise(
+        self, noise: Noise, residual: Tensor, variance: Tensor | float = 0.0, floor: float = 1e-18
+    ) -> Noise:
+        """The noise at rest and in motion, see `Noise.learned`: a block of samples is a segment."""
+        return noise.learned(
+            self,
+            residual,
+            common=COMMON_ERROR,
+            blocks=max(1.0, float(self.valid.sum())),
+            variance=variance,
+            floor=floor,
+        )
 
     @property
     def inside(self) -> Tensor:
@@ -206,10 +239,7 @@ class CommandProblem:
 
     def commands(self, x: Tensor) -> Tensor:
         """Effective commands, single precision, at `sample`; with memory, at every sample."""
-        z = torch.cat([self.per_segment(x), self.missed], dim=-1)
-        return effective_commands(
-            self.reference, self.segments, z, self._times, self.frozen
-        ).float()
+        return self._effective(self.per_segment(x), torch.arange(len(self))).float()
 
     def predicted(self, commands: Tensor) -> Tensor:
         """The surrogate's outputs (n, S, d_y) at `sample` for such commands."""
@@ -219,20 +249,19 @@ class CommandProblem:
     @torch.no_grad()
     def residual(self, x: Tensor) -> Tensor:
         """Measured minus predicted outputs (n, S, d_y) for x (n, P), in `unit`."""
-        return torch.cat([part._residual(some) for part, some in self._batches(x)])
+        return torch.cat([part._white(part._residual(some)) for part, some in self._batches(x)])
 
     @torch.no_grad()
     def linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residual, and the Jacobian (n, S, d_y, P) of the predicted outputs."""
-        parts = [part._linearised(some) for part, some in self._batches(x)]
+        parts = [map(part._white, part._linearised(some)) for part, some in self._batches(x)]
         residual, jacobian = zip(*parts, strict=True)
         return torch.cat(residual), torch.cat(jacobian)
 
     @torch.no_grad()
-    def actuator_delay_jacobian(self, x: Tensor) -> Tensor:
-        """Jacobian (n, S, d_y, M d_u) of the outputs by a delay of every actuator of its own."""
-        parts = [part._actuator_delay_jacobian(some) for part, some in self._batches(x)]
-        return torch.cat(parts)
+    def gain(self) -> Tensor:
+        """Change (n, S, d_y, d_u) of the outputs, in `unit`, by a constant change of a command."""
+        return torch.cat([part._gain() for part, _ in self._batches(self.zero)])
 
     @property
     def _times(self) -> Tensor:
@@ -248,6 +277,32 @@ class CommandProblem:
         for rows in torch.arange(len(self)).split(TRAJECTORIES_PER_BATCH):
             yield self[rows], x[rows]
 
+    def _white(self, values: Tensor) -> Tensor:
+        """Values (n, S, d_y) or (n, S, d_y, P) times `whitening`."""
+        if self.whitening is None:
+            return values
+        return (self.whitening @ values.reshape(*values.shape[:3], -1)).view_as(values)
+
+    def _gain(self) -> Tensor:
+        commands = self.commands(self.zero)
+        columns = []
+        for actuator, step in enumerate((GAIN_STEP * self.spread).tolist()):
+            ends = []
+            for move in (-step, step):
+                moved = commands.clone()
+                moved[..., actuator] += move
+                ends.append(self.predicted(moved).double())
+            columns.append((ends[1] - ends[0]) / (2 * step))
+        return torch.stack(columns, dim=-1) / self.unit[:, None]
+
+    @property
+    def spread(self) -> Tensor:
+        """Standard deviation (d_u,) of the commands; of those that never change, their size."""
+        flat = self.reference.flatten(0, 1)
+        spread, size = flat.std(dim=0, correction=0), flat.abs().amax(dim=0)
+        constant = spread <= 1e-9 * size
+        return torch.where(constant, torch.where(size > 0, size, 1.0), spread)
+
     def _residual(self, x: Tensor) -> Tensor:
         commands = self.commands(x)
         if self.memory:
@@ -258,18 +313,20 @@ class CommandProblem:
     def _linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if self.memory:
             residual = self._residual(x)
-            moved = [
-                self._residual(x + SURROGATE_STEP * each)
-                for each in torch.eye(x.shape[1], dtype=x.dtype)
-            ]
-            columns = [(residual - each) / SURROGATE_STEP for each in moved]
+            delay = torch.full((self.size - len(self.spread),), SURROGATE_STEP)
+            step = torch.cat([delay[:1], GAIN_STEP * self.spread, delay[1:]])
+            moves = torch.diag(step.to(x).repeat(self.missed.shape[1]))
+            columns = [(residual - self._residual(x + each)) / each.sum() for each in moves]
             return residual, torch.stack(columns, dim=-1)
         # Without memory the chain rule is local: the surrogate's Jacobian, sample by sample.
         residual, by_command = self._by_command(x)
         delay, offset = self._command_jacobians(x)
         by_delay = torch.einsum("nsyu,nmsu->nsym", by_command, delay)[..., None]
         by_offset = torch.einsum("nsyu,nmsu->nsymu", by_command, offset)
-        return residual, torch.cat([by_delay, by_offset], dim=-1).flatten(3)
+        parts = [by_delay, by_offset]
+        if self.own_delays:
+            parts.append(torch.einsum("nsyu,nmsu->nsymu", by_command, delay))
+        return residual, torch.cat(parts, dim=-1).flatten(3)
 
     def _by_command(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residual (n, S, d_y), and the surrogate's Jacobian (n, S, d_y, d_u)."""
@@ -284,42 +341,34 @@ class CommandProblem:
         jacobian = torch.cat(rows).movedim(0, 1)[place].double() / self.unit[..., None]
         return self.observed - outputs.detach()[0, place].double() / self.unit, jacobian
 
-    def _actuator_delay_jacobian(self, x: Tensor) -> Tensor:
-        delay = self._command_jacobians(x)[0]
-        if not self.memory:
-            by_command = self._by_command(x)[1]
-            return torch.einsum("nsyu,nmsu->nsymu", by_command, delay).flatten(3)
-        commands = self.commands(x)
-        outputs = self.predicted(commands)
-        columns = []
-        for segment, actuator in itertools.product(*map(range, self.missed.shape[1:])):
-            moved = commands.clone()
-            moved[..., actuator] += (SURROGATE_STEP * delay[:, segment, :, actuator]).to(moved)
-            columns.append((self.predicted(moved) - outputs).double() / SURROGATE_STEP)
-        return torch.stack(columns, dim=-1) / self.unit[..., None]
-
     def _command_jacobians(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Jacobians (n, M, S, d_u) of the commands by each segment's delay, and by its offsets.
 
         An actuator's command depends on its own offset only, so all are moved at once.
         """
         n, segments, width = self.missed.shape
-        step = torch.zeros(2, segments, segments, 1 + width, dtype=x.dtype)
+        step = torch.zeros(2, segments, segments, self.size, dtype=x.dtype)
         index = torch.arange(segments)
         step[0, index, index, 0] = COMMAND_STEP
-        step[1, index, index, 1:] = COMMAND_STEP
+        step[1, index, index, 1 : 1 + width] = COMMAND_STEP
         moves = torch.cat([torch.zeros_like(step[0, :1]), step.flatten(0, 1)])
         rows = torch.arange(n).repeat_interleave(len(moves))
         x = (self.per_segment(x)[:, None] + moves).flatten(0, 1)
-        commands = effective_commands(
-            self.reference,
-            self.segments[rows.numpy()],
-            torch.cat([x, self.missed[rows]], dim=-1),
-            self._times[rows],
-            self.frozen[rows],
-        ).unflatten(0, (n, len(moves)))
+        commands = self._effective(x, rows).unflatten(0, (n, len(moves)))
         delay, offset = ((commands[:, 1:] - commands[:, :1]) / COMMAND_STEP).split(segments, dim=1)
         return delay, offset
+
+    def _effective(self, x: Tensor, rows: Tensor) -> Tensor:
+        """Effective commands for x (k, M, size) of the trajectories `rows` (k,), in order."""
+        common, own = x.split([1 + self.missed.shape[2], self.size - 1 - self.missed.shape[2]], -1)
+        return effective_commands(
+            self.reference,
+            self.segments[rows.numpy()],
+            torch.cat([common, self.missed[rows]], dim=-1),
+            self._times[rows],
+            self.frozen[rows],
+            own if self.own_delays else None,
+        )
 
 
 def _unit(context: Context, measured: Tensor) -> Tensor:

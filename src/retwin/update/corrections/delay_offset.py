@@ -18,7 +18,7 @@ from retwin.data.trajectories import Channels
 from retwin.inference.em import expectation_maximisation
 from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
-from retwin.inference.solver import Solution, solve
+from retwin.inference.solver import Solution, blocks, solve
 from retwin.update.corrections.correction import Context, Discrepancy, Head
 from retwin.update.corrections.delay_range import checked_range, range_in_samples
 from retwin.update.corrections.delays import at_bound, first_delays
@@ -174,7 +174,7 @@ def _discrepancy(
 ) -> Discrepancy:
     """z, each segment's covariance, and which components the outputs identify."""
     z = problem.per_segment(solution.x)
-    covariance = solution.blocks(z.shape[1])
+    covariance = blocks(solution.covariance, z.shape[1])
     deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
     wide = problem.per_segment(prior.deviation)
     valid = torch.as_tensor(problem.segments.valid)

@@ -15,7 +15,12 @@ STILL = 1e-6
 
 
 def effective_commands(
-    reference: Tensor, segments: Segments, z: Tensor, times: Tensor, frozen: Tensor | None = None
+    reference: Tensor,
+    segments: Segments,
+    z: Tensor,
+    times: Tensor,
+    frozen: Tensor | None = None,
+    own_delays: Tensor | None = None,
 ) -> Tensor:
     """The effective commands T_z(u) at some times.
 
@@ -33,6 +38,8 @@ def effective_commands(
         (S,) or (n, S), in samples, fractions allowed.
     frozen : Tensor, optional
         (n, d_u), the sample from which a fault holds an actuator; by default it holds none.
+    own_delays : Tensor, optional
+        (n, M, d_u), delay of every actuator besides the common one, in samples; by default none.
 
     Returns
     -------
@@ -41,6 +48,8 @@ def effective_commands(
 
     """
     times = times.to(z.dtype).expand(len(z), -1)
+    if own_delays is not None:
+        return _one_by_one(reference, segments, z, times, frozen, own_delays)
     if frozen is None:
         return _moving(reference, segments, z, times)
     since = frozen.to(z.dtype)
@@ -48,6 +57,34 @@ def effective_commands(
     free, stopped = moving.split([times.shape[1], reference.shape[2]], dim=1)
     held = stopped.diagonal(dim1=1, dim2=2)
     return torch.where(times[..., None] < since[:, None], free, held[:, None])
+
+
+def _one_by_one(
+    reference: Tensor,
+    segments: Segments,
+    z: Tensor,
+    times: Tensor,
+    frozen: Tensor | None,
+    own_delays: Tensor,
+) -> Tensor:
+    """The effective commands if every actuator has delays of its own.
+
+    No actuator's command depends on another's: each is computed as a system of one actuator.
+    """
+    n, _, width = own_delays.shape
+    index = torch.arange(n).view(len(reference), 1, -1), torch.arange(width)[:, None]
+    row, actuator = (each.flatten() for each in torch.broadcast_tensors(*index))
+    delay, offset, missed = z.split([1, width, width], dim=-1)
+    parts = delay + own_delays, offset, missed
+    commands = effective_commands(
+        reference.mT.flatten(0, 1)[..., None],
+        segments[row.numpy()],
+        torch.stack([each[row, :, actuator] for each in parts], dim=-1),
+        times[row],
+        None if frozen is None else frozen[row, actuator][:, None],
+    )
+    separate = commands.view(len(reference), width, -1, times.shape[1])
+    return separate.permute(0, 2, 3, 1).flatten(0, 1)
 
 
 def _moving(reference: Tensor, segments: Segments, z: Tensor, times: Tensor) -> Tensor:
