@@ -116,7 +116,7 @@ def test_correlated_noise_is_learned_at_every_polling_phase() -> None:
         problem = posed(context, observed, mask)
         residual = problem.residual(problem.zero)
         noise = Noise.from_median(problem, residual, groups=2)
-        found = noise.learned(problem, residual, max_effective=problem.max_effective)
+        found = problem.learned_noise(noise, residual)
         thinning.append(found.thinning)
     assert thinning[0][0] > 10
     torch.testing.assert_close(thinning[1], thinning[0], rtol=0.2, atol=0.0)

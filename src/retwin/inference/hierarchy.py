@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from retwin.inference.priors import GaussianPrior
+from retwin.inference.priors import GaussianPrior, inverse
 from retwin.inference.solver import Solution
 
 __all__ = ["Design", "Hierarchy"]
@@ -141,7 +141,7 @@ class Hierarchy:
     ) -> Hierarchy:
         """One step: the posterior of coefficients and x, then the variances."""
         features, precision = design.features, self._variances(design).reciprocal()
-        covariance = torch.linalg.inv(curvature + torch.diag_embed(precision))
+        covariance = inverse(curvature + torch.diag_embed(precision))
         weighted = features * precision[..., None]
         # With x integrated out, β has this precision, and the errors ε depend on β by -left.
         left = features - covariance @ weighted
@@ -149,7 +149,7 @@ class Hierarchy:
         own = torch.where(design.kind == FLAT, torch.inf, own)
         information = (weighted.mT @ left).sum(dim=0) + torch.diag(own.reciprocal())
         mean = (covariance @ slope[..., None])[..., 0]
-        uncertain = torch.linalg.inv(information)
+        uncertain = inverse(information[None])[0]
         beta = uncertain @ (weighted * mean[..., None]).sum(dim=(0, 1))
         error = mean - left @ beta
         spread = covariance.diagonal(dim1=1, dim2=2) + ((left @ uncertain) * left).sum(dim=-1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["GaussianPrior"]
+__all__ = ["GaussianPrior", "inverse"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,3 +64,11 @@ class GaussianPrior:
     def energy(self, x: Tensor) -> Tensor:
         """Minus the log density (R,) at x (R, P), in nats, 0 at the mean."""
         return 0.5 * ((x - self.mean) * self.gradient(x)).sum(dim=1)
+
+
+def inverse(precision: Tensor) -> Tensor:
+    """Covariance (R, P, P) of a precision, scaled to a unit diagonal: units differ by orders."""
+    unit = precision.diagonal(dim1=1, dim2=2).rsqrt()
+    scale = unit[:, :, None] * unit[:, None, :]
+    found = torch.linalg.inv(precision * scale) * scale
+    return (found + found.mT) / 2

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from retwin.inference.noise import Noise
-from retwin.inference.priors import GaussianPrior
+from retwin.inference.priors import GaussianPrior, inverse
 from retwin.inference.problem import Problem
 
 __all__ = ["Bounds", "Solution", "Step", "blocks", "gauss_newton_step", "solve"]
@@ -94,7 +94,7 @@ class Solution:
     @property
     def covariance(self) -> Tensor:
         """Posterior covariance (R, P, P)."""
-        return torch.linalg.inv(self.curvature)
+        return inverse(self.curvature)
 
 
 def blocks(covariance: Tensor, count: int) -> Tensor:

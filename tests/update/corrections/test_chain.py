@@ -8,9 +8,11 @@ import torch
 
 import retwin as rt
 from retwin import catalog
-from retwin.cases.armpi_fpv.twin import POLL
+from retwin.cases.armpi_fpv.twin import RATE, SENSOR_RATE
 from retwin.serialisation.configs import from_config, to_config
 from retwin.update.corrections import fit_correction, measured_outputs, sample_mask
+
+POLL = round(RATE / SENSOR_RATE)
 
 KINDS = catalog.classes(catalog.CORRECTIONS)
 

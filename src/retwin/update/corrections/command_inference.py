@@ -232,8 +232,7 @@ def _discrepancy(
     prior, design = belief.prior(problem).gaussian, belief.features.design(problem)
     common = _common(problem)
     x, mean = (
-        (common @ problem.per_segment(each)[..., None])[..., 0]
-        for each in (solution.x, prior.mean)
+        (common @ problem.per_segment(each)[..., None])[..., 0] for each in (solution.x, prior.mean)
     )
     inner, wide = (
         common @ blocks(each, segments) @ common.mT
@@ -249,9 +248,7 @@ def _discrepancy(
     bounded = at_bound(delay, problem.delay_range) & problem.valid
     known[..., 0] &= ~bounded
     known[..., 1:] &= missed < 0.5
-    own = torch.cat(
-        [wide[..., :1], belief.hierarchy.variance[1:-1].expand_as(severity)], dim=-1
-    )
+    own = torch.cat([wide[..., :1], belief.hierarchy.variance[1:-1].expand_as(severity)], dim=-1)
     inner = inner * learned[..., None] * learned[..., None, :]
     inner = inner + torch.diag_embed(own * (1 - learned))
     covariance = block_diagonal(inner, torch.diag_embed(probability * (1 - probability)))

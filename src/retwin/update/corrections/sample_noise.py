@@ -7,9 +7,12 @@ a long lever. Both variances are learned from the residual at rest, within segme
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
 from torch import Tensor
 
 from retwin.inference.noise import Noise
@@ -17,14 +20,11 @@ from retwin.update.corrections.command_problem import CommandProblem
 
 __all__ = ["SampleNoise"]
 
-TOLERANCE = 1e-2
-"""Relative change of the likelihood's variances below which they have converged."""
-MAX_STEPS = 100
-"""Steps of expectation-maximisation at most."""
 HYPERPRIOR_SEGMENTS = 2.0
 """Segments that the hyperprior of an actuator's variance counts as much as."""
 SMALLEST = 1e-6
-"""Smallest share of a variance in the total: it keeps covariances from being singular."""
+"""Smallest share of the residual's power that a variance explains: it keeps covariances from being
+singular."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class SampleNoise:
 
         The common factor keeps the mean square of what they whiten.
         """
-        covariance = self._covariance(self.gain)
+        covariance = _covariance(self.output, self.actuator, self.gain)
         size = covariance.shape[-1]
         mean = covariance.diagonal(dim1=-2, dim2=-1).mean()
         factor = torch.linalg.cholesky(covariance / mean)
@@ -65,7 +65,7 @@ class SampleNoise:
         return torch.linalg.solve_triangular(factor, identity, upper=False)
 
     def learned(self, problem: CommandProblem, noise: Noise, x: Tensor) -> SampleNoise:
-        """The most probable variances, by expectation-maximisation.
+        """The most probable variances of Gaussian errors.
 
         Samples at rest count, with the weight that robust noise gives them. Without any, the
         variances stay as they are.
@@ -77,38 +77,45 @@ class SampleNoise:
         residual, gain = problem.unwhitened.residual(x)[rest], self.gain[rest]
         power = (weights[:, None] * residual.square()).mean().clamp_min(1e-30)
         lever = gain.square().sum(dim=1).mean(dim=0)
-        floor = SMALLEST * power / lever.clamp_min(1e-30)
-        output, actuator = self.output, self.actuator
-        if not actuator.any():
-            output, actuator = power / 2, power / 2 / lever.sum().clamp_min(1e-30) + 0 * lever
         # An actuator without any effect has no noise that could be seen.
         seen = lever > SMALLEST * lever.amax()
+        gain, spread = gain[..., seen], problem.spread.square()[seen]
+        # By parts of the residual's power, which each of them could explain alone.
+        alone = torch.cat([power[None], power / lever[seen]])
+        before = torch.cat([self.output[None], self.actuator[seen]])
+        if not self.actuator.any():
+            before = alone / len(alone)
         # Few segments may show no change of a rounded position at all: the variances of actuators
-        # are expected to be the same share of what their commands vary.
-        spread = problem.spread.square()
+        # are expected to be about the same share of what their commands vary.
+        usual = (alone[1:] / spread).log()
         believed = HYPERPRIOR_SEGMENTS / max(1.0, float(problem.valid.sum()))
-        for _ in range(MAX_STEPS):
-            precision = torch.linalg.inv(
-                output * torch.eye(residual.shape[1], dtype=gain.dtype)
-                + (gain * actuator) @ gain.mT
-            )
+
+        def objective(logarithm: NDArray) -> tuple[float, NDArray]:
+            variance = alone * torch.as_tensor(logarithm).exp()
+            covariance = _covariance(variance[0], variance[1:], gain)
+            precision = torch.linalg.inv(covariance)
             score = (precision @ residual[..., None])[..., 0]
             slope = (gain.mT @ score[..., None])[..., 0]
             curvature = ((precision @ gain) * gain).sum(dim=1)
-            step = weights[:, None] * slope.square() - curvature
-            new = actuator + actuator.square() * step.mean(dim=0)
-            expected = (actuator / spread)[seen].mean() * spread
-            new = ((new + believed * expected) / (1 + believed)).maximum(floor)
-            step = weights * score.square().sum(dim=-1) - precision.diagonal(dim1=1, dim2=2).sum(-1)
-            level = (output + output.square() * step.mean() / residual.shape[1]).maximum(
-                SMALLEST * power
-            )
-            change = torch.cat([(new / actuator)[seen], (level / output)[None]]).log().abs()
-            output, actuator = level, torch.where(seen, new, 0.0)
-            if change.amax() < TOLERANCE:
-                break
-        return SampleNoise(self.gain, output, actuator)
+            value = torch.logdet(covariance) + weights * (residual * score).sum(dim=-1)
+            trace = precision.diagonal(dim1=1, dim2=2).sum(dim=-1)
+            by_output = (trace - weights * score.square().sum(dim=-1)).mean()
+            by_actuator = (curvature - weights[:, None] * slope.square()).mean(dim=0)
+            share = torch.as_tensor(logarithm)[1:] + usual
+            away = share - share.mean()
+            gradient = torch.cat([by_output[None], by_actuator]) * variance
+            gradient[1:] += 2 * believed * away
+            return float(value.mean() + believed * away.square().sum()), gradient.numpy()
 
-    def _covariance(self, gain: Tensor) -> Tensor:
-        identity = torch.eye(gain.shape[-2], dtype=gain.dtype)
-        return self.output * identity + (gain * self.actuator) @ gain.mT
+        start = (before / alone).clamp(SMALLEST, 1 / SMALLEST).log().numpy()
+        bounds = [(math.log(SMALLEST), -math.log(SMALLEST))] * len(start)
+        found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
+        variance = alone * torch.as_tensor(found.x).exp()
+        actuator = torch.zeros_like(self.actuator)
+        actuator[seen] = variance[1:]
+        return SampleNoise(self.gain, variance[0], actuator)
+
+
+def _covariance(output: Tensor, actuator: Tensor, gain: Tensor) -> Tensor:
+    """Covariance (..., d_y, d_y) of samples with a gain (..., d_y, d_u)."""
+    return output * torch.eye(gain.shape[-2], dtype=gain.dtype) + (gain * actuator) @ gain.mT
