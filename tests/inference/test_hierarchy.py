@@ -16,7 +16,7 @@ pytestmark = pytest.mark.numerical
 
 VARIANCE = torch.tensor([0.25, 4.0], dtype=torch.float64)
 COEFFICIENTS = torch.tensor([3.0, 1.5, -2.0, 0.0], dtype=torch.float64)
-"""A mean of the first group that is not shrunk, a constant and a slope of the second, and nothing."""
+"""A mean of the first group, which is not shrunk; a constant, a slope and nothing of the second."""
 
 
 @dataclass

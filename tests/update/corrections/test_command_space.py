@@ -245,7 +245,7 @@ def test_a_fault_does_not_pass_for_a_discrepancy(exact, commands: np.ndarray) ->
     assert found.severity is not None
     bias = found.severity[0, :, 0].numpy() + 1.0 - z[0, :, 1].numpy()
     np.testing.assert_allclose(bias, [30.0, -20.0, 40.0, -35.0, 25.0], atol=3.0)
-    # What the prior expects stands in for the discrepancy, which the outputs cannot separate from the fault.
+    # Outputs cannot separate the discrepancy from the fault: the prior stands.
     width = found.covariance[0, :, 1, 1].sqrt()
     assert (width > 0.5 * z[1:, :, 1].std()).all()
     assert (found.z[0, :, 1].abs() < 2 * width).all()

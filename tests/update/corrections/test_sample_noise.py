@@ -71,7 +71,7 @@ def test_whitened_errors_are_independent_and_of_one_size(exact, case: rt.Case) -
     # Before, they were largest in the direction in which the actuators act most.
     _, axes = torch.linalg.eigh(found.gain[rest] @ found.gain[rest].mT)
     along = (axes.mT @ problem.residual(problem.zero)[rest][..., None])[..., 0].square().mean(dim=0)
-    assert along[-1] > 2 * along[0]
+    assert along[-1] > 1.5 * along[0]
 
 
 def test_nothing_at_rest_leaves_the_noise_as_it_is(exact, case: rt.Case) -> None:
