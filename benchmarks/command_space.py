@@ -107,7 +107,7 @@ def main() -> None:
     case = rt.cases.armpi()
     robots = {
         "errors as in set A": case.emulator,
-        "half the errors": replace(case.emulator, delay=1.1, jitter=0.5, offset=1.7, bias=0.4),
+        "half the errors": replace(case.emulator, delay=0.011, jitter=0.005, offset=1.7, bias=0.4),
     }
     columns: dict[str, dict[str, float]] = {}
     for name, robot in robots.items():

@@ -49,7 +49,6 @@ _HOME = {
     "faulty_commands": "faults",
     "frozen_response": "faults",
     "keep_workers": "workers",
-    "ramps_and_holds": "ramps",
     "residual_scale": "noisy",
     "simulate_in_chunks": "twin",
 }

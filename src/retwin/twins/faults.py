@@ -221,7 +221,7 @@ class ActuatorBias:
             "size",
             expected="a pair (low, high) of magnitudes in command units, at least 0 and in order",
             got=repr(self.size) if self.size else "none",
-            remedy="leave the sign out, it is drawn",
+            remedy="give the sizes of real errors; the sign is drawn",
         )
 
     def drawn(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from retwin.checks import positive, require
 from retwin.times import to_samples
 from retwin.twins.ramps import draw_onsets, ramps_and_holds
+from retwin.twins.time_step import Timed
 
 __all__ = [
     "CommandSampler",
@@ -64,33 +65,8 @@ class CommandSampler(Protocol):
         ...
 
 
-class _Timed:
-    """The number of samples of a sampler with a rate and a duration."""
-
-    if TYPE_CHECKING:
-        rate: float
-        duration: float
-
-    @property
-    def steps(self) -> int:
-        """Samples per trajectory."""
-        return to_samples(self.duration, self.rate)
-
-    def _check_steps(self) -> None:
-        """Refuse a rate that is not positive, and fewer than two samples."""
-        positive("rate", self.rate, unit="Hz")
-        least = 2 / self.rate
-        require(
-            0 < self.duration < np.inf and self.steps >= 2,
-            "duration",
-            expected=f"at least two samples, {least:g} s",
-            got=f"{self.duration!r} s",
-            remedy="give the duration of a trajectory in seconds",
-        )
-
-
 @dataclass(frozen=True)
-class RampSampler(_Timed):
+class RampSampler(Timed):
     """Commands that ramp to a random level, hold it, and ramp to the next.
 
     Parameters
@@ -135,7 +111,7 @@ class RampSampler(_Timed):
             got=self.start,
             remedy="leave start out to begin in the middle of the limits",
         )
-        self._check_steps()
+        self.check_steps()
         require(
             1 <= self.segments <= self.steps,
             "segments",
@@ -186,7 +162,7 @@ class RampSampler(_Timed):
 
 
 @dataclass(frozen=True)
-class HoldSampler(_Timed):
+class HoldSampler(Timed):
     """Random levels, each held for a random time, independently in every channel.
 
     This is an amplitude-modulated pseudo-random binary signal (APRBS): steps of all sizes and of
@@ -220,7 +196,7 @@ class HoldSampler(_Timed):
 
     def __post_init__(self) -> None:
         _checked_limits(self.low, self.high)
-        self._check_steps()
+        self.check_steps()
         require(
             np.isfinite(self.hold_durations).all()
             and len(self._hold) == 2
@@ -251,7 +227,7 @@ class HoldSampler(_Timed):
 
 
 @dataclass(frozen=True)
-class MultisineSampler(_Timed):
+class MultisineSampler(Timed):
     """Multisines of random phases about a mean, independently in every channel.
 
     Parameters
@@ -294,7 +270,7 @@ class MultisineSampler(_Timed):
 
     def __post_init__(self) -> None:
         low, high = _checked_limits(self.low, self.high)
-        self._check_steps()
+        self.check_steps()
         mean, deviation = self.mean or (low + high) / 2, self.deviation or (high - low) / 6
         fits = np.shape(mean) == np.shape(deviation) == low.shape
         require(
@@ -347,7 +323,7 @@ class MultisineSampler(_Timed):
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedSampler(_Timed):
+class RecordedSampler(Timed):
     """Recorded commands, or pieces of them, drawn with replacement.
 
     Parameters
@@ -382,7 +358,7 @@ class RecordedSampler(_Timed):
         )
         longest = shape[1] / positive("rate", self.rate, unit="Hz")
         object.__setattr__(self, "duration", float(self.duration or longest))
-        self._check_steps()
+        self.check_steps()
         require(
             self.steps <= shape[1],
             "duration",

@@ -1,10 +1,14 @@
-"""How many steps of a simulator make up one sample."""
+"""How many steps of a simulator make up one sample, and how many samples a duration."""
 
 from __future__ import annotations
 
-from retwin.checks import positive, require
+from math import inf
+from typing import TYPE_CHECKING
 
-__all__ = ["steps_per_sample"]
+from retwin.checks import positive, require
+from retwin.times import to_samples
+
+__all__ = ["Timed", "steps_per_sample"]
 
 TOLERANCE = 1e-5
 """Largest relative deviation of the steps from a whole number per sample, which covers steps that
@@ -43,3 +47,33 @@ def steps_per_sample(rate: float, step: float) -> int:
         remedy=f"give for instance step={1.0 / (rate * max(count, 1)):g}",
     )
     return count
+
+
+class Timed:
+    """What has a sample rate in Hz and a duration in s, which are fields of the subclass."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def rate(self) -> float:
+            """Sample rate in Hz."""
+
+        @property
+        def duration(self) -> float:
+            """Duration in s."""
+
+    @property
+    def steps(self) -> int:
+        """Samples per trajectory."""
+        return to_samples(self.duration, self.rate)
+
+    def check_steps(self) -> None:
+        """Raise InputError for a rate that is not positive, and for fewer than two samples."""
+        positive("rate", self.rate, unit="Hz")
+        require(
+            0 < self.duration < inf and self.steps >= 2,
+            "duration",
+            expected=f"at least two samples, {2 / self.rate:g} s",
+            got=f"{self.duration!r} s",
+            remedy="give the duration of a trajectory in seconds",
+        )

@@ -29,6 +29,7 @@ from retwin.progress import Progress
 from retwin.times import stride_of, to_samples
 from retwin.twins.faults import ActuatorBias, Fault, Stuck, frozen_response
 from retwin.twins.ramps import draw_onsets, ramps_and_holds
+from retwin.twins.time_step import Timed
 from retwin.update.corrections import Chain, CommandSpace, DelayOffset, SampledSensor
 
 __all__ = ["ArmSampler", "armpi"]
@@ -53,7 +54,7 @@ PUBLISHED = {
 
 
 @dataclass(frozen=True)
-class ArmSampler:
+class ArmSampler(Timed):
     """Commands as in the published data: every motor ramps to a new target, then all hold.
 
     Parameters
@@ -81,11 +82,6 @@ class ArmSampler:
     def rate(self) -> float:
         """Sample rate in Hz."""
         return RATE
-
-    @property
-    def steps(self) -> int:
-        """Samples per trajectory."""
-        return to_samples(self.duration, RATE)
 
     def sample(
         self, count: int, *, rng: np.random.Generator, onsets: NDArray | None = None

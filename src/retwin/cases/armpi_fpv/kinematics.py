@@ -50,10 +50,7 @@ class YawPitchArm:
             End-effector position in m.
 
         """
-        yaw = angles[..., 0]
-        pitch = np.cumsum(angles[..., 1:], axis=-1)
-        links = np.asarray(self.links, dtype=angles.dtype)
-        radius = np.sin(pitch) @ links
+        yaw, pitch, links, radius = self._in_plane(angles)
         height = np.cos(pitch) @ links
         return np.stack([np.sin(yaw) * radius, -np.cos(yaw) * radius, self.base + height], axis=-1)
 
@@ -71,11 +68,8 @@ class YawPitchArm:
             Derivatives in m/rad.
 
         """
-        yaw = angles[..., 0]
-        pitch = np.cumsum(angles[..., 1:], axis=-1)
-        links = np.asarray(self.links, dtype=angles.dtype)
+        yaw, pitch, links, radius = self._in_plane(angles)
         sine, cosine = np.sin(yaw), np.cos(yaw)
-        radius = np.sin(pitch) @ links
         # A pitch joint rotates every link behind it: sums from the tip inwards.
         d_radius = np.cumsum((np.cos(pitch) * links)[..., ::-1], axis=-1)[..., ::-1]
         d_height = -np.cumsum((np.sin(pitch) * links)[..., ::-1], axis=-1)[..., ::-1]
@@ -84,3 +78,9 @@ class YawPitchArm:
             [sine[..., None] * d_radius, -cosine[..., None] * d_radius, d_height], axis=-2
         )
         return np.concatenate([by_yaw[..., None], by_pitch], axis=-1)
+
+    def _in_plane(self, angles: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Yaw, pitch of each link, lengths of the links, and distance of the tip from the axis."""
+        pitch = np.cumsum(angles[..., 1:], axis=-1)
+        links = np.asarray(self.links, dtype=angles.dtype)
+        return angles[..., 0], pitch, links, np.sin(pitch) @ links
