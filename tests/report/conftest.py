@@ -158,7 +158,7 @@ def _fidelity() -> dict[str, Any]:
             "delay",
             *(f"{kind}_{axis}" for kind in ("offset", "noise") for axis in "xyz"),
         ],
-        "movement_units": ["samples", *["m"] * 6],
+        "movement_units": ["ms", *["m"] * 6],
         "movements": 48,
         "rivals": ["mean_only"],
         "widening": 1.31,
@@ -254,7 +254,7 @@ def synthetic(*, runs: int = 10, per_class: int = 10) -> Study:
         "portrait": {
             "source": "ibg_rg",
             "movement": ["delay", "offset_motor_1"],
-            "movement_units": ["samples", "0.24 deg"],
+            "movement_units": ["ms", "0.24 deg"],
         },
         "learning_curve": [
             {

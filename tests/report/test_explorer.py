@@ -59,7 +59,7 @@ def test_all_trajectories_are_in_the_page(
     assert content["inputs"]["units"] == ["deg"] * 4
     np.testing.assert_allclose(unpacked(content["commands"])[0, 0], 0.24 * 400, atol=0.01)
     latent = content["latent"]
-    assert (latent["names"], latent["units"]) == (["delay", "offset motor 1"], ["samples", "deg"])
+    assert (latent["names"], latent["units"]) == (["delay", "offset motor 1"], ["ms", "deg"])
     assert latent["z"][0][1][0] is None
     pose = unpacked(content["pose"]["observed"]) - unpacked(content["pose"]["nominal"])
     np.testing.assert_allclose(pose[1, :, -1, 1], 0.01, atol=1e-4)

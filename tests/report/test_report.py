@@ -156,6 +156,14 @@ def test_fidelity(study: Study, write: Write) -> None:
     assert "widened" not in text
 
 
+def test_delays_at_the_end_of_their_range_are_said(study: Study, write: Write) -> None:
+    fidelity = study[0]["fidelity"]["ibg_rg"]
+    for share, said in ((None, False), (0.0, False), (0.31, True)):
+        fidelity["at_bound"] = share
+        text = read(write(study)).text
+        assert ("31 % of the delays inferred in calibration are at a bound" in text) == said
+
+
 def test_two_sources_with_a_residual_model_have_figures_of_their_own(
     study: Study, write: Write
 ) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -107,3 +109,58 @@ def test_a_fitted_operator_holds_numbers(operator: type) -> None:
 def test_a_range_that_does_not_rise_is_refused(operator: type, bad: tuple[float, float]) -> None:
     with pytest.raises(rt.InputError, match=r"delay_range: expected .* in seconds"):
         operator(delay_range=bad)
+
+
+def recorded(rate: float, delay: float) -> tuple[rt.Trajectories, Linear]:
+    """The same as calibration data, with the twin that they belong to."""
+    context, outputs = measured(rate, delay)
+    twin = Linear()
+    twin.inputs, twin.outputs = rt.Channels.numbered("u", 2), rt.Channels.numbered("y", 3)
+    twin.rate = rate
+    found = rt.Trajectories(
+        commands=context.commands.numpy(),
+        nominal=context.nominal.numpy(),
+        observed=outputs.float().numpy(),
+        rate=rate,
+        inputs=twin.inputs,
+        outputs=twin.outputs,
+        labels=np.full(len(outputs), "Healthy"),
+    )
+    return found, twin
+
+
+SHORT = rt.Mixture(components=1, hidden=(4,), training=rt.Training(max_epochs=2, batch_size=32))
+
+
+def test_a_residual_model_holds_the_range_and_says_where_it_ends() -> None:
+    record, twin = recorded(500.0, 0.12)
+    rg = rt.fit_residual(twin, record, rt.DelayOffset(), SHORT, seed=0)
+    low, high = rg.correction.delay_range
+    assert low < 0.12 < high
+    assert rg.fitted.figures["delays_at_bound"] == 0
+    assert "delay_range" not in rg.fitted.reason
+    ends = rt.fit_residual(twin, record, rt.DelayOffset((-0.01, 0.06)), SHORT, seed=0)
+    assert ends.fitted.figures["delays_at_bound"] > 0.8
+    wanted = r"; \d+% of the delays are at a bound of delay_range, give a wider one$"
+    assert re.search(wanted, ends.fitted.reason)
+
+
+def test_samples_in_place_of_seconds_are_refused() -> None:
+    record, twin = recorded(100.0, 0.12)
+    expected = r"delay_range: expected delays in seconds, shorter than the trajectories of 7\.5 s"
+    with pytest.raises(rt.InputError, match=expected):
+        rt.fit_residual(twin, record, rt.CommandSpace((-5, 30)), SHORT, seed=0)
+
+
+def test_delays_of_a_slow_sensor_are_identified() -> None:
+    """A tenth of the samples is measured, in motion as at rest."""
+    context, outputs = measured(100.0, 0.12)
+    mask = torch.zeros(outputs.shape, dtype=torch.bool)
+    mask[:, ::10] = True
+    found = rt.DelayOffset().infer(context, outputs, mask)
+    assert found.identified[..., 0].float().mean() > 0.9
+    np.testing.assert_allclose(found.z[..., 0].mean() / 100, 0.12, atol=0.004)
+    start, settle = context.segments.start[0, 2], context.segments.settle[0, 2]
+    mask[0, int(start) - 1 : int(settle) + 2] = False
+    found = rt.DelayOffset().infer(context, outputs, mask)
+    assert not found.identified[0, 2, 0]

@@ -121,10 +121,17 @@ class PathProblem:
 
     @property
     def motion_measured(self) -> Tensor:
-        """Share (n, M) of the samples of each motion at which any output was measured."""
-        inside = within(self.sample, self.segments.start, self.segments.settle)
+        """Share (n, M) of the samples of each motion at which any output was measured.
+
+        Relative to that of the trajectory's best measured segment: a sensor may be slow throughout.
+        """
+        start, settle, stop = self.segments.start, self.segments.settle, self.segments.stop
         seen = self.available.any(dim=-1)[:, None]
-        return (inside * seen).sum(dim=-1) / inside.sum(dim=-1).clamp_min(1)
+        motion, whole = (
+            (inside * seen).sum(dim=-1) / inside.sum(dim=-1).clamp_min(1)
+            for inside in (within(self.sample, start, end) for end in (settle, stop))
+        )
+        return motion / whole.amax(dim=1, keepdim=True).clamp_min(1e-9)
 
     def per_segment(self, x: Tensor) -> Tensor:
         """Values (n, P) by segment, (n, M, 1 + d_y)."""
