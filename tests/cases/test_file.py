@@ -387,7 +387,7 @@ WRONG = [
     ),
     ('unit = "m"', 'units = "m"', r"case\.toml: outputs\.y\.units: expected one of unit, low"),
     ("low = -1", 'low = "a"', r"case\.toml: inputs\.a\.low: expected a valid number, got 'a'"),
-    ("low = -1", "low = 2", r"case\.toml: inputs\.limits: expected one low and one greater high"),
+    ("low = -1", "low = 2", r"case\.toml: inputs\.limits: expected one low and one high"),
     ("low = -1, ", "", r"case\.toml: commands\.limits: expected a finite low"),
     (BASE, 'correction = "warped"\n' + BASE, r"case\.toml: correction: expected one of additive"),
     (BASE, BASE + "[correction]\nkind = 'Warp'\n", r"case\.toml: correction\.kind: expected one"),
