@@ -47,6 +47,14 @@ Inputs = Annotated[str, typer.Option(metavar="NAMES", help="Of the inputs, joine
 Outputs = Annotated[str, typer.Option(metavar="NAMES", help="Of the outputs, joined by commas.")]
 Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Samples per second.", min=1e-9)]
 
+NoMeshes = Annotated[
+    bool, typer.Option("--no-meshes", metavar="", help="Leave out the meshes of a model file.")
+]
+Servos = Annotated[
+    list[str] | None,
+    typer.Option("--servo", metavar="JOINT=K,D", help="A servo for a joint of a URDF; repeatable."),
+]
+
 OTHERS = {
     "FILE.fmu": "an FMU for co-simulation (FMI 2 or 3)",
     "FILE.xml, FILE.urdf": "a MuJoCo model",
@@ -78,10 +86,12 @@ def info(
     inputs: Inputs = "",
     outputs: Outputs = "",
     rate: Rate = None,
+    servo: Servos = None,
+    no_meshes: NoMeshes = False,
     as_json: Json = False,
 ) -> None:
     """Describe a twin: its inputs with their limits, its outputs, its rate."""
-    found = _twin(twin, inputs, outputs, rate)
+    found = _twin(twin, inputs, outputs, rate, servo, no_meshes)
     facts: dict[str, Any] = {
         "title": _title(twin, found),
         "rate": found.rate,
@@ -148,6 +158,8 @@ def simulate(
     inputs: Inputs = "",
     outputs: Outputs = "",
     rate: Rate = None,
+    servo: Servos = None,
+    no_meshes: NoMeshes = False,
     seed: Seed = 0,
     clip: Annotated[
         bool, typer.Option("--clip", metavar="", help="Clip commands to the limits.")
@@ -160,7 +172,7 @@ def simulate(
     from retwin.deploy.simulations import SimulationPlan
 
     check_target(out)
-    found = _twin(twin, inputs, outputs, rate)
+    found = _twin(twin, inputs, outputs, rate, servo, no_meshes)
     system = _case(case, twin, found)
     faults = _faults(system, fault)
     drawn = _sampler(system, found) if commands is None else read(commands, system)
@@ -176,15 +188,44 @@ app.command(
 )(animate)
 
 
-def _twin(name: str, inputs: str, outputs: str, rate: float | None) -> Twin:
+def _twin(
+    name: str,
+    inputs: str,
+    outputs: str,
+    rate: float | None,
+    servos: list[str] | None,
+    no_meshes: bool,
+) -> Twin:
     """The twin of that name, or the model in that folder."""
-    if (Path(name) / "model.json").is_file() and not (inputs or outputs or rate):
+    options: dict[str, Any] = {"meshes": False} if no_meshes else {}
+    if servos:
+        options["servos"] = list(map(_servo, servos))
+    own = not (inputs or outputs or rate or options)
+    if (Path(name) / "model.json").is_file() and own:
         return _model(Path(name))
-    if _is_case(name) and not (inputs or outputs or rate):
+    if _is_case(name) and own:
         from retwin import cases
 
         return cases.get(name).twin
-    return twins.get(name, inputs=_names(inputs), outputs=_names(outputs), rate=rate)
+    names = {"inputs": _names(inputs), "outputs": _names(outputs)}
+    return twins.get(name, **names, rate=rate, **options)
+
+
+def _servo(given: str) -> tuple[str, Any]:
+    """A joint and its servo, from "JOINT=STIFFNESS,DAMPING"."""
+    from retwin.twins.mujoco import Servo
+
+    joint, _, gains = given.rpartition("=")
+    try:
+        stiffness, damping = map(float, gains.split(","))
+    except ValueError:
+        raise InputError(
+            "--servo",
+            expected="JOINT=STIFFNESS,DAMPING in N m/rad and N m s/rad",
+            got=repr(given),
+            remedy="write for instance --servo hip=500,40",
+        ) from None
+    return joint, Servo(stiffness, damping)
 
 
 def _is_case(name: str) -> bool:
