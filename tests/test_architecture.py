@@ -24,6 +24,7 @@ ROOMS = (
         "checks",
         "progress",
         "arrays",
+        "modules",
         "processes",
         "jobs",
         "serialisation",

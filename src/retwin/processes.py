@@ -29,6 +29,9 @@ from typing import Any
 
 from pebble import ProcessPool
 
+from retwin.errors import place_of
+from retwin.modules import add_known, known
+
 __all__ = [
     "IsolatedPool",
     "ProcessEnded",
@@ -83,8 +86,8 @@ def worker_pool(
     """
     pool = ProcessPool(
         max_workers=workers,
-        initializer=_begin,
-        initargs=(start, arguments, orphaned),
+        initializer=_begin_with_modules,
+        initargs=(known(), start, arguments, orphaned),
         context=_Spawn(),
     )
     try:
@@ -350,6 +353,12 @@ class _Spawn(SpawnContext):
         return self.locks[-1]
 
 
+def _begin_with_modules(modules: dict[str, str], *begin: Any) -> None:
+    """Find the modules of users that the parent found, of which tasks may be made."""
+    add_known(modules)
+    _begin(*begin)
+
+
 def _begin(
     start: Callable[..., None] | None,
     arguments: tuple[Any, ...],
@@ -377,10 +386,15 @@ def _end_with_parent(orphaned: Callable[..., None] | None, arguments: tuple[Any,
 def sendable_errors() -> Iterator[None]:
     """Replace an exception that cannot be pickled by a RuntimeError with its type and message.
 
-    For code in a worker, whose pool such an exception would break.
+    For code in a worker, whose pool such an exception would break. SystemExit is replaced too: it
+    is that of a user's code, and would end the parent as if all were done.
     """
     try:
         yield
+    except SystemExit as error:
+        described = RuntimeError(f"the code ended the program (SystemExit: {error.code})")
+        described.add_note(place_of(error))
+        raise described from error
     except Exception as error:
         try:
             pickle.loads(pickle.dumps(error))

@@ -7,6 +7,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterator
 from functools import reduce
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -290,6 +291,23 @@ def test_worker_processes_find_the_module(read: Callable[..., rt.Case], tmp_path
     np.testing.assert_allclose(
         made.observed, 2 * made.commands[..., :1] + made.commands[..., 1:], rtol=1e-6
     )
+
+
+def test_a_module_beside_the_case_is_found_alone(
+    read: Callable[..., rt.Case], tmp_path: Path
+) -> None:
+    """A file beside it stands in for no package; the module itself may import its neighbours."""
+    (tmp_path / "not_installed.py").write_text("")
+    (tmp_path / "toy_helpers.py").write_text("def twice(commands):\n    return 2 * commands")
+    before = [*sys.path]
+    case = read(BASE)
+    assert sys.path == before
+    assert find_spec("not_installed") is None
+    (tmp_path / "toy_two.py").write_text("from toy_helpers import twice")
+    single = "{ name = 'toy_two:twice', vectorised = false, workers = 2 }"
+    case = read(BASE.replace('"toy_module:turned"', single).replace("y = {", "y = {}\nz = {"))
+    made = case.twin.simulate(np.ones((3, 9, 2)), seed=0)  # also in worker processes
+    assert made.observed.min() == made.observed.max() == 2
 
 
 def test_another_module_of_that_name_is_not_taken(

@@ -153,9 +153,46 @@ def test_a_module_in_the_current_folder(mine: str, tmp_path: Path) -> None:
     more = ["--n", "6", "--chunk", "2", "--workers", "2", "--out", "a.zarr"]
     done = subprocess.run([*command, *more], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    (tmp_path / "numpy.py").write_text("raise SystemExit('not the real one')")
+    for name in ("numpy", "zarr"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('not the real one')")
     done = subprocess.run([*command, *more], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+QUITTER = """
+import sys
+
+
+def quits(commands):
+    if len(commands) < 99:
+        sys.exit(0)
+    return commands
+"""
+QUITTING = """
+name = "quitter"
+twin = "quitter:quits"
+rate = 10
+[inputs]
+u = { low = 0, high = 1 }
+[outputs]
+y = {}
+"""
+
+
+def test_code_that_ends_the_program_is_a_failure(call, tmp_path: Path) -> None:
+    (tmp_path / "quitter.py").write_text(QUITTER)
+    (tmp_path / "case.toml").write_text(QUITTING)
+    code, out, err = call("info", tmp_path / "case.toml")
+    assert code == 0
+    assert f"runs {tmp_path / 'quitter.py'} with your rights" in out.replace("\n", " ")
+    code, _, err = call("simulate", tmp_path / "case.toml", "--out", tmp_path / "a.npz")
+    assert code == 1
+    assert re.search(r"error: \S+quitter\.py:7: this line ended the program \(SystemExit: 0\)", err)
+    (tmp_path / "quitting.py").write_text("raise SystemExit")
+    (tmp_path / "case.toml").write_text(QUITTING.replace("quitter:", "quitting:"))
+    code, _, err = call("info", tmp_path / "case.toml")
+    assert code == 1
+    assert "quitting.py:1: this line ended the program" in err
 
 
 @pytest.mark.parametrize(

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -16,6 +14,7 @@ from retwin import twins
 from retwin.checks import require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
+from retwin.modules import import_beside
 from retwin.serialisation.configs import at, checked, from_settings, key
 from retwin.twins.fmu import FMUTwin
 from retwin.twins.function import FunctionTwin
@@ -54,10 +53,7 @@ Named = Mapping[str, Any] | Sequence[str]
 
 
 def imported(name: Any, folder: Path, place: str) -> Any:
-    """The object that `module:object` names.
-
-    From then on, modules in `folder` can be imported here and in worker processes, after all that
-    is installed.
+    """The object that `module:object` names, the module installed or else in `folder`.
 
     Raises
     ------
@@ -70,10 +66,8 @@ def imported(name: Any, folder: Path, place: str) -> Any:
     expected = "module:object, the module installed or beside the case"
     if not re.fullmatch(r"\w+(\.\w+)*:\w+", str(name)):
         raise InputError(place, expected=expected, got=repr(name), remedy="check the spelling")
-    if str(folder.resolve()) not in sys.path:
-        sys.path.append(str(folder.resolve()))
     try:
-        home = importlib.import_module(module)
+        home = import_beside(module, folder)
         found = getattr(home, attribute)
     except (ImportError, AttributeError) as error:
         raise InputError(

@@ -20,6 +20,7 @@ from retwin.cli.reading import read
 from retwin.cli.terminal import answer, example, table
 from retwin.data.io import check_target
 from retwin.errors import InputError
+from retwin.modules import known
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
@@ -90,13 +91,18 @@ def info(
     no_meshes: NoMeshes = False,
     as_json: Json = False,
 ) -> None:
-    """Describe a twin: its inputs with their limits, its outputs, its rate."""
+    """Describe a twin: its inputs with their limits, its outputs, its rate.
+
+    A module that is named by the twin or its case, and lies beside the case or in the current
+    folder, is run with your rights.
+    """
     found = _twin(twin, inputs, outputs, rate, servo, no_meshes)
     facts: dict[str, Any] = {
         "title": _title(twin, found),
         "rate": found.rate,
         "inputs": _channels(found.inputs, getattr(found, "limits", None)),
         "outputs": _channels(found.outputs, None),
+        "runs": sorted(known().values()) if ":" in twin or _is_case(twin) else [],
     }
     rows = [
         (kind.removesuffix("s"), each["name"], each["unit"], *_ends(each))
@@ -108,6 +114,7 @@ def info(
         facts["title"],
         table(("", "name", "unit", "low", "high"), rows, numbers=("low", "high")),
         f"{found.rate:g} samples per second",
+        *[f"runs {file} with your rights" for file in facts["runs"]],
         as_json=as_json,
     )
 
@@ -207,8 +214,7 @@ def _twin(
         from retwin import cases
 
         return cases.get(name).twin
-    names = {"inputs": _names(inputs), "outputs": _names(outputs)}
-    return twins.get(name, **names, rate=rate, **options)
+    return twins.get(name, inputs=_names(inputs), outputs=_names(outputs), rate=rate, **options)
 
 
 def _servo(given: str) -> tuple[str, Any]:
@@ -305,8 +311,12 @@ def _faults(system: Case | None, fault: str) -> dict[str, Any]:
 def _sampler(system: Case | None, found: Twin) -> Any:
     if system is not None:
         return system.sampler
+    import numpy as np
+
     from retwin.twins.samplers import RampSampler
 
+    if not len(found.inputs):  # nothing to draw: as many samples as a drawn trajectory has
+        return np.zeros((1, RampSampler.steps, 0))
     limits = getattr(found, "limits", None)
     if limits is None or not all(map(isfinite, limits.low + limits.high)):
         raise InputError(
