@@ -35,6 +35,10 @@ def ideal(commands):
     return commands[..., :1]
 
 
+def lagging(commands):
+    return np.cumsum(commands[..., :1], axis=1) / 10
+
+
 def noisy(commands, rng):
     return ideal(commands) + rng.normal(size=(*commands.shape[:2], 1))
 
@@ -50,6 +54,12 @@ def split(path):
     return path, path
 
 
+def foreign(path):
+    data = rt.FunctionTwin(ideal, CHANNELS, CHANNELS, 10).simulate(np.ones((1, 9, 1)), seed=0)
+    return data, data
+
+
+CHANNELS = rt.Channels(("a",), ("V",))
 leak = rt.ActuatorBias(1, (1.0, 2.0))
 TWIN = rt.FunctionTwin(turned, rt.Channels(("a", "b"), ("V", "V")), rt.Channels(("y",), ("m",)), 10)
 """
@@ -201,6 +211,66 @@ def test_parameters_are_arguments_of_the_function(read: Callable[..., rt.Case]) 
     measured = truth.simulate(drawn, seed=0)
     found = identify(case.parametric, measured, seed=0, method=LeastSquares(starts=1))
     assert found.values == pytest.approx({"gain": 1.4, "offset": -0.3}, abs=1e-4)
+
+
+MULTISINE = "[commands]\nkind = 'MultisineSampler'\nmean = [0, 2]\ndeviation = [0.3, 0.3]\n"
+
+
+def test_correction_and_network_are_those_that_suit_the_system(
+    read: Callable[..., rt.Case],
+) -> None:
+    """Without segments no correction per segment, and with memory no network without."""
+    static = read(BASE + MULTISINE)
+    assert (static.correction, static.network) == (rt.Additive(), rt.MLP())
+    lagging = read(BASE.replace("turned", "lagging"))
+    assert (lagging.correction, lagging.network) == (rt.DelayOffset(), rt.LSTM())
+    given = 'correction = "delay_offset"\nnetwork = "mlp"\n' + BASE.replace("turned", "lagging")
+    chosen = read(given + MULTISINE)
+    assert (chosen.correction, chosen.network) == (rt.DelayOffset(), rt.MLP())
+
+
+RECORDS = """
+[records]
+calibration = [
+    { columns = { a = "u", b = "v", y = "w" }, rows = [0, 40], transient = 0.45 },
+    { columns = { a = "u", b = "v", y = "w" }, rows = [40, 60] },
+]
+test = { columns = { a = "u", b = "v", y = "w" }, rows = [60, 90] }
+"""
+
+
+def test_records_are_parts_of_a_table(read: Callable[..., rt.Case], tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    table = rng.uniform(0, 1, (100, 3))
+    np.savetxt(tmp_path / "d.csv", table, delimiter=",", header="u,v,w", comments="")
+    calibration, test = read(BASE + RECORDS).records(tmp_path / "d.csv")
+    assert calibration.ids.tolist() == ["calibration-1", "calibration-2"]
+    assert test.ids.tolist() == ["test"]
+    np.testing.assert_allclose(test.commands[0], table[60:90, :2])
+    np.testing.assert_allclose(test.observed[0, :, 0], table[60:90, 2])
+    np.testing.assert_allclose(calibration.commands[1, :20], table[40:60, :2])
+    # A transient is masked, and so is what pads the shorter record.
+    assert calibration.mask[:, :, 0].tolist() == [
+        [False] * 4 + [True] * 36,
+        [True] * 20 + [False] * 20,
+    ]
+    assert test.mask.all()
+
+
+def test_a_function_of_records_is_checked(read: Callable[..., rt.Case], tmp_path: Path) -> None:
+    for name, message in [
+        (
+            "split",
+            r"case\.toml: records \(toy_module:split\): expected a function that returns two",
+        ),
+        (
+            "foreign",
+            r"case\.toml: records .* expected Trajectories of a, b, y at 10 Hz, got a, a at",
+        ),
+    ]:
+        case = read(f'records = "toy_module:{name}"\n' + BASE)
+        with pytest.raises(rt.InputError, match=message):
+            case.records(tmp_path / "d.csv")
 
 
 def test_a_correction_per_sample_brings_its_density(read: Callable[..., rt.Case]) -> None:
@@ -430,7 +500,36 @@ WRONG = [
         r"case\.toml: density: expected SequenceMixture, for a correction with one z per sample",
     ),
     (BASE, 'density = "sequence_mixture"\n' + BASE, r"case\.toml: density: expected Mixture or"),
-    (BASE, "network = { kind = 'CNN' }\n" + BASE, r"case\.toml: network\.kind: expected one of"),
+    (
+        BASE,
+        "network = { kind = 'GRU' }\n" + BASE,
+        r"network\.kind: expected one of MLP, LSTM, TCN, StateSpace, got 'GRU'; check the \S+$",
+    ),
+    (
+        BASE,
+        'correction = "additive"\noutput_correction = "delay_offset"\n' + BASE,
+        r"case\.toml: output_correction: expected a correction with one z per sample, ",
+    ),
+    (
+        BASE,
+        BASE + RECORDS.replace("[60, 90]", "[59, 90]"),
+        r"case\.toml: records\.test: expected measurements that are in no calibration record",
+    ),
+    (
+        BASE,
+        BASE + RECORDS.replace(", rows = [60, 90]", ""),
+        r"case\.toml: records\.test: .* the same columns, u, v, w; .* rows = \[FIRST, END\]",
+    ),
+    (
+        BASE,
+        BASE + RECORDS.replace("[40, 60]", "[60, 40]"),
+        r"records\.calibration\.rows: expected the f",
+    ),
+    (
+        BASE,
+        BASE + RECORDS.replace("0.45", "-1"),
+        r"case\.toml: records\.calibration\.transient: expected",
+    ),
     (
         BASE,
         BASE + "[training]\nmax_epochs = 2.5\n",

@@ -86,11 +86,12 @@ def from_config(values: Mapping[str, Any], kinds: Sequence[type], *, place: str 
     """
     known = {kind.__name__: kind for kind in kinds}
     name: Any = values.get("kind")
+    version = "; a model loads with the version of retwin that wrote it"
     name = one_of(
         key(place, "kind"),
         RENAMED_KINDS.get(name, name) if isinstance(name, str) else name,
         known,
-        remedy="check the spelling; a model loads with the version of retwin that wrote it",
+        remedy=f"check the spelling{version if place == 'config' else ''}",
     )
     settings = {each: value for each, value in values.items() if each != "kind"}
     return from_settings(known[name], settings, kinds, place=place)
@@ -234,7 +235,9 @@ def _config(hints: tuple[Any, ...], kinds: tuple[type, ...], value: Any) -> Any:
         classes = _classes(hints)
         if "kind" not in value and len(hints) == len(classes) == 1:
             return from_settings(classes[0], value, kinds, place="")
-        made = from_config(value, (*classes, *kinds), place="")
+        fitting = [kind for kind in kinds if any(fits(kind, hint) for hint in hints)]
+        known = value.get("kind") in [kind.__name__ for kind in kinds]
+        made = from_config(value, (*classes, *(kinds if known else fitting)), place="")
         if any(fits(made, hint) for hint in hints):
             return made
     names = " or ".join(hint.__name__ for hint in hints)
