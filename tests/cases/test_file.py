@@ -588,6 +588,14 @@ def test_a_refusal_names_file_and_key(
     assert "case.toml" in str(caught.value)
 
 
+def test_more_channels_than_can_be_read_in_seconds_are_refused(
+    read: Callable[..., rt.Case],
+) -> None:
+    many = "".join(f"u{i} = {{}}\n" for i in range(10_001))
+    with pytest.raises(rt.InputError, match=r"inputs: expected at most 10000 channels, got 10003"):
+        read(BASE.replace("[outputs]", many + "[outputs]"))
+
+
 def test_a_file_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(rt.InputError, match=r"gone\.toml: expected a case as a TOML file"):
         rt.cases.get(str(tmp_path / "gone.toml"))

@@ -104,8 +104,7 @@ def read_case(path: str | Path) -> Case:
         ]
         twin = parametric = parametric_twin(twin, free, inside)
     sampler = _sampler(keys.commands, twin, folder, key(place, "commands"))
-    default = "delay_offset" if _has_segments(sampler) else "additive"
-    correction = keys.correction or default
+    correction = keys.correction or ("delay_offset" if _has_segments(sampler) else "additive")
     correction = _chosen(correction, catalog.CORRECTIONS, key(place, "correction"))
     network = keys.network or ("mlp" if _is_static(twin, sampler) else "lstm")
     stepwise = correction.resolution == "step"
@@ -180,7 +179,7 @@ def _is_static(twin: Twin, sampler: CommandSampler) -> bool:
     order = rng.permutation(drawn.shape[1])
     try:
         ideal, other = (twin.simulate(u, seed=0).nominal for u in (drawn, drawn[:, order]))
-    except Exception:  # of the user's code, which is reported where the twin is used
+    except (Exception, SystemExit):  # of the user's code: reported where the twin is used
         return False
     scale = float(np.abs(ideal).max(initial=0.0))
     return bool(np.allclose(ideal[:, order], other, rtol=0, atol=1e-6 * scale))

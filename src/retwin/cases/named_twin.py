@@ -30,6 +30,10 @@ FILES: dict[str, Any] = {".fmu": FMUTwin, ".xml": MuJoCoTwin, ".urdf": MuJoCoTwi
 ELSEWHERE = ("path", "function", "inputs", "outputs", "sensors", "rate", "limits")
 """Parameters of twins that other keys of a case.toml set."""
 
+MAX_CHANNELS = 10_000
+"""Largest number of inputs, and of outputs, in a case.toml: more take minutes to read, and a
+trajectory takes hundreds of MB."""
+
 
 @dataclass(frozen=True)
 class _Channel:
@@ -214,6 +218,13 @@ def _making(options: dict[str, Any], place: str, *names: str) -> _Making:
 def _channels(given: Named, place: str) -> dict[str, _Channel]:
     """A table of each channel, for which its name alone may stand."""
     tables = given if isinstance(given, Mapping) else {name: {} for name in given}
+    require(
+        len(tables) <= MAX_CHANNELS,
+        place,
+        expected=f"at most {MAX_CHANNELS} channels",
+        got=len(tables),
+        remedy="leave out those that are constant, or split the system",
+    )
     return {
         name: from_settings(_Channel, value, place=key(place, name))
         for name, value in tables.items()

@@ -56,6 +56,8 @@ Servos = Annotated[
     typer.Option("--servo", metavar="JOINT=K,D", help="A servo for a joint of a URDF; repeatable."),
 ]
 
+SHOWN = 100
+"""Largest number of channels in a table: one of thousands takes minutes to lay out."""
 OTHERS = {
     "FILE.fmu": "an FMU for co-simulation (FMI 2 or 3)",
     "FILE.xml, FILE.urdf": "a MuJoCo model",
@@ -104,15 +106,17 @@ def info(
         "outputs": _channels(found.outputs, None),
         "runs": sorted(known().values()) if ":" in twin or _is_case(twin) else [],
     }
-    rows = [
+    every = [
         (kind.removesuffix("s"), each["name"], each["unit"], *_ends(each))
         for kind in ("inputs", "outputs")
         for each in facts[kind]
     ]
+    rest = len(every) - SHOWN
     answer(
         facts,
         facts["title"],
-        table(("", "name", "unit", "low", "high"), rows, numbers=("low", "high")),
+        table(("", "name", "unit", "low", "high"), every[:SHOWN], numbers=("low", "high")),
+        *([f"… and {rest} more channels, which --json lists"] if rest > 0 else []),
         f"{found.rate:g} samples per second",
         *[f"runs {file} with your rights" for file in facts["runs"]],
         as_json=as_json,
