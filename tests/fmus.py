@@ -18,20 +18,37 @@ COMPILER = os.environ.get("CC", "cc")
 # A first-order lag, tau x' = gain u - x, exact for an input that is held; and troubles on request.
 SOURCE = r"""
 #include "fmi3Functions.h"
+#include <fenv.h>
 #include <math.h>
 #include <signal.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <unistd.h>
+#ifdef __SSE__
+#include <xmmintrin.h>
+#endif
 
 typedef struct {
-    double u, gain, tau, x;
-    int trouble, seen, runs;
+    double u, gain, tau, x, pair[2], sums[2], fixed;
+    int trouble, seen;
+    long long mode;
     bool on;
     fmi3LogMessageCallback log;
 } Lag;
 
+static double left_over; /* x of the last run of any instance, which RESET == 3 begins with */
+
 static void begin(Lag *s) {
-    s->u = 0; s->gain = 1; s->tau = 0.1; s->x = 0; s->trouble = 0; s->seen = 0; s->on = true;
+    s->u = 0; s->gain = 1; s->tau = 0.1; s->x = RESET == 3 ? left_over : 0; s->trouble = 0;
+    s->seen = 0; s->on = true; s->pair[0] = 0; s->pair[1] = 5; s->mode = 1; s->fixed = 3;
+    s->sums[0] = 0; s->sums[1] = 0;
+}
+
+/* Counts instances (i) and runs (r) in the file that LAG_LOG names. */
+static void count(char kind) {
+    char *name = getenv("LAG_LOG");
+    FILE *file = name ? fopen(name, "a") : NULL;
+    if (file) { fputc(kind, file); fclose(file); }
 }
 
 fmi3Instance fmi3InstantiateCoSimulation(fmi3String a, fmi3String b, fmi3String c, fmi3Boolean d,
@@ -42,6 +59,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String a, fmi3String b, fmi3String 
     Lag *s = calloc(1, sizeof(Lag));
     begin(s);
     s->log = log;
+    count('i');
     return s;
 }
 
@@ -49,36 +67,43 @@ void fmi3FreeInstance(fmi3Instance p) { free(p); }
 
 fmi3Status fmi3Reset(fmi3Instance p) {
     if (RESET == 1) return fmi3Error;
-    if (RESET == 0) begin(p);
+    if (RESET == 4) raise(SIGSEGV);
+    if (RESET != 2) begin(p);
     return fmi3OK;
 }
 
 fmi3Status fmi3EnterInitializationMode(fmi3Instance p, fmi3Boolean a, fmi3Float64 b, fmi3Float64 c,
         fmi3Boolean d, fmi3Float64 e) { return fmi3OK; }
 
-fmi3Status fmi3ExitInitializationMode(fmi3Instance p) { ((Lag *)p)->runs++; return fmi3OK; }
+fmi3Status fmi3ExitInitializationMode(fmi3Instance p) { count('r'); return fmi3OK; }
 
 static double *real(Lag *s, fmi3ValueReference r) {
-    return r == 1 ? &s->u : r == 2 ? &s->gain : r == 3 ? &s->tau : r == 4 ? &s->x : NULL;
+    return r == 1 ? &s->u : r == 2 ? &s->gain : r == 3 ? &s->tau : r == 4 ? &s->x
+        : r == 8 ? s->pair : r == 10 ? s->sums : r == 12 ? &s->fixed : NULL;
 }
 
 static int *whole(Lag *s, fmi3ValueReference r) {
-    return r == 5 ? &s->trouble : r == 6 ? &s->seen : r == 9 ? &s->runs : NULL;
+    return r == 5 ? &s->trouble : r == 6 ? &s->seen : NULL;
 }
 
-#define ACCESS(VERB, TYPE, T, PLACE, CONST, ASSIGN)                                             \
+static long long *choice(Lag *s, fmi3ValueReference r) { return r == 11 ? &s->mode : NULL; }
+
+#define ACCESS(VERB, TYPE, T, PLACE, CONST, LEFT, RIGHT)                                        \
     fmi3Status fmi3##VERB##TYPE(fmi3Instance p, const fmi3ValueReference r[], size_t n,         \
                                 CONST T v[], size_t m) {                                        \
+        size_t k = 0;                                                                           \
         for (size_t i = 0; i < n; i++) {                                                        \
             if (!PLACE(p, r[i])) return fmi3Error;                                              \
-            ASSIGN;                                                                             \
+            for (int j = 0; j < (r[i] == 8 || r[i] == 10 ? 2 : 1); j++, k++) LEFT = RIGHT;      \
         }                                                                                       \
-        return fmi3OK;                                                                          \
+        return k == m ? fmi3OK : fmi3Error;                                                     \
     }
-ACCESS(Get, Float64, fmi3Float64, real, , v[i] = *real(p, r[i]))
-ACCESS(Set, Float64, fmi3Float64, real, const, *real(p, r[i]) = v[i])
-ACCESS(Get, Int32, fmi3Int32, whole, , v[i] = *whole(p, r[i]))
-ACCESS(Set, Int32, fmi3Int32, whole, const, *whole(p, r[i]) = v[i])
+ACCESS(Get, Float64, fmi3Float64, real, , v[k], real(p, r[i])[j])
+ACCESS(Set, Float64, fmi3Float64, real, const, real(p, r[i])[j], v[k])
+ACCESS(Get, Int32, fmi3Int32, whole, , v[k], *whole(p, r[i]))
+ACCESS(Set, Int32, fmi3Int32, whole, const, *whole(p, r[i]), v[k])
+ACCESS(Get, Int64, fmi3Int64, choice, , v[k], *choice(p, r[i]))
+ACCESS(Set, Int64, fmi3Int64, choice, const, *choice(p, r[i]), v[k])
 
 fmi3Status fmi3SetBoolean(fmi3Instance p, const fmi3ValueReference r[], size_t n,
         const fmi3Boolean v[], size_t m) {
@@ -102,13 +127,33 @@ fmi3Status fmi3DoStep(fmi3Instance p, fmi3Float64 t, fmi3Float64 h, fmi3Boolean 
     if (s->trouble == 5) return fmi3Fatal;
     if (s->trouble == 6) _exit(3);
     if (s->trouble == 7) *end = true;
+    if (s->trouble == 111) exit(75);
+    if (s->trouble == 112) exit(0);
+    if (s->trouble == 113) return -1;
+    if (s->trouble == 114) {
+        fesetround(FE_UPWARD);
+#ifdef __SSE__
+        _mm_setcsr(_mm_getcsr() | 0x8040); /* flush tiny numbers to zero */
+#endif
+    }
+    if (s->trouble == 115) for (int i = 0; i < 1024; i++) if (write(i, "hello\n", 6)) continue;
+    if (s->trouble == 116) for (int i = 3; i < 1024; i++) close(i);
+    if (s->trouble == 117) for (int i = 3; i < 64; i++) {
+        char zeros[4096] = {0}, numbers[4] = {0, 0, 1, 0};
+        if (write(i, i % 2 ? zeros : numbers, i % 2 ? 4096 : 4)) continue;
+    }
     double target = s->on ? s->gain * s->u : 0;
     s->x = target + (s->x - target) * exp(-h / s->tau);
+    s->sums[0] += s->pair[0] * s->fixed;
+    s->sums[1] += s->pair[1] * s->mode * s->gain;
+    left_over = s->x;
     return fmi3OK;
 }
 """
 
-BY_MACRO = ("fmi3GetFloat64", "fmi3SetFloat64", "fmi3GetInt32", "fmi3SetInt32")
+BY_MACRO = [
+    f"fmi3{verb}{kind}" for verb in ("Get", "Set") for kind in ("Float64", "Int32", "Int64")
+]
 
 DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 <fmiModelDescription fmiVersion="3.0" modelName="Lag" instantiationToken="{lag}">
@@ -116,6 +161,8 @@ DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
   <UnitDefinitions><Unit name="V"/><Unit name="m"/><Unit name="s"/></UnitDefinitions>
   <TypeDefinitions>
     <Float64Type name="Length" unit="m"/>
+    <EnumerationType name="Mode"><Item name="slow" value="1"/><Item name="fast" value="4"/>
+    </EnumerationType>
   </TypeDefinitions>
   <ModelVariables>
     <Float64 name="time" valueReference="0" causality="independent" variability="continuous"/>
@@ -127,12 +174,14 @@ DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
     <Int32 name="trouble" valueReference="5" causality="input" variability="discrete" start="0"/>
     <Int32 name="seen" valueReference="6" causality="output" variability="discrete"/>
     <Boolean name="on" valueReference="7" causality="input" variability="discrete" start="true"/>
-    <Float64 name="pair" valueReference="8" causality="input" start="0 0"><Dimension start="2"/>
+    <Float64 name="pair" valueReference="8" causality="input" start="0 5"><Dimension start="2"/>
     </Float64>
-    <Int32 name="runs" valueReference="9" causality="output" variability="discrete"/>
+    <Float64 name="sums" valueReference="10" causality="local"><Dimension start="2"/></Float64>
+    <Enumeration name="mode" valueReference="11" causality="input" declaredType="Mode" start="1"/>
+    <Float64 name="fixed" valueReference="12" causality="input" min="3" max="3" start="3"/>
   </ModelVariables>
   <ModelStructure>
-    <Output valueReference="4"/><Output valueReference="6"/><Output valueReference="9"/>
+    <Output valueReference="4"/><Output valueReference="6"/>
   </ModelStructure>
 </fmiModelDescription>
 """
@@ -174,7 +223,8 @@ def c_fmu(folder: Path, *, reset: int = 0, load: int = 0, name: str = "Lag") -> 
     Parameters
     ----------
     folder: where to.
-    reset: 0 works, 1 gives an error, 2 reports success but changes nothing.
+    reset: 0 works, 1 gives an error, 2 reports success but changes nothing, 3 restores all but a
+        variable that new instances begin with as well, 4 crashes.
     load: 0 works, 1 gives no instance, 2 crashes.
     name: of the file.
 

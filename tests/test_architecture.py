@@ -25,6 +25,7 @@ ROOMS = (
         "times",
         "progress",
         "arrays",
+        "modules",
         "processes",
         "jobs",
         "serialisation",

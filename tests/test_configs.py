@@ -79,7 +79,7 @@ def test_only_a_listed_kind_is_saved() -> None:
         ({"kind": "Pair"}, r"config\.first: expected a value, got none"),
         ({"first": 3}, r"config\.first: expected a table whose kind is a Shape, got 3"),
         ({"first": {"kind": "Point"}}, r"config\.first: expected a table whose kind is a Shape"),
-        ({"first": {"kind": "Disc"}}, r"config\.first\.kind: expected one of Square, Point, Pair"),
+        ({"first": {"kind": "Disc"}}, r"config\.first\.kind: expected one of Square, Pair, got"),
         ({"first": {"kind": "Square", "side": 0}}, r"config\.first\.side: expected above 0, got 0"),
         ({"point": {"at": ["a", 1]}}, r"config\.point\.at: expected a valid number"),
         ({"count": 1.5}, r"config\.count: expected a valid integer.* or a valid tuple, got 1\.5"),

@@ -8,12 +8,13 @@ write its module and add one entry here.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 from retwin.checks import one_of
+from retwin.modules import import_beside
 
 __all__ = [
     "CALIBRATE_ON",
@@ -251,7 +252,7 @@ class PublicFile:
 
 
 def resolve(target: str) -> Any:
-    """The object that "package.module:object" names.
+    """The object that "package.module:object" names, installed or in the current folder.
 
     Raises
     ------
@@ -260,7 +261,7 @@ def resolve(target: str) -> Any:
 
     """
     module, _, attribute = target.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    return getattr(import_beside(module, Path.cwd()), attribute)
 
 
 def lookup(entries: Mapping[str, T], name: str, argument: str) -> T:

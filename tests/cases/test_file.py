@@ -7,6 +7,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterator
 from functools import reduce
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,10 @@ def ideal(commands):
     return commands[..., :1]
 
 
+def lagging(commands):
+    return np.cumsum(commands[..., :1], axis=1) / 10
+
+
 def noisy(commands, rng):
     return ideal(commands) + rng.normal(size=(*commands.shape[:2], 1))
 
@@ -50,6 +55,12 @@ def split(path):
     return path, path
 
 
+def foreign(path):
+    data = rt.FunctionTwin(ideal, CHANNELS, CHANNELS, 10).simulate(np.ones((1, 9, 1)), seed=0)
+    return data, data
+
+
+CHANNELS = rt.Channels(("a",), ("V",))
 leak = rt.ActuatorBias(1, (1.0, 2.0))
 TWIN = rt.FunctionTwin(turned, rt.Channels(("a", "b"), ("V", "V")), rt.Channels(("y",), ("m",)), 10)
 """
@@ -211,6 +222,66 @@ def test_parameters_are_arguments_of_the_function(read: Callable[..., rt.Case]) 
     assert found.values == pytest.approx({"gain": 1.4, "offset": -0.3}, abs=1e-4)
 
 
+MULTISINE = "[commands]\nkind = 'MultisineSampler'\nmean = [0, 2]\ndeviation = [0.3, 0.3]\n"
+
+
+def test_correction_and_network_are_those_that_suit_the_system(
+    read: Callable[..., rt.Case],
+) -> None:
+    """Without segments no correction per segment, and with memory no network without."""
+    static = read(BASE + MULTISINE)
+    assert (static.correction, static.network) == (rt.Additive(), rt.MLP())
+    lagging = read(BASE.replace("turned", "lagging"))
+    assert (lagging.correction, lagging.network) == (rt.DelayOffset(), rt.LSTM())
+    given = 'correction = "delay_offset"\nnetwork = "mlp"\n' + BASE.replace("turned", "lagging")
+    chosen = read(given + MULTISINE)
+    assert (chosen.correction, chosen.network) == (rt.DelayOffset(), rt.MLP())
+
+
+RECORDS = """
+[records]
+calibration = [
+    { columns = { a = "u", b = "v", y = "w" }, rows = [0, 40], transient = 0.45 },
+    { columns = { a = "u", b = "v", y = "w" }, rows = [40, 60] },
+]
+test = { columns = { a = "u", b = "v", y = "w" }, rows = [60, 90] }
+"""
+
+
+def test_records_are_parts_of_a_table(read: Callable[..., rt.Case], tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    table = rng.uniform(0, 1, (100, 3))
+    np.savetxt(tmp_path / "d.csv", table, delimiter=",", header="u,v,w", comments="")
+    calibration, test = read(BASE + RECORDS).records(tmp_path / "d.csv")
+    assert calibration.ids.tolist() == ["calibration-1", "calibration-2"]
+    assert test.ids.tolist() == ["test"]
+    np.testing.assert_allclose(test.commands[0], table[60:90, :2])
+    np.testing.assert_allclose(test.observed[0, :, 0], table[60:90, 2])
+    np.testing.assert_allclose(calibration.commands[1, :20], table[40:60, :2])
+    # A transient is masked, and so is what pads the shorter record.
+    assert calibration.mask[:, :, 0].tolist() == [
+        [False] * 4 + [True] * 36,
+        [True] * 20 + [False] * 20,
+    ]
+    assert test.mask.all()
+
+
+def test_a_function_of_records_is_checked(read: Callable[..., rt.Case], tmp_path: Path) -> None:
+    for name, message in [
+        (
+            "split",
+            r"case\.toml: records \(toy_module:split\): expected a function that returns two",
+        ),
+        (
+            "foreign",
+            r"case\.toml: records .* expected Trajectories of a, b, y at 10 Hz, got a, a at",
+        ),
+    ]:
+        case = read(f'records = "toy_module:{name}"\n' + BASE)
+        with pytest.raises(rt.InputError, match=message):
+            case.records(tmp_path / "d.csv")
+
+
 def test_a_correction_per_sample_brings_its_density(read: Callable[..., rt.Case]) -> None:
     case = read('correction = "additive"\n' + BASE)
     assert case.correction == case.output_correction == rt.Additive()
@@ -311,6 +382,23 @@ def test_worker_processes_find_the_module(read: Callable[..., rt.Case], tmp_path
     )
 
 
+def test_a_module_beside_the_case_is_found_alone(
+    read: Callable[..., rt.Case], tmp_path: Path
+) -> None:
+    """A file beside it stands in for no package; the module itself may import its neighbours."""
+    (tmp_path / "not_installed.py").write_text("")
+    (tmp_path / "toy_helpers.py").write_text("def twice(commands):\n    return 2 * commands")
+    before = [*sys.path]
+    case = read(BASE)
+    assert sys.path == before
+    assert find_spec("not_installed") is None
+    (tmp_path / "toy_two.py").write_text("from toy_helpers import twice")
+    single = "{ name = 'toy_two:twice', vectorised = false, workers = 2 }"
+    case = read(BASE.replace('"toy_module:turned"', single).replace("y = {", "y = {}\nz = {"))
+    made = case.twin.simulate(np.ones((3, 9, 2)), seed=0)  # also in worker processes
+    assert made.observed.min() == made.observed.max() == 2
+
+
 def test_another_module_of_that_name_is_not_taken(
     read: Callable[..., rt.Case], tmp_path: Path
 ) -> None:
@@ -406,7 +494,7 @@ WRONG = [
     ),
     ('unit = "m"', 'units = "m"', r"case\.toml: outputs\.y\.units: expected one of unit, low"),
     ("low = -1", 'low = "a"', r"case\.toml: inputs\.a\.low: expected a valid number, got 'a'"),
-    ("low = -1", "low = 2", r"case\.toml: inputs\.limits: expected one low and one greater high"),
+    ("low = -1", "low = 2", r"case\.toml: inputs\.limits: expected one low and one high"),
     ("low = -1, ", "", r"case\.toml: commands\.limits: expected a finite low"),
     (BASE, 'correction = "warped"\n' + BASE, r"case\.toml: correction: expected one of additive"),
     (BASE, BASE + "[correction]\nkind = 'Warp'\n", r"case\.toml: correction\.kind: expected one"),
@@ -431,7 +519,36 @@ WRONG = [
         r"case\.toml: density: expected SequenceMixture, for a correction with one z per sample",
     ),
     (BASE, 'density = "sequence_mixture"\n' + BASE, r"case\.toml: density: expected Mixture or"),
-    (BASE, "network = { kind = 'CNN' }\n" + BASE, r"case\.toml: network\.kind: expected one of"),
+    (
+        BASE,
+        "network = { kind = 'GRU' }\n" + BASE,
+        r"network\.kind: expected one of MLP, LSTM, TCN, StateSpace, got 'GRU'; check the \S+$",
+    ),
+    (
+        BASE,
+        'correction = "additive"\noutput_correction = "delay_offset"\n' + BASE,
+        r"case\.toml: output_correction: expected a correction with one z per sample, ",
+    ),
+    (
+        BASE,
+        BASE + RECORDS.replace("[60, 90]", "[59, 90]"),
+        r"case\.toml: records\.test: expected measurements that are in no calibration record",
+    ),
+    (
+        BASE,
+        BASE + RECORDS.replace(", rows = [60, 90]", ""),
+        r"case\.toml: records\.test: .* the same columns, u, v, w; .* rows = \[FIRST, END\]",
+    ),
+    (
+        BASE,
+        BASE + RECORDS.replace("[40, 60]", "[60, 40]"),
+        r"records\.calibration\.rows: expected the f",
+    ),
+    (
+        BASE,
+        BASE + RECORDS.replace("0.45", "-1"),
+        r"case\.toml: records\.calibration\.transient: expected",
+    ),
     (
         BASE,
         BASE + "[training]\nmax_epochs = 2.5\n",
@@ -488,6 +605,14 @@ def test_a_refusal_names_file_and_key(
         read(BASE.replace(old, new))
     assert "\n" not in str(caught.value)
     assert "case.toml" in str(caught.value)
+
+
+def test_more_channels_than_can_be_read_in_seconds_are_refused(
+    read: Callable[..., rt.Case],
+) -> None:
+    many = "".join(f"u{i} = {{}}\n" for i in range(10_001))
+    with pytest.raises(rt.InputError, match=r"inputs: expected at most 10000 channels, got 10003"):
+        read(BASE.replace("[outputs]", many + "[outputs]"))
 
 
 def test_a_file_that_is_not_there_is_one_line(tmp_path: Path) -> None:

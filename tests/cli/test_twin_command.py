@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import signal
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fmus import c_fmu, described
 
 import retwin as rt
 from retwin import twins
@@ -153,9 +155,87 @@ def test_a_module_in_the_current_folder(mine: str, tmp_path: Path) -> None:
     more = ["--n", "6", "--duration", "4", "--chunk", "2", "--workers", "2", "--out", "a.zarr"]
     done = subprocess.run([*command, *more], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    (tmp_path / "numpy.py").write_text("raise SystemExit('not the real one')")
+    for name in ("numpy", "zarr"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('not the real one')")
     done = subprocess.run([*command, *more], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_table_of_channels_has_an_end(call, mine: str, tmp_path: Path) -> None:
+    names = ",".join(f"u{i}" for i in range(300))
+    words = ("info", f"{mine}:double", "--rate", 9, "--inputs", names, "--outputs", "y")
+    code, out, _ = call(*words)
+    assert code == 0
+    assert "… and 201 more channels, which --json lists" in out
+    assert len(out.splitlines()) < 110
+    assert len(json.loads(call(*words, "--json")[1])["inputs"]) == 300
+
+
+def test_an_fmu_without_inputs_simulates(call, tmp_path: Path) -> None:
+    alone = described(c_fmu(tmp_path), "alone", 'causality="input"', 'causality="local"')
+    out = tmp_path / "a.npz"
+    code, _, err = call("simulate", alone, "--n", 2, "--outputs", "sums", "--out", out)
+    assert code == 0, err
+    assert rt.load(out).observed.shape == (2, 1000, 2)
+
+
+def test_the_options_of_a_model_file(call, tmp_path: Path) -> None:
+    """Those that the messages name."""
+    mesh = '<collision><geometry><mesh filename="gone.stl"/></geometry></collision>'
+    inertia = '<inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/>'
+    (tmp_path / "arm.urdf").write_text(
+        f'<robot name="a"><link name="base"/><link name="arm">{mesh}<inertial><mass value="1"/>'
+        f'{inertia}</inertial></link><joint name="hip" type="revolute"><parent link="base"/>'
+        '<child link="arm"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" '
+        'velocity="1"/></joint></robot>'
+    )
+    file = tmp_path / "arm.urdf"
+    refused(call, "--no-meshes", "info", file)
+    words = ("info", file, "--no-meshes", "--outputs", "joint:hip")
+    refused(call, "--servo JOINT=STIFFNESS,DAMPING", *words)
+    refused(call, "--servo: expected", "info", file, "--no-meshes", "--servo", "hip")
+    words = ("info", file, "--no-meshes", "--servo", "hip=500,40")
+    refused(call, "joint:NAME.* joint:hip, body:arm", *words)
+    code, out, _ = call(*words, "--outputs", "joint:hip,body:arm")
+    assert code == 0
+    assert "joint:hip" in out
+    refused(call, "options of another kind|no such options", "info", "armpi", "--no-meshes")
+
+
+QUITTER = """
+import sys
+
+
+def quits(commands):
+    if len(commands) < 99:
+        sys.exit(0)
+    return commands
+"""
+QUITTING = """
+name = "quitter"
+twin = "quitter:quits"
+rate = 10
+[inputs]
+u = { low = 0, high = 1 }
+[outputs]
+y = {}
+"""
+
+
+def test_code_that_ends_the_program_is_a_failure(call, tmp_path: Path) -> None:
+    (tmp_path / "quitter.py").write_text(QUITTER)
+    (tmp_path / "case.toml").write_text(QUITTING)
+    code, out, err = call("info", tmp_path / "case.toml")
+    assert code == 0
+    assert f"runs {tmp_path / 'quitter.py'} with your rights" in out.replace("\n", " ")
+    code, _, err = call("simulate", tmp_path / "case.toml", "--out", tmp_path / "a.npz")
+    assert code == 1
+    assert re.search(r"error: \S+quitter\.py:7: this line ended the program \(SystemExit: 0\)", err)
+    (tmp_path / "quitting.py").write_text("raise SystemExit")
+    (tmp_path / "case.toml").write_text(QUITTING.replace("quitter:", "quitting:"))
+    code, _, err = call("info", tmp_path / "case.toml")
+    assert code == 1
+    assert "quitting.py:1: this line ended the program" in err
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +22,8 @@ from fmus import c_fmu, changed, described, python_fmu
 
 import retwin as rt
 from retwin.twins.fmu import FMUTwin
+from retwin.twins.parametric import Parameter, ParametricTwin
+from retwin.twins.randomised import RandomisedTwin
 
 TAU = 0.1
 RATE = 100.0
@@ -94,9 +97,14 @@ def test_whole_numbers_are_rounded_and_held(lag: Path, pylag: Path) -> None:
 
 def test_names_units_and_limits_come_from_the_fmu(lag: Path) -> None:
     twin = FMUTwin.from_file(lag)
-    assert twin.inputs == rt.Channels(("u", "trouble", "on"), ("V", "1", "1"))
-    assert twin.outputs == rt.Channels(("x", "seen", "runs"), ("m", "1", "1"))
-    assert twin.limits == rt.Limits((-10.0, -np.inf, 0.0), (10.0, np.inf, 1.0))
+    # An input whose range is one value is a constant and no command.
+    names = ("u", "trouble", "on", "pair[0]", "pair[1]", "mode")
+    assert twin.inputs == rt.Channels(names, ("V", "1", "1", "1", "1", "1"))
+    assert twin.outputs == rt.Channels(("x", "seen"), ("m", "1"))
+    free = (np.inf, np.inf)
+    assert twin.limits == rt.Limits(
+        (-10.0, -np.inf, 0.0, -np.inf, -np.inf, 1.0), (10.0, np.inf, 1.0, *free, 4.0)
+    )
     assert FMUTwin.from_file(lag, inputs=["trouble"]).limits is None
     loud = np.full((1, 20, 1), 12.0)
     with pytest.raises(rt.InputError, match="expected u from -10 to 10 V, got 12"):
@@ -123,24 +131,57 @@ def test_start_values_may_differ_between_runs(fmu: str, request: pytest.FixtureR
 
 def test_an_fmu_may_have_no_inputs(lag: Path) -> None:
     alone = described(lag, "alone", 'causality="input"', 'causality="local"')
-    twin = FMUTwin.from_file(alone, RATE, outputs=["runs"], workers=1)
+    twin = FMUTwin.from_file(alone, RATE, outputs=["sums"], workers=1)
+    assert twin.outputs.names == ("sums[0]", "sums[1]")
     made = twin.simulate(np.zeros((2, 10, 0)), seed=0, parameters={"gain": [1, 2]})
-    assert made.observed[:, -1, 0].tolist() == [1, 2]
+    assert made.observed[:, -1].tolist() == [[0, 45], [0, 90]]
 
 
-def test_faults_hold_the_command(lag: Path) -> None:
+def test_arrays_are_channels_and_constants_may_be_named(lag: Path) -> None:
+    """The element of an array that is no channel keeps its start value."""
+    commands = np.arange(1.0, 21.0).reshape(1, 10, 2)
+    commands[:, :, 1] = 3.0
+    twin = FMUTwin.from_file(lag, RATE, ["pair[0]", "fixed"], ["sums[1]", "sums[0]"], workers=1)
+    made = twin.simulate(commands, seed=0)
+    assert made.observed[0, -1].tolist() == [9 * 5, 3 * commands[0, :-1, 0].sum()]
+    both = FMUTwin.from_file(lag, RATE, ["pair", "mode"], ["sums", "x"], workers=1)
+    assert both.inputs.names == ("pair[0]", "pair[1]", "mode")
+    assert both.outputs.names == ("sums[0]", "sums[1]", "x")
+    drive = np.tile([2.0, 3.0, 3.6], (1, 10, 1))
+    assert both.simulate(drive, seed=0).observed[0, -1].tolist() == [9 * 2 * 3, 9 * 3 * 4, 0]
+    with pytest.raises(rt.InputError, match="expected mode from 1 to 4 1, got 5"):
+        both.simulate(drive * 1.4, seed=0)
+    with pytest.raises(rt.InputError, match="expected fixed from 3 to 3"):
+        twin.simulate(commands + 1, seed=0)
+
+
+def test_an_array_without_bound_is_refused(lag: Path) -> None:
+    bomb = described(
+        lag, "bomb", '<Dimension start="2"/></Float64>', '<Dimension start="9999999"/></Float64>'
+    )
+    with pytest.raises(rt.InputError, match="outputs: expected arrays of at most 1000000 numbers"):
+        FMUTwin.from_file(bomb, outputs=["sums"])
+
+
+@pytest.fixture
+def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the FMU counts its instances (i) and runs (r)."""
+    monkeypatch.setenv("LAG_LOG", str(tmp_path / "log"))
+    return tmp_path / "log"
+
+
+def test_faults_hold_the_command(lag: Path, log: Path) -> None:
     ramp = np.linspace(0, 6, 60)
     commands = np.tile(ramp[:, None], (3, 1, 1))
-    twin = FMUTwin.from_file(lag, RATE, ["u"], ["x", "runs"], workers=1)
+    twin = FMUTwin.from_file(lag, RATE, ["u"], ["x"], workers=1)
     made = twin.simulate(commands, faults=[None, rt.Stuck(0, onset=0.2), None], seed=0)
     assert made.labels.tolist() == ["Healthy", "Stuck", "Healthy"]
     stuck = np.minimum(ramp, ramp[20])
     np.testing.assert_allclose(made.observed[1, :, 0], lagged(stuck, 1 / RATE), atol=1e-12)
     for nominal in made.nominal[:, :, 0]:
         np.testing.assert_allclose(nominal, lagged(ramp, 1 / RATE), atol=1e-12)
-    # The FMU counts the runs of an instance: the healthy ones were not run twice.
-    assert made.observed[:, -1, 1].tolist() == [1, 2, 3]
-    assert made.nominal[:, -1, 1].tolist() == [1, 4, 3]
+    # Healthy trajectories are not run twice; two runs more check that the reset is complete.
+    assert log.read_text("utf-8") == "i" + 6 * "r"
 
 
 def test_nominal_may_be_given(lag: Path) -> None:
@@ -164,24 +205,30 @@ TROUBLES = {
     4: "x is nan from 0.06 s on",
     5: "FMI status fatal in fmi3DoStep",
     6: "its process ended (exit code 3)",
-    7: "the FMU ended its simulation at 0.06 s",
+    111: "its process ended (exit code 75)",
+    112: "its process ended (exit code 0)",
+    113: "FMI status -1 in fmi3DoStep",
+    115: "it wrote to the connection of its process",
+    116: "it closed the connection of its process",
+    117: "it wrote to the connection of its process",
 }
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_run_that_fails_ends_alone(lag: Path, workers: int) -> None:
     twin = FMUTwin.from_file(lag, RATE, ["u", "trouble"], ["x"], timeout=1.5, workers=workers)
-    commands = np.zeros((16, 20, 2))
-    commands[:, :, 0] = np.arange(16)[:, None] / 2
-    commands[1::2, 5:, 1] = np.arange(1, 9)[:, None]  # number 8 is no trouble
+    kinds = list(TROUBLES)
+    commands = np.zeros((2 * len(kinds), 20, 2))
+    commands[:, :, 0] = np.arange(len(commands))[:, None] / 4
+    commands[1::2, 5:, 1] = np.array(kinds)[:, None]
     reported: list[float] = []
-    with pytest.raises(rt.SimulationError, match=r"7 of 16 .* trajectory 1: hung") as caught:
+    with pytest.raises(rt.SimulationError, match=r"12 of 24 .* trajectory 1: hung") as caught:
         twin.simulate(commands, seed=0, progress=reported.append)
-    assert caught.value.failed == {2 * kind - 1: why for kind, why in TROUBLES.items()}
+    assert caught.value.failed == {2 * i + 1: TROUBLES[kind] for i, kind in enumerate(kinds)}
     finished = caught.value.finished
-    assert finished.ids.tolist() == [f"{i:05d}" for i in (0, 2, 4, 6, 8, 10, 12, 14, 15)]
+    assert finished.ids.tolist() == [f"{i:05d}" for i in range(0, 24, 2)]
     for made, which in zip(finished.observed, finished.ids, strict=True):
-        truth = lagged(np.full(20, int(which) / 2), 1 / RATE)
+        truth = lagged(np.full(20, int(which) / 4), 1 / RATE)
         np.testing.assert_allclose(made[:, 0], truth, atol=1e-12)
     assert reported == sorted(reported)
     assert reported[-1] == 1.0
@@ -198,15 +245,66 @@ def test_the_failure_of_a_healthy_run_is_named_as_such(lag: Path) -> None:
 
 @pytest.mark.parametrize(("reset", "reuse"), [(1, True), (2, False)], ids=["refused", "idle"])
 def test_an_fmu_without_a_reset_is_instantiated_anew(
-    tmp_path: Path, reset: int, reuse: bool
+    tmp_path: Path, log: Path, reset: int, reuse: bool
 ) -> None:
     """More often than one process may."""
-    path = c_fmu(tmp_path, reset=reset)
-    twin = FMUTwin.from_file(path, RATE, ["u"], ["x", "runs"], reuse=reuse, workers=1)
+    twin = FMUTwin.from_file(c_fmu(tmp_path, reset=reset), RATE, ["u"], ["x"], reuse=reuse)
     made = twin.simulate(np.ones((600, 4, 1)), seed=0)
     assert np.ptp(made.observed, axis=0).max() == 0
-    assert made.observed[:, :, 1].max() == 1
     np.testing.assert_allclose(made.observed[-1, :, 0], lagged(np.ones(4), 1 / RATE), atol=1e-12)
+    kinds = log.read_text("utf-8")
+    assert kinds.count("i") == kinds.count("r") > 600
+
+
+@pytest.mark.parametrize(
+    ("reset", "warning"),
+    [(2, "every run has a new instance"), (3, "every run has a process of its own"), (4, "")],
+    ids=["instance forgets", "library remembers", "crashes"],
+)
+def test_an_incomplete_reset_is_found(tmp_path: Path, reset: int, warning: str) -> None:
+    """Also where the first trajectories end as they begin; whatever the number of processes."""
+    commands = np.repeat([0.0, 0.0, 1.0, 1.0, 1.0, 2.0], 20).reshape(6, 20, 1)
+    path = c_fmu(tmp_path, reset=reset)
+    for workers in (1, 2):
+        twin = FMUTwin.from_file(path, RATE, ["u"], ["x"], workers=workers)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            made = twin.simulate(commands, seed=0)
+        assert {str(each.message).count(warning) for each in caught} <= {1}
+        assert len(caught) == 1 if warning and workers == 1 else len(caught) <= 1
+        for drive, out in zip(commands[:, :, 0], made.observed[:, :, 0], strict=True):
+            np.testing.assert_allclose(out, lagged(drive, 1 / RATE), atol=1e-12)
+
+
+def test_a_run_does_not_change_the_arithmetic_of_the_next(lag: Path) -> None:
+    """Trouble 114 rounds upwards and flushes tiny numbers to zero."""
+    commands = np.zeros((3, 20, 2))
+    commands[:, :, 0] = [[0.1], [0.3], [1e-307]]
+    quiet = FMUTwin.from_file(lag, RATE, ["u", "trouble"], ["x"], workers=1)
+    truth = quiet.simulate(commands[1:], seed=0).observed
+    commands[0, :, 1] = 114
+    made = quiet.simulate(commands, seed=0).observed[1:]
+    assert made.tobytes() == truth.tobytes()
+    assert 0 < made[1, 1, 0] < np.finfo(float).tiny * 10
+
+
+def test_an_fmu_that_ends_early_gives_what_it_has(lag: Path) -> None:
+    commands = np.ones((3, 20, 2))
+    commands[:, :, 1] = 0
+    commands[1, 5:, 1] = 7
+    twin = FMUTwin.from_file(lag, RATE, ["u", "trouble"], ["x"], step=1 / (2 * RATE), workers=1)
+    with pytest.warns(
+        UserWarning, match=r"ended 1 simulations .*trajectory 1 at 0.055 s"
+    ) as caught:
+        made = twin.simulate(commands, seed=0)
+    assert len(caught) == 1
+    assert made.mask[[0, 2]].all()
+    assert made.mask[1, :, 0].tolist() == [True] * 6 + [False] * 14
+    np.testing.assert_allclose(made.observed[1, :6, 0], made.observed[0, :6, 0], atol=1e-12)
+    gain = Parameter("gain", "1", 1.0, 1.0 + 1e-9)
+    with pytest.warns(UserWarning, match="ended 1 simulations"):
+        drawn = RandomisedTwin(ParametricTwin(twin, (gain,))).simulate(commands, seed=0)
+    np.testing.assert_array_equal(drawn.mask, made.mask)
 
 
 def test_same_bytes_whatever_the_workers(lag: Path) -> None:
@@ -258,8 +356,8 @@ def test_native_code_stays_out_of_this_process_and_off_the_disk(
         ({"rates": {"w": 2.0}}, "rates: .* 'w' .*the inputs are u, trouble, on"),
         ({"inputs": ["truble"]}, "inputs: .* 'truble', which the FMU does not have; did you mean "),
         ({"inputs": ["gain"]}, "inputs: .* 'gain', whose causality is parameter, type Float64; "),
-        ({"inputs": ["pair"]}, r"inputs: .* 'pair', .* of shape \(2,\); there are: u, trouble, on"),
-        ({"outputs": ["u"]}, "outputs: .* whose causality is input, .*there are: x, seen, runs"),
+        ({"inputs": ["pair[2]"]}, r"inputs: .* 'pair\[2\]', which the FMU does not have"),
+        ({"outputs": ["u"]}, "outputs: .* whose causality is input, .*there are: x, seen, sums"),
         ({"start": {"gian": 1.0}}, "start: .* 'gian'; did you mean gain"),
         ({"start": {"u": 1.0}}, "start: expected scalar variables .* no commands, got 'u'"),
         ({"start": {"x": 1.0}}, "start: .* got 'x'"),
@@ -292,7 +390,9 @@ def test_files_that_cannot_run_are_refused(lag: Path, tmp_path: Path) -> None:
     (tmp_path / "none.fmu").write_bytes(b"PK\x05\x06" + bytes(18))
     exchange = described(lag, "exchange", "<CoSimulation", "<ModelExchange")
     elsewhere = changed(lag, "elsewhere", lambda n, c: (n.replace("x86_64", "riscv64"), c))
+    hollow = changed(lag, "hollow", lambda n, c: (n.replace("Lag.so", "readme.txt"), c))
     cases = {
+        hollow: r"Lag.so, got hollow.fmu, whose binaries/\S+ does not have it",
         tmp_path / "missing.fmu": "which is not there",
         tmp_path / "text.fmu": "which is no zip file",
         tmp_path / "none.fmu": "no item named 'modelDescription.xml'",
@@ -301,7 +401,7 @@ def test_files_that_cannot_run_are_refused(lag: Path, tmp_path: Path) -> None:
         exchange: "for co-simulation, FMI 2.0 or 3.0, got exchange.fmu, FMI 3.0 for model exchange",
         changed(lag, "bare", lambda n, c: None if "bin" in n else (n, c)): "which has none",
         elsewhere: "which has riscv64-",
-        described(lag, "mute", 'causality="output"', 'causality="local"'): "at least one variable",
+        described(lag, "mute", 'causality="output"', 'causality="local"'): "name local variables",
     }
     for path, message in cases.items():
         with pytest.raises(rt.InputError, match=message) as caught:
@@ -402,10 +502,10 @@ def test_without_fmpy_it_says_how_to_get_it(lag: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.slow
-def test_ten_thousand_runs_do_not_grow_the_worker(lag: Path) -> None:
+def test_ten_thousand_runs_do_not_grow_the_worker(lag: Path, log: Path) -> None:
     if sys.platform != "linux":
         pytest.skip("reads /proc")
-    twin = FMUTwin.from_file(lag, RATE, ["u"], ["x", "runs"], workers=1)
+    twin = FMUTwin.from_file(lag, RATE, ["u"], ["x"], workers=1)
     memory: list[float] = []
 
     def measure(share: float) -> None:
@@ -413,7 +513,7 @@ def test_ten_thousand_runs_do_not_grow_the_worker(lag: Path) -> None:
             pages = int(Path(f"/proc/{child.pid}/statm").read_text("utf-8").split()[1])
             memory.append(pages * 4096 / 2**20)
 
-    made = twin.simulate(np.ones((10_000, 20, 1)), seed=0, progress=measure)
-    assert made.observed[-1, -1, 1] == 10_000  # one instance, one process
+    twin.simulate(np.ones((10_000, 20, 1)), seed=0, progress=measure)
+    assert log.read_text("utf-8").count("i") == 1  # one instance, one process
     assert len(memory) == 10_000
     assert max(memory[1000:]) - memory[1000] < 3.0

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -371,3 +372,31 @@ def test_the_how_to_is_true(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stdout + done.stderr
         for line in re.findall(r"  # prints (.*)", code):
             assert line in done.stdout
+
+
+def ramp(commands: np.ndarray, rate: float, slope: float = 1.0) -> np.ndarray:
+    """Time in s since the begin, for one trajectory."""
+    return slope * np.arange(len(commands))[:, None] / rate
+
+
+def leaves(commands: np.ndarray) -> np.ndarray:
+    raise SystemExit(0)
+
+
+def test_the_rate_is_given_to_a_function_that_has_it() -> None:
+    channel = rt.Channels(("a",), ("1",))
+    for function, last in [
+        (ramp, 0.8),
+        (partial(ramp, rate=1.0), 8.0),
+        (partial(ramp, slope=2), 1.6),
+    ]:
+        twin = FunctionTwin(function, channel, channel, 10.0, vectorised=False)
+        made = twin.simulate(np.ones((2, 9, 1)), seed=0)
+        assert made.observed[:, -1, 0].tolist() == [last, last]
+
+
+def test_a_function_that_ends_the_program_in_a_worker_is_a_failure() -> None:
+    channel = rt.Channels(("a",), ("1",))
+    twin = FunctionTwin(leaves, channel, channel, 10.0, vectorised=False, workers=2)
+    with pytest.raises(RuntimeError, match=r"ended the program \(SystemExit: 0\)"):
+        twin.simulate(np.ones((2, 9, 1)), seed=0)

@@ -102,14 +102,14 @@ def test_a_velocity_actuator_starts_where_the_model_does(make) -> None:
     assert made.observed[0, 10:, 0].mean() > still.observed[0, 10:, 0].mean()
 
 
-def test_what_has_no_name_is_left_out(tmp_path: Path) -> None:
+def test_sensors_without_names_are_left_out(tmp_path: Path) -> None:
     path = tmp_path / "model.xml"
     unnamed = PENDULUM.replace('jointpos name="angle"', "jointpos")
     path.write_text(unnamed.format(actuator=f'<motor joint="hinge"/>{MOTOR}', joint=""))
     twin = MuJoCoTwin.from_file(path)
-    assert (twin.inputs.names, twin.outputs.names) == (("motor",), ("speed",))
-    path.write_text(unnamed.format(actuator='<motor joint="hinge"/>', joint=""))
-    with pytest.raises(rt.InputError, match="actuators that have names"):
+    assert (twin.inputs.names, twin.outputs.names) == (("hinge", "motor"), ("speed",))
+    path.write_text(unnamed.format(actuator="", joint=""))
+    with pytest.raises(rt.InputError, match=r"a model with actuators, .* --servo JOINT"):
         MuJoCoTwin.from_file(path)
 
 
@@ -230,10 +230,58 @@ def test_urdf_gets_servos(tmp_path: Path) -> None:
         MuJoCoTwin.from_file(path, servos=servos, outputs=["hand"])
     with pytest.raises(rt.InputError, match="add servos"):
         MuJoCoTwin.from_file(path, outputs=["hand"], meshes=False)
-    with pytest.raises(rt.InputError, match=r"name places .* hand"):
+    with pytest.raises(rt.InputError, match=r"joint:NAME.* body:hand"):
         MuJoCoTwin.from_file(path, servos=servos, meshes=False)
     with pytest.raises(rt.InputError, match=r"servos: .* got 'hips'; did you mean 'hip'\?"):
         MuJoCoTwin.from_file(path, servos=[("hips", Servo(1, 1))], meshes=False)
+
+
+def test_joints_sites_and_bodies_are_outputs_by_name(make) -> None:
+    """Also velocities, and joints of models without sensors; names that stand for several."""
+    names = ("joint:hinge", "joint_velocity:hinge", "site:tip", "site_velocity:tip", "body:bob")
+    twin = make(outputs=(*names, "hinge"), keyframe="raised")
+    assert twin.outputs.names[:3] == ("joint:hinge", "joint_velocity:hinge", "site:tip_x")
+    assert twin.outputs.units == ("rad", "rad/s", *("m",) * 3, *("m/s",) * 3, *("m",) * 3, "rad")
+    made = twin.simulate(np.zeros((1, 100, 1)), seed=0).observed[0]
+    angle, speed, tip, swing = made[:, 0], made[:, 1], made[:, 2:5], made[:, 5:8]
+    own = make(keyframe="raised").simulate(np.zeros((1, 100, 1)), seed=0).observed[0]
+    np.testing.assert_array_equal(made[:, [0, 1]], own)
+    np.testing.assert_array_equal(made[:, -1], angle)
+    np.testing.assert_allclose(tip[:, 0], -np.sin(angle), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(swing, axis=1), np.abs(speed), atol=1e-9)
+    for bad, meant in [
+        ("joint:hing", "joint:hinge"),
+        ("hip:tip", "site:tip"),
+        ("tipp", "site:tip"),
+    ]:
+        with pytest.raises(rt.InputError, match=f"outputs: .* did you mean '{meant}'"):
+            make(outputs=(bad,))
+
+
+def test_joints_of_other_kinds(tmp_path: Path) -> None:
+    balls = PENDULUM.format(actuator=MOTOR, joint="").replace(
+        '<body name="bob">',
+        '<body name="top"><joint name="{}" type="{}"/><geom size=".1"/></body><body name="bob">',
+    )
+    path = tmp_path / "balls.xml"
+    path.write_text(re.sub("<keyframe>.*</keyframe>", "", balls.format("ball", "ball")))
+    twin = MuJoCoTwin.from_file(path, outputs=["joint:ball", "joint_velocity:ball"])
+    assert twin.outputs.names == tuple(
+        [f"joint:ball_{part}" for part in "wxyz"]
+        + [f"joint_velocity:ball_{part}" for part in "xyz"]
+    )
+    path.write_text(re.sub("<keyframe>.*</keyframe>", "", balls.format("loose", "free")))
+    with pytest.raises(rt.InputError, match=r"no free joint, got 'joint:loose'; .* body:top"):
+        MuJoCoTwin.from_file(path, outputs=["joint:loose"])
+
+
+def test_actuators_without_names_have_those_of_their_joints(make) -> None:
+    nameless = (
+        '<motor joint="hinge"/><velocity joint="hinge" kv="1"/><motor name="m" joint="hinge"/>'
+    )
+    twin = make(nameless)
+    assert twin.inputs.names == ("hinge", "hinge_2", "m")
+    assert make(nameless, inputs=("hinge_2",)).simulate(np.ones((1, 9, 1)), seed=0).observed.any()
 
 
 def test_what_is_refused(make, tmp_path: Path) -> None:

@@ -9,22 +9,28 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from retwin import catalog
 from retwin.cases.case import Case
-from retwin.cases.columns import ColumnRecords
+from retwin.cases.columns import ColumnRecords, Record
 from retwin.cases.named_twin import imported, parametric_twin, read_twin
 from retwin.checks import one_of, positive, require
 from retwin.data.io import load
+from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Channels, Trajectories
 from retwin.errors import InputError
 from retwin.nets.networks import Network
 from retwin.nets.training import Training
 from retwin.serialisation.configs import at, checked, fits, from_config, from_settings, key
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
+from retwin.twins.fmu import FMUTwin
 from retwin.twins.limits import Limits
+from retwin.twins.mujoco import MuJoCoTwin
 from retwin.twins.parametric import Parameter
 from retwin.twins.samplers import (
     CommandSampler,
@@ -45,10 +51,10 @@ FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
 
 @dataclass(frozen=True)
 class _Columns:
-    """The column of each channel in a table, one record per set."""
+    """The records of each set in a table: the column of each channel, a `Record`, or several."""
 
-    calibration: Mapping[str, str] = field(default_factory=dict)
-    test: Mapping[str, str] = field(default_factory=dict)
+    calibration: Any = field(default_factory=dict)
+    test: Any = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -65,10 +71,10 @@ class CaseFile:
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     commands: dict[str, Any] | str = field(default_factory=dict)
     faults: dict[str, dict[str, Any] | str] = field(default_factory=dict)
-    correction: Correction | str = "delay_offset"
+    correction: Correction | str | None = None
     output_correction: Correction | str | None = None
     density: Density | SequenceMixture | str | None = None
-    network: Network | str = "mlp"
+    network: Network | str | None = None
     training: Training | None = None
     records: _Columns | str | None = None
 
@@ -100,18 +106,27 @@ def read_case(path: str | Path) -> Case:
             for name, value in keys.parameters.items()
         ]
         twin = parametric = parametric_twin(twin, free, inside)
-    correction = _chosen(keys.correction, catalog.CORRECTIONS, key(place, "correction"))
+    sampler = _sampler(keys.commands, twin, folder, key(place, "commands"))
+    correction = keys.correction or ("delay_offset" if _has_segments(sampler) else "additive")
+    correction = _chosen(correction, catalog.CORRECTIONS, key(place, "correction"))
+    network = keys.network or ("mlp" if _is_static(twin, sampler) else "lstm")
     stepwise = correction.resolution == "step"
     density = keys.density or (SequenceMixture() if stepwise else Mixture())
     density = _chosen(density, catalog.DENSITIES, key(place, "density"))
     at_outputs = keys.output_correction or (correction if stepwise else DelayOffset())
     at_outputs = _chosen(at_outputs, catalog.CORRECTIONS, key(place, "output_correction"))
-    for operator in (correction, at_outputs):
-        check_density(operator, density, key(place, "density"))
+    check_density(correction, density, key(place, "density"))
+    require(
+        at_outputs.resolution == correction.resolution,
+        key(place, "output_correction"),
+        expected=f"a correction with one z per {'sample' if stepwise else 'segment'}, as that of "
+        "`correction`",
+        got=type(at_outputs).__name__,
+        remedy="leave it out, or choose another correction",
+    )
     sensor_rate = twin.rate if keys.sensor_rate is None else keys.sensor_rate
     faults = _faults(keys.faults, twin.inputs, folder, key(place, "faults"))
-    sampler = _sampler(keys.commands, twin, folder, key(place, "commands"))
-    network = _chosen(keys.network, catalog.NETWORKS, key(place, "network"))
+    network = _chosen(network, catalog.NETWORKS, key(place, "network"))
     records = _records(keys.records, twin, folder, key(place, "records"))
     sensor_rate = positive(key(place, "sensor_rate"), sensor_rate, unit="Hz")
     with at(place):
@@ -148,8 +163,34 @@ def check_density(
         if stepwise
         else "Mixture or Flow, for a correction with one z per segment",
         got=type(density).__name__,
-        remedy="leave it out, or choose another correction",
+        remedy="leave it out, so that it suits the correction, or choose another correction",
     )
+
+
+def _has_segments(sampler: CommandSampler) -> bool:
+    """Whether commands move and rest, so that a discrepancy per segment is more than an offset."""
+    drawn = sampler.sample(2, rng=np.random.default_rng(0))
+    return Segments.from_commands(drawn).max_count > 1
+
+
+def _is_static(twin: Twin, sampler: CommandSampler) -> bool:
+    """Whether each ideal output depends on the command of the same sample alone.
+
+    Then samples in another order give the same outputs in that order. MuJoCo models and FMUs are
+    taken to have memory, without a simulation.
+    """
+    inner = getattr(twin, "twin", twin)
+    if isinstance(inner, FMUTwin | MuJoCoTwin):
+        return False
+    rng = np.random.default_rng(0)
+    drawn = np.asarray(sampler.sample(1, rng=rng), dtype=float)
+    order = rng.permutation(drawn.shape[1])
+    try:
+        ideal, other = (twin.simulate(u, seed=0).nominal for u in (drawn, drawn[:, order]))
+    except (Exception, SystemExit):  # of the user's code: reported where the twin is used
+        return False
+    scale = float(np.abs(ideal).max(initial=0.0))
+    return bool(np.allclose(ideal[:, order], other, rtol=0, atol=1e-6 * scale))
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -248,7 +289,47 @@ def _records(
     if value is None:
         return None
     if isinstance(value, str):
-        split: Callable[[Path], tuple[Trajectories, Trajectories]] = imported(value, folder, place)
-        return split
+        function = imported(value, folder, place)
+        return partial(_checked_split, function, twin, f"{place} ({value})")
+    sets = {
+        name: _record_list(getattr(value, name), key(place, name))
+        for name in ("calibration", "test")
+    }
     with at(place):
-        return ColumnRecords(twin, value.calibration, value.test)
+        return ColumnRecords(twin, **sets)
+
+
+def _record_list(value: Any, place: str) -> list[Record]:
+    """Records from a table of columns, a table of a `Record`, or several of these."""
+    tables = value if isinstance(value, tuple) else [value]
+    full = [isinstance(t, Mapping) and isinstance(t.get("columns"), Mapping) for t in tables]
+    return [
+        from_settings(Record, table if whole else {"columns": table}, place=place)
+        for table, whole in zip(tables, full, strict=True)
+    ]
+
+
+def _checked_split(
+    function: Any, twin: Twin, place: str, path: Path
+) -> tuple[Trajectories, Trajectories]:
+    """The records that a user's function gives, checked."""
+    made = function(Path(path))
+    fine = isinstance(made, tuple) and len(made) == 2
+    require(
+        fine and all(isinstance(each, Trajectories) for each in made),
+        place,
+        expected="a function that returns two Trajectories, for calibration and for tests",
+        got=f"one that returned {made!r:.80}",
+        remedy="return (calibration, test)",
+    )
+    for each in made:
+        require(
+            (each.inputs, each.outputs, each.rate) == (twin.inputs, twin.outputs, twin.rate),
+            place,
+            expected=f"Trajectories of {', '.join(twin.inputs.names + twin.outputs.names)} at "
+            f"{twin.rate:g} Hz",
+            got=f"{', '.join(each.inputs.names + each.outputs.names)} at {each.rate:g} Hz",
+            remedy="give them the channels and the rate of the twin",
+        )
+    calibration, test = made
+    return calibration, test

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -16,6 +14,7 @@ from retwin import twins
 from retwin.checks import require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
+from retwin.modules import import_beside
 from retwin.serialisation.configs import at, checked, from_settings, key
 from retwin.twins.fmu import FMUTwin
 from retwin.twins.function import FunctionTwin
@@ -30,6 +29,10 @@ FILES: dict[str, Any] = {".fmu": FMUTwin, ".xml": MuJoCoTwin, ".urdf": MuJoCoTwi
 """The kind of twin that a file of each suffix holds."""
 ELSEWHERE = ("path", "function", "inputs", "outputs", "sensors", "rate", "limits")
 """Parameters of twins that other keys of a case.toml set."""
+
+MAX_CHANNELS = 10_000
+"""Largest number of inputs, and of outputs, in a case.toml: more take minutes to read, and a
+trajectory takes hundreds of MB."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +57,7 @@ Named = Mapping[str, Any] | Sequence[str]
 
 
 def imported(name: Any, folder: Path, place: str) -> Any:
-    """The object that `module:object` names.
-
-    From then on, modules in `folder` can be imported here and in worker processes, after all that
-    is installed.
+    """The object that `module:object` names, the module installed or else in `folder`.
 
     Raises
     ------
@@ -70,10 +70,8 @@ def imported(name: Any, folder: Path, place: str) -> Any:
     expected = "module:object, the module installed or beside the case"
     if not re.fullmatch(r"\w+(\.\w+)*:\w+", str(name)):
         raise InputError(place, expected=expected, got=repr(name), remedy="check the spelling")
-    if str(folder.resolve()) not in sys.path:
-        sys.path.append(str(folder.resolve()))
     try:
-        home = importlib.import_module(module)
+        home = import_beside(module, folder)
         found = getattr(home, attribute)
     except (ImportError, AttributeError) as error:
         raise InputError(
@@ -220,6 +218,13 @@ def _making(options: dict[str, Any], place: str, *names: str) -> _Making:
 def _channels(given: Named, place: str) -> dict[str, _Channel]:
     """A table of each channel, for which its name alone may stand."""
     tables = given if isinstance(given, Mapping) else {name: {} for name in given}
+    require(
+        len(tables) <= MAX_CHANNELS,
+        place,
+        expected=f"at most {MAX_CHANNELS} channels",
+        got=len(tables),
+        remedy="leave out those that are constant, or split the system",
+    )
     return {
         name: from_settings(_Channel, value, place=key(place, name))
         for name, value in tables.items()

@@ -34,7 +34,7 @@ from retwin.cli.terminal import (
     interrupted_by_term,
     show_warnings,
 )
-from retwin.errors import InputError
+from retwin.errors import InputError, place_of
 
 __all__ = ["app", "main"]
 
@@ -102,11 +102,8 @@ def options(
 def main() -> None:
     """Run the command line and exit with its code.
 
-    SIGTERM acts as Ctrl-C, so that temporary files are removed. Modules in the current folder can
-    be imported, after installed packages, which a file there therefore cannot replace.
+    SIGTERM acts as Ctrl-C, so that temporary files are removed.
     """
-    if "" not in sys.path:
-        sys.path.append("")
     with show_warnings(), interrupted_by_term():
         sys.exit(_run())
 
@@ -129,6 +126,12 @@ def _run() -> int:
     except USAGE_ERROR as error:
         complain_of_usage(error)
         return BAD_INPUT
+    except SystemExit as error:
+        at = place_of(error)
+        if not at:  # as the completion of words ends
+            raise
+        complain(f"{at}: this line ended the program (SystemExit: {error.code})")
+        return FAILED
     except Exception as error:
         if os.environ.get("RETWIN_TRACEBACK"):
             raise

@@ -20,6 +20,7 @@ from retwin.cli.reading import read
 from retwin.cli.terminal import answer, example, table
 from retwin.data.io import check_target
 from retwin.errors import InputError
+from retwin.modules import known
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
@@ -50,6 +51,16 @@ Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Samples per seco
 
 RAMPS = 5
 """Ramps in a trajectory whose commands no case draws: enough to reach levels far apart."""
+NoMeshes = Annotated[
+    bool, typer.Option("--no-meshes", metavar="", help="Leave out the meshes of a model file.")
+]
+Servos = Annotated[
+    list[str] | None,
+    typer.Option("--servo", metavar="JOINT=K,D", help="A servo for a joint of a URDF; repeatable."),
+]
+
+SHOWN = 100
+"""Largest number of channels in a table: one of thousands takes minutes to lay out."""
 OTHERS = {
     "FILE.fmu": "an FMU for co-simulation (FMI 2 or 3)",
     "FILE.xml, FILE.urdf": "a MuJoCo model",
@@ -81,26 +92,36 @@ def info(
     inputs: Inputs = "",
     outputs: Outputs = "",
     rate: Rate = None,
+    servo: Servos = None,
+    no_meshes: NoMeshes = False,
     as_json: Json = False,
 ) -> None:
-    """Describe a twin: its inputs with their limits, its outputs, its rate."""
-    found = _twin(twin, inputs, outputs, rate)
+    """Describe a twin: its inputs with their limits, its outputs, its rate.
+
+    A module that is named by the twin or its case, and lies beside the case or in the current
+    folder, is run with your rights.
+    """
+    found = _twin(twin, inputs, outputs, rate, servo, no_meshes)
     facts: dict[str, Any] = {
         "title": _title(twin, found),
         "rate": found.rate,
         "inputs": _channels(found.inputs, getattr(found, "limits", None)),
         "outputs": _channels(found.outputs, None),
+        "runs": sorted(known().values()) if ":" in twin or _is_case(twin) else [],
     }
-    rows = [
+    every = [
         (kind.removesuffix("s"), each["name"], each["unit"], *_ends(each))
         for kind in ("inputs", "outputs")
         for each in facts[kind]
     ]
+    rest = len(every) - SHOWN
     answer(
         facts,
         facts["title"],
-        table(("", "name", "unit", "low", "high"), rows, numbers=("low", "high")),
+        table(("", "name", "unit", "low", "high"), every[:SHOWN], numbers=("low", "high")),
+        *([f"… and {rest} more channels, which --json lists"] if rest > 0 else []),
         f"{found.rate:g} samples per second",
+        *[f"runs {file} with your rights" for file in facts["runs"]],
         as_json=as_json,
     )
 
@@ -155,6 +176,8 @@ def simulate(
     inputs: Inputs = "",
     outputs: Outputs = "",
     rate: Rate = None,
+    servo: Servos = None,
+    no_meshes: NoMeshes = False,
     seed: Seed = 0,
     clip: Annotated[
         bool, typer.Option("--clip", metavar="", help="Clip commands to the limits.")
@@ -167,7 +190,7 @@ def simulate(
     from retwin.deploy.simulations import SimulationPlan
 
     check_target(out)
-    found = _twin(twin, inputs, outputs, rate)
+    found = _twin(twin, inputs, outputs, rate, servo, no_meshes)
     system = _case(case, twin, found)
     faults = _faults(system, fault)
     require(
@@ -190,15 +213,43 @@ app.command(
 )(animate)
 
 
-def _twin(name: str, inputs: str, outputs: str, rate: float | None) -> Twin:
+def _twin(
+    name: str,
+    inputs: str,
+    outputs: str,
+    rate: float | None,
+    servos: list[str] | None,
+    no_meshes: bool,
+) -> Twin:
     """The twin of that name, or the model in that folder."""
-    if (Path(name) / "model.json").is_file() and not (inputs or outputs or rate):
+    options: dict[str, Any] = {"meshes": False} if no_meshes else {}
+    if servos:
+        options["servos"] = list(map(_servo, servos))
+    own = not (inputs or outputs or rate or options)
+    if (Path(name) / "model.json").is_file() and own:
         return _model(Path(name))
-    if _is_case(name) and not (inputs or outputs or rate):
+    if _is_case(name) and own:
         from retwin import cases
 
         return cases.get(name).twin
-    return twins.get(name, inputs=_names(inputs), outputs=_names(outputs), rate=rate)
+    return twins.get(name, inputs=_names(inputs), outputs=_names(outputs), rate=rate, **options)
+
+
+def _servo(given: str) -> tuple[str, Any]:
+    """A joint and its servo, from "JOINT=STIFFNESS,DAMPING"."""
+    from retwin.twins.mujoco import Servo
+
+    joint, _, gains = given.rpartition("=")
+    try:
+        stiffness, damping = map(float, gains.split(","))
+    except ValueError:
+        raise InputError(
+            "--servo",
+            expected="JOINT=STIFFNESS,DAMPING in N m/rad and N m s/rad",
+            got=repr(given),
+            remedy="write for instance --servo hip=500,40",
+        ) from None
+    return joint, Servo(stiffness, damping)
 
 
 def _is_case(name: str) -> bool:
@@ -275,12 +326,23 @@ def _faults(system: Case | None, fault: str) -> dict[str, Any]:
     )
 
 
-def _sampler(system: Case | None, found: Twin, duration: float | None) -> CommandSampler:
+def _sampler(system: Case | None, found: Twin, duration: float | None) -> Any:
     """The sampler of the case, or ramps within the limits of the twin."""
     if system is not None:
         return system.sampler
+    if duration is None:
+        raise InputError(
+            "--duration",
+            expected="the duration of a trajectory in seconds, since no case draws commands",
+            got="none",
+            remedy="give --duration SECONDS, --commands FILE, or --case NAME",
+        )
+    import numpy as np
+
     from retwin.twins.samplers import RampSampler
 
+    if not len(found.inputs):  # nothing to draw
+        return np.zeros((1, max(2, round(duration * found.rate)), 0))
     limits = getattr(found, "limits", None)
     if limits is None or not all(map(isfinite, limits.low + limits.high)):
         raise InputError(
@@ -288,12 +350,5 @@ def _sampler(system: Case | None, found: Twin, duration: float | None) -> Comman
             expected="commands, since not all inputs have limits within which to draw them",
             got="none",
             remedy="give --commands FILE, or --case NAME",
-        )
-    if duration is None:
-        raise InputError(
-            "--duration",
-            expected="the duration of a trajectory in seconds, since no case draws commands",
-            got="none",
-            remedy="give --duration SECONDS, --commands FILE, or --case NAME",
         )
     return RampSampler(limits.low, limits.high, found.rate, duration, RAMPS)

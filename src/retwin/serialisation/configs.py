@@ -148,11 +148,12 @@ def from_config(
     """
     known = {kind.__name__: kind for kind in kinds}
     name: Any = values.get("kind")
+    version = "; a model loads with the version of retwin that wrote it"
     name = one_of(
         key(place, "kind"),
         RENAMED_KINDS.get(name, name) if isinstance(name, str) else name,
         known,
-        remedy="check the spelling; a model loads with the version of retwin that wrote it",
+        remedy=f"check the spelling{version if place == 'config' else ''}",
     )
     settings = {each: value for each, value in values.items() if each != "kind"}
     return from_settings(known[name], settings, kinds, place=place, rate=rate)
@@ -339,7 +340,10 @@ def _config(
         classes = _classes(hints)
         if "kind" not in value and len(hints) == len(classes) == 1:
             return from_settings(classes[0], value, kinds, place="", rate=info.context)
-        made = from_config(value, (*classes, *kinds), place="", rate=info.context)
+        fitting = [kind for kind in kinds if any(fits(kind, hint) for hint in hints)]
+        known = value.get("kind") in [kind.__name__ for kind in kinds]
+        allowed = (*classes, *(kinds if known else fitting))
+        made = from_config(value, allowed, place="", rate=info.context)
         if any(fits(made, hint) for hint in hints):
             return made
     names = " or ".join(hint.__name__ for hint in hints)

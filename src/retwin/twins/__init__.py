@@ -7,7 +7,7 @@ Not here: learned twins (see `update`) and the twins of built-in systems (see `c
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -67,6 +67,7 @@ def get(
     outputs: Sequence[str] = (),
     rate: float | None = None,
     outside: Literal["refuse", "clip"] = "refuse",
+    **options: Any,
 ) -> Twin:
     """Find a twin by its name.
 
@@ -80,6 +81,8 @@ def get(
         Sample rate in Hz, above 0. A function needs it; for a file the default is 100 Hz.
     outside : {"refuse", "clip"}
         What the twin of a file does with commands outside its limits.
+    **options
+        Other arguments of `FMUTwin.from_file` or `MuJoCoTwin.from_file`.
 
     Returns
     -------
@@ -104,22 +107,35 @@ def get(
 
     """
     if name in TWINS or ":" in name:
+        _check_none(name, options)
         return _from_module(name, inputs, outputs, rate)
     suffix = Path(name).suffix.lower()
     if suffix not in FILES:
         raise _unknown(name, "no such twin")
     if not Path(name).is_file():
         raise _unknown(name, "no file of that name")
-    options: dict[str, Any] = {"inputs": tuple(inputs), "outputs": tuple(outputs)}
+    options |= {"inputs": tuple(inputs), "outputs": tuple(outputs)}
     if rate is not None:
         options["rate"] = rate
     if suffix == ".fmu":
+        _check_none(name, {each: options[each] for each in ("meshes", "servos") if each in options})
         from retwin.twins.fmu import FMUTwin
 
         return FMUTwin.from_file(name, outside=outside, **options)
     from retwin.twins.mujoco import MuJoCoTwin
 
     return MuJoCoTwin.from_file(name, outside=outside, **options)
+
+
+def _check_none(name: str, options: Mapping[str, Any]) -> None:
+    """Refuse options that this kind of twin does not have."""
+    require(
+        not options,
+        f"twin {name!r}",
+        expected="no such options, which are those of another kind of twin",
+        got=", ".join(options),
+        remedy="leave them out",
+    )
 
 
 def _from_module(

@@ -7,7 +7,8 @@ from sources that you trust.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -17,18 +18,17 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pebble import ProcessExpired, ProcessPool
 
 from retwin.checks import positive, require
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.processes import scratch_folder, worker_pool
+from retwin.processes import IsolatedPool, ProcessEnded, isolated_pool, scratch_folder
 from retwin.progress import Progress
 from retwin.twins import fmu_worker
 from retwin.twins.faults import Fault
 from retwin.twins.fmu_model import (
     channels_of,
     extract,
-    find_variables,
+    find_scalars,
     limits_of,
     read_description,
     start_column,
@@ -42,6 +42,10 @@ __all__ = ["FMUTwin"]
 
 TRAJECTORIES_PER_CHUNK = 256
 """Number of trajectories per chunk: it bounds the tasks that wait for a process."""
+FORGETS = (
+    "its reset does not restore the initial state, so every run has a new instance; reuse=False "
+    "does so without this check"
+)
 
 
 @dataclass(frozen=True)
@@ -50,15 +54,17 @@ class FMUTwin:
 
     `FMUTwin.from_file` makes one with names, units and limits from the FMU. Each process loads the
     FMU once and resets it between runs; see also `keep_workers`. A script that simulates must do
-    so under `if __name__ == "__main__":`.
+    so under `if __name__ == "__main__":`. A run depends neither on the runs before it nor on the
+    number of processes: see `reuse`.
 
     Parameters
     ----------
     path : Path
         The .fmu file.
     inputs, outputs : Channels
-        Variables that are commands and outputs. Continuous inputs are linear between samples,
-        other inputs are rounded and held. In each step the FMU has the inputs of its begin.
+        Variables, or elements of arrays, that are commands and outputs. Continuous inputs are
+        linear between samples, other inputs are rounded and held. In each step the FMU has the
+        inputs of its begin.
     rate : float, default 100.0
         Sample rate in Hz, above 0.
     start : mapping of str to float or str, optional
@@ -73,8 +79,10 @@ class FMUTwin:
         From clean commands (n, T, d_u) to the ideal output (n, T, d_y); by default the FMU's own
         output without faults.
     reuse : bool, default True
-        Whether an instance is reset between runs. False makes a new instance for every run, for
-        FMUs whose reset is incomplete.
+        Whether an instance is reset between runs. In each process the first trajectory is run
+        again after its first reset, and after the first run with other outputs. An FMU whose
+        outputs then differ gets a new instance for every run, and where that does not help either
+        a new process, with one warning. False makes a new instance for every run at once.
     timeout : float, default 60.0
         Duration of a run in s, loading included, after which it is ended as hung.
     workers : int, default 0
@@ -135,8 +143,10 @@ class FMUTwin:
         rate : float, default 100.0
             Sample rate in Hz.
         inputs, outputs : sequence of str, optional
-            Names of variables, in order; by default all scalar numbers among the FMU's inputs and
-            outputs.
+            Names of variables, in order; of an array its own, for all elements, or "y[0]" for
+            one. Local variables may be named as outputs. By default all outputs that are numbers,
+            and all such inputs whose range is more than one value; the others keep their start
+            values.
         start : mapping of str to float or str, optional
             Start values by name.
         outside : {"refuse", "clip"}
@@ -158,14 +168,14 @@ class FMUTwin:
         """
         path = Path(path)
         description = read_description(path)
-        inputs_found = find_variables(description, "inputs", inputs)
-        outputs_found = find_variables(description, "outputs", outputs)
+        inputs_found = find_scalars(description, "inputs", inputs)
+        outputs_found = find_scalars(description, "outputs", outputs)
         require(
             outputs_found,
             "outputs",
             expected="at least one variable that is an output and a number",
             got=f"{path.name}, which has none",
-            remedy="export the FMU with outputs",
+            remedy="name local variables as outputs, or export the FMU with outputs",
         )
         twin = cls(
             path.resolve(),
@@ -225,6 +235,8 @@ class FMUTwin:
         commands = checked_commands(commands, self.inputs)
         count = len(commands)
         values = self._start_values(read_description(self.path), parameters or {}, count)
+        notes: dict[str, None] = {}
+        ended: dict[int, float] = {}
 
         def report(finished: float) -> None:
             if progress is not None:
@@ -235,13 +247,37 @@ class FMUTwin:
             pool = cache(lambda: stack.enter_context(self._workers(count)))
 
             def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-                return self._run(pool(), chunk, values[chunk.index], report)
+                made = self._run(pool(), chunk, values[chunk.index], report, ended)
+                notes.update(dict.fromkeys(pool().notes))
+                return made
 
-            return simulate_in_chunks(
-                self, run, commands, faults, seed=seed, progress=None, size=TRAJECTORIES_PER_CHUNK
+            try:
+                return simulate_in_chunks(
+                    self,
+                    run,
+                    commands,
+                    faults,
+                    seed=seed,
+                    progress=None,
+                    size=TRAJECTORIES_PER_CHUNK,
+                )
+            finally:
+                self._warn(notes, ended)
+
+    def _warn(self, notes: Collection[str], ended: Mapping[int, float]) -> None:
+        """Warn once of an FMU that does not restore its state, and of runs that ended early."""
+        for note in notes:
+            warnings.warn(f"{self.path.name}: {note}", stacklevel=3)
+        if ended:
+            some = [f"trajectory {i} at {time:g} s" for i, time in list(ended.items())[:5]]
+            more = ", …" if len(ended) > 5 else ""
+            warnings.warn(
+                f"{self.path.name} ended {len(ended)} simulations before their commands end: "
+                f"{', '.join(some)}{more}; their later outputs are masked",
+                stacklevel=3,
             )
 
-    def _workers(self, count: int) -> AbstractContextManager[ProcessPool]:
+    def _workers(self, count: int) -> AbstractContextManager[IsolatedPool]:
         """Processes that have loaded the FMU, for `count` trajectories."""
         job = fmu_worker.Job(
             inputs=self.inputs.names,
@@ -257,23 +293,27 @@ class FMUTwin:
         return worker_processes((version, job, workers), lambda: self._start(job, workers))
 
     @contextmanager
-    def _start(self, job: fmu_worker.Job, workers: int) -> Iterator[ProcessPool]:
+    def _start(self, job: fmu_worker.Job, workers: int) -> Iterator[IsolatedPool]:
         """Start the processes on an unpacked FMU, which is removed when they end."""
         begin, orphaned = fmu_worker.start, fmu_worker.orphaned
         with scratch_folder() as folder:
             extract(self.path, folder)
-            with worker_pool(workers, begin, (folder, job), orphaned=orphaned) as pool:
+            with isolated_pool(workers, begin, (folder, job), orphaned=orphaned) as pool:
                 self._check_loads(pool)
                 yield pool
 
     def _run(
         self,
-        pool: ProcessPool,
+        pool: IsolatedPool,
         chunk: Chunk,
         values: Sequence[fmu_worker.Start],
         report: Callable[[float], None],
+        ended: dict[int, float],
     ) -> tuple[NDArray, NDArray]:
-        """Nominal and observed outputs of a chunk; reports the number of finished trajectories."""
+        """Nominal and observed outputs of a chunk; reports the number of finished trajectories.
+
+        The time in s is entered in `ended` for each trajectory whose simulation the FMU ended.
+        """
         clean, held = chunk.commands, chunk.held_commands
         observed = np.zeros((*clean.shape[:2], len(self.outputs)))
         nominal = np.zeros_like(observed)
@@ -283,45 +323,49 @@ class FMUTwin:
         if self.nominal is None:
             runs += [(nominal, i, clean[i]) for i in np.flatnonzero(changed).tolist()]
         futures = [self._schedule(pool, commands, values[i]) for _, i, commands in runs]
-        for done, ((outputs, i, commands), future) in enumerate(zip(runs, futures, strict=True), 1):
-            outcome = self._outcome(pool, future, commands, values[i])
-            if isinstance(outcome, str):
+        for done, ((outputs, i, _), future) in enumerate(zip(runs, futures, strict=True), 1):
+            outcome = self._outcome(future)
+            if outcome.reason:
                 healthy = "" if outputs is observed else "without its fault: "
-                chunk.failed.setdefault(i, healthy + outcome)
+                chunk.failed.setdefault(i, healthy + outcome.reason)
             else:
-                outputs[i] = outcome
+                known = len(outcome.outputs)
+                outputs[i, :known], outputs[i, known:] = outcome.outputs, outcome.outputs[-1]
+                if outcome.ended is not None:
+                    chunk.known[i] = min(known, chunk.known.get(i, known))
+                    ended.setdefault(chunk.index.start + i, outcome.ended)
+            if outcome.forgets and FORGETS not in pool.notes:
+                pool.notes.append(FORGETS)
             report(chunk.index.start + len(clean) * done / len(runs))
         if self.nominal is not None:
             return nominal_outputs(self.nominal, clean, len(self.outputs)), observed
         nominal[~changed] = observed[~changed]
         return nominal, observed
 
-    def _schedule(self, pool: ProcessPool, commands: NDArray, values: fmu_worker.Start) -> Future:
+    def _schedule(
+        self, pool: IsolatedPool, commands: NDArray, values: fmu_worker.Start
+    ) -> Future[fmu_worker.Outcome]:
         """The outcome of one run, in the future."""
-        return pool.schedule(fmu_worker.run, args=(commands, values), timeout=self.timeout)
+        size = 8 * len(commands) * len(self.outputs)
+        return pool.schedule(fmu_worker.run, commands, values, timeout=self.timeout, size=size)
 
-    def _outcome(
-        self, pool: ProcessPool, future: Future, commands: NDArray, values: fmu_worker.Start
-    ) -> NDArray | str:
-        """Outputs (T, d_y), or the reason of the failure."""
-        while True:
-            try:
-                return future.result()
-            except TimeoutError:
-                return f"hung for more than {self.timeout:g} s"
-            except ProcessExpired as error:
-                if error.exitcode != fmu_worker.RETRY:
-                    return _death(error.exitcode)
-                future = self._schedule(pool, commands, values)
+    def _outcome(self, future: Future[fmu_worker.Outcome]) -> fmu_worker.Outcome:
+        """The outcome of a run, also of one that harmed its process."""
+        try:
+            return future.result()
+        except TimeoutError:
+            return fmu_worker.Outcome(reason=f"hung for more than {self.timeout:g} s")
+        except ProcessEnded as error:
+            return fmu_worker.Outcome(reason=str(error))
 
-    def _check_loads(self, pool: ProcessPool) -> None:
+    def _check_loads(self, pool: IsolatedPool) -> None:
         """Refuse an FMU that cannot be loaded, once instead of in every run."""
         try:
-            reason = pool.schedule(fmu_worker.load, timeout=self.timeout).result()
+            reason = pool.schedule(fmu_worker.load, timeout=self.timeout, size=0).result()
         except TimeoutError:
             reason = f"it hung for more than {self.timeout:g} s"
-        except ProcessExpired as error:
-            reason = _death(error.exitcode)
+        except ProcessEnded as error:
+            reason = str(error)
         require(
             not reason,
             "path",
@@ -340,10 +384,3 @@ class FMUTwin:
             for own, single in zip(values, column, strict=True):
                 own[name] = single
         return values
-
-
-def _death(code: int | None) -> str:
-    """The reason of a failure: how a process ended."""
-    if code is not None and code < 0:
-        return f"its process died (signal {-code})"
-    return f"its process ended (exit code {code})"

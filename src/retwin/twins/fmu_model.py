@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,9 +18,10 @@ from retwin.errors import InputError, brief
 from retwin.twins.limits import Limits
 
 __all__ = [
+    "Scalar",
     "channels_of",
     "extract",
-    "find_variables",
+    "find_scalars",
     "limits_of",
     "read_description",
     "start_column",
@@ -31,8 +34,56 @@ WHOLE = (
     *(f"{u}Int{bits}" for u in ("", "U") for bits in (8, 16, 32, 64)),
 )
 SCALARS = (*NUMBERS, *WHOLE, "Boolean")
+HIDDEN = (("output", "local"), ("output", "calculatedParameter"))
+"""Pairs of what a channel is and another causality that it may have if it is named."""
 UNLIMITED = 1e30
 """Magnitude above which a declared limit counts as none: tools write the largest float for it."""
+MAX_SCALARS = 1_000_000
+"""Largest number of scalars that one array may hold, since a file of some bytes may declare any."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scalar:
+    """A number of an FMU that can be a channel: a variable, or one element of an array.
+
+    Parameters
+    ----------
+    name : str
+        Name of the variable; of an element "y[0]" or "y[0,1]", counted from 0.
+    variable : fmpy.model_description.ModelVariable
+        The variable.
+    place : int, default 0
+        The element's place among those of the variable.
+
+    """
+
+    name: str
+    variable: Any
+    place: int = 0
+
+    @property
+    def constant(self) -> bool:
+        """Whether its range is a single value."""
+        low, high = self.bounds
+        return low == high
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Its range as the FMU declares it; infinite where it declares none."""
+        if self.variable.type == "Boolean":
+            return 0.0, 1.0
+        items = [
+            int(each.value) for each in getattr(self.variable.declaredType, "items", None) or ()
+        ]
+        low = min(items, default=_declared(self.variable, "min"))
+        high = max(items, default=_declared(self.variable, "max"))
+        return _limit(low, -np.inf), _limit(high, np.inf)
+
+
+def _limit(declared: Any, none: float) -> float:
+    """A declared limit as a number; `none` where it is none."""
+    value = none if declared is None else float(declared)
+    return value if abs(value) < UNLIMITED else none
 
 
 def _fmpy() -> Any:
@@ -89,10 +140,13 @@ def read_description(path: Path) -> Any:
     platform = fmpy.platform if description.fmiMajorVersion == 2 else fmpy.platform_tuple
     library = description.coSimulation.modelIdentifier + fmpy.sharedLibraryExtension
     if f"binaries/{platform}/{library}" not in names:
-        there = sorted({name.split("/")[1] for name in names if name.startswith("binaries/")})
+        there = {name.split("/")[1] for name in names if name.startswith("binaries/")} - {""}
+        got = f"which has {', '.join(sorted(there)) or 'none'}"
+        if platform in there:
+            got = f"whose binaries/{platform} does not have it"
         raise refuse(
             f"native code for this machine, binaries/{platform}/{library}",
-            f"which has {', '.join(filter(None, there)) or 'none'}",
+            got,
             "export it for this system",
         )
     return description
@@ -125,57 +179,84 @@ def extract(path: Path, folder: str) -> None:
         ) from None
 
 
-def find_variables(description: Any, argument: str, names: Sequence[str]) -> list[Any]:
-    """Find the variables that are channels.
+def find_scalars(description: Any, argument: str, names: Sequence[str]) -> list[Scalar]:
+    """Find the numbers that are channels.
 
     Parameters
     ----------
     description : fmpy.model_description.ModelDescription
         The FMU's description.
     argument : {"inputs", "outputs"}
-        The causality of the variables, and the argument that errors name.
+        What the channels are, and the argument that errors name.
     names : sequence of str
-        Names of variables; empty takes all that can be a channel.
+        Names of scalar variables, of elements of arrays, or of arrays for all their elements;
+        local variables may be named as outputs. Empty takes all inputs that are not constant, or
+        all outputs.
 
     Returns
     -------
-    list of fmpy.model_description.ScalarVariable
-        The variables in the order of the names.
+    list of Scalar
+        The numbers in the order of the names.
 
     Raises
     ------
     InputError
-        A variable that is missing, of another causality or no scalar number.
+        A variable that is missing, of another causality or no number.
 
     """
     causality = argument.removesuffix("s")
-    every = {variable.name: variable for variable in description.modelVariables}
-    able = {
-        name: variable
-        for name, variable in every.items()
-        if variable.causality == causality
-        and variable.type in SCALARS
-        and not variable.shape
+    able = [
+        variable
+        for variable in description.modelVariables
+        if variable.type in SCALARS
         and not variable.clocks
-    }
+        and (variable.causality == causality or (causality, variable.causality) in HIDDEN)
+    ]
+    found = {each.name: each for variable in able for each in _scalars(variable, argument)}
+    if not names:
+        own = [each for each in found.values() if each.variable.causality == causality]
+        return [each for each in own if causality == "output" or not each.constant]
+    arrays = {variable.name: variable for variable in able if variable.shape}
+    chosen: list[Scalar] = []
     for name in names:
-        require(
-            name in able,
-            argument,
-            expected=f"variables that are an {causality} and a scalar number",
-            got=f"{name!r}, {_description(every.get(name))}",
-            remedy=_close_matches(name, able),
-        )
-    return [able[name] for name in names] if names else list(able.values())
+        if name in arrays:
+            chosen += _scalars(arrays[name], argument)
+            continue
+        if name not in found:
+            every = {variable.name: variable for variable in description.modelVariables}
+            local = " or local" if causality == "output" else ""
+            raise InputError(
+                argument,
+                expected=f"variables that are an {causality}{local} and a number",
+                got=f"{name!r}, {_description(every.get(name))}",
+                remedy=_close_matches(name, found),
+            )
+        chosen.append(found[name])
+    return chosen
+
+
+def _scalars(variable: Any, argument: str) -> Iterator[Scalar]:
+    """The elements of an array; of another variable itself."""
+    if not variable.shape:
+        yield Scalar(variable.name, variable)
+        return
+    require(
+        prod(variable.shape) <= MAX_SCALARS,
+        argument,
+        expected=f"arrays of at most {MAX_SCALARS} numbers",
+        got=f"{variable.name!r} of shape {variable.shape}",
+        remedy="export the FMU with smaller arrays",
+    )
+    for place, index in enumerate(np.ndindex(variable.shape)):
+        yield Scalar(f"{variable.name}[{','.join(map(str, index))}]", variable, place)
 
 
 def _description(variable: Any) -> str:
     """Why a variable cannot be a channel."""
     if variable is None:
         return "which the FMU does not have"
-    shape = f" of shape {variable.shape}" if variable.shape else ""
     clocked = " with a clock" if variable.clocks else ""
-    return f"whose causality is {variable.causality}, type {variable.type}{shape}{clocked}"
+    return f"whose causality is {variable.causality}, type {variable.type}{clocked}"
 
 
 def _close_matches(name: str, names: Sequence[str] | Mapping[str, Any]) -> str:
@@ -192,53 +273,19 @@ def _declared(variable: Any, attribute: str) -> Any:
     return value if value is not None else getattr(variable.declaredType, attribute, None)
 
 
-def channels_of(variables: Sequence[Any]) -> Channels:
-    """Channels of variables.
-
-    Parameters
-    ----------
-    variables : sequence of fmpy.model_description.ScalarVariable
-        See `find_variables`.
-
-    Returns
-    -------
-    Channels
-        Their names and units; "1" where a variable has no unit.
-
-    """
+def channels_of(scalars: Sequence[Scalar]) -> Channels:
+    """Channels of numbers: their names and units; "1" where a variable has no unit."""
     return Channels(
-        tuple(variable.name for variable in variables),
-        tuple(_declared(variable, "unit") or "1" for variable in variables),
+        tuple(each.name for each in scalars),
+        tuple(_declared(each.variable, "unit") or "1" for each in scalars),
     )
 
 
-def limits_of(variables: Sequence[Any], outside: Literal["refuse", "clip"]) -> Limits | None:
-    """Limits of inputs.
-
-    Parameters
-    ----------
-    variables : sequence of fmpy.model_description.ScalarVariable
-        The inputs.
-    outside : {"refuse", "clip"}
-        See `Limits`.
-
-    Returns
-    -------
-    Limits or None
-        The ranges that the FMU declares; None where it declares none.
-
-    """
-
-    def bound(variable: Any, attribute: str, open_end: float) -> float:
-        if variable.type == "Boolean":
-            return float(attribute == "max")
-        declared = _declared(variable, attribute)
-        value = open_end if declared is None else float(declared)
-        return value if abs(value) < UNLIMITED else open_end
-
-    low = tuple(bound(variable, "min", -np.inf) for variable in variables)
-    high = tuple(bound(variable, "max", np.inf) for variable in variables)
-    return None if np.isinf([*low, *high]).all() else Limits(low, high, outside)
+def limits_of(inputs: Sequence[Scalar], outside: Literal["refuse", "clip"]) -> Limits | None:
+    """Limits of inputs: the ranges that the FMU declares; None where it declares none."""
+    bounds = [each.bounds for each in inputs]
+    low, high = tuple(low for low, _ in bounds), tuple(high for _, high in bounds)
+    return None if np.isinf(bounds).all() else Limits(low, high, outside)
 
 
 def start_column(

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import inspect
 import pickle
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import KW_ONLY, dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,7 +41,8 @@ class FunctionTwin:
     function : callable
         From commands to outputs in physical units. Vectorised: (n, T, d_u) to (n, T, d_y), for at
         most 128 trajectories at a time; otherwise (T, d_u) to (T, d_y). A function with a
-        parameter `rng` is stochastic; it gets a `numpy.random.Generator` by that name.
+        parameter `rng` is stochastic; it gets a `numpy.random.Generator` by that name. One with a
+        parameter `rate` gets the sample rate in Hz, unless a `functools.partial` binds it.
     inputs, outputs : Channels
         Channels of the commands and the outputs.
     rate : float
@@ -92,7 +93,7 @@ class FunctionTwin:
                 remedy="give a function of the commands that returns the outputs",
             )
         require(
-            self.nominal is not None or not _takes_rng(self.function),
+            self.nominal is not None or not _takes(self.function, "rng"),
             "nominal",
             expected=f"a function for the ideal output, since {_name(self.function)} is random",
             got="None",
@@ -185,7 +186,8 @@ class FunctionTwin:
     ) -> list[_Call]:
         """The calls that give the outputs of those rows of the chunk, in order."""
         function = getattr(self, role)
-        random = role == "function" and _takes_rng(function)
+        random = role == "function" and _takes(function, "rng")
+        options = {"rate": self.rate} if _takes(function, "rate") else {}
         if len(rows) == 0:
             return []
         parts = [rows] if self.vectorised else np.split(rows, len(rows))
@@ -199,6 +201,7 @@ class FunctionTwin:
                 ids=part + chunk.index.start,
                 single=not self.vectorised,
                 seed=seed if random else None,
+                options=options,
             )
             for part in parts
         ]
@@ -215,16 +218,18 @@ class _Call:
     ids: NDArray
     single: bool
     seed: int | None
+    options: Mapping[str, float]
 
     def outputs_of(self) -> NDArray:
         """Call the function and check its outputs (n, T, d_y)."""
         given = self.commands[0] if self.single else self.commands
         if self.seed is None:
-            returned = self.function(given)
+            returned = self.function(given, **self.options)
         else:
             # With a spawn key, since the severities of faults are drawn from the seed itself.
             sequence = np.random.SeedSequence(self.seed, spawn_key=(int(self.ids[0]),))
-            returned = self.function(given, rng=np.random.default_rng(sequence))
+            rng = np.random.default_rng(sequence)
+            returned = self.function(given, rng=rng, **self.options)
         outputs = self._numbers(returned)
         outputs = outputs[None] if self.single else outputs
         self._check_finite(outputs)
@@ -319,10 +324,12 @@ def _not_importable(role: str, reason: str) -> InputError:
     )
 
 
-def _takes_rng(function: Function) -> bool:
-    """Whether the function is stochastic."""
+def _takes(function: Function, name: str) -> bool:
+    """Whether the function has a parameter of that name besides the commands, and not yet bound."""
+    if isinstance(function, partial) and name in function.keywords:
+        return False
     try:
-        return "rng" in inspect.signature(function).parameters
+        return name in list(inspect.signature(function).parameters)[1:]
     except (TypeError, ValueError):  # some compiled functions have no signature
         return False
 

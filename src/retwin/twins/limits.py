@@ -25,14 +25,15 @@ class Limits:
     Parameters
     ----------
     low, high : tuple of float
-        One per channel, in its unit; -inf and inf where a channel has no limit.
+        One per channel, in its unit; -inf and inf where a channel has no limit. Equal limits are
+        those of a constant.
     outside : {"refuse", "clip"}
         Whether commands outside the limits are an error or are clipped to the limit.
 
     Raises
     ------
     InputError
-        Not one low and one greater high per channel, or another word for `outside`.
+        Not one low and one high per channel in order, or another word for `outside`.
 
     Notes
     -----
@@ -48,9 +49,9 @@ class Limits:
     def __post_init__(self) -> None:
         paired = len(self.low) == len(self.high)
         require(
-            paired and all(a < b for a, b in zip(self.low, self.high, strict=True)),
+            paired and all(a <= b for a, b in zip(self.low, self.high, strict=True)),
             "limits",
-            expected="one low and one greater high per input channel",
+            expected="one low and one high per input channel, low at most high",
             got=f"low {self.low}, high {self.high}",
             remedy=UNLIMITED,
         )

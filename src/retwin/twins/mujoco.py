@@ -50,7 +50,9 @@ class MuJoCoTwin:
     inputs : Channels
         Actuators that the commands drive, in the model's control units.
     sensors : tuple of str
-        Sensors, sites or bodies that are the outputs; of sites and bodies the position in m.
+        The outputs: sensors by name; "joint:NAME" and "joint_velocity:NAME"; "site:NAME" and
+        "body:NAME" for positions in m, "site_velocity:NAME" and "body_velocity:NAME" for velocities
+        in m/s; bare names of sites, bodies and joints stand for their positions.
     outputs : Channels
         One channel per component of the sensors.
     rate : float
@@ -125,9 +127,10 @@ class MuJoCoTwin:
         path : str or Path
             MJCF or URDF file.
         inputs : sequence of str, optional
-            Actuators, in the order of the commands; by default all.
+            Actuators, in the order of the commands; by default all. One without a name has that of
+            the joint that it drives.
         outputs : sequence of str, optional
-            Sensors, sites and bodies, in order; by default all sensors.
+            See `sensors` of the class, in order; by default all sensors of the model.
         rate, servos, meshes, **options
             See the parameters of the class.
 

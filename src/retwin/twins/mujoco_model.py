@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from itertools import chain, count
 from pathlib import Path
 
 import mujoco
@@ -59,6 +60,27 @@ FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
 FOLLOWING = (int(mujoco.mjtDyn.mjDYN_NONE), *FILTERS)
 """Dynamics of actuators whose gain acts on their control, and not for instance on its integral."""
 
+PLACES = {
+    "joint": ("joints", mujoco.mjtSensor.mjSENS_JOINTPOS),
+    "joint_velocity": ("joints", mujoco.mjtSensor.mjSENS_JOINTVEL),
+    "site": ("sites", mujoco.mjtSensor.mjSENS_FRAMEPOS),
+    "site_velocity": ("sites", mujoco.mjtSensor.mjSENS_FRAMELINVEL),
+    "body": ("bodies", mujoco.mjtSensor.mjSENS_FRAMEPOS),
+    "body_velocity": ("bodies", mujoco.mjtSensor.mjSENS_FRAMELINVEL),
+}
+"""What an output "KIND:NAME" is measured by: the list of the model in which the name is, and the
+kind of sensor."""
+OBJECTS = {
+    "joints": mujoco.mjtObj.mjOBJ_JOINT,
+    "sites": mujoco.mjtObj.mjOBJ_SITE,
+    "bodies": mujoco.mjtObj.mjOBJ_XBODY,
+}
+OF_BALLS = {
+    mujoco.mjtSensor.mjSENS_JOINTPOS: mujoco.mjtSensor.mjSENS_BALLQUAT,
+    mujoco.mjtSensor.mjSENS_JOINTVEL: mujoco.mjtSensor.mjSENS_BALLANGVEL,
+}
+"""The sensors of ball joints."""
+
 
 def compiled(
     path: Path,
@@ -68,7 +90,9 @@ def compiled(
     step: float | None = None,
     meshes: bool = True,
 ) -> mujoco.MjModel:
-    """Compile a model, with servos added to joints and sensors added to sites or bodies.
+    """Compile a model, with servos added to joints and sensors added to named places.
+
+    Actuators without a name get that of what they drive.
 
     Parameters
     ----------
@@ -77,7 +101,8 @@ def compiled(
     servos : sequence of (str, Servo)
         Position servos, by the joint that they drive.
     places : sequence of str
-        Sites or bodies that get a position sensor; other names are ignored.
+        What gets a sensor: "joint:NAME" or "joint_velocity:NAME", and so for site and body, or
+        the bare name of a site, a body or a joint. Other names are ignored.
     step : float, optional
         Integration step in s; by default the model's.
     meshes : bool, default True
@@ -109,13 +134,8 @@ def compiled(
                     spec.delete(geom)
             for mesh in list(spec.meshes):
                 spec.delete(mesh)
-        sensors = {each.name for each in spec.sensors}
-        kinds = {each.name: mujoco.mjtObj.mjOBJ_XBODY for each in spec.bodies}
-        kinds |= {each.name: mujoco.mjtObj.mjOBJ_SITE for each in spec.sites}
-        for name in places:
-            if name in kinds and name not in sensors:
-                kind = mujoco.mjtSensor.mjSENS_FRAMEPOS
-                spec.add_sensor(name=name, type=kind, objtype=kinds[name], objname=name)
+        _name_actuators(spec)
+        _add_sensors(spec, places)
         for joint, servo in servos:
             _name("servos", joint, [each.name for each in spec.joints])
             actuator = spec.add_actuator(
@@ -133,13 +153,50 @@ def compiled(
     except ValueError as error:
         if isinstance(error, InputError):
             raise
+        flag = ", or --no-meshes" if meshes else ""
         missing = "meshes that are not there can be left out" if meshes else "or load its meshes"
         raise InputError(
             "model",
             expected="an MJCF or URDF file that MuJoCo can compile",
             got=f"{path} ({' '.join(str(error).split())})",
-            remedy=f"repair the file, {missing} (meshes={not meshes})",
+            remedy=f"repair the file, {missing} (meshes={not meshes}{flag})",
         ) from None
+
+
+def _name_actuators(spec: mujoco.MjSpec) -> None:
+    """Give actuators without a name that of the joint, tendon, … that they drive."""
+    used = {each.name for each in spec.actuators}
+    for actuator in spec.actuators:
+        if not actuator.name and actuator.target:
+            numbered = (f"{actuator.target}_{k}" for k in count(2))
+            actuator.name = next(n for n in chain([actuator.target], numbered) if n not in used)
+            used.add(actuator.name)
+
+
+def _add_sensors(spec: mujoco.MjSpec, places: Sequence[str]) -> None:
+    """Add a sensor of the same name for each place that has none."""
+    named = {
+        what: {each.name: each for each in getattr(spec, what) if each.name} for what in OBJECTS
+    }
+    sensors = {each.name for each in spec.sensors}
+    for place in dict.fromkeys(places):
+        kind, _, name = place.rpartition(":")
+        kinds = [kind] if kind in PLACES else ["site", "body", "joint"]
+        found = next((each for each in kinds if name in named[PLACES[each][0]]), None)
+        if place in sensors or found is None or (kind and kind not in PLACES):
+            continue
+        what, sensor = PLACES[found]
+        if what == "joints":
+            joint = named[what][name]
+            require(
+                joint.type != mujoco.mjtJoint.mjJNT_FREE,
+                "outputs",
+                expected="a joint that is no free joint",
+                got=repr(place),
+                remedy=f"name the body that it moves, body:{joint.parent.name}",
+            )
+            sensor = OF_BALLS[sensor] if joint.type == mujoco.mjtJoint.mjJNT_BALL else sensor
+        spec.add_sensor(name=place, type=sensor, objtype=OBJECTS[what], objname=name)
 
 
 def input_channels(model: mujoco.MjModel, names: Sequence[str]) -> Channels:
@@ -168,9 +225,10 @@ def input_channels(model: mujoco.MjModel, names: Sequence[str]) -> Channels:
     require(
         chosen,
         "inputs",
-        expected="a model with actuators that have names",
+        expected="a model with actuators",
         got="one without, as a URDF file always is",
-        remedy="name them, or add servos=((joint, Servo(stiffness, damping)), …)",
+        remedy="add servos=[(joint, Servo(stiffness, damping)), …], in a case.toml a table "
+        "servos, or on the command line --servo JOINT=STIFFNESS,DAMPING for each joint",
     )
     for name in chosen:
         controls = model.actuator_ctrlnum[model.actuator(name).id]
@@ -194,7 +252,7 @@ def output_channels(
     model : mujoco.MjModel
         The model, compiled with the sensors' places.
     names : sequence of str
-        Sensors, sites and bodies, in order; empty takes all sensors that have a name.
+        Sensors, and places as in `compiled`, in order; empty takes all sensors that have a name.
 
     Returns
     -------
@@ -206,23 +264,24 @@ def output_channels(
     Raises
     ------
     InputError
-        No sensor, site or body of that name, or none at all.
+        No sensor or place of that name, or none at all.
 
     """
     existing = [name for i in range(model.nsensor) if (name := model.sensor(i).name)]
-    places = [name for i in range(model.nsite) if (name := model.site(i).name)]
-    places += [name for i in range(1, model.nbody) if (name := model.body(i).name)]
+    places = [f"joint:{n}" for i in range(model.njnt) if (n := model.joint(i).name)]
+    places += [f"site:{n}" for i in range(model.nsite) if (n := model.site(i).name)]
+    places += [f"body:{n}" for i in range(1, model.nbody) if (n := model.body(i).name)]
     # The chosen places became sensors when the model was compiled.
     for name in names:
-        _name("outputs", name, list(dict.fromkeys(existing + places)))
+        _name("outputs", name, existing, [*existing, *places])
     chosen = list(names) or existing
-    example = f", such as {', '.join(places[-3:])}" if places else ""
     require(
         chosen,
         "outputs",
-        expected="sensors, sites or bodies of the model",
+        expected="sensors, joints, sites or bodies of the model",
         got="no names, and no sensors with names in the model",
-        remedy=f"name places whose position is the output{example}",
+        remedy="name what is measured: joint:NAME, joint_velocity:NAME, or the position of "
+        f"site:NAME or body:NAME; there are {', '.join(places[:12])}",
     )
     channels: list[str] = []
     units: list[str] = []
@@ -314,10 +373,13 @@ def joint_of(model: mujoco.MjModel, name: str) -> int | None:
     return joint if direct else None
 
 
-def _name(argument: str, name: str, existing: Sequence[str]) -> str:
-    """`name`, if the model has it."""
-    close = get_close_matches(name, existing, n=1)
-    shown = ", ".join(existing[:12]) + (", …" if len(existing) > 12 else "")
+def _name(argument: str, name: str, existing: Sequence[str], also: Sequence[str] = ()) -> str:
+    """`name`, if the model has it; the message proposes names of `also`, or else of `existing`."""
+    known = also or existing
+    bare = {each.rpartition(":")[2]: each for each in reversed(known)} | {n: n for n in known}
+    near = get_close_matches(name, bare, n=1) or get_close_matches(name.rpartition(":")[2], bare, 1)
+    close = [bare[each] for each in near]
+    shown = ", ".join(known[:12]) + (", …" if len(known) > 12 else "")
     require(
         name in existing,
         argument,

@@ -244,6 +244,9 @@ class Chunk:
     failed : dict of int to str
         Filled in by the simulation: the trajectories of this chunk, counted from 0, that could
         not be simulated, and the reasons. Their outputs are ignored.
+    known : dict of int to int
+        Filled in by the simulation: the trajectories of this chunk whose simulation ended early,
+        and the number of their samples that are known. Later ones are masked.
 
     """
 
@@ -254,6 +257,7 @@ class Chunk:
     segments: Segments
     rate: float
     failed: dict[int, str] = field(default_factory=dict)
+    known: dict[int, int] = field(default_factory=dict)
 
     @property
     def frozen(self) -> NDArray:
@@ -323,6 +327,7 @@ def simulate_in_chunks(
     nominal = np.empty((*commands.shape[:2], len(twin.outputs)), dtype=commands.dtype)
     observed = np.empty_like(nominal)
     failed: dict[int, str] = {}
+    known = np.full(len(commands), commands.shape[1])
     for begin in range(0, len(commands), size):
         index = slice(begin, begin + size)
         own_commands, own_faults, own_segments = commands[index], drawn[index], segments[index]
@@ -331,14 +336,18 @@ def simulate_in_chunks(
         nominal[index], observed[index] = run(chunk)
         reasons = _not_finite(twin, nominal[index], observed[index]) | chunk.failed
         failed |= {begin + i: reason for i, reason in sorted(reasons.items())}
+        for i, samples in chunk.known.items():
+            known[begin + i] = samples
         if progress is not None:
             progress(min(1.0, (begin + size) / len(commands)))
     labels = np.array([HEALTHY if fault is None else fault.label for fault in drawn])
     good = np.setdiff1d(np.arange(len(commands)), list(failed)) if failed else slice(None)
+    mask = np.arange(commands.shape[1])[:, None] < known[good, None, None]
     simulated = Trajectories(
         commands=commands[good].copy(),  # the caller may change its own array afterwards
         nominal=nominal[good],
         observed=observed[good],
+        mask=np.broadcast_to(mask, observed[good].shape),
         ids=np.array([f"{i:05d}" for i in range(len(commands))], dtype=np.str_)[good],
         labels=labels[good],
         rate=twin.rate,

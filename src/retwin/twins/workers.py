@@ -6,10 +6,11 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-
-from pebble import ProcessPool
+from typing import Any, TypeVar
 
 __all__ = ["keep_workers", "worker_processes"]
+
+Pool = TypeVar("Pool")
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,7 +18,7 @@ class _Kept:
     """A pool that is kept: the twin settings that it serves, and what ends it."""
 
     key: object
-    pool: ProcessPool
+    pool: Any
     stack: ExitStack
 
 
@@ -48,8 +49,8 @@ def keep_workers() -> Iterator[None]:
 
 @contextmanager
 def worker_processes(
-    key: object, start: Callable[[], AbstractContextManager[ProcessPool]]
-) -> Iterator[ProcessPool]:
+    key: object, start: Callable[[], AbstractContextManager[Pool]]
+) -> Iterator[Pool]:
     """The pool that `start` opens, or within `keep_workers` one that serves the same settings.
 
     Parameters
@@ -61,7 +62,7 @@ def worker_processes(
 
     Yields
     ------
-    pebble.ProcessPool
+    Pool
         The running pool. An exception in the block ends it, and with it all pending tasks.
 
     """

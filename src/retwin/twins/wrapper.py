@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.data.trajectories import Channels
+from retwin.data.trajectories import Channels, Trajectories
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.twin import Chunk, SimulationError, Twin
@@ -68,7 +68,8 @@ def simulate_chunk(
 ) -> tuple[NDArray, NDArray]:
     """Outputs that a wrapped twin gives for some trajectories of a chunk.
 
-    A trajectory that fails is entered in `chunk.failed`, and its outputs are 0.
+    A trajectory that fails is entered in `chunk.failed`, and its outputs are 0. One that ends early
+    is entered in `chunk.known`.
 
     Parameters
     ----------
@@ -107,8 +108,17 @@ def simulate_chunk(
         observed = np.zeros_like(nominal)
         good = np.setdiff1d(np.arange(len(rows)), list(error.failed))
         nominal[good], observed[good] = error.finished.nominal, error.finished.observed
+        _enter_known(chunk, rows[good], error.finished)
         return nominal, observed
+    _enter_known(chunk, rows, simulated)
     return simulated.nominal, simulated.observed
+
+
+def _enter_known(chunk: Chunk, rows: NDArray, simulated: Trajectories) -> None:
+    """Enter the trajectories that ended early in `chunk.known`."""
+    known = simulated.mask.any(axis=2).sum(axis=1)
+    for i in np.flatnonzero(known < simulated.steps):
+        chunk.known[int(rows[i])] = int(known[i])
 
 
 def chunk_generator(seed: int, chunk: Chunk, purpose: int) -> np.random.Generator:
