@@ -14,6 +14,7 @@ from retwin.checks import require
 from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
+from retwin.serialisation.sizes import Budget
 
 __all__ = ["DataCase", "Raw", "Reader", "assemble", "settle", "split_columns"]
 
@@ -61,6 +62,7 @@ class Reader(Protocol):
         case: DataCase | None,
         rate: float | None,
         progress: Progress | None,
+        max_bytes: int | None,
     ) -> Trajectories:
         """The trajectories at `path`; see `data.io.load`."""
         ...
@@ -135,6 +137,7 @@ def assemble(
     source: Provenance,
     case: DataCase | None,
     rate: float | None,
+    budget: Budget,
     inputs: Channels | None = None,
 ) -> Trajectories:
     """Trajectories from `raws`; shorter ones are padded with the last value and mask False.
@@ -149,6 +152,8 @@ def assemble(
         Sets the sample rate.
     rate : float or None
         The sample rate in Hz, None if the case or every file holds it.
+    budget : Budget
+        The memory that the padded arrays may take.
     inputs : Channels or None
         Names of the commands, None for numbered ones.
 
@@ -156,7 +161,7 @@ def assemble(
     ------
     InputError
         Widths, sample rates or the presence of commands differ among `raws`, no sample rate is
-        known, or a command or nominal output is not finite.
+        known, a command or nominal output is not finite, or the padded arrays are too large.
 
     """
     first = raws[0]
@@ -177,6 +182,8 @@ def assemble(
         for raw, none in zip(raws, empty, strict=True)
     ]
     _check_finite(raws, commands)
+    width = commands[0].shape[1] + 2 * first.nominal.shape[1]
+    budget.take(len(raws) * steps * width * (first.nominal.itemsize + 1))
     lengths = np.array([len(raw.nominal) for raw in raws])
     observed = _padded([raw.observed for raw in raws], steps)
     present = np.arange(steps)[None, :, None] < lengths[:, None, None]

@@ -25,7 +25,7 @@ from retwin.deploy.bundle.verdicts import (
 )
 from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.serialisation.models import refusing
+from retwin.serialisation.files import refusing
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, checked_seed, simulate_in_chunks
 
