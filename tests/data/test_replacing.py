@@ -1,4 +1,4 @@
-"""Replacing a file or a folder, killed at every step: the old contents or the new ones are there."""
+"""Replacing files and folders, killed at every step: the old contents or the new are there."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,12 +13,14 @@ from retwin.catalog import CASES, TWINS
 from retwin.checks import require
 from retwin.cli.animate import animate
 from retwin.cli.completion import complete_faults, complete_twins, one_of
-from retwin.cli.options import Json, Seed
+from retwin.cli.options import Json, MaxBytes, Seed
 from retwin.cli.plans import Scheduler, Workers, carry_out
 from retwin.cli.reading import read
 from retwin.cli.terminal import answer, example, table
 from retwin.data.io import check_target
 from retwin.errors import InputError
+from retwin.serialisation.files import recover
+from retwin.serialisation.models import kind_of
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
@@ -155,6 +156,7 @@ def simulate(
     workers: Workers = None,
     scheduler: Scheduler = None,
     chunk: Annotated[int, typer.Option(metavar="N", help="Trajectories per chunk.", min=1)] = 256,
+    max_bytes: MaxBytes = None,
 ) -> None:
     """Simulate trajectories to a file; an interrupted *.zarr is resumed."""
     from retwin.deploy.simulations import SimulationPlan
@@ -163,9 +165,10 @@ def simulate(
     found = _twin(twin, inputs, outputs, rate)
     system = _case(case, twin, found)
     faults = _faults(system, fault)
-    drawn = _sampler(system, found) if commands is None else read(commands, system)
-    if commands is None and n is None:
-        n = len(faults)
+    if commands is not None:
+        drawn = read(commands, system, max_bytes=max_bytes)
+    else:
+        drawn, n = _sampler(system, found), len(faults) if n is None else n
     plan = SimulationPlan(found, drawn, seed, n, faults, clip=clip, chunk=chunk)
     carry_out(plan, out, "simulate", workers=workers, scheduler=scheduler)
 
@@ -178,7 +181,7 @@ app.command(
 
 def _twin(name: str, inputs: str, outputs: str, rate: float | None) -> Twin:
     """The twin of that name, or the model in that folder."""
-    if (Path(name) / "model.json").is_file() and not (inputs or outputs or rate):
+    if (recover(name) / "model.json").exists() and not (inputs or outputs or rate):
         return _model(Path(name))
     if _is_case(name) and not (inputs or outputs or rate):
         from retwin import cases
@@ -192,11 +195,7 @@ def _is_case(name: str) -> bool:
 
 
 def _model(folder: Path) -> Twin:
-    try:
-        kind = json.loads((folder / "model.json").read_text("utf-8"))["kind"]
-    except (OSError, ValueError, LookupError, TypeError):
-        kind = "damaged"
-    if kind == "surrogate":
+    if kind_of(folder) == "surrogate":
         from retwin.update.surrogate import Surrogate
 
         return Surrogate.load(folder)

@@ -13,8 +13,10 @@ __all__ = ["Budget", "container", "memory"]
 
 CGROUP = Path("/sys/fs/cgroup")
 """The folder with the limits of the container, where there are some."""
-SHARE = 0.5
-"""The share of what is free that one file or plan may take: the work on it needs memory too."""
+MEMORY_SHARE = 0.5
+"""The share of the free memory that one file or plan may take: the work on it needs memory too."""
+DISK_SHARE = 0.9
+"""The same of the free disk."""
 
 
 class Budget:
@@ -25,8 +27,8 @@ class Budget:
     where : str
         The file or the argument, for messages.
     limit : int, optional
-        The largest number of bytes, at least 1; by default half of the free memory, or of the free
-        disk.
+        The largest number of bytes, at least 1; by default a share of the free memory, or of
+        the free disk.
     disk : path, optional
         A folder on the disk that is written to; memory is limited without one.
 
@@ -46,10 +48,10 @@ class Budget:
         if limit is not None:
             self._limit = whole("max_bytes", limit, least=1)
         elif disk is None:
-            self._limit = int(SHARE * (memory()[1] or sys.maxsize))
+            self._limit = int(MEMORY_SHARE * (memory()[1] or sys.maxsize))
         else:
             existing = next(each for each in (Path(disk), *Path(disk).parents) if each.exists())
-            self._limit = int(SHARE * shutil.disk_usage(existing).free)
+            self._limit = int(DISK_SHARE * shutil.disk_usage(existing).free)
         self._taken = 0
 
     @property
@@ -67,7 +69,8 @@ class Budget:
 
         """
         self._taken += int(size)
-        limit = "the limit that was given" if self._given else f"half of the free {self._kind}"
+        share = MEMORY_SHARE if self._kind == "memory" else DISK_SHARE
+        limit = "as given" if self._given else f"{share:.0%} of the free {self._kind}"
         require(
             self._taken <= self._limit,
             self._where,

@@ -51,7 +51,7 @@ def load(
         Called with the share that is done, from 0 to 1.
     max_bytes : int
         The largest size of all that is read, as the file declares it; by default half of the free
-        memory, and for Zarr half of the free disk, to which its arrays are copied.
+        memory, and for Zarr nine tenths of the free disk, to which its arrays are copied.
 
     Returns
     -------

@@ -103,7 +103,7 @@ def read_zarr(
         The trajectories to read. Of a set that was written chunk by chunk, only the chunks that
         hold them are read, each of which is checked as a whole.
     max_bytes : int
-        The largest size of the copy; by default half of the free disk.
+        The largest size of the copy; by default nine tenths of the free disk.
 
     Returns
     -------
