@@ -112,10 +112,15 @@ def fetch(
             help="Else RETWIN_CACHE, else the user's cache.",
         ),
     ] = None,
+    max_bytes: Annotated[
+        int, typer.Option(metavar="N", help="Most that the file may hold.", min=1)
+    ] = download.MAX_BYTES,
 ) -> None:
     """Download a public data file, check its SHA-256 and print its path."""
     with bar("fetch") as show:
-        path = download.fetch(name, folder=folder, progress=lambda share: show(name, share))
+        path = download.fetch(
+            name, folder=folder, progress=lambda share: show(name, share), max_bytes=max_bytes
+        )
     answer(path, str(path))
 
 
