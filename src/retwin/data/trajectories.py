@@ -58,6 +58,10 @@ class Channels:
     def __len__(self) -> int:
         return len(self.names)
 
+    def __str__(self) -> str:
+        pairs = zip(self.names, self.units, strict=True)
+        return ", ".join(f"{name} [{unit}]" for name, unit in pairs) or "none"
+
     @property
     def comparable(self) -> bool:
         """Whether all channels have the same unit, other than "1", or there is only one channel."""

@@ -52,14 +52,15 @@ _count = itertools.count()
 
 
 @contextmanager
-def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
+def write_atomically(path: str | os.PathLike[str], *, folder: bool = False) -> Iterator[Path]:
     """A name in the same folder to write to; moved to `path` on success, removed on failure.
 
     For a file and for a folder alike: write a file to that name, or make a folder of that name and
-    fill it. Folders above `path` are made. If the block fails, with an exception or Ctrl-C, `path`
-    stays as it was; a kill leaves the old contents or the new ones, and hidden files that the next
-    process to write there removes. The name keeps the suffix of `path`, since many writers choose
-    their format by it.
+    fill it; with `folder`, the folder is made, and a file at `path` is refused at once. Folders
+    above `path` are made. If the block fails, with an exception or Ctrl-C, `path` stays as it was;
+    a kill leaves the old contents or the new ones, and hidden files that the next process to write
+    there removes. The name keeps the suffix of `path`, since many writers choose their format by
+    it.
 
     Raises
     ------
@@ -72,12 +73,15 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     # Through a link the file behind it is replaced, not the link.
     target = Path(os.path.realpath(path))
-    _make_parent(target)
-    recover(target)
-    _sweep(target.parent)
     mark = f"{os.getpid()}-{TOKEN}-{next(_count)}"
     part = target.with_name(f"{_beginning(target)}{mark}{target.suffix}")
+    _make_parent(target, part)
+    recover(target)
+    _sweep(target.parent)
     try:
+        if folder:
+            _check_kind(target, folder=True)
+            part.mkdir()
         yield part
         if not part.exists():
             raise FileNotFoundError(f"nothing was written for {target.name}")
@@ -89,7 +93,8 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
 def recover(path: str | os.PathLike[str]) -> Path:
     """`path`; a folder there whose replacement was killed halfway is put back first."""
     target = Path(os.path.realpath(path))
-    if not target.exists() and target.parent.is_dir():
+    # Not `target.exists()`, which raises for a name that is too long.
+    if not os.path.exists(target) and target.parent.is_dir():
         for former in _formers(target):
             with suppress(OSError):  # another process has put it back
                 os.rename(former, target)
@@ -176,32 +181,37 @@ def sha256(path: str | os.PathLike[str]) -> str:
     return total.hexdigest()
 
 
-def _make_parent(target: Path) -> None:
-    """Make the folder of `target`; InputError if it cannot be written."""
+def _make_parent(target: Path, part: Path) -> None:
+    """Make the folder of `target`; InputError if it cannot be written, or not under that name."""
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        writable = os.access(target.parent, os.W_OK | os.X_OK)
-        reason = "one without write permission"
+        # By trying: the rights of a file do not show whether its file system takes more.
+        part.touch()
+        part.unlink()
+        target.exists()
     except OSError as error:
-        writable, reason = False, error.strerror or type(error).__name__
-    require(
-        writable,
-        "path",
-        expected="a place that can be written",
-        got=f"{target} ({reason})",
-        remedy="give another folder",
-    )
+        raise InputError(
+            "path",
+            expected="a place that can be written",
+            got=f"{target} ({error.strerror or type(error).__name__})",
+            remedy="give another folder or name",
+        ) from None
 
 
-def _move(part: Path, target: Path) -> None:
-    if target.exists() and target.is_dir() != part.is_dir():
-        kinds = ("folder", "file") if target.is_dir() else ("file", "folder")
+def _check_kind(target: Path, *, folder: bool) -> None:
+    """Raise InputError unless `target` is free, or is a folder where a folder is to be."""
+    if target.exists() and target.is_dir() != folder:
+        kinds = ("file", "folder") if folder else ("folder", "file")
         raise InputError(
             "path",
             expected=f"a name that is free or a {kinds[1]} to replace",
             got=f"{target}, a {kinds[0]}",
             remedy="give another name",
         )
+
+
+def _move(part: Path, target: Path) -> None:
+    _check_kind(target, folder=part.is_dir())
     if not (target.is_dir() and part.is_dir()):
         os.replace(part, target)
         return

@@ -53,8 +53,7 @@ def write_model(
     """
     from safetensors.torch import save
 
-    with write_atomically(folder) as temporary:
-        temporary.mkdir()
+    with write_atomically(folder, folder=True) as temporary:
         text = json.dumps({"schema": SCHEMA, "kind": kind, **about}, indent=1)
         (temporary / "model.json").write_text(text + "\n", encoding="utf-8")
         if weights:

@@ -2,7 +2,7 @@
 
 Belongs here: one file per format, whose contents are validated while they are read. Not here:
 fitted models (see `serialisation`). Pickle is used nowhere. To add a format, write a module with a
-`Reader` and add one entry to `catalog.FORMATS`.
+function that takes the arguments of `load` and add one entry to `catalog.FORMATS`.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def load(
     if rate is not None:
         rate = positive("rate", rate, unit="Hz")
     require(
-        path.exists(),
+        os.path.exists(path),
         "path",
         expected="an existing file or folder",
         got=f"{path}, where there is none",

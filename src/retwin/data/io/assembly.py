@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -16,7 +15,7 @@ from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["DataCase", "Raw", "Reader", "assemble", "settle", "split_columns"]
+__all__ = ["DataCase", "Raw", "assemble", "settle", "split_columns"]
 
 RATE_TOLERANCE = 1e-3
 """Relative difference of sample rates that count as equal: files round their times."""
@@ -49,22 +48,6 @@ class DataCase(Protocol):
         self, trajectories: Trajectories, *, progress: Progress | None = None
     ) -> Trajectories:
         """`trajectories` with the commands that the file does not hold, and their channels."""
-        ...
-
-
-class Reader(Protocol):
-    """A function that reads one file format."""
-
-    def __call__(
-        self,
-        path: Path,
-        *,
-        case: DataCase | None,
-        rate: float | None,
-        progress: Progress | None,
-        max_bytes: int | None,
-    ) -> Trajectories:
-        """The trajectories at `path`; see `data.io.load`."""
         ...
 
 
@@ -242,8 +225,8 @@ def settle(
         require(
             channels in (wanted, unnamed),
             name,
-            expected=f"the channels of the case, {_described(wanted)}",
-            got=_described(channels),
+            expected=f"the channels of the case, {wanted}",
+            got=channels,
             remedy="give the case that the data belong to",
         )
     unknown = sorted(trajectories.known_labels - set(case.classes))
@@ -330,10 +313,3 @@ def _common_rate(raws: Sequence[Raw], case: DataCase | None, rate: float | None)
 
 def _close(rate: float, other: float) -> bool:
     return bool(np.isclose(rate, other, rtol=RATE_TOLERANCE, atol=0))
-
-
-def _described(channels: Channels) -> str:
-    return (
-        ", ".join(f"{n} [{u}]" for n, u in zip(channels.names, channels.units, strict=True))
-        or "none"
-    )

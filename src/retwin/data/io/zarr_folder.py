@@ -86,8 +86,8 @@ def write_zarr(trajectories: Trajectories, path: Path) -> None:
         target = group.create_array(
             name, shape=array.shape, dtype=array.dtype, chunks=(count, *rest)
         )
-        for rows in _chunks(len(array), count) if array.size else ():
-            target[rows] = array[rows]
+        for begin in range(0, len(array) if array.size else 0, count):
+            target[begin : begin + count] = array[begin : begin + count]
 
 
 def read_zarr(
@@ -238,10 +238,6 @@ def _read_chunks(
                 scratch[name].append(array[good[-1] - begin])
         arrays = {name: each.array() for name, each in scratch.items()}
     return restore_chunked(header, arrays, np.concatenate(good))
-
-
-def _chunks(count: int, size: int) -> list[slice]:
-    return [slice(begin, begin + size) for begin in range(0, count, size)]
 
 
 def _check_size(array: Any, shape: list[int], chunk: int, where: str) -> None:

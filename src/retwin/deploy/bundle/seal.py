@@ -75,6 +75,8 @@ def verify_seal(folder: str | Path) -> None:
     try:
         written = check_regular(folder / SUMS).read_bytes()
         found = _sums(folder)
+    except InputError:
+        raise
     except (OSError, ValueError) as error:
         raise _damaged(folder, f"{type(error).__name__}: {brief(error)}") from None
     if written != found:

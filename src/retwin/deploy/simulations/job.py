@@ -45,7 +45,8 @@ MAX_NPZ_BYTES = 2**29
 
 
 COPIES = 3
-"""Arrays of a chunk that are in memory together: simulated, stored and packed."""
+"""Arrays of a chunk that are in memory together: simulated, stored and packed. Zarr takes memory
+for a whole chunk, also where the last one is shorter."""
 
 
 @dataclass(frozen=True)
@@ -165,8 +166,7 @@ class _Job:
         part = _part(target)
         if not part.exists():
             Budget("n", disk=target.parent).take(plan.count * plan.trajectory_bytes)
-            chunk = min(plan.chunk, plan.count)
-            Budget("chunk").take(COPIES * chunk * plan.trajectory_bytes)
+            Budget("chunk").take(COPIES * plan.chunk * plan.trajectory_bytes)
             with write_atomically(part) as new:
                 (new / "done").mkdir(parents=True)
                 if isinstance(plan.commands, Recorded):

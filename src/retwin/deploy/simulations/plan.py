@@ -340,12 +340,7 @@ def _check_compatible(trajectories: Trajectories, twin: Twin) -> None:
     require(
         trajectories.inputs in (twin.inputs, Channels.numbered("u", len(twin.inputs))),
         "commands",
-        expected=f"the inputs of the twin, {_named(twin.inputs)}",
-        got=_named(trajectories.inputs),
+        expected=f"the inputs of the twin, {twin.inputs}",
+        got=trajectories.inputs,
         remedy="give commands for this twin; a file without commands needs its case",
     )
-
-
-def _named(channels: Channels) -> str:
-    pairs = zip(channels.names, channels.units, strict=True)
-    return ", ".join(f"{name} [{unit}]" for name, unit in pairs) or "none"
