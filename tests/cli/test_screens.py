@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
-import re
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import pytest
 import typer
 from rich.console import Console
@@ -17,7 +14,6 @@ from test_readme import check
 import retwin as rt
 from retwin.cli import app
 from retwin.cli.terminal import answer, bar, be_quiet, note, table
-from retwin.data.trajectories import Provenance
 
 WITHOUT_TABLES = {
     *("data convert", "data split", "data fetch", "twin simulate", "twin animate"),
@@ -181,44 +177,3 @@ def test_quiet_leaves_out_bars_and_notes(on_screen, capsys: pytest.CaptureFixtur
     finally:
         be_quiet(False)
     assert tuple(capsys.readouterr()) == ("result\n", "")
-
-
-STEERING = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202e\r"
-
-
-def test_names_cannot_steer_the_terminal(narrow, on_screen, tmp_path) -> None:
-    """Of classes, channels, files, errors and warnings, in tables and as JSON."""
-    made = rt.Trajectories(
-        np.zeros((2, 5, 1)),
-        np.zeros((2, 5, 1)),
-        np.zeros((2, 5, 1)),
-        10.0,
-        labels=[f"Worn{STEERING}", f"Worn{STEERING}"],
-        ids=[STEERING, "b"],
-        inputs=rt.Channels((f"u{STEERING}",), ("V",)),
-        provenance=(Provenance(STEERING),),
-    )
-    file = tmp_path / f"a{STEERING}.npz"
-    rt.save(made, file)
-    printed = [*narrow("data", "info", file)[1:], *narrow("data", "info", file, "--json")[1:]]
-    assert json.loads(printed[2])[0]["inputs"][0]["name"] == f"u{STEERING}"
-    printed += narrow("data", "info", file, "--case", "armpi")[1:]
-    printed += narrow("data", "convert", file, tmp_path / f"b{STEERING}.npz")[1:]
-    printed += narrow("data", "info", f"{STEERING}.mat")[1:]
-    printed += narrow(f"{STEERING}")[1:]
-    printed += narrow("data", "info", file, f"--{STEERING}")[1:]
-    for text in printed:
-        # What rich writes itself: colours, bars and their lines.
-        left = re.sub("\x1b\\[[0-9;?]*[mKAhl]", "", text)
-        assert not re.search("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u202e]", left), text
-
-
-def test_bytes_of_a_name_that_are_no_text_are_shown(narrow, tmp_path, monkeypatch) -> None:
-    name = os.fsdecode(b"a\xff.npz")
-    made = rt.Trajectories(np.zeros((2, 5, 1)), np.zeros((2, 5, 1)), np.zeros((2, 5, 1)), 10.0)
-    monkeypatch.chdir(tmp_path)
-    rt.save(made, name)
-    for more in ((), ("--json",)):
-        code, out, _ = narrow("data", "info", name, *more)
-        assert code == 0
-        assert r"a\udcff.npz" in out

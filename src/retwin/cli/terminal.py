@@ -5,9 +5,7 @@ Bars and notes go to stderr unless `--quiet` is given; warnings and errors alway
 
 from __future__ import annotations
 
-import json
 import logging
-import re
 import shlex
 import signal
 import sys
@@ -59,10 +57,6 @@ LOG_DELAY = 2.0
 SPEED_WINDOW = 3600.0
 """Seconds over which the speed is averaged, since the jobs of a study differ much in length."""
 
-CONTROL = re.compile(
-    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
-)
-"""Control codes but for tabs and ends of lines, marks of direction, and halves of letters."""
 _quiet = False
 
 
@@ -99,15 +93,14 @@ def answer(result: object, *shown: RenderableType, as_json: bool = False) -> Non
 
     """
     if as_json:
-        from pydantic_core import to_jsonable_python
+        from pydantic_core import to_json
 
-        plain = to_jsonable_python(result, inf_nan_mode="null")
-        typer.echo(_visible(json.dumps(plain, indent=2, ensure_ascii=False)))
+        typer.echo(to_json(result, indent=2, inf_nan_mode="null").decode())
         return
     console = Console()
     for each in shown:
         if isinstance(each, str):
-            console.print(_visible(each), markup=False, highlight=False, soft_wrap=True)
+            console.print(each, markup=False, highlight=False, soft_wrap=True)
         else:
             console.print(each)
 
@@ -134,18 +127,10 @@ def table(
     # Texts are escaped, since a class named [red] must not colour the table.
     for name in columns:
         justify: JustifyMethod = "right" if name in numbers else "left"
-        made.add_column(escape(_visible(name)), overflow="fold", justify=justify)
+        made.add_column(escape(name), overflow="fold", justify=justify)
     for row in rows:
-        made.add_row(*(escape(_visible(str(cell))) for cell in row))
+        made.add_row(*(escape(str(cell)) for cell in row))
     return made
-
-
-def _visible(text: str) -> str:
-    """The text with the codes that steer a terminal as JSON writes them, in hexadecimal.
-
-    Names come from files that others made. Within JSON it is the same text.
-    """
-    return CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 # Progress.
@@ -153,7 +138,7 @@ def _visible(text: str) -> str:
 
 def note(text: str) -> None:
     """Print a line on stderr about what was done."""
-    _stderr().print(_visible(text), markup=False, highlight=False, soft_wrap=True)
+    _stderr().print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager
@@ -195,7 +180,6 @@ def bar(what: str) -> Iterator[Callable[[str, float], None]]:
         task = bars.add_task(what, total=1.0)
 
         def show(text: str, share: float) -> None:
-            text = _visible(text)
             if share < bars.tasks[task].completed:
                 bars.reset(task, total=1.0)
             bars.update(task, completed=share, description=f"{what}: {text}" if text else what)
@@ -217,7 +201,7 @@ def _lines(console: Console, what: str) -> Callable[[str, float], None]:
         left = (now - since) * (1 - share) / (share - first) if share > first else 0.0
         after = f", {left:.0f} s left" if left else ""
         line = f"{what}: {text} {share:.0%}{after}"
-        console.print(_visible(line), markup=False, highlight=False, soft_wrap=True)
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     return show
 
@@ -231,7 +215,7 @@ def _stderr() -> Console:
 
 def complain(text: str) -> None:
     """Print an error in one line on stderr, never wrapped."""
-    line = escape(_visible(" ".join(text.split())))
+    line = escape(" ".join(text.split()))
     Console(stderr=True, soft_wrap=True).print(f"[red]error:[/] {line}", highlight=False)
 
 
@@ -290,7 +274,7 @@ def show_warnings() -> Iterator[None]:
     console = Console(stderr=True, soft_wrap=True)
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
-        console.print(f"[yellow]warning:[/] {escape(_visible(str(message)))}", highlight=False)
+        console.print(f"[yellow]warning:[/] {escape(str(message))}", highlight=False)
 
     with warnings.catch_warnings():
         warnings.simplefilter("default", UserWarning)
