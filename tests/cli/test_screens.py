@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
 from rich.console import Console
@@ -202,3 +204,14 @@ def test_names_do_not_steer_the_terminal(
     assert shown in err
     assert printed.out.count(shown) == 3
     assert printed.err.count(shown) >= 3
+
+
+def test_bytes_of_a_name_that_are_no_text_are_shown(narrow, tmp_path, monkeypatch) -> None:
+    name = os.fsdecode(b"a\xff.npz")
+    made = rt.Trajectories(np.zeros((2, 5, 1)), np.zeros((2, 5, 1)), np.zeros((2, 5, 1)), 10.0)
+    monkeypatch.chdir(tmp_path)
+    rt.save(made, name)
+    for more in ((), ("--json",)):
+        code, out, _ = narrow("data", "info", name, *more)
+        assert code == 0
+        assert r"a\udcff.npz" in out

@@ -5,6 +5,7 @@ Bars and notes go to stderr unless `--quiet` is given; warnings and errors alway
 
 from __future__ import annotations
 
+import json
 import logging
 import shlex
 import signal
@@ -106,10 +107,12 @@ def answer(result: object, *shown: RenderableType, as_json: bool = False) -> Non
 
     """
     if as_json:
-        from pydantic_core import to_json
+        from pydantic_core import to_jsonable_python
 
-        text = to_json(result, indent=2, inf_nan_mode="null").decode()
-        typer.echo(text.translate(CONTROL))
+        # Not `to_json`, which refuses file names whose bytes are no text.
+        values = to_jsonable_python(result, inf_nan_mode="null")
+        text = json.dumps(values, indent=2, ensure_ascii=False)
+        typer.echo(text.translate(CONTROL).encode(errors="backslashreplace").decode())
         return
     console = Console()
     for each in shown:
