@@ -197,7 +197,7 @@ class FormatEntry:
     title : str
         What it holds.
     reader : str
-        The function that reads it, a `data.io.assembly.Reader`.
+        The function that reads it, with the arguments of `data.io.load`.
     writer : str
         The function of trajectories and a path that writes it; "" if the format is only read.
     extra : str

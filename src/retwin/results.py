@@ -6,7 +6,6 @@ the model does not have are ignored, so that files of later versions of the sche
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Callable, Mapping
@@ -26,6 +25,7 @@ from pydantic import (
 from retwin.catalog import METRICS
 from retwin.checks import require
 from retwin.errors import InputError
+from retwin.serialisation.files import read_json
 
 __all__ = [
     "SCHEMA",
@@ -389,6 +389,11 @@ class Results(Part):
         unknown = set(self.data.test.labels) - set(self.classes)
         if unknown and self.classes:
             raise ValueError(f"test label {min(unknown)!r} is none of the classes")
+        pairs = [name for each in self.comparisons for name in (each.a, each.b)]
+        curve = [point.source for point in self.learning_curve or ()]
+        for name in (*pairs, *self.fidelity, *curve):
+            if name not in self.sources:
+                raise ValueError(f"{name!r} is none of the sources")
         return self
 
     def has(self, metric: str) -> bool:
@@ -424,7 +429,9 @@ def read_results(folder: str | os.PathLike[str]) -> Results:
         remedy=again,
     )
     try:
-        content = json.loads(path.read_bytes())
+        content = read_json(path)
+    except InputError:
+        raise
     except (ValueError, OSError) as error:
         raise InputError(
             "results.json", expected="JSON", got=f"{path} ({error})", remedy=again

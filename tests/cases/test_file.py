@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
@@ -664,3 +665,16 @@ test = { a = "a2", b = "b", y = "y2" }
         (tmp_path / "data.csv").write_text(text)
         with pytest.raises(rt.InputError, match=message):
             case.records(tmp_path / "data.csv")
+
+
+@pytest.mark.parametrize("text", ["a" + ".a" * 20_000 + " = 1", "a = " + "[" * 20_000, "a = {b.c"])
+def test_a_case_that_is_nested_too_deeply_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "case.toml").write_text(text)
+    with pytest.raises(rt.InputError, match=r"case\.toml: expected a case as a TOML file"):
+        rt.cases.get(str(tmp_path / "case.toml"))
+
+
+def test_a_pipe_is_no_case(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "case.toml")
+    with pytest.raises(rt.InputError, match="no regular file"):
+        rt.cases.get(str(tmp_path / "case.toml"))

@@ -132,7 +132,7 @@ def test_a_container_is_not_the_whole_machine(healthy: pytest.MonkeyPatch, tmp_p
         "memory.current": str(2**28),
     }.items():
         (tmp_path / name).write_text(text)
-    healthy.setattr(doctor, "CGROUP", tmp_path)
+    healthy.setattr("retwin.serialisation.sizes.CGROUP", tmp_path)
     healthy.setenv("OMP_NUM_THREADS", "64")
     assert found("cores").state == "warning"
     assert "OMP_NUM_THREADS=1" in found("cores").remedy

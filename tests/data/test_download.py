@@ -3,6 +3,9 @@
 import hashlib
 import logging
 import threading
+import time
+import zlib
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pooch
@@ -22,6 +25,9 @@ class Server:
 
     def __init__(self):
         self.content = CONTENT
+        self.headers = {}
+        self.pause = None
+        self.over = threading.Event()
         self.promised = None
         self.asked = []
         server = self
@@ -34,9 +40,12 @@ class Server:
                     return
                 self.send_response(200)
                 length = server.promised or len(server.content)
-                self.send_header("Content-Length", str(length))
+                headers = server.headers or {"Content-Length": str(length)}
+                for name, value in headers.items():
+                    self.send_header(name, value)
                 self.end_headers()
-                self.wfile.write(server.content)
+                with suppress(OSError):  # the client has gone
+                    server.send(self.wfile)
 
             def log_message(self, *_):
                 """Keep quiet."""
@@ -46,7 +55,17 @@ class Server:
         self.thread = threading.Thread(target=self.http.serve_forever, args=(0.02,))
         self.thread.start()
 
+    def send(self, file):
+        """The content; in pieces, again and again, if there is a pause between them."""
+        if self.pause is None:
+            file.write(self.content)
+            return
+        while not self.over.wait(self.pause):
+            file.write(self.content)
+            file.flush()
+
     def stop(self):
+        self.over.set()
         self.http.shutdown()
         self.thread.join()
         self.http.server_close()
@@ -117,6 +136,54 @@ def test_download_that_breaks_off_leaves_nothing(tmp_path, server):
     with pytest.raises((OSError, RuntimeError)) as caught:
         fetch("toy", folder=tmp_path)
     assert "fetch toy" in str(caught.value)
+    assert left(tmp_path) == []
+
+
+def test_an_endless_stream_is_cut_off(tmp_path, server):
+    server.headers, server.pause = {"Connection": "close"}, 0.0
+    with pytest.raises(InputError, match=r"toy: expected contents of at most 1 MB, as given"):
+        fetch("toy", folder=tmp_path, max_bytes=10**6)
+    assert left(tmp_path) == []
+
+
+def test_a_file_that_is_larger_than_it_may_be_is_not_begun(tmp_path, server):
+    server.promised, server.pause = 2**40, 10.0
+    begun = time.monotonic()
+    with pytest.raises(InputError, match=r"toy: .*at most 4.29 GB, as given, got 1.1e\+03 GB"):
+        fetch("toy", folder=tmp_path)
+    assert time.monotonic() - begun < 5
+    assert left(tmp_path) == []
+
+
+def test_a_slow_drip_ends_in_time(tmp_path, server, monkeypatch):
+    server.content, server.promised, server.pause = b"x", 10**6, 0.05
+    monkeypatch.setattr(download, "MAX_SECONDS", 0.5)
+    begun = time.monotonic()
+    with pytest.raises(OSError, match=r"not complete after 0.5 s.*check the network"):
+        fetch("toy", folder=tmp_path)
+    assert time.monotonic() - begun < 5
+    assert left(tmp_path) == []
+
+
+def test_headers_that_drip_end_in_time(tmp_path, server, monkeypatch):
+    class Slow(dict):
+        def items(self):
+            while not server.over.wait(0.05):
+                yield "X-More", "x"
+
+    server.headers = Slow(x="")
+    monkeypatch.setattr(download, "MAX_SECONDS", 0.5)
+    with pytest.raises(OSError, match=r"not complete after 0.5 s"):
+        fetch("toy", folder=tmp_path)
+    assert left(tmp_path) == []
+
+
+def test_packed_contents_are_not_unpacked(tmp_path, server):
+    packer = zlib.compressobj(9, wbits=31)
+    server.content = packer.compress(bytes(10**8)) + packer.flush()
+    server.headers = {"Content-Encoding": "gzip", "Content-Length": str(len(server.content))}
+    with pytest.raises(RuntimeError, match="thrown away"):
+        fetch("toy", folder=tmp_path, max_bytes=10**6)
     assert left(tmp_path) == []
 
 

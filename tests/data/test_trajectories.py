@@ -164,14 +164,14 @@ labelled = st.lists(st.sampled_from("abcd"), min_size=2, max_size=40)
 @given(labelled, st.floats(0.05, 0.95), st.integers(0, 10))
 def test_split_is_a_stratified_partition(labels, fraction, seed):
     made = make(n=len(labels), steps=2, d_u=1, d_y=1, labels=labels)
-    first, second = made.split(fraction, seed=seed)
+    first, second = (made[index] for index in made.split_index(fraction, seed=seed))
     assert sorted([*first.ids, *second.ids]) == sorted(made.ids)
     for label in set(labels):
         share = fraction * labels.count(label)
         # Half a trajectory carried over from the class before, half from rounding.
         assert abs(len(first.with_label(label)) - share) <= 1 + 1e-9
     assert abs(len(first) - fraction * len(labels)) <= 0.5 + 1e-9
-    again, _ = made.split(fraction, seed=seed)
+    again = made[made.split_index(fraction, seed=seed)[0]]
     assert again.ids.tolist() == first.ids.tolist()
 
 
@@ -186,6 +186,12 @@ def test_split_depends_on_the_seed_and_keeps_the_order():
 def test_split_refuses_shares_that_leave_nothing(fraction):
     with pytest.raises(InputError, match="strictly between 0 and 1"):
         make().split(fraction, seed=0)
+
+
+@pytest.mark.parametrize("fraction", [1e-300, 0.01, 0.99, 1 - 1e-15])
+def test_split_refuses_shares_too_small_for_these(fraction):
+    with pytest.raises(InputError, match="leaves some of the 4 trajectories to both sets, got"):
+        make(n=4).split(fraction, seed=0)
 
 
 @settings(max_examples=60, deadline=None)

@@ -9,9 +9,9 @@ import plotly.graph_objects as go
 import pytest
 from numpy.typing import NDArray
 
-from retwin.report.figure import Figure, Line
+from retwin.report.figure import Figure, Line, Matrices, Matrix
 from retwin.report.plotly_specs import panel_spec
-from retwin.report.png import draw
+from retwin.report.png import draw, png
 from retwin.report.sections import SECTIONS, sections_of
 from retwin.report.sections.discrepancy import latents
 from retwin.report.sections.fidelity import fidelity
@@ -108,3 +108,11 @@ def test_figures_are_valid_for_both_renderers(study: Content) -> None:
         for panel in figure.panels if isinstance(figure, Figure) else ():
             spec = panel_spec(panel)
             assert go.Figure(coloured({key: spec[key] for key in ("data", "layout")})).data
+
+
+def test_names_with_dollars_are_no_formulas() -> None:
+    """Such text ended with an error of matplotlib's, or was set as a formula."""
+    bad, other = r"$\frac{", "a$b$"
+    matrix = Matrix(bad, "ibg_rg", [[3, 1], [0, 4]], np.array([[0.75, 0.25], [0.0, 1.0]]), 7, 8)
+    image = png(Matrices("confusion", [bad, other], [matrix]), emulated=False)
+    assert image.startswith(b"\x89PNG")

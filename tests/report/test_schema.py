@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from retwin.catalog import METRICS
+from retwin.errors import InputError
 from retwin.results import Results, read_results
 from retwin.scores import classification
 
@@ -59,3 +60,28 @@ def test_every_score_of_a_diagnoser_is_a_metric_of_the_catalog() -> None:
 def test_the_model_needs_no_numpy() -> None:
     code = "import sys, retwin.results; assert not {'numpy', 'torch'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def changed(folder: Path, name: str, change) -> Path:
+    content = json.loads((FILES[0].parent / name).read_text("utf-8"))
+    change(content)
+    (folder / "results.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.mark.parametrize("part", ["sources", "comparisons", "fidelity"])
+def test_names_of_sources_that_do_not_agree_are_refused(tmp_path: Path, part: str) -> None:
+    def rename(content) -> None:
+        if part == "comparisons":
+            content[part][0]["b"] = "other"
+        else:
+            content[part] = {f"other_{name}": each for name, each in content[part].items()}
+
+    with pytest.raises(InputError, match="is none of the sources"):
+        read_results(changed(tmp_path, "arm.json", rename))
+
+
+def test_results_that_are_nested_too_deeply_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "results.json").write_text('{"schema": 1, "x": ' + "[" * 100_000)
+    with pytest.raises(InputError, match="nested too deeply"):
+        read_results(tmp_path)

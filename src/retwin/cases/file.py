@@ -6,6 +6,7 @@ Code is named as `module:object`; a module beside the file is found. No other co
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -27,6 +28,7 @@ from retwin.errors import InputError
 from retwin.nets.networks import Network
 from retwin.nets.training import Training
 from retwin.serialisation.configs import at, checked, fits, from_config, from_settings, key
+from retwin.serialisation.files import check_regular
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.fmu import FMUTwin
 from retwin.twins.limits import Limits
@@ -45,6 +47,8 @@ from retwin.update.residual import Density, Mixture, SequenceMixture
 
 __all__ = ["check_density", "read_case"]
 
+MAX_DEPTH = 100
+"""The largest number of dots in a key; reading takes memory by the square of it."""
 SAMPLERS: tuple[type, ...] = (RampSampler, HoldSampler, MultisineSampler, RecordedSampler)
 FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
 
@@ -195,8 +199,11 @@ def _is_static(twin: Twin, sampler: CommandSampler) -> bool:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:  # UnicodeDecodeError and TOMLDecodeError are such
+        text = check_regular(path).read_text("utf-8")
+        if max(part.count(".") for part in re.split(r"[=,{}\n]", text)) > MAX_DEPTH:
+            raise ValueError("a key is nested too deeply")
+        return tomllib.loads(text)
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             str(path),
             expected="a case as a TOML file",

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import sys
+from errno import ENAMETOOLONG
 from typing import Annotated, Any
 
 import typer
@@ -136,5 +137,5 @@ def _run() -> int:
         if os.environ.get("RETWIN_TRACEBACK"):
             raise
         complain(described(error))
-        return FAILED
+        return BAD_INPUT if getattr(error, "errno", None) == ENAMETOOLONG else FAILED
     return INTERRUPTED

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from retwin.cli.diagnose import EMULATED, diagnoses, write_probabilities
-from retwin.cli.options import CaseOption, Json, OtherCase, Seed
+from retwin.cli.options import CaseOption, Json, MaxBytes, OtherCase, Seed
 from retwin.cli.reading import case_named, read
 from retwin.cli.terminal import answer, bar, command_given, example, note, table
 from retwin.data.io import check_target
@@ -40,6 +40,7 @@ def save(
     ] = None,
     case: OtherCase = None,
     seed: Seed = 0,
+    max_bytes: MaxBytes = None,
 ) -> None:
     """Fit a guard and put it, the twin and the diagnoser into one sealed folder."""
     import retwin as rt
@@ -49,7 +50,7 @@ def save(
     twin = rt.CorrectedTwin.load(model)
     system = rt.cases.get(case or twin.case)
     classifier = None if diagnoser is None else rt.load_diagnoser(diagnoser)
-    calibration = read(real, system)
+    calibration = read(real, system, max_bytes=max_bytes)
     with bar("bundle") as show:
         guard = fit_guard(twin, system, calibration, seed=seed, progress=lambda s: show("guard", s))
     notes = {"seed": seed, "command": command_given()}
@@ -97,6 +98,7 @@ def predict(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="CSV file for all probabilities.")
     ] = None,
+    max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
     """Diagnose trajectories, and flag those that the bundle was not made for.
@@ -104,7 +106,7 @@ def predict(
     A trajectory that is outside has no diagnosis and no probabilities.
     """
     bundle = _opened(folder)
-    trajectories = read(file, case_named(case))
+    trajectories = read(file, case_named(case), max_bytes=max_bytes)
     found = bundle.predict(trajectories)
     diagnosed = diagnoses(trajectories, found.classes, found.probabilities)
     verdicts = zip(found.verdicts.verdict.tolist(), found.verdicts.reason.tolist(), strict=True)

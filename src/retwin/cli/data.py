@@ -11,7 +11,7 @@ from rich.table import Table
 
 from retwin.checks import require
 from retwin.cli.completion import complete_files
-from retwin.cli.options import CaseOption, Json, Rate, Seed
+from retwin.cli.options import CaseOption, Json, MaxBytes, Rate, Seed
 from retwin.cli.reading import case_named, read
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data import download
@@ -39,10 +39,12 @@ def info(
     ],
     case: CaseOption = None,
     rate: Rate = None,
+    max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
     """Describe files: classes, samples, channels, missing values, SHA-256."""
-    facts = [_facts(read(file, case_named(case), rate), file) for file in files]
+    system = case_named(case)
+    facts = [_facts(read(file, system, rate, max_bytes=max_bytes), file) for file in files]
     answer(facts, *map(_table, facts), as_json=as_json)
 
 
@@ -52,10 +54,11 @@ def convert(
     target: Annotated[Path, typer.Argument(metavar="OUT", help="New *.npz or *.zarr.")],
     case: CaseOption = None,
     rate: Rate = None,
+    max_bytes: MaxBytes = None,
 ) -> None:
     """Write trajectories in retwin's own format, with channels, rate and provenance."""
     check_target(target)
-    trajectories = read(source, case_named(case), rate)
+    trajectories = read(source, case_named(case), rate, max_bytes=max_bytes)
     save(trajectories, target)
     note(f"Wrote {target}: {trajectories}")
 
@@ -73,6 +76,7 @@ def split(
     seed: Seed = 0,
     case: CaseOption = None,
     rate: Rate = None,
+    max_bytes: MaxBytes = None,
 ) -> None:
     """Split trajectories in two, at random, with the same shares of every class."""
     for target in (first, second):
@@ -84,7 +88,8 @@ def split(
         got=second,
         remedy="give each part its own file",
     )
-    parts = read(file, case_named(case), rate).split(fraction, seed=seed)
+    whole = read(file, case_named(case), rate, max_bytes=max_bytes)
+    parts = whole.split(fraction, seed=seed)
     for part, target in zip(parts, (first, second), strict=True):
         save(part, target)
         note(f"Wrote {target}: {part}")
@@ -107,10 +112,15 @@ def fetch(
             help="Else RETWIN_CACHE, else the user's cache.",
         ),
     ] = None,
+    max_bytes: Annotated[
+        int, typer.Option(metavar="N", help="Most that the file may hold.", min=1)
+    ] = download.MAX_BYTES,
 ) -> None:
     """Download a public data file, check its SHA-256 and print its path."""
     with bar("fetch") as show:
-        path = download.fetch(name, folder=folder, progress=lambda share: show(name, share))
+        path = download.fetch(
+            name, folder=folder, progress=lambda share: show(name, share), max_bytes=max_bytes
+        )
     answer(path, str(path))
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from retwin import catalog
 from retwin.checks import require
 from retwin.cli.completion import one_of
-from retwin.cli.options import CaseOption, Json, Seed
+from retwin.cli.options import CaseOption, Json, MaxBytes, Seed
 from retwin.cli.reading import case_named, read
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data.trajectories import Trajectories
@@ -48,13 +48,14 @@ def fit(
         float | None, typer.Option(metavar="HZ", help="Sample rate of the features.")
     ] = None,
     seed: Seed = 0,
+    max_bytes: MaxBytes = None,
 ) -> None:
     """Train a diagnoser on labelled trajectories."""
     import retwin as rt
 
     system = case_named(case)
     chosen = catalog.make(catalog.CLASSIFIERS, classifier, "classifier")
-    training = read(file, system)
+    training = read(file, system, max_bytes=max_bytes)
     with bar("train") as show:
         diagnoser = rt.fit_diagnoser(
             training,
@@ -84,6 +85,7 @@ def invert(
         bool,
         typer.Option("--random-onset", metavar="", help="Infer the onset of stuck motors."),
     ] = False,
+    max_bytes: MaxBytes = None,
 ) -> None:
     """Derive a diagnoser from a corrected twin; only healthy trajectories are used."""
     import retwin as rt
@@ -92,7 +94,7 @@ def invert(
     system = rt.cases.get(updated.case)
     if random_onset:
         system = system.with_random_onset()
-    calibration = read(real, system)
+    calibration = read(real, system, max_bytes=max_bytes)
     diagnoser = rt.fit_inversion(updated.surrogate, updated.residual, calibration, system.faults)
     diagnoser.save(out)
     note(f"Saved {out}")
@@ -108,13 +110,14 @@ def predict(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="CSV file for all probabilities.")
     ] = None,
+    max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
     """Diagnose trajectories, and score the diagnoses if the labels are known."""
     import retwin as rt
 
     diagnoser = rt.load_diagnoser(model)
-    trajectories = read(file, case_named(case))
+    trajectories = read(file, case_named(case), max_bytes=max_bytes)
     probabilities = diagnoser.predict_proba(trajectories)
     _check_finite(trajectories, probabilities)
     labels = trajectories.labels.tolist()

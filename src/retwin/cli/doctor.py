@@ -25,16 +25,17 @@ import typer
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from rich.console import Group, RenderableType
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from retwin._version import __version__
 from retwin.catalog import DOWNLOADS, EXTRAS
 from retwin.cli.options import Json
-from retwin.cli.terminal import FAILED, answer, bar
+from retwin.cli.terminal import FAILED, answer, bar, plain
 from retwin.data.download import cache_folder
 from retwin.errors import InputError
 from retwin.serialisation.files import sha256
+from retwin.serialisation.sizes import container, memory
 
 __all__ = ["FOR_DEVELOPERS", "Check", "State", "doctor", "examine"]
 
@@ -52,8 +53,6 @@ DATA = (".mat", ".npz", ".csv", ".zarr")
 """Suffixes of data files."""
 BYTES_PER_PROCESS = 2**30
 """Memory that one process of a study takes, as measured for the arm."""
-CGROUP = Path("/sys/fs/cgroup")
-"""Folder in which Linux states the limits of a container."""
 
 
 @dataclass(frozen=True)
@@ -139,11 +138,10 @@ def _shown(checks: list[Check]) -> RenderableType:
         grid.add_column(min_width=12)
         grid.add_column(overflow="fold")
         for each in members:
-            found = escape(each.found)
+            found = plain(each.found)
             if each.remedy:
-                found += f"\n[dim]→[/] {escape(each.remedy)}"
-            colour = COLOURS[each.state]
-            grid.add_row(f"[{colour}]{each.state}[/]", escape(each.name), found)
+                found = Text.assemble(found, "\n", ("→", "dim"), " ", plain(each.remedy))
+            grid.add_row(Text(each.state, COLOURS[each.state]), plain(each.name), found)
         parts += [f"[bold]{group}[/]", grid, ""]
     return Group(*parts, _summary(checks))
 
@@ -258,7 +256,7 @@ def _machine(deep: bool) -> Iterator[Check]:
     yield Check(group, "system", "ok", f"{platform.system()} {platform.release()}")
     cores = _cores()
     yield _threads(cores)
-    total, free = _memory()
+    total, free = memory()
     if total:
         found = f"{free / 2**30:.1f} GB free of {total / 2**30:.1f}"
         if free >= BYTES_PER_PROCESS * cores:
@@ -282,7 +280,7 @@ def _machine(deep: bool) -> Iterator[Check]:
 def _cores() -> int:
     """Cores that this process may use, in a container too."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    quota, _, period = _cgroup("cpu.max").partition(" ")
+    quota, _, period = container("cpu.max").partition(" ")
     cores = allowed or 1
     return min(cores, max(1, int(quota) // int(period))) if quota.isdecimal() else cores
 
@@ -297,29 +295,6 @@ def _threads(cores: int) -> Check:
         remedy = f"give studies and simulations --processes {cores} or --workers {cores}"
         return Check("machine", "cores", "warning", found, remedy)
     return Check("machine", "cores", "ok", found)
-
-
-def _memory() -> tuple[int, int]:
-    """Total and free memory in bytes, in a container too; 0 if the system does not state it."""
-    try:
-        page = os.sysconf("SC_PAGE_SIZE")
-        total, free = (page * os.sysconf(f"SC_{name}_PAGES") for name in ("PHYS", "AVPHYS"))
-        fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        free = 1024 * int(fields["MemAvailable"].split()[0])
-    except (AttributeError, OSError, ValueError, KeyError):
-        return 0, 0
-    limit, used = _cgroup("memory.max"), _cgroup("memory.current")
-    if limit.isdecimal() and used.isdecimal():
-        total, free = min(total, int(limit)), min(free, int(limit) - int(used))
-    return total, free
-
-
-def _cgroup(name: str) -> str:
-    """A limit of the container, "" for none."""
-    try:
-        return (CGROUP / name).read_text().strip()
-    except OSError:
-        return ""
 
 
 def _gpu(deep: bool) -> Check:

@@ -12,7 +12,7 @@ import typer
 from retwin import catalog
 from retwin.checks import require
 from retwin.cli.completion import one_of
-from retwin.cli.options import CaseArgument, Json, OtherCase, Seed
+from retwin.cli.options import CaseArgument, Json, MaxBytes, OtherCase, Seed
 from retwin.cli.plans import Workers, carry_out
 from retwin.cli.reading import read
 from retwin.cli.terminal import answer, bar, note, table
@@ -81,15 +81,19 @@ def fit(
         bool, model_option("--refine", metavar="", help="Fine-tune on outputs afterwards.")
     ] = False,
     seed: Seed = 0,
+    max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
     """Fit surrogate and residual model; save the corrected twin."""
     import retwin as rt
 
     system = _system(case, network, correction, density, refine)
-    measured = _measured(system, real, data)
+    measured = _measured(system, real, data, max_bytes)
     size = system.per_class if simulations is None else simulations
-    nominal = _nominal(system, twin_data, size, seed)
+    if twin_data is None:
+        nominal = _simulated(system, size, seed)
+    else:
+        nominal = read(twin_data, system, max_bytes=max_bytes)
     with bar("fit") as show:
         ibg = rt.fit_surrogate(
             nominal,
@@ -145,7 +149,9 @@ def _system(
     return replace(system, density=replace(system.density, refinement=rt.Refinement()))
 
 
-def _measured(system: Case, real: Path | None, data: Path | None) -> Trajectories:
+def _measured(
+    system: Case, real: Path | None, data: Path | None, max_bytes: int | None
+) -> Trajectories:
     """The real trajectories to calibrate on."""
     import retwin as rt
 
@@ -157,7 +163,7 @@ def _measured(system: Case, real: Path | None, data: Path | None) -> Trajectorie
         remedy="give --real FILE; or --data FILE, for a case that defines how it is split",
     )
     if real is not None:
-        return read(real, system)
+        return read(real, system, max_bytes=max_bytes)
     assert data is not None
     if system.records is None:
         raise rt.InputError(
@@ -169,12 +175,10 @@ def _measured(system: Case, real: Path | None, data: Path | None) -> Trajectorie
     return system.records(data)[0]
 
 
-def _nominal(system: Case, file: Path | None, simulations: int, seed: int) -> Trajectories:
-    """Trajectories of the twin: from a file, or healthy simulations of the case's twin."""
+def _simulated(system: Case, simulations: int, seed: int) -> Trajectories:
+    """Healthy simulations of the case's twin."""
     import retwin as rt
 
-    if file is not None:
-        return read(file, system)
     healthy = replace(system, faults={HEALTHY: None})
     with bar("simulate") as show:
         return rt.generate(

@@ -9,7 +9,7 @@ import typer
 from retwin.catalog import CASES
 from retwin.cli.completion import one_of
 
-__all__ = ["CaseArgument", "CaseOption", "Json", "OtherCase", "Rate", "Seed"]
+__all__ = ["CaseArgument", "CaseOption", "Json", "MaxBytes", "OtherCase", "Rate", "Seed"]
 
 CaseArgument = Annotated[
     str,
@@ -40,6 +40,10 @@ OtherCase = Annotated[
 Rate = Annotated[
     float | None,
     typer.Option("--rate", metavar="HZ", help="Samples per second, if the file has none."),
+]
+MaxBytes = Annotated[
+    int | None,
+    typer.Option(metavar="N", help="Most that a file may hold; else by what is free.", min=1),
 ]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", help="Same seed, same result.", min=0)]
 Json = Annotated[

@@ -25,7 +25,19 @@ def case_named(name: str | None) -> Case | None:
     return cases.get(name)
 
 
-def read(file: Path, case: DataCase | None = None, rate: float | None = None) -> Trajectories:
+def read(
+    file: Path,
+    case: DataCase | None = None,
+    rate: float | None = None,
+    *,
+    max_bytes: int | None = None,
+) -> Trajectories:
     """The trajectories of a file, with a bar while they are read."""
     with bar("read") as show:
-        return load(file, case=case, rate=rate, progress=lambda share: show(file.name, share))
+        return load(
+            file,
+            case=case,
+            rate=rate,
+            progress=lambda share: show(file.name, share),
+            max_bytes=max_bytes,
+        )

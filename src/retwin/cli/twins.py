@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,13 +13,14 @@ from retwin.catalog import CASES, TWINS
 from retwin.checks import require
 from retwin.cli.animate import animate
 from retwin.cli.completion import complete_faults, complete_twins, one_of
-from retwin.cli.options import Json, Seed
+from retwin.cli.options import Json, MaxBytes, Seed
 from retwin.cli.plans import Scheduler, Workers, carry_out
 from retwin.cli.reading import read
 from retwin.cli.terminal import answer, example, table
 from retwin.data.io import check_target
 from retwin.errors import InputError
 from retwin.modules import known
+from retwin.serialisation.files import recover
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
@@ -185,6 +185,7 @@ def simulate(
     workers: Workers = None,
     scheduler: Scheduler = None,
     chunk: Annotated[int, typer.Option(metavar="N", help="Trajectories per chunk.", min=1)] = 256,
+    max_bytes: MaxBytes = None,
 ) -> None:
     """Simulate trajectories to a file; an interrupted *.zarr is resumed."""
     from retwin.deploy.simulations import SimulationPlan
@@ -200,9 +201,10 @@ def simulate(
         got=duration,
         remedy="leave it out",
     )
-    drawn = _sampler(system, found, duration) if commands is None else read(commands, system)
-    if commands is None and n is None:
-        n = len(faults)
+    if commands is not None:
+        drawn = read(commands, system, max_bytes=max_bytes)
+    else:
+        drawn, n = _sampler(system, found, duration), len(faults) if n is None else n
     plan = SimulationPlan(found, drawn, seed, n, faults, clip=clip, chunk=chunk)
     carry_out(plan, out, "simulate", workers=workers, scheduler=scheduler)
 
@@ -226,7 +228,7 @@ def _twin(
     if servos:
         options["servos"] = list(map(_servo, servos))
     own = not (inputs or outputs or rate or options)
-    if (Path(name) / "model.json").is_file() and own:
+    if own and (recover(name) / "model.json").is_file():
         return _model(Path(name))
     if _is_case(name) and own:
         from retwin import cases
@@ -257,11 +259,7 @@ def _is_case(name: str) -> bool:
 
 
 def _model(folder: Path) -> Twin:
-    try:
-        kind = json.loads((folder / "model.json").read_text("utf-8"))["kind"]
-    except (OSError, ValueError, LookupError, TypeError):
-        kind = "damaged"
-    if kind == "surrogate":
+    if kind_of(folder) == "surrogate":
         from retwin.update.surrogate import Surrogate
 
         return Surrogate.load(folder)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,15 +16,22 @@ from retwin.checks import needs_extra, require
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.files import sha256 as sha256_of
+from retwin.serialisation.sizes import Budget
 
-__all__ = ["cache_folder", "fetch"]
+__all__ = ["MAX_BYTES", "cache_folder", "fetch"]
 
 CACHE_VARIABLE = "RETWIN_CACHE"
 """The environment variable that names the cache folder."""
 TIMEOUT = 30.0
 """Seconds without an answer after which a download fails."""
+MAX_SECONDS = 3600.0
+"""Seconds after which a download fails that is not complete, however slowly it goes on."""
+MAX_BYTES = 2**32
+"""The largest size of a file, unless another is given: no server can fill the disk."""
 BYTES_PER_BLOCK = 64 * 1024
-"""Bytes that are received between two reports of progress."""
+"""Bytes that are received and written together."""
+SECONDS_PER_REPORT = 0.1
+"""Seconds between two reports of progress."""
 
 
 def fetch(
@@ -32,6 +41,7 @@ def fetch(
     url: str | None = None,
     sha256: str | None = None,
     progress: Progress | None = None,
+    max_bytes: int = MAX_BYTES,
 ) -> Path:
     """The path of a public file, downloaded if it is not in the cache.
 
@@ -50,14 +60,17 @@ def fetch(
         Another SHA-256, in hexadecimal.
     progress : callable
         Called with the share that is done, from 0 to 1.
+    max_bytes : int
+        The largest size of the file; by default 4 GiB.
 
     Raises
     ------
     InputError
-        The name is unknown and has no `url` and `sha256`, the address is not http(s), or the extra
-        `fetch` is missing.
+        The name is unknown and has no `url` and `sha256`, the address is not http(s), the file is
+        larger than `max_bytes`, or the extra `fetch` is missing.
     OSError
-        There is no network or no such file, or the folder cannot be written.
+        There is no network or no such file, it did not come within an hour, or the folder cannot
+        be written.
     RuntimeError
         The downloaded file has another SHA-256; nothing of it is kept.
 
@@ -82,8 +95,11 @@ def fetch(
                 known_hash=f"sha256:{known.sha256}",
                 fname=target.name,
                 path=target.parent,
-                downloader=_downloader(progress),
+                downloader=_downloader(Budget(name, max_bytes), progress),
             )
+    except InputError:
+        _tidy(target.parent, place)
+        raise
     except OSError as error:
         _tidy(target.parent, place)
         reason = " ".join(str(error).split())[:200]
@@ -133,22 +149,92 @@ def _tidy(folder: Path, place: Path) -> None:
             folder.rmdir()
 
 
-def _downloader(progress: Progress | None) -> Callable[[str, str, Any], None]:
-    """A downloader for pooch, whose own one leaves the connection open on errors."""
+def _downloader(
+    budget: Budget, progress: Progress | None
+) -> Callable[[str, str | os.PathLike[str], Any], None]:
+    """A downloader for pooch, whose own one has no limits."""
 
-    def download(url: str, output: str, _: Any) -> None:
-        import requests
-
-        with requests.get(url, stream=True, timeout=TIMEOUT) as answer, open(output, "wb") as file:
-            answer.raise_for_status()
-            # A server need not state the size.
-            size = int(answer.headers.get("content-length", 0))
-            for chunk in answer.iter_content(BYTES_PER_BLOCK):
-                file.write(chunk)
-                if progress is not None and size:
-                    progress(min(1.0, file.tell() / size))
+    def download(url: str, output: str | os.PathLike[str], _: Any) -> None:
+        transfer = Transfer(url, output, budget)
+        deadline = time.monotonic() + MAX_SECONDS
+        transfer.start()
+        try:
+            while transfer.is_alive():
+                transfer.join(SECONDS_PER_REPORT)
+                if progress is not None and transfer.share:
+                    progress(transfer.share)
+                if time.monotonic() > deadline:
+                    raise OSError(f"not complete after {MAX_SECONDS:g} s")
+        finally:
+            transfer.abandoned = True
+        if transfer.error is not None:
+            raise transfer.error
+        if progress is not None:
+            progress(1.0)
 
     return download
+
+
+class Transfer(threading.Thread):
+    """A download in a thread of its own, which may wait for a server longer than it is waited for.
+
+    Parameters
+    ----------
+    url : str
+        The address.
+    output : path
+        The file to write.
+    budget : Budget
+        The largest size.
+
+    Attributes
+    ----------
+    share : float
+        The share that is done; 0 if the server does not state the size.
+    error : Exception or None
+        What ended it.
+    abandoned : bool
+        Whether it is to end at the next block.
+
+    """
+
+    def __init__(self, url: str, output: str | os.PathLike[str], budget: Budget) -> None:
+        super().__init__(daemon=True)
+        self._url, self._output, self._budget = url, output, budget
+        self.share = 0.0
+        self.error: Exception | None = None
+        self.abandoned = False
+
+    def run(self) -> None:
+        """Download."""
+        try:
+            self._download()
+        except Exception as error:
+            self.error = error
+
+    def _download(self) -> None:
+        import requests
+        from urllib3.exceptions import HTTPError
+
+        # Packed contents could inflate to any size, and would have another SHA-256.
+        plain = {"Accept-Encoding": "identity"}
+        with (
+            requests.get(self._url, stream=True, timeout=TIMEOUT, headers=plain) as answer,
+            open(self._output, "wb") as file,
+        ):
+            answer.raise_for_status()
+            stated = answer.headers.get("content-length", "")
+            size = int(stated) if stated.isdecimal() else 0
+            self._budget.take(size)
+            try:
+                for block in answer.raw.stream(BYTES_PER_BLOCK, decode_content=False):
+                    if self.abandoned:
+                        return
+                    self._budget.take(0 if size else len(block))
+                    file.write(block)
+                    self.share = min(1.0, file.tell() / size) if size else 0.0
+            except HTTPError as error:
+                raise OSError(str(error)) from None
 
 
 @contextmanager

@@ -61,6 +61,10 @@ class Channels:
     def __len__(self) -> int:
         return len(self.names)
 
+    def __str__(self) -> str:
+        pairs = zip(self.names, self.units, strict=True)
+        return ", ".join(f"{name} [{unit}]" for name, unit in pairs) or "none"
+
     @property
     def comparable(self) -> bool:
         """Whether all channels have the same unit, other than "1", or there is only one channel."""
@@ -296,10 +300,17 @@ class Trajectories:
         Raises
         ------
         InputError
-            `fraction` is out of range.
+            `fraction` is out of range, or leaves a set without any trajectory.
 
         """
         first, second = self.split_index(fraction, seed=seed)
+        require(
+            len(first) and len(second),
+            "fraction",
+            expected=f"a share that leaves some of the {len(self)} trajectories to both sets",
+            got=f"{fraction!r}, which gives {len(first)} and {len(second)}",
+            remedy="give another share, or more trajectories",
+        )
         return self[first], self[second]
 
     def split_index(self, fraction: float, *, seed: int) -> tuple[NDArray, NDArray]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retwin.arrays import row_blocks
-from retwin.checks import require
+from retwin.checks import positive, require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.times import stride_of
@@ -23,6 +23,9 @@ SETTLED = 2
 """Samples of the features, from the end of the first motion on, that are still hidden: one for the
 delay of the response, and one because a value interpolated between two sensor samples depends on
 the earlier one."""
+
+MAX_STRIDE = 10**6
+"""The largest stride that is read from a file, so that its phases fit the memory."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +90,8 @@ class Features:
         """From the plain values that `about` returned; other keys have no effect."""
         return cls(
             Channels.of(values["outputs"]),
-            values["rate"],
-            values["stride"],
+            positive("rate", values["rate"], unit="Hz"),
+            whole("stride", values["stride"], least=1, most=MAX_STRIDE),
             values.get("hide_start", False),
         )
 

@@ -7,6 +7,7 @@ import math
 from typing import Any, Literal
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
@@ -40,6 +41,7 @@ STYLES: dict[str, Any] = dict(zip(DASHES, ("-", "--", ":", "-."), strict=True))
 SYMBOLS = {"circle": "o", "square": "s", "diamond": "D", "diamond-open": "D"}
 
 
+@rc_context({"text.parse_math": False})  # a name with $ is no formula
 def png(shown: Figure | Matrices, *, emulated: bool) -> bytes:
     """The figure as PNG; a heading marks emulated data."""
     canvas = draw(shown)

@@ -2,27 +2,64 @@
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
+import itertools
+import json
 import os
+import platform
+import re
 import secrets
 import shutil
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 from retwin.checks import require
-from retwin.errors import InputError
+from retwin.errors import InputError, brief
+from retwin.serialisation.sizes import Budget
 
-__all__ = ["sha256", "write_atomically"]
+__all__ = [
+    "check_regular",
+    "parse_json",
+    "read_json",
+    "recover",
+    "refusing",
+    "sha256",
+    "write_atomically",
+]
+
+AT_FDCWD, EXCHANGE = -100, 2
+"""Arguments of `renameat2` in Linux; `EXCHANGE` also of `renamex_np` in macOS."""
+MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
+"""This machine in the names of temporary files, whose process others cannot test for."""
+TOKEN = secrets.token_hex(4)
+"""This process in the same names, since the system gives its number to later ones."""
+TEMPORARY = re.compile(
+    rf"\..*-{MACHINE}-(?P<process>\d+)-(?P<token>[0-9a-f]{{8}})-\d+(\..*)?", re.DOTALL
+)
+"""The name of a temporary file or folder of this machine."""
+FORMER = ".former"
+"""The end of the name of a folder that is being replaced."""
+MAX_STEM = 128
+"""Bytes of a file's name that its temporary name holds; systems allow 255 in all."""
+BYTES_PER_JSON_BYTE = 16
+"""Memory that the values of a JSON text may take, in multiples of its size."""
+_count = itertools.count()
 
 
 @contextmanager
-def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
+def write_atomically(path: str | os.PathLike[str], *, folder: bool = False) -> Iterator[Path]:
     """A name in the same folder to write to; moved to `path` on success, removed on failure.
 
     For a file and for a folder alike: write a file to that name, or make a folder of that name and
-    fill it. Folders above `path` are made. If the block fails, with an exception or Ctrl-C, `path`
-    stays as it was. The name keeps the suffix of `path`, since many writers choose their format by
+    fill it; with `folder`, the folder is made, and a file at `path` is refused at once. Folders
+    above `path` are made. If the block fails, with an exception or Ctrl-C, `path` stays as it was;
+    a kill leaves the old contents or the new ones, and hidden files that the next process to write
+    there removes. The name keeps the suffix of `path`, since many writers choose their format by
     it.
 
     Raises
@@ -36,15 +73,82 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     # Through a link the file behind it is replaced, not the link.
     target = Path(os.path.realpath(path))
-    _make_parent(target)
-    part = target.with_name(f".{target.stem}-{secrets.token_hex(4)}{target.suffix}")
+    mark = f"{os.getpid()}-{TOKEN}-{next(_count)}"
+    part = target.with_name(f"{_beginning(target)}{mark}{target.suffix}")
+    _make_parent(target, part)
+    recover(target)
+    _sweep(target.parent)
     try:
+        if folder:
+            _check_kind(target, folder=True)
+            part.mkdir()
         yield part
         if not part.exists():
             raise FileNotFoundError(f"nothing was written for {target.name}")
         _move(part, target)
     finally:
         _remove(part)
+
+
+def recover(path: str | os.PathLike[str]) -> Path:
+    """`path`; a folder there whose replacement was killed halfway is put back first."""
+    target = Path(os.path.realpath(path))
+    # Not `target.exists()`, which raises for a name that is too long.
+    if not os.path.exists(target) and target.parent.is_dir():
+        for former in _formers(target):
+            with suppress(OSError):  # another process has put it back
+                os.rename(former, target)
+    return Path(path)
+
+
+def check_regular(path: str | os.PathLike[str]) -> Path:
+    """`path`; ValueError for a pipe or a device, from which reading may never end."""
+    path = Path(path)
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path.name} is no regular file")
+    return path
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """The values of a JSON file.
+
+    Raises
+    ------
+    OSError, ValueError
+        It is no regular file, or no JSON, or nested too deeply.
+    InputError
+        Its values may take more memory than there is.
+
+    """
+    path = check_regular(path)
+    Budget(path.name).take(path.stat().st_size)
+    return parse_json(path.read_bytes(), path.name)
+
+
+def parse_json(text: bytes, where: str) -> Any:
+    """The values of a JSON text; raises as `read_json` does, with `where` in the messages."""
+    Budget(where).take(BYTES_PER_JSON_BYTE * len(text))
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError(f"{where} is nested too deeply") from None
+
+
+@contextmanager
+def refusing(file: str | os.PathLike[str], *, expected: str, remedy: str) -> Iterator[None]:
+    """Turn every exception that reading untrusted contents raises into an InputError.
+
+    A sealed folder is untrusted too although its seal is intact, since anyone can seal a folder.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        got = f"what is damaged or of another kind ({type(error).__name__}: {brief(error)})"
+        if isinstance(error, MemoryError):
+            got, remedy = "too little memory to read it", "end what else takes memory"
+        raise InputError(str(file), expected=expected, got=got, remedy=remedy) from None
 
 
 def sha256(path: str | os.PathLike[str]) -> str:
@@ -77,35 +181,42 @@ def sha256(path: str | os.PathLike[str]) -> str:
     return total.hexdigest()
 
 
-def _make_parent(target: Path) -> None:
-    """Make the folder of `target`; InputError if it cannot be written."""
+def _make_parent(target: Path, part: Path) -> None:
+    """Make the folder of `target`; InputError if it cannot be written, or not under that name."""
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        writable = os.access(target.parent, os.W_OK | os.X_OK)
-        reason = "one without write permission"
+        # By trying: the rights of a file do not show whether its file system takes more.
+        part.touch()
+        part.unlink()
+        target.exists()
     except OSError as error:
-        writable, reason = False, error.strerror or type(error).__name__
-    require(
-        writable,
-        "path",
-        expected="a place that can be written",
-        got=f"{target} ({reason})",
-        remedy="give another folder",
-    )
+        raise InputError(
+            "path",
+            expected="a place that can be written",
+            got=f"{target} ({error.strerror or type(error).__name__})",
+            remedy="give another folder or name",
+        ) from None
 
 
-def _move(part: Path, target: Path) -> None:
-    if target.exists() and target.is_dir() != part.is_dir():
-        kinds = ("folder", "file") if target.is_dir() else ("file", "folder")
+def _check_kind(target: Path, *, folder: bool) -> None:
+    """Raise InputError unless `target` is free, or is a folder where a folder is to be."""
+    if target.exists() and target.is_dir() != folder:
+        kinds = ("file", "folder") if folder else ("folder", "file")
         raise InputError(
             "path",
             expected=f"a name that is free or a {kinds[1]} to replace",
             got=f"{target}, a {kinds[0]}",
             remedy="give another name",
         )
+
+
+def _move(part: Path, target: Path) -> None:
+    _check_kind(target, folder=part.is_dir())
     if not (target.is_dir() and part.is_dir()):
         os.replace(part, target)
         return
+    for former in _formers(target):
+        shutil.rmtree(former, ignore_errors=True)
     others = {each.name for each in target.iterdir()} - {each.name for each in part.iterdir()}
     require(
         not others,
@@ -114,8 +225,10 @@ def _move(part: Path, target: Path) -> None:
         got=f"{target}, which also holds {min(others, default='')}",
         remedy="give another name, so that nothing is lost",
     )
-    # No call swaps two folders: the old one is renamed, and back again if the new one cannot move.
-    former = target.with_name(f"{part.name}.old")
+    if _exchanged(part, target):
+        return
+    # A kill between the two steps leaves no folder of that name: `recover` puts the former back.
+    former = part.with_name(f"{part.name}{FORMER}")
     os.replace(target, former)
     try:
         os.replace(part, target)
@@ -125,8 +238,67 @@ def _move(part: Path, target: Path) -> None:
     shutil.rmtree(former)
 
 
+def _exchanged(part: Path, target: Path) -> bool:
+    """Exchange the names of two folders in one step; False where the file system cannot."""
+    if os.name != "posix":
+        return False
+    system = ctypes.CDLL(None)
+    names = os.fsencode(part), os.fsencode(target)
+    if hasattr(system, "renameat2"):
+        failed = system.renameat2(AT_FDCWD, names[0], AT_FDCWD, names[1], EXCHANGE)
+    else:
+        failed = system.renamex_np(*names, EXCHANGE) if hasattr(system, "renamex_np") else True
+    return not failed
+
+
 def _remove(part: Path) -> None:
     if part.is_dir():
         shutil.rmtree(part)
     else:
         part.unlink(missing_ok=True)
+
+
+def _beginning(target: Path) -> str:
+    """How the names of all temporary files for `target` on this machine begin."""
+    stem = os.fsencode(target.stem)
+    short = target.stem if len(stem) <= MAX_STEM else hashlib.sha256(stem).hexdigest()
+    return f".{short}-{MACHINE}-"
+
+
+@cache
+def _sweep(folder: Path) -> None:
+    """Remove what killed processes were writing there; once per process, for it takes time."""
+    for file in _left_in(folder):
+        if not file.name.endswith(FORMER):
+            with suppress(OSError):  # another process removes it too, or it cannot be removed
+                _remove(file)
+
+
+def _formers(target: Path) -> list[Path]:
+    """Folders of that name whose replacement was killed halfway."""
+    begin = _beginning(target)
+    left = [file for file in _left_in(target.parent) if file.name.startswith(begin)]
+    return [file for file in left if file.name.endswith(FORMER)]
+
+
+def _left_in(folder: Path) -> Iterator[Path]:
+    """The temporary files and folders in `folder` whose process has ended."""
+    for file in list(folder.iterdir()):
+        found = TEMPORARY.fullmatch(file.name)
+        if found and _ended(int(found["process"]), found["token"]):
+            yield file
+
+
+def _ended(process: int, token: str) -> bool:
+    """Whether this machine has no such process; False where that cannot be tested."""
+    if os.name != "posix":  # elsewhere signal 0 does not test whether a process exists
+        return False
+    if process == os.getpid():  # or one of a container that began anew
+        return token != TOKEN
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    except (OSError, OverflowError):
+        return False
+    return False

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from retwin.checks import require
-from retwin.errors import InputError
-from retwin.serialisation.files import write_atomically
+from retwin.serialisation import files
+from retwin.serialisation.files import check_regular, read_json, recover, write_atomically
+from retwin.serialisation.sizes import Budget
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -20,6 +22,8 @@ __all__ = ["kind_of", "read_about", "read_model", "refusing", "write_model"]
 SCHEMA = 1
 """The version of the layout of model folders."""
 REMEDY = "give the folder of a saved model, or save it again"
+BYTES_PER_NUMBER = 4
+"""The size of a weight, in float32."""
 
 
 @contextmanager
@@ -47,15 +51,15 @@ def write_model(
         See `write_atomically`.
 
     """
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
-    with write_atomically(folder) as temporary:
-        temporary.mkdir()
+    with write_atomically(folder, folder=True) as temporary:
         text = json.dumps({"schema": SCHEMA, "kind": kind, **about}, indent=1)
         (temporary / "model.json").write_text(text + "\n", encoding="utf-8")
         if weights:
             contiguous = {name: weight.contiguous() for name, weight in weights.items()}
-            save_file(contiguous, temporary / "weights.safetensors")
+            # Not `save_file`, whose files only their owner can read.
+            (temporary / "weights.safetensors").write_bytes(save(contiguous))
         yield temporary
 
 
@@ -65,24 +69,21 @@ def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str,
     Raises
     ------
     InputError
-        The folder is missing, damaged, of another schema, or holds another kind of model.
+        The folder is missing, damaged, of another schema, larger than the free memory allows, or
+        holds another kind of model.
 
     """
-    from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    folder = Path(folder)
-    try:
-        about = json.loads((folder / "model.json").read_text(encoding="utf-8"))
-        file = folder / "weights.safetensors"
-        weights = load_file(file) if file.exists() else {}
-    except (OSError, ValueError, SafetensorError) as error:
-        raise InputError(
-            str(folder),
-            expected=f"a {kind} model (model.json and weights.safetensors)",
-            got=f"{type(error).__name__}: {str(error).splitlines()[0]}",
-            remedy=REMEDY,
-        ) from None
+    folder = recover(folder)
+    expected = f"a {kind} model (model.json and weights.safetensors)"
+    with refusing(folder, expected=expected):
+        about = read_json(folder / "model.json")
+        file = check_regular(folder / "weights.safetensors")
+        weights = {}
+        if file.exists():
+            Budget(str(file)).take(file.stat().st_size)
+            weights = load_file(file)
     found = (about.get("schema"), about.get("kind")) if isinstance(about, dict) else (None, None)
     require(
         found == (SCHEMA, kind),
@@ -96,17 +97,32 @@ def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str,
 
 @contextmanager
 def refusing(folder: str | Path, *, expected: str, remedy: str = REMEDY) -> Iterator[None]:
-    """Turn every exception that reading untrusted contents raises into an InputError.
+    """Refuse a model folder for every exception in the block, see `files.refusing`.
 
-    A sealed folder is untrusted too although its seal is intact, since anyone can seal a folder.
+    The block cannot allocate tensors that are larger than the free memory allows: a description
+    states the sizes of networks before their weights are compared.
     """
-    try:
+    with files.refusing(folder, expected=expected, remedy=remedy), _limited(str(folder)):
         yield
-    except InputError:
-        raise
-    except Exception as error:
-        got = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:100]}"
-        raise InputError(str(folder), expected=expected, got=got, remedy=remedy) from None
+
+
+@contextmanager
+def _limited(where: str) -> Iterator[None]:
+    """Refuse to make tensors in the block that take more memory than there is."""
+    from torch.utils._python_dispatch import TorchDispatchMode
+
+    budget = Budget(where)
+
+    class Limit(TorchDispatchMode):
+        def __torch_dispatch__(
+            self, operator: Any, types: Any, args: Any = (), kwargs: Any = None
+        ) -> Any:
+            if args and isinstance(args[0], list) and all(isinstance(n, int) for n in args[0]):
+                budget.take(BYTES_PER_NUMBER * math.prod(args[0]))
+            return operator(*args, **(kwargs or {}))
+
+    with Limit():
+        yield
 
 
 def read_about(folder: str | Path, kind: str) -> dict[str, Any]:
@@ -117,7 +133,7 @@ def read_about(folder: str | Path, kind: str) -> dict[str, Any]:
 def kind_of(folder: str | Path) -> str:
     """The kind in the model.json of a folder; "" if there is none."""
     try:
-        about = json.loads((Path(folder) / "model.json").read_text(encoding="utf-8"))
+        about = read_json(recover(folder) / "model.json")
     except (OSError, ValueError):
         return ""
     return str(about.get("kind", "")) if isinstance(about, dict) else ""

@@ -14,6 +14,7 @@ from retwin.checks import whole
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.models import read_about, refusing, write_model
+from retwin.serialisation.sizes import Budget
 from retwin.twins.faults import Fault
 from retwin.twins.system import System
 from retwin.twins.twin import (
@@ -28,6 +29,9 @@ from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
 
 __all__ = ["CorrectedTwin", "generate"]
+
+BYTES_PER_NUMBER = 4
+"""The size of a generated number in bytes, in float32."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,10 +173,13 @@ def generate(
     Raises
     ------
     InputError
-        `per_class` is below 1.
+        `per_class` is below 1, or the memory has no room for the set.
 
     """
     whole("per_class", per_class, least=1)
+    width = len(twin.inputs) + 2 * len(twin.outputs)
+    numbers = per_class * len(case.faults) * case.sampler.steps * width
+    Budget("per_class").take(BYTES_PER_NUMBER * numbers)
     if onsets is None and isinstance(twin, CorrectedTwin):
         onsets = twin.onsets
     for_commands, for_twin = np.random.SeedSequence(seed).spawn(2)

@@ -352,8 +352,37 @@ def test_a_damaged_export_is_refused(exported: Exported, tmp_path: Path) -> None
     for name in ("kind", "schema", "faults", "steps", "inputs", "rate", "domain", "sensor"):
         (folder / "model.json").write_text(json.dumps(about | {name: [[]]}))
         seal(folder)
-        with pytest.raises(rt.InputError, match=r"ONNX export|schema 2"):
+        with pytest.raises(rt.InputError, match=r"ONNX export|schema 2|(positive|whole) number"):
             Portable.load(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[(("stride",), value) for value in (0, -1, 2**40, 1.5, "1")],
+        *[(("diagnoser", "stride"), value) for value in (0, 2**40)],
+        *[(("diagnoser", "settled"), value) for value in (-1, 2**62)],
+        *[(("sensor", "every"), value) for value in (0, 2**40)],
+        *[(("sensor", "phases"), value) for value in ([-1], [2**40])],
+        *[(("movements",), value) for value in (-1, 0.5, 10**21)],
+        *[(("steps",), value) for value in (0, 0.5)],
+        *[(("domain", name), []) for name in ("low", "speed", "floor", "spread")],
+        (("rate",), 0.0),
+        (("rate",), np.nan),
+    ],
+)
+def test_forged_settings_are_refused(
+    exported: Exported, emulated: rt.Trajectories, tmp_path: Path, name: tuple[str, ...], value
+) -> None:
+    folder = Path(shutil.copytree(exported[0], tmp_path / "copy"))
+    about = json.loads((folder / "model.json").read_text())
+    holder = about if len(name) == 1 else about[name[0]]
+    assert name[-1] in holder
+    holder[name[-1]] = value
+    (folder / "model.json").write_text(json.dumps(about))
+    seal(folder)
+    with pytest.raises(rt.InputError):
+        Portable.load(folder).predict(emulated)
 
 
 def test_an_export_of_schema_1_names_the_command_that_makes_it_anew(

@@ -694,3 +694,21 @@ def test_workers_work_alone() -> None:
     same = Toy(workers=1)
     assert alone(same) is same
     assert alone(3) == 3
+
+
+def test_more_than_the_disk_or_the_memory_holds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    huge = 999_999_999_999_999_999_999
+    with pytest.raises(rt.InputError, match=r"n: expected contents of .* of the free disk"):
+        simulate_to(tmp_path / "a.zarr", plan(n=huge))
+    with pytest.raises(rt.InputError, match=r"for more than 512 MB"):
+        simulate_to(tmp_path / "a.npz", plan(n=huge))
+    with pytest.raises(rt.InputError, match="chunk: expected a whole number from 1 to"):
+        plan(chunk=2**63)
+    monkeypatch.setattr("retwin.serialisation.sizes.memory", lambda: (10**6, 10**6))
+    with pytest.raises(rt.InputError, match="chunk: expected contents of at most 500 kB"):
+        simulate_to(tmp_path / "a.zarr", plan(n=10**4, chunk=10**4))
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(rt.InputError, match="per_class: expected contents of at most"):
+        rt.generate(rt.cases.armpi().twin, rt.cases.armpi(), per_class=huge, seed=0)

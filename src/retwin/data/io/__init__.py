@@ -2,7 +2,7 @@
 
 Belongs here: one file per format, whose contents are validated while they are read. Not here:
 fitted models (see `serialisation`). Pickle is used nowhere. To add a format, write a module with a
-`Reader` and add one entry to `catalog.FORMATS`.
+function that takes the arguments of `load` and add one entry to `catalog.FORMATS`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from retwin.data.io.assembly import DataCase, settle
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.serialisation.files import write_atomically
+from retwin.serialisation.files import recover, write_atomically
 
 __all__ = ["DataCase", "check_target", "load", "save"]
 
@@ -27,6 +27,7 @@ def load(
     case: DataCase | None = None,
     rate: float | None = None,
     progress: Progress | None = None,
+    max_bytes: int | None = None,
 ) -> Trajectories:
     """Trajectories from a file or folder, whose name decides how it is read.
 
@@ -48,6 +49,9 @@ def load(
         Sample rate in Hz, needed without a case if the file does not hold it.
     progress : callable
         Called with the share that is done, from 0 to 1.
+    max_bytes : int
+        The largest size of all that is read, as the file declares it; by default half of the free
+        memory, and for Zarr nine tenths of the free disk, to which its arrays are copied.
 
     Returns
     -------
@@ -58,21 +62,22 @@ def load(
     Raises
     ------
     InputError
-        There is no such file, or its contents are not as described.
+        There is no such file, its contents are not as described, or they are too large.
 
     """
-    path = Path(path)
+    path = recover(path)
     if rate is not None:
         rate = positive("rate", rate, unit="Hz")
     require(
-        path.exists(),
+        os.path.exists(path),
         "path",
         expected="an existing file or folder",
         got=f"{path}, where there is none",
         remedy="check the name",
     )
     read = resolve(_format(path).reader)
-    return settle(read(path, case=case, rate=rate, progress=progress), case, rate, progress)
+    found = read(path, case=case, rate=rate, progress=progress, max_bytes=max_bytes)
+    return settle(found, case, rate, progress)
 
 
 def save(trajectories: Trajectories, path: str | os.PathLike[str]) -> None:
@@ -117,7 +122,8 @@ def _format(path: Path) -> FormatEntry:
     """The format of what is at `path`; a Zarr folder may have any name."""
     folder = path.is_dir()
     entry = FORMATS.get(path.suffix.lower())
-    if entry is not None and entry.folder == folder and path.suffix:
+    regular = folder or path.is_file()  # a pipe may never end
+    if entry is not None and entry.folder == folder and path.suffix and regular:
         return entry
     if folder:
         return FORMATS[".zarr" if (path / "zarr.json").exists() else ""]
@@ -128,6 +134,6 @@ def _format(path: Path) -> FormatEntry:
     raise InputError(
         "path",
         expected=f"a file {files}, a folder {folders} or one with a folder per class",
-        got=str(path),
+        got=str(path) if regular else f"{path}, a pipe or a device",
         remedy="convert the data to one of these",
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -14,8 +13,9 @@ from retwin.checks import require
 from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
+from retwin.serialisation.sizes import Budget
 
-__all__ = ["DataCase", "Raw", "Reader", "assemble", "settle", "split_columns"]
+__all__ = ["DataCase", "Raw", "assemble", "settle", "split_columns"]
 
 RATE_TOLERANCE = 1e-3
 """Relative difference of sample rates that count as equal: files round their times."""
@@ -48,21 +48,6 @@ class DataCase(Protocol):
         self, trajectories: Trajectories, *, progress: Progress | None = None
     ) -> Trajectories:
         """`trajectories` with the commands that the file does not hold, and their channels."""
-        ...
-
-
-class Reader(Protocol):
-    """A function that reads one file format."""
-
-    def __call__(
-        self,
-        path: Path,
-        *,
-        case: DataCase | None,
-        rate: float | None,
-        progress: Progress | None,
-    ) -> Trajectories:
-        """The trajectories at `path`; see `data.io.load`."""
         ...
 
 
@@ -135,6 +120,7 @@ def assemble(
     source: Provenance,
     case: DataCase | None,
     rate: float | None,
+    budget: Budget,
     inputs: Channels | None = None,
 ) -> Trajectories:
     """Trajectories from `raws`; shorter ones are padded with the last value and mask False.
@@ -149,6 +135,8 @@ def assemble(
         Sets the sample rate.
     rate : float or None
         The sample rate in Hz, None if the case or every file holds it.
+    budget : Budget
+        The memory that the padded arrays may take.
     inputs : Channels or None
         Names of the commands, None for numbered ones.
 
@@ -156,7 +144,7 @@ def assemble(
     ------
     InputError
         Widths, sample rates or the presence of commands differ among `raws`, no sample rate is
-        known, or a command or nominal output is not finite.
+        known, a command or nominal output is not finite, or the padded arrays are too large.
 
     """
     first = raws[0]
@@ -177,6 +165,8 @@ def assemble(
         for raw, none in zip(raws, empty, strict=True)
     ]
     _check_finite(raws, commands)
+    width = commands[0].shape[1] + 2 * first.nominal.shape[1]
+    budget.take(len(raws) * steps * width * (first.nominal.itemsize + 1))
     lengths = np.array([len(raw.nominal) for raw in raws])
     observed = _padded([raw.observed for raw in raws], steps)
     present = np.arange(steps)[None, :, None] < lengths[:, None, None]
@@ -235,8 +225,8 @@ def settle(
         require(
             channels in (wanted, unnamed),
             name,
-            expected=f"the channels of the case, {_described(wanted)}",
-            got=_described(channels),
+            expected=f"the channels of the case, {wanted}",
+            got=channels,
             remedy="give the case that the data belong to",
         )
     unknown = sorted(trajectories.known_labels - set(case.classes))
@@ -323,10 +313,3 @@ def _common_rate(raws: Sequence[Raw], case: DataCase | None, rate: float | None)
 
 def _close(rate: float, other: float) -> bool:
     return bool(np.isclose(rate, other, rtol=RATE_TOLERANCE, atol=0))
-
-
-def _described(channels: Channels) -> str:
-    return (
-        ", ".join(f"{n} [{u}]" for n, u in zip(channels.names, channels.units, strict=True))
-        or "none"
-    )

@@ -20,12 +20,17 @@ from retwin.data.trajectories import Channels, Provenance, Trajectories
 from retwin.errors import InputError, brief
 from retwin.progress import Progress
 from retwin.serialisation.files import sha256
+from retwin.serialisation.sizes import Budget
 
 __all__ = ["read_class_folders"]
 
-Reader = Callable[[Path, str, "DataCase | None"], Raw]
+Reader = Callable[[Path, str, "DataCase | None", Budget], Raw]
 COORDINATES = 3
 """Outputs per sample in the arm's authors' files: x, y and z."""
+VARIABLES = ("trajCmds", "trajResps", "dataset", "motorCmdsRadius")
+"""The variables of these files that are read."""
+BYTES_PER_BLOCK, BYTES_PER_NUMBER = 2**20, 8
+"""Bytes of a CSV file that are read together to count its numbers, and those of a number."""
 PERIOD_RATIO = 1.5
 """The largest ratio of two sample periods that count as jitter: one sample less makes it 2."""
 
@@ -36,6 +41,7 @@ def read_class_folders(
     case: DataCase | None = None,
     rate: float | None = None,
     progress: Progress | None = None,
+    max_bytes: int | None = None,
 ) -> Trajectories:
     """Trajectories of the files `path`/class name/*.csv or `path`/class name/dataset_*.mat.
 
@@ -48,7 +54,8 @@ def read_class_folders(
     Raises
     ------
     InputError
-        There are no such files or files of both kinds, or one has other contents.
+        There are no such files or files of both kinds, one has other contents, or all of them are
+        too large.
 
     """
     kinds: list[tuple[str, Reader]] = [("*.csv", _read_csv), ("dataset_*.mat", _read_dataset)]
@@ -62,9 +69,17 @@ def read_class_folders(
         remedy="keep the kinds apart" if found else "give the folder above the class folders",
     )
     files, read = found[0]
-    raws = []
+    raws, budget = [], Budget(path.name, max_bytes)
     for i, file in enumerate(files):
-        raws.append(read(file, f"{file.parent.name}/{file.name}", case))
+        where = f"{file.parent.name}/{file.name}"
+        require(
+            file.is_file(),
+            where,
+            expected="a regular file",
+            got="a pipe, a device or a folder",
+            remedy="keep nothing else of that name there",
+        )
+        raws.append(read(file, where, case, budget))
         if progress is not None:
             progress((i + 1) / len(files))
     raws, inputs = _commands_of_case(raws, case, radians=read is _read_dataset)
@@ -73,6 +88,7 @@ def read_class_folders(
         source=Provenance(path.resolve().name, sha256(path)),
         case=case,
         rate=rate,
+        budget=budget,
         inputs=inputs,
     )
 
@@ -82,15 +98,18 @@ def _in_order(path: Path, pattern: str) -> list[Path]:
     files = [file for file in path.glob(f"*/{pattern}") if not file.parent.name.startswith(".")]
 
     def key(file: Path) -> tuple[Any, ...]:
-        parts = re.split(r"(\d+)", file.name)
+        parts: list[Any] = re.split(r"([0-9]+)", file.name)
+        parts[1::2] = map(int, parts[1::2])
         # Equal names (2 and 02) fall back on the text, so that the order never depends on the disk.
-        numbers = tuple(int(p) if p.isdigit() else p for p in parts)
-        return file.parent.name, numbers, file.name
+        return file.parent.name, parts, file.name
 
     return sorted(files, key=key)
 
 
-def _read_csv(file: Path, where: str, case: DataCase | None) -> Raw:
+def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget) -> Raw:
+    with file.open("rb") as blocks:
+        for part in iter(lambda: blocks.read(BYTES_PER_BLOCK), b""):
+            budget.take(BYTES_PER_NUMBER * (1 + part.count(b",") + part.count(b"\n")))
     try:
         with file.open(encoding="utf-8-sig") as lines, warnings.catch_warnings():
             warnings.simplefilter("error")  # numpy only warns when there is no row at all
@@ -141,13 +160,13 @@ def _is_number(field: str) -> bool:
     return True
 
 
-def _read_dataset(file: Path, where: str, case: DataCase | None) -> Raw:
+def _read_dataset(file: Path, where: str, case: DataCase | None, budget: Budget) -> Raw:
     width = len(case.outputs) if case is not None else COORDINATES
-    paths = mat_variables(file, ["trajCmds", "trajResps", "dataset"])
+    paths = mat_variables(file, budget, VARIABLES)
     if {"trajCmds", "trajResps"} <= set(paths):
         nominal = _upright(paths["trajCmds"], width, f"{where}: trajCmds")
         observed = _upright(paths["trajResps"], width, f"{where}: trajResps")
-        commands, recorded = _motor_commands(file, where, len(nominal))
+        commands, recorded = _motor_commands(paths.get(VARIABLES[-1]), where, len(nominal))
     elif "dataset" in paths:
         both = _upright(paths["dataset"], 2 * width, f"{where}: dataset")
         nominal, observed = both[:, :width], both[:, width:]
@@ -156,7 +175,7 @@ def _read_dataset(file: Path, where: str, case: DataCase | None) -> Raw:
         raise InputError(
             where,
             expected="the variables trajCmds and trajResps, or dataset",
-            got=", ".join(sorted(mat_variables(file))) or "none",
+            got=", ".join(sorted(mat_variables(file, budget))) or "none",
             remedy="give the folder of the authors' data as it is",
         )
     require(
@@ -183,12 +202,11 @@ def _upright(value: Any, width: int, where: str) -> NDArray:
     return block if block.shape[1] == width else block.T
 
 
-def _motor_commands(file: Path, where: str, steps: int) -> tuple[NDArray | None, float | None]:
+def _motor_commands(value: Any, where: str, steps: int) -> tuple[NDArray | None, float | None]:
     """Commands (T, motors) in rad and their sample rate in Hz, None where the file has none.
 
     A table of numbers, or a cell per motor with a vector or with a struct of `Data` and `Time`.
     """
-    value = mat_variables(file, ["motorCmdsRadius"]).get("motorCmdsRadius")
     where = f"{where}: motorCmdsRadius"
     if value is None or isinstance(value, Opaque):
         return None, None

@@ -203,9 +203,9 @@ def _about(trajectories: Trajectories, schema: int) -> dict[str, Any]:
         "format": FORMAT,
         "schema": schema,
         "rate": trajectories.rate,
-        "inputs": _channels(trajectories.inputs),
-        "outputs": _channels(trajectories.outputs),
-        "provenance": [{"name": s.name, "sha256": s.sha256} for s in trajectories.provenance],
+        "inputs": vars(trajectories.inputs),
+        "outputs": vars(trajectories.outputs),
+        "provenance": [vars(source) for source in trajectories.provenance],
         "emulated": trajectories.emulated,
     }
 
@@ -213,16 +213,8 @@ def _about(trajectories: Trajectories, schema: int) -> dict[str, Any]:
 def _read_about(header: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "rate": header["rate"],
-        "inputs": _read_channels(header["inputs"]),
-        "outputs": _read_channels(header["outputs"]),
+        "inputs": Channels.of(header["inputs"]),
+        "outputs": Channels.of(header["outputs"]),
         "provenance": tuple(Provenance(s["name"], s["sha256"]) for s in header["provenance"]),
         "emulated": bool(header["emulated"]),
     }
-
-
-def _channels(channels: Channels) -> dict[str, list[str]]:
-    return {"names": list(channels.names), "units": list(channels.units)}
-
-
-def _read_channels(values: Mapping[str, Any]) -> Channels:
-    return Channels(tuple(map(str, values["names"])), tuple(map(str, values["units"])))

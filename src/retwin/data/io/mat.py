@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ from retwin.checks import require
 from retwin.data.io.assembly import DataCase, Raw, assemble, split_columns
 from retwin.data.io.mat5 import NewerMat, read_mat5
 from retwin.data.trajectories import Provenance, Trajectories
-from retwin.errors import InputError, brief
-from retwin.serialisation.files import sha256
+from retwin.errors import InputError
+from retwin.serialisation.files import check_regular, refusing, sha256
+from retwin.serialisation.sizes import Budget
 
 __all__ = ["mat_variables", "matrix", "read_mat"]
 
@@ -22,7 +24,12 @@ PAIRS = (("X_array", "y_array"), ("X_test_array", "y_test_array"))
 
 
 def read_mat(
-    path: Path, *, case: DataCase | None = None, rate: float | None = None, **_: Any
+    path: Path,
+    *,
+    case: DataCase | None = None,
+    rate: float | None = None,
+    max_bytes: int | None = None,
+    **_: Any,
 ) -> Trajectories:
     """Trajectories of a MAT v5 file in the public layout.
 
@@ -32,10 +39,12 @@ def read_mat(
     Raises
     ------
     InputError
-        The file is damaged, has other variables, shapes or types, or no sample rate is known.
+        The file is damaged or too large, has other variables, shapes or types, or no sample rate is
+        known.
 
     """
-    variables = mat_variables(path)
+    budget = Budget(path.name, max_bytes)
+    variables = mat_variables(path, budget)
     found = [pair for pair in PAIRS if set(pair) <= set(variables)]
     require(
         len(found) == 1,
@@ -68,34 +77,31 @@ def read_mat(
                 commands=commands if commands.shape[1] else None,
             )
         )
-    return assemble(raws, source=Provenance(path.name, sha256(path)), case=case, rate=rate)
+    source = Provenance(path.name, sha256(path))
+    return assemble(raws, source=source, case=case, rate=rate, budget=budget)
 
 
-def mat_variables(path: Path, names: list[str] | None = None) -> dict[str, Any]:
+def mat_variables(path: Path, budget: Budget, names: Sequence[str] | None = None) -> dict[str, Any]:
     """The variables of a MAT file (those in `names`), as `read_mat5` gives them.
 
     Raises
     ------
     InputError
-        The file is damaged or of version 7.3 (HDF5).
+        The file is damaged, of version 7.3 (HDF5), or larger than the budget.
 
     """
-    try:
-        return read_mat5(path.read_bytes(), names)
-    except NewerMat:
-        raise InputError(
-            "path",
-            expected="a MAT file of version 5 to 7",
-            got=f"{path.name}, of version 7.3 (HDF5) or newer",
-            remedy="save it in MATLAB with the option '-v7'",
-        ) from None
-    except Exception as error:
-        raise InputError(
-            "path",
-            expected="a readable MAT file",
-            got=f"{path.name}, which is damaged or of another kind ({brief(error)})",
-            remedy="get the file again",
-        ) from None
+    expected = "a readable MAT file"
+    with refusing(path.name, expected=expected, remedy="get the file again"):
+        budget.take(path.stat().st_size)
+        try:
+            return read_mat5(check_regular(path).read_bytes(), budget, names)
+        except NewerMat:
+            raise InputError(
+                path.name,
+                expected="a MAT file of version 5 to 7",
+                got="one of version 7.3 (HDF5) or newer",
+                remedy="save it in MATLAB with the option '-v7'",
+            ) from None
 
 
 def matrix(value: Any, where: str) -> NDArray:

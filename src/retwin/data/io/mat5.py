@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.serialisation.sizes import Budget
+
 __all__ = ["Damaged", "NewerMat", "Opaque", "read_mat5"]
 
 HEADER = 128
@@ -45,6 +47,12 @@ NUMBERS = {
 """The type of the numbers of an array, by its class in MATLAB."""
 
 
+BYTES_PER_LETTER = 8
+"""The largest size of a letter in memory, as a text and in an array of texts."""
+BYTES_PER_OBJECT = 256
+"""The size in memory of a cell, a field or a text, with what refers to it."""
+
+
 class Damaged(ValueError):
     """The file violates the format."""
 
@@ -60,8 +68,10 @@ class Opaque:
     kind: str
 
 
-def read_mat5(data: bytes, names: Collection[str] | None = None) -> dict[str, Any]:
+def read_mat5(data: bytes, budget: Budget, names: Collection[str] | None = None) -> dict[str, Any]:
     """The variables in the bytes of a MAT file (only those in `names`).
+
+    What the file declares counts in `budget` before it is allocated.
 
     Returns
     -------
@@ -76,6 +86,8 @@ def read_mat5(data: bytes, names: Collection[str] | None = None) -> dict[str, An
         The file is of version 7.3.
     Damaged, ValueError, struct.error, zlib.error
         The file violates the format.
+    InputError
+        The variables are larger than the budget.
 
     """
     order = {b"IM": "<", b"MI": ">"}.get(data[126:HEADER])
@@ -86,18 +98,34 @@ def read_mat5(data: bytes, names: Collection[str] | None = None) -> dict[str, An
     variables: dict[str, Any] = {}
     for kind, payload in _elements(memoryview(data)[HEADER:], order):
         if kind == COMPRESSED:
-            inner = list(_elements(memoryview(zlib.decompress(payload)), order))
+            inner = list(_elements(memoryview(_inflated(payload, order, budget)), order))
             if len(inner) != 1:
                 raise Damaged("a compressed element that is not one variable")
             kind, payload = inner[0]
         if kind != MATRIX:
             raise Damaged(f"an element of type {kind} among the variables")
-        name, value = _Matrix(payload, order).read(names)
+        name, value = _Matrix(payload, order, budget).read(names)
         if name in variables:
             raise Damaged(f"the variable {name} comes twice")
         if name and (names is None or name in names):  # MATLAB's own storage has no name
             variables[name] = value
     return variables
+
+
+def _inflated(payload: memoryview, order: str, budget: Budget) -> bytes:
+    """The one element in a compressed element, whose size is in its first bytes."""
+    stream = zlib.decompressobj()
+    tag = stream.decompress(payload, 8)
+    if len(tag) < 8:
+        raise Damaged("a compressed element that is cut off")
+    # Of a small element there is no more; of others the size is the tag's second number.
+    kind, size = struct.unpack(f"{order}II", tag)
+    rest = 0 if kind >> 16 else size
+    budget.take(rest)
+    data = tag + (stream.decompress(stream.unconsumed_tail, rest) if rest else b"")
+    if stream.decompress(stream.unconsumed_tail, 1) or not stream.eof:
+        raise Damaged("a compressed element of another size than it declares")
+    return data
 
 
 def _elements(buffer: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
@@ -122,8 +150,9 @@ def _elements(buffer: memoryview, order: str) -> Iterator[tuple[int, memoryview]
 class _Matrix:
     """One array of any class: a walk through the elements that it consists of."""
 
-    def __init__(self, payload: memoryview, order: str) -> None:
+    def __init__(self, payload: memoryview, order: str, budget: Budget) -> None:
         self._size = len(payload)
+        self._budget = budget
         self._order = order
         self._parts = _elements(payload, order)
 
@@ -175,6 +204,7 @@ class _Matrix:
             raise Damaged(f"an element of type {kind} in place of a text")
         wide = TEXTS[kind].startswith(("utf-16", "utf-32"))
         codec = TEXTS[kind] + ({"<": "-le", ">": "-be"}[self._order] if wide else "")
+        self._budget.take(BYTES_PER_LETTER * len(payload))
         return bytes(payload).decode(codec)
 
     def _table(self, kind: int, sizes: list[int], is_complex: bool) -> NDArray:
@@ -182,6 +212,8 @@ class _Matrix:
         if any(len(part) != math.prod(sizes) for part in parts):
             raise Damaged(f"{len(parts[0])} numbers for an array of shape {sizes}")
         # MATLAB stores whole numbers in as few bytes as they need, whatever their class.
+        size = np.dtype(NUMBERS[kind]).itemsize * math.prod(sizes)
+        self._budget.take(size + is_complex * 4 * size)
         table = parts[0].astype(NUMBERS[kind])
         return (table + 1j * parts[1] if is_complex else table).reshape(sizes, order="F")
 
@@ -189,6 +221,7 @@ class _Matrix:
         # An empty text may come without its element.
         text = self._text() if math.prod(sizes) else ""
         rows = math.prod(sizes[:-1])
+        self._budget.take(BYTES_PER_OBJECT * rows if text else 0)
         if rows == 1 and text:
             return np.array([text])
         if len(text) != math.prod(sizes):
@@ -196,15 +229,15 @@ class _Matrix:
         return np.array([text[row::rows] for row in range(rows)] if text else [], dtype=np.str_)
 
     def _children(self, count: int) -> NDArray:
-        # An array takes 8 bytes at least, so no count can ask for more memory than the file has.
-        if 8 * count > self._size:
+        if 8 * count > self._size:  # an array takes 8 bytes at least
             raise Damaged(f"{count} parts in {self._size} bytes")
+        self._budget.take(BYTES_PER_OBJECT * count)
         made = np.empty(count, dtype=object)
         for i in range(count):
             kind, payload = self._next()
             if kind != MATRIX:
                 raise Damaged(f"an element of type {kind} in place of an array")
-            made[i] = _Matrix(payload, self._order).read()[1]
+            made[i] = _Matrix(payload, self._order, self._budget).read()[1]
         return made
 
     def _structs(self, sizes: list[int]) -> Any:
@@ -217,6 +250,7 @@ class _Matrix:
             letters[i : i + step].split(b"\0")[0].decode() for i in range(0, len(letters), step)
         ]
         count, size = math.prod(sizes), len(fields)
+        self._budget.take(BYTES_PER_OBJECT * count)
         values = self._children(count * size)
         made = np.empty(count, dtype=object)
         for i in range(count):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.data.io.header import NAMES, arrays_of, check_header, header_of, restore
 from retwin.data.trajectories import Trajectories
-from retwin.errors import InputError, brief
+from retwin.serialisation.files import parse_json, refusing
+from retwin.serialisation.sizes import Budget
 
 __all__ = ["read_npz", "write_npz"]
 
@@ -36,42 +38,48 @@ def write_npz(trajectories: Trajectories, path: Path) -> None:
                 np.lib.format.write_array(file, array, allow_pickle=False)
 
 
-def read_npz(path: Path, **_: Any) -> Trajectories:
+def read_npz(path: Path, *, max_bytes: int | None = None, **_: Any) -> Trajectories:
     """Trajectories that `write_npz` wrote; the file holds all that other formats must be given.
 
     Raises
     ------
     InputError
-        The file is damaged, another kind of NPZ, holds pickled objects, or has a newer schema.
+        The file is damaged, too large, another kind of NPZ, holds pickled objects, or has a newer
+        schema.
 
     """
-    try:
+    expected = "a readable NPZ file without pickled objects"
+    with (
+        refusing(path.name, expected=expected, remedy="get or make the file again"),
         # Not np.load: it leaves a damaged file open.
-        with zipfile.ZipFile(path) as archive:
-            require(
-                "header.npy" in archive.namelist(),
-                path.name,
-                expected="trajectories saved by retwin, with a header",
-                got="an NPZ file without",
-                remedy="give a file that `retwin data convert` wrote",
-            )
-            header = json.loads(_array(archive, "header").tobytes())
-            check_header(header, path.name)
-            arrays = {name: _array(archive, name) for name in NAMES}
+        zipfile.ZipFile(path) as archive,
+    ):
+        require(
+            "header.npy" in archive.namelist(),
+            path.name,
+            expected="trajectories saved by retwin, with a header",
+            got="an NPZ file without",
+            remedy="give a file that `retwin data convert` wrote",
+        )
+        budget = Budget(path.name, max_bytes)
+        header = parse_json(_array(archive, "header", budget).tobytes(), path.name)
+        check_header(header, path.name)
+        arrays = {name: _array(archive, name, budget) for name in NAMES}
         return restore(header, arrays, path.name)
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(
-            "path",
-            expected="a readable NPZ file without pickled objects",
-            got=f"{path.name}, which is damaged or of another kind ({brief(error)})",
-            remedy="get or make the file again",
-        ) from None
 
 
-def _array(archive: zipfile.ZipFile, name: str) -> NDArray:
-    with archive.open(f"{name}.npy") as file:
+def _array(archive: zipfile.ZipFile, name: str, budget: Budget) -> NDArray:
+    entry = archive.getinfo(f"{name}.npy")
+    budget.take(entry.file_size)
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{name} is compressed in a way that has no limit")
+    with archive.open(entry) as file:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0
+        shape, _, dtype = (read if version[0] == 1 else np.lib.format.read_array_header_2_0)(file)
+        if math.prod(shape) * max(1, dtype.itemsize) > entry.file_size:
+            raise ValueError(f"{name} of shape {shape} in {entry.file_size} bytes")
+        file.seek(0)
         array: NDArray = np.lib.format.read_array(file, allow_pickle=False)
         file.read(1)  # to the very end, where the zip checks its checksum
     return array

@@ -8,8 +8,9 @@ several processes, chunk by chunk: `create_chunked`, then `write_chunk` in any o
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from contextlib import ExitStack
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,8 @@ from retwin.data.io.header import (
 )
 from retwin.data.io.scratch import Scratch
 from retwin.data.trajectories import Trajectories
-from retwin.errors import InputError, brief
+from retwin.serialisation.files import check_regular, read_json, refusing
+from retwin.serialisation.sizes import Budget
 
 __all__ = [
     "create_chunked",
@@ -49,6 +51,12 @@ BYTES_PER_CHUNK = 2**23
 """The largest size of a chunk in bytes: a chunk is in memory as a whole, with its packed copies."""
 KEY = "retwin"
 """The attribute of the Zarr group that holds the header."""
+CODECS = ["BytesCodec", "ZstdCodec"]
+"""How arrays are stored, which is what Zarr does by default."""
+COPIES = 3
+"""Arrays of the size of a chunk that are in memory while one is unpacked and checked."""
+BYTES_PER_TRAJECTORY = 32
+"""Memory for the place of a trajectory in a set of which a part is read."""
 TEXTS = ("labels", "ids")
 """The arrays of texts, which are stored in the header."""
 
@@ -78,11 +86,13 @@ def write_zarr(trajectories: Trajectories, path: Path) -> None:
         target = group.create_array(
             name, shape=array.shape, dtype=array.dtype, chunks=(count, *rest)
         )
-        for rows in _chunks(len(array), count) if array.size else ():
-            target[rows] = array[rows]
+        for begin in range(0, len(array) if array.size else 0, count):
+            target[begin : begin + count] = array[begin : begin + count]
 
 
-def read_zarr(path: Path, rows: slice = slice(None), **_: Any) -> Trajectories:
+def read_zarr(
+    path: Path, rows: slice = slice(None), *, max_bytes: int | None = None, **_: Any
+) -> Trajectories:
     """Trajectories that `write_zarr` wrote, or that were written chunk by chunk.
 
     Parameters
@@ -92,6 +102,8 @@ def read_zarr(path: Path, rows: slice = slice(None), **_: Any) -> Trajectories:
     rows : slice
         The trajectories to read. Of a set that was written chunk by chunk, only the chunks that
         hold them are read, each of which is checked as a whole.
+    max_bytes : int
+        The largest size of the copy; by default nine tenths of the free disk.
 
     Returns
     -------
@@ -106,30 +118,17 @@ def read_zarr(path: Path, rows: slice = slice(None), **_: Any) -> Trajectories:
         copy, the memory has none for a chunk, or the package zarr is not installed.
 
     """
-    zarr = _zarr()
-    try:
-        group = zarr.open_group(str(path), mode="r")
-        header = _header(group, path.name)
+    with _opened(path) as (group, header):
+        budget = Budget(path.name, max_bytes, disk=tempfile.gettempdir())
         if header["schema"] == CHUNKED:
-            return _read_chunks(group, header, path.name, rows)
+            return _read_chunks(group, header, path.name, rows, budget)
         arrays = {name: np.array(header[name], dtype=np.str_) for name in TEXTS}
         for name in set(NAMES) - set(TEXTS):
-            _check_size(
-                group[name], header["arrays"][name]["shape"], TRAJECTORIES_PER_CHUNK, path.name
-            )
+            shape = header["arrays"][name]["shape"]
+            _check_size(group[name], shape, TRAJECTORIES_PER_CHUNK, path.name)
+            budget.take(group[name].nbytes)
             arrays[name] = _copied(group[name])
         return restore(header, arrays, path.name)[rows]
-    except InputError:
-        raise
-    except MemoryError:
-        raise InputError(
-            "path",
-            expected="memory for one chunk of the set, several times over",
-            got=f"too little to read {path.name}",
-            remedy="end what else takes memory, or read it on a larger machine",
-        ) from None
-    except Exception as error:
-        raise _damaged(path, error) from None
 
 
 def read_header(path: Path) -> dict[str, Any]:
@@ -141,13 +140,23 @@ def read_header(path: Path) -> dict[str, Any]:
         See `read_zarr`.
 
     """
-    zarr = _zarr()
-    try:
-        return _header(zarr.open_group(str(path), mode="r"), path.name)
-    except InputError:
-        raise
-    except Exception as error:
-        raise _damaged(path, error) from None
+    with _opened(path) as (_, header):
+        return header
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """The group in a folder, and its header; InputError for every exception in the block."""
+    zarr, about = _zarr(), "zarr.json"
+    expected = "a readable Zarr folder of trajectories"
+    with refusing(path.name, expected=expected, remedy="get or make the folder again"):
+        for file in (path / about, *(path / name / about for name in NAMES)):
+            if file.exists():  # a pipe may never end, and deep nesting is no JSON
+                read_json(file)
+        group = zarr.open_group(str(path), mode="r", zarr_format=3)
+        header: Any = dict(group.attrs).get(KEY)
+        check_header(header, path.name, newest=CHUNKED)
+        yield group, dict(header)
 
 
 def create_chunked(path: Path, header: Mapping[str, Any], dtype: DTypeLike) -> None:
@@ -190,28 +199,28 @@ def seal_chunked(path: Path, header: Mapping[str, Any]) -> None:
     _zarr().open_group(str(path), mode="r+").attrs[KEY] = dict(header)
 
 
-def _header(group: Any, where: str) -> dict[str, Any]:
-    header: Any = dict(group.attrs).get(KEY)
-    check_header(header, where, newest=CHUNKED)
-    return dict(header)
-
-
 def _copied(stored: Any) -> NDArray:
     """An array of Zarr as a memory map; one chunk at a time is in memory."""
     if not stored.size:
         return np.empty(stored.shape, stored.dtype)
     with Scratch(stored.shape[1:], stored.dtype) as scratch:
-        for rows in _chunks(stored.shape[0], stored.chunks[0]):
-            scratch.append(np.asarray(stored[rows]))
+        for number in range(stored.cdata_shape[0]):
+            scratch.append(_chunk(stored, number))
         return scratch.array()
 
 
-def _read_chunks(group: Any, header: Mapping[str, Any], where: str, rows: slice) -> Trajectories:
+def _read_chunks(
+    group: Any, header: Mapping[str, Any], where: str, rows: slice, budget: Budget
+) -> Trajectories:
     """The trajectories at `rows` that did not fail; one chunk at a time is in memory."""
     size = int(header["chunk"])
     for name in CHUNKED_NAMES:
         _check_size(group[name], header["arrays"][name]["shape"], size, where)
-    index = np.arange(group["labels"].shape[0])[rows]
+    count = group["labels"].shape[0]
+    Budget(where).take(BYTES_PER_TRAJECTORY * count)
+    index = np.arange(count)[rows]
+    for name in CHUNKED_NAMES:
+        budget.take(len(index) * group[name].nbytes // max(1, count))
     of_chunks = np.split(index, np.flatnonzero(np.diff(index // size)) + 1) if len(index) else []
     good = [index[:0]]
     with ExitStack() as files:
@@ -222,7 +231,7 @@ def _read_chunks(group: Any, header: Mapping[str, Any], where: str, rows: slice)
         for some in of_chunks:
             number = int(some[0]) // size
             begin = number * size
-            chunk = {name: np.asarray(group[name][begin : begin + size]) for name in CHUNKED_NAMES}
+            chunk = {name: _chunk(group[name], number) for name in CHUNKED_NAMES}
             check_chunk(header, chunk, number, where)
             good.append(some[chunk["labels"][some - begin] != FAILED])
             for name, array in chunk.items():
@@ -231,29 +240,53 @@ def _read_chunks(group: Any, header: Mapping[str, Any], where: str, rows: slice)
     return restore_chunked(header, arrays, np.concatenate(good))
 
 
-def _chunks(count: int, size: int) -> list[slice]:
-    return [slice(begin, begin + size) for begin in range(0, count, size)]
-
-
 def _check_size(array: Any, shape: list[int], chunk: int, where: str) -> None:
-    """Raise InputError for a size that was not written, before memory is allocated for it."""
-    largest = chunk * math.prod(max(1, size) for size in shape[1:])
+    """Check the layout of an array, and the size of its chunks, before memory is allocated."""
+    where = f"{where}: {array.basename}"
+    chunks = (min(array.chunks[0], chunk), *(max(1, size) for size in shape[1:]))
     require(
-        list(array.shape) == shape and math.prod(array.chunks) <= largest,
-        f"{where}: {array.basename}",
+        list(array.shape) == shape and array.chunks == chunks,
+        where,
         expected=f"shape {tuple(shape)}",
         got=f"shape {array.shape} in chunks of {array.chunks}",
         remedy="the folder is damaged: get or make it again",
     )
-
-
-def _damaged(path: Path, error: Exception) -> InputError:
-    return InputError(
-        "path",
-        expected="a readable Zarr folder of trajectories",
-        got=f"{path.name}, which is damaged or of another kind ({brief(error)})",
-        remedy="get or make the folder again",
+    # Other codecs may unpack a small file to any size.
+    codecs = [type(codec).__name__ for codec in array.metadata.codecs]
+    require(
+        codecs == CODECS,
+        where,
+        expected=f"numbers that are packed by {' and '.join(CODECS)}",
+        got=", ".join(codecs),
+        remedy="the folder is damaged: get or make it again",
     )
+    Budget(where).take(COPIES * math.prod(chunks) * array.dtype.itemsize)
+
+
+def _chunk(stored: Any, number: int) -> NDArray:
+    """A chunk of an array, whose file is checked before it is unpacked.
+
+    A packed file can declare any size, or none: then it is unpacked to its end.
+    """
+    size = stored.chunks[0]
+    key = stored.metadata.encode_chunk_key((number, *(0 for _ in stored.shape[1:])))
+    file = Path(stored.store_path.store.root) / stored.store_path.path / key
+    if file.exists():  # zeros are not always stored
+        with check_regular(file).open("rb") as opened:
+            _check_frame(
+                opened.read(18).ljust(18), math.prod(stored.chunks) * stored.dtype.itemsize
+            )
+    return np.asarray(stored[number * size : (number + 1) * size])
+
+
+def _check_frame(head: bytes, size: int) -> None:
+    """Check that the head of a Zstandard frame declares `size` bytes (RFC 8878, 3.1.1.1)."""
+    code, single = head[4] >> 6, head[4] >> 5 & 1
+    begin = 5 + (not single) + (0, 1, 2, 4)[head[4] & 3]
+    width = (single, 2, 4, 8)[code]
+    declared = int.from_bytes(head[begin : begin + width], "little") + 256 * (width == 2)
+    if head[:4] != b"\x28\xb5\x2f\xfd" or not width or declared != size:
+        raise ValueError(f"a chunk that is not one frame of {size} bytes")
 
 
 def _zarr() -> Any:

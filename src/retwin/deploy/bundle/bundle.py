@@ -23,7 +23,7 @@ from retwin.deploy.bundle.verdicts import Prediction, no_diagnoser
 from retwin.diagnosis import FittedDiagnoser, load_diagnoser
 from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.serialisation.models import read_model, write_model
+from retwin.serialisation.models import read_model, refusing, write_model
 from retwin.update.corrected import CorrectedTwin, generate
 
 __all__ = ["Bundle"]
@@ -217,7 +217,7 @@ class Bundle:
 
         """
         folder = Path(folder)
-        with open_sealed(folder, "bundle") as about:
+        with open_sealed(folder, "bundle") as about, refusing(folder, expected="a bundle"):
             twin = CorrectedTwin.load(folder / "twin")
             return cls(
                 twin=twin,

@@ -34,7 +34,7 @@ class Facts:
     steps : int
         Samples per trajectory, at least 2.
     max_segments : int
-        Greatest number of segments in a trajectory.
+        Greatest number of segments in a trajectory, at most `steps`.
     sampler : RampSampler or None
         Command sampler; None if commands are drawn by code of the case.
 
@@ -55,7 +55,7 @@ class Facts:
     def __post_init__(self) -> None:
         remedy = "take it from the case"
         whole("facts.steps", self.steps, least=2, remedy=remedy)
-        whole("facts.max_segments", self.max_segments, remedy=remedy)
+        whole("facts.max_segments", self.max_segments, most=self.steps, remedy=remedy)
         positive("facts.sensor_rate", self.sensor_rate, unit="Hz", remedy=remedy)
 
     @property
@@ -90,8 +90,8 @@ class Facts:
         return cls(
             case=str(about["case"]),
             faults=faults,
-            sensor_rate=float(about["sensor_rate"]),
-            steps=int(about["steps"]),
-            max_segments=int(about["movements"]),
+            sensor_rate=about["sensor_rate"],
+            steps=about["steps"],
+            max_segments=about["movements"],
             sampler=sampler,
         )

@@ -7,16 +7,15 @@ harm because reading it runs no code that it names.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from retwin.checks import require
-from retwin.errors import InputError
-from retwin.serialisation.files import sha256
-from retwin.serialisation.models import refusing
+from retwin.errors import InputError, brief
+from retwin.serialisation.files import check_regular, read_json, recover, refusing, sha256
+from retwin.serialisation.sizes import Budget
 
 __all__ = ["SCHEMAS", "SUMS", "open_sealed", "read_sealed", "seal", "verify_seal"]
 
@@ -32,8 +31,6 @@ REMEDIES = {
     "portable": "make it anew with retwin bundle export",
 }
 EXPECTED = {"bundle": "a bundle", "portable": "the ONNX export of a bundle"}
-MAX_DESCRIPTION_BYTES = 2**20
-"""Greatest size of model.json; that of a bundle is some kilobytes."""
 
 
 @contextmanager
@@ -74,12 +71,14 @@ def verify_seal(folder: str | Path) -> None:
         If the folder is not sealed, if a file was changed, removed or added, or if one is a link.
 
     """
-    folder = Path(folder)
+    folder = recover(folder)
     try:
-        written = (folder / SUMS).read_bytes()
+        written = check_regular(folder / SUMS).read_bytes()
         found = _sums(folder)
-    except OSError as error:
-        raise _damaged(folder, f"{type(error).__name__}: {error.strerror}") from None
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
+        raise _damaged(folder, f"{type(error).__name__}: {brief(error)}") from None
     if written != found:
         raise _damaged(folder, _difference(written, found))
 
@@ -94,13 +93,10 @@ def read_sealed(folder: str | Path, *kinds: str) -> dict[str, Any]:
 
     """
     verify_seal(folder)
-    file = Path(folder) / "model.json"
     try:
-        if file.stat().st_size > MAX_DESCRIPTION_BYTES:
-            raise ValueError("too long")
-        about = json.loads(file.read_text(encoding="utf-8"))
+        about = read_json(Path(folder) / "model.json")
         kind, schema = about["kind"], about["schema"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise _damaged(Path(folder), f"model.json with {type(error).__name__}") from None
     require(
         kind in kinds and schema == SCHEMAS[kind],
@@ -115,7 +111,7 @@ def read_sealed(folder: str | Path, *kinds: str) -> dict[str, Any]:
 
 def _sums(folder: Path) -> bytes:
     """One line per file, sorted by name: its SHA-256 and its name."""
-    lines = []
+    lines, budget = [], Budget(str(folder))
     for file in sorted(folder.rglob("*")):
         name = file.relative_to(folder).as_posix()
         if any(part.startswith(".") for part in name.split("/")) or name == SUMS:
@@ -123,6 +119,7 @@ def _sums(folder: Path) -> bytes:
         if file.is_symlink():
             raise _damaged(folder, f"a link, {name}")
         if file.is_file():
+            budget.take(file.stat().st_size)
             lines.append(f"{sha256(file)}  {name}\n")
     return "".join(lines).encode("utf-8", "surrogateescape")
 

@@ -33,8 +33,8 @@ CHECKS = (
     "probabilities",
 )
 """Names of the checks, in the order of their scores; the last checks the diagnoser's output."""
-RANGES = ("low", "high", "speed", "floor", "ceiling", "spread")
-"""Fields of `Domain` that have one number per channel."""
+COMMANDS, OUTPUTS = ("low", "high", "speed"), ("floor", "ceiling", "spread")
+"""Fields of `Domain` that have one number per command, and per output."""
 TOLERANCE = 0.02
 """Limit of how far a value may leave its range, as a share of the range's width."""
 MISSING_LIMIT = 0.25
@@ -164,7 +164,7 @@ class Domain:
     Raises
     ------
     InputError
-        If a number, or the width of a range, is not finite.
+        If a number, or the width of a range, is not finite; or if one per channel is missing.
 
     """
 
@@ -178,6 +178,14 @@ class Domain:
     energy: float = 0.0
 
     def __post_init__(self) -> None:
+        counts = [[len(getattr(self, name)) for name in names] for names in (COMMANDS, OUTPUTS)]
+        require(
+            all(len(set(each)) == 1 for each in counts),
+            "domain",
+            expected="one number per channel in every range",
+            got=counts,
+            remedy="make the bundle and its export anew",
+        )
         with np.errstate(over="ignore", invalid="ignore"):
             widths = [
                 np.subtract(self.high, self.low),
@@ -196,7 +204,7 @@ class Domain:
     def of(cls, values: Mapping[str, Any]) -> Domain:
         """The domain from the values of `dataclasses.asdict`, with JSON lists or tuples."""
         return cls(
-            **{name: _floats(values[name]) for name in RANGES},
+            **{name: _floats(values[name]) for name in (*COMMANDS, *OUTPUTS)},
             mismatch=float(values["mismatch"]),
             energy=float(values["energy"]),
         )
@@ -250,7 +258,7 @@ class Domain:
         Raises
         ------
         InputError
-            If there are no commands, or those of another number of channels.
+            If commands or outputs have another number of channels.
 
         """
         require(
@@ -259,6 +267,13 @@ class Domain:
             expected=f"{len(self.low)} columns, since the ranges of commands are checked",
             got=trajectories.commands.shape[2],
             remedy="read the file with its case, which recovers commands",
+        )
+        require(
+            trajectories.nominal.shape[2] == len(self.floor),
+            "domain",
+            expected=f"ranges of {trajectories.nominal.shape[2]} outputs",
+            got=f"those of {len(self.floor)}",
+            remedy="make the bundle and its export anew",
         )
 
         def nominal(some: Trajectories) -> NDArray:

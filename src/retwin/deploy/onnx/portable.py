@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import needs_extra, require
+from retwin.checks import needs_extra, positive, require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.deploy.bundle.facts import Facts
@@ -25,7 +25,7 @@ from retwin.deploy.bundle.verdicts import (
 )
 from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.serialisation.models import refusing
+from retwin.serialisation.files import refusing
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, checked_seed, simulate_in_chunks
 
@@ -57,10 +57,11 @@ class Sensor:
     phases: tuple[int, ...]
 
     @classmethod
-    def of(cls, about: Mapping[str, Any]) -> Sensor:
-        """The settings from JSON values."""
-        every = int(about["every"])
-        return cls(every, tuple(int(phase) for phase in about["phases"] or range(every)))
+    def of(cls, about: Mapping[str, Any], steps: int) -> Sensor:
+        """The settings from JSON values, for trajectories of so many samples."""
+        every = whole("sensor.every", about["every"], least=1, most=steps)
+        phases = about["phases"] or range(every)
+        return cls(every, tuple(whole("sensor.phases", phase, most=every - 1) for phase in phases))
 
 
 @dataclass(frozen=True)
@@ -83,11 +84,14 @@ class Classifier:
     settled: int | None
 
     @classmethod
-    def of(cls, about: Mapping[str, Any]) -> Classifier:
-        """The settings from JSON values."""
+    def of(cls, about: Mapping[str, Any], steps: int) -> Classifier:
+        """The settings from JSON values, for trajectories of so many samples."""
         settled = about["settled"]
-        names = tuple(str(name) for name in about["classes"])
-        return cls(names, int(about["stride"]), None if settled is None else int(settled))
+        return cls(
+            tuple(str(name) for name in about["classes"]),
+            whole("diagnoser.stride", about["stride"], least=1, most=steps),
+            None if settled is None else whole("diagnoser.settled", settled, most=steps),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,8 +163,10 @@ class Portable:
         options.intra_op_num_threads = threads
         options.log_severity_level = 4  # errors are raised, and need not be printed too
         with open_sealed(folder, "portable") as about:
-            sensor = None if about["sensor"] is None else Sensor.of(about["sensor"])
-            classifier = None if about["diagnoser"] is None else Classifier.of(about["diagnoser"])
+            facts = Facts.of(about, positive("rate", about["rate"], unit="Hz"))
+            sensor, classifier = about["sensor"], about["diagnoser"]
+            sensor = None if sensor is None else Sensor.of(sensor, facts.steps)
+            classifier = None if classifier is None else Classifier.of(classifier, facts.steps)
             names = [*GRAPHS, *["sensor"] * bool(sensor)]
             names += ["features", "diagnoser"] * bool(classifier)
             files = {name: Path(folder) / f"{name}.onnx" for name in names}
@@ -171,12 +177,12 @@ class Portable:
                     )
                     for name, file in files.items()
                 },
-                facts=Facts.of(about, float(about["rate"])),
+                facts=facts,
                 inputs=Channels.of(about["inputs"]),
                 outputs=Channels.of(about["outputs"]),
-                rate=float(about["rate"]),
+                rate=positive("rate", about["rate"], unit="Hz"),
                 domain=Domain.of(about["domain"]),
-                stride=int(about["stride"]),
+                stride=whole("stride", about["stride"], least=1, most=facts.steps),
                 sensor=sensor,
                 diagnoser=classifier,
                 emulated=bool(about["emulated"]),

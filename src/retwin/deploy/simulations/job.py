@@ -34,6 +34,7 @@ from retwin.jobs import alone, each
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.identity import identity
+from retwin.serialisation.sizes import Budget
 
 __all__ = ["Simulated", "simulate_to"]
 
@@ -41,6 +42,11 @@ SCHEMA = 2
 """The version of the plan's identity. Digests of the first, which has no such key, differ."""
 MAX_NPZ_BYTES = 2**29
 """Greatest size of an NPZ's arrays, which are held in memory."""
+
+
+COPIES = 3
+"""Arrays of a chunk that are in memory together: simulated, stored and packed. Zarr takes memory
+for a whole chunk, also where the last one is shorter."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +108,8 @@ def simulate_to(
     Raises
     ------
     InputError
-        If the plan cannot be carried out; if the folder holds another plan's work or anything else;
+        If the plan cannot be carried out; if the disk has no room for it, or the memory none for a
+        chunk; if the folder holds another plan's work or anything else;
         if an NPZ would exceed 512 MB or workers are given for it; or if both workers and a
         scheduler are given.
     SimulationError
@@ -158,6 +165,8 @@ class _Job:
         """The job in the folder next to `target`, which is created or resumed."""
         part = _part(target)
         if not part.exists():
+            Budget("n", disk=target.parent).take(plan.count * plan.trajectory_bytes)
+            Budget("chunk").take(COPIES * plan.chunk * plan.trajectory_bytes)
             with write_atomically(part) as new:
                 (new / "done").mkdir(parents=True)
                 if isinstance(plan.commands, Recorded):
@@ -312,8 +321,7 @@ def _check_same(where: Path, written: dict[str, Any], given: dict[str, Any]) -> 
 
 
 def _check_small(plan: SimulationPlan, workers: int | None, scheduler: str | None) -> None:
-    width = len(plan.twin.inputs) + 2 * len(plan.twin.outputs)
-    size = plan.count * plan.steps * width * np.dtype(plan.dtype).itemsize
+    size = plan.count * plan.trajectory_bytes
     require(
         size <= MAX_NPZ_BYTES and workers is None and scheduler is None,
         "path",

@@ -29,6 +29,8 @@ if TYPE_CHECKING:  # a worker that simulates without torch need not load it
 
 __all__ = ["Recorded", "SimulatedChunk", "SimulationPlan", "simulate_chunk"]
 
+MAX_CHUNK = 2**31 - 1
+"""Greatest number of trajectories in a chunk; the memory allows fewer of any length."""
 MAX_REASON_CHARACTERS = 200
 """Greatest number of characters of a failure's reason; a header holds up to a million of them."""
 
@@ -113,7 +115,7 @@ class SimulationPlan:
         if self.n is None and isinstance(self.commands, Recorded):
             object.__setattr__(self, "n", len(self.commands.array))
         whole("n", self.n, least=1, remedy="give the number of trajectories that are to be drawn")
-        whole("chunk", self.chunk, least=1)
+        whole("chunk", self.chunk, least=1, most=MAX_CHUNK)
         whole("seed", self.seed)
         remedy = f"give {{'{HEALTHY}': None}} for healthy trajectories only"
         at_least("faults", self.faults, 1, "class", remedy=remedy)
@@ -129,6 +131,13 @@ class SimulationPlan:
         """Samples per trajectory, T."""
         assert not isinstance(self.commands, Trajectories | np.ndarray)
         return self.commands.steps
+
+    @property
+    def trajectory_bytes(self) -> int:
+        """Size of a trajectory in bytes, as it is stored before it is packed."""
+        outputs = len(self.twin.outputs)
+        numbers = np.dtype(self.dtype).itemsize * (len(self.twin.inputs) + 2 * outputs)
+        return self.steps * (numbers + outputs)
 
     @property
     def chunks(self) -> int:
@@ -337,12 +346,7 @@ def _check_channels(trajectories: Trajectories, twin: Twin) -> None:
     require(
         trajectories.inputs in (twin.inputs, Channels.numbered("u", len(twin.inputs))),
         "commands",
-        expected=f"the inputs of the twin, {_named(twin.inputs)}",
-        got=_named(trajectories.inputs),
+        expected=f"the inputs of the twin, {twin.inputs}",
+        got=trajectories.inputs,
         remedy="give commands for this twin; a file without commands needs its case",
     )
-
-
-def _named(channels: Channels) -> str:
-    pairs = zip(channels.names, channels.units, strict=True)
-    return ", ".join(f"{name} [{unit}]" for name, unit in pairs) or "none"
