@@ -1,6 +1,6 @@
 """Simulated studies with known truths: how often intervals contain them, and verdicts err.
 
-`python tests/long/coverage.py` prints the table of docs/theory.md, "What the intervals were checked
+`python tests/long/simulated_studies.py` prints the table of docs/theory.md, "What the intervals were checked
 on". The constants of `retwin.scores` were chosen on other simulations, which that page describes.
 """
 
