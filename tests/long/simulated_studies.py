@@ -1,7 +1,7 @@
 """Simulated studies with known truths: how often intervals contain them, and verdicts err.
 
-`python tests/long/simulated_studies.py` prints the table of docs/theory.md, "What the intervals were checked
-on". The constants of `retwin.scores` were chosen on other simulations, which that page describes.
+`python tests/long/simulated_studies.py` prints the figures of docs/theory.md. The constants of
+`retwin.scores` were chosen on other simulations, which that page describes.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import simulated_studies as simulated
 import pytest
+import simulated_studies as simulated
 from scipy.stats import binom
 
 pytestmark = [pytest.mark.long, pytest.mark.numerical]
