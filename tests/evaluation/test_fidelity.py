@@ -296,7 +296,7 @@ def test_mean_only_is_the_mean_of_the_draws(
     [
         ({"labels": np.array(["Healthy", "Stuck"])}, {}, "1 of them with a fault"),
         ({"mask": np.zeros((2, STEPS, 2), dtype=bool)}, {}, "one that was never measured"),
-        ({"rate": 20.0}, {}, r"trajectories\.rate: expected what the twin has, 10"),
+        ({"rate": 20.0}, {}, r"trajectories\.rate: expected that of the twin, 10"),
         ({}, {"draws": 5}, "at least 19"),
         ({}, {"rate": 3.0}, "a whole part of it"),
         ({}, {"rate": 0.0}, "a whole part of it"),

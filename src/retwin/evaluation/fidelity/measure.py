@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import require, whole
 from retwin.data.segments import Segments
-from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Trajectories
+from retwin.data.trajectories import Channels, Trajectories
 from retwin.evaluation.fidelity.figures import BINS, Fidelity
 from retwin.progress import Progress
 from retwin.scores.distributions import (
@@ -24,7 +24,7 @@ from retwin.scores.distributions import (
     quantiles,
 )
 from retwin.scores.energy import energy_score
-from retwin.twins.twin import Twin
+from retwin.twins.twin import Twin, checked_stride
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import DelayOffset
 from retwin.update.residual import infer_discrepancy, segment
@@ -191,14 +191,7 @@ def measure_widening(
 
 def _checked(twin: Twin, trajectories: Trajectories, rate: float | None, draws: int) -> int:
     """The stride of the comparison in samples; InputError for what cannot be compared."""
-    healthy = np.isin(trajectories.labels, (HEALTHY, UNLABELLED))
-    require(
-        len(trajectories) > 0 and healthy.all(),
-        "trajectories",
-        expected="healthy trajectories, one at least",
-        got=f"{len(trajectories)}, {int((~healthy).sum())} of them with a fault",
-        remedy=f"take trajectories.with_label({HEALTHY!r})",
-    )
+    stride = checked_stride(twin, trajectories, rate, "trajectories")
     require(
         np.all(np.any(np.all(trajectories.mask, axis=2), axis=1)),
         "trajectories",
@@ -206,24 +199,7 @@ def _checked(twin: Twin, trajectories: Trajectories, rate: float | None, draws: 
         got="one that was never measured",
         remedy="leave it out",
     )
-    for name in ("inputs", "outputs", "rate"):
-        expected, given = getattr(twin, name), getattr(trajectories, name)
-        require(
-            given == expected,
-            f"trajectories.{name}",
-            expected=f"what the twin has, {expected}",
-            got=given,
-            remedy="load the file with its case, or convert it",
-        )
     whole("draws", draws, least=INFERRED, remedy="take the default of 200")
-    stride = 1 if rate is None else round(trajectories.rate / rate) if rate > 0 else 0
-    require(
-        stride >= 1 and (rate is None or abs(stride * rate - trajectories.rate) <= 1e-6),
-        "rate",
-        expected=f"{trajectories.rate:g} Hz, the data's rate, or a whole part of it",
-        got=rate,
-        remedy="choose the rate of the data divided by a whole number",
-    )
     return stride
 
 
