@@ -27,9 +27,11 @@ def test_intervals_contain_the_true_scores(
     assert min(found.values()) >= least, found
 
 
-@pytest.mark.parametrize(("n", "runs", "f1"), [(36, 5, 0.8), (90, 5, 0.8), (90, 10, 0.9)])
-def test_equal_methods_are_rarely_called_better(n: int, runs: int, f1: float) -> None:
+@pytest.mark.parametrize(("n", "runs", "f1", "spread"), simulated.EQUAL)
+def test_equal_methods_are_rarely_called_better(
+    n: int, runs: int, f1: float, spread: float
+) -> None:
     """With a standard deviation of macro-F1 between runs of 0.05 to 0.11."""
-    made = replace(simulated.Classifier().with_f1(f1), spread=0.5)
+    made = replace(simulated.Classifier().with_f1(f1), spread=spread)
     wrong = simulated.false_verdicts(made, n, runs, studies=STUDIES)
     assert wrong <= binom.isf(1e-6, STUDIES, 0.06) / STUDIES
