@@ -31,6 +31,7 @@ _HOME = {
     "cumulative_counts": "distributions",
     "decide": "decisions",
     "energy_score": "energy",
+    "further_group_quantile": "distributions",
     "grouped_quantile": "distributions",
     "grouped_share_interval": "intervals",
     "holm": "comparison",

@@ -19,7 +19,7 @@ from retwin.progress import Progress
 from retwin.scores.distributions import (
     LEVELS,
     crps,
-    grouped_quantile,
+    further_group_quantile,
     pit_histograms,
     quantiles,
 )
@@ -143,10 +143,10 @@ def measure_widening(
 ) -> float:
     """Estimate of the factor by which 90 % bands are widened about their median to cover 90 %.
 
-    Split conformal prediction with trajectories as groups, whose distributions are pooled: K groups
-    and a further one that lies outside, so that the quantile of the K is at 0.9 (K + 1) / K. From
-    nine trajectories on, the coverage of a further one is at least 0.9 on average. Fewer guarantee
-    nothing: the factor is then the largest one that occurred.
+    Split conformal prediction with trajectories as groups, whose distributions are pooled. The
+    further trajectory, the (K + 1)-th, is one of the groups: it is taken to be as bad as the worst
+    of the K measured ones. A guarantee would take it to be outside altogether, so that fewer than
+    nine trajectories gave no finite factor; this is an estimate.
 
     Parameters
     ----------
@@ -160,8 +160,8 @@ def measure_widening(
     Returns
     -------
     float
-        At least 1, since bands are not narrowed. Infinite if more samples than the quantile leaves
-        out lie outside bands without width.
+        At least 1, since bands are not narrowed. Infinite if more than a tenth of the samples lie
+        outside bands without width.
 
     Raises
     ------
@@ -185,8 +185,7 @@ def measure_widening(
         width = np.where(error >= 0, high - middle, middle - low)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratios.append(np.where(error == 0, 0.0, np.abs(error) / width).ravel())
-    level = min(1.0, 0.9 * (len(ratios) + 1) / len(ratios))
-    return max(1.0, grouped_quantile(ratios, level))
+    return max(1.0, further_group_quantile(ratios, 0.9))
 
 
 def _checked(twin: Twin, trajectories: Trajectories, rate: float | None, draws: int) -> int:
