@@ -124,7 +124,8 @@ class SourceResults(Scored):
     title : str
         The name in tables.
     intervals : dict of str to Interval
-        The 95 % bootstrap interval over test trajectories of a metric's mean over runs.
+        The 95 % interval over test trajectories of a metric's mean over the runs at hand; of a
+        study without classes with few records, over other stretches of these.
     confusion : list of list of int
         Counts (true class, predicted class), summed over runs.
     predictions : list of list of int
@@ -160,7 +161,7 @@ class SourceResults(Scored):
     notes: list[str] = []
 
     def interval(self, metric: str) -> tuple[float, float] | None:
-        """The bootstrap interval of a metric; None if there is none."""
+        """The interval of a metric; None if there is none."""
         return _finite(self.intervals.get(metric))
 
     def generation_seconds(self, trajectories: int) -> float | None:
@@ -196,7 +197,7 @@ class CurvePoint(Scored):
         return {**made.pop("scores"), **made, **intervals}
 
     def interval(self, metric: str) -> tuple[float, float] | None:
-        """The bootstrap interval of a metric; None if there is none."""
+        """The interval of a metric; None if there is none."""
         return _finite(self.intervals.get(metric))
 
 
@@ -235,8 +236,22 @@ class ChannelNames(Part):
 class Comparison(Part):
     """A pair of sources on one metric: `mean_diff` is the mean of `a` minus that of `b`.
 
-    `t`, `df` and `p` are Welch's over runs, `p_holm` is adjusted over the family of metrics, and
-    `bootstrap_ci95` is the paired bootstrap interval over test trajectories.
+    Attributes
+    ----------
+    t, df, p : float
+        Welch's test over runs.
+    p_holm : float
+        The same adjusted over the family of metrics.
+    bootstrap_ci95 : Interval
+        The paired bootstrap interval over test trajectories and, from five runs on, over runs.
+    p_bootstrap : float
+        The two-sided p-value of these draws.
+    p_verdict : float
+        The same adjusted over all pairs on this metric; None for a pair without a verdict.
+    no_verdict : str
+        Why there is none, see `retwin.scores.comparison.no_verdict`; "" for a pair that has one,
+        and None in files of versions that did not state it.
+
     """
 
     a: str
@@ -248,6 +263,9 @@ class Comparison(Part):
     p: float | None = None
     p_holm: float | None = None
     bootstrap_ci95: Interval | None = None
+    p_bootstrap: float | None = None
+    p_verdict: float | None = None
+    no_verdict: str | None = None
 
     @property
     def interval(self) -> tuple[float, float] | None:
@@ -270,7 +288,7 @@ class Comparison(Part):
 
 
 class FidelityFigure(Part):
-    """A figure with its bootstrap interval, and its p-value under a perfect generator."""
+    """A figure with its interval over trajectories, and its p-value under a perfect generator."""
 
     value: Number = math.nan
     interval: Interval | None = None

@@ -244,7 +244,11 @@ def test_a_study_of_a_case_of_ones_own(call, own: Path, words: tuple, printed: s
     for source in printed_again["sources"].values():
         assert source.keys() in ({"title", *SCORES}, {"title", *ERRORS})
     assert all(
-        each.keys() == {"a", "b", "metric", "mean_diff", "bootstrap_ci95"}
+        each.keys()
+        == {
+            *("a", "b", "metric", "mean_diff", "bootstrap_ci95"),
+            *("p_verdict", "no_verdict", "outcome"),
+        }
         for each in printed_again["comparisons"]
     )
     page = own / "study" / "report.html"

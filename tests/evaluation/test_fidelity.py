@@ -97,7 +97,7 @@ def test_the_truth_scores_best(truth: Fidelity) -> None:
 
 @pytest.mark.parametrize(
     ("twin", "narrower", "auroc"),
-    [(Walk(0.5), True, 0.6), (Walk(2.0), False, 0.6), (Walk(correlation=0.0), None, 0.9)],
+    [(Walk(0.5), True, 0.8), (Walk(2.0), False, 0.8), (Walk(correlation=0.0), None, 0.95)],
     ids=["too narrow", "too wide", "white"],
 )
 def test_other_generators_are_detected(
@@ -106,10 +106,12 @@ def test_other_generators_are_detected(
     figures = measure_fidelity(twin, real[:12], draws=DRAWS, seed=3).figures
     coverage = figures["coverage90"]
     if narrower is not None:
-        assert coverage.interval[1] < 0.85 if narrower else coverage.interval[0] > 0.95
+        # Twelve trajectories within a band do not exclude that a thirteenth is outside.
+        assert coverage.interval[1] < 0.85 if narrower else coverage.value > 0.95
         assert figures["pit"].p <= 0.02
     assert figures["ks/noise_x"].p == pytest.approx(0.05)
-    assert figures["auroc"].interval[0] > auroc
+    assert figures["auroc"].value > auroc
+    assert figures["auroc"].interval[0] > 0.5
 
 
 def test_dependent_samples_do_not_make_the_truth_look_bad() -> None:
@@ -170,7 +172,8 @@ def test_outputs_of_different_units_are_standardised(real: rt.Trajectories) -> N
 
 def test_widening_is_one_for_the_truth_and_more_for_one_too_narrow() -> None:
     kept, others = measured(60, seed=7), measured(60, seed=8)
-    assert measure_widening(Walk(), kept, draws=200, seed=0) == pytest.approx(1, abs=0.1)
+    assert 1 <= measure_widening(Walk(), kept, draws=200, seed=0) <= 1.15
+    assert measure_widening(Walk(2.0), kept, draws=200, seed=0) == 1, "bands are not narrowed"
     narrow = Walk(0.5)
     factor = measure_widening(narrow, kept, draws=200, seed=0)
     assert factor == pytest.approx(2, rel=0.1)
@@ -226,8 +229,25 @@ def test_same_seed_same_bytes_kept_joined_and_read_again(
     assert "auroc" not in back.figures, "five trajectories train no classifier"
 
 
-def test_one_trajectory_has_no_interval(real: rt.Trajectories) -> None:
-    figures = measure_fidelity(Walk(), real[:1], draws=20, seed=0).figures
+def test_bands_widened_by_two_trajectories_are_hardly_too_narrow() -> None:
+    """Bands of 0.7 times the true width, widened by pairs, cover 0.89 on average, not 0.87.
+
+    The mean is compared with 0.87 less five standard errors, so that chance does not fail it.
+    """
+    covered = []
+    for seed in range(30):
+        factor = measure_widening(Walk(0.7), measured(2, seed=seed), draws=60, seed=seed)
+        others = measured(4, seed=100 + seed)
+        low, high = (others.nominal + sign * 0.7 * factor * norm.ppf(0.95) for sign in (-1, 1))
+        covered.append(np.mean((low <= others.observed) & (others.observed <= high)))
+    error = np.std(covered, ddof=1) / np.sqrt(30)
+    assert error < 0.02
+    assert np.mean(covered) > 0.87 - 5 * error
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_few_trajectories_have_no_interval(real: rt.Trajectories, count: int) -> None:
+    figures = measure_fidelity(Walk(), real[:count], draws=20, seed=0).figures
     assert all(each.interval is None for each in figures.values())
     assert np.isfinite([each.value for each in figures.values()]).all()
 
@@ -276,7 +296,7 @@ def test_mean_only_is_the_mean_of_the_draws(
     [
         ({"labels": np.array(["Healthy", "Stuck"])}, {}, "1 of them with a fault"),
         ({"mask": np.zeros((2, STEPS, 2), dtype=bool)}, {}, "one that was never measured"),
-        ({"rate": 20.0}, {}, r"trajectories\.rate: expected what the twin has, 10"),
+        ({"rate": 20.0}, {}, r"trajectories\.rate: expected that of the twin, 10"),
         ({}, {"draws": 5}, "at least 19"),
         ({}, {"rate": 3.0}, "a whole part of it"),
         ({}, {"rate": 0.0}, "a whole part of it"),

@@ -79,6 +79,7 @@ def _source(rng: np.random.Generator, truth: NDArray, skill: float, runs: int) -
 
 def _comparison(sources: dict[str, Any], a: str, b: str, metric: str) -> dict[str, Any]:
     difference = float(np.mean(sources[a][metric]) - np.mean(sources[b][metric]))
+    few = len(sources[a][metric]) < 5
     width = 0.02 if metric == "auroc" else 0.08
     family = metric in ("macro_f1", "balanced_accuracy", "auroc")
     return {
@@ -91,6 +92,9 @@ def _comparison(sources: dict[str, Any], a: str, b: str, metric: str) -> dict[st
         "p": 0.0000123,
         "p_holm": 0.0000369 if family else None,
         "bootstrap_ci95": [difference - width, difference + width],
+        "p_bootstrap": 0.0002,
+        "p_verdict": None if few else 0.0006,
+        "no_verdict": "few runs" if few else "",
     }
 
 

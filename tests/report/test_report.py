@@ -256,6 +256,46 @@ def test_verdict_worse_whichever_way_the_pair_is_given(study: Study, write: Writ
     assert "−0.150 to −0.050" in text
 
 
+def test_better_needs_the_p_value_over_all_pairs(study: Study, write: Write) -> None:
+    for each in study[0]["comparisons"]:
+        each["p_verdict"] = 0.06
+    text = read(write(study)).text
+    assert "is better than" not in text
+    assert "cannot be distinguished from" in text
+
+
+def test_few_runs_get_no_verdict(single: Study, write: Write) -> None:
+    text = read(write(single)).text
+    assert "No verdict, since a verdict needs at least 5 runs." in text
+    assert "which does not contain the randomness of training" in text
+    assert "is better than" not in text
+
+
+def test_intervals_without_runs_of_older_files_get_no_verdict(study: Study, write: Write) -> None:
+    for each in study[0]["comparisons"]:
+        for name in ("p_bootstrap", "p_verdict", "no_verdict"):
+            del each[name]
+    text = read(write(study)).text
+    assert "a version whose intervals do not contain the runs" in text
+    assert "is better than" not in text
+
+
+@pytest.mark.parametrize("kind", ["transductive", "labelled"])
+def test_a_source_on_other_data_is_not_called_ahead(study: Study, write: Write, kind: str) -> None:
+    """The best source is named only among those that see the same kind of real data."""
+    sources = study[0]["sources"]
+    sources["ibg"]["macro_f1"] = [0.99] * 10
+    row = next(
+        each
+        for each in study[0]["comparisons"]
+        if (each["a"], each["b"], each["metric"]) == ("ibg_rg", "ibg", "macro_f1")
+    )
+    row["mean_diff"], row["bootstrap_ci95"] = -0.2, [-0.3, -0.1]
+    assert "IBG alone is better than" in read(write(study)).text.replace("Of the sources", "")
+    sources["ibg"]["real_data"] = kind
+    assert "Of the sources that use comparable data" not in read(write(study)).text
+
+
 def test_no_verdict_without_intervals(study: Study, write: Write) -> None:
     for each in study[0]["comparisons"]:
         each["bootstrap_ci95"] = None

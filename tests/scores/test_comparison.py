@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from statsmodels.stats.multitest import multipletests
 
-from retwin.scores.comparison import compare_runs, compliance, holm, outcome
+from retwin.scores.comparison import compare_runs, compliance, holm, no_verdict, outcome
 
 pytestmark = pytest.mark.numerical
 
@@ -44,19 +44,36 @@ def test_holm_is_statsmodels_s(p: list[float]) -> None:
     np.testing.assert_allclose(holm(p), multipletests(p, method="holm")[1], atol=1e-12)
 
 
-def test_better_needs_an_interval_without_zero() -> None:
-    assert [outcome(each, 1) for each in ((0.1, 0.2), (-0.1, 0.2), (-0.2, -0.1), None)] == [
-        "better",
-        "open",
-        "worse",
-        "",
-    ]
-    assert outcome((0.1, 0.2), -1) == "worse"
-    assert outcome((0.1, 0.2), 0) == ""
+def test_better_needs_an_interval_without_zero_and_a_small_p_over_all_pairs() -> None:
+    intervals = ((0.1, 0.2), (-0.1, 0.2), (-0.2, -0.1), None)
+    assert [outcome(each, 0.01, 1) for each in intervals] == ["better", "open", "worse", ""]
+    assert outcome((0.1, 0.2), 0.06, 1) == "open"
+    assert outcome((0.1, 0.2), None, 1) == "", "a pair without a verdict"
+    assert outcome((0.1, 0.2), 0.01, -1) == "worse"
+    assert outcome((0.1, 0.2), 0.01, 0) == ""
+
+
+@pytest.mark.parametrize(
+    ("runs", "records", "kinds", "reason"),
+    [
+        (5, None, ("healthy", "none"), ""),
+        (4, None, ("healthy", "none"), "few runs"),
+        (5, 8, ("healthy", "timing"), ""),
+        (5, 7, ("healthy", "timing"), "few records"),
+        (5, None, ("transductive", "unlabelled"), "different data"),
+        (5, None, ("labelled", "transductive"), "different data"),
+        (5, None, ("labelled", "labelled"), ""),
+    ],
+)
+def test_which_pairs_get_a_verdict(
+    runs: int, records: int | None, kinds: tuple[str, str], reason: str
+) -> None:
+    assert no_verdict(runs=runs, records=records, real_data=kinds) == reason
 
 
 def test_a_requirement_is_open_where_only_the_interval_meets_it() -> None:
-    assert compliance(0.9, None, 0.85, 0.95) == "holds"
+    assert compliance(0.9, (0.8, 0.97), 0.85, 0.95) == "holds"
     assert compliance(0.8, (0.75, 0.86), 0.85, 0.95) == "open"
     assert compliance(0.8, (0.75, 0.84), 0.85, 0.95) == "fails"
-    assert compliance(0.8, None, 0.85) == "fails"
+    assert compliance(0.9, None, 0.85, 0.95) == "open", "nothing is shown without an interval"
+    assert compliance(0.8, None, 0.85) == "open"

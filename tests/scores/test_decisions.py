@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest
+from scipy.stats import binom, norm
 
 from retwin.scores.decisions import decide
-from retwin.scores.intervals import share_interval
 
 pytestmark = pytest.mark.numerical
 
@@ -57,7 +56,47 @@ def test_costs_follow_from_the_rates() -> None:
     assert cost.total == pytest.approx(90 + 50 * 50)
 
 
-@pytest.mark.parametrize(("count", "n"), [(0, 9), (3, 9), (9, 9), (1, 1)])
-def test_intervals_of_shares_are_scipy_s(count: int, n: int) -> None:
-    wanted = binomtest(count, n).proportion_ci()
-    assert share_interval(count, n) == pytest.approx((wanted.low, wanted.high))
+@pytest.mark.parametrize(("healthy", "rate"), [(20, 0.1), (40, 0.3)])
+def test_ranges_contain_the_rates_of_a_known_detector(healthy: int, rate: float) -> None:
+    """Healthy values are standard normal, faulty ones 1.5 higher.
+
+    For the detection at exactly the rate, the interval at the threshold covers 0.4 to 0.7.
+    """
+    rng, shift, studies = np.random.default_rng(0), 1.5, 200
+    truth = np.repeat([0, 1], [healthy, 80])
+    hits = np.zeros(3)
+    for _ in range(studies):
+        fault = norm.cdf(rng.standard_normal(healthy + 80) + shift * truth - 1)
+        probabilities = np.stack([1 - fault, fault, 0 * fault], axis=1)
+        found = decide(probabilities, truth, CLASSES, rate)
+        threshold = norm.ppf(found.threshold) + 1
+        for i, (ends, true) in enumerate(
+            (
+                (found.interval, norm.sf(threshold - shift)),
+                (found.false_alarms, norm.sf(threshold)),
+                (found.at_rate, norm.sf(norm.isf(rate) - shift)),
+            )
+        ):
+            hits[i] += ends[0] <= true <= ends[1]
+    assert (hits >= binom.ppf(1e-6, studies, 0.95)).all()
+
+
+def test_many_healthy_trajectories_leave_the_interval_of_the_share() -> None:
+    rng = np.random.default_rng(1)
+    fault = rng.beta(1, 4, size=20_000)
+    probabilities = np.stack([1 - fault, fault, 0 * fault], axis=1)
+    probabilities = np.concatenate([probabilities, [[0.1, 0.9, 0.0]] * 30 + [[0.9, 0.1, 0.0]] * 5])
+    truth = np.repeat([0, 1], [20_000, 35])
+    found = decide(probabilities, truth, CLASSES, 0.1)
+    assert found.at_rate == pytest.approx(found.interval, abs=1e-6)
+    assert found.false_alarms == pytest.approx((0.1, 0.1), abs=0.006)
+
+
+def test_everything_or_nothing_detected_has_an_open_end() -> None:
+    healthy = np.linspace(0.1, 0.5, 99)
+    for fault, end, value in ((0.9, 1, 1.0), (0.01, 0, 0.0)):
+        values = np.append(healthy, [fault] * 9)
+        probabilities = np.stack([1 - values, values, 0 * values], axis=1)
+        found = decide(probabilities, np.repeat([0, 1], [99, 9]), CLASSES, 0.2)
+        assert found.at_rate[end] == value
+        assert found.at_rate == pytest.approx(found.interval, abs=1e-6)

@@ -13,6 +13,7 @@ from retwin.scores.distributions import (
     central_band,
     crps,
     cumulative_counts,
+    further_group_quantile,
     grouped_quantile,
     inside,
     ks_distance,
@@ -72,6 +73,14 @@ def test_every_group_has_the_same_weight_in_a_quantile() -> None:
     assert grouped_quantile(groups, 0.5) == 0
     assert grouped_quantile(groups, 0.51) == 1
     assert grouped_quantile([np.arange(1, 11)], 0.9) == 9
+
+
+def test_a_further_group_is_as_large_as_the_largest() -> None:
+    """Of 0.1 to 1.0 and 1.1 to 2.0: 18 of 20 values, then 9 of 10 with two thirds above 1."""
+    groups = [np.arange(1, 11) / 10, 1 + np.arange(1, 11) / 10]
+    assert grouped_quantile(groups, 0.9) == pytest.approx(1.8)
+    assert further_group_quantile(groups, 0.9) == pytest.approx(1.9)
+    assert further_group_quantile(groups[:1], 0.9) == grouped_quantile(groups[:1], 0.9)
 
 
 def test_ks_distances_are_scipys() -> None:

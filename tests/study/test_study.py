@@ -67,6 +67,8 @@ def test_results_follow_the_schema(finished: tuple[dict, Path], case: rt.Case) -
         low, high = row["bootstrap_ci95"]
         assert low <= row["mean_diff"] + 1e-9
         assert row["mean_diff"] - 1e-9 <= high
+        assert (row["p_verdict"], row["no_verdict"]) == (None, "few runs"), "two runs"
+        assert 0 < row["p_bootstrap"] <= 1
     found = results["fidelity"]["ibg_rg"]
     assert (found["trajectories"], found["movements"]) == (10, 50)
     assert found["rivals"] == ["mean_only", "single_gaussian"]

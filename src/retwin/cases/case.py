@@ -86,8 +86,8 @@ class Case:
     parametric : ParametricTwin or None
         The twin with its uncertain parameters free, for identification; None if there are none.
     encoder_noise : callable or None
-        Adds the encoder noise of frozen actuators (trajectories, standard deviation in command
-        units, seed); None if its effect on the outputs is not known.
+        Adds the encoder noise of the actuators to all trajectories alike (trajectories, amplitude
+        in command units, seed); None if its effect on the outputs is not known.
     published : mapping of str to mapping of str to str
         Figures of a paper, shown beside the results: source to metric to text.
     body : Body or None

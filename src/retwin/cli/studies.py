@@ -25,6 +25,8 @@ __all__ = ["demo", "report", "study"]
 
 COLUMNS = {name: metric.head for name, metric in catalog.METRICS.items() if metric.head}
 """Scores that are shown, and the heads of their columns."""
+VERDICTS = {"better": "better", "worse": "worse", "open": "undecided"}
+"""Outcomes of a comparison in words."""
 data_option, compared_option = (
     partial(typer.Option, rich_help_panel=panel)
     for panel in (
@@ -97,7 +99,7 @@ def study(
         bool, compared_option("--random-onset", metavar="", help="Draw the onset of stuck motors.")
     ] = False,
     encoder_noise: Annotated[
-        float, compared_option(metavar="X", help="Noise on frozen joints, in command units.")
+        float, compared_option(metavar="X", help="Encoder noise on all joints, in command units.")
     ] = 0.0,
     learning_curve: Annotated[
         bool,
@@ -210,6 +212,8 @@ def _run(
 
 def _summary(results: Results, page: Path) -> dict[str, Any]:
     """The contents of the table as JSON; everything else is in results.json."""
+    from retwin.report.verdict import outcome_of
+
     shown = _metrics(results)
     return {
         "title": results.title,
@@ -222,7 +226,12 @@ def _summary(results: Results, page: Path) -> dict[str, Any]:
             for name, source in results.sources.items()
         },
         "comparisons": [
-            row.model_dump(include={"a", "b", "metric", "mean_diff", "bootstrap_ci95"})
+            row.model_dump(
+                include={
+                    *("a", "b", "metric", "mean_diff", "bootstrap_ci95", "p_verdict", "no_verdict")
+                }
+            )
+            | {"outcome": outcome_of(row)}
             for row in results.comparisons
         ],
         "report": str(page),
@@ -268,11 +277,15 @@ def _over_runs(values: list[float]) -> str:
 
 
 def _differences(results: Results) -> list[str]:
-    """The difference of each source from the plain twin, with its interval."""
+    """The difference of each source from the plain twin, with its interval and verdict."""
+    from retwin.report.labels import reason
+    from retwin.report.verdict import outcome_of
+
     first, metric = next(iter(results.sources)), "macro_f1" if results.classes else "nrmse"
     return [
         f"{row.a} - {first}, {COLUMNS[metric]}: {row.mean_diff:+.3f} "
-        f"(95 % bootstrap interval {row.interval[0]:+.3f} to {row.interval[1]:+.3f})"
+        f"(95 % bootstrap interval {row.interval[0]:+.3f} to {row.interval[1]:+.3f}): "
+        f"{VERDICTS.get(outcome_of(row)) or 'no verdict, since ' + reason(row)}"
         for row in results.comparisons
         if row.b == first and row.metric == metric and row.interval is not None
     ]

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from retwin.cases.case import Case
     from retwin.data.trajectories import Channels
     from retwin.twins.limits import Limits
-    from retwin.twins.samplers import CommandSampler
     from retwin.twins.twin import Twin
 
 __all__ = ["app"]

@@ -11,6 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.catalog import METRICS, SOURCES, selected_metrics
+from retwin.results import Comparison
+from retwin.scores.bootstrap import MIN_RECORDS
+from retwin.scores.comparison import MIN_RUNS
 
 __all__ = [
     "MAIN",
@@ -28,6 +31,7 @@ __all__ = [
     "p_value",
     "quantity",
     "real_data",
+    "reason",
     "signed",
     "source_in_sentence",
     "source_name",
@@ -43,6 +47,14 @@ MAIN = tuple(name for name, metric in METRICS.items() if metric.headline)
 """The metrics that summarise a study."""
 SELECTED = selected_metrics(simulated=False)
 """The metrics of diagnoses that are shown of many sources."""
+NO_VERDICT = {
+    "few runs": f"a verdict needs at least {MIN_RUNS} runs",
+    "few records": f"a verdict over records needs at least {MIN_RECORDS} of them",
+    "different data": "only one of the two uses labelled trajectories or outputs of the test set",
+    None: "these results come from a version whose intervals do not contain the runs; "
+    "run `retwin study` with this folder as --out again",
+}
+"""Why a pair has no verdict, by `retwin.results.Comparison.no_verdict`."""
 REAL_DATA = {
     "none": "none",
     "timing": "timing of commands",
@@ -118,6 +130,11 @@ def counted(count: int, what: str) -> str:
 def real_data(text: str | None) -> str:
     """The real data that a source learns from."""
     return "not stated" if text is None else REAL_DATA.get(text, text)
+
+
+def reason(comparison: Comparison) -> str:
+    """Why a comparison has no verdict; "" where it has one."""
+    return NO_VERDICT.get(comparison.no_verdict, "")
 
 
 def number(value: float | None, digits: int = 3) -> str:

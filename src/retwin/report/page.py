@@ -24,6 +24,8 @@ from retwin.report.sections import sections_of
 from retwin.report.study import Study, read_study
 from retwin.report.style import CHROME, PALETTE, colour_of, symbol
 from retwin.report.verdict import claims, outcome_of, verdict
+from retwin.scores.bootstrap import MIN_RECORDS
+from retwin.scores.comparison import MIN_RUNS
 from retwin.serialisation.files import write_atomically
 
 __all__ = ["FIGURES", "render", "write_report"]
@@ -57,6 +59,7 @@ FILTERS = {
     "source_name": labels.source_name,
     "span": labels.span,
     "outcome": outcome_of,
+    "reason": labels.reason,
     "one_line": lambda text: Markup(" ").join(text.split()),
 }
 """What templates apply to values; see `retwin.report.labels`."""
@@ -115,6 +118,8 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
     environment.globals |= {
         "results": study.results,
         "word": study.word,
+        "min_runs": MIN_RUNS,
+        "min_records": MIN_RECORDS,
         "anchors": {section.key for section in sections},
         "images": {name: base64.b64encode(data).decode() for name, data in images.items()},
         "colour_of": colour_of,

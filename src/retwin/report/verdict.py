@@ -13,7 +13,7 @@ from retwin.catalog import METRICS
 from retwin.report.labels import MAIN, order, with_role
 from retwin.report.study import Study
 from retwin.results import Comparison, Results
-from retwin.scores.comparison import compliance, outcome
+from retwin.scores.comparison import alike, compliance, outcome
 
 __all__ = ["Claim", "claims", "headline", "outcome_of", "verdict"]
 
@@ -50,7 +50,7 @@ class Claim:
 def outcome_of(comparison: Comparison) -> str:
     """The outcome of a comparison, see `retwin.scores.comparison.outcome`."""
     known = METRICS.get(comparison.metric)
-    return outcome(comparison.interval, known.better if known else 0)
+    return outcome(comparison.interval, comparison.p_verdict, known.better if known else 0)
 
 
 def headline(results: Results) -> tuple[str, str] | None:
@@ -70,16 +70,18 @@ def headline(results: Results) -> tuple[str, str] | None:
 def verdict(study: Study) -> dict[str, Any] | None:
     """The values of up to three sentences; None where no interval is known.
 
-    `first` is the comparison of the headline's pair on the first metric that has an outcome,
-    `others` those on the other main metrics, `rival` that of the best other source with the
-    updated twin, and `surrogate` that of the updated twin with the surrogate alone.
+    `first` is the comparison of the headline's pair on the first metric with an interval and a
+    direction, `others` those with an outcome on the other main metrics, `rival` that of the best
+    other source on comparable data with the updated twin, and `surrogate` that of the updated twin
+    with the surrogate alone.
     """
     results = study.results
     pair = headline(results)
     if pair is None:
         return None
     found = results.compared(*pair)
-    metric = next((name for name in METRICS if name in found and outcome_of(found[name])), None)
+    directed = [name for name, each in METRICS.items() if each.better and name in found]
+    metric = next((name for name in directed if found[name].interval is not None), None)
     if metric is None:
         return None
     alone = [results.compared(pair[0], name) for name in with_role(results.sources, "surrogate")]
@@ -98,13 +100,18 @@ def verdict(study: Study) -> dict[str, Any] | None:
 
 
 def _rival(results: Results, metric: str, pair: tuple[str, str]) -> Comparison | None:
-    """The comparison of the source with the best mean, if that is better than the updated one."""
+    """The comparison of the source with the best mean, if that is better than the updated one.
+
+    Only sources that see the same kind of real data as the updated one take part.
+    """
+    seen = results.sources[pair[0]].real_data
+    rivals = [name for name, each in results.sources.items() if alike(each.real_data, seen)]
 
     def rank(name: str) -> float:
         value = METRICS[metric].better * results.sources[name].mean(metric)
         return value if math.isfinite(value) else -np.inf
 
-    best = max(results.sources, key=rank)
+    best = max(rivals, key=rank)
     if best in pair or rank(best) <= rank(pair[0]):
         return None
     return results.compared(best, pair[0]).get(metric)

@@ -55,13 +55,30 @@ def calibration_error(happened: NDArray, probability: NDArray) -> float:
     Returns
     -------
     float
-        The mean absolute difference of mean probability and frequency per bin, in [0, 1].
+        The mean absolute difference of mean probability and frequency per bin, in [0, 1]. Events of
+        equal probability share their frequency, so that the order of the events has no effect.
 
     """
     order = np.argsort(probability, kind="stable")
-    bins = np.array_split(order, min(BINS, len(order)))
-    errors = [abs(probability[part].mean() - happened[part].mean()) * len(part) for part in bins]
-    return float(sum(errors) / len(probability))
+    confidence = probability[order]
+    frequency = _shared_frequency(happened[order], confidence)
+    return float(_binned_error(frequency, confidence))
+
+
+def _shared_frequency(happened: NDArray, probability: NDArray) -> NDArray:
+    """Mean (..., n) of what happened (..., n) over the events of equal, sorted probability (n,)."""
+    _, begins, counts = np.unique(probability, return_index=True, return_counts=True)
+    sums = np.add.reduceat(np.asarray(happened, dtype=float), begins, axis=-1)
+    shares: NDArray = np.repeat(sums / counts, counts, axis=-1)
+    return shares
+
+
+def _binned_error(frequency: NDArray, probability: NDArray) -> NDArray:
+    """Calibration error (...) of frequencies (..., n) of events of sorted probability (n,)."""
+    difference = frequency - probability
+    bins = np.array_split(np.arange(len(probability)), min(BINS, len(probability)))
+    errors: NDArray = np.sum([np.abs(difference[..., part].sum(axis=-1)) for part in bins], axis=0)
+    return errors / len(probability)
 
 
 def calibration_floor(probabilities: NDArray, *, draws: int = 200) -> float:
@@ -78,19 +95,15 @@ def calibration_floor(probabilities: NDArray, *, draws: int = 200) -> float:
     Returns
     -------
     float
-        The error that comes from the finite number of trajectories alone.
+        The error that comes from the finite number of trajectories alone. It depends on the
+        confidences: about √(20 c (1 - c) / (π n)) for n trajectories of about the confidence c.
 
     """
     rng = np.random.default_rng(0)
     floors = []
     for confidence in np.sort(probabilities.max(axis=2), axis=1):
         correct = rng.random((draws, len(confidence))) < confidence
-        errors = np.zeros(draws)
-        for part in np.array_split(np.arange(len(confidence)), BINS):
-            if len(part):
-                error = correct[:, part].mean(axis=1) - confidence[part].mean()
-                errors += len(part) / len(confidence) * np.abs(error)
-        floors.append(errors.mean())
+        floors.append(_binned_error(_shared_frequency(correct, confidence), confidence).mean())
     return float(np.mean(floors))
 
 
@@ -114,11 +127,12 @@ def reliability(probabilities: NDArray, truth: NDArray) -> Reliability:
     bins = max(1, min(BINS, len(truth) // PER_BIN))
     confidence, accuracy, drawn = [], [], []
     for run in probabilities:
-        top = run.max(axis=1)
-        correct = run.argmax(axis=1) == truth
-        parts = np.array_split(np.argsort(top, kind="stable"), bins)
+        order = np.argsort(run.max(axis=1), kind="stable")
+        top, parts = run.max(axis=1)[order], np.array_split(np.arange(len(truth)), bins)
+        correct = _shared_frequency((run.argmax(axis=1) == truth)[order], top)
+        perfect = _shared_frequency(uniform[:, order] < top, top)
         confidence.append([top[part].mean() for part in parts])
         accuracy.append([correct[part].mean() for part in parts])
-        drawn.append([(uniform[:, part] < top[part]).mean(axis=1) for part in parts])
+        drawn.append([perfect[:, part].mean(axis=1) for part in parts])
     low, high = np.quantile(np.mean(drawn, axis=0), [0.05, 0.95], axis=1)
     return Reliability(np.mean(confidence, axis=0), np.mean(accuracy, axis=0), low, high)

@@ -34,8 +34,9 @@ class Scores:
     healthy_recall : float
         Share of healthy trajectories that are recognised.
     ece : float
-        Expected calibration error of the top label, 10 bins of equal mass; its noise floor is about
-        0.04 at 90 trajectories and 0.06 at 36.
+        Expected calibration error of the top label, 10 bins of equal mass; its noise floor depends
+        on the number of trajectories and their confidence, see
+        `retwin.scores.calibration.calibration_floor`.
     ece_classwise : float
         The expected calibration error of each class's probability, averaged over all classes, 10
         bins of equal mass each. It detects a class whose probability is always too low, which the
@@ -172,11 +173,8 @@ def weighted_score(
     if metric == "auroc_micro":
         return _auroc_micro(truth, probabilities, weights)
     count = len(classes)
-    cells = np.zeros((len(truth), count * count))
-    cells[np.arange(len(truth)), truth * count + probabilities.argmax(axis=1)] = 1
-    table = (weights @ cells).reshape(len(weights), count, count)
-    correct = np.diagonal(table, axis1=1, axis2=2)
-    actual, predicted = table.sum(axis=2), table.sum(axis=1)
+    members, answers = np.eye(count)[truth], np.eye(count)[probabilities.argmax(axis=1)]
+    actual, predicted, correct = (weights @ each for each in (members, answers, members * answers))
     occurs = np.isin(np.arange(count), truth)
     with np.errstate(invalid="ignore", divide="ignore"):
         recall = correct / actual

@@ -1,7 +1,8 @@
 """Whether one source is better than another: Welch's test, Holm's adjustment, intervals.
 
-Welch's test over runs measures the randomness of training only. A statement that one source is
-better rests on the paired bootstrap interval over test trajectories (`retwin.scores.bootstrap`).
+Welch's test over runs measures the randomness of training only. A verdict that one source is
+better rests on paired bootstrap draws over test trajectories and runs (`retwin.scores.bootstrap`),
+adjusted over all pairs, and on the conditions of `no_verdict`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-__all__ = ["compare_runs", "compliance", "holm", "outcome"]
+from retwin.scores.bootstrap import MIN_RECORDS
+
+__all__ = ["MIN_RUNS", "alike", "compare_runs", "compliance", "holm", "no_verdict", "outcome"]
+
+MIN_RUNS = 5
+"""Least number of runs for a verdict: fewer do not show the randomness of training."""
+SIGNIFICANCE = 0.05
+"""Adjusted p-value up to which a difference is decided."""
+APART = ("transductive", "labelled")
+"""Real data whose use makes a source comparable only with sources that use the same."""
 
 
 def compare_runs(a: Sequence[float], b: Sequence[float]) -> dict[str, float | None]:
@@ -74,26 +84,58 @@ def holm(p: Sequence[float]) -> list[float]:
     return out.tolist()
 
 
-def outcome(interval: tuple[float, float] | None, better: int) -> str:
-    """What the interval of a difference shows.
+def alike(*real_data: str | None) -> bool:
+    """Whether sources that see these real data may be compared: like with like only."""
+    return len({kind if kind in APART else "" for kind in real_data}) == 1
+
+
+def no_verdict(*, runs: int, records: int | None, real_data: Sequence[str]) -> str:
+    """Why a pair of sources gets no verdict.
+
+    Parameters
+    ----------
+    runs : int
+        Runs of each source.
+    records : int, optional
+        Test records of a study without classes; None for a study with classes.
+    real_data : sequence of str
+        The real data that each of the two sees, see `retwin.catalog.SourceEntry`.
+
+    Returns
+    -------
+    str
+        "different data", "few records", "few runs", or "" for a pair that gets a verdict.
+
+    """
+    if not alike(*real_data):
+        return "different data"
+    if records is not None and records < MIN_RECORDS:
+        return "few records"
+    return "few runs" if runs < MIN_RUNS else ""
+
+
+def outcome(interval: tuple[float, float] | None, p: float | None, better: int) -> str:
+    """What the draws of a difference show.
 
     Parameters
     ----------
     interval : (float, float)
-        Lower and upper end; None if there is none.
+        The 95 % interval of the difference; None if there is none.
+    p : float
+        The p-value of no difference, adjusted over all pairs; None for a pair without a verdict.
     better : int
         1 if larger values are better, -1 if smaller ones are, 0 for a target to be met.
 
     Returns
     -------
     str
-        "better" or "worse" if the interval excludes 0, "open" if it includes 0, "" if there is no
-        interval or no direction.
+        "better" or "worse" if the interval excludes 0 and `p` is at most 0.05, else "open"; "" if
+        there is no interval, no verdict or no direction.
 
     """
-    if interval is None or better == 0:
+    if interval is None or p is None or better == 0:
         return ""
-    if interval[0] <= 0 <= interval[1]:
+    if p > SIGNIFICANCE or interval[0] <= 0 <= interval[1]:
         return "open"
     return "better" if (interval[0] > 0) == (better > 0) else "worse"
 
@@ -115,11 +157,12 @@ def compliance(
     Returns
     -------
     str
-        "holds" if the value lies in the range, "open" if only a part of its interval does, else
-        "fails".
+        "open" without an interval; else "holds" if the value lies in the range, "open" if only a
+        part of its interval does, and "fails" if nothing of it does.
 
     """
+    if interval is None:
+        return "open"
     if low <= value <= high:
         return "holds"
-    overlaps = interval is not None and interval[0] <= high and interval[1] >= low
-    return "open" if overlaps else "fails"
+    return "open" if interval[0] <= high and interval[1] >= low else "fails"

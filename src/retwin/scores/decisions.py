@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import bdtr, betainc, betaincinv
 
 from retwin.data.trajectories import HEALTHY
 from retwin.scores.intervals import share_interval
@@ -39,7 +40,13 @@ class Decision:
     detected : float
         Share of faulty trajectories that raise an alarm.
     interval : (float, float)
-        Its 95 % interval (Clopper and Pearson).
+        Its 95 % interval for this threshold (Clopper and Pearson).
+    at_rate : (float, float)
+        The 95 % interval of the share that would be detected at exactly the requested rate. It is
+        wider, since the healthy trajectories show only about where the threshold of that rate is.
+    false_alarms : (float, float)
+        The central 95 % of the false-alarm rate of such a threshold over sets of healthy
+        trajectories; on average it is `guaranteed`.
     identified : float
         Share of these whose fault is diagnosed correctly.
     most_missed : str
@@ -54,6 +61,8 @@ class Decision:
     threshold: float
     detected: float
     interval: tuple[float, float]
+    at_rate: tuple[float, float]
+    false_alarms: tuple[float, float]
     identified: float
     most_missed: str
     most_confused: tuple[str, str] | tuple[()]
@@ -82,7 +91,7 @@ def decide(probabilities: NDArray, truth: NDArray, classes: list[str], rate: flo
     Parameters
     ----------
     probabilities : array (n, classes)
-        Predicted probabilities.
+        Predicted probabilities of one model: the mean over several has other thresholds.
     truth : array (n,)
         True class indices.
     classes : list of str
@@ -103,7 +112,8 @@ def decide(probabilities: NDArray, truth: NDArray, classes: list[str], rate: flo
     rank = math.ceil((1 - rate) * (len(reference) + 1) - 1e-9)
     faulty = truth != healthy
     if rank > len(reference) or not faulty.any():
-        return Decision(rate, 0.0, math.nan, math.nan, (math.nan, math.nan), math.nan, "", ())
+        none = (math.nan, math.nan)
+        return Decision(rate, 0.0, math.nan, math.nan, none, none, none, math.nan, "", ())
     # An alarm needs more than the threshold, so the trajectory that sets it raises none.
     threshold = float(reference[rank - 1]) if rank else -math.inf
     raised = faulty & (fault > threshold)
@@ -119,7 +129,59 @@ def decide(probabilities: NDArray, truth: NDArray, classes: list[str], rate: flo
         threshold=threshold,
         detected=float(raised.sum() / faulty.sum()),
         interval=share_interval(int(raised.sum()), int(faulty.sum())),
+        at_rate=_at_rate(reference, fault[faulty], rate),
+        false_alarms=_false_alarms(rank, len(reference)),
         identified=float((diagnosis == truth)[raised].mean()) if raised.any() else math.nan,
         most_missed=classes[int(missed.argmax())] if missed.any() else "",
         most_confused=(classes[true], classes[answer]) if pairs.any() else (),
     )
+
+
+def _false_alarms(rank: int, n: int) -> tuple[float, float]:
+    """Central 95 % of the false-alarm rate of the threshold at that rank of n healthy ones."""
+    if rank == 0:
+        return 1.0, 1.0
+    low, high = betaincinv(n + 1 - rank, rank, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def _at_rate(reference: NDArray, faulty: NDArray, rate: float) -> tuple[float, float]:
+    """Interval of the share of faulty trajectories that is detected at the false-alarm rate.
+
+    The number of n healthy values below the threshold of the rate is binomial (n, 1 - rate), so
+    that this threshold lies between two neighbours among them. The ends mix the distributions of
+    Clopper and Pearson over these intervals: at their upper neighbour for the lower end, at their
+    lower one for the upper end.
+
+    Parameters
+    ----------
+    reference : array (n,)
+        Probabilities of a fault of the healthy trajectories, increasing.
+    faulty : array (m,)
+        The same of the faulty ones.
+    rate : float
+        The false-alarm rate.
+
+    """
+    from scipy.optimize import brentq
+
+    n, m = len(reference), len(faulty)
+    weights = np.diff(bdtr(np.arange(n + 1), n, 1 - rate), prepend=0.0)
+    found = (faulty > reference[:, None]).sum(axis=1)
+    fewest, most = np.append(found, 0), np.insert(found, 0, m)
+
+    def below(share: float, hits: NDArray, more: int) -> float:
+        """Probability that the detected share is at most `share`, in (0, 1)."""
+        a, b = hits + more, m - hits + 1 - more
+        inside = betainc(np.maximum(a, 1), np.maximum(b, 1), share)
+        return float(weights @ np.where(a == 0, 1.0, np.where(b == 0, 0.0, inside)))
+
+    def end(hits: NDArray, more: int, level: float) -> float:
+        low, high = below(0.0, hits, more), 1 - weights[m - hits + 1 - more == 0].sum()
+        if low >= level:
+            return 0.0
+        if high <= level:
+            return 1.0
+        return float(brentq(lambda share: below(share, hits, more) - level, 0.0, 1.0))
+
+    return end(fewest, 0, 0.025), end(most, 1, 0.975)

@@ -17,6 +17,7 @@ __all__ = [
     "central_band",
     "crps",
     "cumulative_counts",
+    "further_group_quantile",
     "grouped_quantile",
     "inside",
     "ks_distance",
@@ -150,6 +151,15 @@ def grouped_quantile(groups: Sequence[NDArray], level: float) -> float:
     cumulative = np.cumsum(weights[order]) / len(groups)
     # The tolerance allows for the rounding of the sum.
     return float(pooled[order][np.searchsorted(cumulative, level - 1e-9)])
+
+
+def further_group_quantile(groups: Sequence[NDArray], level: float) -> float:
+    """The same for a mixture with one further group, taken to be as large as the largest.
+
+    The largest group is the one with the largest quantile at `level` of its own.
+    """
+    largest = max(groups, key=lambda each: grouped_quantile([each], level))
+    return grouped_quantile([*groups, largest], level)
 
 
 def cumulative_counts(values: NDArray, places: int) -> tuple[NDArray, NDArray]:

@@ -14,18 +14,18 @@ from retwin.catalog import SOURCES, selected_metrics
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.pooled import pool_probabilities
 from retwin.evaluation.fidelity import Simulation, record_means, simulation_scores
-from retwin.scores.bootstrap import bootstrap, bootstrap_means, bootstrap_weights
+from retwin.scores.bootstrap import Draws, Resampling, bootstrap_means
 from retwin.scores.classification import METRICS, confusion, score
 from retwin.study.work import Work
 
 __all__ = ["Answers", "Diagnoses", "Simulations", "answers"]
 
 RESAMPLINGS = 10_000
-"""Bootstrap resamplings of the test set, as docs/theory.md states."""
+"""Bootstrap draws, as docs/theory.md states."""
 
 
 class Answers(Protocol):
-    """Scores of every source, for each run and for each bootstrap resampling of the test set.
+    """Scores of every source, for each run and for each bootstrap draw of the test set.
 
     Attributes
     ----------
@@ -35,6 +35,8 @@ class Answers(Protocol):
         Scores whose p-values are adjusted together (Holm).
     curved : tuple of str
         Scores of a learning curve.
+    records : int or None
+        Test records of a case without classes.
 
     """
 
@@ -42,12 +44,17 @@ class Answers(Protocol):
     family: ClassVar[tuple[str, ...]]
     curved: ClassVar[tuple[str, ...]]
 
+    @property
+    def records(self) -> int | None:
+        """See `Answers`."""
+        ...
+
     def scores(self, source: str, healthy: int = 0) -> dict[str, list[float]]:
         """Each score of a source, with one value per run; `healthy` as in `Job`."""
         ...
 
-    def drawn(self, source: str, healthy: int = 0) -> dict[str, NDArray]:
-        """Each compared score (resamplings,), averaged over runs; paired between sources."""
+    def drawn(self, source: str, healthy: int = 0) -> dict[str, Draws]:
+        """Draws of each compared score's mean over runs; paired between sources."""
         ...
 
     def details(self, source: str) -> dict[str, Any]:
@@ -86,9 +93,14 @@ class Diagnoses:
         return np.array([self.work.case.classes.index(label) for label in labels])
 
     @cached_property
-    def _weights(self) -> NDArray:
+    def _resampling(self) -> Resampling:
         seed = self.work.plan.seed_of("bootstrap", 0)
-        return bootstrap_weights(self._truth, draws=RESAMPLINGS, seed=seed)
+        return Resampling(self._truth, self.work.case.classes, RESAMPLINGS, seed)
+
+    @property
+    def records(self) -> int | None:
+        """See `Answers`."""
+        return None
 
     def _probabilities(self, source: str, healthy: int = 0) -> NDArray:
         members = SOURCES[source].pool
@@ -108,10 +120,10 @@ class Diagnoses:
         runs = [score(self._truth, run, classes) for run in self._probabilities(source, healthy)]
         return {metric: [getattr(each, metric) for each in runs] for metric in METRICS}
 
-    def drawn(self, source: str, healthy: int = 0) -> dict[str, NDArray]:
+    def drawn(self, source: str, healthy: int = 0) -> dict[str, Draws]:
         """See `Answers.drawn`."""
-        runs, classes = self._probabilities(source, healthy), self.work.case.classes
-        return {m: bootstrap(m, self._truth, runs, self._weights, classes) for m in self.compared}
+        runs = self._probabilities(source, healthy)
+        return {metric: self._resampling.of(metric, runs) for metric in self.compared}
 
     def details(self, source: str) -> dict[str, Any]:
         """Confusion counts, rows true, summed over runs; and the predicted class indices."""
@@ -148,6 +160,11 @@ class Simulations:
     def _records(self) -> Trajectories:
         return self.work.files.real_data()[sorted(self.work.roles.tested)]
 
+    @property
+    def records(self) -> int | None:
+        """See `Answers`."""
+        return len(self._records)
+
     def _runs(self, source: str, healthy: int = 0) -> list[Simulation]:
         """A simulation of all test records for each run."""
         jobs = self.work.answers(source, healthy)
@@ -163,7 +180,7 @@ class Simulations:
         runs = [simulation_scores(each, self._records) for each in means]
         return {name: [float(run[name]) for run in runs] for name in runs[0]}
 
-    def drawn(self, source: str, healthy: int = 0) -> dict[str, NDArray]:
+    def drawn(self, source: str, healthy: int = 0) -> dict[str, Draws]:
         """See `Answers.drawn`."""
         seed = self.work.plan.seed_of("bootstrap", 0)
         runs = []
@@ -173,7 +190,8 @@ class Simulations:
             means = bootstrap_means(flat, draws=RESAMPLINGS, seed=seed)
             means = means.reshape(RESAMPLINGS, *values.shape[2:])
             runs.append(simulation_scores(means, self._records))
-        return {name: np.mean([run[name] for run in runs], axis=0) for name in runs[0]}
+        over_runs = {name: np.mean([run[name] for run in runs], axis=0) for name in runs[0]}
+        return {name: Draws(each, each) for name, each in over_runs.items()}
 
     def details(self, source: str) -> dict[str, Any]:
         """Simulations have no other entries."""

@@ -68,9 +68,9 @@ class StudyPlan:
     calibrate_on : str
         "healthy" or "all": the real trajectories from which residual models learn.
     encoder_noise : float
-        Standard deviation of measurement noise added to frozen joints in training and test sets,
-        in command units; 0 leaves the data as they are. Real stuck joints are frozen in software,
-        and a diagnoser could exploit that they do not move at all.
+        Amplitude of encoder noise added to the joints of all trajectories, in training and test
+        sets, in command units; 0 leaves the data as they are. Real stuck joints are frozen in
+        software, and a diagnoser could exploit that they do not move at all.
     learning_curve : bool
         Whether sources that are calibrated on healthy trajectories are also calibrated on fewer.
 

@@ -17,7 +17,8 @@ from retwin.catalog import SOURCES
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.fidelity import Fidelity, Overlay
 from retwin.results import SCHEMA, CurvePoint, Results, SourceResults
-from retwin.scores.comparison import compare_runs, holm
+from retwin.scores.bootstrap import Draws
+from retwin.scores.comparison import MIN_RUNS, compare_runs, holm, no_verdict
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.models import read_about
 from retwin.study.answers import Answers, answers
@@ -84,7 +85,7 @@ def write_results(
             "data": _data(work, real, test, about),
             "sources": sources,
             "published": {} if real.emulated else dict(work.case.published),
-            "comparisons": _comparisons(found, sources, drawn),
+            "comparisons": _comparisons(work, found, sources, drawn),
             "surrogate": _surrogate(work),
             "fidelity": {name: each.as_dict() for name, each in fidelity.items()},
             "learning_curve": _learning_curve(work, found) or None,
@@ -100,24 +101,15 @@ def write_results(
     return results
 
 
-def _source(work: Work, found: Answers, name: str, drawn: Mapping[str, NDArray]) -> SourceResults:
+def _source(work: Work, found: Answers, name: str, drawn: Mapping[str, Draws]) -> SourceResults:
     return SourceResults(
         scores=found.scores(name),
-        intervals={metric: _interval(each) for metric, each in drawn.items()},
+        intervals={metric: each.interval for metric, each in drawn.items()},
         **found.details(name),
         title=SOURCES[name].title,
         real_data=work.sees(name),
         **_costs(work, name),
     )
-
-
-def _interval(drawn: NDArray) -> tuple[float, float] | None:
-    """The central 95 % of the finite draws; None if there are none."""
-    known = drawn[np.isfinite(drawn)]
-    if not len(known):
-        return None
-    low, high = np.quantile(known, [0.025, 0.975]).tolist()
-    return low, high
 
 
 def _costs(work: Work, source: str) -> dict[str, Any]:
@@ -184,7 +176,7 @@ def _learning_curve(work: Work, found: Answers) -> list[CurvePoint]:
         for healthy in (*counts, 0) if counts else ():
             values, drawn = found.scores(source, healthy), found.drawn(source, healthy)
             scores: dict[str, Any] = {metric: values[metric] for metric in found.curved}
-            intervals = {metric: _interval(drawn[metric]) for metric in found.curved}
+            intervals = {metric: drawn[metric].interval for metric in found.curved}
             fidelity = _fidelity_of(work, source, healthy)
             if fidelity is not None:
                 covered = fidelity.figures["coverage90"]
@@ -197,30 +189,54 @@ def _learning_curve(work: Work, found: Answers) -> list[CurvePoint]:
 
 
 def _comparisons(
+    work: Work,
     found: Answers,
     sources: Mapping[str, SourceResults],
-    drawn: Mapping[str, Mapping[str, NDArray]],
+    drawn: Mapping[str, Mapping[str, Draws]],
 ) -> list[dict[str, Any]]:
-    """Every pair of sources, the later one minus the earlier one."""
-    out = []
+    """Every pair of sources, the later one minus the earlier one.
+
+    From `MIN_RUNS` runs on the intervals contain the randomness of training. p-values of verdicts
+    are adjusted over all pairs with a verdict on the same metric.
+    """
+    runs, out = work.plan.number_of_runs, []
     for b, a in combinations(sources, 2):
-        rows: list[dict[str, Any]] = [
-            {
-                "a": a,
-                "b": b,
-                "metric": metric,
-                **compare_runs(sources[a].runs(metric), sources[b].runs(metric)),
-                "p_holm": None,
-                "bootstrap_ci95": _interval(drawn[a][metric] - drawn[b][metric]),
-            }
-            for metric in found.compared
-            if np.isfinite(drawn[a][metric] - drawn[b][metric]).any()
-        ]
-        family = [row for row in rows if row["metric"] in found.family and row["p"] is not None]
-        for row, adjusted in zip(family, holm([row["p"] for row in family]), strict=True):
-            row["p_holm"] = adjusted
+        pair = [work.sees(name) for name in (a, b)]
+        reason = no_verdict(runs=runs, records=found.records, real_data=pair)
+        rows: list[dict[str, Any]] = []
+        for metric in found.compared:
+            each = drawn[a][metric] - drawn[b][metric]
+            ours, theirs = sources[a].runs(metric), sources[b].runs(metric)
+            if runs >= MIN_RUNS:
+                seed = work.plan.seed_of("bootstrap", 1)
+                each = each.with_runs(np.subtract(ours, theirs).tolist(), seed=seed)
+            if each.interval is not None:
+                rows.append(
+                    {
+                        "a": a,
+                        "b": b,
+                        "metric": metric,
+                        **compare_runs(ours, theirs),
+                        "p_holm": None,
+                        "bootstrap_ci95": each.interval,
+                        "p_bootstrap": each.p,
+                        "p_verdict": None,
+                        "no_verdict": reason,
+                    }
+                )
+        _adjust([row for row in rows if row["metric"] in found.family], "p", "p_holm")
         out += rows
+    for metric in found.compared:
+        family = [row for row in out if row["metric"] == metric and not row["no_verdict"]]
+        _adjust(family, "p_bootstrap", "p_verdict")
     return out
+
+
+def _adjust(rows: Sequence[dict[str, Any]], p: str, adjusted: str) -> None:
+    """Add the adjusted p-values of the rows that have one."""
+    family = [row for row in rows if row[p] is not None]
+    for row, value in zip(family, holm([row[p] for row in family]), strict=True):
+        row[adjusted] = value
 
 
 def _data(

@@ -314,15 +314,16 @@ class Work:
     def _widening(self, trial: Trial) -> float | None:
         """Factor by which bands are widened, from healthy calibration trajectories held out.
 
-        The RG is fitted to the others for this; no test trajectory is used.
+        The RG is fitted to the rest of what it is fitted to for this, faulty trajectories included
+        where it uses these; no test trajectory is used.
         """
-        healthy = trial.healthy
-        if len(healthy) < MIN_HEALTHY:
+        if len(trial.healthy) < MIN_HEALTHY:
             return None
         seed = trial.seed("widening")
-        fitted_on, held_out = healthy.split(0.6, seed=seed)
+        fitted_on, held_out = self._calibration(trial).split(0.6, seed=seed)
         twin = self._refitted(trial, fitted_on, self.case.density)
-        return measure_widening(twin, held_out, seed=seed, rate=self.case.sensor_rate)
+        healthy = held_out.with_label(HEALTHY)
+        return measure_widening(twin, healthy, seed=seed, rate=self.case.sensor_rate)
 
     def _refitted(
         self, trial: Trial, calibration: Trajectories, density: Density | SequenceMixture

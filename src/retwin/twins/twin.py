@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.arrays import check_finite
 from retwin.checks import require, whole
 from retwin.data.segments import Segments
-from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
+from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Provenance, Trajectories
 from retwin.progress import Progress
+from retwin.times import stride_of
 from retwin.twins.faults import Fault, draw_faults, faulty_commands, frozen_from, frozen_response
 from retwin.twins.limits import Limits
 
@@ -23,6 +24,7 @@ __all__ = [
     "Twin",
     "checked_commands",
     "checked_seed",
+    "checked_stride",
     "nominal_outputs",
     "simulate_in_chunks",
 ]
@@ -147,6 +149,54 @@ def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:
     )
     check_finite("commands", array)
     return array if array.dtype.kind == "f" else array.astype(np.float64)
+
+
+def checked_stride(
+    twin: Twin, trajectories: Trajectories, rate: float | None, argument: str
+) -> int:
+    """Check that a twin can be compared with healthy trajectories at a rate.
+
+    Parameters
+    ----------
+    twin : Twin
+        The twin.
+    trajectories : Trajectories
+        Healthy or unlabelled ones.
+    rate : float, optional
+        Sample rate of the comparison in Hz; by default that of the trajectories.
+    argument : str
+        The name of the trajectories in messages.
+
+    Returns
+    -------
+    int
+        Samples of the trajectories per sample of the comparison.
+
+    Raises
+    ------
+    InputError
+        There is no trajectory, one has a fault, channels or rate are not the twin's, or `rate` does
+        not divide that of the trajectories.
+
+    """
+    healthy = np.isin(trajectories.labels, (HEALTHY, UNLABELLED))
+    require(
+        len(trajectories) > 0 and healthy.all(),
+        argument,
+        expected="healthy trajectories, one at least",
+        got=f"{len(trajectories)}, {int((~healthy).sum())} of them with a fault",
+        remedy=f"take {argument}.with_label({HEALTHY!r})",
+    )
+    for name in ("inputs", "outputs", "rate"):
+        expected, given = getattr(twin, name), getattr(trajectories, name)
+        require(
+            given == expected,
+            f"{argument}.{name}",
+            expected=f"that of the twin, {expected}",
+            got=given,
+            remedy="load the file with its case, or convert it",
+        )
+    return stride_of(trajectories.rate, rate, remedy="give the sensor's true rate")
 
 
 def checked_seed(seed: int) -> int:

@@ -26,8 +26,8 @@ from retwin.cases.armpi_fpv.twin import (
 from retwin.cases.case import Case
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.progress import Progress
-from retwin.times import stride_of, to_samples
-from retwin.twins.faults import ActuatorBias, Fault, Stuck, frozen_response
+from retwin.times import stride_of
+from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.ramps import draw_onsets, ramps_and_holds
 from retwin.twins.time_step import Timed
 from retwin.update.corrections import Chain, CommandSpace, DelayOffset, SampledSensor
@@ -147,15 +147,16 @@ FAULTS: dict[str, Fault | None] = {
 
 
 def encoder_noise(trajectories: Trajectories, units: float, seed: int) -> Trajectories:
-    """Add encoder noise of stuck motors to the outputs.
+    """Add the noise of all encoders to the outputs of all trajectories alike.
 
-    The encoder of a held motor varies by -1, 0 or 1 times `units` from sample to sample of the
-    sensor. The outputs change by the arm's Jacobian at the commanded pose with the motor held.
+    Each motor's encoder varies by -1, 0 or 1 times `units` from sample to sample of the sensor, and
+    the outputs change by the arm's Jacobian at the commanded pose. Labels are not used: noise on
+    stuck motors alone would reveal them.
 
     Parameters
     ----------
     trajectories : Trajectories
-        Trajectories of the arm; those of other classes stay unchanged.
+        Trajectories of the arm.
     units : float
         Amplitude of the noise in command units.
     seed : int
@@ -172,13 +173,11 @@ def encoder_noise(trajectories: Trajectories, units: float, seed: int) -> Trajec
     time = np.arange(trajectories.steps)
     every = stride_of(RATE, SENSOR_RATE)
     polls = np.arange(0, trajectories.steps + every, every)
-    for i, label in enumerate(trajectories.labels):
-        fault = FAULTS.get(str(label))
-        noise = np.interp(time, polls, units * rng.integers(-1, 2, size=len(polls)))
-        if isinstance(fault, Stuck):
-            held = frozen_response(trajectories.commands[i : i + 1], [fault], rate=RATE)[0]
-            effect = ARM.jacobian(KINEMATIC.angles(held))[:, :, fault.actuator] * KINEMATIC.scale
-            observed[i] += np.where(time > to_samples(ONSET, RATE), noise, 0.0)[:, None] * effect
+    for i, commands in enumerate(trajectories.commands):
+        steps = units * rng.integers(-1, 2, size=(commands.shape[1], len(polls)))
+        noise = np.stack([np.interp(time, polls, each) for each in steps], axis=1)
+        slopes = ARM.jacobian(KINEMATIC.angles(commands)) * KINEMATIC.scale
+        observed[i] += np.einsum("tda,ta->td", slopes, noise)
     return trajectories.replace(observed=observed)
 
 

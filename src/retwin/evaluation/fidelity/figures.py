@@ -1,7 +1,8 @@
 """`Fidelity`: scores of simulated against measured trajectories, and figures with intervals.
 
-The statistical unit is the trajectory, because samples within one are correlated: intervals come
-from a bootstrap over trajectories. Some figures would not be at their ideal value even for a
+The statistical unit is the trajectory, because samples within one are correlated: intervals are
+Student's over trajectories, on the scale of the logarithm for scores and of the logit for shares.
+Some figures would not be at their ideal value even for a
 perfect generator, because there are few trajectories. For these, each of the twin's draws takes
 the place of the measured trajectory in turn, which gives the distribution under a perfect
 generator.
@@ -20,21 +21,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.trajectories import Channels
-from retwin.scores.bootstrap import bootstrap_weights
 from retwin.scores.distributions import (
     central_band,
     cumulative_counts,
     ks_distance,
     share_as_far,
 )
+from retwin.scores.intervals import grouped_share_interval, jackknife_interval
 from retwin.serialisation.files import write_atomically
 
 __all__ = ["BINS", "Fidelity", "Figure"]
 
 BINS = 100
 """Bins of the PIT histograms, which are stored; pages show fewer."""
-RESAMPLINGS = 2000
-"""Bootstrap resamplings behind each interval: its ends vary by about 2 % of its width."""
 MIN_TRAJECTORIES = 8
 """Least number of trajectories for the classifier two-sample test: fewer do not train it."""
 MAX_PLACES = 512
@@ -65,7 +64,7 @@ class Figure:
     value : float
         NaN where it is not defined.
     interval : (float, float) or None
-        95 % bootstrap interval over trajectories; None for a single trajectory.
+        95 % interval over trajectories; None for fewer than five of them.
     p : float or None
         Monte Carlo p-value that the generator is perfect, for figures that have one: the share of
         members, the measured one included, whose figure is at least as bad when each takes the
@@ -211,16 +210,15 @@ class Fidelity:
     @cached_property
     def figures(self) -> dict[str, Figure]:
         """Every figure by its name; see docs/theory.md, How a generator is scored."""
-        found = {"energy": self._mean(self.energy)}
+        found = {"energy": self._positive(self.energy)}
         for c, name in enumerate(self.outputs.names):
-            found[f"crps/{name}"] = self._mean(self.crps[:, c])
+            found[f"crps/{name}"] = self._positive(self.crps[:, c])
         for name, (crps, energy) in self.rivals.items():
             found |= self._compared(name, crps, energy)
         for level in (50, 90):
-            found[f"coverage{level}"] = self._mean(self.inside(level).mean(axis=1))
+            found[f"coverage{level}"] = _share(self.inside(level).mean(axis=1))
         if np.isfinite(self.widening).all():
-            widened = self.inside(90, widened=True)
-            found["coverage90_widened"] = self._mean(widened.mean(axis=1))
+            found["coverage90_widened"] = _share(self.inside(90, widened=True).mean(axis=1))
         found["pit"] = self._pit()
         for k, name in enumerate(self.segment_channels.names):
             found |= self._per_segment(name, self.segment_values[..., k])
@@ -259,37 +257,24 @@ class Fidelity:
         shares = pooled.reshape(len(pooled), bins, -1).sum(axis=2)
         return np.stack([shares[0], *np.quantile(shares[1:], [0.05, 0.95], axis=0)])
 
-    @cached_property
-    def _weights(self) -> NDArray:
-        """Weight (RESAMPLINGS, n) of each trajectory in each resampling."""
-        one = np.zeros(len(self), dtype=int)
-        return bootstrap_weights(one, draws=RESAMPLINGS, seed=0) / len(self)
-
-    def _mean(self, values: NDArray) -> Figure:
-        return self._figure(lambda weights: weights @ values)
-
-    def _figure(self, of: Callable[[NDArray], NDArray], p: float | None = None) -> Figure:
-        """The figure, which `of` computes (b,) from weights (b, n) of the trajectories."""
-        value = float(of(np.full((1, len(self)), 1 / len(self)))[0])
-        if len(self) < 2 or not np.isfinite(value):
-            return Figure(value, None, p)
-        low, high = np.nanquantile(of(self._weights), [0.025, 0.975])
-        return Figure(value, (float(low), float(high)), p)
+    def _positive(self, values: NDArray) -> Figure:
+        """The mean of positive values (n,)."""
+        return Figure(
+            float(values.mean()), jackknife_interval(lambda w: w @ values, len(self), positive=True)
+        )
 
     def _distance(self, of: Callable[[NDArray], NDArray], p: float) -> Figure:
-        """The same for a distance, less its bootstrap bias: repeated trajectories increase it."""
-        plain = self._figure(of, p)
-        if plain.interval is None:
-            return plain
-        bias = float(np.nanmean(of(self._weights))) - plain.value
-        low, high = (min(max(0.0, end - bias), 1.0) for end in plain.interval)
-        return Figure(plain.value, (low, high), p)
+        """A distance from 0 to 1, which `of` computes (b,) from weights (b, n)."""
+        value = float(of(np.full((1, len(self)), 1 / len(self)))[0])
+        ends = jackknife_interval(of, len(self))
+        interval = None if ends is None else (max(ends[0], 0.0), min(ends[1], 1.0))
+        return Figure(value, interval, p)
 
     def _compared(self, name: str, crps: NDArray, energy: NDArray) -> dict[str, Figure]:
         """Scores of another twin, and the paired relative differences of this one's from them."""
-        found = {f"energy/{name}": self._mean(energy)}
+        found = {f"energy/{name}": self._positive(energy)}
         for c, output in enumerate(self.outputs.names):
-            found[f"crps/{output}/{name}"] = self._mean(crps[:, c])
+            found[f"crps/{output}/{name}"] = self._positive(crps[:, c])
             found[f"crps_below/{output}/{name}"] = self._below(self.crps[:, c], crps[:, c])
         found[f"crps_below/{name}"] = self._below(self.crps, crps)
         found[f"energy_below/{name}"] = self._below(self.energy, energy)
@@ -301,11 +286,14 @@ class Fidelity:
         It is 0 where both scores are 0.
         """
 
-        def share(w: NDArray) -> NDArray:
+        def ratio(w: NDArray) -> NDArray:
             a, b = w @ own, w @ other
-            return ((b - a) / np.where(b == 0, 1, b)).reshape(len(w), -1).mean(axis=1)
+            share = np.where(b == 0, 1 + a, a / np.where(b == 0, 1, b))
+            return share.reshape(len(w), -1).mean(axis=1)
 
-        return self._figure(share)
+        value = 1 - float(ratio(np.full((1, len(self)), 1 / len(self)))[0])
+        ends = jackknife_interval(ratio, len(self), positive=True)
+        return Figure(value, None if ends is None else (1 - ends[1], 1 - ends[0]))
 
     def _pit(self) -> Figure:
         """Kolmogorov–Smirnov distance of the PIT from the uniform distribution."""
@@ -338,9 +326,7 @@ class Fidelity:
             warnings.filterwarnings("ignore", message="All-NaN slice")
             low, high = np.nanmin(values[:, 1:], axis=1), np.nanmax(values[:, 1:], axis=1)
         hit = ((low <= values[:, 0]) & (values[:, 0] <= high)).sum(axis=1)
-        count = np.isfinite(values[:, 0]).sum(axis=1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return self._figure(lambda w: (w @ hit) / (w @ count))
+        return _share(hit, np.isfinite(values[:, 0]).sum(axis=1))
 
     def _classifier(self) -> dict[str, Figure]:
         """AUROC of a forest that separates measured from drawn, cross-validated by trajectory."""
@@ -360,7 +346,13 @@ class Fidelity:
             scores[test] = forest.predict_proba(rows[test])[:, 1]
         # Within a trajectory, so that commands cannot reveal the measured one.
         own, drawn = scores.reshape(n, members)[:, :1], scores.reshape(n, members)[:, 1:]
-        return {"auroc": self._mean(((own > drawn) + 0.5 * (own == drawn)).mean(axis=1))}
+        return {"auroc": _share(((own > drawn) + 0.5 * (own == drawn)).mean(axis=1))}
+
+
+def _share(hits: NDArray, counts: NDArray | None = None) -> Figure:
+    """Successes over trials of all trajectories (n,), by default of one trial each."""
+    trials = np.ones(len(hits)) if counts is None else counts
+    return Figure(float(hits.sum() / trials.sum()), grouped_share_interval(hits, trials))
 
 
 def _padded(values: NDArray, segments: int) -> NDArray:

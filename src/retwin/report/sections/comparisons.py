@@ -1,4 +1,4 @@
-"""Every pair of sources on every metric: Welch's test over runs, bootstrap over trajectories."""
+"""Every pair of sources on every metric: paired bootstrap, verdict, Welch's test over runs."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from retwin.report.labels import (
     number,
     order,
     p_value,
+    reason,
     signed,
     source_name,
     span,
@@ -44,6 +45,7 @@ def comparisons(study: Study) -> Section | None:
         "metric": metric_name(metric),
         "pairs": _pairs(found),
         "many": many,
+        "reasons": sorted({reason(each) for each in found} - {""}),
     }
     return Section("comparisons", "Comparisons", values)
 
@@ -68,6 +70,7 @@ def _pairs(found: Sequence[Comparison]) -> Table:
         Column("Difference"),
         Column("95 % interval"),
         Column("", numeric=False),
+        Column("p, all pairs"),
         Column("t (df)", group="Welch’s test over runs"),
         Column("p", group="Welch’s test over runs"),
         Column("p, Holm", group="Welch’s test over runs"),
@@ -105,10 +108,11 @@ def _row(each: Comparison, low: float, high: float) -> list[Cell]:
     result = outcome_of(each)
     return [
         Cell(metric_name(each.metric)),
-        Cell("undecided" if result == "open" else result or "–", tone=result),
+        Cell({"open": "undecided", "": "no verdict"}.get(result, result), tone=result),
         Cell(signed(each.mean_diff)),
         Cell(span(each.interval, sign=True)),
         Cell("", forest=forest, source=each.a),
+        Cell(p_value(each.p_verdict)),
         Cell(f"{number(each.t, 2)} ({number(each.df, 1)})" if each.t is not None else "–"),
         Cell(p_value(each.p)),
         Cell(p_value(each.p_holm)),

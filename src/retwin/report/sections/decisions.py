@@ -20,7 +20,10 @@ TRAJECTORIES, FAULTY, MISSED = 1000, 0.02, 50
 
 
 def decisions(study: Study) -> Section | None:
-    """A row per false-alarm rate for the source with the best macro-F1, and a calculator."""
+    """A row per false-alarm rate for the source with the best macro-F1, and a calculator.
+
+    A threshold belongs to one model, so these are the decisions of the model of the first run.
+    """
     sources = [name for name in study.diagnosing if study.sources[name].real_data != "transductive"]
     best = max(sources, key=lambda name: study.sources[name].mean("macro_f1"), default=None)
     if best is None or HEALTHY not in study.results.classes:
@@ -43,8 +46,8 @@ def decisions(study: Study) -> Section | None:
 
 
 def _decide(study: Study, source: str, rate: float) -> Decision:
-    shares = study.probabilities(source).mean(axis=0)
-    return decide(shares, study.truth, study.results.classes, rate)
+    first = study.probabilities(source)[0]
+    return decide(first, study.truth, study.results.classes, rate)
 
 
 def _table(found: list[Decision]) -> Table:
@@ -52,7 +55,9 @@ def _table(found: list[Decision]) -> Table:
     columns = [
         Column("Requested false-alarm rate", numeric=False),
         Column("Alarm threshold"),
+        Column("Its false alarms"),
         Column("Faults detected"),
+        Column("Detected at the rate"),
         Column("of these, correct class"),
         Column("Most often missed", numeric=False),
         Column("Most often confused", numeric=False),
@@ -66,12 +71,14 @@ def _table(found: list[Decision]) -> Table:
 def _row(each: Decision) -> list[Cell]:
     requested = Cell(f"{each.requested:.0%}")
     if math.isnan(each.threshold):
-        return [requested, *[Cell("–")] * 8]
+        return [requested, *[Cell("–")] * 10]
     cost = each.cost(trajectories=TRAJECTORIES, faulty=FAULTY, missed=MISSED)
     return [
         requested,
         Cell(number(each.threshold)),
+        Cell(span(each.false_alarms, 2)),
         Cell(number(each.detected, 2), f"[{span(each.interval, 2)}]"),
+        Cell(span(each.at_rate, 2)),
         Cell(number(each.identified, 2)),
         Cell(class_name(each.most_missed) or "none"),
         Cell(" as ".join(map(class_name, each.most_confused)) or "none"),
@@ -102,7 +109,7 @@ def _calculator(study: Study, sources: list[str], first: str, healthy: int) -> d
 
 def _entry(each: Decision) -> dict[str, Any]:
     """The numbers that costs are computed from, and the texts of the table's cells."""
-    cells = _row(each)[1:6]
+    cells = _row(each)[1:8]
     return {
         "rate": each.guaranteed,
         "detected": each.detected,

@@ -4,7 +4,7 @@
   const content = JSON.parse(document.getElementById("calculator-content").textContent);
   const at = (name) => document.getElementById("calculate-" + name);
   const fields = ["source", "rate", "faulty", "missed"];
-  const terms = ["alarm threshold", "faults detected", "of these, correct class", "most often missed", "most often confused"];
+  const terms = ["alarm threshold", "its false alarms, 95 % range", "faults detected", "detected at the rate, 95 % interval", "of these, correct class", "most often missed", "most often confused"];
 
   // False alarms, missed faults and their total cost among `content.trajectories`; rate 0 means no alarm at all.
   const costs = (decision, faulty, missed) => {

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from pebble import ProcessPool
 
 from retwin.checks import require, whole
-from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.processes import sendable_errors, worker_pool
-from retwin.times import stride_of
 from retwin.twins.parametric import ParametricTwin
-from retwin.twins.twin import SimulationError, checked_seed
+from retwin.twins.twin import SimulationError, checked_seed, checked_stride
 
 __all__ = ["Misfit", "misfit_of"]
 
@@ -184,24 +183,7 @@ def _checked(twin: ParametricTwin, observed: Trajectories, rate: float | None) -
         got=type(twin).__name__,
         remedy="see ParametricTwin, CommandSide and ParametricTwin.built",
     )
-    healthy = np.isin(observed.labels, (HEALTHY, UNLABELLED))
-    require(
-        len(observed) > 0 and healthy.all(),
-        "observed",
-        expected="healthy trajectories, one at least",
-        got=f"{len(observed)}, {int((~healthy).sum())} of them with a fault",
-        remedy=f"take observed.with_label({HEALTHY!r})",
-    )
-    for name in ("inputs", "outputs", "rate"):
-        expected, got = getattr(twin, name), getattr(observed, name)
-        require(
-            expected == got,
-            f"observed.{name}",
-            expected=f"that of the twin, {expected}",
-            got=got,
-            remedy="load the file with its case, or convert it",
-        )
-    stride = stride_of(observed.rate, rate, remedy="give the sensor's true rate")
+    stride = checked_stride(twin, observed, rate, "observed")
     count = int(observed.mask[:, ::stride].sum())
     require(
         count > len(twin.parameters),
