@@ -31,6 +31,7 @@ RENAMED_SETTINGS = {
     "RampSampler": {"movements": "segments"},
     "Training": {"epochs": "max_epochs", "batch": "batch_size", "rate": "learning_rate"},
     "CommandSpace": {"most": "max_samples", "known": "identified_below"},
+    "SequenceMixture": {"gap": "margin"},
 }
 """Per kind, settings in files of versions before 0.1.0, and their present names."""
 

@@ -28,9 +28,10 @@ from retwin.update.corrections import (
     fit_sensor,
     sample_mask,
 )
-from retwin.update.residual.model import ResidualModel, segment
+from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.penalties import checked_bounds, penalties
 from retwin.update.residual.refining import refine
+from retwin.update.residual.residual import segment
 from retwin.update.residual.sequence import SequenceMixture, SequenceResidual
 from retwin.update.residual.sequence_fitting import fit_sequence
 from retwin.update.residual.settings import Density, Mixture

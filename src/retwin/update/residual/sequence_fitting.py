@@ -1,4 +1,4 @@
-"""Fitting the residual model per sample: windows, cross-validation with a gap, calibration."""
+"""Fitting the residual model per sample: windows, cross-validation, calibration."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def fit_sequence(
         remedy="give longer records, fewer members, or shorter blocks",
     )
     _prepare(model, data, bounds, seed)
-    fitted = [identified & ~_dilated(part, density.gap) for part in held_out]
+    fitted = [identified & ~_dilated(part, density.margin) for part in held_out]
     report = _counter(progress, (1 + density.refit) * len(fitted))
     fits = _trained(model, data, fitted, seed, report)
     figures = _calibrate(model, data, held_out)
@@ -190,9 +190,9 @@ def held_out_parts(valid: Tensor, density: SequenceMixture) -> Tensor:
     return fold == torch.arange(density.members)[:, None, None]
 
 
-def _dilated(held_out: Tensor, gap: int) -> Tensor:
-    """The flags (n, T) with `gap` samples more on either side."""
-    wide = torch.nn.functional.max_pool1d(held_out.float()[:, None], 2 * gap + 1, 1, gap)
+def _dilated(held_out: Tensor, margin: int) -> Tensor:
+    """The flags (n, T) with `margin` samples more on either side."""
+    wide = torch.nn.functional.max_pool1d(held_out.float()[:, None], 2 * margin + 1, 1, margin)
     return wide[:, 0] > 0
 
 
