@@ -29,7 +29,12 @@ class ResidualModel(Residual):
     density : Density
         Settings of the distribution and of its encoder.
     inputs, outputs, segmentation
-        See `Residual`, also for the attributes.
+        See `Residual`, also for the attributes that are not named here.
+
+    Attributes
+    ----------
+    spread : Tensor
+        (d_z,), factor by which deviations from the mean are multiplied, 1 for events.
 
     Raises
     ------
@@ -74,6 +79,7 @@ class ResidualModel(Residual):
             else BernoulliHead(width, block.width)
             for block in correction.heads(inputs, outputs)
         )
+        self.register_buffer("spread", torch.ones(len(self.latent)))
 
     def forward(self, context: Context) -> Blocks:
         """The distribution q_ψ(z | u, ŷ), in physical units."""
@@ -86,8 +92,18 @@ class ResidualModel(Residual):
             yield head, slice(begin, begin + size)
             begin += size
 
+    @property
+    def events(self) -> Tensor:
+        """(d_z,) bool, the components of z that are 0 or 1."""
+        kinds = [isinstance(head, BernoulliHead) for head in self.heads]
+        return torch.tensor(kinds).repeat_interleave(torch.tensor(self.sizes))
+
     def distribution(self, features: Tensor) -> Blocks:
         """The distribution q_ψ for features (..., F) of segments, see `describe`."""
+        return self.predict(features).widened(self.spread)
+
+    def predict(self, features: Tensor) -> Blocks:
+        """The distribution that the network predicts, before its calibration by `spread`."""
         encoded = self.encoder(self.before(features))
         parts = zip(
             self.heads, self.shift.split(self.sizes), self.scale.split(self.sizes), strict=True

@@ -66,6 +66,7 @@ class Residual(nn.Module, ABC):
     shift: Tensor
     scale: Tensor
     persistence: Tensor
+    spread: Tensor
 
     def __init__(
         self,
@@ -156,7 +157,8 @@ class Residual(nn.Module, ABC):
             # Development versions before 0.1.0 wrote neither for one z per sample.
             segmentation=about.get("segmentation", "commands"),
         )
-        model.load_state_dict(weights)
+        # Models per segment had no `spread` in development versions before 0.1.0.
+        model.load_state_dict({"spread": torch.ones_like(model.spread), **weights})
         model.emulated = about["emulated"]
         model.timing = np.atleast_2d(np.array(about.get("timing", []), dtype=float))
         model.fitted = Fit.of(about["fitted"])

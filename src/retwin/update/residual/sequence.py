@@ -173,7 +173,6 @@ class SequenceResidual(Residual):
 
     kind = "sequence residual"
     trust: Tensor
-    spread: Tensor
 
     def __init__(
         self,
