@@ -13,19 +13,14 @@ from scipy import stats
 from torch import Tensor
 
 from retwin.nets.mixtures import BernoulliHead
-from retwin.nets.training import Fit, Loss, Training, train
+from retwin.nets.training import Fit, Training, train
 from retwin.progress import Progress
 from retwin.update.residual.model import ResidualModel
-from retwin.update.residual.penalties import checked_bounds, penalties
-from retwin.update.residual.settings import Density
+from retwin.update.residual.penalties import BOUND_MARGIN, SMALLEST, checked_bounds, penalties
 from retwin.update.residual.targets import Targets
 
 __all__ = ["fit_segments"]
 
-SMALLEST = 1e-12
-"""Smallest value taken for the largest |z*|: a millionth of it still has a square in float32."""
-BOUND_MARGIN = 1.25
-"""Default bound b of Eq. 9, over the largest |z*|."""
 HELD_OUT = 20
 """Trajectories to hold out at least, over all folds: from as many the 90 % quantile of a score is
 between the 74th and the 98th percentile (95 % interval)."""
@@ -136,7 +131,7 @@ def _trained(
     _prepare(model, fitted, bounds, seed)
     return train(
         model,
-        _objective(model.density),
+        _objective,
         fitted.examples(model),
         None if held_out is None else held_out.examples(model),
         how or model.density.training,
@@ -250,22 +245,11 @@ def _prepare(model: ResidualModel, targets: Targets, bounds: NDArray | None, see
         model.bounds.copy_(checked_bounds(bounds, model.latent))
 
 
-def _objective(density: Density) -> Loss:
+def _objective(model: Any, batch: tuple[Tensor, ...]) -> Tensor:
     """L_RG of Eq. 10, averaged over segments."""
-
-    def loss(model: Any, batch: tuple[Tensor, ...]) -> Tensor:
-        features, z, identified, valid = batch
-        distribution = model.predict(features)
-        # Blocks that are not identified hold a finite placeholder and are not in the likelihood.
-        log_prob = torch.where(identified, distribution.block_log_prob(z), 0.0).sum()
-        nll = -log_prob / identified.sum().clamp_min(1) * identified.shape[-1]
-        return nll + penalties(
-            distribution.mean,
-            model.bounds,
-            model.scale,
-            valid,
-            density.smoothness,
-            density.boundedness,
-        )
-
-    return loss
+    features, z, identified, valid = batch
+    distribution = model.predict(features)
+    # Blocks that are not identified hold a finite placeholder and are not in the likelihood.
+    log_prob = torch.where(identified, distribution.block_log_prob(z), 0.0).sum()
+    nll = -log_prob / identified.sum().clamp_min(1) * identified.shape[-1]
+    return nll + penalties(model, distribution.mean, valid)

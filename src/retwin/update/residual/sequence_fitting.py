@@ -18,7 +18,7 @@ from retwin.nets.mixtures import Blocks
 from retwin.nets.training import Fit, Loss, isolated, train
 from retwin.progress import Progress
 from retwin.update.corrections import Context, Correction, Discrepancy
-from retwin.update.residual.penalties import checked_bounds, penalties
+from retwin.update.residual.penalties import BOUND_MARGIN, SMALLEST, checked_bounds, penalties
 from retwin.update.residual.sequence import (
     SequenceMixture,
     SequenceResidual,
@@ -202,9 +202,9 @@ def _prepare(model: SequenceResidual, data: _Records, bounds: NDArray | None, se
     values = data.z[data.identified]
     model.before.fit(data.features[data.identified])
     model.shift.copy_(values.mean(dim=0))
-    largest = values.abs().amax(dim=0).clamp_min(1e-12)
+    largest = values.abs().amax(dim=0).clamp_min(SMALLEST)
     model.scale.copy_(values.std(dim=0, correction=0).maximum(1e-6 * largest))
-    model.bounds.copy_(1.25 * largest)
+    model.bounds.copy_(BOUND_MARGIN * largest)
     if bounds is not None:
         model.bounds.copy_(checked_bounds(bounds, model.latent))
     _initialise(model, data, seed)
@@ -230,14 +230,7 @@ def _objective(model: SequenceResidual) -> Loss:
         deviation = (distribution.variance.sqrt() / model.scale).detach().mean(dim=-1)
         nll = -distribution.log_prob(z) * deviation ** (2 * density.moderation)
         nll = torch.where(used, nll, 0.0).sum() / used.sum().clamp_min(1)
-        return nll + penalties(
-            distribution.mean,
-            model.bounds,
-            model.scale,
-            used,
-            density.smoothness,
-            density.boundedness,
-        )
+        return nll + penalties(model, distribution.mean, used)
 
     return loss
 
