@@ -19,6 +19,7 @@ from retwin.errors import InputError
 from retwin.nets.training import isolated
 from retwin.progress import Progress
 from retwin.twins.faults import Fault, draw_faults, faulty_commands, frozen_from
+from retwin.twins.twin import Twin
 from retwin.update.corrections import (
     Context,
     Correction,
@@ -27,6 +28,7 @@ from retwin.update.corrections import (
     fit_sensor,
     sample_mask,
 )
+from retwin.update.exact import exact_surrogate
 from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.refining import refine
 from retwin.update.residual.residual import segment
@@ -46,7 +48,7 @@ BOUND_MARGIN = 1.25
 
 
 def infer_discrepancy(
-    surrogate: Surrogate,
+    surrogate: Surrogate | Twin,
     trajectories: Trajectories,
     correction: Correction,
     *,
@@ -57,8 +59,8 @@ def infer_discrepancy(
 
     Parameters
     ----------
-    surrogate : Surrogate
-        The IBG.
+    surrogate : Surrogate or Twin
+        The IBG, or a twin in its place (see `ExactSurrogate`).
     trajectories : Trajectories
         Commands and measured outputs.
     correction : Correction
@@ -75,13 +77,13 @@ def infer_discrepancy(
         What g is applied to, and z* with its uncertainty.
 
     """
-    context = _context(surrogate, trajectories, segments, faults)
+    context = _context(exact_surrogate(surrogate), trajectories, segments, faults)
     return context, correction.infer(context, *_measured(trajectories))
 
 
 @overload
 def fit_residual(
-    surrogate: Surrogate,
+    surrogate: Surrogate | Twin,
     calibration: Trajectories,
     correction: Correction = ...,
     density: Density = ...,
@@ -96,7 +98,7 @@ def fit_residual(
 
 @overload
 def fit_residual(
-    surrogate: Surrogate,
+    surrogate: Surrogate | Twin,
     calibration: Trajectories,
     correction: Correction,
     density: SequenceMixture,
@@ -110,7 +112,7 @@ def fit_residual(
 
 
 def fit_residual(
-    surrogate: Surrogate,
+    surrogate: Surrogate | Twin,
     calibration: Trajectories,
     correction: Correction = DelayOffset(),  # noqa: B008 - a frozen config
     density: Density | SequenceMixture = Mixture(),  # noqa: B008 - a frozen config
@@ -125,8 +127,8 @@ def fit_residual(
 
     Parameters
     ----------
-    surrogate : Surrogate
-        The IBG.
+    surrogate : Surrogate or Twin
+        The IBG, or a twin in its place (see `ExactSurrogate`).
     calibration : Trajectories
         Real trajectories with commands. Six suffice; from few the distribution is widened, and a
         warning is given below three.
@@ -162,6 +164,7 @@ def fit_residual(
         identified, or an unknown `calibrate_on`.
 
     """
+    surrogate = exact_surrogate(surrogate)
     _check_match(surrogate, calibration)
     stepwise = correction.resolution == "step" or isinstance(density, SequenceMixture)
     keep, faults = _chosen(
