@@ -21,6 +21,7 @@ from retwin.data.io import check_target
 from retwin.errors import InputError
 from retwin.modules import known
 from retwin.serialisation.files import recover
+from retwin.serialisation.models import kind_of
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case

@@ -70,6 +70,10 @@ class FlowDistribution(Distribution):
         """The standard normal noise (..., D) of which `value` (..., D) is the draw."""
         return self.flow.transform((value - self.shift) / self.scale)
 
+    def widened(self, factor: Tensor) -> FlowDistribution:
+        """The same with all deviations from `shift` multiplied by `factor` (D,)."""
+        return FlowDistribution(self.flow, self.shift, factor * self.scale)
+
     def _quasi_random_draws(self) -> Tensor:
         points = _quasi_random_noise(self.event_shape[0]).to(self.shift)
         shape = (len(points), *(1 for _ in self.batch_shape), -1)

@@ -84,6 +84,13 @@ class GaussianMixture(MixtureSameFamily):
         )[..., 0, :, :]
         return mean + (factor @ normal[..., None])[..., 0]
 
+    def widened(self, factor: Tensor) -> GaussianMixture:
+        """The same with all deviations from the mean multiplied by `factor` (D,)."""
+        middle = self.mean[..., None, :]
+        means = middle + factor * (self.means - middle)
+        logits = self.mixture_distribution.logits
+        return GaussianMixture(logits, means, factor[:, None] * self.factor)
+
     def marginal_cdf(self, value: Tensor) -> Tensor:
         """The marginal probabilities P(z_d <= value_d), (..., D): the PIT of `value`."""
         deviation = self.factor.square().sum(dim=-1).sqrt()
@@ -143,6 +150,10 @@ class Bernoullis(Distribution):
         probability = torch.where(value < 1, 1 - self.mean, torch.ones_like(value))
         return torch.special.ndtri(probability.clamp(*PIT_RANGE))
 
+    def widened(self, factor: Tensor) -> Bernoullis:
+        """The same events: they have no width."""
+        return self
+
 
 class Block(Protocol):
     """A distribution that `Blocks` can join: torch's interface, `from_noise`, `normal_scores`."""
@@ -166,6 +177,8 @@ class Block(Protocol):
     def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor: ...
 
     def normal_scores(self, value: Tensor) -> Tensor: ...
+
+    def widened(self, factor: Tensor) -> Block: ...
 
 
 class Blocks(Distribution):
@@ -230,6 +243,11 @@ class Blocks(Distribution):
         return torch.cat(
             [block.normal_scores(part) for block, part in zip(self.blocks, parts, strict=True)], -1
         )
+
+    def widened(self, factor: Tensor) -> Blocks:
+        """The same with all deviations from the mean multiplied by `factor` (D,), but of events."""
+        parts = factor.split(self.widths)
+        return Blocks([block.widened(part) for block, part in zip(self.blocks, parts, strict=True)])
 
 
 class MixtureHead(nn.Module):

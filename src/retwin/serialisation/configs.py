@@ -84,6 +84,7 @@ RENAMED_SETTINGS: dict[str, dict[str, str | Converted]] = {
     "Training": {"epochs": "max_epochs", "batch": "batch_size", "rate": "learning_rate"},
     "CommandSpace": {"most": "max_samples", "known": "identified_below"},
     "SampledSensor": {"every": Converted("period"), "glitch_rate": "glitch_probability"},
+    "SequenceMixture": {"gap": "margin"},
 }
 """Per kind, settings in files of versions before 0.1.0, and their present names."""
 

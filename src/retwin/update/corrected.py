@@ -25,6 +25,7 @@ from retwin.twins.twin import (
     simulate_in_chunks,
 )
 from retwin.update.corrections import measured_outputs
+from retwin.update.exact import exact_surrogate
 from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
 
@@ -41,7 +42,8 @@ class CorrectedTwin:
     Parameters
     ----------
     surrogate : Surrogate
-        The IBG, which gives the nominal output ŷ.
+        The IBG, which gives the nominal output ŷ; or a twin in its place (see `ExactSurrogate`),
+        with which it cannot be saved.
     residual : Residual
         The RG, which gives the distribution of z and holds the correction g.
     case : str
@@ -55,6 +57,11 @@ class CorrectedTwin:
     residual: Residual
     case: str = ""
     random: bool = True
+
+    def __post_init__(self) -> None:
+        # To simulate, z is applied once: no differences are taken.
+        exact = exact_surrogate(self.surrogate, differences=False)
+        object.__setattr__(self, "surrogate", exact)
 
     @property
     def inputs(self) -> Channels:

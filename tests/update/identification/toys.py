@@ -23,6 +23,10 @@ def line(commands: np.ndarray, a: float, b: float) -> np.ndarray:
     return a * commands[..., :1] + b * commands[..., 1:]
 
 
+def affine(commands: np.ndarray, a: float, b: float) -> np.ndarray:
+    return a * commands[..., :1] + b
+
+
 def lag(commands: np.ndarray, gain: float, share: float) -> np.ndarray:
     """A first-order lag that keeps `share` of its value per sample."""
     return lfilter([gain * (1 - share)], [1.0, -share], commands[..., :1], axis=-2)
@@ -42,6 +46,7 @@ def parametric(function, **bounds: tuple[float, float]) -> ParametricTwin:
 
 
 LINE = parametric(line, a=(-3.0, 5.0), b=(-4.0, 4.0))
+AFFINE = parametric(affine, a=(-3.0, 5.0), b=(-4.0, 4.0))
 LAG = parametric(lag, gain=(0.1, 5.0), share=(0.1, 0.98))
 PRODUCT = parametric(product, a=(0.5, 2.0), b=(0.5, 2.0))
 

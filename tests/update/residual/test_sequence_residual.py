@@ -126,7 +126,7 @@ def test_a_discrepancy_that_the_past_does_not_predict_is_not_trusted(twin: rt.Su
     """One slow wave beside the input: members learn it by heart, and it holds nowhere else."""
     made = twin.simulate(commands_of(1, 20), seed=0)
     wave = np.sin(np.arange(STEPS) / 60)[None, :, None].astype(np.float32)
-    quick = replace(SMALL, members=4, block=100, gap=50)
+    quick = replace(SMALL, members=4, block=100, margin=50)
     rg = fit_residual(twin, made.replace(observed=made.nominal + wave), Additive(), quick, seed=0)
     figures = rg.fitted.figures
     assert float(rg.trust) == figures["trust_residual_y"] < 0.6

@@ -97,7 +97,7 @@ def tanks() -> Case:
         network=LSTM(64),
         training=Training(max_epochs=120, batch_size=8, learning_rate=5e-3),
         per_class=800,
-        density=SequenceMixture(block=64, gap=32),
+        density=SequenceMixture(block=64, margin=32),
         records=benchmark(FITTED),
     )
 

@@ -7,7 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CHI2_95", "Identifiability", "identifiability", "noise_of"]
+__all__ = [
+    "CHI2_95",
+    "MIN_TRAJECTORIES",
+    "Identifiability",
+    "identifiability",
+    "noise_of",
+    "standard_errors",
+]
 
 RANK_TOLERANCE = 1e-5
 """Singular values below this share of the largest count as 0: finite differences are no better."""
@@ -17,6 +24,11 @@ UNIFORM = 12**-0.5
 """Standard deviation of a uniform distribution between the bounds, in widths of the bounds."""
 AGREEMENT = 0.05
 """Distance of equally good optima, in widths of the bounds, up to which they agree in any case."""
+MIN_TRAJECTORIES = 3
+"""Smallest number of trajectories from which standard errors are estimated."""
+LEVERAGE = 1 - 1e-6
+"""Share of the information on a direction that a trajectory may have: without it, nothing would be
+known of that direction, nor of its error."""
 MAX_AUTOCORRELATION = 0.999
 """Largest lag-one autocorrelation, which bounds the correlation time at 1999 samples."""
 
@@ -30,8 +42,8 @@ class Identifiability:
     names : tuple of str
         Names of the parameters.
     errors : NDArray
-        (k,), standard errors in the parameters' units; infinite where outputs do not depend on
-        the parameter.
+        (k,), standard errors in the parameters' units, if the residuals of a trajectory correlate
+        from one sample to the next only; infinite where outputs do not depend on the parameter.
     correlation : NDArray
         (k, k), of the estimates; NaN where an error is infinite.
     singular_values : NDArray
@@ -136,6 +148,53 @@ def identifiability(
         identified=(errors < UNIFORM) & agree,
         independent=measured / correlation_time(residual),
     )
+
+
+def standard_errors(jacobian: NDArray, residual: NDArray) -> NDArray:
+    """Standard errors (k,) by the jackknife over trajectories, in one Gauss-Newton step each.
+
+    They hold for errors that are correlated in any way within a trajectory, and independent between
+    trajectories. Divided by them, estimates follow Student's t distribution with n - 1 degrees of
+    freedom.
+
+    Parameters
+    ----------
+    jacobian : NDArray
+        (n, P, d_y, k).
+    residual : NDArray
+        (n, P, d_y), at the optimum.
+
+    Returns
+    -------
+    NDArray
+        (k,), infinite where outputs do not depend on the parameter; NaN below three trajectories,
+        and where only one of them determines some direction.
+
+    References
+    ----------
+    Bell and McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage
+    samples", Survey Methodology 28, 2002: the variance of the jackknife.
+
+    """
+    count, size = len(jacobian), jacobian.shape[-1]
+    if count < MIN_TRAJECTORIES:
+        return np.full(size, np.nan)
+    each = jacobian.reshape(count, -1, size)
+    _, singular, directions = np.linalg.svd(each.reshape(-1, size), full_matrices=False)
+    nonzero = singular > RANK_TOLERANCE * singular.max(initial=0.0)
+    # In these coordinates the information of all trajectories is the identity.
+    back = directions[nonzero].T / singular[nonzero]
+    scaled = each @ back
+    information = scaled.mT @ scaled
+    if np.linalg.eigvalsh(information).max(initial=0.0) > LEVERAGE:
+        return np.full(size, np.nan)
+    gradient = np.einsum("npk,np->nk", scaled, residual.reshape(count, -1))
+    without = np.linalg.solve(np.eye(information.shape[1]) - information, gradient[..., None])
+    step = without[..., 0] @ back.T
+    errors = np.sqrt((count - 1) * np.var(step, axis=0))
+    # A direction does not concern a parameter in which it has no component.
+    open_ = np.abs(directions[~nonzero]).max(axis=0, initial=0.0) > 1e-6
+    return np.where(open_, np.inf, errors)
 
 
 def noise_of(residual: NDArray, measured: int, free: int) -> float:

@@ -9,6 +9,7 @@ from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
@@ -17,9 +18,11 @@ from retwin.twins.parametric import ParametricTwin
 from retwin.update.identification.bayes import infer_posterior
 from retwin.update.identification.identifiability import (
     CHI2_95,
+    MIN_TRAJECTORIES,
     Identifiability,
     identifiability,
     noise_of,
+    standard_errors,
 )
 from retwin.update.identification.mcmc import MCMC
 from retwin.update.identification.misfit import misfit_of
@@ -46,8 +49,12 @@ class Updated:
     twin : ParametricTwin
         The updated twin.
     values, errors : dict of str to float
-        θ̂ and its standard errors by name. The errors allow for autocorrelated residuals and for a
-        robust loss, but not for a twin that cannot fit the data.
+        θ̂ and its standard errors by name. They allow for residuals that are correlated in any way
+        within a trajectory, and for a robust loss, but not for a twin that cannot fit the data.
+        NaN below three trajectories, from which they cannot be given; `reason` then has a note.
+    intervals : dict of str to tuple of float
+        95 % intervals from the standard errors and Student's t distribution, with one degree of
+        freedom less than trajectories.
     objective : float
         ‖y_obs − f(θ̂, u)‖ of Eq. 2 over all measurements.
     starts : tuple of Optimum
@@ -74,6 +81,7 @@ class Updated:
     twin: ParametricTwin
     values: dict[str, float]
     errors: dict[str, float]
+    intervals: dict[str, tuple[float, float]]
     objective: float
     starts: tuple[Optimum, ...]
     identifiability: Identifiability
@@ -204,13 +212,23 @@ def _fit(
         optima = search.run(np.random.default_rng(seed))
         best, point = optima[0]
         residual = misfit.residuals(np.array([best.values]))[0]
-        found, agreeing = _identifiability(search, optima, point, residual)
+        found, errors, agreeing = _identifiability(search, optima, point, residual)
     if found.warning:
         warnings.warn(found.warning, stacklevel=3)
+    count = len(observed)
+    half = stats.t.ppf(0.975, max(count - 1, 1)) * errors
+    values = np.array(best.values)
+    unknown = ""
+    if np.isnan(errors).any():
+        alone = "" if count < MIN_TRAJECTORIES else ", of which one alone determines a parameter"
+        unknown = f"no standard errors can be given from {count} trajectories{alone}"
     return Updated(
         twin=twin.with_values(best.values),
         values=dict(zip(twin.names, best.values, strict=True)),
-        errors=dict(zip(twin.names, found.errors.tolist(), strict=True)),
+        errors=dict(zip(twin.names, errors.tolist(), strict=True)),
+        intervals=dict(
+            zip(twin.names, zip(values - half, values + half, strict=True), strict=True)
+        ),
         objective=float(np.sqrt(np.sum(residual**2))),
         starts=tuple(each for each, _ in optima),
         identifiability=found,
@@ -223,7 +241,7 @@ def _fit(
             "independent": found.independent,
             "starts_agreeing": float(agreeing),
         },
-        reason="; ".join(filter(None, [best.reason, found.warning])),
+        reason="; ".join(filter(None, [best.reason, found.warning, unknown])),
         loss=search.loss,
         scale=search.scale,
     )
@@ -231,8 +249,8 @@ def _fit(
 
 def _identifiability(
     search: Search, optima: list[tuple[Optimum, NDArray]], best: NDArray, residual: NDArray
-) -> tuple[Identifiability, int]:
-    """The identifiability at the best optimum, and how many starts fit as well as it."""
+) -> tuple[Identifiability, NDArray, int]:
+    """The identifiability at the best optimum, its standard errors, and how many starts agree."""
     misfit = search.misfit
     # Outliers have as little weight in the standard errors as they had in the optimum.
     _, residual, curvature = search.linearised(residual)
@@ -240,13 +258,14 @@ def _identifiability(
     measured, lowest = int(misfit.seen.sum()), optima[0][0].objective ** 2
     margin = CHI2_95 * curvature * noise_of(residual, measured, len(best)) + 1e-6 * lowest
     alternatives = [point for each, point in optima if each.objective**2 <= lowest + margin]
+    jacobian, width = search.jacobian(best).reshape(*residual.shape, -1), misfit.high - misfit.low
     found = identifiability(
         misfit.twin.names,
-        search.jacobian(best).reshape(*residual.shape, -1),
+        jacobian,
         residual,
         measured=measured,
-        width=misfit.high - misfit.low,
+        width=width,
         at_bound=(best <= AT_BOUND) | (best >= 1 - AT_BOUND),
         alternatives=np.array(alternatives) - best,
     )
-    return found, len(alternatives)
+    return found, width * standard_errors(jacobian, residual), len(alternatives)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from retwin.checks import one_of, whole
 from retwin.data.trajectories import Trajectories
@@ -15,6 +16,9 @@ from retwin.update.identification.misfit import misfit_of
 from retwin.update.identification.search import LeastSquares, Search
 
 __all__ = ["Profile", "profile"]
+
+MARGIN = 2.0
+"""Distance of the outermost values from the optimum, in halves of the 95 % interval."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +34,12 @@ class Profile:
     objective : NDArray
         (g,), Eq. 2 (or the root of the sum of robust losses) there, with all others fitted anew.
     rise : NDArray
-        (g,), twice the negative log-likelihood minus its minimum, with the noise that the best fit
-        leaves and its autocorrelation. A value is in the 95 % interval where it is below 3.84.
+        (g,), twice the negative log-likelihood minus its minimum, with the noise with which its
+        curvature is that of the standard error; where that is not known, the noise that the best
+        fit leaves and its autocorrelation.
+    limit : float
+        A value is in the 95 % interval where `rise` is below it: the square of the quantile of
+        Student's t distribution that belongs to the standard error, or else 3.84.
 
     """
 
@@ -39,17 +47,20 @@ class Profile:
     values: NDArray
     objective: NDArray
     rise: NDArray
+    limit: float
 
     @property
     def interval(self) -> tuple[float, float]:
         """The 95 % interval, by linear interpolation; at a bound it may extend beyond it."""
-        inside = self.rise <= CHI2_95
+        inside = self.rise <= self.limit
         first, last = np.flatnonzero(inside)[[0, -1]]
         low, high = self.values[first], self.values[last]
         if first > 0:
-            low = np.interp(CHI2_95, self.rise[[first, first - 1]], self.values[[first, first - 1]])
+            ends = [first, first - 1]
+            low = np.interp(self.limit, self.rise[ends], self.values[ends])
         if last < len(self.values) - 1:
-            high = np.interp(CHI2_95, self.rise[[last, last + 1]], self.values[[last, last + 1]])
+            ends = [last, last + 1]
+            high = np.interp(self.limit, self.rise[ends], self.values[ends])
         return float(low), float(high)
 
 
@@ -73,8 +84,8 @@ def profile(
     name : str
         Name of the parameter.
     points : int
-        Values at which it is held, at least 3, within the bounds and up to four standard errors to
-        either side, in addition to the optimum.
+        Values at which it is held, at least 3, within the bounds and up to twice the half of the
+        95 % interval to either side, in addition to the optimum.
 
     Returns
     -------
@@ -90,21 +101,26 @@ def profile(
     one_of("name", name, names)
     whole("points", points, least=3)
     which = names.index(name)
+    error, limit, ratio = updated.identifiability.errors[which], CHI2_95, 1.0
+    if np.isfinite(updated.errors[name]):
+        error, ratio = updated.errors[name], (updated.errors[name] / error) ** 2
+        limit = stats.t.ppf(0.975, len(observed) - 1) ** 2
     with misfit_of(updated.twin, observed, seed=0, rate=rate, processes=processes) as misfit:
         search = Search(misfit, LeastSquares(starts=1), None)
         search.loss, search.scale = updated.loss, updated.scale
         best = (np.array(updated.twin.values) - misfit.low) / search.width
-        distance = 4 * updated.errors[name] / search.width[which]
+        distance = MARGIN * np.sqrt(limit) * error / search.width[which]
         low, high = max(best[which] - distance, 0.0), min(best[which] + distance, 1.0)
         grid = np.unique(np.append(np.linspace(low, high, points), best[which]))
         sums = _profiled(search, which, grid, best)
         _, residual, curvature = search.linearised(misfit.residuals(search.theta(best[None]))[0])
-        noise = curvature * noise_of(residual, int(misfit.seen.sum()), len(names))
+        noise = ratio * curvature * noise_of(residual, int(misfit.seen.sum()), len(names))
     return Profile(
         name,
         misfit.low[which] + search.width[which] * grid,
         np.sqrt(sums),
         (sums - sums.min()) / max(noise, 1e-300),
+        float(limit),
     )
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from retwin.update.residual.fitting import fit_residual, infer_discrepancy
-from retwin.update.residual.model import ResidualModel, segment
-from retwin.update.residual.residual import Residual, load_residual
+from retwin.update.residual.loading import load_residual
+from retwin.update.residual.model import ResidualModel
+from retwin.update.residual.residual import Residual, segment
 from retwin.update.residual.sequence import SequenceMixture, SequenceResidual
 from retwin.update.residual.settings import Density, Flow, Mixture, Refinement
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, overload
+from typing import overload
 
 import numpy as np
 import torch
@@ -16,10 +16,10 @@ from retwin.checks import require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
-from retwin.nets.mixtures import BernoulliHead
-from retwin.nets.training import Loss, isolated, train
+from retwin.nets.training import isolated
 from retwin.progress import Progress
 from retwin.twins.faults import Fault, draw_faults, faulty_commands, frozen_from
+from retwin.twins.twin import Twin
 from retwin.update.corrections import (
     Context,
     Correction,
@@ -29,9 +29,11 @@ from retwin.update.corrections import (
     sample_mask,
 )
 from retwin.update.corrections.delay_range import bound_note
-from retwin.update.residual.model import ResidualModel, segment
-from retwin.update.residual.penalties import checked_bounds, penalties
+from retwin.update.exact import exact_surrogate
+from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.refining import refine
+from retwin.update.residual.residual import segment
+from retwin.update.residual.segment_fitting import fit_segments
 from retwin.update.residual.sequence import SequenceMixture, SequenceResidual
 from retwin.update.residual.sequence_fitting import fit_sequence
 from retwin.update.residual.settings import Density, Mixture
@@ -47,7 +49,7 @@ BOUND_MARGIN = 1.25
 
 
 def infer_discrepancy(
-    surrogate: Surrogate,
+    surrogate: Surrogate | Twin,
     trajectories: Trajectories,
     correction: Correction,
     *,
@@ -58,8 +60,8 @@ def infer_discrepancy(
 
     Parameters
     ----------
-    surrogate : Surrogate
-        The IBG.
+    surrogate : Surrogate or Twin
+        The IBG, or a twin in its place (see `ExactSurrogate`).
     trajectories : Trajectories
         Commands and measured outputs.
     correction : Correction
@@ -76,13 +78,13 @@ def infer_discrepancy(
         What g is applied to, and z* with its uncertainty.
 
     """
-    context = _context(surrogate, trajectories, segments, faults)
+    context = _context(exact_surrogate(surrogate), trajectories, segments, faults)
     return context, correction.infer(context, *_measured(trajectories))
 
 
 @overload
 def fit_residual(
-    surrogate: Surrogate,
+    surrogate: Surrogate | Twin,
     calibration: Trajectories,
     correction: Correction = ...,
     density: Density = ...,
@@ -97,7 +99,7 @@ def fit_residual(
 
 @overload
 def fit_residual(
-    surrogate: Surrogate,
+    surrogate: Surrogate | Twin,
     calibration: Trajectories,
     correction: Correction,
     density: SequenceMixture,
@@ -111,7 +113,7 @@ def fit_residual(
 
 
 def fit_residual(
-    surrogate: Surrogate,
+    surrogate: Surrogate | Twin,
     calibration: Trajectories,
     correction: Correction = DelayOffset(),  # noqa: B008 - a frozen config
     density: Density | SequenceMixture = Mixture(),  # noqa: B008 - a frozen config
@@ -126,11 +128,11 @@ def fit_residual(
 
     Parameters
     ----------
-    surrogate : Surrogate
-        The IBG.
+    surrogate : Surrogate or Twin
+        The IBG, or a twin in its place (see `ExactSurrogate`).
     calibration : Trajectories
-        Real trajectories with commands. Six suffice; of fewer than three none is held out for
-        validation, with a warning.
+        Real trajectories with commands. Six suffice; from few the distribution is widened, and a
+        warning is given below three.
     correction : Correction
         The operator g, which defines z. The parameters of a sensor in it are fitted too.
     density : Density or SequenceMixture
@@ -163,6 +165,7 @@ def fit_residual(
         identified, or an unknown `calibrate_on`.
 
     """
+    surrogate = exact_surrogate(surrogate)
     _check_match(surrogate, calibration)
     stepwise = correction.resolution == "step" or isinstance(density, SequenceMixture)
     keep, faults = _chosen(
@@ -198,34 +201,23 @@ def fit_residual(
             correction, density, inputs=used.inputs, outputs=used.outputs, segmentation=rule
         )
     targets = Targets.of(model, context, found, seed=seed)
-    _prepare(model, targets, bounds, seed)
-    fitted, held_out = _validation_split(used, seed)
-    result = train(
-        model,
-        _objective(density),
-        targets.examples(model, fitted),
-        None if held_out is None else targets.examples(model, held_out),
-        density.training,
-        seed=seed,
-        progress=progress,
-    )
-    if targets.posterior:
-        model.persistence.copy_(targets.persistence(model))
+    result, held_out = fit_segments(model, targets, bounds=bounds, seed=seed, progress=progress)
     figures = {"trajectories": float(len(used)), "movements": float(parts.valid.sum())}
     if found.at_bound is not None:
         figures["delays_at_bound"] = share = float(found.at_bound.double()[parts.valid].mean())
         result = replace(result, reason="; ".join(filter(None, [result.reason, bound_note(share)])))
-    if density.refinement is not None and held_out is not None:
+    if density.refinement is not None and len(held_out):
         observed, mask = _measured(used)
         sampled = sample_mask(correction, observed, mask, used.rate)
+        fitted = np.setdiff1d(np.arange(len(used)), held_out)
         figures |= refine(
-            model, context, observed, sampled, fitted=fitted, held_out=held_out,
+            model, context, observed, sampled, fitted=torch.as_tensor(fitted), held_out=held_out,
             how=density.refinement, seed=seed, progress=progress,
         )  # fmt: skip
     model.emulated = used.emulated
     onsets = Segments.from_commands(calibration.commands)
     model.timing = np.where(onsets.valid, onsets.start, np.nan)
-    model.fitted = replace(result, figures=figures)
+    model.fitted = replace(result, figures=figures | result.figures)
     return model.eval()
 
 
@@ -304,62 +296,7 @@ def _chosen(
     if keep.sum() < minimum:
         warnings.warn(
             f"calibration: {keep.sum()} trajectories to calibrate on, at least three are needed to "
-            "hold one out; training runs to its last epoch without validation",
+            "learn how much they differ; the distribution of the discrepancy is widened for it",
             stacklevel=3,
         )
     return np.flatnonzero(keep), faults
-
-
-@torch.no_grad()
-def _prepare(model: ResidualModel, targets: Targets, bounds: NDArray | None, seed: int) -> None:
-    """Take units, bounds and initial heads of the model from the data that it is trained on."""
-    valid, z = targets.valid, targets.z
-    model.before.fit(targets.features[valid])
-    for head, part in model.parts():
-        if isinstance(head, BernoulliHead):
-            model.shift[part], model.scale[part], model.bounds[part] = 0.0, 1.0, 1.0
-            head.initialise(z[:, valid][..., part].flatten(0, 1).double().numpy(), seed)
-            continue
-        identified = targets.identified[..., part].all(dim=-1) & valid
-        values = z[:, identified if identified.any() else valid][..., part].flatten(0, 1)
-        # Robust: the unit of z must not depend on a few missed segments.
-        shift = values.median(dim=0).values
-        scale = 1.4826 * (values - shift).abs().median(dim=0).values
-        spread = values.std(dim=0, correction=0)
-        largest = values.abs().amax(dim=0).clamp_min(SMALLEST)
-        scale = torch.maximum(scale, 0.1 * spread).maximum(1e-6 * largest)
-        model.shift[part], model.scale[part] = shift, scale
-        model.bounds[part] = BOUND_MARGIN * largest
-        head.initialise(((values - shift) / scale).double().numpy(), seed)
-    if bounds is not None:
-        model.bounds.copy_(checked_bounds(bounds, model.latent))
-
-
-def _validation_split(used: Trajectories, seed: int) -> tuple[Tensor, Tensor | None]:
-    """Indices to train on, and a fifth of the trajectories, at least one, for validation."""
-    if len(used) < 3:
-        return torch.arange(len(used)), None
-    order = torch.as_tensor(np.random.default_rng(seed).permutation(len(used)))
-    count = max(1, round(0.2 * len(used)))
-    return order[count:], order[:count]
-
-
-def _objective(density: Density) -> Loss:
-    """L_RG of Eq. 10, averaged over segments."""
-
-    def loss(model: Any, batch: tuple[Tensor, ...]) -> Tensor:
-        features, z, identified, valid = batch
-        distribution = model.distribution(features)
-        # Blocks that are not identified hold a finite placeholder and are not in the likelihood.
-        log_prob = torch.where(identified, distribution.block_log_prob(z), 0.0).sum()
-        nll = -log_prob / identified.sum().clamp_min(1) * identified.shape[-1]
-        return nll + penalties(
-            distribution.mean,
-            model.bounds,
-            model.scale,
-            valid,
-            density.smoothness,
-            density.boundedness,
-        )
-
-    return loss

@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retwin.catalog import DENSITIES, classes
-from retwin.checks import one_of, require
-from retwin.data.segments import Segments
+from retwin.checks import require
 from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import BernoulliHead, Blocks
 from retwin.nets.networks import Standardise
-from retwin.nets.training import Fit
-from retwin.serialisation.configs import from_config, to_config
-from retwin.serialisation.models import read_model, write_model
 from retwin.update.corrections import Context, Correction
-from retwin.update.residual.former import read_correction, written_correction
+from retwin.update.residual.residual import Residual
 from retwin.update.residual.settings import Density
-from retwin.update.surrogate import Surrogate
 
-__all__ = ["ResidualModel", "describe", "segment"]
+__all__ = ["ResidualModel", "describe"]
 
 
-class ResidualModel(nn.Module):
+class ResidualModel(Residual):
     """The distribution of z (n, M, d_z) given a `Context`: call it to get a torch distribution.
 
     Parameters
@@ -38,17 +28,13 @@ class ResidualModel(nn.Module):
         The operator g, with one z per segment.
     density : Density
         Settings of the distribution and of its encoder.
-    inputs, outputs : Channels
-        Channels of the commands and of the outputs.
-    segmentation : str
-        Rule by which segments are found, see `segment`.
+    inputs, outputs, segmentation
+        See `Residual`, also for the attributes that are not named here.
 
     Attributes
     ----------
-    latent : Channels
-        Names and units of the components of z.
-    emulated, timing, fitted
-        See `Residual`.
+    spread : Tensor
+        (d_z,), factor by which deviations from the mean are multiplied, 1 for events.
 
     Raises
     ------
@@ -57,10 +43,7 @@ class ResidualModel(nn.Module):
 
     """
 
-    bounds: Tensor
-    shift: Tensor
-    scale: Tensor
-    persistence: Tensor
+    kind = "residual"
 
     def __init__(
         self,
@@ -71,12 +54,6 @@ class ResidualModel(nn.Module):
         outputs: Channels,
         segmentation: str = "commands",
     ) -> None:
-        super().__init__()
-        self.correction = correction
-        self.density = density
-        self.inputs = inputs
-        self.outputs = outputs
-        self.segmentation = segmentation
         require(
             getattr(correction, "resolution", "") == "segment",
             "correction",
@@ -85,10 +62,9 @@ class ResidualModel(nn.Module):
             remedy="use DelayOffset, CommandSpace, or a Chain of one with a SampledSensor; or, for "
             "one z per sample, a SequenceMixture as the density",
         )
-        self.latent = correction.latent(inputs, outputs)
-        self.emulated = False
-        self.timing: NDArray = np.empty((0, 0))
-        self.fitted: Fit | None = None
+        super().__init__(
+            correction, density, inputs=inputs, outputs=outputs, segmentation=segmentation
+        )
         features = 3 * (len(inputs) + len(outputs)) + 2
         self.before = Standardise(features)
         layers: list[nn.Module] = []
@@ -97,39 +73,13 @@ class ResidualModel(nn.Module):
             layers += [nn.Linear(width, following), nn.SiLU(), nn.Dropout(density.dropout)]
             width = following
         self.encoder = nn.Sequential(*layers)
-        blocks = correction.heads(inputs, outputs)
         self.heads = nn.ModuleList(
             density.head(width, block.width)
             if block.kind == "mixture"
             else BernoulliHead(width, block.width)
-            for block in blocks
+            for block in correction.heads(inputs, outputs)
         )
-        self.sizes = [block.width for block in blocks]
-        for name in ("bounds", "shift", "scale"):
-            self.register_buffer(name, torch.ones(len(self.latent)))
-        self.register_buffer("persistence", torch.zeros(len(self.latent)))
-
-    def context(
-        self,
-        surrogate: Surrogate,
-        commands: NDArray,
-        segments: Segments | None = None,
-        *,
-        faulty_commands: NDArray | None = None,
-        frozen: NDArray | None = None,
-    ) -> Context:
-        """The context of commands (n, T, d_u), with segments by this model's rule unless given."""
-        if segments is None or self.segmentation == "path":
-            nominal = surrogate.predict(commands) if self.segmentation == "path" else commands
-            segments = segment(commands, nominal, self.segmentation)
-        return Context.of(
-            surrogate,
-            commands,
-            segments,
-            rate=surrogate.rate,
-            faulty_commands=faulty_commands,
-            frozen=frozen,
-        )
+        self.register_buffer("spread", torch.ones(len(self.latent)))
 
     def forward(self, context: Context) -> Blocks:
         """The distribution q_ψ(z | u, ŷ), in physical units."""
@@ -142,18 +92,23 @@ class ResidualModel(nn.Module):
             yield head, slice(begin, begin + size)
             begin += size
 
+    @property
+    def events(self) -> Tensor:
+        """(d_z,) bool, the components of z that are 0 or 1."""
+        kinds = [isinstance(head, BernoulliHead) for head in self.heads]
+        return torch.tensor(kinds).repeat_interleave(torch.tensor(self.sizes))
+
     def distribution(self, features: Tensor) -> Blocks:
         """The distribution q_ψ for features (..., F) of segments, see `describe`."""
+        return self.predict(features).widened(self.spread)
+
+    def predict(self, features: Tensor) -> Blocks:
+        """The distribution that the network predicts, before its calibration by `spread`."""
         encoded = self.encoder(self.before(features))
         parts = zip(
             self.heads, self.shift.split(self.sizes), self.scale.split(self.sizes), strict=True
         )
         return Blocks([head(encoded, shift, scale) for head, shift, scale in parts])
-
-    @torch.no_grad()
-    def mean(self, context: Context) -> Tensor:
-        """The mean z̄ (n, M, d_z) of Eq. 8, clipped at b."""
-        return self(context).mean.clamp(-self.bounds, self.bounds)
 
     @torch.no_grad()
     def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:
@@ -175,41 +130,6 @@ class ResidualModel(nn.Module):
             own = self.persistence.sqrt() * common + (1 - self.persistence).sqrt() * own
         return distribution.from_noise(uniform, own).clamp(-self.bounds, self.bounds)
 
-    def save(self, folder: str | Path) -> None:
-        """Write the weights and the description, see `retwin.serialisation.models`."""
-        about = {
-            **written_correction(self.correction),
-            "density": to_config(self.density, classes(DENSITIES, Density)),
-            "inputs": vars(self.inputs),
-            "outputs": vars(self.outputs),
-            "segmentation": self.segmentation,
-            "emulated": self.emulated,
-            "timing": [[None if np.isnan(t) else t for t in row] for row in self.timing],
-            "fitted": None if self.fitted is None else asdict(self.fitted),
-        }
-        with write_model(folder, "residual", about, self.state_dict()):
-            pass
-
-    @classmethod
-    def load(cls, folder: str | Path, rate: float | None = None) -> ResidualModel:
-        """Read what `save` wrote; `rate` in Hz is for files from before version 0.1.0 only.
-
-        Raises InputError if the folder holds no residual model or is damaged.
-        """
-        about, weights = read_model(folder, "residual")
-        model = cls(
-            read_correction(about, rate),
-            from_config(about["density"], classes(DENSITIES, Density)),
-            inputs=Channels.of(about["inputs"]),
-            outputs=Channels.of(about["outputs"]),
-            segmentation=about["segmentation"],
-        )
-        model.load_state_dict(weights)
-        model.emulated = about["emulated"]
-        model.timing = np.array(about["timing"], dtype=float)
-        model.fitted = Fit.of(about["fitted"])
-        return model.eval()
-
 
 def describe(context: Context) -> Tensor:
     """The features (n, M, F) of each segment that the residual model is conditioned on.
@@ -229,28 +149,3 @@ def describe(context: Context) -> Tensor:
             columns.append(values.gather(1, index.expand(-1, -1, values.shape[2])))
     lengths = torch.stack([settle - start, stop - settle], dim=-1) / context.rate
     return torch.cat([*columns, lengths.to(context.nominal)], dim=-1)
-
-
-def segment(commands: NDArray, nominal: NDArray, rule: str = "commands") -> Segments:
-    """The segments of trajectories.
-
-    Parameters
-    ----------
-    commands, nominal : NDArray
-        (n, T, d_u) and (n, T, d_y).
-    rule : str
-        "commands" finds them from command events, "path" from the speed of the nominal output.
-
-    Returns
-    -------
-    Segments
-        One row per trajectory.
-
-    Raises
-    ------
-    InputError
-        An unknown rule.
-
-    """
-    one_of("segments", rule, ("commands", "path"), remedy="use 'path' without command events")
-    return Segments.from_commands(commands) if rule == "commands" else Segments.from_path(nominal)

@@ -9,30 +9,28 @@ from torch import Tensor
 
 from retwin.checks import require
 from retwin.data.trajectories import Channels
+from retwin.update.residual.residual import Residual
 
-__all__ = ["checked_bounds", "penalties"]
+__all__ = ["BOUND_MARGIN", "SMALLEST", "checked_bounds", "penalties"]
+
+SMALLEST = 1e-12
+"""Smallest value taken for the largest |z*|: a millionth of it still has a square in float32."""
+BOUND_MARGIN = 1.25
+"""Default bound b of Eq. 9, over the largest |z*|."""
 
 
-def penalties(
-    mean: Tensor,
-    bounds: Tensor,
-    scale: Tensor,
-    valid: Tensor,
-    smoothness: float,
-    boundedness: float,
-) -> Tensor:
+def penalties(model: Residual, mean: Tensor, valid: Tensor) -> Tensor:
     """λ_s times the mean square step of z̄, plus λ_b times its mean square excess over b (Eq. 9).
 
     Parameters
     ----------
+    model : Residual
+        Its `bounds` are b, its `scale` the unit in which steps and excess are measured, and its
+        `density` holds λ_s and λ_b.
     mean : Tensor
         (n, M, d_z), z̄ over M segments or samples.
-    bounds, scale : Tensor
-        (d_z,), b, and the unit of z in which steps and excess are measured.
     valid : Tensor
         (n, M) bool, what is averaged over.
-    smoothness, boundedness : float
-        λ_s and λ_b.
 
     Returns
     -------
@@ -40,12 +38,12 @@ def penalties(
         A scalar.
 
     """
-    step = (mean[:, 1:] - mean[:, :-1]) / scale
+    step = (mean[:, 1:] - mean[:, :-1]) / model.scale
     both = valid[:, 1:] & valid[:, :-1]
     roughness = (step.square().sum(-1) * both).sum() / both.sum().clamp_min(1)
-    beyond = torch.relu(mean.abs() - bounds) / scale
+    beyond = torch.relu(mean.abs() - model.bounds) / model.scale
     excess = (beyond.square().sum(-1) * valid).sum() / valid.sum().clamp_min(1)
-    return smoothness * roughness + boundedness * excess
+    return model.density.smoothness * roughness + model.density.boundedness * excess
 
 
 def checked_bounds(bounds: NDArray, latent: Channels) -> Tensor:

@@ -1,34 +1,57 @@
-"""The interface of residual models: draws and the mean of z for a context."""
+"""`Residual`: what residual models with one z per segment and with one z per sample share."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from dataclasses import asdict
 from pathlib import Path
-from typing import Protocol
+from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
+from retwin.catalog import DENSITIES, NETWORKS, classes
+from retwin.checks import one_of
 from retwin.data.segments import Segments
+from retwin.data.trajectories import Channels
+from retwin.nets.mixtures import Blocks
 from retwin.nets.training import Fit
-from retwin.serialisation.models import kind_of, refusing
+from retwin.serialisation.configs import from_config, to_config
+from retwin.serialisation.models import read_model, write_model
 from retwin.update.corrections import Context, Correction
-from retwin.update.residual.model import ResidualModel
-from retwin.update.residual.sequence import SequenceResidual
+from retwin.update.residual.former import read_correction, written_correction
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["Residual", "load_residual"]
+__all__ = ["Residual", "segment"]
 
 
-class Residual(Protocol):
-    """A fitted residual model, with one z per segment or per sample.
+class Residual(nn.Module, ABC):
+    """The distribution of z given a `Context`: call it to get a torch distribution.
 
-    Attributes
+    Parameters
     ----------
     correction : Correction
         The operator g, which defines z.
+    density : Density or SequenceMixture
+        Settings of the distribution.
+    inputs, outputs : Channels
+        Channels of the commands and of the outputs.
     segmentation : str
         Rule by which segments are found, see `segment`.
+
+    Attributes
+    ----------
+    latent : Channels
+        Names and units of the components of z.
+    sizes : list of int
+        Widths of the blocks of z.
+    bounds, shift, scale : Tensor
+        (d_z,), b of Eq. 9, and the origin and unit of z.
+    persistence : Tensor
+        (d_z,), correlation of the normal scores of z, between the segments of a trajectory or from
+        one sample to the next.
     emulated : bool
         Whether it was fitted to an emulated system instead of the real one.
     timing : NDArray
@@ -38,11 +61,37 @@ class Residual(Protocol):
 
     """
 
-    correction: Correction
-    segmentation: str
-    emulated: bool
-    timing: NDArray
-    fitted: Fit | None
+    kind: ClassVar[str]
+    """Kind of the saved model."""
+    bounds: Tensor
+    shift: Tensor
+    scale: Tensor
+    persistence: Tensor
+    spread: Tensor
+
+    def __init__(
+        self,
+        correction: Correction,
+        density: Any,
+        *,
+        inputs: Channels,
+        outputs: Channels,
+        segmentation: str = "commands",
+    ) -> None:
+        super().__init__()
+        self.correction = correction
+        self.density = density
+        self.inputs = inputs
+        self.outputs = outputs
+        self.segmentation = segmentation
+        self.latent = correction.latent(inputs, outputs)
+        self.sizes = [head.width for head in correction.heads(inputs, outputs)]
+        self.emulated = False
+        self.timing: NDArray = np.empty((0, 0))
+        self.fitted: Fit | None = None
+        for name in ("bounds", "shift", "scale"):
+            self.register_buffer(name, torch.ones(len(self.latent)))
+        self.register_buffer("persistence", torch.zeros(len(self.latent)))
 
     def context(
         self,
@@ -53,27 +102,95 @@ class Residual(Protocol):
         faulty_commands: NDArray | None = None,
         frozen: NDArray | None = None,
     ) -> Context:
-        """The context of commands (n, T, d_u), which the model is conditioned on."""
-        ...
+        """The context of commands (n, T, d_u), with segments by this model's rule unless given."""
+        if segments is None or self.segmentation == "path":
+            nominal = surrogate.predict(commands) if self.segmentation == "path" else commands
+            segments = segment(commands, nominal, self.segmentation)
+        return Context.of(
+            surrogate,
+            commands,
+            segments,
+            rate=surrogate.rate,
+            faulty_commands=faulty_commands,
+            frozen=frozen,
+        )
 
+    @abstractmethod
+    def forward(self, context: Context) -> Blocks:
+        """The distribution q_ψ of each z, in physical units."""
+
+    @torch.no_grad()
     def mean(self, context: Context) -> Tensor:
-        """The mean z̄ (n, M, d_z) of Eq. 8, within b."""
-        ...
+        """The mean z̄ (n, M, d_z) of Eq. 8, clipped at b."""
+        return self(context).mean.clamp(-self.bounds, self.bounds)
 
+    @abstractmethod
     def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:
-        """Draws of z (n, M, d_z), within b."""
-        ...
+        """Draws of z (n, M, d_z), clipped at b."""
 
     def save(self, folder: str | Path) -> None:
-        """Write the weights and the description."""
-        ...
+        """Write the weights and the description, see `retwin.serialisation.models`."""
+        about = {
+            **written_correction(self.correction),
+            "density": to_config(self.density, _densities()),
+            "inputs": vars(self.inputs),
+            "outputs": vars(self.outputs),
+            "segmentation": self.segmentation,
+            "emulated": self.emulated,
+            "timing": [[None if np.isnan(t) else t for t in row] for row in self.timing],
+            "fitted": None if self.fitted is None else asdict(self.fitted),
+        }
+        with write_model(folder, self.kind, about, self.state_dict()):
+            pass
+
+    @classmethod
+    def load(cls, folder: str | Path, rate: float | None = None) -> Self:
+        """Read what `save` wrote; `rate` in Hz is for files from before version 0.1.0 only.
+
+        Raises InputError if the folder holds no such residual model or is damaged.
+        """
+        about, weights = read_model(folder, cls.kind)
+        model = cls(
+            read_correction(about, rate),
+            from_config(about["density"], _densities()),
+            inputs=Channels.of(about["inputs"]),
+            outputs=Channels.of(about["outputs"]),
+            # Development versions before 0.1.0 wrote neither for one z per sample.
+            segmentation=about.get("segmentation", "commands"),
+        )
+        # Models per segment had no `spread` in development versions before 0.1.0.
+        model.load_state_dict({"spread": torch.ones_like(model.spread), **weights})
+        model.emulated = about["emulated"]
+        model.timing = np.atleast_2d(np.array(about.get("timing", []), dtype=float))
+        model.fitted = Fit.of(about["fitted"])
+        return model.eval()
 
 
-def load_residual(
-    folder: str | Path, rate: float | None = None
-) -> ResidualModel | SequenceResidual:
-    """The residual model that `folder` holds, of either kind; InputError if it holds none."""
-    with refusing(folder, expected="a residual model"):
-        if kind_of(folder) == "sequence residual":
-            return SequenceResidual.load(folder, rate)
-        return ResidualModel.load(folder, rate)
+def _densities() -> tuple[type, ...]:
+    """The kinds that the description of a density may name."""
+    return (*classes(DENSITIES), *classes(NETWORKS))
+
+
+def segment(commands: NDArray, nominal: NDArray, rule: str = "commands") -> Segments:
+    """The segments of trajectories.
+
+    Parameters
+    ----------
+    commands, nominal : NDArray
+        (n, T, d_u) and (n, T, d_y).
+    rule : str
+        "commands" finds them from command events, "path" from the speed of the nominal output.
+
+    Returns
+    -------
+    Segments
+        One row per trajectory.
+
+    Raises
+    ------
+    InputError
+        An unknown rule.
+
+    """
+    one_of("segments", rule, ("commands", "path"), remedy="use 'path' without command events")
+    return Segments.from_commands(commands) if rule == "commands" else Segments.from_path(nominal)

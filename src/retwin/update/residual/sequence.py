@@ -9,28 +9,21 @@ network is trained with a past z that it does not have in simulation.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 from torch import Tensor, nn
 
-from retwin.catalog import NETWORKS, classes
 from retwin.checks import require
-from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import Blocks, GaussianMixture, MixtureHead
 from retwin.nets.networks import LSTM, Network, Standardise
-from retwin.nets.training import Fit, Training
-from retwin.serialisation.configs import from_config, to_config
-from retwin.serialisation.models import read_model, write_model
+from retwin.nets.training import Training
 from retwin.update.corrections import Context, Correction
-from retwin.update.residual.former import read_correction, written_correction
-from retwin.update.surrogate import Surrogate
+from retwin.update.residual.residual import Residual
 
 __all__ = ["Member", "SequenceMixture", "SequenceResidual", "past", "shrunk", "widened"]
 
@@ -53,7 +46,7 @@ class SequenceMixture:
         λ_s and λ_b of Eq. 10, on z̄ in standard units (Eq. 9 over t).
     members : int
         Networks of the ensemble, at least 2; each holds out another part of the data.
-    block, gap : int
+    block, margin : int
         Samples of a held-out part of a record, and samples on either side of it that are not
         trained on either, since they correlate with it. With at least as many records as members,
         whole records are held out.
@@ -91,7 +84,7 @@ class SequenceMixture:
     boundedness: float = 1.0
     members: int = 8
     block: int = 32
-    gap: int = 8
+    margin: int = 8
     window: int = 192
     burn_in: int = 64
     moderation: float = 0.5
@@ -106,7 +99,7 @@ class SequenceMixture:
         sound = (
             min(counts) >= 1
             and self.members >= 2
-            and self.gap >= 0
+            and self.margin >= 0
             and 0 <= self.burn_in < self.window
             and 0 <= self.dropout < 1
             and 0 <= self.moderation <= 1
@@ -152,7 +145,7 @@ class Member(nn.Module):
         return [head(encoded, *unit) for head, *unit in zip(self.heads, shift, scale, strict=True)]
 
 
-class SequenceResidual(nn.Module):
+class SequenceResidual(Residual):
     """The distribution of z (n, T, d_z) given a `Context`: call it to get a torch distribution.
 
     Parameters
@@ -161,21 +154,15 @@ class SequenceResidual(nn.Module):
         The operator g, with one z per sample.
     density : SequenceMixture
         Settings.
-    inputs, outputs : Channels
-        Channels of the commands and of the outputs.
+    inputs, outputs, segmentation
+        See `Residual`, also for the attributes that are not named here.
 
     Attributes
     ----------
-    latent : Channels
-        Names and units of the components of z.
     trust : Tensor
         (d_z,), factor from 0 to 1 by which means are shrunk towards `shift`.
     spread : Tensor
         Factor by which standard deviations are multiplied.
-    persistence : Tensor
-        (d_z,), autoregressive coefficient of the normal scores of z.
-    segmentation, emulated, timing, fitted
-        See `Residual`.
 
     Raises
     ------
@@ -184,12 +171,8 @@ class SequenceResidual(nn.Module):
 
     """
 
-    bounds: Tensor
-    shift: Tensor
-    scale: Tensor
+    kind = "sequence residual"
     trust: Tensor
-    spread: Tensor
-    persistence: Tensor
 
     def __init__(
         self,
@@ -198,10 +181,9 @@ class SequenceResidual(nn.Module):
         *,
         inputs: Channels,
         outputs: Channels,
+        segmentation: str = "commands",
     ) -> None:
-        super().__init__()
-        blocks = correction.heads(inputs, outputs)
-        kinds = {block.kind for block in blocks}
+        kinds = {head.kind for head in correction.heads(inputs, outputs)}
         require(
             correction.resolution == "step" and kinds == {"mixture"},
             "correction",
@@ -209,48 +191,19 @@ class SequenceResidual(nn.Module):
             got=repr(correction),
             remedy="use Additive, or a density such as Mixture for one z per segment",
         )
-        self.correction = correction
-        self.density = density
-        self.inputs = inputs
-        self.outputs = outputs
-        self.segmentation = "commands"
-        self.latent = correction.latent(inputs, outputs)
-        self.sizes = [block.width for block in blocks]
-        self.emulated = False
-        self.timing: NDArray = np.empty((0, 0))
-        self.fitted: Fit | None = None
+        super().__init__(
+            correction, density, inputs=inputs, outputs=outputs, segmentation=segmentation
+        )
         self.before = Standardise(len(inputs) + len(outputs))
         self.members = self.fresh()
-        for name in ("bounds", "shift", "scale", "trust"):
-            self.register_buffer(name, torch.ones(len(self.latent)))
+        self.register_buffer("trust", torch.ones(len(self.latent)))
         self.register_buffer("spread", torch.ones(()))
-        self.register_buffer("persistence", torch.zeros(len(self.latent)))
 
     def fresh(self) -> nn.ModuleList:
         """Members with random initial weights."""
         width = len(self.inputs) + len(self.outputs)
         return nn.ModuleList(
             Member(self.density, width, self.sizes) for _ in range(self.density.members)
-        )
-
-    def context(
-        self,
-        surrogate: Surrogate,
-        commands: NDArray,
-        segments: Segments | None = None,
-        *,
-        faulty_commands: NDArray | None = None,
-        frozen: NDArray | None = None,
-    ) -> Context:
-        """The context of commands (n, T, d_u), which the model is conditioned on."""
-        parts = Segments.from_commands(commands) if segments is None else segments
-        return Context.of(
-            surrogate,
-            commands,
-            parts,
-            rate=surrogate.rate,
-            faulty_commands=faulty_commands,
-            frozen=frozen,
         )
 
     def forward(self, context: Context) -> Blocks:
@@ -270,11 +223,6 @@ class SequenceResidual(nn.Module):
         units = self.shift.split(self.sizes), self.scale.split(self.sizes)
         blocks: list[GaussianMixture] = member(self.before(features), *units)
         return blocks
-
-    @torch.no_grad()
-    def mean(self, context: Context) -> Tensor:
-        """The mean z̄ (n, T, d_z) of Eq. 8, clipped at b."""
-        return self(context).mean.clamp(-self.bounds, self.bounds)
 
     @torch.no_grad()
     def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:
@@ -298,37 +246,6 @@ class SequenceResidual(nn.Module):
         )
         z = drawn_from.from_noise(torch.special.ndtr(of_components), of_values)
         return z.clamp(-self.bounds, self.bounds)
-
-    def save(self, folder: str | Path) -> None:
-        """Write the weights and the description, see `retwin.serialisation.models`."""
-        about = {
-            **written_correction(self.correction),
-            "density": to_config(self.density, (SequenceMixture, *classes(NETWORKS))),
-            "inputs": vars(self.inputs),
-            "outputs": vars(self.outputs),
-            "emulated": self.emulated,
-            "fitted": None if self.fitted is None else asdict(self.fitted),
-        }
-        with write_model(folder, "sequence residual", about, self.state_dict()):
-            pass
-
-    @classmethod
-    def load(cls, folder: str | Path, rate: float | None = None) -> SequenceResidual:
-        """Read what `save` wrote; `rate` in Hz is for files from before version 0.1.0 only.
-
-        Raises InputError if the folder holds no such model or is damaged.
-        """
-        about, weights = read_model(folder, "sequence residual")
-        model = cls(
-            read_correction(about, rate),
-            from_config(about["density"], (SequenceMixture, *classes(NETWORKS))),
-            inputs=Channels.of(about["inputs"]),
-            outputs=Channels.of(about["outputs"]),
-        )
-        model.load_state_dict(weights)
-        model.emulated = about["emulated"]
-        model.fitted = Fit.of(about["fitted"])
-        return model.eval()
 
 
 def past(context: Context) -> Tensor:

@@ -1,4 +1,4 @@
-"""Fitting the residual model per sample: windows, cross-validation with a gap, calibration."""
+"""Fitting the residual model per sample: windows, cross-validation, calibration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from retwin.nets.mixtures import Blocks
 from retwin.nets.training import Fit, Loss, isolated, train
 from retwin.progress import Progress
 from retwin.update.corrections import Context, Correction, Discrepancy
-from retwin.update.residual.penalties import checked_bounds, penalties
+from retwin.update.residual.penalties import BOUND_MARGIN, SMALLEST, checked_bounds, penalties
 from retwin.update.residual.sequence import (
     SequenceMixture,
     SequenceResidual,
@@ -97,7 +97,7 @@ def fit_sequence(
         remedy="give longer records, fewer members, or shorter blocks",
     )
     _prepare(model, data, bounds, seed)
-    fitted = [identified & ~_dilated(part, density.gap) for part in held_out]
+    fitted = [identified & ~_dilated(part, density.margin) for part in held_out]
     report = _counter(progress, (1 + density.refit) * len(fitted))
     fits = _trained(model, data, fitted, seed, report)
     figures = _calibrate(model, data, held_out)
@@ -190,9 +190,9 @@ def held_out_parts(valid: Tensor, density: SequenceMixture) -> Tensor:
     return fold == torch.arange(density.members)[:, None, None]
 
 
-def _dilated(held_out: Tensor, gap: int) -> Tensor:
-    """The flags (n, T) with `gap` samples more on either side."""
-    wide = torch.nn.functional.max_pool1d(held_out.float()[:, None], 2 * gap + 1, 1, gap)
+def _dilated(held_out: Tensor, margin: int) -> Tensor:
+    """The flags (n, T) with `margin` samples more on either side."""
+    wide = torch.nn.functional.max_pool1d(held_out.float()[:, None], 2 * margin + 1, 1, margin)
     return wide[:, 0] > 0
 
 
@@ -202,9 +202,9 @@ def _prepare(model: SequenceResidual, data: _Records, bounds: NDArray | None, se
     values = data.z[data.identified]
     model.before.fit(data.features[data.identified])
     model.shift.copy_(values.mean(dim=0))
-    largest = values.abs().amax(dim=0).clamp_min(1e-12)
+    largest = values.abs().amax(dim=0).clamp_min(SMALLEST)
     model.scale.copy_(values.std(dim=0, correction=0).maximum(1e-6 * largest))
-    model.bounds.copy_(1.25 * largest)
+    model.bounds.copy_(BOUND_MARGIN * largest)
     if bounds is not None:
         model.bounds.copy_(checked_bounds(bounds, model.latent))
     _initialise(model, data, seed)
@@ -230,14 +230,7 @@ def _objective(model: SequenceResidual) -> Loss:
         deviation = (distribution.variance.sqrt() / model.scale).detach().mean(dim=-1)
         nll = -distribution.log_prob(z) * deviation ** (2 * density.moderation)
         nll = torch.where(used, nll, 0.0).sum() / used.sum().clamp_min(1)
-        return nll + penalties(
-            distribution.mean,
-            model.bounds,
-            model.scale,
-            used,
-            density.smoothness,
-            density.boundedness,
-        )
+        return nll + penalties(model, distribution.mean, used)
 
     return loss
 
