@@ -69,6 +69,8 @@ class ArmSampler(Timed):
         Largest angle of a target from straight in degrees, one per motor.
     speed : float, default 272.0
         Largest speed of a motor in degrees per s.
+    rate : float, default 100.0
+        Sample rate in Hz.
 
     """
 
@@ -77,28 +79,24 @@ class ArmSampler(Timed):
     period: float = 2.0
     amplitude: tuple[float, ...] = (80.0, 50.0, 50.0, 50.0)
     speed: float = 272.0
-
-    @property
-    def rate(self) -> float:
-        """Sample rate in Hz."""
-        return RATE
+    rate: float = RATE
 
     def sample(
         self, count: int, *, rng: np.random.Generator, onsets: NDArray | None = None
     ) -> NDArray:
         """Draw commands (count, steps, 4) in units of 0.24 degrees; see `CommandSampler.sample`."""
         shape = (count, self.movements, len(self.amplitude))
-        ramps = rng.choice(RAMPS, size=shape)
+        ramps = rng.choice(RAMPS, size=shape) * (self.rate / RATE)
         goals = rng.uniform(-1, 1, size=shape) * self.amplitude
         targets = np.empty(shape)
         now = np.zeros((count, len(self.amplitude)))
         for movement in range(self.movements):
-            largest = self.speed / RATE * ramps[:, movement]
+            largest = self.speed / self.rate * ramps[:, movement]
             now = now + np.clip(goals[:, movement] - now, -largest, largest)
             now = UNIT * np.round(now / UNIT)
             targets[:, movement] = STRAIGHT - now / UNIT
-        given = None if onsets is None else onsets * RATE
-        begins = draw_onsets(count, self.movements, self.period * RATE, rng=rng, given=given)
+        given = None if onsets is None else onsets * self.rate
+        begins = draw_onsets(count, self.movements, self.period * self.rate, rng=rng, given=given)
         start = np.full((count, len(self.amplitude)), STRAIGHT)
         return ramps_and_holds(start, targets, ramps, begins, self.steps, dtype=np.float32)
 

@@ -21,7 +21,7 @@ from retwin.checks import finite
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.times import stride_of
+from retwin.times import stride_of, to_samples
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, Twin, simulate_in_chunks
 from retwin.twins.wrapper import TwinWrapper
@@ -74,6 +74,9 @@ class EmulatedArmPi(TwinWrapper):
     sensor_rate : float
         Rate of the sensor in Hz, the rate of the data divided by a whole number; sensor samples are
         interpolated linearly.
+    phases : tuple of float
+        Times of the first sensor sample in s, each shorter than the sensor's period. Trajectories
+        take them in turn; the output is held until then.
     noise : float
         Scale of the error of a sensor sample before rounding, in command units (Student's t
         distribution with 3 degrees of freedom).
@@ -103,6 +106,7 @@ class EmulatedArmPi(TwinWrapper):
     dead_zone: float = 1.0
     backlash: float = 0.5
     sensor_rate: float = SENSOR_RATE
+    phases: tuple[float, ...] = (0.0,)
     noise: float = 0.25
     resolution: float = 1.0
     glitch: float = 0.06
@@ -112,10 +116,12 @@ class EmulatedArmPi(TwinWrapper):
     def __post_init__(self) -> None:
         remedy = "leave it out to have it as in the real arm"
         for each in fields(self):
-            if each.name != "arm":
+            if each.name not in ("arm", "phases"):
                 most = 1.0 if each.name in PROBABILITIES else math.inf
                 finite(each.name, getattr(self, each.name), least=0.0, most=most, remedy=remedy)
         stride_of(self.rate, self.sensor_rate, argument="sensor_rate")
+        for phase in self.phases or (math.nan,):
+            finite("phases", phase, least=0.0, most=1 / self.sensor_rate, remedy=remedy)
 
     @property
     def twin(self) -> Twin:
@@ -154,7 +160,7 @@ class EmulatedArmPi(TwinWrapper):
             driven = self.arm.respond(effective, frozen, chunk.failed)
             angles = _with_play(driven, self.backlash / 2)
             drawn.append(z | {"delay": z["delay"] / self.rate, "angles": angles})
-            observed = KINEMATIC.position(self._read(angles, frozen, rng))
+            observed = KINEMATIC.position(self._read(angles, chunk, rng))
             return KINEMATIC.position(chunk.commands), observed
 
         made = simulate_in_chunks(
@@ -183,23 +189,26 @@ class EmulatedArmPi(TwinWrapper):
             "missed": rng.random(joints) < self.missed,
         }
 
-    def _read(self, angles: NDArray, frozen: NDArray, rng: np.random.Generator) -> NDArray:
+    def _read(self, angles: NDArray, chunk: Chunk, rng: np.random.Generator) -> NDArray:
         """Sensor data (n, T, d_u): sampled, rounded, with glitches, and interpolated."""
         n, steps, width = angles.shape
         every = stride_of(self.rate, self.sensor_rate)
-        polls = np.arange(0, steps, every)
-        noise = self.noise * rng.standard_t(3, size=(n, len(polls), width))
+        turn = (chunk.index.start + np.arange(n)) % len(self.phases)
+        first = np.array([to_samples(phase, self.rate) for phase in self.phases])[turn, None]
+        polls = np.minimum(first + np.arange(0, steps, every), steps - 1)
+        noise = self.noise * rng.standard_t(3, size=(*polls.shape, width))
         # A frozen joint is held in software: its sensor samples are constant.
-        noise[polls[None, :, None] >= frozen[:, None, :]] = 0.0
-        samples = angles[:, polls] + noise
+        noise[polls[..., None] >= chunk.frozen[:, None]] = 0.0
+        samples = np.take_along_axis(angles, polls[..., None], axis=1) + noise
         if self.resolution:
             samples = self.resolution * np.round(samples / self.resolution)
         affected = np.flatnonzero(rng.random(n) < self.glitch)
-        for i in affected if len(polls) > 3 else ():
-            at, joint = rng.integers(1, len(polls) - 2), rng.integers(width)
+        count = polls.shape[1]
+        for i in affected if count > 3 else ():
+            at, joint = rng.integers(1, count - 2), rng.integers(width)
             size = rng.uniform(0.1, 1.0) * self.glitch_size * rng.choice([-1.0, 1.0])
             samples[i, at : at + rng.integers(1, 3), joint] += size
-        return interpolated(samples, np.arange(steps), every)
+        return interpolated(samples, np.maximum(np.arange(steps) - first, 0), every)
 
 
 def _repeating(commands: NDArray, segments: Segments) -> NDArray:

@@ -77,12 +77,15 @@ class ArmPiTwin:
         What is done with commands outside 0 to 1000.
     threads : int, default 0
         Threads that simulate; 0 takes all cores. The result does not depend on it.
+    rate : float, default 100.0
+        Sample rate in Hz; where a sample is shorter than `step`, it is one step.
 
     """
 
     step: float = 0.005
     outside: Literal["refuse", "clip"] = "refuse"
     threads: int = 0
+    rate: float = RATE
 
     @property
     def inputs(self) -> Channels:
@@ -93,11 +96,6 @@ class ArmPiTwin:
     def outputs(self) -> Channels:
         """Output channels: the end-effector's position."""
         return KINEMATIC.outputs
-
-    @property
-    def rate(self) -> float:
-        """Sample rate in Hz."""
-        return RATE
 
     @property
     def limits(self) -> Limits:
@@ -114,8 +112,8 @@ class ArmPiTwin:
             inputs=self.inputs,
             sensors=("tip",),
             outputs=self.outputs,
-            rate=RATE,
-            step=self.step,
+            rate=self.rate,
+            step=min(self.step, 1 / self.rate),
             nominal=KINEMATIC.position,
             outside=self.outside,
             threads=self.threads,
