@@ -160,7 +160,7 @@ def test_split_writes_two_disjoint_parts(file, tmp_path):
 def test_fetch_prints_the_path(tmp_path, monkeypatch):
     requested = {}
 
-    def fetch(name, *, folder, progress):
+    def fetch(name, *, folder, progress, max_bytes):
         requested.update(name=name, folder=folder)
         progress(1.0)
         return tmp_path / "armpi" / "x.mat"
