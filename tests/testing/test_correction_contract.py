@@ -52,7 +52,7 @@ def offsets_of_joints(context: rt.Context) -> Tensor:
 
 
 CORRECTIONS: dict[str, tuple[rt.Correction, Callable[[rt.Context], Tensor], str]] = {
-    "delay and offset": (rt.DelayOffset(), delays_and_offsets, "context"),
+    "delay and offset": (rt.DelayOffset((-0.05, 0.3)), delays_and_offsets, "context"),
     # Its prior is learned from all trajectories, so it needs more than a few.
     "command space": (rt.CommandSpace(), offsets_of_joints, "several"),
     "chain": (rt.Chain(rt.CommandSpace(), rt.SampledSensor()), offsets_of_joints, "several"),
@@ -76,13 +76,13 @@ class Modified:
     """`DelayOffset` with parts replaced."""
 
     resolution: str = "segment"
-    latent: Callable = rt.DelayOffset().latent
-    heads: Callable = rt.DelayOffset().heads
-    apply: Callable = rt.DelayOffset().apply
-    infer: Callable = rt.DelayOffset().infer
+    latent: Callable = rt.DelayOffset((-0.05, 0.3)).latent
+    heads: Callable = rt.DelayOffset((-0.05, 0.3)).heads
+    apply: Callable = rt.DelayOffset((-0.05, 0.3)).apply
+    infer: Callable = rt.DelayOffset((-0.05, 0.3)).infer
 
 
-GOOD = rt.DelayOffset()
+GOOD = rt.DelayOffset((-0.05, 0.3))
 
 
 def heads_that_overlap(inputs: rt.Channels, outputs: rt.Channels) -> tuple[Head, ...]:

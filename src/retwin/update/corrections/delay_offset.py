@@ -77,6 +77,11 @@ class DelayOffset:
         """One z per segment."""
         return "segment"
 
+    @property
+    def pools(self) -> bool:
+        """`infer` learns the range of delays from all trajectories together, unless it is given."""
+        return self.delay_range is None
+
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:
         """`delay` in samples, then one offset per output in its unit."""
         return Channels(
