@@ -85,15 +85,14 @@ class CaseEntry:
         A function without arguments that returns the `Case`.
     title : str
         What it is, in a few words.
-    classes : str
-        The class names in their fixed order, a tuple that can be imported without torch; "" for a
-        case without classes.
+    recorded : str
+        A `data.io.DataCase` for its files, which can be imported without torch.
 
     """
 
     target: str
     title: str
-    classes: str = ""
+    recorded: str
 
 
 @dataclass(frozen=True)
@@ -306,13 +305,17 @@ CASES: Mapping[str, CaseEntry] = {
     "armpi": CaseEntry(
         "retwin.cases.armpi_fpv.case:armpi",
         "ArmPi FPV robot arm",
-        "retwin.cases.armpi_fpv.classes:CLASSES",
+        "retwin.cases.armpi_fpv.recorded:RECORDED",
     ),
     "tanks": CaseEntry(
-        "retwin.cases.cascaded_tanks.case:tanks", "two cascaded tanks, without overflow"
+        "retwin.cases.cascaded_tanks.case:tanks",
+        "two cascaded tanks, without overflow",
+        "retwin.cases.cascaded_tanks.recorded:RECORDED",
     ),
     "tanks_overflow": CaseEntry(
-        "retwin.cases.cascaded_tanks.case:tanks_overflow", "two cascaded tanks that overflow"
+        "retwin.cases.cascaded_tanks.case:tanks_overflow",
+        "two cascaded tanks that overflow",
+        "retwin.cases.cascaded_tanks.recorded:RECORDED",
     ),
 }
 

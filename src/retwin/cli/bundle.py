@@ -9,7 +9,7 @@ import typer
 
 from retwin.cli.diagnose import EMULATED, diagnoses, write_probabilities
 from retwin.cli.options import CaseOption, Json, OtherCase, Seed
-from retwin.cli.reading import case_named, read
+from retwin.cli.reading import case_named, data_case, read
 from retwin.cli.terminal import answer, bar, command_given, example, note, table
 from retwin.data.io import check_target
 
@@ -104,7 +104,7 @@ def predict(
     A trajectory that is outside has no diagnosis and no probabilities.
     """
     bundle = _opened(folder)
-    trajectories = read(file, case_named(case))
+    trajectories = read(file, data_case(case))
     found = bundle.predict(trajectories)
     diagnosed = diagnoses(trajectories, found.classes, found.probabilities)
     verdicts = zip(found.verdicts.verdict.tolist(), found.verdicts.reason.tolist(), strict=True)

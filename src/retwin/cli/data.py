@@ -12,7 +12,7 @@ from rich.table import Table
 from retwin.checks import require
 from retwin.cli.completion import complete_files
 from retwin.cli.options import CaseOption, Json, Rate, Seed
-from retwin.cli.reading import case_named, read
+from retwin.cli.reading import data_case, read
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data import download
 from retwin.data.io import check_target, save
@@ -42,7 +42,7 @@ def info(
     as_json: Json = False,
 ) -> None:
     """Describe files: classes, samples, channels, missing values, SHA-256."""
-    facts = [_facts(read(file, case_named(case), rate), file) for file in files]
+    facts = [_facts(read(file, data_case(case), rate), file) for file in files]
     answer(facts, *map(_table, facts), as_json=as_json)
 
 
@@ -55,7 +55,7 @@ def convert(
 ) -> None:
     """Write trajectories in retwin's own format, with channels, rate and provenance."""
     check_target(target)
-    trajectories = read(source, case_named(case), rate)
+    trajectories = read(source, data_case(case), rate)
     save(trajectories, target)
     note(f"Wrote {target}: {trajectories}")
 
@@ -84,7 +84,7 @@ def split(
         got=second,
         remedy="give each part its own file",
     )
-    parts = read(file, case_named(case), rate).split(fraction, seed=seed)
+    parts = read(file, data_case(case), rate).split(fraction, seed=seed)
     for part, target in zip(parts, (first, second), strict=True):
         save(part, target)
         note(f"Wrote {target}: {part}")

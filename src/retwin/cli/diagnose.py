@@ -15,7 +15,7 @@ from retwin import catalog
 from retwin.checks import require
 from retwin.cli.completion import one_of
 from retwin.cli.options import CaseOption, Json, Seed
-from retwin.cli.reading import case_named, read
+from retwin.cli.reading import case_named, data_case, read
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data.trajectories import Trajectories
 from retwin.serialisation.files import write_atomically
@@ -114,7 +114,7 @@ def predict(
     import retwin as rt
 
     diagnoser = rt.load_diagnoser(model)
-    trajectories = read(file, case_named(case))
+    trajectories = read(file, data_case(case))
     probabilities = diagnoser.predict_proba(trajectories)
     _check_finite(trajectories, probabilities)
     labels = trajectories.labels.tolist()

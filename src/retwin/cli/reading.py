@@ -12,17 +12,21 @@ from retwin.data.trajectories import Trajectories
 if TYPE_CHECKING:
     from retwin.cases.case import Case
 
-__all__ = ["case_named", "read"]
+__all__ = ["case_named", "data_case", "read"]
 
 
 def case_named(name: str | None) -> Case | None:
-    """The case of that name, if one is given."""
-    if name is None:
-        return None
-    # Imported here, since cases need torch and many commands do not.
+    """The case of that name, if one is given; it needs torch."""
     from retwin import cases
 
-    return cases.get(name)
+    return None if name is None else cases.get(name)
+
+
+def data_case(name: str | None) -> DataCase | None:
+    """What the files of the case of that name need of it, if one is given."""
+    from retwin import cases
+
+    return None if name is None else cases.data_case(name)
 
 
 def read(file: Path, case: DataCase | None = None, rate: float | None = None) -> Trajectories:
