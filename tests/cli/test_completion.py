@@ -33,7 +33,7 @@ def test_the_recorded_case_of_the_catalog_is_that_of_the_case(name: str) -> None
     case, recorded = cases.get(name), cases.data_case(name)
     for each in ("classes", "inputs", "outputs", "rate"):
         assert getattr(case, each) == getattr(recorded, each), each
-    assert getattr(recorded, "recover") is case.recover
+    assert recorded.recover is case.recover
 
 
 @pytest.mark.parametrize(
