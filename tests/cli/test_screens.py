@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,7 +15,7 @@ from test_readme import check
 
 import retwin as rt
 from retwin.cli import app
-from retwin.cli.terminal import answer, bar, be_quiet, note, table
+from retwin.cli.terminal import answer, bar, be_quiet, note, show_warnings, table
 
 WITHOUT_TABLES = {
     *("data convert", "data split", "data fetch", "twin simulate", "twin animate"),
@@ -177,3 +179,26 @@ def test_quiet_leaves_out_bars_and_notes(on_screen, capsys: pytest.CaptureFixtur
     finally:
         be_quiet(False)
     assert tuple(capsys.readouterr()) == ("result\n", "")
+
+
+def test_names_do_not_steer_the_terminal(
+    on_screen, narrow, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Escape codes, a lone byte of a file's name, text that runs to the left."""
+    odd = "a\x1b[31m\x9b1m\udcff\u202e"
+    shown = r"a\u001b[31m\u009b1m\udcff\u202e"
+    answer(None, odd, table((odd, "b"), [(1, odd)]))
+    answer({"name": odd[:-2]}, as_json=True)
+    note(odd)
+    with bar("read") as show:
+        show(odd, 0.5)
+    with show_warnings():
+        warnings.warn(odd, stacklevel=1)
+    printed = capsys.readouterr()
+    _, out, err = narrow("data", "info", tmp_path / odd)
+    for text in (printed.out, printed.err, out, err):
+        assert not set("\x9b\udcff\u202e") & set(text)
+        assert odd[:6] not in text
+    assert shown in err
+    assert printed.out.count(shown) == 3
+    assert printed.err.count(shown) >= 3

@@ -25,13 +25,13 @@ import typer
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from rich.console import Group, RenderableType
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from retwin._version import __version__
 from retwin.catalog import DOWNLOADS, EXTRAS
 from retwin.cli.options import Json
-from retwin.cli.terminal import FAILED, answer, bar
+from retwin.cli.terminal import FAILED, answer, bar, plain
 from retwin.data.download import cache_folder
 from retwin.errors import InputError
 from retwin.serialisation.files import sha256
@@ -139,11 +139,10 @@ def _shown(checks: list[Check]) -> RenderableType:
         grid.add_column(min_width=12)
         grid.add_column(overflow="fold")
         for each in members:
-            found = escape(each.found)
+            found = plain(each.found)
             if each.remedy:
-                found += f"\n[dim]→[/] {escape(each.remedy)}"
-            colour = COLOURS[each.state]
-            grid.add_row(f"[{colour}]{each.state}[/]", escape(each.name), found)
+                found = Text.assemble(found, "\n", ("→", "dim"), " ", plain(each.remedy))
+            grid.add_row(Text(each.state, COLOURS[each.state]), plain(each.name), found)
         parts += [f"[bold]{group}[/]", grid, ""]
     return Group(*parts, _summary(checks))
 

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from retwin import catalog
 from retwin.cli.completion import complete_sources, one_of
 from retwin.cli.options import CaseArgument, Json, Seed
-from retwin.cli.terminal import answer, bar, command_given, note, resumable, table
+from retwin.cli.terminal import answer, bar, command_given, note, plain, resumable, table
 from retwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -252,7 +251,7 @@ def _table(results: Results) -> Table:
     for name, figures in results.published.items():
         title = sources[name].title if name in sources else name
         cells = (f"  paper: {title}", *(figures.get(metric, "") for metric in shown))
-        made.add_row(*(escape(str(cell)) for cell in cells), style="dim")
+        made.add_row(*map(plain, cells), style="dim")
     return made
 
 

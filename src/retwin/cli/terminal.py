@@ -18,9 +18,9 @@ from typing import Any
 import typer
 from rich import box
 from rich.console import Console, JustifyMethod, RenderableType
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from retwin.errors import place_of
 
@@ -41,6 +41,7 @@ __all__ = [
     "example",
     "interrupted_by_term",
     "note",
+    "plain",
     "resumable",
     "show_warnings",
     "table",
@@ -56,6 +57,12 @@ LOG_DELAY = 2.0
 """Seconds before the first line of progress in a log; shorter work leaves none."""
 SPEED_WINDOW = 3600.0
 """Seconds over which the speed is averaged, since the jobs of a study differ much in length."""
+CONTROL = {
+    code: f"\\u{code:04x}"
+    for code in (*range(32), *range(127, 160), *range(0x202A, 0x202F), *range(0x2066, 0x206A))
+    if chr(code) not in "\n\t"
+}
+"""Characters by which a name could steer a terminal or reverse a line, and what is printed."""
 
 _quiet = False
 
@@ -74,6 +81,12 @@ def example(command: str) -> str:
 def command_given() -> str:
     """The command line of this process, quoted for a shell."""
     return shlex.join(["retwin", *sys.argv[1:]])
+
+
+def plain(text: object) -> Text:
+    """Text as it is, without markup, in which control characters are made visible."""
+    readable = str(text).encode(errors="backslashreplace").decode()
+    return Text(readable.translate(CONTROL))
 
 
 # Results.
@@ -95,12 +108,13 @@ def answer(result: object, *shown: RenderableType, as_json: bool = False) -> Non
     if as_json:
         from pydantic_core import to_json
 
-        typer.echo(to_json(result, indent=2, inf_nan_mode="null").decode())
+        text = to_json(result, indent=2, inf_nan_mode="null").decode()
+        typer.echo(text.translate(CONTROL))
         return
     console = Console()
     for each in shown:
         if isinstance(each, str):
-            console.print(each, markup=False, highlight=False, soft_wrap=True)
+            console.print(plain(each), soft_wrap=True)
         else:
             console.print(each)
 
@@ -124,12 +138,11 @@ def table(
 
     """
     made = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    # Texts are escaped, since a class named [red] must not colour the table.
     for name in columns:
         justify: JustifyMethod = "right" if name in numbers else "left"
-        made.add_column(escape(name), overflow="fold", justify=justify)
+        made.add_column(plain(name), overflow="fold", justify=justify)
     for row in rows:
-        made.add_row(*(escape(str(cell)) for cell in row))
+        made.add_row(*map(plain, row))
     return made
 
 
@@ -138,7 +151,7 @@ def table(
 
 def note(text: str) -> None:
     """Print a line on stderr about what was done."""
-    _stderr().print(text, markup=False, highlight=False, soft_wrap=True)
+    _stderr().print(plain(text), soft_wrap=True)
 
 
 @contextmanager
@@ -182,7 +195,8 @@ def bar(what: str) -> Iterator[Callable[[str, float], None]]:
         def show(text: str, share: float) -> None:
             if share < bars.tasks[task].completed:
                 bars.reset(task, total=1.0)
-            bars.update(task, completed=share, description=f"{what}: {text}" if text else what)
+            described = plain(f"{what}: {text}" if text else what).plain
+            bars.update(task, completed=share, description=described)
 
         yield show
 
@@ -200,8 +214,7 @@ def _lines(console: Console, what: str) -> Callable[[str, float], None]:
             return
         left = (now - since) * (1 - share) / (share - first) if share > first else 0.0
         after = f", {left:.0f} s left" if left else ""
-        line = f"{what}: {text} {share:.0%}{after}"
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.print(plain(f"{what}: {text} {share:.0%}{after}"), soft_wrap=True)
 
     return show
 
@@ -215,8 +228,12 @@ def _stderr() -> Console:
 
 def complain(text: str) -> None:
     """Print an error in one line on stderr, never wrapped."""
-    line = escape(" ".join(text.split()))
-    Console(stderr=True, soft_wrap=True).print(f"[red]error:[/] {line}", highlight=False)
+    _mark("error", "red", " ".join(text.split()))
+
+
+def _mark(kind: str, colour: str, text: str) -> None:
+    line = Text.assemble((f"{kind}:", colour), " ", plain(text))
+    Console(stderr=True, soft_wrap=True).print(line)
 
 
 def complain_of_usage(error: Any) -> None:
@@ -271,10 +288,9 @@ def interrupted_by_term() -> Iterator[None]:
 @contextmanager
 def show_warnings() -> Iterator[None]:
     """Print each warning as one line on stderr, without its source line."""
-    console = Console(stderr=True, soft_wrap=True)
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
-        console.print(f"[yellow]warning:[/] {escape(str(message))}", highlight=False)
+        _mark("warning", "yellow", str(message))
 
     with warnings.catch_warnings():
         warnings.simplefilter("default", UserWarning)
