@@ -16,7 +16,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from multiprocessing.context import SpawnContext
+from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.synchronize import RLock
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -70,12 +70,29 @@ def worker_pool(
         pool.join()
 
 
+class _Process(SpawnProcess):
+    """A process that Ctrl-C does not reach before `_begin` ignores it."""
+
+    def start(self) -> None:
+        """Start it; it inherits that SIGINT is blocked."""
+        if os.name != "posix":
+            return super().start()
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        return None
+
+
 class _Spawn(SpawnContext):
     """Spawns instead of forking, since torch's threads do not survive a fork.
 
     Keeps references to its locks: a worker that still starts when its pool ends opens them by name
     and prints an error if they are gone.
     """
+
+    Process = _Process
 
     def __init__(self) -> None:
         self.locks: list[RLock] = []
@@ -91,6 +108,8 @@ def _begin(
     orphaned: Callable[..., None] | None,
 ) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if os.name == "posix":
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.Thread(target=_end_with_parent, args=(orphaned, arguments), daemon=True).start()
     if start is not None:
         start(*arguments)
