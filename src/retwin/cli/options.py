@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from retwin.catalog import CASES
+from retwin.checks import whole
 from retwin.cli.completion import one_of
 
 __all__ = ["CaseArgument", "CaseOption", "Json", "OtherCase", "Rate", "Seed"]
@@ -41,7 +42,18 @@ Rate = Annotated[
     float | None,
     typer.Option("--rate", metavar="HZ", help="Samples per second, if the file has none."),
 ]
-Seed = Annotated[int, typer.Option("--seed", metavar="N", help="Same seed, same result.", min=0)]
+MAX_SEED = 2**63 - 1
+"""The largest seed that every generator of random numbers takes."""
+Seed = Annotated[
+    int,
+    typer.Option(
+        "--seed",
+        metavar="N",
+        help="Same seed, same result.",
+        min=0,
+        callback=lambda seed: whole("--seed", seed, most=MAX_SEED),
+    ),
+]
 Json = Annotated[
     bool, typer.Option("--json", metavar="", help="Print JSON instead, and nothing else.")
 ]

@@ -27,7 +27,10 @@ from retwin.update.corrections import measured_outputs
 from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["CorrectedTwin", "generate"]
+__all__ = ["MAX_PER_CLASS", "CorrectedTwin", "generate"]
+
+MAX_PER_CLASS = 10_000_000
+"""Trajectories per class that are generated in memory at most: more fit into none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +155,7 @@ def generate(
     case : System
         A `Case`, or another object with `faults`, `classes` and a command `sampler`.
     per_class : int
-        Trajectories per class, at least 1.
+        Trajectories per class, from 1 to 1e7.
     seed : int
         The same seed gives the same bytes on the same machine.
     timing : NDArray, optional
@@ -169,10 +172,11 @@ def generate(
     Raises
     ------
     InputError
-        `per_class` is below 1.
+        `per_class` is out of range.
 
     """
-    whole("per_class", per_class, least=1)
+    remedy = "give fewer, or write a *.zarr with simulate_to"
+    whole("per_class", per_class, least=1, most=MAX_PER_CLASS, remedy=remedy)
     if timing is None and isinstance(twin, CorrectedTwin):
         timing = twin.timing
     for_commands, for_twin = np.random.SeedSequence(seed).spawn(2)
