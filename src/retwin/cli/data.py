@@ -85,6 +85,13 @@ def split(
         remedy="give each part its own file",
     )
     parts = read(file, data_case(case), rate).split(fraction, seed=seed)
+    require(
+        all(map(len, parts)),
+        "--fraction",
+        expected="a share that leaves trajectories in both parts",
+        got=fraction,
+        remedy="give another share, or more trajectories",
+    )
     for part, target in zip(parts, (first, second), strict=True):
         save(part, target)
         note(f"Wrote {target}: {part}")

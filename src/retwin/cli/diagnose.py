@@ -15,10 +15,11 @@ from retwin import catalog
 from retwin.checks import require
 from retwin.cli.completion import one_of
 from retwin.cli.options import CaseOption, Json, Seed
-from retwin.cli.reading import case_named, data_case, read
+from retwin.cli.reading import case_named, data_case, read, saved
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data.trajectories import Trajectories
 from retwin.serialisation.files import write_atomically
+from retwin.serialisation.places import check_place
 
 __all__ = ["EMULATED", "app", "diagnoses", "write_probabilities"]
 
@@ -52,6 +53,7 @@ def fit(
     """Train a diagnoser on labelled trajectories."""
     import retwin as rt
 
+    check_place(out, folder=True, holds=("model.json", "weights.safetensors"))
     system = case_named(case)
     chosen = catalog.make(catalog.CLASSIFIERS, classifier, "classifier")
     training = read(file, system)
@@ -88,7 +90,9 @@ def invert(
     """Derive a diagnoser from a corrected twin; only healthy trajectories are used."""
     import retwin as rt
 
-    updated = rt.CorrectedTwin.load(model)
+    parts = ("model.json", "weights.safetensors", "surrogate", "residual")
+    check_place(out, folder=True, holds=parts)
+    updated = rt.CorrectedTwin.load(saved(model))
     system = rt.cases.get(updated.case)
     if random_onset:
         system = system.with_random_onset()
@@ -113,7 +117,9 @@ def predict(
     """Diagnose trajectories, and score the diagnoses if the labels are known."""
     import retwin as rt
 
-    diagnoser = rt.load_diagnoser(model)
+    if out is not None:
+        check_place(out)
+    diagnoser = rt.load_diagnoser(saved(model))
     trajectories = read(file, data_case(case))
     probabilities = diagnoser.predict_proba(trajectories)
     _check_finite(trajectories, probabilities)

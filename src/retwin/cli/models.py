@@ -14,10 +14,11 @@ from retwin.checks import require
 from retwin.cli.completion import one_of
 from retwin.cli.options import CaseArgument, Json, OtherCase, Seed
 from retwin.cli.plans import Workers, carry_out
-from retwin.cli.reading import read
+from retwin.cli.reading import read, saved
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
 from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
@@ -86,6 +87,7 @@ def fit(
     """Fit surrogate and residual model; save the corrected twin."""
     import retwin as rt
 
+    check_place(out, folder=True, holds=("model.json", "surrogate", "residual"))
     system = _system(case, network, correction, density, refine)
     measured = _measured(system, real, data)
     size = system.per_class if simulations is None else simulations
@@ -241,7 +243,7 @@ def generate(
     import retwin as rt
 
     kind = check_target(out)
-    updated = rt.CorrectedTwin.load(model)
+    updated = rt.CorrectedTwin.load(saved(model))
     require(
         case or updated.case,
         "case",

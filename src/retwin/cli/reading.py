@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from retwin.checks import require
 from retwin.cli.terminal import bar
 from retwin.data.io import DataCase, load
 from retwin.data.trajectories import Trajectories
@@ -12,7 +13,7 @@ from retwin.data.trajectories import Trajectories
 if TYPE_CHECKING:
     from retwin.cases.case import Case
 
-__all__ = ["case_named", "data_case", "read"]
+__all__ = ["case_named", "data_case", "read", "saved"]
 
 
 def case_named(name: str | None) -> Case | None:
@@ -27,6 +28,18 @@ def data_case(name: str | None) -> DataCase | None:
     from retwin import cases
 
     return None if name is None else cases.data_case(name)
+
+
+def saved(folder: Path) -> Path:
+    """The folder of a saved model or bundle, which must be there."""
+    require(
+        folder.is_dir(),
+        "path",
+        expected="the folder of a saved model",
+        got=f"{folder}, where there is none",
+        remedy="check the name",
+    )
+    return folder
 
 
 def read(file: Path, case: DataCase | None = None, rate: float | None = None) -> Trajectories:
