@@ -254,7 +254,7 @@ def generate(
     system = rt.cases.get(case or updated.case)
     if kind == ".zarr" or workers is not None:
         n = per_class * len(system.faults)
-        plan = rt.SimulationPlan(updated, system.sampler, seed, n, system.faults)
+        plan = rt.deploy.SimulationPlan(updated, system.sampler, seed, n, system.faults)
         carry_out(plan, out, "generate", workers=workers)
         return
     with bar("generate") as show:
