@@ -42,8 +42,8 @@ __all__ = [
     "classes",
     "lookup",
     "make",
+    "metrics_with",
     "resolve",
-    "selected_metrics",
 ]
 
 T = TypeVar("T")
@@ -174,6 +174,10 @@ class Metric:
         Whether it is shown where there is room for few metrics only, as learning curves are.
     simulated : bool
         Whether it scores simulations, and no diagnoses.
+    compared : bool
+        Whether sources are compared by it.
+    family : bool
+        Whether its p-values are adjusted together with those of the others of its kind (Holm).
 
     """
 
@@ -184,6 +188,8 @@ class Metric:
     head: str = ""
     selected: bool = False
     simulated: bool = False
+    compared: bool = False
+    family: bool = False
 
 
 @dataclass(frozen=True)
@@ -555,21 +561,42 @@ PRESETS: Mapping[str, Entry] = {
 """Classifier, training and number of runs of a study."""
 
 METRICS: Mapping[str, Metric] = {
-    "macro_f1": Metric("Macro-F1", headline=True, head="macro-F1", selected=True),
-    "balanced_accuracy": Metric("Balanced accuracy", headline=True, head="balanced\nacc."),
-    "auroc": Metric("AUROC", headline=True, head="AUROC"),
-    "healthy_recall": Metric(
-        "Healthy recall", headline=True, head="healthy\nrecall", selected=True
+    "macro_f1": Metric(
+        "Macro-F1", headline=True, head="macro-F1", selected=True, compared=True, family=True
     ),
-    "accuracy": Metric("Accuracy"),
+    "balanced_accuracy": Metric(
+        "Balanced accuracy", headline=True, head="balanced\nacc.", compared=True, family=True
+    ),
+    "auroc": Metric("AUROC", headline=True, head="AUROC", compared=True, family=True),
+    "healthy_recall": Metric(
+        "Healthy recall", headline=True, head="healthy\nrecall", selected=True, compared=True
+    ),
+    "accuracy": Metric("Accuracy", compared=True),
     "auroc_micro": Metric("Micro AUROC"),
     "ece": Metric("ECE", -1),
     "ece_classwise": Metric("Class-wise ECE", -1),
     "rmse": Metric(
-        "RMSE", -1, headline=True, unit="output", head="RMSE", selected=True, simulated=True
+        "RMSE",
+        -1,
+        headline=True,
+        unit="output",
+        head="RMSE",
+        selected=True,
+        simulated=True,
+        compared=True,
+        family=True,
     ),
-    "nrmse": Metric("NRMSE", -1, headline=True, head="NRMSE", simulated=True),
-    "crps": Metric("CRPS", -1, headline=True, unit="output", head="CRPS", simulated=True),
+    "nrmse": Metric("NRMSE", -1, headline=True, head="NRMSE", simulated=True, compared=True),
+    "crps": Metric(
+        "CRPS",
+        -1,
+        headline=True,
+        unit="output",
+        head="CRPS",
+        simulated=True,
+        compared=True,
+        family=True,
+    ),
     "coverage50": Metric("Coverage of the 50 % band", 0, simulated=True),
     "coverage90": Metric(
         "Coverage of the 90 % band", 0, head="in 90 %\nband", selected=True, simulated=True
@@ -577,8 +604,10 @@ METRICS: Mapping[str, Metric] = {
 }
 
 
-def selected_metrics(*, simulated: bool) -> tuple[str, ...]:
-    """The names of the selected metrics of simulations, or of those of diagnoses."""
+def metrics_with(*marks: str, simulated: bool) -> tuple[str, ...]:
+    """The names of the metrics of simulations, or of diagnoses, with all of these fields true."""
     return tuple(
-        name for name, each in METRICS.items() if each.selected and each.simulated == simulated
+        name
+        for name, each in METRICS.items()
+        if each.simulated == simulated and all(getattr(each, mark) for mark in marks)
     )

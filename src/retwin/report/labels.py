@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.catalog import METRICS, SOURCES, selected_metrics
+from retwin.catalog import METRICS, SOURCES, metrics_with
 
 __all__ = [
     "MAIN",
@@ -41,7 +41,7 @@ MANY = 5
 """Number of sources beyond which figures and tables show a selection."""
 MAIN = tuple(name for name, metric in METRICS.items() if metric.headline)
 """The metrics that summarise a study."""
-SELECTED = selected_metrics(simulated=False)
+SELECTED = metrics_with("selected", simulated=False)
 """The metrics of diagnoses that are shown of many sources."""
 REAL_DATA = {
     "none": "none",
