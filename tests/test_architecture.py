@@ -27,6 +27,7 @@ ROOMS = (
         "processes",
         "jobs",
         "serialisation",
+        "entries",
         "catalog",
         "results",
     ),

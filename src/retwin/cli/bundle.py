@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from retwin.cli.diagnose import EMULATED, diagnoses, write_probabilities
-from retwin.cli.options import CaseOption, Json, OtherCase, Seed
+from retwin.cli.options import (
+    CaseOption,
+    Json,
+    Measured,
+    Model,
+    OtherCase,
+    PerClass,
+    Probabilities,
+    Real,
+    Seed,
+)
 from retwin.cli.reading import case_named, data_case, read, saved
 from retwin.cli.terminal import answer, bar, command_given, example, note, table
 from retwin.data.io import check_target
@@ -31,10 +41,8 @@ Folder = Annotated[Path, typer.Argument(metavar="BUNDLE", help="Folder of a bund
 
 @app.command(epilog=example("retwin bundle save model real.mat --diagnoser cnn --out bundle"))
 def save(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of a corrected twin.")],
-    real: Annotated[
-        Path, typer.Argument(metavar="REAL", help="The trajectories it was calibrated on.")
-    ],
+    model: Model,
+    real: Real,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where to save the bundle.")],
     diagnoser: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Folder of a diagnoser.")
@@ -93,13 +101,9 @@ def predict(
         Path,
         typer.Argument(metavar="BUNDLE", help="Folder of a bundle, or of its ONNX export."),
     ],
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Trajectories; labels are not needed.")
-    ],
+    file: Measured,
     case: CaseOption = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="CSV file for all probabilities.")
-    ] = None,
+    out: Probabilities = None,
     as_json: Json = False,
 ) -> None:
     """Diagnose trajectories, and flag those that the bundle was not made for.
@@ -139,7 +143,7 @@ def predict(
 def generate(
     folder: Folder,
     out: Annotated[Path, typer.Option(metavar="FILE", help="New *.npz or *.zarr.")],
-    per_class: Annotated[int, typer.Option(metavar="N", help="Trajectories per class.")] = 400,
+    per_class: PerClass = 400,
     case: OtherCase = None,
     seed: Seed = 0,
 ) -> None:

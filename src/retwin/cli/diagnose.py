@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from retwin import catalog
 from retwin.checks import require
 from retwin.cli.completion import one_of
-from retwin.cli.options import CaseOption, Json, Seed
+from retwin.cli.options import CaseOption, Json, Measured, Probabilities, Real, Seed
 from retwin.cli.reading import case_named, data_case, read, saved
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data.trajectories import Trajectories
@@ -78,9 +78,7 @@ def invert(
     model: Annotated[
         Path, typer.Argument(metavar="MODEL", help="A corrected twin, in command space.")
     ],
-    real: Annotated[
-        Path, typer.Argument(metavar="REAL", help="The trajectories it was calibrated on.")
-    ],
+    real: Real,
     out: Out,
     random_onset: Annotated[
         bool,
@@ -105,13 +103,9 @@ def invert(
 @app.command(epilog=example("retwin diagnose predict cnn real.mat --case armpi"))
 def predict(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of a diagnoser.")],
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Trajectories; labels are not needed.")
-    ],
+    file: Measured,
     case: CaseOption = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="CSV file for all probabilities.")
-    ] = None,
+    out: Probabilities = None,
     as_json: Json = False,
 ) -> None:
     """Diagnose trajectories, and score the diagnoses if the labels are known."""

@@ -12,7 +12,7 @@ import typer
 from retwin import catalog
 from retwin.checks import require
 from retwin.cli.completion import one_of
-from retwin.cli.options import CaseArgument, Json, OtherCase, Seed
+from retwin.cli.options import CaseArgument, Json, Model, OtherCase, PerClass, Seed
 from retwin.cli.plans import Workers, carry_out
 from retwin.cli.reading import read, saved
 from retwin.cli.terminal import answer, bar, note, table
@@ -32,55 +32,68 @@ data_option, model_option = (
     for panel in ("Data", "Model; by default the case's")
 )
 
+ModelFolder = Annotated[
+    Path, typer.Option(metavar="FOLDER", help="Where to save the corrected twin.")
+]
+RealSet = Annotated[
+    Path | None, data_option(metavar="FILE", help="Real trajectories to calibrate on.")
+]
+OneFile = Annotated[
+    Path | None, data_option(metavar="FILE", help="Or one file that the case splits in two.")
+]
+TwinSet = Annotated[
+    Path | None, data_option(metavar="FILE", help="Trajectories of the twin; else simulated.")
+]
+Simulations = Annotated[
+    int | None, data_option(metavar="N", help="Trajectories simulated; else the case's.")
+]
+CalibrateOn = Annotated[
+    str,
+    data_option(
+        metavar="NAME", help="healthy or all.", autocompletion=one_of(catalog.CALIBRATE_ON)
+    ),
+]
+Network = Annotated[
+    str | None,
+    model_option(
+        metavar="NAME",
+        help="Surrogate: mlp, lstm, tcn or state_space.",
+        autocompletion=one_of(catalog.NETWORKS),
+    ),
+]
+Correction = Annotated[
+    str | None,
+    model_option(
+        metavar="NAME",
+        help="additive, delay_offset or command_space.",
+        autocompletion=one_of(catalog.CORRECTIONS),
+    ),
+]
+Density = Annotated[
+    str | None,
+    model_option(
+        metavar="NAME",
+        help="Distribution: mixture, flow or sequence_mixture.",
+        autocompletion=one_of(catalog.DENSITIES),
+    ),
+]
+Refine = Annotated[
+    bool, model_option("--refine", metavar="", help="Fine-tune on outputs afterwards.")
+]
+
 
 def fit(
     case: CaseArgument,
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where to save the corrected twin.")],
-    real: Annotated[
-        Path | None, data_option(metavar="FILE", help="Real trajectories to calibrate on.")
-    ] = None,
-    data: Annotated[
-        Path | None, data_option(metavar="FILE", help="Or one file that the case splits in two.")
-    ] = None,
-    twin_data: Annotated[
-        Path | None, data_option(metavar="FILE", help="Trajectories of the twin; else simulated.")
-    ] = None,
-    simulations: Annotated[
-        int | None, data_option(metavar="N", help="Trajectories simulated; else the case's.")
-    ] = None,
-    calibrate_on: Annotated[
-        str,
-        data_option(
-            metavar="NAME", help="healthy or all.", autocompletion=one_of(catalog.CALIBRATE_ON)
-        ),
-    ] = "healthy",
-    network: Annotated[
-        str | None,
-        model_option(
-            metavar="NAME",
-            help="Surrogate: mlp, lstm, tcn or state_space.",
-            autocompletion=one_of(catalog.NETWORKS),
-        ),
-    ] = None,
-    correction: Annotated[
-        str | None,
-        model_option(
-            metavar="NAME",
-            help="additive, delay_offset or command_space.",
-            autocompletion=one_of(catalog.CORRECTIONS),
-        ),
-    ] = None,
-    density: Annotated[
-        str | None,
-        model_option(
-            metavar="NAME",
-            help="Distribution: mixture, flow or sequence_mixture.",
-            autocompletion=one_of(catalog.DENSITIES),
-        ),
-    ] = None,
-    refine: Annotated[
-        bool, model_option("--refine", metavar="", help="Fine-tune on outputs afterwards.")
-    ] = False,
+    out: ModelFolder,
+    real: RealSet = None,
+    data: OneFile = None,
+    twin_data: TwinSet = None,
+    simulations: Simulations = None,
+    calibrate_on: CalibrateOn = "healthy",
+    network: Network = None,
+    correction: Correction = None,
+    density: Density = None,
+    refine: Refine = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -228,9 +241,9 @@ def _residual_line(rg: ResidualModel | SequenceResidual) -> str:
 
 
 def generate(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of a corrected twin.")],
+    model: Model,
     out: Annotated[Path, typer.Option(metavar="FILE", help="New *.npz, or *.zarr of any size.")],
-    per_class: Annotated[int, typer.Option(metavar="N", help="Trajectories per class.")] = 400,
+    per_class: PerClass = 400,
     case: OtherCase = None,
     seed: Seed = 0,
     workers: Workers = None,
