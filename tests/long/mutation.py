@@ -32,7 +32,7 @@ from retwin.deploy.bundle.seal import SUMS, seal
 
 HEADROOM = 2**30
 """Bytes of address space that a case may take beyond what is mapped when it starts."""
-TIMEOUT = 20
+TIMEOUT = 60
 """Seconds that a case may take."""
 HEAD = 512
 """Bytes at the beginning of a file; half of all mutations are there, where headers are."""
