@@ -31,11 +31,11 @@ from retwin.update.identification import NPE, identify
 FOLDS = 3
 PER_CLASS = 100
 DRAWS = 50
-ARM = rt.ArmPiTwin(threads=1)
+ARM = rt.cases.ArmPiTwin(threads=1)
 
 Found = tuple[rt.Twin, int]
 """An updated twin, and the number of runs of the MuJoCo arm that it took."""
-Score = tuple[float, int, rt.Fidelity]
+Score = tuple[float, int, rt.evaluation.Fidelity]
 """Seconds, runs, and fidelity on the held-out trajectories."""
 
 
@@ -66,7 +66,7 @@ def rivals(case: rt.Case, ibg: rt.Surrogate) -> dict[str, Callable[[rt.Trajector
     }
 
 
-def accuracy(fidelity: rt.Fidelity) -> dict[str, float]:
+def accuracy(fidelity: rt.evaluation.Fidelity) -> dict[str, float]:
     figures = fidelity.figures
     crps = [each.value for name, each in figures.items() if name.startswith("crps/")]
     return {
@@ -119,7 +119,7 @@ def publish(
             "seconds": seconds[name],
             "with the surrogate": seconds[name] + once * surrogate,
             "twin runs": float(np.mean([runs for _, runs, _ in folds])) + simulations * surrogate,
-            **accuracy(rt.Fidelity.concatenate([fidelity for _, _, fidelity in folds])),
+            **accuracy(rt.evaluation.Fidelity.concatenate([fidelity for _, _, fidelity in folds])),
         }
     held_out = sum(len(fidelity) for _, _, fidelity in next(iter(scored.values())))
     record("updating", f"updating the MuJoCo arm, {held_out} trajectories held out", rows)

@@ -29,6 +29,7 @@ ROOMS = (
         "processes",
         "jobs",
         "serialisation",
+        "entries",
         "catalog",
         "results",
     ),

@@ -9,15 +9,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from retwin.catalog import (
     CLASSIFIERS,
     CORRECTIONS,
     DENSITIES,
+    DIAGNOSERS,
     DOWNLOADS,
     FORMATS,
     NETWORKS,
@@ -31,9 +33,11 @@ from retwin.catalog import (
 )
 from retwin.data.io import load, save
 from retwin.data.trajectories import Trajectories
+from retwin.diagnosis import fit_diagnoser, load_diagnoser
 from retwin.errors import InputError
 from retwin.nets.networks import Network
 from retwin.serialisation.configs import from_config, to_config
+from retwin.serialisation.models import read_model, write_model
 
 
 def example() -> Trajectories:
@@ -100,6 +104,49 @@ def test_a_new_correction_is_one_class_and_one_entry(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(CORRECTIONS, "scaled", Entry("scaled:Scaled", "a factor"))  # type: ignore[arg-type]
     assert classes(CORRECTIONS)[-1] is Scaled
     assert classes(CORRECTIONS, ABC) == ()
+
+
+@dataclass(frozen=True)
+class Frequencies:
+    """A kind of diagnoser: the shares of the classes in the training set."""
+
+    adapts: ClassVar[bool] = False
+
+    def fit(self, trajectories: Trajectories, target: None, **_: Any) -> Prior:
+        classes, counts = np.unique(trajectories.labels, return_counts=True)
+        return Prior(tuple(classes.tolist()), tuple((counts / counts.sum()).tolist()))
+
+
+@dataclass(frozen=True)
+class Prior:
+    classes: tuple[str, ...]
+    shares: tuple[float, ...]
+    fitted: None = None
+
+    def predict_proba(self, trajectories: Trajectories) -> NDArray:
+        return np.tile(self.shares, (len(trajectories), 1))
+
+    def save(self, folder: Path) -> None:
+        with write_model(folder, "prior", {"classes": self.classes, "shares": self.shares}, {}):
+            pass
+
+    @classmethod
+    def load(cls, folder: Path) -> Prior:
+        about, _ = read_model(folder, "prior")
+        return cls(tuple(about["classes"]), tuple(about["shares"]))
+
+
+def test_a_new_kind_of_diagnoser_is_one_module_and_one_entry(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    entry = Entry(f"{__name__}:Prior", "shares of classes")
+    monkeypatch.setitem(DIAGNOSERS, "prior", entry)  # type: ignore[arg-type]
+    made = example().replace(labels=np.array(["a", "b"]))
+    diagnoser = fit_diagnoser(made, Frequencies(), seed=0)
+    diagnoser.save(tmp_path / "prior")
+    assert load_diagnoser(tmp_path / "prior") == diagnoser == Prior(("a", "b"), (0.5, 0.5))
+    with pytest.raises(InputError, match="target: expected none for Frequencies"):
+        fit_diagnoser(made, Frequencies(), target=made, seed=0)
 
 
 def test_a_classifier_without_a_network_is_no_network() -> None:

@@ -27,8 +27,9 @@ Only the real machine's outputs need to be measured. Five nouns, each with its v
 A verb takes its method as a config object: `fit_surrogate` a network (`MLP`, `LSTM`, `TCN`,
 `StateSpace`), `fit_residual` a correction (`Additive`, `Chain`, `CommandSpace`, `DelayOffset`,
 `SampledSensor`) and a density (`Flow`, `Mixture`, `SequenceMixture`), `fit_diagnoser` a classifier
-(`CNN`, `LSTMClassifier`, `Rocket`, `DANN`, `FineTune`), `identify` a method (`LeastSquares`,
-`Evolution`, `MCMC`, `NPE`). `Training` has the epochs, the batch size and the learning rate.
+(`CNN`, `LSTMClassifier`, `Rocket`, `DANN`, `FineTune`), `identify` a method of `rt.update`
+(`LeastSquares`, `Evolution`, `MCMC`, `NPE`). `Training` has the epochs, the batch size and the
+learning rate.
 
 What fewer users need is in its room, a package of its own that `rt.<room>` imports on first use,
 as in `rt.twins.HoldSampler` or `from retwin.deploy import Bundle`:
@@ -60,7 +61,6 @@ from retwin._version import __version__
 _HOME = {
     "ActuatorBias": "twins.faults",
     "Additive": "update.corrections",
-    "ArmPiTwin": "cases.armpi_fpv.twin",
     "CNN": "nets.networks",
     "Case": "cases.case",
     "Chain": "update.corrections",
@@ -73,40 +73,28 @@ _HOME = {
     "DelayOffset": "update.corrections",
     "Diagnoser": "diagnosis",
     "Discrepancy": "update.corrections",
-    "Evolution": "update.identification",
     "FMUTwin": "twins.fmu",
     "Fault": "twins.faults",
-    "Fidelity": "evaluation.fidelity",
     "FineTune": "diagnosis",
     "Flow": "update.residual",
     "FunctionTwin": "twins.function",
     "InputError": "errors",
-    "InversionDiagnoser": "diagnosis",
     "LSTM": "nets.networks",
     "LSTMClassifier": "nets.networks",
-    "LeastSquares": "update.identification",
     "Limits": "twins.limits",
-    "MCMC": "update.identification",
     "MLP": "nets.networks",
     "Mixture": "update.residual",
     "MuJoCoTwin": "twins.mujoco",
-    "NPE": "update.identification",
     "NetworkDiagnoser": "diagnosis",
-    "Noise": "update.identification",
-    "NoisyTwin": "twins.noisy",
     "Parameter": "twins.parametric",
     "ParametricTwin": "twins.parametric",
-    "PooledDiagnoser": "diagnosis",
-    "RandomisedTwin": "twins.randomised",
     "Refinement": "update.residual",
     "ResidualModel": "update.residual",
     "Rocket": "diagnosis",
     "SampledSensor": "update.corrections",
-    "Scores": "scores.classification",
     "Segments": "data.segments",
     "SequenceMixture": "update.residual",
     "SimulationError": "twins.twin",
-    "SimulationPlan": "deploy.simulations",
     "StateSpace": "nets.networks",
     "Stuck": "twins.faults",
     "StudyData": "study",
@@ -116,7 +104,6 @@ _HOME = {
     "Training": "nets.training",
     "Trajectories": "data.trajectories",
     "Twin": "twins.twin",
-    "animate": "cases.animation",
     "evaluate": "evaluation.diagnosers",
     "fetch": "data.download",
     "fit_diagnoser": "diagnosis",
@@ -131,7 +118,6 @@ _HOME = {
     "measure_fidelity": "evaluation.fidelity",
     "run_study": "study",
     "save": "data.io",
-    "simulate_to": "deploy.simulations",
     "write_report": "report",
 }
 
@@ -169,21 +155,16 @@ if TYPE_CHECKING:
         twins,
         update,
     )
-    from retwin.cases.animation import animate
-    from retwin.cases.armpi_fpv.twin import ArmPiTwin
     from retwin.cases.case import Case
     from retwin.data.download import fetch
     from retwin.data.io import load, save
     from retwin.data.segments import Segments
     from retwin.data.trajectories import Channels, Trajectories
-    from retwin.deploy.simulations import SimulationPlan, simulate_to
     from retwin.diagnosis import (
         DANN,
         Diagnoser,
         FineTune,
-        InversionDiagnoser,
         NetworkDiagnoser,
-        PooledDiagnoser,
         Rocket,
         fit_diagnoser,
         fit_inversion,
@@ -191,20 +172,17 @@ if TYPE_CHECKING:
     )
     from retwin.errors import InputError
     from retwin.evaluation.diagnosers import evaluate
-    from retwin.evaluation.fidelity import Fidelity, measure_fidelity
+    from retwin.evaluation.fidelity import measure_fidelity
     from retwin.nets.networks import CNN, LSTM, MLP, TCN, LSTMClassifier, StateSpace
     from retwin.nets.training import Training
     from retwin.report import write_report
-    from retwin.scores.classification import Scores
     from retwin.study import StudyData, StudyPlan, run_study
     from retwin.twins.faults import ActuatorBias, Fault, Stuck
     from retwin.twins.fmu import FMUTwin
     from retwin.twins.function import FunctionTwin
     from retwin.twins.limits import Limits
     from retwin.twins.mujoco import MuJoCoTwin
-    from retwin.twins.noisy import NoisyTwin
     from retwin.twins.parametric import Parameter, ParametricTwin
-    from retwin.twins.randomised import RandomisedTwin
     from retwin.twins.twin import SimulationError, Twin
     from retwin.update.corrected import CorrectedTwin, generate
     from retwin.update.corrections import (
@@ -218,11 +196,6 @@ if TYPE_CHECKING:
         SampledSensor,
     )
     from retwin.update.identification import (
-        MCMC,
-        NPE,
-        Evolution,
-        LeastSquares,
-        Noise,
         identify,
     )
     from retwin.update.residual import (

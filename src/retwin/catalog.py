@@ -9,12 +9,21 @@ write its module and add one entry here.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, TypeVar
 
-from retwin.checks import one_of
-from retwin.modules import import_beside
+from retwin.entries import (
+    CaseEntry,
+    Entry,
+    Extra,
+    FormatEntry,
+    Metric,
+    Need,
+    PublicFile,
+    SourceEntry,
+    classes,
+    lookup,
+    make,
+    resolve,
+)
 
 __all__ = [
     "CALIBRATE_ON",
@@ -43,277 +52,25 @@ __all__ = [
     "classes",
     "lookup",
     "make",
+    "metrics_with",
     "resolve",
-    "selected_metrics",
 ]
-
-T = TypeVar("T")
-
-Need = tuple[str, str]
-"""Kind and name of a job of a study whose result is needed."""
-
-
-@dataclass(frozen=True)
-class Entry:
-    """An implementation.
-
-    Parameters
-    ----------
-    target : str
-        The object, as "package.module:object".
-    title : str
-        What it is, in a few words.
-    extra : str
-        The extra of the package that it needs; "" if it needs none.
-    kinds : sequence of str
-        The classes of the config objects that a target which is a function makes.
-
-    """
-
-    target: str
-    title: str
-    extra: str = ""
-    kinds: Sequence[str] = ()
-
-
-@dataclass(frozen=True)
-class CaseEntry:
-    """A built-in case.
-
-    Parameters
-    ----------
-    target : str
-        A function without arguments that returns the `Case`.
-    title : str
-        What it is, in a few words.
-    classes : str
-        The class names in their fixed order, a tuple that can be imported without torch; "" for a
-        case without classes.
-
-    """
-
-    target: str
-    title: str
-    classes: str = ""
-
-
-@dataclass(frozen=True)
-class SourceEntry:
-    """A source of training data in a study: an updated twin, or a method compared with it.
-
-    Exactly one of `twin`, `diagnoser` and `pool` is given.
-
-    Parameters
-    ----------
-    title : str
-        The name in tables and figures.
-    real_data : str
-        What it may learn from: "none", "timing" (of commands), "healthy", "unlabelled",
-        "transductive" (outputs of the test set without labels) or "labelled".
-    needs : sequence of Need
-        The jobs that must be done first.
-    twin : str
-        A function of a `Trial` that returns the twin on whose trajectories the study's classifier
-        is trained, or that simulates the test records.
-    diagnoser : str
-        A function of a `Trial` that returns the diagnoser itself.
-    pool : sequence of str
-        The sources whose probabilities are pooled.
-    network : bool
-        Whether the study's classifier must be a neural network.
-    parametric : bool
-        Whether the case must declare the free parameters of its twin.
-    extra : str
-        The extra of the package that it needs.
-    simulates : bool
-        Whether it occurs only in studies of cases without classes.
-    role : str
-        Its role in what a report states: "plain" (the twin as it is), "surrogate" (the surrogate
-        without residual model), "updated" (the surrogate with its residual model) or "".
-
-    """
-
-    title: str
-    real_data: str
-    needs: Sequence[Need] = ()
-    twin: str = ""
-    diagnoser: str = ""
-    pool: Sequence[str] = ()
-    network: bool = False
-    parametric: bool = False
-    extra: str = ""
-    simulates: bool = False
-    role: str = ""
-
-    @property
-    def per_fold(self) -> bool:
-        """Whether it depends on the calibration set, so that it is made once per fold."""
-        return self.real_data != "none"
-
-    @property
-    def fidelity(self) -> bool:
-        """Whether its trajectories are compared with measured ones."""
-        return bool(self.twin) and self.real_data == "healthy"
-
-
-@dataclass(frozen=True)
-class Metric:
-    """A score.
-
-    Parameters
-    ----------
-    title : str
-        The name in tables and figures.
-    better : int
-        1 if larger values are better, -1 if smaller ones are, 0 for a target to be met.
-    headline : bool
-        Whether a study is summarised by it.
-    unit : str
-        "output" for the unit of the outputs; "1" for numbers without a unit.
-    head : str
-        The head of its column in a terminal; "" if it is not shown there.
-    selected : bool
-        Whether it is shown where there is room for few metrics only, as learning curves are.
-    simulated : bool
-        Whether it scores simulations, and no diagnoses.
-
-    """
-
-    title: str
-    better: int = 1
-    headline: bool = False
-    unit: str = "1"
-    head: str = ""
-    selected: bool = False
-    simulated: bool = False
-
-
-@dataclass(frozen=True)
-class FormatEntry:
-    """A file format of trajectories.
-
-    Parameters
-    ----------
-    title : str
-        What it holds.
-    reader : str
-        The function that reads it, with the arguments of `data.io.load`.
-    writer : str
-        The function of trajectories and a path that writes it; "" if the format is only read.
-    extra : str
-        The extra of the package that it needs.
-    folder : bool
-        Whether it is a folder and no file.
-
-    """
-
-    title: str
-    reader: str
-    writer: str = ""
-    extra: str = ""
-    folder: bool = False
-
-
-@dataclass(frozen=True)
-class Extra:
-    """An extra of the package, which installs optional packages.
-
-    Parameters
-    ----------
-    purpose : str
-        What it is needed for.
-    module : str
-        A module by which its installation is recognised.
-
-    """
-
-    purpose: str
-    module: str
-
-
-@dataclass(frozen=True)
-class PublicFile:
-    """A public file.
-
-    Parameters
-    ----------
-    url : str
-        Its address.
-    sha256 : str
-        The SHA-256 of its contents, in hexadecimal.
-    file : str
-        Its name below the cache folder.
-
-    """
-
-    url: str
-    sha256: str
-    file: str
-
-
-def resolve(target: str) -> Any:
-    """The object that "package.module:object" names, installed or in the current folder.
-
-    Raises
-    ------
-    ImportError, AttributeError
-        There is no such module or object; for each entry of this module there is one.
-
-    """
-    module, _, attribute = target.partition(":")
-    return getattr(import_beside(module, Path.cwd()), attribute)
-
-
-def lookup(entries: Mapping[str, T], name: str, argument: str) -> T:
-    """The entry of that name.
-
-    Raises
-    ------
-    InputError
-        There is none; the message names `argument`.
-
-    """
-    return entries[one_of(argument, name, entries)]
-
-
-def make(entries: Mapping[str, Entry], name: str, argument: str) -> Any:
-    """The result of the target of that entry, called without arguments.
-
-    Raises
-    ------
-    InputError
-        There is no entry of that name; the message names `argument`.
-
-    """
-    return resolve(lookup(entries, name, argument).target)()
-
-
-def classes(entries: Mapping[str, Entry], base: type = object) -> tuple[type, ...]:
-    """The config classes of all entries: the kinds that a saved model may name.
-
-    Parameters
-    ----------
-    entries : mapping of str to Entry
-        Entries whose targets are config classes, or functions with `kinds`.
-    base : type
-        Only subclasses of this class, or classes with the methods of this protocol, are returned.
-
-    """
-    targets = [target for each in entries.values() for target in each.kinds or (each.target,)]
-    return tuple(kind for kind in map(resolve, targets) if issubclass(kind, base))
-
 
 CASES: Mapping[str, CaseEntry] = {
     "armpi": CaseEntry(
         "retwin.cases.armpi_fpv.case:armpi",
         "ArmPi FPV robot arm",
-        "retwin.cases.armpi_fpv.classes:CLASSES",
+        "retwin.cases.armpi_fpv.recorded:RECORDED",
     ),
     "tanks": CaseEntry(
-        "retwin.cases.cascaded_tanks.case:tanks", "two cascaded tanks, without overflow"
+        "retwin.cases.cascaded_tanks.case:tanks",
+        "two cascaded tanks, without overflow",
+        "retwin.cases.cascaded_tanks.recorded:RECORDED",
     ),
     "tanks_overflow": CaseEntry(
-        "retwin.cases.cascaded_tanks.case:tanks_overflow", "two cascaded tanks that overflow"
+        "retwin.cases.cascaded_tanks.case:tanks_overflow",
+        "two cascaded tanks that overflow",
+        "retwin.cases.cascaded_tanks.recorded:RECORDED",
     ),
 }
 
@@ -553,21 +310,42 @@ PRESETS: Mapping[str, Entry] = {
 """Classifier, training and number of runs of a study."""
 
 METRICS: Mapping[str, Metric] = {
-    "macro_f1": Metric("Macro-F1", headline=True, head="macro-F1", selected=True),
-    "balanced_accuracy": Metric("Balanced accuracy", headline=True, head="balanced\nacc."),
-    "auroc": Metric("AUROC", headline=True, head="AUROC"),
-    "healthy_recall": Metric(
-        "Healthy recall", headline=True, head="healthy\nrecall", selected=True
+    "macro_f1": Metric(
+        "Macro-F1", headline=True, head="macro-F1", selected=True, compared=True, family=True
     ),
-    "accuracy": Metric("Accuracy"),
+    "balanced_accuracy": Metric(
+        "Balanced accuracy", headline=True, head="balanced\nacc.", compared=True, family=True
+    ),
+    "auroc": Metric("AUROC", headline=True, head="AUROC", compared=True, family=True),
+    "healthy_recall": Metric(
+        "Healthy recall", headline=True, head="healthy\nrecall", selected=True, compared=True
+    ),
+    "accuracy": Metric("Accuracy", compared=True),
     "auroc_micro": Metric("Micro AUROC"),
     "ece": Metric("ECE", -1),
     "ece_classwise": Metric("Class-wise ECE", -1),
     "rmse": Metric(
-        "RMSE", -1, headline=True, unit="output", head="RMSE", selected=True, simulated=True
+        "RMSE",
+        -1,
+        headline=True,
+        unit="output",
+        head="RMSE",
+        selected=True,
+        simulated=True,
+        compared=True,
+        family=True,
     ),
-    "nrmse": Metric("NRMSE", -1, headline=True, head="NRMSE", simulated=True),
-    "crps": Metric("CRPS", -1, headline=True, unit="output", head="CRPS", simulated=True),
+    "nrmse": Metric("NRMSE", -1, headline=True, head="NRMSE", simulated=True, compared=True),
+    "crps": Metric(
+        "CRPS",
+        -1,
+        headline=True,
+        unit="output",
+        head="CRPS",
+        simulated=True,
+        compared=True,
+        family=True,
+    ),
     "coverage50": Metric("Coverage of the 50 % band", 0, simulated=True),
     "coverage90": Metric(
         "Coverage of the 90 % band", 0, head="in 90 %\nband", selected=True, simulated=True
@@ -575,8 +353,10 @@ METRICS: Mapping[str, Metric] = {
 }
 
 
-def selected_metrics(*, simulated: bool) -> tuple[str, ...]:
-    """The names of the selected metrics of simulations, or of those of diagnoses."""
+def metrics_with(*marks: str, simulated: bool) -> tuple[str, ...]:
+    """The names of the metrics of simulations, or of diagnoses, with all of these fields true."""
     return tuple(
-        name for name, each in METRICS.items() if each.selected and each.simulated == simulated
+        name
+        for name, each in METRICS.items()
+        if each.simulated == simulated and all(getattr(each, mark) for mark in marks)
     )

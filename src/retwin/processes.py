@@ -21,7 +21,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnContext
+from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.synchronize import RLock
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -336,6 +336,19 @@ def _serve(
                 answer = False, retired.args
             connection.send_bytes(pickle.dumps(answer, pickle.HIGHEST_PROTOCOL))
     threading.Event().wait()
+class _Process(SpawnProcess):
+    """A process that Ctrl-C does not reach before `_begin` ignores it."""
+
+    def start(self) -> None:
+        """Start it; it inherits that SIGINT is blocked."""
+        if os.name != "posix":
+            return super().start()
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        return None
 
 
 class _Spawn(SpawnContext):
@@ -344,6 +357,8 @@ class _Spawn(SpawnContext):
     Keeps references to its locks: a worker that still starts when its pool ends opens them by name
     and prints an error if they are gone.
     """
+
+    Process = _Process
 
     def __init__(self) -> None:
         self.locks: list[RLock] = []
@@ -365,6 +380,8 @@ def _begin(
     orphaned: Callable[..., None] | None,
 ) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if os.name == "posix":
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.Thread(target=_end_with_parent, args=(orphaned, arguments), daemon=True).start()
     if start is not None:
         start(*arguments)

@@ -375,8 +375,8 @@ def test_a_model_and_an_fmu_lie_beside_the_file(
 
 def test_worker_processes_find_the_module(read: Callable[..., rt.Case], tmp_path: Path) -> None:
     case = read(BODY + "[commands]\nduration = 2\nsegments = 1\nramp_durations = [0.5]\n")
-    plan = rt.SimulationPlan(case.twin, case.sampler, 0, 6, chunk=3)
-    rt.simulate_to(tmp_path / "made.zarr", plan, workers=2)
+    plan = rt.deploy.SimulationPlan(case.twin, case.sampler, 0, 6, chunk=3)
+    rt.deploy.simulate_to(tmp_path / "made.zarr", plan, workers=2)
     made = rt.load(tmp_path / "made.zarr")
     np.testing.assert_allclose(
         made.observed, 2 * made.commands[..., :1] + made.commands[..., 1:], rtol=1e-6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -100,6 +101,7 @@ class Running:
                 stdout=subprocess.PIPE,
                 stderr=file,
                 text=True,
+                start_new_session=True,
                 # Tests that run in a shell's background would hand down that SIGINT is ignored.
                 preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             )
@@ -109,14 +111,23 @@ class Running:
         """What it has said there."""
         return self._stderr.read_text()
 
-    def interrupt(self, when: Callable[[], bool], number: int = signal.SIGINT) -> str:
-        """Ctrl-C as soon as that is so; the line that it ends with, and code 130."""
+    def wait(self, when: Callable[[], bool]) -> None:
+        """Wait until that is so."""
         deadline = time.monotonic() + 120
         while not when():
             assert self.process.poll() is None, self.stderr
             assert time.monotonic() < deadline
             time.sleep(0.01)
-        self.process.send_signal(number)
+
+    def interrupt(
+        self, when: Callable[[], bool], number: int = signal.SIGINT, *, workers: bool = False
+    ) -> str:
+        """Ctrl-C as soon as that is so; the line that it ends with, and code 130.
+
+        With `workers` it reaches the worker processes too, as it does from a terminal.
+        """
+        self.wait(when)
+        (os.killpg if workers else os.kill)(self.process.pid, number)
         out, _ = self.process.communicate(timeout=60)
         assert (self.process.returncode, out) == (130, ""), self.stderr
         assert "Traceback" not in self.stderr

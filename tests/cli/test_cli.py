@@ -135,7 +135,7 @@ def test_bad_files_end_with_one_line_and_code_2(
     [
         (("fit", "armpi", "--twin-data", "no.mat", "--real", "no.mat", "--out", "m"), "no.mat"),
         (("fit", "unheard", "--twin-data", "x", "--real", "x", "--out", "m"), "case 'unheard'"),
-        (("generate", "nowhere", "--out", "x.npz"), "expected a corrected model"),
+        (("generate", "nowhere", "--out", "x.npz"), "nowhere, where there is none; check"),
         (("generate", "nowhere", "--out", "x.txt"), "ends in .npz or .zarr"),
         (("study", "armpi", "--sources", "dt,magic", "--out", "s"), "'magic'"),
         (("study", "armpi", "--real", "no.mat", "--out", "s"), "no.mat"),

@@ -28,10 +28,12 @@ def completed(*typed: str, folder: Path, **environment: str) -> list[str]:
     return done.stdout.split()
 
 
-def test_the_classes_of_a_case_are_those_of_the_catalog() -> None:
-    for name, entry in catalog.CASES.items():
-        classes = catalog.resolve(entry.classes) if entry.classes else ("Healthy",)
-        assert cases.get(name).classes == classes, name
+@pytest.mark.parametrize("name", catalog.CASES)
+def test_the_recorded_case_of_the_catalog_is_that_of_the_case(name: str) -> None:
+    case, recorded = cases.get(name), cases.data_case(name)
+    for each in ("classes", "inputs", "outputs", "rate"):
+        assert getattr(case, each) == getattr(recorded, each), each
+    assert recorded.recover is case.recover
 
 
 @pytest.mark.parametrize(

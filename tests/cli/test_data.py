@@ -59,7 +59,7 @@ def cases(monkeypatch):
         requested.append(name)
         return Case()
 
-    module = SimpleNamespace(get=get)
+    module = SimpleNamespace(data_case=get)
     monkeypatch.setitem(sys.modules, "retwin.cases", module)
     monkeypatch.setattr(retwin, "cases", module, raising=False)
     return requested

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from retwin.serialisation.places import in_use
+
 
 @pytest.mark.slow
 def test_a_study_goes_on(call, start, own: Path) -> None:
@@ -32,6 +34,48 @@ def test_a_study_goes_on(call, start, own: Path) -> None:
     after = finished()
     assert len(after) > len(before)
     assert {file: after[file] for file in before} == before, "made twice"
+
+
+def others(running) -> list[str]:
+    """Lines of standard error that state no progress."""
+    return [line for line in running.stderr.splitlines() if not re.match(r"\w+: .*%", line)]
+
+
+@pytest.mark.slow
+def test_a_study_in_use_is_refused_and_all_its_processes_end_in_one_line(
+    call, start, own: Path
+) -> None:
+    words = (
+        *("study", "reach.toml", "--real", "real.npz", "--folds", 2, "--sources", "dt,ibg"),
+        *("--per-class", 12, "--processes", 2, "--out", "in use"),
+    )
+    running = start(*words)
+    roles = own / "in use" / "work" / "roles.json"
+    running.wait(roles.exists)
+    code, out, err = call(*words)
+    assert (code, out) == (2, "")
+    assert "expected a folder that no other process writes to" in err.splitlines()[-1]
+    running.interrupt(
+        lambda: "diagnosis" in running.stderr or "surrogate" in running.stderr, workers=True
+    )
+    assert len(others(running)) == 1, running.stderr
+    with in_use("in use"):
+        assert roles.exists(), "the interrupted study is free to go on"
+
+
+@pytest.mark.slow
+def test_a_simulation_in_use_is_refused_and_all_its_processes_end_in_one_line(
+    call, start, own: Path
+) -> None:
+    words = ("twin", "simulate", "armpi", "--n", 4000, "--workers", 2, "--chunk", 8)
+    target = own / "made.zarr"
+    running = start(*words, "--out", target)
+    running.wait(lambda: any((own / "made.zarr.part" / "done").glob("*.json")))
+    code, out, err = call(*words, "--out", target)
+    assert (code, out) == (2, "")
+    assert "expected a folder that no other process writes to" in err
+    running.interrupt(lambda: True, workers=True)
+    assert len(others(running)) == 1, running.stderr
 
 
 @pytest.mark.slow

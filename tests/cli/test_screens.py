@@ -105,7 +105,7 @@ def test_json_has_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
         "a": float("nan"),
         "b": [float("inf"), 1.5],
         "c": "ö",
-        "d": rt.Scores(*(8 * [0.5]), 2),
+        "d": rt.scores.Scores(*(8 * [0.5]), 2),
     }
     answer(printed, "for people", as_json=True)
     read = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)

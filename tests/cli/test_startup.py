@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from retwin import cases
 from retwin.data.io import save
 from retwin.data.trajectories import Trajectories
 
@@ -48,10 +49,16 @@ def measured(code: str, words: tuple[str, ...], folder: Path) -> tuple[int, floa
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with made.npz, a set of trajectories."""
+    """A folder with sets of trajectories: made.npz, and one of each built-in system."""
     outputs = np.zeros((3, 20, 2))
     made = Trajectories(commands=outputs, nominal=outputs, observed=outputs, rate=10.0)
     save(made, tmp_path / "made.npz")
+    for name in ("armpi", "tanks"):
+        case = cases.data_case(name)
+        arm = {"inputs": case.inputs, "outputs": case.outputs, "rate": case.rate}
+        u, y = (np.zeros((3, 20, len(arm[each]))) for each in ("inputs", "outputs"))
+        made = Trajectories(commands=u, nominal=y, observed=y, **arm)
+        save(made, tmp_path / f"{name.removesuffix('pi')}.npz")
     return tmp_path
 
 
@@ -64,6 +71,9 @@ def folder(tmp_path: Path) -> Path:
         (("twin", "list"), 0),
         (("twin", "info", "armpi-kinematic"), 0),
         (("data", "info", "made.npz"), 0),
+        (("data", "info", "arm.npz", "--case", "armpi"), 0),
+        (("data", "info", "tanks.npz", "--case", "tanks"), 0),
+        (("data", "info", "nowhere", "--case", "tanks_overflow"), 2),
         (("data", "convert", "made.npz", "again.npz"), 0),
         (("data", "fetch", "nonsense"), 2),
         (("bundle", "verify", "nowhere"), 2),

@@ -8,18 +8,19 @@ Everything is imported once; each case runs in a forked process of its own.
 from __future__ import annotations
 
 import contextlib
-import importlib
+import importlib.util
 import json
 import os
 import re
 import resource
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,9 @@ FORMATS = {
     "onnx": Format("sealed", SEALED),
     "results": Format("study/results.json", ("report study",)),
 }
+EXTRAS = {"zarr": "zarr", "onnx": "onnxruntime"}
+"""What the formats need that not every installation has."""
+NAMES = [name for name in FORMATS if importlib.util.find_spec(EXTRAS.get(name, "numpy"))]
 
 
 # --- mutations -----------------------------------------------------------------------------------
@@ -200,8 +204,11 @@ def files_in(folder: Path) -> frozenset[str]:
     return frozenset(str(each.relative_to(folder)) for each in folder.rglob("*"))
 
 
-def call(folder: Path, command: str, output: Path, modules: Path | None = None) -> Ended:
+def call(
+    folder: Path, command: str | Sequence[str], output: Path, modules: Path | None = None
+) -> Ended:
     """`retwin COMMAND` in a child that works in `folder`, under limits."""
+    words = command.split() if isinstance(command, str) else command
     pid = os.fork()
     if not pid:
         code = 1
@@ -217,7 +224,7 @@ def call(folder: Path, command: str, output: Path, modules: Path | None = None) 
             for number, name in ((0, os.devnull), (1, os.devnull), (2, str(output))):
                 flags = os.O_RDONLY if not number else os.O_WRONLY | os.O_CREAT | os.O_TRUNC
                 os.dup2(os.open(name, flags), number)
-            sys.argv = ["retwin", *command.split()]
+            sys.argv = ["retwin", *words]
             try:
                 main()
             except SystemExit as ended:
@@ -279,6 +286,21 @@ def run(samples: Path, work: Path, first: int, count: int, name: str) -> Iterato
         if problem:
             yield f"{name} {seed}: retwin {command}: {problem}"
         shutil.rmtree(folder)
+
+
+def printed(script: str, *words: object) -> list[str]:
+    """The lines that a script like this one prints."""
+    done = subprocess.run(
+        [sys.executable, script, *map(str, words)],
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+        # One thread, since a process that has several cannot be forked safely.
+        env=os.environ
+        | {"OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "1", "COLUMNS": "200", "RETWIN_QUIET": "1"}
+        | {"PYTHONDONTWRITEBYTECODE": "1"},
+    )
+    return done.stdout.splitlines()
 
 
 if __name__ == "__main__":

@@ -141,6 +141,7 @@ def test_results_hold_simulations_instead_of_diagnoses(folder: Path) -> None:
     assert np.mean(sources["ibg_rg"]["rmse"]) < 0.7 * np.mean(sources["ibg"]["rmse"])
     assert np.mean(sources["ibg_rg"]["coverage90"]) > 0.6
     assert sources["twin"]["twin_runs"] == 0
+    assert not any("satisfied" in note for each in sources.values() for note in each["notes"])
     assert sources["pi_ls_rg"]["twin_runs"] > sources["pi_ls"]["twin_runs"] > 0
     assert {row["metric"] for row in results["comparisons"]} == {"rmse", "nrmse", "crps"}
     pair = [row for row in results["comparisons"] if (row["a"], row["b"]) == ("pi_ls", "twin")]

@@ -128,7 +128,7 @@ def test_holding_keeps_the_value() -> None:
 def test_a_failed_simulation_is_named() -> None:
     commands = np.full((3, 40, 4), 500.0)
     commands[:, 10:] = 620.0
-    twin = armpi_parametric(rt.ArmPiTwin(step=0.01))
+    twin = armpi_parametric(rt.cases.ArmPiTwin(step=0.01))
     unstable = {"damping": [4.7, -1e6, 4.7]}
     with pytest.raises(rt.SimulationError) as caught:
         twin.simulate(commands, seed=0, parameters=unstable)
@@ -166,7 +166,7 @@ SUBJECTS = {
         (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2, (10.0, 50.0))),
     ),
     "arm": lambda case: TwinSubject(
-        armpi_parametric(rt.ArmPiTwin(step=0.01)),
+        armpi_parametric(rt.cases.ArmPiTwin(step=0.01)),
         arm_commands(case),
         (None, rt.Stuck(1, onset=(0.2, 0.8)), rt.ActuatorBias(2, (10.0, 50.0))),
     ),

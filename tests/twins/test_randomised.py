@@ -88,7 +88,7 @@ def test_bad_input_is_named() -> None:
 def test_a_simulation_that_fails_inside_is_named() -> None:
     commands = np.full((3, 40, 4), 500.0)
     commands[:, 10:] = 620.0
-    unstable = armpi_parametric(rt.ArmPiTwin(step=0.01)).with_values({"damping": -1e6})
+    unstable = armpi_parametric(rt.cases.ArmPiTwin(step=0.01)).with_values({"damping": -1e6})
     with pytest.raises(rt.SimulationError) as caught:
         NoisyTwin(unstable, np.ones(3)).simulate(commands, seed=0)
     assert set(caught.value.failed) == {0, 1, 2}
@@ -119,6 +119,6 @@ def test_arms_at_all_corners_of_the_box_can_be_simulated(case: rt.Case) -> None:
     corners = np.array([[a, b] for a in (low[0], high[0]) for b in (low[1], high[1])])
     commands = np.repeat(arm_commands(case)[:1], 4, axis=0)
     values = {"stiffness": corners[:, 0], "damping": corners[:, 1]}
-    fine = armpi_parametric(rt.ArmPiTwin(step=0.001))
+    fine = armpi_parametric(rt.cases.ArmPiTwin(step=0.001))
     coarse, wanted = (t.simulate(commands, seed=0, parameters=values) for t in (twin, fine))
     assert np.abs(coarse.observed - wanted.observed).max() < 5e-4

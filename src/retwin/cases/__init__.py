@@ -15,6 +15,7 @@ from retwin.errors import InputError
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
+    from retwin.data.io import DataCase
 
 _HOME = {
     "ArmPiTwin": "armpi_fpv.twin",
@@ -36,7 +37,7 @@ _CASES = {
 }
 
 __getattr__, __dir__, __all__ = names(__name__, _HOME | _CASES)
-__all__ += ["get"]
+__all__ += ["data_case", "get"]
 
 
 def get(name: str) -> Case:
@@ -68,3 +69,14 @@ def get(name: str) -> Case:
         got=got,
         remedy="check the spelling, or that the file or module is there",
     )
+
+
+def data_case(name: str) -> DataCase:
+    """What files of that case's trajectories need of it; for a built-in case without torch.
+
+    Raises as `get` does.
+    """
+    if name in catalog.CASES:
+        found: DataCase = catalog.resolve(catalog.CASES[name].recorded)
+        return found
+    return get(name)

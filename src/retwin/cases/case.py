@@ -9,6 +9,7 @@ from typing import Protocol
 
 from numpy.typing import NDArray
 
+from retwin.cases.recorded import RecordedCase
 from retwin.checks import require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.nets.networks import MLP, Network
@@ -184,6 +185,5 @@ class Case:
         self, trajectories: Trajectories, *, progress: Progress | None = None
     ) -> Trajectories:
         """`trajectories` with commands, recovered if the file has none and the case can do so."""
-        if trajectories.commands.shape[2] or self.recover is None:
-            return trajectories
-        return self.recover(trajectories, progress)
+        recorded = RecordedCase(self.classes, self.twin, self.recover)
+        return recorded.complete(trajectories, progress=progress)

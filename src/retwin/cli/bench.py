@@ -12,6 +12,7 @@ import typer
 from retwin.cli.options import Json
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.serialisation.files import write_atomically
+from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:
     from retwin.cli.benchmark import Benchmark
@@ -34,6 +35,8 @@ def bench(
     """Time twins of the arm and what learns from them, beside the paper."""
     from retwin.cli.benchmark import run_bench
 
+    if out is not None:
+        check_place(out)
     with bar("bench") as show:
         found = run_bench(count=n, repeats=repeats, report=show)
     figures = found.about()

@@ -8,10 +8,22 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from retwin.cli.diagnose import EMULATED, diagnoses, write_probabilities
-from retwin.cli.options import CaseOption, Json, MaxBytes, OtherCase, Seed
-from retwin.cli.reading import case_named, read
+from retwin.cli.options import (
+    CaseOption,
+    Json,
+    MaxBytes,
+    Measured,
+    Model,
+    OtherCase,
+    PerClass,
+    Probabilities,
+    Real,
+    Seed,
+)
+from retwin.cli.reading import case_named, data_case, read, saved
 from retwin.cli.terminal import answer, bar, command_given, example, note, table
 from retwin.data.io import check_target
+from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:
     from retwin.deploy.bundle.bundle import Bundle
@@ -30,10 +42,8 @@ Folder = Annotated[Path, typer.Argument(metavar="BUNDLE", help="Folder of a bund
 
 @app.command(epilog=example("retwin bundle save model real.mat --diagnoser cnn --out bundle"))
 def save(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of a corrected twin.")],
-    real: Annotated[
-        Path, typer.Argument(metavar="REAL", help="The trajectories it was calibrated on.")
-    ],
+    model: Model,
+    real: Real,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where to save the bundle.")],
     diagnoser: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Folder of a diagnoser.")
@@ -46,8 +56,10 @@ def save(
     import retwin as rt
     from retwin.deploy.bundle.bundle import Bundle
     from retwin.deploy.bundle.guard import fit_guard
+    from retwin.deploy.bundle.seal import SUMS
 
-    twin = rt.CorrectedTwin.load(model)
+    check_place(out, folder=True, holds=("model.json", SUMS, "twin", "guard", "diagnoser"))
+    twin = rt.CorrectedTwin.load(saved(model))
     system = rt.cases.get(case or twin.case)
     classifier = None if diagnoser is None else rt.load_diagnoser(diagnoser)
     calibration = read(real, system, max_bytes=max_bytes)
@@ -63,7 +75,7 @@ def verify(folder: Folder, as_json: Json = False) -> None:
     """Compare every file with its SHA-256, and describe the bundle; nothing is loaded."""
     from retwin.deploy.bundle.seal import read_sealed
 
-    about = read_sealed(folder, "bundle", "portable")
+    about = read_sealed(saved(folder), "bundle", "portable")
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     properties = ("case", "schema", "steps", "movements", "sensor_rate")
     values = {name: about.get(name) for name in properties}
@@ -91,13 +103,9 @@ def predict(
         Path,
         typer.Argument(metavar="BUNDLE", help="Folder of a bundle, or of its ONNX export."),
     ],
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Trajectories; labels are not needed.")
-    ],
+    file: Measured,
     case: CaseOption = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="CSV file for all probabilities.")
-    ] = None,
+    out: Probabilities = None,
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
@@ -105,8 +113,10 @@ def predict(
 
     A trajectory that is outside has no diagnosis and no probabilities.
     """
+    if out is not None:
+        check_place(out)
     bundle = _opened(folder)
-    trajectories = read(file, case_named(case), max_bytes=max_bytes)
+    trajectories = read(file, data_case(case), max_bytes=max_bytes)
     found = bundle.predict(trajectories)
     diagnosed = diagnoses(trajectories, found.classes, found.probabilities)
     verdicts = zip(found.verdicts.verdict.tolist(), found.verdicts.reason.tolist(), strict=True)
@@ -136,7 +146,7 @@ def predict(
 def generate(
     folder: Folder,
     out: Annotated[Path, typer.Option(metavar="FILE", help="New *.npz or *.zarr.")],
-    per_class: Annotated[int, typer.Option(metavar="N", help="Trajectories per class.")] = 400,
+    per_class: PerClass = 400,
     case: OtherCase = None,
     seed: Seed = 0,
 ) -> None:
@@ -145,7 +155,7 @@ def generate(
     from retwin.deploy.bundle.bundle import Bundle
 
     check_target(out)
-    bundle = Bundle.load(folder)
+    bundle = Bundle.load(saved(folder))
     system = case_named(case)
     # Only built-in names: code that a file names is not run, so other cases are given by --case.
     if system is None and bundle.facts.sampler is None and bundle.facts.case.isidentifier():
@@ -168,8 +178,9 @@ def export(
     from retwin.deploy.bundle.bundle import Bundle
     from retwin.deploy.onnx.export import export_onnx
 
+    check_place(onnx, folder=True)
     with bar("export") as show:
-        parity = export_onnx(Bundle.load(folder), onnx, progress=lambda s: show("", s))
+        parity = export_onnx(Bundle.load(saved(folder)), onnx, progress=lambda s: show("", s))
     rows = [(name, f"{difference:.1e}") for name, difference in parity.items()]
     answer(
         {"saved": str(onnx), "differences": parity},
@@ -183,10 +194,10 @@ def _opened(folder: Path) -> Bundle | Portable:
     """The bundle, or its export, for which torch is not imported."""
     from retwin.deploy.bundle.seal import read_sealed
 
-    if read_sealed(folder, "bundle", "portable")["kind"] == "portable":
+    if read_sealed(saved(folder), "bundle", "portable")["kind"] == "portable":
         from retwin.deploy.onnx.portable import Portable
 
         return Portable.load(folder)
     from retwin.deploy.bundle.bundle import Bundle
 
-    return Bundle.load(folder)
+    return Bundle.load(saved(folder))

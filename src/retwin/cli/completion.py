@@ -61,7 +61,7 @@ def complete_faults(ctx: typer.Context, incomplete: str) -> list[str]:
 def _faults(named: str) -> Sequence[str]:
     if not named.endswith(".toml"):
         entry = catalog.CASES.get(named.partition("-")[0])
-        return catalog.resolve(entry.classes) if entry and entry.classes else ()
+        return catalog.resolve(entry.recorded).classes if entry else ()
     try:
         faults = tomllib.loads(Path(named).read_text("utf-8")).get("faults", {})
     except (OSError, ValueError):

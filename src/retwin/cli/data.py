@@ -12,7 +12,7 @@ from rich.table import Table
 from retwin.checks import require
 from retwin.cli.completion import complete_files
 from retwin.cli.options import CaseOption, Json, MaxBytes, Rate, Seed
-from retwin.cli.reading import case_named, read
+from retwin.cli.reading import data_case, read
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data import download
 from retwin.data.io import check_target, save
@@ -43,7 +43,7 @@ def info(
     as_json: Json = False,
 ) -> None:
     """Describe files: classes, samples, channels, missing values, SHA-256."""
-    system = case_named(case)
+    system = data_case(case)
     facts = [_facts(read(file, system, rate, max_bytes=max_bytes), file) for file in files]
     answer(facts, *map(_table, facts), as_json=as_json)
 
@@ -58,7 +58,7 @@ def convert(
 ) -> None:
     """Write trajectories in retwin's own format, with channels, rate and provenance."""
     check_target(target)
-    trajectories = read(source, case_named(case), rate, max_bytes=max_bytes)
+    trajectories = read(source, data_case(case), rate, max_bytes=max_bytes)
     save(trajectories, target)
     note(f"Wrote {target}: {trajectories}")
 
@@ -88,7 +88,7 @@ def split(
         got=second,
         remedy="give each part its own file",
     )
-    whole = read(file, case_named(case), rate, max_bytes=max_bytes)
+    whole = read(file, data_case(case), rate, max_bytes=max_bytes)
     parts = whole.split(fraction, seed=seed)
     for part, target in zip(parts, (first, second), strict=True):
         save(part, target)

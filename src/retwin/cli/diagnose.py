@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from retwin import catalog
 from retwin.checks import require
 from retwin.cli.completion import one_of
-from retwin.cli.options import CaseOption, Json, MaxBytes, Seed
-from retwin.cli.reading import case_named, read
+from retwin.cli.options import CaseOption, Json, MaxBytes, Measured, Probabilities, Real, Seed
+from retwin.cli.reading import case_named, data_case, read, saved
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data.trajectories import Trajectories
 from retwin.serialisation.files import write_atomically
+from retwin.serialisation.places import check_place
 
 __all__ = ["EMULATED", "app", "diagnoses", "write_probabilities"]
 
@@ -53,6 +54,7 @@ def fit(
     """Train a diagnoser on labelled trajectories."""
     import retwin as rt
 
+    check_place(out, folder=True, holds=("model.json", "weights.safetensors"))
     system = case_named(case)
     chosen = catalog.make(catalog.CLASSIFIERS, classifier, "classifier")
     training = read(file, system, max_bytes=max_bytes)
@@ -77,9 +79,7 @@ def invert(
     model: Annotated[
         Path, typer.Argument(metavar="MODEL", help="A corrected twin, in command space.")
     ],
-    real: Annotated[
-        Path, typer.Argument(metavar="REAL", help="The trajectories it was calibrated on.")
-    ],
+    real: Real,
     out: Out,
     random_onset: Annotated[
         bool,
@@ -90,7 +90,9 @@ def invert(
     """Derive a diagnoser from a corrected twin; only healthy trajectories are used."""
     import retwin as rt
 
-    updated = rt.CorrectedTwin.load(model)
+    parts = ("model.json", "weights.safetensors", "surrogate", "residual")
+    check_place(out, folder=True, holds=parts)
+    updated = rt.CorrectedTwin.load(saved(model))
     system = rt.cases.get(updated.case)
     if random_onset:
         system = system.with_random_onset()
@@ -103,21 +105,19 @@ def invert(
 @app.command(epilog=example("retwin diagnose predict cnn real.mat --case armpi"))
 def predict(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of a diagnoser.")],
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Trajectories; labels are not needed.")
-    ],
+    file: Measured,
     case: CaseOption = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="CSV file for all probabilities.")
-    ] = None,
+    out: Probabilities = None,
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
     """Diagnose trajectories, and score the diagnoses if the labels are known."""
     import retwin as rt
 
-    diagnoser = rt.load_diagnoser(model)
-    trajectories = read(file, case_named(case), max_bytes=max_bytes)
+    if out is not None:
+        check_place(out)
+    diagnoser = rt.load_diagnoser(saved(model))
+    trajectories = read(file, data_case(case), max_bytes=max_bytes)
     probabilities = diagnoser.predict_proba(trajectories)
     _check_finite(trajectories, probabilities)
     labels = trajectories.labels.tolist()

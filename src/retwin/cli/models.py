@@ -12,12 +12,13 @@ import typer
 from retwin import catalog
 from retwin.checks import require
 from retwin.cli.completion import one_of
-from retwin.cli.options import CaseArgument, Json, MaxBytes, OtherCase, Seed
+from retwin.cli.options import CaseArgument, Json, MaxBytes, Model, OtherCase, PerClass, Seed
 from retwin.cli.plans import Workers, carry_out
-from retwin.cli.reading import read
+from retwin.cli.reading import read, saved
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
 from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
@@ -31,55 +32,68 @@ data_option, model_option = (
     for panel in ("Data", "Model; by default the case's")
 )
 
+ModelFolder = Annotated[
+    Path, typer.Option(metavar="FOLDER", help="Where to save the corrected twin.")
+]
+RealSet = Annotated[
+    Path | None, data_option(metavar="FILE", help="Real trajectories to calibrate on.")
+]
+OneFile = Annotated[
+    Path | None, data_option(metavar="FILE", help="Or one file that the case splits in two.")
+]
+TwinSet = Annotated[
+    Path | None, data_option(metavar="FILE", help="Trajectories of the twin; else simulated.")
+]
+Simulations = Annotated[
+    int | None, data_option(metavar="N", help="Trajectories simulated; else the case's.")
+]
+CalibrateOn = Annotated[
+    str,
+    data_option(
+        metavar="NAME", help="healthy or all.", autocompletion=one_of(catalog.CALIBRATE_ON)
+    ),
+]
+Network = Annotated[
+    str | None,
+    model_option(
+        metavar="NAME",
+        help="Surrogate: mlp, lstm, tcn or state_space.",
+        autocompletion=one_of(catalog.NETWORKS),
+    ),
+]
+Correction = Annotated[
+    str | None,
+    model_option(
+        metavar="NAME",
+        help="additive, delay_offset or command_space.",
+        autocompletion=one_of(catalog.CORRECTIONS),
+    ),
+]
+Density = Annotated[
+    str | None,
+    model_option(
+        metavar="NAME",
+        help="Distribution: mixture, flow or sequence_mixture.",
+        autocompletion=one_of(catalog.DENSITIES),
+    ),
+]
+Refine = Annotated[
+    bool, model_option("--refine", metavar="", help="Fine-tune on outputs afterwards.")
+]
+
 
 def fit(
     case: CaseArgument,
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where to save the corrected twin.")],
-    real: Annotated[
-        Path | None, data_option(metavar="FILE", help="Real trajectories to calibrate on.")
-    ] = None,
-    data: Annotated[
-        Path | None, data_option(metavar="FILE", help="Or one file that the case splits in two.")
-    ] = None,
-    twin_data: Annotated[
-        Path | None, data_option(metavar="FILE", help="Trajectories of the twin; else simulated.")
-    ] = None,
-    simulations: Annotated[
-        int | None, data_option(metavar="N", help="Trajectories simulated; else the case's.")
-    ] = None,
-    calibrate_on: Annotated[
-        str,
-        data_option(
-            metavar="NAME", help="healthy or all.", autocompletion=one_of(catalog.CALIBRATE_ON)
-        ),
-    ] = "healthy",
-    network: Annotated[
-        str | None,
-        model_option(
-            metavar="NAME",
-            help="Surrogate: mlp, lstm, tcn or state_space.",
-            autocompletion=one_of(catalog.NETWORKS),
-        ),
-    ] = None,
-    correction: Annotated[
-        str | None,
-        model_option(
-            metavar="NAME",
-            help="additive, delay_offset or command_space.",
-            autocompletion=one_of(catalog.CORRECTIONS),
-        ),
-    ] = None,
-    density: Annotated[
-        str | None,
-        model_option(
-            metavar="NAME",
-            help="Distribution: mixture, flow or sequence_mixture.",
-            autocompletion=one_of(catalog.DENSITIES),
-        ),
-    ] = None,
-    refine: Annotated[
-        bool, model_option("--refine", metavar="", help="Fine-tune on outputs afterwards.")
-    ] = False,
+    out: ModelFolder,
+    real: RealSet = None,
+    data: OneFile = None,
+    twin_data: TwinSet = None,
+    simulations: Simulations = None,
+    calibrate_on: CalibrateOn = "healthy",
+    network: Network = None,
+    correction: Correction = None,
+    density: Density = None,
+    refine: Refine = False,
     seed: Seed = 0,
     max_bytes: MaxBytes = None,
     as_json: Json = False,
@@ -87,6 +101,7 @@ def fit(
     """Fit surrogate and residual model; save the corrected twin."""
     import retwin as rt
 
+    check_place(out, folder=True, holds=("model.json", "surrogate", "residual"))
     system = _system(case, network, correction, density, refine)
     measured = _measured(system, real, data, max_bytes)
     size = system.per_class if simulations is None else simulations
@@ -230,9 +245,9 @@ def _residual_line(rg: ResidualModel | SequenceResidual) -> str:
 
 
 def generate(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of a corrected twin.")],
+    model: Model,
     out: Annotated[Path, typer.Option(metavar="FILE", help="New *.npz, or *.zarr of any size.")],
-    per_class: Annotated[int, typer.Option(metavar="N", help="Trajectories per class.")] = 400,
+    per_class: PerClass = 400,
     case: OtherCase = None,
     seed: Seed = 0,
     workers: Workers = None,
@@ -245,7 +260,7 @@ def generate(
     import retwin as rt
 
     kind = check_target(out)
-    updated = rt.CorrectedTwin.load(model)
+    updated = rt.CorrectedTwin.load(saved(model))
     require(
         case or updated.case,
         "case",
@@ -256,7 +271,7 @@ def generate(
     system = rt.cases.get(case or updated.case)
     if kind == ".zarr" or workers is not None:
         n = per_class * len(system.faults)
-        plan = rt.SimulationPlan(updated, system.sampler, seed, n, system.faults)
+        plan = rt.deploy.SimulationPlan(updated, system.sampler, seed, n, system.faults)
         carry_out(plan, out, "generate", workers=workers)
         return
     with bar("generate") as show:

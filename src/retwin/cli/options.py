@@ -2,41 +2,50 @@
 
 from __future__ import annotations
 
+from functools import partial
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from retwin.catalog import CASES
+from retwin.checks import whole
 from retwin.cli.completion import one_of
 
-__all__ = ["CaseArgument", "CaseOption", "Json", "MaxBytes", "OtherCase", "Rate", "Seed"]
+__all__ = [
+    "CaseArgument",
+    "CaseOption",
+    "Json",
+    "MaxBytes",
+    "Measured",
+    "Model",
+    "OtherCase",
+    "PerClass",
+    "Probabilities",
+    "Rate",
+    "Real",
+    "Seed",
+]
+
+CASE = "Built-in case, case.toml, or module:object."
+case_option = partial(typer.Option, "--case", metavar="CASE", autocompletion=one_of(CASES))
 
 CaseArgument = Annotated[
-    str,
-    typer.Argument(
-        metavar="CASE",
-        help="Built-in case, case.toml, or module:object.",
-        autocompletion=one_of(CASES),
-    ),
+    str, typer.Argument(metavar="CASE", help=CASE, autocompletion=one_of(CASES))
 ]
-CaseOption = Annotated[
-    str | None,
-    typer.Option(
-        "--case",
-        metavar="CASE",
-        help="Built-in case, case.toml, or module:object.",
-        autocompletion=one_of(CASES),
-    ),
+CaseOption = Annotated[str | None, case_option(help=CASE)]
+OtherCase = Annotated[str | None, case_option(help="If another than it was fitted for.")]
+Model = Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of a corrected twin.")]
+Real = Annotated[
+    Path, typer.Argument(metavar="REAL", help="The trajectories it was calibrated on.")
 ]
-OtherCase = Annotated[
-    str | None,
-    typer.Option(
-        "--case",
-        metavar="CASE",
-        help="If another than it was fitted for.",
-        autocompletion=one_of(CASES),
-    ),
+Measured = Annotated[
+    Path, typer.Argument(metavar="FILE", help="Trajectories; labels are not needed.")
 ]
+Probabilities = Annotated[
+    Path | None, typer.Option("--out", metavar="FILE", help="CSV file for all probabilities.")
+]
+PerClass = Annotated[int, typer.Option(metavar="N", help="Trajectories per class.")]
 Rate = Annotated[
     float | None,
     typer.Option("--rate", metavar="HZ", help="Samples per second, if the file has none."),
@@ -45,7 +54,18 @@ MaxBytes = Annotated[
     int | None,
     typer.Option(metavar="N", help="Most that a file may hold; else by what is free.", min=1),
 ]
-Seed = Annotated[int, typer.Option("--seed", metavar="N", help="Same seed, same result.", min=0)]
+MAX_SEED = 2**63 - 1
+"""The largest seed that every generator of random numbers takes."""
+Seed = Annotated[
+    int,
+    typer.Option(
+        "--seed",
+        metavar="N",
+        help="Same seed, same result.",
+        min=0,
+        callback=lambda seed: whole("--seed", seed, most=MAX_SEED),
+    ),
+]
 Json = Annotated[
     bool, typer.Option("--json", metavar="", help="Print JSON instead, and nothing else.")
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from retwin.checks import require
 from retwin.cli.terminal import bar
 from retwin.data.io import DataCase, load
 from retwin.data.trajectories import Trajectories
@@ -12,17 +13,33 @@ from retwin.data.trajectories import Trajectories
 if TYPE_CHECKING:
     from retwin.cases.case import Case
 
-__all__ = ["case_named", "read"]
+__all__ = ["case_named", "data_case", "read", "saved"]
 
 
 def case_named(name: str | None) -> Case | None:
-    """The case of that name, if one is given."""
-    if name is None:
-        return None
-    # Imported here, since cases need torch and many commands do not.
+    """The case of that name, if one is given; it needs torch."""
     from retwin import cases
 
-    return cases.get(name)
+    return None if name is None else cases.get(name)
+
+
+def data_case(name: str | None) -> DataCase | None:
+    """What the files of the case of that name need of it, if one is given."""
+    from retwin import cases
+
+    return None if name is None else cases.data_case(name)
+
+
+def saved(folder: Path) -> Path:
+    """The folder of a saved model or bundle, which must be there."""
+    require(
+        folder.is_dir(),
+        "path",
+        expected="the folder of a saved model",
+        got=f"{folder}, where there is none",
+        remedy="check the name",
+    )
+    return folder
 
 
 def read(

@@ -35,82 +35,99 @@ data_option, compared_option = (
     )
 )
 
+StudyFolder = Annotated[
+    Path, typer.Option(metavar="FOLDER", help="Called again, the study goes on there.")
+]
+RealSet = Annotated[
+    Path | None, data_option(metavar="FILE", help="One real set, split into folds.")
+]
+Folds = Annotated[int, data_option(metavar="N", help="Folds of --real.")]
+CalibrationSet = Annotated[
+    Path | None, data_option(metavar="FILE", help="Real set to calibrate on.")
+]
+TestSet = Annotated[Path | None, data_option(metavar="FILE", help="Real set to test on.")]
+OneFile = Annotated[
+    Path | None, data_option(metavar="FILE", help="One file that the case splits itself.")
+]
+TwinSet = Annotated[
+    Path | None, data_option(metavar="FILE", help="Trajectories of the twin; else simulated.")
+]
+Sources = Annotated[
+    str | None,
+    compared_option(
+        metavar="NAMES",
+        help="Joined by commas, or all; else dt,ibg,ibg_rg.",
+        autocompletion=complete_sources,
+    ),
+]
+Preset = Annotated[
+    str,
+    compared_option(
+        metavar="NAME",
+        help="quick or paper: classifier, training, runs.",
+        autocompletion=one_of(catalog.PRESETS),
+    ),
+]
+Classifier = Annotated[
+    str | None,
+    compared_option(
+        metavar="NAME",
+        help="cnn, lstm or rocket; else the preset's.",
+        autocompletion=one_of(catalog.CLASSIFIERS),
+    ),
+]
+Runs = Annotated[int | None, compared_option(metavar="N", help="Runs; else the preset's.")]
+Rate = Annotated[
+    float | None,
+    compared_option(metavar="HZ", help="Rate of the features; else the sensor's."),
+]
+PerClass = Annotated[
+    int | None, compared_option(metavar="N", help="Generated trajectories; else the case's.")
+]
+CalibrateOn = Annotated[
+    str,
+    compared_option(
+        metavar="NAME", help="healthy or all.", autocompletion=one_of(catalog.CALIBRATE_ON)
+    ),
+]
+RandomOnset = Annotated[
+    bool, compared_option("--random-onset", metavar="", help="Draw the onset of stuck motors.")
+]
+EncoderNoise = Annotated[
+    float, compared_option(metavar="X", help="Noise on frozen joints, in command units.")
+]
+LearningCurve = Annotated[
+    bool,
+    compared_option(
+        "--learning-curve", metavar="", help="Also calibrate on 1, 2, 4, 6 … healthy ones."
+    ),
+]
+Processes = Annotated[
+    int | None, typer.Option(metavar="N", help="Jobs at a time; else one per core.")
+]
+
 
 def study(
     case: CaseArgument,
-    out: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Called again, the study goes on there.")
-    ],
-    real: Annotated[
-        Path | None, data_option(metavar="FILE", help="One real set, split into folds.")
-    ] = None,
-    folds: Annotated[int, data_option(metavar="N", help="Folds of --real.")] = 3,
-    calibration: Annotated[
-        Path | None, data_option(metavar="FILE", help="Real set to calibrate on.")
-    ] = None,
-    test: Annotated[Path | None, data_option(metavar="FILE", help="Real set to test on.")] = None,
-    data: Annotated[
-        Path | None, data_option(metavar="FILE", help="One file that the case splits itself.")
-    ] = None,
-    twin_data: Annotated[
-        Path | None, data_option(metavar="FILE", help="Trajectories of the twin; else simulated.")
-    ] = None,
-    sources: Annotated[
-        str | None,
-        compared_option(
-            metavar="NAMES",
-            help="Joined by commas, or all; else dt,ibg,ibg_rg.",
-            autocompletion=complete_sources,
-        ),
-    ] = None,
-    preset: Annotated[
-        str,
-        compared_option(
-            metavar="NAME",
-            help="quick or paper: classifier, training, runs.",
-            autocompletion=one_of(catalog.PRESETS),
-        ),
-    ] = "quick",
-    classifier: Annotated[
-        str | None,
-        compared_option(
-            metavar="NAME",
-            help="cnn, lstm or rocket; else the preset's.",
-            autocompletion=one_of(catalog.CLASSIFIERS),
-        ),
-    ] = None,
-    runs: Annotated[
-        int | None, compared_option(metavar="N", help="Runs; else the preset's.")
-    ] = None,
-    rate: Annotated[
-        float | None,
-        compared_option(metavar="HZ", help="Rate of the features; else the sensor's."),
-    ] = None,
-    per_class: Annotated[
-        int | None, compared_option(metavar="N", help="Generated trajectories; else the case's.")
-    ] = None,
-    calibrate_on: Annotated[
-        str,
-        compared_option(
-            metavar="NAME", help="healthy or all.", autocompletion=one_of(catalog.CALIBRATE_ON)
-        ),
-    ] = "healthy",
-    random_onset: Annotated[
-        bool, compared_option("--random-onset", metavar="", help="Draw the onset of stuck motors.")
-    ] = False,
-    encoder_noise: Annotated[
-        float, compared_option(metavar="X", help="Encoder noise on all joints, in command units.")
-    ] = 0.0,
-    learning_curve: Annotated[
-        bool,
-        compared_option(
-            "--learning-curve", metavar="", help="Also calibrate on 1, 2, 4, 6 … healthy ones."
-        ),
-    ] = False,
+    out: StudyFolder,
+    real: RealSet = None,
+    folds: Folds = 3,
+    calibration: CalibrationSet = None,
+    test: TestSet = None,
+    data: OneFile = None,
+    twin_data: TwinSet = None,
+    sources: Sources = None,
+    preset: Preset = "quick",
+    classifier: Classifier = None,
+    runs: Runs = None,
+    rate: Rate = None,
+    per_class: PerClass = None,
+    calibrate_on: CalibrateOn = "healthy",
+    random_onset: RandomOnset = False,
+    encoder_noise: EncoderNoise = 0.0,
+    learning_curve: LearningCurve = False,
     seed: Seed = 0,
-    processes: Annotated[
-        int | None, typer.Option(metavar="N", help="Jobs at a time; else one per core.")
-    ] = None,
+    processes: Processes = None,
     as_json: Json = False,
 ) -> None:
     """Compare updated twins with other sources on real trajectories."""

@@ -16,6 +16,7 @@ from retwin.checks import needs_extra, require
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.files import sha256 as sha256_of
+from retwin.serialisation.places import check_place
 from retwin.serialisation.sizes import Budget
 
 __all__ = ["MAX_BYTES", "cache_folder", "fetch"]
@@ -85,8 +86,9 @@ def fetch(
     )
     place = Path(folder) if folder else cache_folder()
     target = place / known.file
-    if target.is_file() and sha256_of(target) == known.sha256:
+    if os.path.isfile(target) and sha256_of(target) == known.sha256:
         return target
+    check_place(target)
     pooch = needs_extra("pooch", "fetch", "downloads public files")
     try:
         with _quiet(pooch.get_logger()):

@@ -7,7 +7,13 @@ Belongs here: one file per kind of diagnoser, and what they share. Not here: the
 from __future__ import annotations
 
 from retwin.diagnosis.adversarial import DANN
-from retwin.diagnosis.diagnoser import Diagnoser, FittedDiagnoser, load_diagnoser
+from retwin.diagnosis.diagnoser import (
+    Diagnoser,
+    FittedDiagnoser,
+    Method,
+    TrainedDiagnoser,
+    load_diagnoser,
+)
 from retwin.diagnosis.features import Features
 from retwin.diagnosis.fine_tuning import FineTune
 from retwin.diagnosis.fitting import Classifier, fit_diagnoser
@@ -26,10 +32,12 @@ __all__ = [
     "FineTune",
     "FittedDiagnoser",
     "InversionDiagnoser",
+    "Method",
     "NetworkDiagnoser",
     "PooledDiagnoser",
     "Rocket",
     "RocketDiagnoser",
+    "TrainedDiagnoser",
     "fit_diagnoser",
     "fit_inversion",
     "load_diagnoser",

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -25,7 +25,7 @@ from retwin.nets.networks import CNN, Network
 from retwin.nets.training import Training, isolated, train
 from retwin.progress import Progress
 
-__all__ = ["DANN", "fit_dann"]
+__all__ = ["DANN"]
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,7 @@ class DANN:
 
     """
 
+    adapts: ClassVar[bool] = True
     network: Network = CNN()  # noqa: RUF009 - a frozen config
     hidden: int = 100
     gamma: float = 10.0
@@ -57,53 +58,53 @@ class DANN:
         whole("hidden", self.hidden, least=1)
         positive("gamma", self.gamma)
 
+    def fit(
+        self,
+        source: Trajectories,
+        target: Trajectories | None,
+        *,
+        seed: int,
+        classes: Sequence[str] | None,
+        rate: float | None,
+        training: Training | None,
+        progress: Progress | None,
+    ) -> NetworkDiagnoser:
+        """Train the network and its critic; see `fit_diagnoser`.
 
-def fit_dann(
-    source: Trajectories,
-    classifier: DANN,
-    target: Trajectories,
-    *,
-    seed: int,
-    classes: Sequence[str] | None = None,
-    rate: float | None = None,
-    training: Training | None = None,
-    progress: Progress | None = None,
-) -> NetworkDiagnoser:
-    """Train the network and its critic; see `fit_diagnoser`.
-
-    Each batch holds as many real trajectories as of the source, drawn with replacement. The start
-    of every trajectory is hidden (`Features.hide_start`), and each is sampled at a new random
-    phase each time (`Features.phases`), so that the critic learns less of single ones. The last
-    epoch is kept: choosing a better one for real data would need their labels. The figures hold
-    the critic's `domain_accuracy` too, the mean of its accuracies on the held-out fifth and the
-    target: 0.5 where the critic fails.
-    """
-    order = class_order(source, classes)
-    features = Features.at(source, rate, hide_start=True)
-    require(
-        len(target) > 0 and target.steps == source.steps,
-        "target",
-        expected=f"at least one real trajectory of {source.steps} samples, as in the source",
-        got=f"{len(target)} of {target.steps} samples",
-        remedy="give the unlabelled real trajectories, cut to the source's length",
-    )
-    fitted_on, held_out = source.split(0.8, seed=seed)
-    with isolated(seed):
-        diagnoser = NetworkDiagnoser(classifier.network, features, classes=order)
-        pair = _Pair(diagnoser, classifier.hidden)
-    phases, unlabelled = features.phases(fitted_on), features.phases(target)
-    diagnoser.before.fit(phases)
-    how = training or training_for(classifier.network)
-    steps = how.max_epochs * math.ceil(len(phases) / how.batch_size)
-    loss = _Loss(unlabelled, torch.Generator().manual_seed(seed), classifier.gamma, steps)
-    labelled = (phases, class_index(fitted_on, order))
-    result = train(pair, loss, labelled, None, how, seed=seed, progress=progress)
-    figures = {
-        "accuracy": _accuracy(diagnoser, held_out),
-        "domain_accuracy": pair.domain_accuracy(features(held_out), unlabelled[:, 0]),
-    }
-    diagnoser.fitted = replace(result, figures=figures)
-    return diagnoser
+        Each batch holds as many real trajectories as of the source, drawn with replacement. The
+        start of every trajectory is hidden (`Features.hide_start`), and each is sampled at a new
+        random phase each time (`Features.phases`), so that the critic learns less of single ones.
+        The last epoch is kept: choosing a better one for real data would need their labels. The
+        figures hold the critic's `domain_accuracy` too, the mean of its accuracies on the held-out
+        fifth and the target: 0.5 where the critic fails.
+        """
+        assert target is not None, "checked by fit_diagnoser"
+        order = class_order(source, classes)
+        features = Features.at(source, rate, hide_start=True)
+        require(
+            len(target) > 0 and target.steps == source.steps,
+            "target",
+            expected=f"at least one real trajectory of {source.steps} samples, as in the source",
+            got=f"{len(target)} of {target.steps} samples",
+            remedy="give the unlabelled real trajectories, cut to the source's length",
+        )
+        fitted_on, held_out = source.split(0.8, seed=seed)
+        with isolated(seed):
+            diagnoser = NetworkDiagnoser(self.network, features, classes=order)
+            pair = _Pair(diagnoser, self.hidden)
+        phases, unlabelled = features.phases(fitted_on), features.phases(target)
+        diagnoser.before.fit(phases)
+        how = training or training_for(self.network)
+        steps = how.max_epochs * math.ceil(len(phases) / how.batch_size)
+        loss = _Loss(unlabelled, torch.Generator().manual_seed(seed), self.gamma, steps)
+        labelled = (phases, class_index(fitted_on, order))
+        result = train(pair, loss, labelled, None, how, seed=seed, progress=progress)
+        figures = {
+            "accuracy": _accuracy(diagnoser, held_out),
+            "domain_accuracy": pair.domain_accuracy(features(held_out), unlabelled[:, 0]),
+        }
+        diagnoser.fitted = replace(result, figures=figures)
+        return diagnoser
 
 
 class _Pair(nn.Module):

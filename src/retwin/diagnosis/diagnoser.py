@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 from numpy.typing import NDArray
 
 from retwin.catalog import DIAGNOSERS, resolve
 from retwin.data.trajectories import Trajectories
+from retwin.nets.training import Fit, Training
+from retwin.progress import Progress
 from retwin.serialisation.models import kind_of, refusing
 
-__all__ = ["Diagnoser", "FittedDiagnoser", "load_diagnoser"]
+__all__ = ["Diagnoser", "FittedDiagnoser", "Method", "TrainedDiagnoser", "load_diagnoser"]
 
 
 @runtime_checkable
@@ -50,6 +53,44 @@ class FittedDiagnoser(Diagnoser, Protocol):
 
     def save(self, folder: str | Path) -> None:
         """Write a folder that `load_diagnoser` reads."""
+        ...
+
+
+class TrainedDiagnoser(FittedDiagnoser, Protocol):
+    """A diagnoser that `fit_diagnoser` returns."""
+
+    @property
+    def fitted(self) -> Fit | None:
+        """How its training ended."""
+        ...
+
+
+@runtime_checkable
+class Method(Protocol):
+    """A config object that trains a diagnoser of its own kind; a plain network needs none.
+
+    Attributes
+    ----------
+    adapts : bool
+        Whether it learns from real trajectories besides, the `target`.
+
+    """
+
+    adapts: ClassVar[bool]
+
+    def fit(
+        self,
+        trajectories: Trajectories,
+        target: Trajectories | None,
+        /,
+        *,
+        seed: int,
+        classes: Sequence[str] | None,
+        rate: float | None,
+        training: Training | None,
+        progress: Progress | None,
+    ) -> TrainedDiagnoser:
+        """Train a diagnoser; arguments are those of `fit_diagnoser`."""
         ...
 
 

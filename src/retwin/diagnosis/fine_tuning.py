@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +16,7 @@ from retwin.diagnosis.network import NetworkDiagnoser
 from retwin.nets.training import Training, isolated, train
 from retwin.progress import Progress
 
-__all__ = ["FineTune", "fine_tune"]
+__all__ = ["FineTune"]
 
 FINE_TUNING = Training(max_epochs=10, batch_size=48, learning_rate=1e-3, weight_decay=1e-2)
 """The default training. Its learning rate is a third of the first training's; it was fixed in
@@ -41,6 +43,7 @@ class FineTune:
 
     """
 
+    adapts: ClassVar[bool] = True
     base: NetworkDiagnoser
     generated_per_labelled: int = 3
 
@@ -54,42 +57,52 @@ class FineTune:
         )
         whole("generated_per_labelled", self.generated_per_labelled, least=1)
 
+    def fit(
+        self,
+        generated: Trajectories,
+        target: Trajectories | None,
+        *,
+        seed: int,
+        classes: Sequence[str] | None,
+        rate: float | None,
+        training: Training | None,
+        progress: Progress | None,
+    ) -> NetworkDiagnoser:
+        """Train a copy of the base on both sets; see `fit_diagnoser`.
 
-def fine_tune(
-    generated: Trajectories,
-    classifier: FineTune,
-    target: Trajectories,
-    *,
-    seed: int,
-    training: Training | None = None,
-    progress: Progress | None = None,
-) -> NetworkDiagnoser:
-    """Train a copy of the base on both sets; see `fit_diagnoser`.
+        Trajectories of the target are drawn with replacement. All epochs are run and the last is
+        kept. The start of every trajectory is hidden, in training and in later use
+        (`Features.hide_start`), and each is sampled at a new random phase each time
+        (`Features.phases`).
+        """
+        assert target is not None, "checked by fit_diagnoser"
+        require(
+            classes is None and rate is None,
+            "classes and rate",
+            expected="none for FineTune, which keeps those of its base",
+            got=f"{classes} and {rate}",
+            remedy="leave them out, or train another base",
+        )
+        base = self.base
+        for part in (generated, target):
+            class_order(part, base.classes)
+        features = replace(base.features, hide_start=True)
+        with isolated(seed):
+            tuned = NetworkDiagnoser(base.config, features, classes=base.classes)
+        tuned.load_state_dict(base.state_dict())
+        real, real_class = features.phases(target), class_index(target, base.classes)
+        generator = torch.Generator().manual_seed(seed)
 
-    Trajectories of the target are drawn with replacement. All epochs are run and the last is kept.
-    The start of every trajectory is hidden, in training and in later use (`Features.hide_start`),
-    and each is sampled at a new random phase each time (`Features.phases`).
-    """
-    base = classifier.base
-    for part in (generated, target):
-        class_order(part, base.classes)
-    features = replace(base.features, hide_start=True)
-    with isolated(seed):
-        tuned = NetworkDiagnoser(base.config, features, classes=base.classes)
-    tuned.load_state_dict(base.state_dict())
-    real, real_class = features.phases(target), class_index(target, base.classes)
-    generator = torch.Generator().manual_seed(seed)
+        def loss(module: nn.Module, batch: tuple[Tensor, ...]) -> Tensor:
+            phases, labels = batch
+            count = max(1, len(phases) // self.generated_per_labelled)
+            drawn = torch.randint(len(real), (count,), generator=generator)
+            mixed = torch.cat([phases, real[drawn].to(phases.device)])
+            truth = torch.cat([labels, real_class[drawn].to(phases.device)])
+            return nn.functional.cross_entropy(module(random_phase(mixed, generator)), truth)
 
-    def loss(module: nn.Module, batch: tuple[Tensor, ...]) -> Tensor:
-        phases, classes = batch
-        count = max(1, len(phases) // classifier.generated_per_labelled)
-        drawn = torch.randint(len(real), (count,), generator=generator)
-        mixed = torch.cat([phases, real[drawn].to(phases.device)])
-        truth = torch.cat([classes, real_class[drawn].to(phases.device)])
-        return nn.functional.cross_entropy(module(random_phase(mixed, generator)), truth)
-
-    examples = (features.phases(generated), class_index(generated, base.classes))
-    tuned.fitted = train(
-        tuned, loss, examples, None, training or FINE_TUNING, seed=seed, progress=progress
-    )
-    return tuned
+        examples = (features.phases(generated), class_index(generated, base.classes))
+        tuned.fitted = train(
+            tuned, loss, examples, None, training or FINE_TUNING, seed=seed, progress=progress
+        )
+        return tuned

@@ -7,18 +7,17 @@ from typing import Any
 
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.adversarial import DANN, fit_dann
-from retwin.diagnosis.fine_tuning import FineTune, fine_tune
-from retwin.diagnosis.network import NetworkDiagnoser, fit_network
-from retwin.diagnosis.rocket import Rocket, RocketDiagnoser, fit_rocket
+from retwin.diagnosis.diagnoser import Method, TrainedDiagnoser
+from retwin.diagnosis.network import fit_network
 from retwin.nets.networks import CNN, Network
 from retwin.nets.training import Training
 from retwin.progress import Progress
 
 __all__ = ["Classifier", "fit_diagnoser"]
 
-Classifier = Network | Rocket | DANN | FineTune
-"""What `fit_diagnoser` can train: a network such as `CNN` or `LSTMClassifier`, or a method."""
+Classifier = Network | Method
+"""What `fit_diagnoser` can train: a network such as `CNN` or `LSTMClassifier`, or a method such as
+`Rocket`, `DANN` or `FineTune`."""
 
 
 def fit_diagnoser(
@@ -31,7 +30,7 @@ def fit_diagnoser(
     rate: float | None = None,
     training: Training | None = None,
     progress: Progress | None = None,
-) -> NetworkDiagnoser | RocketDiagnoser:
+) -> TrainedDiagnoser:
     """Train a classifier on labelled trajectories.
 
     Parameters
@@ -61,7 +60,7 @@ def fit_diagnoser(
 
     Returns
     -------
-    NetworkDiagnoser or RocketDiagnoser
+    NetworkDiagnoser or RocketDiagnoser, or what another `Method` makes
         `fitted.figures` holds the `accuracy` on the held-out fifth, where there is one.
 
     Raises
@@ -72,30 +71,7 @@ def fit_diagnoser(
         channels or another rate.
 
     """
-    _check_arguments(classifier, target, classes, rate, training)
-    how: dict[str, Any] = {"seed": seed, "training": training, "progress": progress}
-    features: dict[str, Any] = {"classes": classes, "rate": rate}
-    real: dict[str, Any] = {"target": target}
-    match classifier:
-        case DANN():
-            return fit_dann(trajectories, classifier, **real, **features, **how)
-        case FineTune():
-            return fine_tune(trajectories, classifier, **real, **how)
-        case Rocket():
-            return fit_rocket(trajectories, classifier, **features, seed=seed, progress=progress)
-        case _:
-            return fit_network(trajectories, classifier, **features, **how)
-
-
-def _check_arguments(
-    classifier: Classifier,
-    target: Trajectories | None,
-    classes: Sequence[str] | None,
-    rate: float | None,
-    training: Training | None,
-) -> None:
-    """Refuse arguments that the classifier needs and lacks, or that have no use for it."""
-    adapts = isinstance(classifier, DANN | FineTune)
+    adapts = isinstance(classifier, Method) and classifier.adapts
     require(
         (target is not None) == adapts,
         "target",
@@ -103,19 +79,7 @@ def _check_arguments(
         got="none" if target is None else f"{len(target)} trajectories",
         remedy="give real trajectories to DANN and FineTune, and to no other classifier",
     )
-    if isinstance(classifier, FineTune):
-        require(
-            classes is None and rate is None,
-            "classes and rate",
-            expected="none for FineTune, which keeps those of its base",
-            got=f"{classes} and {rate}",
-            remedy="leave them out, or train another base",
-        )
-    if isinstance(classifier, Rocket):
-        require(
-            training is None,
-            "training",
-            expected="none for Rocket, whose weights have a closed form",
-            got=training,
-            remedy="leave it out",
-        )
+    how: dict[str, Any] = {"seed": seed, "classes": classes, "rate": rate, "training": training}
+    if isinstance(classifier, Method):
+        return classifier.fit(trajectories, target, **how, progress=progress)
+    return fit_network(trajectories, classifier, **how, progress=progress)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -24,11 +24,11 @@ from retwin.checks import needs_extra, require, whole
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.features import Features, class_index, class_names, class_order
 from retwin.nets.networks import Standardise
-from retwin.nets.training import Fit
+from retwin.nets.training import Fit, Training
 from retwin.progress import Progress
 from retwin.serialisation.models import read_model, write_model
 
-__all__ = ["Rocket", "RocketDiagnoser", "fit_rocket"]
+__all__ = ["Rocket", "RocketDiagnoser"]
 
 PATTERNS = 84
 """Kernels of MiniRocket without their dilations; it uses each of them equally often."""
@@ -68,6 +68,7 @@ class Rocket:
 
     """
 
+    adapts: ClassVar[bool] = False
     kernels: int = 9996
 
     def __post_init__(self) -> None:
@@ -77,6 +78,68 @@ class Rocket:
             expected=f"a multiple of {PATTERNS}",
             got=self.kernels,
             remedy="round it",
+        )
+
+    def fit(
+        self,
+        trajectories: Trajectories,
+        target: Trajectories | None,
+        *,
+        seed: int,
+        classes: Sequence[str] | None,
+        rate: float | None,
+        training: Training | None,
+        progress: Progress | None,
+    ) -> RocketDiagnoser:
+        """Fit MiniRocket and a ridge; see `fit_diagnoser`.
+
+        The penalty of the ridge minimises the leave-one-out error on four fifths. Its scores become
+        probabilities by one temperature, chosen on the held-out fifth (Guo et al., "On calibration
+        of modern neural networks", ICML 2017).
+        """
+        require(
+            training is None,
+            "training",
+            expected="none for Rocket, whose weights have a closed form",
+            got=training,
+            remedy="leave it out",
+        )
+        order = class_order(trajectories, classes)
+        features = Features.at(trajectories, rate)
+        require(
+            trajectories.steps > (KERNEL_LENGTH - 1) * features.stride,
+            "rate",
+            expected=f"at least {KERNEL_LENGTH} samples per trajectory, the length of a kernel",
+            got=f"{-(-trajectories.steps // features.stride)} samples",
+            remedy="choose a higher rate or give longer trajectories",
+        )
+        fitted_on, held_out = trajectories.split(0.8, seed=seed)
+        before = Standardise(features.width)
+        learnt = before.fit(features(fitted_on))(features(fitted_on))
+        transform = _minirocket(self.kernels, seed)
+        transform.fit(_channels(learnt))
+        convolved = _convolved(transform, learnt)
+        if progress is not None:
+            progress(0.4)
+        slope, level = _ridge(convolved, fitted_on.labels, order)
+        scores = _convolved(transform, before(features(held_out))) @ slope.T + level
+        truth = class_index(held_out, order).numpy()
+        temperature, log_loss = _temperature(scores, truth)
+        weights = {
+            **dict(zip(PARAMETERS, map(torch.as_tensor, transform.parameters), strict=True)),
+            "mean": before.mean,
+            "scale": before.scale,
+            "slope": torch.as_tensor(slope / temperature),
+            "level": torch.as_tensor(level / temperature),
+        }
+        if progress is not None:
+            progress(1.0)
+        return RocketDiagnoser(
+            features,
+            classes=order,
+            samples=learnt.shape[1],
+            weights=weights,
+            figures={"accuracy": float((scores.argmax(1) == truth).mean()), "log_loss": log_loss},
         )
 
 
@@ -173,60 +236,6 @@ class RocketDiagnoser:
             weights=weights,
             figures=about["figures"],
         )
-
-
-def fit_rocket(
-    trajectories: Trajectories,
-    classifier: Rocket,
-    *,
-    seed: int,
-    classes: Sequence[str] | None = None,
-    rate: float | None = None,
-    progress: Progress | None = None,
-) -> RocketDiagnoser:
-    """Fit MiniRocket and a ridge; see `fit_diagnoser`.
-
-    The penalty of the ridge minimises the leave-one-out error on four fifths. Its scores become
-    probabilities by one temperature, chosen on the held-out fifth (Guo et al., "On calibration of
-    modern neural networks", ICML 2017).
-    """
-    order = class_order(trajectories, classes)
-    features = Features.at(trajectories, rate)
-    require(
-        trajectories.steps > (KERNEL_LENGTH - 1) * features.stride,
-        "rate",
-        expected=f"at least {KERNEL_LENGTH} samples per trajectory, the length of a kernel",
-        got=f"{-(-trajectories.steps // features.stride)} samples",
-        remedy="choose a higher rate or give longer trajectories",
-    )
-    fitted_on, held_out = trajectories.split(0.8, seed=seed)
-    before = Standardise(features.width)
-    learnt = before.fit(features(fitted_on))(features(fitted_on))
-    transform = _minirocket(classifier.kernels, seed)
-    transform.fit(_channels(learnt))
-    convolved = _convolved(transform, learnt)
-    if progress is not None:
-        progress(0.4)
-    slope, level = _ridge(convolved, fitted_on.labels, order)
-    scores = _convolved(transform, before(features(held_out))) @ slope.T + level
-    truth = class_index(held_out, order).numpy()
-    temperature, log_loss = _temperature(scores, truth)
-    weights = {
-        **dict(zip(PARAMETERS, map(torch.as_tensor, transform.parameters), strict=True)),
-        "mean": before.mean,
-        "scale": before.scale,
-        "slope": torch.as_tensor(slope / temperature),
-        "level": torch.as_tensor(level / temperature),
-    }
-    if progress is not None:
-        progress(1.0)
-    return RocketDiagnoser(
-        features,
-        classes=order,
-        samples=learnt.shape[1],
-        weights=weights,
-        figures={"accuracy": float((scores.argmax(1) == truth).mean()), "log_loss": log_loss},
-    )
 
 
 def _ridge(convolved: NDArray, labels: NDArray, order: tuple[str, ...]) -> tuple[NDArray, NDArray]:

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.catalog import METRICS, SOURCES, selected_metrics
+from retwin.catalog import METRICS, SOURCES, metrics_with
 from retwin.results import Comparison
 from retwin.scores.bootstrap import MIN_RECORDS
 from retwin.scores.comparison import MIN_RUNS
@@ -45,7 +45,7 @@ MANY = 5
 """Number of sources beyond which figures and tables show a selection."""
 MAIN = tuple(name for name, metric in METRICS.items() if metric.headline)
 """The metrics that summarise a study."""
-SELECTED = selected_metrics(simulated=False)
+SELECTED = metrics_with("selected", simulated=False)
 """The metrics of diagnoses that are shown of many sources."""
 NO_VERDICT = {
     "few runs": f"a verdict needs at least {MIN_RUNS} runs",

@@ -27,6 +27,7 @@ from retwin.report.verdict import claims, outcome_of, verdict
 from retwin.scores.bootstrap import MIN_RECORDS
 from retwin.scores.comparison import MIN_RUNS
 from retwin.serialisation.files import write_atomically
+from retwin.serialisation.places import check_place
 
 __all__ = ["FIGURES", "render", "write_report"]
 
@@ -86,20 +87,21 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
 
     """
     study = read_study(folder)
+    page, figures = Path(folder) / "report.html", Path(folder) / "figures"
+    check_place(page)
+    check_place(figures, folder=True)
     sections = sections_of(study)
     images = {
         figure.name: png(figure, emulated=study.results.emulated)
         for section in sections
         for figure in (*section.figures, *section.further)
     }
-    figures = Path(folder) / "figures"
     for name, image in images.items():
         with write_atomically(figures / f"{name}.png") as part:
             part.write_bytes(image)
     for stale in figures.glob("*.png"):  # of an earlier report, whose results had them
         if stale.stem not in images and stale.stem.split("-")[0] in FIGURES:
             stale.unlink()
-    page = Path(folder) / "report.html"
     with write_atomically(page) as part:
         part.write_text(render(study, sections, images), encoding="utf-8", newline="\n")
     return page

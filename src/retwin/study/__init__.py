@@ -18,13 +18,14 @@ import numpy as np
 from retwin._version import __version__
 from retwin.cases.case import Case
 from retwin.catalog import CLASSIFIERS, SOURCES
-from retwin.checks import at_least, require, whole
+from retwin.checks import at_least, finite, require, whole
 from retwin.data.io import load, save
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 from retwin.results import Results
 from retwin.serialisation.files import sha256, write_atomically
 from retwin.serialisation.identity import identity
+from retwin.serialisation.places import in_use
 from retwin.study.files import Files, Roles
 from retwin.study.plan import StudyPlan
 from retwin.study.pool import run_jobs
@@ -121,27 +122,28 @@ def run_study(
     Raises
     ------
     InputError
-        If data or plan do not suit the case, if `out` holds another study, or if `processes` is
-        below 1.
+        If data or plan do not suit the case, if `out` holds another study or another process
+        works on it, or if `processes` is below 1.
 
     """
     workers = (os.cpu_count() or 1) if processes is None else whole("processes", processes, least=1)
     out = Path(out)
     report = report or (lambda _stage, _share: None)
-    digests = _digests(data)
-    found = _identity(case, plan, digests)
-    _check_free(out, found)
-    _check_possible(case, plan)
-    work_folder = out / "work"
-    if not (work_folder / "roles.json").exists():
-        _prepare(case, plan, data, out, found, report)
-    roles = Roles.of(json.loads((work_folder / "roles.json").read_text("utf-8")))
-    _check_healthy(plan, Files(work_folder).real_data(), roles)
-    work = Work(work_folder, case, plan, roles)
-    run_jobs(work, workers, report)
-    report("scores", 1.0)
-    provenance = {"command": command, "seed": plan.seed}
-    return write_results(work, out, about=_about(case, plan, data, digests), provenance=provenance)
+    with in_use(out):
+        digests = _digests(data)
+        found = _identity(case, plan, digests)
+        _check_free(out, found)
+        _check_possible(case, plan)
+        work_folder = out / "work"
+        if not (work_folder / "roles.json").exists():
+            _prepare(case, plan, data, out, found, report)
+        roles = Roles.of(json.loads((work_folder / "roles.json").read_text("utf-8")))
+        _check_healthy(plan, Files(work_folder).real_data(), roles)
+        work = Work(work_folder, case, plan, roles)
+        run_jobs(work, workers, report)
+        report("scores", 1.0)
+        about, provenance = _about(case, plan, data, digests), {"seed": plan.seed}
+        return write_results(work, out, about=about, provenance={"command": command, **provenance})
 
 
 def _digests(data: StudyData) -> dict[str, dict[str, str]]:
@@ -197,6 +199,15 @@ def _check_free(out: Path, expected: Mapping[str, Any]) -> None:
 
 def _check_possible(case: Case, plan: StudyPlan) -> None:
     """Refuse, before hours of work, what the case or the classifier does not permit."""
+    if plan.rate is not None:
+        finite(
+            "rate",
+            plan.rate,
+            least=2 * case.rate / case.sampler.steps,
+            most=case.rate,
+            unit="Hz",
+            remedy="give one between two samples per trajectory and the rate of the data",
+        )
     require(
         plan.encoder_noise == 0 or case.encoder_noise is not None,
         "encoder_noise",

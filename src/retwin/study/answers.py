@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.catalog import SOURCES, selected_metrics
+from retwin.catalog import SOURCES, metrics_with
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.pooled import pool_probabilities
 from retwin.evaluation.fidelity import Simulation, record_means, simulation_scores
@@ -30,7 +30,7 @@ class Answers(Protocol):
     Attributes
     ----------
     compared : tuple of str
-        Scores by which sources are compared, those of the family first.
+        Scores by which sources are compared.
     family : tuple of str
         Scores whose p-values are adjusted together (Holm).
     curved : tuple of str
@@ -79,9 +79,9 @@ class Diagnoses:
     """
 
     work: Work
-    family: ClassVar[tuple[str, ...]] = ("macro_f1", "balanced_accuracy", "auroc")
-    compared: ClassVar[tuple[str, ...]] = (*family, "accuracy", "healthy_recall")
-    curved: ClassVar[tuple[str, ...]] = selected_metrics(simulated=False)
+    family: ClassVar[tuple[str, ...]] = metrics_with("family", simulated=False)
+    compared: ClassVar[tuple[str, ...]] = metrics_with("compared", simulated=False)
+    curved: ClassVar[tuple[str, ...]] = metrics_with("selected", simulated=False)
 
     @cached_property
     def _tested(self) -> list[int]:
@@ -152,9 +152,9 @@ class Simulations:
     """
 
     work: Work
-    family: ClassVar[tuple[str, ...]] = ("rmse", "crps")
-    compared: ClassVar[tuple[str, ...]] = (*family, "nrmse")
-    curved: ClassVar[tuple[str, ...]] = selected_metrics(simulated=True)
+    family: ClassVar[tuple[str, ...]] = metrics_with("family", simulated=True)
+    compared: ClassVar[tuple[str, ...]] = metrics_with("compared", simulated=True)
+    curved: ClassVar[tuple[str, ...]] = metrics_with("selected", simulated=True)
 
     @cached_property
     def _records(self) -> Trajectories:

@@ -13,8 +13,13 @@ from retwin.checks import finite, one_of, positive, require, whole
 from retwin.diagnosis import Rocket
 from retwin.nets.networks import Network
 from retwin.nets.training import Training
+from retwin.update.corrected import MAX_PER_CLASS
 
 __all__ = ["PAPER", "QUICK", "Preset", "StudyPlan"]
+
+
+MAX_RUNS = 1000
+"""Runs beyond this number change no mean by more than 3 % of the spread between runs."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,7 @@ class StudyPlan:
     classifier : str, optional
         "cnn", "lstm" or "rocket"; by default the preset's.
     runs : int, optional
-        Number of runs, at least 1; by default the preset's.
+        Number of runs, from 1 to 1000; by default the preset's.
     seed : int
         Root of all seeds, at least 0.
     folds : int
@@ -64,7 +69,7 @@ class StudyPlan:
     rate : float, optional
         Sample rate of the classifier's features in Hz; by default the case's true sensor rate.
     per_class : int, optional
-        Generated trajectories per class, at least 1; by default the case's.
+        Generated trajectories per class, from 1 to 1e7; by default the case's.
     calibrate_on : str
         "healthy" or "all": the real trajectories from which residual models learn.
     encoder_noise : float
@@ -106,11 +111,11 @@ class StudyPlan:
             got=self.sources,
             remedy=f"choose from {', '.join(SOURCES)}",
         )
-        whole("runs", self.number_of_runs, least=1)
+        whole("runs", self.number_of_runs, least=1, most=MAX_RUNS)
         whole("seed", self.seed)
         whole("folds", self.folds, least=2)
         if self.per_class is not None:
-            whole("per_class", self.per_class, least=1)
+            whole("per_class", self.per_class, least=1, most=MAX_PER_CLASS)
         if self.rate is not None:
             positive("rate", self.rate, unit="Hz")
         finite("encoder_noise", self.encoder_noise, least=0.0, unit="command units")

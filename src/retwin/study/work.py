@@ -230,11 +230,14 @@ class Work:
 
     def _update(self, trial: Trial, path: Path) -> Costs:
         """The update by Eq. 2 or Eq. 3; its warnings are recorded with the costs."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
+        with warnings.catch_warnings(record=True) as given:
+            warnings.simplefilter("always", UserWarning)
             bayes = trial.job.name == "pi_bayes"
             found = _bayes(trial, path) if bayes else _least_squares(trial, path)
-        return {"twin_runs": found.twin_runs, "notes": found.reason}
+        # A search that was cut off is noted too; one that converged is no failure.
+        cut_off = [each for each in found.reason.split("; ") if "exceeded" in each]
+        notes = "; ".join([*cut_off, *dict.fromkeys(str(each.message) for each in given)])
+        return {"twin_runs": found.twin_runs, **({"notes": notes} if notes else {})}
 
     def _diagnosis(self, trial: Trial, path: Path) -> Costs:
         """Train or make the diagnoser of a source, and predict the test trajectories."""

@@ -29,7 +29,10 @@ from retwin.update.exact import exact_surrogate
 from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["CorrectedTwin", "generate"]
+__all__ = ["MAX_PER_CLASS", "CorrectedTwin", "generate"]
+
+MAX_PER_CLASS = 10_000_000
+"""Trajectories per class that are generated in memory at most: more fit into none."""
 
 BYTES_PER_NUMBER = 4
 """The size of a generated number in bytes, in float32."""
@@ -163,7 +166,7 @@ def generate(
     case : System
         A `Case`, or another object with `faults`, `classes` and a command `sampler`.
     per_class : int
-        Trajectories per class, at least 1.
+        Trajectories per class, from 1 to 1e7.
     seed : int
         The same seed gives the same bytes on the same machine.
     onsets : NDArray, optional
@@ -180,10 +183,11 @@ def generate(
     Raises
     ------
     InputError
-        `per_class` is below 1, or the memory has no room for the set.
+        `per_class` is out of range, or the memory has no room for the set.
 
     """
-    whole("per_class", per_class, least=1)
+    remedy = "give fewer, or write a *.zarr with simulate_to"
+    whole("per_class", per_class, least=1, most=MAX_PER_CLASS, remedy=remedy)
     width = len(twin.inputs) + 2 * len(twin.outputs)
     numbers = per_class * len(case.faults) * case.sampler.steps * width
     Budget("per_class").take(BYTES_PER_NUMBER * numbers)

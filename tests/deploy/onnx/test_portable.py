@@ -403,7 +403,7 @@ def test_what_has_no_graph_is_named(bundle: Bundle, tmp_path: Path) -> None:
     moving = rt.Surrogate(rt.StateSpace(), inputs=twin.inputs, outputs=twin.outputs, rate=100.0)
     for part, made in (
         ("surrogate", replace(bundle, twin=CorrectedTwin(moving, twin.residual))),
-        ("diagnoser", replace(bundle, diagnoser=rt.PooledDiagnoser([bundle.diagnoser]))),
+        ("diagnoser", replace(bundle, diagnoser=rt.diagnosis.PooledDiagnoser([bundle.diagnoser]))),
     ):
         with pytest.raises(rt.InputError, match=f"a {part} without one: it"):
             export_onnx(made, tmp_path / "portable")

@@ -198,7 +198,7 @@ def test_delay_and_joint_offsets_of_the_emulated_robot(case: rt.Case) -> None:
     hidden: dict[str, np.ndarray] = {}
     observed = case.emulator.simulate(some, seed=1, hidden=hidden)
     assert hidden["missed"].any()  # a movement of joint 2, an outlier that biases the plain norm
-    twin = armpi_parametric(rt.ArmPiTwin(step=0.01)).holding("stiffness", "damping")
+    twin = armpi_parametric(rt.cases.ArmPiTwin(step=0.01)).holding("stiffness", "damping")
     method = LeastSquares(starts=1, loss="cauchy")
     updated = identify(twin, observed, seed=0, rate=case.sensor_rate, method=method)
     delay = hidden["delay"].mean()

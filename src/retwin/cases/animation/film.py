@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import require
+from retwin.serialisation.places import check_place
 
 __all__ = ["check_film", "write_film"]
 
@@ -34,7 +35,7 @@ def check_film(path: str | os.PathLike[str]) -> str:
     Raises
     ------
     InputError
-        Another suffix, or MP4 without the package that writes it.
+        Another suffix, a place that cannot be written, or MP4 without the package that writes it.
 
     """
     suffix = Path(path).suffix.lower()
@@ -52,6 +53,7 @@ def check_film(path: str | os.PathLike[str]) -> str:
         got="an installation without it",
         remedy='install it: pip install "retwin[render]", or write a *.gif',
     )
+    check_place(path)
     return suffix
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,7 @@ from retwin.cases.armpi_fpv.body import ArmBody
 from retwin.cases.armpi_fpv.classes import BIASED, STUCK
 from retwin.cases.armpi_fpv.emulator import EmulatedArmPi
 from retwin.cases.armpi_fpv.parameters import armpi_parametric
-from retwin.cases.armpi_fpv.recovery import recover_commands
+from retwin.cases.armpi_fpv.recorded import recover
 from retwin.cases.armpi_fpv.twin import (
     ARM,
     KINEMATIC,
@@ -25,7 +24,6 @@ from retwin.cases.armpi_fpv.twin import (
 )
 from retwin.cases.case import Case
 from retwin.data.trajectories import HEALTHY, Trajectories
-from retwin.progress import Progress
 from retwin.times import stride_of
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.ramps import draw_onsets, ramps_and_holds
@@ -99,37 +97,6 @@ class ArmSampler(Timed):
         begins = draw_onsets(count, self.movements, self.period * self.rate, rng=rng, given=given)
         start = np.full((count, len(self.amplitude)), STRAIGHT)
         return ramps_and_holds(start, targets, ramps, begins, self.steps, dtype=np.float32)
-
-
-def recover(trajectories: Trajectories, progress: Progress | None = None) -> Trajectories:
-    """Recover commands from the desired path; a warning names ambiguous trajectories.
-
-    Parameters
-    ----------
-    trajectories : Trajectories
-        Trajectories whose `nominal` is the desired end-effector path in m.
-    progress : callable, optional
-        Called with the finished fraction.
-
-    Returns
-    -------
-    Trajectories
-        The same with commands.
-
-    """
-    found = recover_commands(trajectories.nominal, arm=ARM, progress=progress)
-    ambiguous = np.any(found.ambiguous, axis=1)
-    if ambiguous.any():
-        warnings.warn(
-            f"commands of {ambiguous.sum()} of {len(ambiguous)} trajectories are not certain: "
-            f"{', '.join(trajectories.ids[ambiguous][:5])}{' …' if ambiguous.sum() > 5 else ''}",
-            stacklevel=2,
-        )
-    return trajectories.replace(
-        commands=found.commands.astype(np.float32),
-        inputs=KINEMATIC.inputs,
-        outputs=KINEMATIC.outputs,
-    )
 
 
 ONSET = 0.49

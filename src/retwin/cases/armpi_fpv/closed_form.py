@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from numpy.typing import NDArray
-from scipy.signal import cont2discrete, lfilter
 
 from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.data.trajectories import Channels, Trajectories
@@ -55,6 +54,9 @@ class ServoLag:
             The response in command units.
 
         """
+        # Imported here, since it takes longer than all that a description of the twin needs.
+        from scipy.signal import cont2discrete, lfilter
+
         loop = ([self.proportional, self.integral], [1.0 + self.proportional, self.integral])
         numerator, denominator, _ = cont2discrete(loop, 1.0 / rate, method="foh")
         rest = commands[:, :1]

@@ -23,7 +23,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.integrate import RK45
 
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
@@ -153,6 +152,9 @@ class TanksTwin:
         The step is accepted whatever its error, because trajectories are integrated together and
         must not depend on each other. A sample is short compared with the tanks' time constants.
         """
+        # Imported here, since it takes longer than all that a description of the twin needs.
+        from scipy.integrate import RK45
+
         solver = RK45(
             lambda _, now: self._derivatives(now, voltage, numbers),
             0.0,

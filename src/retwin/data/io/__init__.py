@@ -17,6 +17,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.files import recover, write_atomically
+from retwin.serialisation.places import check_place
 
 __all__ = ["DataCase", "check_target", "load", "save"]
 
@@ -103,7 +104,7 @@ def check_target(path: str | os.PathLike[str]) -> str:
     Raises
     ------
     InputError
-        `save` cannot write a file of that suffix.
+        `save` cannot write a file of that suffix, or not there.
 
     """
     suffix = Path(path).suffix.lower()
@@ -115,6 +116,9 @@ def check_target(path: str | os.PathLike[str]) -> str:
         got=str(path),
         remedy="choose one of these formats by the name",
     )
+    folder = FORMATS[suffix].folder
+    replaced = folder and (Path(path) / "zarr.json").is_file()
+    check_place(path, folder=folder, holds=None if replaced else ())
     return suffix
 
 

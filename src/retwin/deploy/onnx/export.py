@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from retwin.checks import needs_extra, require
 from retwin.data.segments import Segments
 from retwin.deploy.bundle.bundle import Bundle
-from retwin.deploy.bundle.seal import SCHEMAS, seal
+from retwin.deploy.bundle.seal import SCHEMAS, SUMS, seal
 from retwin.deploy.onnx.graphs import (
     CorrectionGraph,
     DiagnoserGraph,
@@ -34,6 +34,7 @@ from retwin.diagnosis.features import SETTLED
 from retwin.nets.networks import MLP, TCN
 from retwin.progress import Progress
 from retwin.serialisation.models import write_model
+from retwin.serialisation.places import check_place
 from retwin.twins.samplers import RampSampler
 from retwin.update.corrections import SampledSensor
 from retwin.update.residual import Mixture, ResidualModel
@@ -103,6 +104,8 @@ def export_onnx(
     _check_installed()
     _check_exportable(bundle)
     graphs = _graphs(bundle)
+    names = [f"{name}.onnx" for name in graphs]
+    check_place(folder, folder=True, holds=("model.json", SUMS, *names))
     parity = {}
     with write_model(folder, "portable", _about(bundle), {}) as inside:
         for done, (name, graph) in enumerate(graphs.items()):

@@ -34,6 +34,7 @@ from retwin.jobs import alone, each
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.identity import identity
+from retwin.serialisation.places import in_use
 from retwin.serialisation.sizes import Budget
 
 __all__ = ["Simulated", "simulate_to"]
@@ -109,7 +110,8 @@ def simulate_to(
     ------
     InputError
         If the plan cannot be carried out; if the disk has no room for it, or the memory none for a
-        chunk; if the folder holds another plan's work or anything else;
+        chunk; if the folder holds another plan's work or anything else; if another process works
+        on it;
         if an NPZ would exceed 512 MB or workers are given for it; or if both workers and a
         scheduler are given.
     SimulationError
@@ -135,22 +137,23 @@ def simulate_to(
         return _finished(target, plan, about)
     earlier = _part(target).exists()
     job = _Job.begun(target, plan, about)
-    try:
-        job.finish(workers, scheduler, report)
-    except InputError as error:
-        # The plan cannot be carried out, although some of its chunks may be finished.
-        if job.done() and earlier:
-            remedy = f"{error.remedy}; what was finished earlier stays in {job.part}"
-            raise InputError(
-                error.argument, expected=error.expected, got=error.got, remedy=remedy
-            ) from error
-        _remove(job.part)
-        raise
-    except BaseException:
-        if not job.done():
+    with in_use(job.part):
+        try:
+            job.finish(workers, scheduler, report)
+        except InputError as error:
+            # The plan cannot be carried out, although some of its chunks may be finished.
+            if job.done() and earlier:
+                remedy = f"{error.remedy}; what was finished earlier stays in {job.part}"
+                raise InputError(
+                    error.argument, expected=error.expected, got=error.got, remedy=remedy
+                ) from error
             _remove(job.part)
-        raise
-    return job.moved(target)
+            raise
+        except BaseException:
+            if not job.done():
+                _remove(job.part)
+            raise
+        return job.moved(target)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,12 @@
+"""The recorded data of the tanks: one class, and the twin's channels."""
+
+from __future__ import annotations
+
+from retwin.cases.cascaded_tanks.twin import TanksTwin
+from retwin.cases.recorded import RecordedCase
+from retwin.data.trajectories import HEALTHY
+
+__all__ = ["RECORDED"]
+
+RECORDED = RecordedCase((HEALTHY,), TanksTwin())
+"""What files of the tanks' trajectories need of their case."""

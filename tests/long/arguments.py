@@ -1,0 +1,163 @@
+"""Odd arguments, and the real command line on each; run as a script.
+
+`python arguments.py SAMPLES WORK` gives every number of every command an odd value, and every name
+that a command writes to a place that cannot be written. It prints a line for every requirement that
+was not met: what is refused is refused with code 2, in one line, before any work, and leaves
+nothing. Everything is imported once; each case runs in a forked process of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+from mutation import broken, call, files_in
+
+# What the commands import, so that the cases need not.
+import retwin.cases.animation
+import retwin.cli.benchmark
+import retwin.deploy.bundle.guard
+import retwin.deploy.onnx.portable
+import retwin.deploy.simulations.job
+import retwin.report.page
+import retwin.study  # noqa: F401
+from retwin.cli import app
+
+with contextlib.suppress(ImportError):  # when it is imported, it writes a file of its own
+    import onnxruntime  # noqa: F401
+
+LONG = "x" * 300
+HUGE = "99999999999999999999"
+NUMBERS = ("nan", "inf", "-inf", "-1", "0", HUGE, "1e308", "1e-300", "")
+POSSIBLE = {
+    "0": {"seed", "encoder_noise", "index"},
+    HUGE: {"chunk", "processes", "workers", "rate"},
+    "1e308": {"rate"},
+    "1e-300": {"rate"},
+}
+"""Options for which an odd number may be accepted."""
+LONG_WORK = ("bench", "demo", "diagnose fit", "fit", "study")
+"""Commands that work for a long time on what they accept; it is not tried."""
+NO_PLACE = ("/", "/proc/none", "reach.toml/none", LONG, f"none/{LONG}", "study", "")
+"""Names at which nothing can be written: the last but one is the folder of another study."""
+
+BASE = {
+    "bench": "",
+    "bundle export": "sealed",
+    "bundle generate": "sealed --case reach.toml --per-class 1",
+    "bundle predict": "sealed real.npz",
+    "bundle save": "model real.npz --case reach.toml",
+    "data convert": "set",
+    "data fetch": "armpi",
+    "data info": "set",
+    "data split": "real.npz",
+    "demo": "--runs 1",
+    "diagnose fit": "real.npz",
+    "diagnose invert": "model real.npz",
+    "diagnose predict": "cnn real.npz",
+    "fit": "reach.toml --real real.npz --simulations 20",
+    "generate": "model --case reach.toml --per-class 1",
+    "study": "reach.toml --real real.npz --folds 2 --sources dt,ibg --runs 1 --per-class 5",
+    "twin animate": "real.npz --case reach.toml",
+    "twin info": "own_of_mutations:reach --inputs first,second --outputs far,high",
+    "twin simulate": "reach.toml --n 2",
+}
+"""The least words with which each command works, but for those that name what it writes."""
+
+
+def leaves(command: Any, *words: str) -> Iterator[tuple[str, Any]]:
+    """Every command, by its words."""
+    for name, each in command.commands.items():
+        if hasattr(each, "commands"):
+            yield from leaves(each, *words, name)
+        else:
+            yield " ".join((*words, name)), each
+
+
+def is_option(parameter: Any) -> bool:
+    return parameter.opts[0].startswith("-")
+
+
+def is_number(parameter: Any) -> bool:
+    return is_option(parameter) and parameter.metavar in ("N", "HZ", "X")
+
+
+def is_target(parameter: Any) -> bool:
+    """Whether it names what a command writes."""
+    written = ("out", "onnx", "first", "second", "folder")
+    return parameter.name == "target" or (parameter.name in written and is_option(parameter))
+
+
+def is_odd(parameter: Any) -> bool:
+    return is_number(parameter) or is_target(parameter)
+
+
+def suffix(name: str, target: Any) -> str:
+    """The suffix that a command wants of that name."""
+    if target.metavar == "FOLDER":
+        return ""
+    return {"bench": ".json", "twin animate": ".gif"}.get(
+        name, ".csv" if "predict" in name else ".npz"
+    )
+
+
+def cases() -> Iterator[tuple[str, list[str], bool]]:
+    """Each command, its words with an odd value, and whether that may be accepted."""
+    for name, command in leaves(typer.main.get_command(app)):
+        if name not in BASE:
+            continue
+        places = [each for each in command.params if is_target(each)]
+
+        def words(odd: dict[str, str], name: str = name, places: list[Any] = places) -> list[str]:
+            made = [*name.split(), *BASE[name].split()]
+            for each in places:
+                if each.required or each.name in odd:
+                    value = odd.get(each.name, f"new-{each.name}{suffix(name, each)}")
+                    made += [each.opts[-1], value] if is_option(each) else [value]
+            return made
+
+        for option in command.params:
+            if not is_number(option):
+                continue
+            for value in NUMBERS:
+                possible = option.name in POSSIBLE.get(value, ())
+                if not (possible and name in LONG_WORK):
+                    yield name, [*words({}), option.opts[0], value], possible
+        for place in places:
+            for value in NO_PLACE[1:5] if name == "data fetch" else NO_PLACE:
+                ending = suffix(name, place)
+                odd = value + ending if value and value not in ("/", "study") else value
+                yield name, words({place.name: odd}), False
+
+
+def run(samples: Path, work: Path, chosen: Sequence[str]) -> Iterator[str]:
+    """Every requirement that an odd argument of a command makes it break."""
+    folder, output = work / "folder", work / "stderr"
+    shutil.copytree(samples, folder)
+    before = files_in(folder)
+    for name, words, possible in cases():
+        if name not in chosen:
+            continue
+        ended = call(folder, words, output)
+        # torch keeps a cache in the folder of temporary files, which is this one here.
+        new = ("new-", "torchinductor_")
+        made = frozenset(name for name in ended.files if name.startswith(new))
+        problem = broken(ended, before, made)
+        if not problem and ended.code == 0 and not possible:
+            problem = "is accepted"
+        if problem:
+            yield f"retwin {' '.join(words)[:200]}: {problem}"
+        if ended.files != before:
+            shutil.rmtree(folder)
+            shutil.copytree(samples, folder)
+
+
+if __name__ == "__main__":
+    samples, work, *names = sys.argv[1:]
+    for failure in run(Path(samples), Path(work), names or list(BASE)):
+        print(failure, flush=True)
