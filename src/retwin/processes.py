@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from math import inf
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
@@ -46,6 +47,8 @@ __all__ = [
 START_TIME = 120.0
 """Duration in s after which a process that has not begun is ended. It is long, since a computer
 that is short of memory may need that long to import Python's packages."""
+RESOLUTION = 0.02
+"""Duration in s between two checks of the time limits of processes."""
 CLOSING_TIME = 1.0
 """Duration in s that a process has to end after it has closed its connection."""
 MORE_TIME = 8
@@ -159,7 +162,8 @@ class IsolatedPool:
         self._threads = ThreadPoolExecutor(workers)
         self._own = threading.local()
         self._all: set[_Isolated] = set()
-        self._closed = False
+        self._closed = threading.Event()
+        threading.Thread(target=self._end_late, daemon=True).start()
 
     def schedule(self, task: Callable[..., Any], *given: Any, timeout: float, size: int) -> Future:
         """The answer of `task(*given)`, in the future.
@@ -185,12 +189,18 @@ class IsolatedPool:
 
     def close(self) -> None:
         """End all processes; tasks that have not begun are dropped."""
-        self._closed = True
+        self._closed.set()
         for process in list(self._all):
             process.process.kill()
         self._threads.shutdown(cancel_futures=True)
         for process in list(self._all):
             process.end()
+
+    def _end_late(self) -> None:
+        """Kill processes that are past their time limit, until the pool is closed."""
+        while not self._closed.wait(RESOLUTION):
+            for process in list(self._all):
+                process.kill_if_late()
 
     def _ask(self, task: tuple[Any, ...], timeout: float, size: int) -> Any:
         """Have a task done by this thread's process.
@@ -204,7 +214,7 @@ class IsolatedPool:
             if process is None:
                 process = self._own.process = _Isolated(self._begin)
                 self._all.add(process)
-                if self._closed:  # after `close` has killed the others
+                if self._closed.is_set():  # after `close` has killed the others
                     process.process.kill()
             try:
                 return process.ask(task, timeout, size)
@@ -230,7 +240,9 @@ class _Isolated:
         with self.starting:
             self.process.start()
         there.close()
-        self.begun = False
+        self.begun = self.late = False
+        self.deadline = inf
+        self.clock = threading.Lock()
 
     def ask(self, task: tuple[Any, ...], timeout: float, size: int) -> Any:
         """The answer to a task."""
@@ -243,26 +255,38 @@ class _Isolated:
         return answer
 
     def _exchange(self, message: Any, timeout: float, size: int) -> Any:
-        """Send a message and receive the answer; the process is killed at the time limit."""
-        late = threading.Event()
-
-        def kill() -> None:
-            late.set()
-            self.process.kill()
-
+        """Send a message and receive the answer within the time limit."""
+        reason = FOREIGN
         try:
             self.here.send(message)
             for _ in range(1 + MORE_TIME):
-                with _after(timeout, kill):
-                    answer = self.here.recv_bytes(size)
-                if answer and not late.is_set():
+                self._limit(time.monotonic() + timeout)
+                answer = self.here.recv_bytes(size)
+                if answer:
+                    self._limit(inf)
                     return pickle.loads(answer)
-            reason = FOREIGN
+        except TimeoutError:
+            raise
         except (EOFError, ConnectionError):
             reason = _ending(self._code())
         except Exception:  # bytes that are no pickle raise anything
             reason = FOREIGN
-        raise TimeoutError if late.is_set() else ProcessEnded(reason)
+        self._limit(inf)
+        raise ProcessEnded(reason)
+
+    def _limit(self, deadline: float) -> None:
+        """Set the time at which the process is killed; TimeoutError if it was killed before."""
+        with self.clock:
+            self.deadline = deadline
+            if self.late:
+                raise TimeoutError
+
+    def kill_if_late(self) -> None:
+        """Kill the process if it is past its time limit."""
+        with self.clock:
+            if time.monotonic() > self.deadline:
+                self.late = True
+                self.process.kill()
 
     def _code(self) -> int | None:
         """The exit code of a process that has closed its connection; None if it goes on."""
@@ -280,18 +304,6 @@ class _Isolated:
             self.process.kill()
             self.process.join()
         self.here.close()
-
-
-@contextmanager
-def _after(seconds: float, action: Callable[[], None]) -> Iterator[None]:
-    """Do something unless the block ends within that time."""
-    timer = threading.Timer(seconds, action)
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-        timer.join()
 
 
 def _ending(code: int | None) -> str:

@@ -44,7 +44,7 @@ TRAJECTORIES_PER_CHUNK = 256
 """Number of trajectories per chunk: it bounds the tasks that wait for a process."""
 FORGETS = (
     "its reset does not restore the initial state, so every run has a new instance; reuse=False "
-    "does so without this check"
+    "makes them at once"
 )
 
 
