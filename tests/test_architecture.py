@@ -26,6 +26,7 @@ ROOMS = (
         "arrays",
         "modules",
         "processes",
+        "isolation",
         "jobs",
         "serialisation",
         "catalog",

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.processes import Retired, more_time
+from retwin.isolation import Retired, more_time
 from retwin.twins.fmu_access import Access
 from retwin.twins.fmu_model import find_scalars
 
