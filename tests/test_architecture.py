@@ -27,6 +27,7 @@ ROOMS = (
         "arrays",
         "modules",
         "processes",
+        "isolation",
         "jobs",
         "serialisation",
         "entries",

@@ -1,7 +1,7 @@
 """Worker processes that end with their parent and may hang or crash without ending it.
 
-`worker_pool` is for Python code. `isolated_pool` is for native code that nobody here has seen.
-Beside them, temporary folders that are removed when their process ends.
+And temporary folders that are removed when their process ends. Native code of unknown origin runs
+in the pools of `isolation`.
 """
 
 from __future__ import annotations
@@ -15,12 +15,8 @@ import shutil
 import signal
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection
+from contextlib import contextmanager
 from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.synchronize import RLock
 from multiprocessing.util import Finalize
@@ -32,29 +28,7 @@ from pebble import ProcessPool
 from retwin.errors import place_of
 from retwin.modules import add_known, known
 
-__all__ = [
-    "IsolatedPool",
-    "ProcessEnded",
-    "Retired",
-    "isolated_pool",
-    "more_time",
-    "scratch_folder",
-    "sendable_errors",
-    "worker_pool",
-]
-
-START_TIME = 120.0
-"""Duration in s after which a process that has not begun is ended. It is long, since a computer
-that is short of memory may need that long to import Python's packages."""
-CLOSING_TIME = 1.0
-"""Duration in s that a process has to end after it has closed its connection."""
-MORE_TIME = 8
-"""How often the time limit of a task may begin anew, so that a process that writes what reads as
-such a message still ends."""
-FOREIGN = "it wrote to the connection of its process"
-"""The reason of a failure whose answer is no answer of the pool."""
-OVERHEAD = 65_536
-"""Bytes that the pickle of an answer may take besides its arrays."""
+__all__ = ["begin_worker", "scratch_folder", "sendable_errors", "worker_pool"]
 
 
 @contextmanager
@@ -100,242 +74,6 @@ def worker_pool(
         pool.join()
 
 
-class Retired(Exception):
-    """Raised by a task of an `IsolatedPool` that only a process of its own can do right.
-
-    The pool replaces the process and does the task again. A message, if there is one, is added to
-    the notes of the pool.
-    """
-
-
-class ProcessEnded(Exception):
-    """A process of an `IsolatedPool` ended during a task, or broke its connection.
-
-    The message is the reason.
-    """
-
-
-@contextmanager
-def isolated_pool(
-    workers: int,
-    start: Callable[..., None],
-    arguments: tuple[Any, ...],
-    *,
-    orphaned: Callable[..., None] | None = None,
-) -> Iterator[IsolatedPool]:
-    """A pool of spawned processes for code that may do anything to its process.
-
-    In a `worker_pool` all processes share one connection, which a process that writes to all its
-    file descriptors blocks for ever. Here each has its own, and a time limit ends whatever happens.
-
-    Parameters
-    ----------
-    workers : int
-        The largest number of processes; each is started when it is needed.
-    start, arguments, orphaned
-        See `worker_pool`.
-
-    """
-    pool = IsolatedPool(workers, (start, arguments, orphaned))
-    try:
-        yield pool
-    finally:
-        pool.close()
-
-
-class IsolatedPool:
-    """See `isolated_pool`.
-
-    Attributes
-    ----------
-    notes : list of str
-        Messages of the processes that retired.
-
-    """
-
-    def __init__(self, workers: int, begin: tuple[Any, ...]) -> None:
-        self.notes: list[str] = []
-        self._begin = begin
-        self._threads = ThreadPoolExecutor(workers)
-        self._own = threading.local()
-        self._all: set[_Isolated] = set()
-        self._closed = False
-
-    def schedule(self, task: Callable[..., Any], *given: Any, timeout: float, size: int) -> Future:
-        """The answer of `task(*given)`, in the future.
-
-        Parameters
-        ----------
-        task : callable
-            A function that other processes can import.
-        *given : object
-            Its arguments, which are pickled.
-        timeout : float
-            Duration in s after which the process is ended; its start is not included.
-        size : int
-            Largest size of the answer's arrays in bytes.
-
-        Returns
-        -------
-        concurrent.futures.Future
-            The answer; `TimeoutError` after that duration, `ProcessEnded` if the process ends.
-
-        """
-        return self._threads.submit(self._ask, (task, given), timeout, size + OVERHEAD)
-
-    def close(self) -> None:
-        """End all processes; tasks that have not begun are dropped."""
-        self._closed = True
-        for process in list(self._all):
-            process.process.kill()
-        self._threads.shutdown(cancel_futures=True)
-        for process in list(self._all):
-            process.end()
-
-    def _ask(self, task: tuple[Any, ...], timeout: float, size: int) -> Any:
-        """Have a task done by this thread's process.
-
-        A process that retires is replaced, and so is one that ends during a task that was not its
-        first: the outcome must not depend on what a process did before.
-        """
-        while True:
-            process: _Isolated | None = getattr(self._own, "process", None)
-            fresh = process is None
-            if process is None:
-                process = self._own.process = _Isolated(self._begin)
-                self._all.add(process)
-                if self._closed:  # after `close` has killed the others
-                    process.process.kill()
-            try:
-                return process.ask(task, timeout, size)
-            except BaseException as error:
-                process.end()
-                self._all.discard(process)
-                self._own.process = None
-                if fresh or not isinstance(error, Retired | ProcessEnded):
-                    raise
-                self.notes += error.args if isinstance(error, Retired) else ()
-
-
-class _Isolated:
-    """A process with a connection of its own."""
-
-    starting = threading.Lock()
-    """Processes are started and awaited one at a time, as multiprocessing requires."""
-
-    def __init__(self, begin: tuple[Any, ...]) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.here, there = context.Pipe()
-        self.process = context.Process(target=_serve, args=(there, *begin), daemon=True)
-        with self.starting:
-            self.process.start()
-        there.close()
-        self.begun = False
-
-    def ask(self, task: tuple[Any, ...], timeout: float, size: int) -> Any:
-        """The answer to a task."""
-        if not self.begun:
-            self._exchange(None, START_TIME, OVERHEAD)
-            self.begun = True
-        fine, answer = self._exchange(task, timeout, size)
-        if not fine:
-            raise Retired(*answer)
-        return answer
-
-    def _exchange(self, message: Any, timeout: float, size: int) -> Any:
-        """Send a message and receive the answer; the process is killed at the time limit."""
-        late = threading.Event()
-
-        def kill() -> None:
-            late.set()
-            self.process.kill()
-
-        try:
-            self.here.send(message)
-            for _ in range(1 + MORE_TIME):
-                with _after(timeout, kill):
-                    answer = self.here.recv_bytes(size)
-                if answer and not late.is_set():
-                    return pickle.loads(answer)
-            reason = FOREIGN
-        except (EOFError, ConnectionError):
-            reason = _ending(self._code())
-        except Exception:  # bytes that are no pickle raise anything
-            reason = FOREIGN
-        raise TimeoutError if late.is_set() else ProcessEnded(reason)
-
-    def _code(self) -> int | None:
-        """The exit code of a process that has closed its connection; None if it goes on."""
-        deadline = time.monotonic() + CLOSING_TIME
-        while True:
-            with self.starting:
-                code: int | None = self.process.exitcode
-            if code is not None or time.monotonic() > deadline:
-                return code
-            time.sleep(0.01)
-
-    def end(self) -> None:
-        """End the process, whatever it does."""
-        with self.starting:
-            self.process.kill()
-            self.process.join()
-        self.here.close()
-
-
-@contextmanager
-def _after(seconds: float, action: Callable[[], None]) -> Iterator[None]:
-    """Do something unless the block ends within that time."""
-    timer = threading.Timer(seconds, action)
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-        timer.join()
-
-
-def _ending(code: int | None) -> str:
-    """How a process ended, by its exit code."""
-    if code is None:
-        return "it closed the connection of its process"
-    if code < 0:
-        return f"its process died (signal {-code})"
-    return f"its process ended (exit code {code})"
-
-
-_connection: Connection | None = None
-"""The connection of this process, if it is one of an `IsolatedPool`."""
-
-
-def more_time() -> None:
-    """Have the time limit of the present task begin anew; a task may do so `MORE_TIME` times."""
-    if _connection is not None:
-        _connection.send_bytes(b"")
-
-
-def _serve(
-    connection: Connection,
-    start: Callable[..., None],
-    arguments: tuple[Any, ...],
-    orphaned: Callable[..., None] | None,
-) -> None:
-    """Do tasks until the connection ends; then this process is killed, or its parent was."""
-    global _connection
-    _connection = connection
-    if os.name == "posix":  # where code that writes to all descriptors would disturb all processes
-        os.close(resource_tracker.getfd() or -1)
-    _begin(start, arguments, orphaned)
-    with suppress(EOFError, OSError):
-        connection.recv()
-        connection.send((True, ()))
-        while True:
-            task, given = connection.recv()
-            try:
-                answer = True, task(*given)
-            except Retired as retired:
-                answer = False, retired.args
-            connection.send_bytes(pickle.dumps(answer, pickle.HIGHEST_PROTOCOL))
-    threading.Event().wait()
 class _Process(SpawnProcess):
     """A process that Ctrl-C does not reach before `_begin` ignores it."""
 
@@ -371,14 +109,15 @@ class _Spawn(SpawnContext):
 def _begin_with_modules(modules: dict[str, str], *begin: Any) -> None:
     """Find the modules of users that the parent found, of which tasks may be made."""
     add_known(modules)
-    _begin(*begin)
+    begin_worker(*begin)
 
 
-def _begin(
+def begin_worker(
     start: Callable[..., None] | None,
     arguments: tuple[Any, ...],
     orphaned: Callable[..., None] | None,
 ) -> None:
+    """Begin a spawned process that ignores Ctrl-C and ends with its parent; see `worker_pool`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if os.name == "posix":
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

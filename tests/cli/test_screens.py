@@ -122,7 +122,7 @@ def test_json_is_alone_on_stdout(narrow) -> None:
     code, out, err = narrow("twin", "info", "armpi-kinematic", "--json")
     assert (code, err) == (0, "")
     printed = json.loads(out)
-    assert printed.keys() == {"title", "rate", "inputs", "outputs"}
+    assert printed.keys() == {"title", "rate", "inputs", "outputs", "runs"}
     for each in (*printed["inputs"], *printed["outputs"]):
         assert each.keys() == {"name", "unit", "low", "high"}
     assert (printed["rate"], len(printed["inputs"]), len(printed["outputs"])) == (100, 4, 3)

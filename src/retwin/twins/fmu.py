@@ -21,7 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import positive, require
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.processes import IsolatedPool, ProcessEnded, isolated_pool, scratch_folder
+from retwin.isolation import IsolatedPool, ProcessEnded, isolated_pool
+from retwin.processes import scratch_folder
 from retwin.progress import Progress
 from retwin.twins import fmu_worker
 from retwin.twins.faults import Fault
@@ -44,7 +45,7 @@ TRAJECTORIES_PER_CHUNK = 256
 """Number of trajectories per chunk: it bounds the tasks that wait for a process."""
 FORGETS = (
     "its reset does not restore the initial state, so every run has a new instance; reuse=False "
-    "does so without this check"
+    "makes them at once"
 )
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.processes import Retired, more_time
+from retwin.isolation import Retired, more_time
 from retwin.twins.fmu_access import Access
 from retwin.twins.fmu_model import find_scalars
 
@@ -137,7 +137,6 @@ class Instance:
             self._renew()
             pristine, self.fresh, self.sound = self.pristine, False, False
             try:
-                more_time()
                 outcome = self._simulate(commands, values)
             except FMICallException as error:
                 self.spent = self.spent or error.status == FATAL
@@ -152,6 +151,7 @@ class Instance:
                 return replace(outcome, forgets=self.forgets)
             if pristine:
                 return Outcome(reason=reason, forgets=self.forgets)
+            more_time()
 
     def _note(self, commands: NDArray, values: Start, outputs: NDArray) -> None:
         """Keep the first good run; have the renewal checked after the first that went elsewhere."""
@@ -189,6 +189,8 @@ class Instance:
             again = self._simulate(commands, values).outputs
         except Exception:  # FMPy raises nothing more special
             return False
+        finally:
+            more_time()
         allowed = tolerance * np.abs(outputs).max(initial=0.0)
         same = again.shape == outputs.shape and bool((np.abs(again - outputs) <= allowed).all())
         self.unchecked = not same

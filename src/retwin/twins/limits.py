@@ -94,6 +94,6 @@ class Limits:
                     f"{inputs.units[channel]}",
                     got=f"{commands[trajectory, sample, channel]:g} in trajectory {trajectory}, "
                     f"sample {sample}",
-                    remedy="keep the limits, or have commands clipped (outside='clip')",
+                    remedy="keep the limits, or have commands clipped (outside='clip', or --clip)",
                 )
         return commands
