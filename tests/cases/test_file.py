@@ -223,18 +223,24 @@ def test_parameters_are_arguments_of_the_function(read: Callable[..., rt.Case]) 
     assert found.values == pytest.approx({"gain": 1.4, "offset": -0.3}, abs=1e-4)
 
 
-MULTISINE = "[commands]\nkind = 'MultisineSampler'\nmean = [0, 2]\ndeviation = [0.3, 0.3]\n"
+MULTISINE = """
+[commands]
+kind = "MultisineSampler"
+duration = 10
+mean = [0, 2]
+deviation = [0.3, 0.3]
+"""
 
 
 def test_correction_and_network_are_those_that_suit_the_system(
     read: Callable[..., rt.Case],
 ) -> None:
     """Without segments no correction per segment, and with memory no network without."""
-    static = read(BASE + MULTISINE)
+    static = read(BODY + MULTISINE)
     assert (static.correction, static.network) == (rt.Additive(), rt.MLP())
     lagging = read(BASE.replace("turned", "lagging"))
     assert (lagging.correction, lagging.network) == (rt.DelayOffset(), rt.LSTM())
-    given = 'correction = "delay_offset"\nnetwork = "mlp"\n' + BASE.replace("turned", "lagging")
+    given = 'correction = "delay_offset"\nnetwork = "mlp"\n' + BODY.replace("turned", "lagging")
     chosen = read(given + MULTISINE)
     assert (chosen.correction, chosen.network) == (rt.DelayOffset(), rt.MLP())
 

@@ -174,7 +174,8 @@ def test_a_table_of_channels_has_an_end(call, mine: str, tmp_path: Path) -> None
 def test_an_fmu_without_inputs_simulates(call, tmp_path: Path) -> None:
     alone = described(c_fmu(tmp_path), "alone", 'causality="input"', 'causality="local"')
     out = tmp_path / "a.npz"
-    code, _, err = call("simulate", alone, "--n", 2, "--outputs", "sums", "--out", out)
+    options = ("--n", 2, "--outputs", "sums", "--duration", 10, "--out", out)
+    code, _, err = call("simulate", alone, *options)
     assert code == 0, err
     assert rt.load(out).observed.shape == (2, 1000, 2)
 

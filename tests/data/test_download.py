@@ -11,6 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pooch
 import pytest
 
+import retwin as rt
 from retwin.catalog import DOWNLOADS, PublicFile
 from retwin.data import download
 from retwin.data.download import fetch
@@ -236,7 +237,7 @@ def test_only_web_addresses(tmp_path, url):
 
 def test_folder_that_cannot_be_made(tmp_path, server):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(OSError, match="fetch toy"):
+    with pytest.raises(rt.InputError, match="expected a place that can be written"):
         fetch("toy", folder=tmp_path / "file")
 
 

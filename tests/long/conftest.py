@@ -16,27 +16,6 @@ from retwin.deploy.bundle.bundle import Bundle
 from retwin.deploy.bundle.guard import fit_guard
 from retwin.nets.training import Training
 
-MODULE = """
-import numpy as np
-
-
-def reach(commands):
-    turned = commands.cumsum(axis=-1)
-    return np.stack([np.sin(turned).sum(axis=-1), np.cos(turned).sum(axis=-1)], axis=-1)
-"""
-CASE = """
-name = "reach"
-twin = "own_of_mutations:reach"
-rate = 10
-inputs = { first = { unit = "rad", low = -1, high = 1 }, second = { low = -1, high = 1 } }
-outputs = { far = { unit = "m" }, high = { unit = "m" } }
-commands = { duration = 6, segments = 2, ramp_durations = [0.8, 1.0] }
-network = { kind = "MLP", hidden = [8] }
-training = { max_epochs = 2, batch = 64, rate = 1e-2 }
-density = { kind = "Mixture", training = { max_epochs = 2, decay = "step" } }
-[faults]
-stuck = { kind = "Stuck", actuator = "second", onset = 1.2 }
-"""
 BRIEF = Training(max_epochs=1, batch_size=32, learning_rate=1e-3)
 STUDY = Path(__file__).parents[1] / "report" / "schema_1" / "arm.json"
 
@@ -48,8 +27,8 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in mutation.NAMES:
         (root / name).mkdir()
     for name in ("case", "model"):
-        (root / name / "own_of_mutations.py").write_text(MODULE)
-        (root / name / "case.toml").write_text(CASE)
+        (root / name / "own_of_mutations.py").write_text(mutation.MODULE)
+        (root / name / "case.toml").write_text(mutation.CASE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "path", [*sys.path, str(root / "case")])
         case = rt.cases.get(str(root / "case" / "case.toml"))

@@ -30,6 +30,27 @@ import numpy as np
 from retwin.cli import main
 from retwin.deploy.bundle.seal import SUMS, seal
 
+MODULE = """
+import numpy as np
+
+
+def reach(commands):
+    turned = commands.cumsum(axis=-1)
+    return np.stack([np.sin(turned).sum(axis=-1), np.cos(turned).sum(axis=-1)], axis=-1)
+"""
+CASE = """
+name = "reach"
+twin = "own_of_mutations:reach"
+rate = 10
+inputs = { first = { unit = "rad", low = -1, high = 1 }, second = { low = -1, high = 1 } }
+outputs = { far = { unit = "m" }, high = { unit = "m" } }
+commands = { duration = 6, segments = 2, ramp_durations = [0.8, 1.0] }
+network = { kind = "MLP", hidden = [8] }
+training = { max_epochs = 2, batch = 64, rate = 1e-2 }
+density = { kind = "Mixture", training = { max_epochs = 2, decay = "step" } }
+[faults]
+stuck = { kind = "Stuck", actuator = "second", onset = 1.2 }
+"""
 HEADROOM = 2**30
 """Bytes of address space that a case may take beyond what is mapped when it starts."""
 TIMEOUT = 60

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import killing
 import pytest
-from test_mutated_files import CASE, MODULE
+from mutation import CASE, MODULE
 
 import retwin as rt
 

@@ -100,7 +100,8 @@ def test_what_was_not_measured_is_not_claimed(study: Study, write: Write) -> Non
 def test_the_headline_is_the_last_updated_source_and_the_plain_one() -> None:
     def of(*pairs: tuple[str, str]) -> tuple[str, str] | None:
         rows = [{"a": a, "b": b, "metric": "macro_f1", "mean_diff": 0.1} for a, b in pairs]
-        content = {"schema": 1, "case": "a", "runs": 1, "sources": {"dt": {}}, "comparisons": rows}
+        sources = {name: {} for name in ("dt", *(each for pair in pairs for each in pair))}
+        content = {"schema": 1, "case": "a", "runs": 1, "sources": sources, "comparisons": rows}
         return headline(Results.model_validate(content))
 
     updated = ("dt", "ibg_rg_command")

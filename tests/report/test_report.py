@@ -168,7 +168,8 @@ def test_two_sources_with_a_residual_model_have_figures_of_their_own(
     study: Study, write: Write
 ) -> None:
     results, arrays = study
-    results["fidelity"]["ibg_rg_command"] = results["fidelity"]["ibg_rg"]
+    for part in ("sources", "fidelity"):
+        results[part]["ibg_rg_command"] = results[part]["ibg_rg"]
     arrays |= {
         name.replace("ibg_rg", "ibg_rg_command"): each
         for name, each in arrays.items()

@@ -22,6 +22,7 @@ from retwin.errors import InputError
 from retwin.modules import known
 from retwin.serialisation.files import recover
 from retwin.serialisation.models import kind_of
+from retwin.times import to_samples
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
@@ -328,6 +329,15 @@ def _sampler(system: Case | None, found: Twin, duration: float | None) -> Any:
     """The sampler of the case, or ramps within the limits of the twin."""
     if system is not None:
         return system.sampler
+    limits = getattr(found, "limits", None)
+    bounded = limits is not None and all(map(isfinite, limits.low + limits.high))
+    require(
+        bounded or not len(found.inputs),
+        "--commands",
+        expected="commands, since not all inputs have limits within which to draw them",
+        got="none",
+        remedy="give --commands FILE, or --case NAME",
+    )
     if duration is None:
         raise InputError(
             "--duration",
@@ -340,13 +350,6 @@ def _sampler(system: Case | None, found: Twin, duration: float | None) -> Any:
     from retwin.twins.samplers import RampSampler
 
     if not len(found.inputs):  # nothing to draw
-        return np.zeros((1, max(2, round(duration * found.rate)), 0))
-    limits = getattr(found, "limits", None)
-    if limits is None or not all(map(isfinite, limits.low + limits.high)):
-        raise InputError(
-            "--commands",
-            expected="commands, since not all inputs have limits within which to draw them",
-            got="none",
-            remedy="give --commands FILE, or --case NAME",
-        )
+        return np.zeros((1, max(2, to_samples(duration, found.rate)), 0))
+    assert limits is not None
     return RampSampler(limits.low, limits.high, found.rate, duration, RAMPS)

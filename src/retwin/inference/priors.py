@@ -9,6 +9,10 @@ from torch import Tensor
 
 __all__ = ["GaussianPrior", "inverse"]
 
+ROUNDING = 1e-12
+"""Added to the unit diagonal of a precision: what outputs without noise leave open may be lost in
+the rounding of what they determine."""
+
 
 @dataclass(frozen=True, eq=False)
 class GaussianPrior:
@@ -70,5 +74,6 @@ def inverse(precision: Tensor) -> Tensor:
     """Covariance (R, P, P) of a precision, scaled to a unit diagonal: units differ by orders."""
     unit = precision.diagonal(dim1=1, dim2=2).rsqrt()
     scale = unit[:, :, None] * unit[:, None, :]
-    found = torch.linalg.inv(precision * scale) * scale
+    identity = torch.eye(precision.shape[1], dtype=precision.dtype)
+    found = torch.linalg.inv(precision * scale + ROUNDING * identity) * scale
     return (found + found.mT) / 2

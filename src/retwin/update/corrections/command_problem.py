@@ -281,7 +281,8 @@ class CommandProblem:
         """Values (n, S, d_y) or (n, S, d_y, P) times `whitening`."""
         if self.whitening is None:
             return values
-        return (self.whitening @ values.reshape(*values.shape[:3], -1)).view_as(values)
+        columns = values[..., None] if values.ndim == 3 else values
+        return (self.whitening @ columns).view_as(values)
 
     def _gain(self) -> Tensor:
         commands = self.commands(self.zero)
