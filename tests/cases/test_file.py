@@ -227,6 +227,7 @@ MULTISINE = """
 [commands]
 kind = "MultisineSampler"
 duration = 10
+band = [0.1, 2.0]
 mean = [0, 2]
 deviation = [0.3, 0.3]
 """

@@ -220,6 +220,9 @@ rate = 10
 u = { low = 0, high = 1 }
 [outputs]
 y = {}
+[commands]
+duration = 10
+segments = 2
 """
 
 

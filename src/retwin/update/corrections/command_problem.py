@@ -229,12 +229,18 @@ class CommandProblem:
         return segment.double() * self.measured[:, None]
 
     @property
-    def distance(self) -> Tensor:
-        """How far each actuator was to move in each segment, (n, M, d_u)."""
+    def levels(self) -> tuple[Tensor, Tensor]:
+        """Commands (n, M, d_u) before and after each segment."""
         first, last = (
             interpolate(self.reference, torch.as_tensor(t))
             for t in (self.segments.start, self.segments.settle)
         )
+        return first, last
+
+    @property
+    def distance(self) -> Tensor:
+        """How far each actuator was to move in each segment, (n, M, d_u)."""
+        first, last = self.levels
         return (last - first).abs()
 
     def commands(self, x: Tensor) -> Tensor:
@@ -298,11 +304,11 @@ class CommandProblem:
 
     @property
     def spread(self) -> Tensor:
-        """Standard deviation (d_u,) of the commands; of those that never change, their size."""
-        flat = self.reference.flatten(0, 1)
-        spread, size = flat.std(dim=0, correction=0), flat.abs().amax(dim=0)
-        constant = spread <= 1e-9 * size
-        return torch.where(constant, torch.where(size > 0, size, 1.0), spread)
+        """Standard deviation (d_u,) of the commands' levels; of constant ones, their size."""
+        ends = torch.cat([each[self.valid] for each in self.levels])
+        spread, size = ends.std(dim=0, correction=0).nan_to_num(0.0), ends.abs().mean(dim=0)
+        size = torch.where(size > 0, size, 1.0)
+        return torch.where(spread > 1e-9 * size, spread, size)
 
     def _residual(self, x: Tensor) -> Tensor:
         commands = self.commands(x)

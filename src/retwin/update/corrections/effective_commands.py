@@ -83,7 +83,7 @@ def _one_by_one(
         times[row],
         None if frozen is None else frozen[row, actuator][:, None],
     )
-    separate = commands.view(len(reference), width, -1, times.shape[1])
+    separate = commands.view(len(reference), width, n // len(reference), times.shape[1])
     return separate.permute(0, 2, 3, 1).flatten(0, 1)
 
 

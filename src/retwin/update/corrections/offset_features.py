@@ -10,7 +10,6 @@ from torch import Tensor
 from retwin.inference.hierarchy import Design
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import STILL
-from retwin.update.corrections.warp import interpolate
 
 __all__ = ["OffsetFeatures"]
 
@@ -43,7 +42,7 @@ class OffsetFeatures:
     @classmethod
     def of(cls, problem: CommandProblem) -> OffsetFeatures:
         """The scales of those commands; 1 where an actuator never moves."""
-        first, last = (each[problem.valid] for each in _ends(problem))
+        first, last = (each[problem.valid] for each in problem.levels)
         centre = last.mean(dim=0)
         spread, travel = (
             each.square().mean(dim=0).sqrt() for each in (last - centre, last - first)
@@ -89,13 +88,13 @@ class OffsetFeatures:
 
     def _direction(self, problem: CommandProblem) -> Tensor:
         """Sign (n, M, d_u) of each actuator's motion, 0 where it stands still."""
-        first, last = _ends(problem)
+        first, last = problem.levels
         size = problem.reference.abs().amax(dim=(0, 1))
         return (last - first).sign() * ((last - first).abs() > STILL * size)
 
     def _features(self, problem: CommandProblem) -> Tensor:
         """(n, M, d_u, F), those of every actuator's offset."""
-        first, last = _ends(problem)
+        first, last = problem.levels
         distance, width = last - first, last.shape[-1]
         direction = self._direction(problem)
         own = torch.stack([torch.ones_like(last), direction, distance / self.travel], dim=-1)
@@ -106,12 +105,3 @@ class OffsetFeatures:
         # An actuator's own target first: coefficients of a kind share a variance.
         order = (torch.arange(width)[:, None] + torch.arange(width)) % width
         return torch.cat([own, every.gather(-1, order.expand_as(every))], dim=-1)
-
-
-def _ends(problem: CommandProblem) -> tuple[Tensor, Tensor]:
-    """Commands (n, M, d_u) before and after each segment."""
-    first, last = (
-        interpolate(problem.reference, torch.as_tensor(t))
-        for t in (problem.segments.start, problem.segments.settle)
-    )
-    return first, last
