@@ -36,7 +36,7 @@ HUGE = "99999999999999999999"
 NUMBERS = ("nan", "inf", "-inf", "-1", "0", HUGE, "1e308", "1e-300", "")
 POSSIBLE = {
     "0": {"seed", "encoder_noise", "index"},
-    HUGE: {"chunk", "processes", "workers", "rate"},
+    HUGE: {"chunk", "max_bytes", "processes", "workers", "rate"},
     "1e308": {"rate"},
     "1e-300": {"rate"},
 }

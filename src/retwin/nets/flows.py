@@ -28,7 +28,7 @@ class FlowDistribution(Distribution):
     flow : NormalizingFlow
         Distribution of z in standard units.
     shift, scale : Tensor
-        (D,), z is its standard value times `scale` plus `shift`.
+        (D,) or (..., D), z is its standard value times `scale` plus `shift`.
 
     """
 
@@ -71,8 +71,11 @@ class FlowDistribution(Distribution):
         return self.flow.transform((value - self.shift) / self.scale)
 
     def widened(self, factor: Tensor) -> FlowDistribution:
-        """The same with all deviations from `shift` multiplied by `factor` (D,)."""
-        return FlowDistribution(self.flow, self.shift, factor * self.scale)
+        """The same with all deviations from the value at noise 0 multiplied by `factor` (D,)."""
+        noise = self.scale.new_zeros(*self.batch_shape, *self.event_shape)
+        centre = self.from_noise(noise, noise)
+        shift = centre + factor * (self.shift - centre)
+        return FlowDistribution(self.flow, shift, factor * self.scale)
 
     def _quasi_random_draws(self) -> Tensor:
         points = _quasi_random_noise(self.event_shape[0]).to(self.shift)
