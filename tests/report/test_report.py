@@ -386,7 +386,7 @@ def test_without_arrays_and_stale_figures(study: Study, write: Write) -> None:
     assert "roc" not in reader.ids
     assert "figure-tde" not in reader.ids
     assert "confusion" in reader.ids
-    assert "about 0.04 with 90 trajectories" in reader.text  # instead of the computed floor
+    assert "with 90 trajectories it is about 0.08" in reader.text  # instead of the computed floor
     assert {path.stem for path in (folder / "figures").iterdir()} == {
         "scores",
         "confusion",
