@@ -41,8 +41,8 @@ POSSIBLE = {
     "1e-300": {"rate"},
 }
 """Options for which an odd number may be accepted."""
-LONG_WORK = ("bench", "demo", "diagnose fit", "fit", "study")
-"""Commands that work for a long time on what they accept; it is not tried."""
+LONG_WORK = ("bench", "data fetch", "demo", "diagnose fit", "fit", "study")
+"""Commands that work for a long time, or download, on what they accept; it is not tried."""
 NO_PLACE = ("/", "/proc/none", "reach.toml/none", LONG, f"none/{LONG}", "study", "")
 """Names at which nothing can be written: the last but one is the folder of another study."""
 

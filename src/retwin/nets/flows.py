@@ -28,24 +28,30 @@ class FlowDistribution(Distribution):
     flow : NormalizingFlow
         Distribution of z in standard units.
     shift, scale : Tensor
-        (D,) or (..., D), z is its standard value times `scale` plus `shift`.
+        (D,), z is its standard value times `scale` plus `shift`.
+    wider : Tensor or float
+        (D,), standard deviation of the noise that the flow transforms.
 
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     support = constraints.real_vector
 
-    def __init__(self, flow: NormalizingFlow, shift: Tensor, scale: Tensor) -> None:
+    def __init__(
+        self, flow: NormalizingFlow, shift: Tensor, scale: Tensor, wider: Tensor | float = 1.0
+    ) -> None:
         self.flow = flow
         self.shift = shift
         self.scale = scale
+        self.wider = torch.as_tensor(wider, dtype=scale.dtype).expand_as(scale)
         super().__init__(flow.batch_shape, flow.event_shape, validate_args=False)
 
     def expand(
         self, batch_shape: Sequence[int], _instance: Distribution | None = None
     ) -> FlowDistribution:
         """The same distribution for a larger batch."""
-        return FlowDistribution(self.flow.expand(torch.Size(batch_shape)), self.shift, self.scale)
+        flow = self.flow.expand(torch.Size(batch_shape))
+        return FlowDistribution(flow, self.shift, self.scale, self.wider)
 
     @property
     def mean(self) -> Tensor:
@@ -59,23 +65,23 @@ class FlowDistribution(Distribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log density (...) at `value` (..., D)."""
-        standard = self.flow.log_prob((value - self.shift) / self.scale)
-        return standard - self.scale.log().sum()
+        standard = (value - self.shift) / self.scale
+        noise = self.flow.transform(standard)
+        narrower = 0.5 * noise.square() * (1 - self.wider.square().reciprocal())
+        density = self.flow.log_prob(standard) + narrower.sum(dim=-1)
+        return density - (self.scale * self.wider).log().sum()
 
     def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
         """A draw (..., D) as a function of normal noise (..., D); `uniform` is not used."""
-        return self.flow.transform.inv(normal) * self.scale + self.shift
+        return self.flow.transform.inv(self.wider * normal) * self.scale + self.shift
 
     def normal_scores(self, value: Tensor) -> Tensor:
         """The standard normal noise (..., D) of which `value` (..., D) is the draw."""
-        return self.flow.transform((value - self.shift) / self.scale)
+        return self.flow.transform((value - self.shift) / self.scale) / self.wider
 
     def widened(self, factor: Tensor) -> FlowDistribution:
-        """The same with all deviations from the value at noise 0 multiplied by `factor` (D,)."""
-        noise = self.scale.new_zeros(*self.batch_shape, *self.event_shape)
-        centre = self.from_noise(noise, noise)
-        shift = centre + factor * (self.shift - centre)
-        return FlowDistribution(self.flow, shift, factor * self.scale)
+        """The same with the deviations of the noise multiplied by `factor` (D,)."""
+        return FlowDistribution(self.flow, self.shift, self.scale, factor * self.wider)
 
     def _quasi_random_draws(self) -> Tensor:
         points = _quasi_random_noise(self.event_shape[0]).to(self.shift)
