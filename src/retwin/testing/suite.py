@@ -66,7 +66,12 @@ def require_same(got: NDArray, wanted: NDArray, message: str) -> None:
 
 
 def require_alike(
-    got: ArrayLike, wanted: ArrayLike, message: str, *, tolerance: float = 1e-5
+    got: ArrayLike,
+    wanted: ArrayLike,
+    message: str,
+    *,
+    tolerance: float = 1e-5,
+    floor: float = 1e-6,
 ) -> None:
     """Assert that two arrays are equal up to rounding.
 
@@ -78,6 +83,8 @@ def require_alike(
         What the contract requires.
     tolerance : float, default 1e-5
         Largest difference, relative to the largest magnitude in the channel.
+    floor : float, default 1e-6
+        What the magnitude of a channel counts as at least, relative to that of all.
 
     Raises
     ------
@@ -89,7 +96,7 @@ def require_alike(
     require(got.shape == wanted.shape, f"{message} (shape {got.shape} and {wanted.shape})")
     size = np.abs(wanted)
     scale = size.max(axis=tuple(range(wanted.ndim - 1)), initial=0.0)
-    near = np.abs(got - wanted) <= tolerance * np.maximum(scale, 1e-6 * size.max(initial=0.0))
+    near = np.abs(got - wanted) <= tolerance * np.maximum(scale, floor * size.max(initial=0.0))
     require(near.all(), f"{message} ({_difference(got, wanted)})")
 
 
