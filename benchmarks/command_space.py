@@ -4,8 +4,8 @@ The discrepancy of the emulated robot is known: 100 trajectories for each of thr
 delays within 1 sample and offsets within 0.3 degrees (mean absolute error), missed segments with an
 F1 of 0.95, 90 % intervals with a coverage of 85 to 95 %. A second robot has half the delays and
 half their spread. True delays, like offsets, are those of the joints: dead zone and play add to the
-drawn delay. The effective sample size was chosen with seed 11. Times are those of the inference on
-54 trajectories, and of the generation of 3600.
+drawn delay. The noise model was developed on these seeds; `offset_grid.py` has others. Times are
+those of the inference on 54 trajectories, and of the generation of 3600.
 """
 
 from __future__ import annotations

@@ -320,7 +320,7 @@ def test_the_polling_phase_does_not_change_z(
     """The same trajectory, earlier or later, has the same z*; so it has with one phase only.
 
     The prior is learned from the whole batch. Here the batch holds everything twice, so that only
-    the pseudo-observations of the prior make a difference to one half alone.
+    the hyperpriors make a difference to one half alone.
     """
     context, observed, mask = two_phases
     operator = rt.CommandSpace(max_samples=max_samples)
