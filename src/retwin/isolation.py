@@ -61,7 +61,7 @@ def isolated_pool(
     """A pool of spawned processes for code that may do anything to its process.
 
     In a `worker_pool` all processes share one connection, which a process that writes to all its
-    file descriptors blocks for ever. Here each has its own, and a time limit ends whatever happens.
+    file descriptors blocks for ever. Here each has its own, and every task has a time limit.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ class _Isolated:
             time.sleep(0.01)
 
     def end(self) -> None:
-        """End the process, whatever it does."""
+        """End the process, also in the middle of a task."""
         with self.starting:
             self.process.kill()
             self.process.join()

@@ -1,4 +1,4 @@
-"""Times in samples: whoever uses retwin gives and reads seconds and Hz, samples are only inside."""
+"""Conversion of times: users give and read seconds and Hz, samples are used internally only."""
 
 from __future__ import annotations
 

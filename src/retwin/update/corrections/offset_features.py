@@ -16,8 +16,8 @@ __all__ = ["OffsetFeatures"]
 OWN_FEATURES = 3
 """Features of an actuator's own motion: a constant, its direction, and its distance."""
 MAX_COEFFICIENTS = 500
-"""Coefficients at most with which an offset depends on the targets of all actuators; beyond, it
-depends on its own actuator's target only."""
+"""Largest number of coefficients in all with which offsets depend on the targets of all actuators;
+with more actuators, each offset depends on its own actuator's target only."""
 WIDE = 30.0
 """Standard deviation of the prior, in that of a healthy offset, where a fault may be anything."""
 
@@ -41,7 +41,7 @@ class OffsetFeatures:
 
     @classmethod
     def of(cls, problem: CommandProblem) -> OffsetFeatures:
-        """The scales of those commands; 1 where an actuator never moves."""
+        """The scales of the commands of `problem`; 1 where an actuator never moves."""
         first, last = (each[problem.valid] for each in problem.levels)
         centre = last.mean(dim=0)
         spread, travel = (
@@ -54,8 +54,8 @@ class OffsetFeatures:
     def design(self, problem: CommandProblem) -> Design:
         """The regression of x on a common delay, and on the features of the offsets.
 
-        Group 0 are the common delays, group 1 + u the offsets of actuator u, and the last group
-        what the delays of the actuators differ.
+        Group 0 holds the common delays, group 1 + u the offsets of actuator u, and the last group
+        the differences of the actuators' own delays from the common one.
         """
         n, segments, width = problem.missed.shape
         own = self._features(problem)
