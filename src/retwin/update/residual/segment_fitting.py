@@ -68,8 +68,9 @@ def fit_segments(
     Returns
     -------
     Fit, Tensor
-        The record, whose figures are `spread`, the factor of the deviations that held-out z need,
-        and `folds`; and the trajectories of the first fold, none if there is a single one.
+        The record, whose figures are `spread`, the largest factor of the deviations of a block
+        that held-out z need, and `folds`; and the trajectories of the first fold, none if there is
+        a single one.
 
     """
     rows = targets.valid.any(dim=1).nonzero().flatten()
@@ -104,7 +105,7 @@ def fit_segments(
     model.spread.copy_(torch.where(model.events, 1.0, factor))
     if bounds is None:
         model.bounds.mul_(model.spread)
-    figures = {"spread": spread, "folds": float(len(folds))}
+    figures = {"spread": float(spread.max()), "folds": float(len(folds))}
     return replace(fits[-1], figures=figures), rows[folds[0]] if len(rows) > 1 else rows[:0]
 
 
@@ -142,24 +143,31 @@ def _trained(
     )
 
 
-def _spread(held_out: list[tuple[ResidualModel, Targets]]) -> float:
-    """The factor of the deviations with which intervals hold held-out z as often as they should.
+def _spread(held_out: list[tuple[ResidualModel, Targets]]) -> Tensor:
+    """The factors (d_z,) with which intervals hold held-out z as often as they should, per block.
 
     By coverage and not by likelihood, which a single missed segment would dominate.
     """
-    predicted = [(model.predict(part.features), part, model.events) for model, part in held_out]
+    predicted = [(model.predict(part.features), part) for model, part in held_out]
+    model = held_out[0][0]
+    spread = torch.ones(len(model.latent))
+    for head, block in model.parts():
+        if isinstance(head, BernoulliHead):
+            continue
 
-    def share(factor: float) -> float:
-        inside, count = 0.0, 0
-        for distribution, part, events in predicted:
-            factors = torch.full((len(events),), factor)
-            scores = distribution.widened(factors).normal_scores(part.z)
-            used = part.used & ~events
-            inside += float((scores.abs() <= QUANTILE)[:, used].float().mean(dim=0).sum())
-            count += int(used.sum())
-        return inside / count if count else 1.0
+        def share(factor: float, block: slice = block) -> float:
+            inside, count = 0.0, 0
+            for distribution, part in predicted:
+                scores = distribution.widened(torch.full_like(spread, factor)).normal_scores(part.z)
+                used = part.used[..., block]
+                held = (scores[..., block].abs() <= QUANTILE)[:, used]
+                inside += float(held.float().mean(dim=0).sum())
+                count += int(used.sum())
+            return inside / count if count else 1.0
 
-    return next((each for each in SPREADS.tolist() if share(each) >= LEVEL), float(SPREADS[-1]))
+        factors = SPREADS.tolist()
+        spread[block] = next((each for each in factors if share(each) >= LEVEL), factors[-1])
+    return spread
 
 
 @torch.no_grad()
