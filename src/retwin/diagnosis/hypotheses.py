@@ -48,6 +48,41 @@ def checked(faults: Mapping[str, Fault | None]) -> dict[str, Fault | None]:
 
 
 @dataclass(frozen=True, eq=False)
+class LimitedPrior(LatentPrior):
+    """A prior under which biases have a largest size.
+
+    Under the Gaussian alone a bias of several times the largest size can be more probable than a
+    missed segment, and the class is then rejected for its size.
+
+    Attributes
+    ----------
+    limit : Tensor
+        (R, P), largest distance of x from its mean, infinite where there is none.
+    healthy : Tensor
+        (R, P), standard deviation of what is not the bias.
+
+    """
+
+    limit: Tensor
+    healthy: Tensor
+
+    def __getitem__(self, rows: Tensor) -> LimitedPrior:
+        """The prior of some rows."""
+        gaussian, odds = self.gaussian[rows], self.odds[rows]
+        return LimitedPrior(gaussian, odds, self.limit[rows], self.healthy[rows])
+
+    @property
+    def deviation(self) -> Tensor:
+        """Standard deviations (R, P) of x without a fault."""
+        return self.healthy
+
+    def excess(self, x: Tensor) -> Tensor:
+        """What the part of x (R, P) beyond its limit costs, in nats."""
+        beyond = ((x - self.gaussian.mean).abs() - self.limit).clamp_min(0)
+        return 0.5 * (beyond / self.healthy).square()
+
+
+@dataclass(frozen=True, eq=False)
 class Hypotheses:
     """All classes about n trajectories: row r is class r % C of trajectory r // C.
 
@@ -95,11 +130,17 @@ class Hypotheses:
         problem = command_problem(residual, context[rows.numpy()], observed[rows], mask[rows])
         prior = healthy_prior(residual, context)[rows]
         made = cls(problem, prior, len(faults), actuator, size.double(), onsets)
-        extra = torch.zeros_like(prior.gaussian.mean)
-        place = made.offset_index
-        extra.scatter_(1, place, made.width.square()[:, None].expand(place.shape))
-        wide = replace(prior, gaussian=prior.gaussian.widened(extra))
-        return replace(made, prior=wide).held(onsets[:, 0])
+        place, biased = made.offset_index, made.width > 0
+        largest = torch.where(biased, made.size[:, 1], torch.inf)
+        extra, limit = (
+            torch.full_like(prior.gaussian.mean, rest).scatter(
+                1, place, own[:, None].expand(place.shape)
+            )
+            for rest, own in ((0.0, made.width.square()), (torch.inf, largest))
+        )
+        wide = prior.gaussian.widened(extra)
+        limited = LimitedPrior(wide, prior.odds, limit, prior.gaussian.deviation)
+        return replace(made, prior=limited).held(onsets[:, 0])
 
     def __getitem__(self, rows: Tensor) -> Hypotheses:
         """Some of the rows."""

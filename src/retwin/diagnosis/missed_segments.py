@@ -92,7 +92,7 @@ def _suspects(
     hopeful = (bound > 0) & (fit.evidence[rows] + bound > best[trajectory[rows]] - MARGIN)
     worst = (gain > 0) & (gain >= gain.topk(min(WORST, gain.shape[1]), dim=1).values[:, -1:])
     # Where next to nothing was to move nothing can be missed.
-    moving = part.distance > 2 * part.per_segment(own.gaussian.deviation)[..., 1:]
+    moving = part.distance > 2 * part.per_segment(own.deviation)[..., 1:]
     chosen = hopeful[:, None, None] & (worst[..., None] | lasting) & moving & part.healthy
     row, segment, actuator = (chosen & (part.missed < 0.5)).nonzero().unbind(dim=1)
     return rows[row], segment, actuator
@@ -108,6 +108,6 @@ def _surplus(problem: CommandProblem, x: Tensor, prior: LatentPrior, noise: Nois
     expected = cast(StudentT, noise.loss).expected(residual.shape[-1]) * noise.count(problem)
     misfit = noise.misfit(problem, residual) - expected
     # Errors of segments are correlated: each segment's share of what the prior costs.
-    cost = 0.5 * (x - prior.gaussian.mean) * prior.gaussian.gradient(x)
+    cost = 0.5 * (x - prior.gaussian.mean) * prior.gaussian.gradient(x) + prior.excess(x)
     cost = problem.per_segment(cost).sum(dim=-1)
     return (problem.inside * misfit[:, None]).sum(dim=-1).clamp_min(0) + cost

@@ -49,6 +49,15 @@ class LatentPrior:
         """The prior of some rows."""
         return LatentPrior(self.gaussian[rows], self.odds[rows])
 
+    @property
+    def deviation(self) -> Tensor:
+        """Standard deviations (R, P) of x without a fault."""
+        return self.gaussian.deviation
+
+    def excess(self, x: Tensor) -> Tensor:
+        """What every x (R, P) costs, in nats, beyond the Gaussian: nothing here."""
+        return torch.zeros_like(x)
+
     def log_probability(self, problem: CommandProblem) -> Tensor:
         """Log probability (R,) of the segments that are missed.
 
@@ -141,7 +150,8 @@ def fitted(
         bounds=problem.bounds,
         minimum_evidence=None if minimum_evidence is None else minimum_evidence - log_probability,
     )
-    return Fit(solution, problem.missed, solution.evidence + log_probability)
+    evidence = solution.evidence + log_probability - prior.excess(solution.x).sum(dim=1)
+    return Fit(solution, problem.missed, evidence)
 
 
 def searched(
