@@ -99,9 +99,11 @@ def fit_segments(
         fits.append(replace(refit, reason=reason))
     # Events are too few to show whether they persist.
     model.persistence.copy_(persistence.masked_fill(model.events, 0.0))
-    # What held-out z need are deviations; those of the refitted model may be larger already.
-    ratio = _deviation(unseen) / _deviation([(model, part) for _, part in unseen])
-    factor = (spread * ratio).clamp_min(1.0) * _student(targets, persistence)
+    # What held-out z need are deviations; those of the refitted model may be larger already. Of
+    # very few trajectories, deviations of the folds' models are chance: errors are then a bound.
+    needed = torch.minimum(spread * _deviation(unseen), _errors(unseen, model.scale))
+    ratio = needed / _deviation([(model, part) for _, part in unseen])
+    factor = ratio.clamp_min(1.0) * _student(targets, persistence)
     model.spread.copy_(torch.where(model.events, 1.0, factor))
     if bounds is None:
         model.bounds.mul_(model.spread)
@@ -175,6 +177,23 @@ def _deviation(held_out: list[tuple[ResidualModel, Targets]]) -> Tensor:
     """Geometric mean of the deviations (d_z,) that models predict for held-out segments."""
     variances = [model.predict(part.features).variance[part.valid] for model, part in held_out]
     return (0.5 * torch.cat(variances).log().mean(dim=0)).exp()
+
+
+@torch.no_grad()
+def _errors(held_out: list[tuple[ResidualModel, Targets]], unit: Tensor) -> Tensor:
+    """The deviations (d_z,) of normal distributions as wide as the errors of held-out z.
+
+    Components of a block have the same deviation in their units (d_z,).
+    """
+    parts = [(part, model.predict(part.features).mean) for model, part in held_out]
+    error = torch.cat([((part.z - mean) / unit).abs() for part, mean in parts], dim=1)
+    used = torch.cat([part.used for part, _ in parts])
+    found = torch.full_like(unit, torch.inf)
+    for _, block in held_out[0][0].parts():
+        own = error[:, used[..., block].any(dim=-1)][..., block].flatten()
+        if len(own):
+            found[block] = own.quantile(LEVEL) / QUANTILE
+    return found * unit
 
 
 def _persistence(held_out: list[tuple[ResidualModel, Targets]], *, single: bool) -> Tensor:
