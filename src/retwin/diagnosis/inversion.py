@@ -36,6 +36,7 @@ from retwin.update.corrections import Context, sample_mask
 from retwin.update.corrections.missed_segments import Fit
 from retwin.update.residual import Residual, ResidualModel
 from retwin.update.surrogate import Surrogate
+from retwin.update.training_range import outside_training
 
 __all__ = ["Diagnosis", "Estimate", "Inversion", "InversionDiagnoser", "fit_inversion", "invert"]
 
@@ -74,6 +75,8 @@ class Diagnosis:
         (n, C), the time in s from which it is stuck.
     bias : Estimate
         (n, C, M), error of a biased actuator in each segment, in its command's unit.
+    outside : NDArray
+        (n,) bool, whether the commands are outside the training range of the surrogate.
 
     """
 
@@ -83,6 +86,7 @@ class Diagnosis:
     level: Estimate
     onset: Estimate
     bias: Estimate
+    outside: NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,14 +196,16 @@ class InversionDiagnoser:
                 progress(min(1.0, (begin + TRAJECTORIES_PER_BATCH) / len(trajectories)))
         evidence, level, onset, bias = (np.concatenate(each) for each in zip(*parts, strict=True))
         share = np.exp(evidence - evidence.max(axis=1, keepdims=True))
+        severities = (level, onset / trajectories.rate, bias)
+        levels, onsets, offsets = (Estimate(*np.moveaxis(each, -1, 0)) for each in severities)
         return Diagnosis(
             self.classes,
             share / share.sum(axis=1, keepdims=True),
             evidence,
-            *(
-                Estimate(*np.moveaxis(each, -1, 0))
-                for each in (level, onset / trajectories.rate, bias)
-            ),
+            levels,
+            onsets,
+            offsets,
+            outside_training(self.surrogate, trajectories),
         )
 
     def save(self, folder: str | Path) -> None:

@@ -26,6 +26,7 @@ _HOME = {
     "Mixture": "residual",
     "NPE": "identification",
     "Noise": "identification",
+    "OutsideTrainingWarning": "training_range",
     "Optimum": "identification",
     "Posterior": "identification",
     "PosteriorTwin": "identification",
