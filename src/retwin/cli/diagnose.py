@@ -97,7 +97,9 @@ def invert(
     if random_onset:
         system = system.with_random_onset()
     calibration = read(real, system, max_bytes=max_bytes)
-    diagnoser = rt.fit_inversion(updated.surrogate, updated.residual, calibration, system.faults)
+    diagnoser = rt.fit_inversion(
+        updated.surrogate, updated.residual, calibration, system.faults, twin=system.twin
+    )
     diagnoser.save(out)
     note(f"Saved {out}")
 

@@ -124,6 +124,7 @@ def fit(
             system.density,
             seed=seed,
             calibrate_on=system.faults if calibrate_on == "all" else calibrate_on,
+            twin=system.twin,
             progress=lambda s: show("residual model, 2 of 2", s),
         )
     # The path is absolute, since a model is also used from other folders.

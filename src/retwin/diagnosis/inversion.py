@@ -32,10 +32,12 @@ from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
+from retwin.twins.twin import Twin
 from retwin.update.corrections import Context, sample_mask
 from retwin.update.corrections.missed_segments import Fit
 from retwin.update.residual import Residual, ResidualModel
 from retwin.update.surrogate import Surrogate
+from retwin.update.surrogate_error import surrogate_variance
 from retwin.update.training_range import outside_training
 
 __all__ = ["Diagnosis", "Estimate", "Inversion", "InversionDiagnoser", "fit_inversion", "invert"]
@@ -141,6 +143,9 @@ class InversionDiagnoser:
         leaves open is inferred: an onset between its limits, the bias of every segment.
     noise : Noise
         What a healthy sample leaves unexplained, in the outputs' units.
+    surrogate_variance : Tensor, optional
+        (d_y,), mean square of the surrogate's own error, in the outputs' units squared; by default
+        it has none.
 
     Raises
     ------
@@ -157,11 +162,14 @@ class InversionDiagnoser:
         faults: Mapping[str, Fault | None],
         *,
         noise: Noise,
+        surrogate_variance: Tensor | None = None,
     ) -> None:
         self.surrogate = surrogate
         self.residual = residual
         self.faults = checked(faults)
         self.noise = noise
+        none = torch.zeros(len(residual.outputs), dtype=torch.float64)
+        self.surrogate_variance = none if surrogate_variance is None else surrogate_variance
         command_space(residual.correction)
 
     @property
@@ -186,6 +194,7 @@ class InversionDiagnoser:
 
         """
         given = _Samples.of(self.surrogate, self.residual, trajectories)
+        given = given.with_error(self.surrogate_variance)
         faults = tuple(self.faults.values())
         parts = []
         for begin in range(0, len(trajectories), TRAJECTORIES_PER_BATCH):
@@ -215,8 +224,12 @@ class InversionDiagnoser:
             for name, fault in self.faults.items()
         ]
         about = {"faults": faults}
-        noise = {"scale": self.noise.scale, "thinning": self.noise.thinning}
-        with write_model(folder, "inversion", about, noise) as inside:
+        learned = {
+            "scale": self.noise.scale,
+            "thinning": self.noise.thinning,
+            "surrogate_variance": self.surrogate_variance,
+        }
+        with write_model(folder, "inversion", about, learned) as inside:
             self.surrogate.save(inside / "surrogate")
             self.residual.save(inside / "residual")
 
@@ -235,6 +248,8 @@ class InversionDiagnoser:
             ResidualModel.load(folder / "residual", surrogate.rate),
             faults,
             noise=Noise(weights["scale"], weights["thinning"]),
+            # Development versions before 0.1.0 did not write it.
+            surrogate_variance=weights.get("surrogate_variance"),
         )
 
 
@@ -248,6 +263,8 @@ def fit_inversion(
     residual: Residual,
     calibration: Trajectories,
     faults: Mapping[str, Fault | None],
+    *,
+    twin: Twin | None = None,
 ) -> InversionDiagnoser:
     """A diagnoser by physics: only its noise is learned, from healthy trajectories.
 
@@ -261,6 +278,10 @@ def fit_inversion(
         Those that the residual model was fitted to; the healthy ones are used.
     faults : mapping of str to Fault or None
         Class name to fault, as a case has them.
+    twin : Twin, optional
+        The twin that the surrogate was trained on. It simulates the commands, and what the
+        surrogate errs there makes diagnoses less certain; without it, what the surrogate erred on
+        held-out simulations.
 
     Raises
     ------
@@ -283,13 +304,20 @@ def fit_inversion(
         got=f"labels {sorted(calibration.known_labels) or 'none'}",
         remedy="label healthy trajectories",
     )
-    context, observed, mask = _Samples.of(surrogate, residual, healthy)[:]
+    given = _Samples.of(surrogate, residual, healthy)
+    segments = given.context.segments
+    found = surrogate_variance(surrogate, twin, healthy.commands, segments)
+    variance = (
+        torch.zeros(len(residual.outputs)) if found is None else found[segments.valid].mean(0)
+    )
+    context, observed, mask = given.with_error(variance)[:]
     problem = command_problem(residual, context, observed, mask)
     return InversionDiagnoser(
         surrogate,
         residual,
         faults,
         noise=fitted_noise(problem, healthy_prior(residual, context), rounds=ROUNDS),
+        surrogate_variance=variance,
     )
 
 
@@ -337,6 +365,14 @@ class _Samples:
             for i in one_by_one
         ]
         return cls(replace(context, surrogate=_Precise(surrogate)), observed, torch.cat(sampled))
+
+    def with_error(self, variance: Tensor) -> _Samples:
+        """The same for a surrogate whose error has this variance (d_y,) in every segment."""
+        if not variance.any():
+            return self
+        shape = (*self.context.segments.valid.shape, len(variance))
+        every = variance.double().expand(shape)
+        return replace(self, context=replace(self.context, surrogate_variance=every))
 
     def __getitem__(self, rows: slice) -> tuple[Context, Tensor, Tensor]:
         return self.context[rows], self.observed[rows], self.mask[rows]

@@ -340,8 +340,12 @@ class Work:
 
     def _base(self, trial: Trial, residual: str) -> Surrogate:
         """The surrogate that the residual model of that name corrects."""
+        return trial.surrogate(self._updated(residual))
+
+    def _updated(self, residual: str) -> str:
+        """The update of the twin whose surrogate that residual model corrects; "" for none."""
         ((_, name),) = NEEDS["residual", residual]
-        return trial.surrogate(name)
+        return name
 
     def _fitted(
         self,
@@ -358,6 +362,7 @@ class Work:
             density,
             seed=trial.seed("residual"),
             calibrate_on=faults if self._uses_labels else "healthy",
+            twin=trial.updated(updated) if (updated := self._updated(name)) else self.case.twin,
             progress=trial.progress,
         )
 

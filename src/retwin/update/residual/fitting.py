@@ -39,6 +39,7 @@ from retwin.update.residual.sequence_fitting import fit_sequence
 from retwin.update.residual.settings import Density, Mixture
 from retwin.update.residual.targets import Targets
 from retwin.update.surrogate import Surrogate
+from retwin.update.surrogate_error import surrogate_variance
 from retwin.update.training_range import checked_once, training_checked
 
 __all__ = ["fit_residual", "infer_discrepancy"]
@@ -59,6 +60,7 @@ def infer_discrepancy(
     *,
     segments: Segments | None = None,
     faults: Sequence[Fault | None] | None = None,
+    twin: Twin | None = None,
 ) -> tuple[Context, Discrepancy]:
     """The discrepancies z* with which g explains measured trajectories best (for Eq. 7).
 
@@ -75,6 +77,8 @@ def infer_discrepancy(
     faults : sequence of Fault or None, optional
         The known fault of each trajectory. An operator with `severities` infers its severity
         together with z* (`Discrepancy.severity`).
+    twin : Twin, optional
+        The twin that the surrogate was trained on, see `fit_residual`.
 
     Returns
     -------
@@ -82,7 +86,7 @@ def infer_discrepancy(
         What g is applied to, and z* with its uncertainty.
 
     """
-    context = _context(exact_surrogate(surrogate), trajectories, segments, faults)
+    context = _context(exact_surrogate(surrogate), trajectories, segments, faults, twin)
     return context, correction.infer(context, *_measured(trajectories))
 
 
@@ -97,6 +101,7 @@ def fit_residual(
     calibrate_on: str | Mapping[str, Fault | None] = ...,
     bounds: NDArray | None = ...,
     segments: Segments | str = ...,
+    twin: Twin | None = ...,
     progress: Progress | None = ...,
 ) -> ResidualModel: ...
 
@@ -112,6 +117,7 @@ def fit_residual(
     calibrate_on: str | Mapping[str, Fault | None] = ...,
     bounds: NDArray | None = ...,
     segments: Segments | str = ...,
+    twin: Twin | None = ...,
     progress: Progress | None = ...,
 ) -> SequenceResidual: ...
 
@@ -126,6 +132,7 @@ def fit_residual(
     calibrate_on: str | Mapping[str, Fault | None] = "healthy",
     bounds: NDArray | None = None,
     segments: Segments | str = "commands",
+    twin: Twin | None = None,
     progress: Progress | None = None,
 ) -> ResidualModel | SequenceResidual:
     """Fit the residual model to measured trajectories, from outputs alone (Eq. 7–10).
@@ -154,6 +161,10 @@ def fit_residual(
     segments : Segments or str
         "commands", "path" (see `segment`), or the segments, one row per trajectory; the segments
         of generated trajectories are then from command events.
+    twin : Twin, optional
+        The twin that the surrogate was trained on. It simulates the calibration commands, and what
+        the surrogate errs there makes z less certain; without it, what the surrogate erred on
+        held-out simulations.
     progress : callable, optional
         Called with the share of the training that is done.
 
@@ -188,8 +199,8 @@ def fit_residual(
         remedy="give segments='path', or the segments themselves",
     )
     with training_checked(surrogate, used.commands) as outside:
-        context = _context(surrogate, used, parts, faults)
-    correction, found = fit_correction(correction, context, *_measured(used))
+        context = _context(surrogate, used, parts, faults, twin)
+        correction, found = fit_correction(correction, context, *_measured(used))
     require(
         found.identified.any(),
         "calibration",
@@ -243,6 +254,7 @@ def _context(
     trajectories: Trajectories,
     segments: Segments | None,
     faults: Sequence[Fault | None] | None,
+    twin: Twin | None,
 ) -> Context:
     """What g is applied to; the severity of a known fault is arbitrary, since it is inferred."""
     commands = trajectories.commands
@@ -255,7 +267,9 @@ def _context(
         drawn = draw_faults(faults, parts, seed=0, rate=rate)
         faulty["faulty_commands"] = faulty_commands(commands, drawn, parts, rate=rate)
         faulty["frozen"] = frozen_from(drawn, *commands.shape[1:], rate=rate)
-    return Context.of(surrogate, commands, parts, rate=rate, **faulty)
+    context = Context.of(surrogate, commands, parts, rate=rate, **faulty)
+    variance = surrogate_variance(surrogate, twin, commands, parts)
+    return replace(context, surrogate_variance=variance)
 
 
 def _measured(trajectories: Trajectories) -> tuple[Tensor, Tensor]:
