@@ -17,7 +17,7 @@ from statistics import NormalDist
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -35,6 +35,7 @@ from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.twin import Twin
 from retwin.update.corrections import Context, sample_mask
 from retwin.update.corrections.missed_segments import Fit
+from retwin.update.exact import exact_surrogate
 from retwin.update.residual import Residual, ResidualModel
 from retwin.update.surrogate import Surrogate
 from retwin.update.surrogate_error import surrogate_variance
@@ -134,8 +135,8 @@ class InversionDiagnoser:
 
     Parameters
     ----------
-    surrogate : Surrogate
-        The IBG.
+    surrogate : Surrogate or Twin
+        The IBG, or a twin in its place.
     residual : ResidualModel
         With `CommandSpace`, fitted on healthy trajectories.
     faults : mapping of str to Fault or None
@@ -157,14 +158,14 @@ class InversionDiagnoser:
 
     def __init__(
         self,
-        surrogate: Surrogate,
+        surrogate: Surrogate | Twin,
         residual: ResidualModel,
         faults: Mapping[str, Fault | None],
         *,
         noise: Noise,
         surrogate_variance: Tensor | None = None,
     ) -> None:
-        self.surrogate = surrogate
+        self.surrogate = exact_surrogate(surrogate)
         self.residual = residual
         self.faults = checked(faults)
         self.noise = noise
@@ -259,7 +260,7 @@ FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
 
 @torch.no_grad()
 def fit_inversion(
-    surrogate: Surrogate,
+    surrogate: Surrogate | Twin,
     residual: Residual,
     calibration: Trajectories,
     faults: Mapping[str, Fault | None],
@@ -270,8 +271,9 @@ def fit_inversion(
 
     Parameters
     ----------
-    surrogate : Surrogate
-        Of the updated twin.
+    surrogate : Surrogate or Twin
+        Of the updated twin, or a twin in its place (see `ExactSurrogate`), with which the diagnoser
+        cannot be saved.
     residual : Residual
         Of the updated twin, a `ResidualModel` with `CommandSpace`.
     calibration : Trajectories
@@ -304,6 +306,7 @@ def fit_inversion(
         got=f"labels {sorted(calibration.known_labels) or 'none'}",
         remedy="label healthy trajectories",
     )
+    surrogate = exact_surrogate(surrogate)
     given = _Samples.of(surrogate, residual, healthy)
     segments = given.context.segments
     found = surrogate_variance(surrogate, twin, healthy.commands, segments)
@@ -364,7 +367,9 @@ class _Samples:
             sample_mask(residual.correction, observed[i], mask[i], trajectories.rate)
             for i in one_by_one
         ]
-        return cls(replace(context, surrogate=_Precise(surrogate)), observed, torch.cat(sampled))
+        if isinstance(surrogate, nn.Module):
+            context = replace(context, surrogate=_Precise(surrogate))
+        return cls(context, observed, torch.cat(sampled))
 
     def with_error(self, variance: Tensor) -> _Samples:
         """The same for a surrogate whose error has this variance (d_y,) in every segment."""
