@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -89,3 +90,28 @@ def test_what_needs_a_surrogate_is_refused(measured: rt.Trajectories, tmp_path: 
     ):
         warnings.simplefilter("ignore")
         rt.fit_residual(TWIN, measured, rt.CommandSpace(), refined, seed=0)
+
+
+def test_a_twin_is_inverted_and_its_diagnoser_is_not_saved(
+    measured: rt.Trajectories, tmp_path: Path
+) -> None:
+    faults = {"Healthy": None, "Bias": rt.ActuatorBias(0, size=(0.5, 1.0))}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        residual = rt.fit_residual(TWIN, measured, rt.CommandSpace(), BRIEF, seed=0)
+        diagnoser = rt.fit_inversion(TWIN, residual, measured, faults)
+        biased = measured.replace(observed=measured.observed + np.array([1.5, 0], np.float32))
+        found = [diagnoser.predict_proba(each[:2])[:, 1] for each in (measured, biased)]
+    assert (found[0] < 0.5).all()
+    assert (found[1] > 0.5).all()
+    with pytest.raises(rt.InputError, match="fit one with fit_surrogate"):
+        diagnoser.save(tmp_path / "d")
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_twin_in_place_of_a_surrogate_has_no_onnx_graph(measured: rt.Trajectories) -> None:
+    export = pytest.importorskip("retwin.deploy.onnx.export")
+    residual = rt.fit_residual(TWIN, measured, rt.DelayOffset(), BRIEF, seed=0)
+    bundle = SimpleNamespace(twin=rt.CorrectedTwin(TWIN, residual), diagnoser=None)
+    with pytest.raises(rt.InputError, match="a twin in place of a surrogate: it is no network"):
+        export._check_exportable(bundle)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from retwin import catalog
 from retwin.cases.case import Case
@@ -34,6 +35,7 @@ from retwin.twins.fmu import FMUTwin
 from retwin.twins.limits import Limits
 from retwin.twins.mujoco import MuJoCoTwin
 from retwin.twins.parametric import Parameter
+from retwin.twins.record_sampler import sampler_from
 from retwin.twins.samplers import (
     CommandSampler,
     HoldSampler,
@@ -51,6 +53,8 @@ MAX_DEPTH = 100
 """The largest number of dots in a key; reading takes memory by the square of it."""
 SAMPLERS: tuple[type, ...] = (RampSampler, HoldSampler, MultisineSampler, RecordedSampler)
 FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
+Records = Callable[[Path], tuple[Trajectories, Trajectories]]
+"""A function that splits a file into calibration records and test records."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,8 @@ def read_case(path: str | Path) -> Case:
             for name, value in keys.parameters.items()
         ]
         twin = parametric = parametric_twin(twin, free, inside)
-    sampler = _sampler(keys.commands, twin, folder, key(place, "commands"))
+    records = _records(keys.records, twin, folder, key(place, "records"))
+    sampler = _sampler(keys.commands, twin, records, folder, key(place, "commands"))
     correction = keys.correction or ("delay_offset" if _has_segments(sampler) else "additive")
     correction = _chosen(correction, catalog.CORRECTIONS, key(place, "correction"))
     network = keys.network or ("mlp" if _is_static(twin, sampler) else "lstm")
@@ -131,7 +136,6 @@ def read_case(path: str | Path) -> Case:
     sensor_rate = twin.rate if keys.sensor_rate is None else keys.sensor_rate
     faults = _faults(keys.faults, twin.inputs, folder, key(place, "faults"))
     network = _chosen(network, catalog.NETWORKS, key(place, "network"))
-    records = _records(keys.records, twin, folder, key(place, "records"))
     sensor_rate = positive(key(place, "sensor_rate"), sensor_rate, unit="Hz")
     with at(place):
         return Case(
@@ -249,24 +253,44 @@ def _faults(
     return made
 
 
-def _sampler(value: Any, twin: Twin, folder: Path, place: str) -> CommandSampler:
-    """The distribution of commands: of a kind of retwin, by default ramps, or of the user's own."""
+def _sampler(
+    value: Any, twin: Twin, records: Records | None, folder: Path, place: str
+) -> CommandSampler:
+    """The distribution of commands: like those of a `file`, of a kind, or of the user's own."""
     if isinstance(value, str):
         own: CommandSampler = _own(value, folder, place, CommandSampler)
         return own
+    require(
+        value,
+        place,
+        expected="how commands are drawn",
+        got="nothing",
+        remedy='write file = "RECORD" for commands like recorded ones, or `kind` and its settings',
+    )
+    limits: Limits | None = getattr(twin, "limits", None)
+    if set(value) == {"file"}:
+        return sampler_from(
+            _recorded(value, twin, records, folder, place), twin.rate, limits=limits
+        )
     settings = {"kind": RampSampler.__name__, "rate": twin.rate, **value}
     if settings["kind"] == RecordedSampler.__name__:
-        return _recorded(settings, twin, folder, place)
-    limits: Limits | None = getattr(twin, "limits", None)
+        options = {name: v for name, v in settings.items() if name not in ("kind", "file")}
+        own_settings = checked(
+            RecordedSampler, options, place=place, besides=("commands",), rate=twin.rate
+        )
+        commands = _recorded(settings, twin, records, folder, place)
+        with at(place):
+            return RecordedSampler(commands, **own_settings)
     if limits is not None:
         settings = {"low": limits.low, "high": limits.high, **settings}
     made: CommandSampler = from_config(settings, SAMPLERS, place=place, rate=twin.rate)
     return made
 
 
-def _recorded(settings: dict[str, Any], twin: Twin, folder: Path, place: str) -> RecordedSampler:
-    """The commands of trajectories in a `file`."""
-    options = {name: value for name, value in settings.items() if name not in ("kind", "file")}
+def _recorded(
+    settings: Mapping[str, Any], twin: Twin, records: Records | None, folder: Path, place: str
+) -> NDArray:
+    """The commands (n, T, d_u) of trajectories in a `file`, or of a table's calibration records."""
     file = settings.get("file")
     require(
         isinstance(file, str),
@@ -276,7 +300,11 @@ def _recorded(settings: dict[str, Any], twin: Twin, folder: Path, place: str) ->
         remedy="write what `retwin data convert` wrote, *.npz or *.zarr",
     )
     with at(key(place, "file")):
-        found = load(folder / str(file))
+        path = folder / str(file)
+        if records is not None and path.suffix.lower() == ".csv":
+            found, _ = records(path)
+        else:
+            found = load(path)
     require(
         (found.inputs, found.rate) == (twin.inputs, twin.rate),
         key(place, "file"),
@@ -284,14 +312,10 @@ def _recorded(settings: dict[str, Any], twin: Twin, folder: Path, place: str) ->
         got=f"{', '.join(found.inputs.names) or 'none'} at {found.rate:g} Hz",
         remedy="take data of this system",
     )
-    own = checked(RecordedSampler, options, place=place, besides=("commands",), rate=twin.rate)
-    with at(place):
-        return RecordedSampler(found.commands, **own)
+    return found.commands
 
 
-def _records(
-    value: _Columns | str | None, twin: Twin, folder: Path, place: str
-) -> Callable[[Path], tuple[Trajectories, Trajectories]] | None:
+def _records(value: _Columns | str | None, twin: Twin, folder: Path, place: str) -> Records | None:
     """How one file is split: by columns, or by the user's own function of its path."""
     if value is None:
         return None

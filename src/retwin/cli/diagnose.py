@@ -97,7 +97,9 @@ def invert(
     if random_onset:
         system = system.with_random_onset()
     calibration = read(real, system, max_bytes=max_bytes)
-    diagnoser = rt.fit_inversion(updated.surrogate, updated.residual, calibration, system.faults)
+    diagnoser = rt.fit_inversion(
+        updated.surrogate, updated.residual, calibration, system.faults, twin=system.twin
+    )
     diagnoser.save(out)
     note(f"Saved {out}")
 
@@ -113,6 +115,7 @@ def predict(
 ) -> None:
     """Diagnose trajectories, and score the diagnoses if the labels are known."""
     import retwin as rt
+    from retwin.update.training_range import outside_training
 
     if out is not None:
         check_place(out)
@@ -124,14 +127,18 @@ def predict(
     labelled = bool(trajectories.known_labels) and "" not in labels
     scores = rt.evaluate(diagnoser, trajectories) if labelled else None
     diagnosed = diagnoses(trajectories, diagnoser.classes, probabilities)
-    for each, label in zip(diagnosed, labels, strict=True):
+    outside = outside_training(getattr(diagnoser, "surrogate", None), trajectories).tolist()
+    for each, label, beyond in zip(diagnosed, labels, outside, strict=True):
         each["label"] = label or None
+        each["commands"] = "outside" if beyond else "ok"
+    shown = ("trajectory", "diagnosis", "probability", "label", *["commands"] * any(outside))
     rows = [
-        (e["id"], e["diagnosis"], f"{e['probability']:.2f}", e["label"] or "") for e in diagnosed
+        (e["id"], e["diagnosis"], f"{e['probability']:.2f}", e["label"] or "", e["commands"])
+        for e in diagnosed
     ]
     answer(
         {"emulated": trajectories.emulated, "trajectories": diagnosed, "scores": scores},
-        table(("trajectory", "diagnosis", "probability", "label"), rows, numbers=("probability",)),
+        table(shown, [row[: len(shown)] for row in rows], numbers=("probability",)),
         *([EMULATED] if trajectories.emulated else []),
         *([str(scores)] if scores is not None else []),
         as_json=as_json,

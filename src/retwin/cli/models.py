@@ -22,6 +22,7 @@ from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
+    from retwin.twins.samplers import CommandSampler
     from retwin.update.residual import ResidualModel, SequenceResidual
     from retwin.update.surrogate import Surrogate
 
@@ -106,7 +107,7 @@ def fit(
     measured = _measured(system, real, data, max_bytes)
     size = system.per_class if simulations is None else simulations
     if twin_data is None:
-        nominal = _simulated(system, size, seed)
+        nominal = _simulated(system, size, seed, measured)
     else:
         nominal = read(twin_data, system, max_bytes=max_bytes)
     with bar("fit") as show:
@@ -124,6 +125,7 @@ def fit(
             system.density,
             seed=seed,
             calibrate_on=system.faults if calibrate_on == "all" else calibrate_on,
+            twin=system.twin,
             progress=lambda s: show("residual model, 2 of 2", s),
         )
     # The path is absolute, since a model is also used from other folders.
@@ -190,15 +192,40 @@ def _measured(
     return system.records(data)[0]
 
 
-def _simulated(system: Case, simulations: int, seed: int) -> Trajectories:
-    """Healthy simulations of the case's twin."""
-    import retwin as rt
+def _simulated(system: Case, simulations: int, seed: int, measured: Trajectories) -> Trajectories:
+    """Healthy simulations of the case's twin, which contain what the real commands contain.
 
-    healthy = replace(system, faults={HEALTHY: None})
-    with bar("simulate") as show:
-        return rt.generate(
-            system.twin, healthy, per_class=simulations, seed=seed, progress=lambda s: show("", s)
-        )
+    Where the sampler of the case does not draw such commands, half as many are added that are like
+    the real ones, and as many parts of these.
+    """
+    import retwin as rt
+    from retwin.twins.command_range import CommandRange
+    from retwin.twins.samplers import RecordedSampler
+
+    def drawn(sampler: CommandSampler, count: int) -> Trajectories:
+        healthy = replace(system, faults={HEALTHY: None}, sampler=sampler)
+        with bar("simulate") as show:
+            return rt.generate(
+                system.twin, healthy, per_class=count, seed=seed, progress=lambda s: show("", s)
+            )
+
+    made = drawn(system.sampler, simulations)
+    real, rate, inputs = measured.commands, measured.rate, system.inputs
+    if (measured.inputs, rate) != (inputs, system.rate):
+        return made
+    outside = CommandRange.of(made.commands, rate).outside(real, rate, inputs)
+    if not outside:
+        return made
+    like = rt.twins.sampler_from(real, rate, limits=getattr(system.twin, "limits", None))
+    duration = min(like.duration, real.shape[1] / rate)
+    count = max(1, simulations // 2)
+    added = [drawn(each, count) for each in (like, RecordedSampler(real, rate, duration))]
+    note(
+        f"The sampler of the case does not draw the real commands: {outside}. {2 * count} "
+        "simulations of commands like these were added"
+    )
+    steps = max(each.steps for each in (made, *added))
+    return Trajectories.concatenate([each.padded(steps) for each in (made, *added)])
 
 
 def _print_fit(

@@ -17,7 +17,7 @@ from statistics import NormalDist
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -32,10 +32,14 @@ from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
+from retwin.twins.twin import Twin
 from retwin.update.corrections import Context, sample_mask
 from retwin.update.corrections.missed_segments import Fit
+from retwin.update.exact import exact_surrogate
 from retwin.update.residual import Residual, ResidualModel
 from retwin.update.surrogate import Surrogate
+from retwin.update.surrogate_error import surrogate_variance
+from retwin.update.training_range import outside_training
 
 __all__ = ["Diagnosis", "Estimate", "Inversion", "InversionDiagnoser", "fit_inversion", "invert"]
 
@@ -74,6 +78,8 @@ class Diagnosis:
         (n, C), the time in s from which it is stuck.
     bias : Estimate
         (n, C, M), error of a biased actuator in each segment, in its command's unit.
+    outside : NDArray
+        (n,) bool, whether the commands are outside the training range of the surrogate.
 
     """
 
@@ -83,6 +89,7 @@ class Diagnosis:
     level: Estimate
     onset: Estimate
     bias: Estimate
+    outside: NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,8 +135,8 @@ class InversionDiagnoser:
 
     Parameters
     ----------
-    surrogate : Surrogate
-        The IBG.
+    surrogate : Surrogate or Twin
+        The IBG, or a twin in its place.
     residual : ResidualModel
         With `CommandSpace`, fitted on healthy trajectories.
     faults : mapping of str to Fault or None
@@ -137,6 +144,9 @@ class InversionDiagnoser:
         leaves open is inferred: an onset between its limits, the bias of every segment.
     noise : Noise
         What a healthy sample leaves unexplained, in the outputs' units.
+    surrogate_variance : Tensor, optional
+        (d_y,), mean square of the surrogate's own error, in the outputs' units squared; by default
+        it has none.
 
     Raises
     ------
@@ -148,16 +158,19 @@ class InversionDiagnoser:
 
     def __init__(
         self,
-        surrogate: Surrogate,
+        surrogate: Surrogate | Twin,
         residual: ResidualModel,
         faults: Mapping[str, Fault | None],
         *,
         noise: Noise,
+        surrogate_variance: Tensor | None = None,
     ) -> None:
-        self.surrogate = surrogate
+        self.surrogate = exact_surrogate(surrogate)
         self.residual = residual
         self.faults = checked(faults)
         self.noise = noise
+        none = torch.zeros(len(residual.outputs), dtype=torch.float64)
+        self.surrogate_variance = none if surrogate_variance is None else surrogate_variance
         command_space(residual.correction)
 
     @property
@@ -182,6 +195,7 @@ class InversionDiagnoser:
 
         """
         given = _Samples.of(self.surrogate, self.residual, trajectories)
+        given = given.with_error(self.surrogate_variance)
         faults = tuple(self.faults.values())
         parts = []
         for begin in range(0, len(trajectories), TRAJECTORIES_PER_BATCH):
@@ -192,14 +206,16 @@ class InversionDiagnoser:
                 progress(min(1.0, (begin + TRAJECTORIES_PER_BATCH) / len(trajectories)))
         evidence, level, onset, bias = (np.concatenate(each) for each in zip(*parts, strict=True))
         share = np.exp(evidence - evidence.max(axis=1, keepdims=True))
+        severities = (level, onset / trajectories.rate, bias)
+        levels, onsets, offsets = (Estimate(*np.moveaxis(each, -1, 0)) for each in severities)
         return Diagnosis(
             self.classes,
             share / share.sum(axis=1, keepdims=True),
             evidence,
-            *(
-                Estimate(*np.moveaxis(each, -1, 0))
-                for each in (level, onset / trajectories.rate, bias)
-            ),
+            levels,
+            onsets,
+            offsets,
+            outside_training(self.surrogate, trajectories),
         )
 
     def save(self, folder: str | Path) -> None:
@@ -209,8 +225,12 @@ class InversionDiagnoser:
             for name, fault in self.faults.items()
         ]
         about = {"faults": faults}
-        noise = {"scale": self.noise.scale, "thinning": self.noise.thinning}
-        with write_model(folder, "inversion", about, noise) as inside:
+        learned = {
+            "scale": self.noise.scale,
+            "thinning": self.noise.thinning,
+            "surrogate_variance": self.surrogate_variance,
+        }
+        with write_model(folder, "inversion", about, learned) as inside:
             self.surrogate.save(inside / "surrogate")
             self.residual.save(inside / "residual")
 
@@ -229,6 +249,8 @@ class InversionDiagnoser:
             ResidualModel.load(folder / "residual", surrogate.rate),
             faults,
             noise=Noise(weights["scale"], weights["thinning"]),
+            # Development versions before 0.1.0 did not write it.
+            surrogate_variance=weights.get("surrogate_variance"),
         )
 
 
@@ -238,23 +260,30 @@ FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
 
 @torch.no_grad()
 def fit_inversion(
-    surrogate: Surrogate,
+    surrogate: Surrogate | Twin,
     residual: Residual,
     calibration: Trajectories,
     faults: Mapping[str, Fault | None],
+    *,
+    twin: Twin | None = None,
 ) -> InversionDiagnoser:
     """A diagnoser by physics: only its noise is learned, from healthy trajectories.
 
     Parameters
     ----------
-    surrogate : Surrogate
-        Of the updated twin.
+    surrogate : Surrogate or Twin
+        Of the updated twin, or a twin in its place (see `ExactSurrogate`), with which the diagnoser
+        cannot be saved.
     residual : Residual
         Of the updated twin, a `ResidualModel` with `CommandSpace`.
     calibration : Trajectories
         Those that the residual model was fitted to; the healthy ones are used.
     faults : mapping of str to Fault or None
         Class name to fault, as a case has them.
+    twin : Twin, optional
+        The twin that the surrogate was trained on. It simulates the commands, and what the
+        surrogate errs there makes diagnoses less certain; without it, what the surrogate erred on
+        held-out simulations.
 
     Raises
     ------
@@ -277,13 +306,21 @@ def fit_inversion(
         got=f"labels {sorted(calibration.known_labels) or 'none'}",
         remedy="label healthy trajectories",
     )
-    context, observed, mask = _Samples.of(surrogate, residual, healthy)[:]
+    surrogate = exact_surrogate(surrogate)
+    given = _Samples.of(surrogate, residual, healthy)
+    segments = given.context.segments
+    found = surrogate_variance(surrogate, twin, healthy.commands, segments)
+    variance = (
+        torch.zeros(len(residual.outputs)) if found is None else found[segments.valid].mean(0)
+    )
+    context, observed, mask = given.with_error(variance)[:]
     problem = command_problem(residual, context, observed, mask)
     return InversionDiagnoser(
         surrogate,
         residual,
         faults,
         noise=fitted_noise(problem, healthy_prior(residual, context), rounds=ROUNDS),
+        surrogate_variance=variance,
     )
 
 
@@ -330,7 +367,17 @@ class _Samples:
             sample_mask(residual.correction, observed[i], mask[i], trajectories.rate)
             for i in one_by_one
         ]
-        return cls(replace(context, surrogate=_Precise(surrogate)), observed, torch.cat(sampled))
+        if isinstance(surrogate, nn.Module):
+            context = replace(context, surrogate=_Precise(surrogate))
+        return cls(context, observed, torch.cat(sampled))
+
+    def with_error(self, variance: Tensor) -> _Samples:
+        """The same for a surrogate whose error has this variance (d_y,) in every segment."""
+        if not variance.any():
+            return self
+        shape = (*self.context.segments.valid.shape, len(variance))
+        every = variance.double().expand(shape)
+        return replace(self, context=replace(self.context, surrogate_variance=every))
 
     def __getitem__(self, rows: slice) -> tuple[Context, Tensor, Tensor]:
         return self.context[rows], self.observed[rows], self.mask[rows]

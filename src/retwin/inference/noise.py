@@ -16,7 +16,7 @@ from torch import Tensor
 from retwin.inference.losses import Loss, StudentT
 from retwin.inference.problem import Problem
 
-__all__ = ["Noise", "correlation_time", "predicted_variance"]
+__all__ = ["CommonError", "Noise", "correlation_time", "predicted_variance"]
 
 HEAVY_TAILED = StudentT()
 """The loss of noise by default: glitches hardly count."""
@@ -24,6 +24,27 @@ MAX_CORRELATION = 0.95
 """Largest lag-one autocorrelation that is learned: beyond it the estimate is too uncertain."""
 SMALLEST_SHARE = 1e-6
 """Smallest scale relative to the largest one: it keeps exact outputs from infinite weight."""
+
+
+@dataclass(frozen=True, eq=False)
+class CommonError:
+    """A normal error of known variance that a block of samples has in common.
+
+    Attributes
+    ----------
+    variance : Tensor
+        (R, K, d), in the residual's unit squared.
+    block : Tensor
+        (R, K), the number of samples of the block that a sample belongs to.
+
+    """
+
+    variance: Tensor
+    block: Tensor
+
+    def __getitem__(self, rows: Tensor) -> CommonError:
+        """That of some rows."""
+        return CommonError(self.variance[rows], self.block[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +69,26 @@ class Noise:
 
     def square(self, problem: Problem, residual: Tensor) -> Tensor:
         """Squared length (R, K) of the residual (R, K, d) in scales."""
-        return (residual / self.scale[problem.group]).square().sum(dim=-1)
+        return (residual.square() / self._variance(problem)).sum(dim=-1)
+
+    def _variance(self, problem: Problem) -> Tensor:
+        """Variance (R, K, d) of each sample, (R, K, 1) if all outputs have the same."""
+        own = self.scale[problem.group].square()
+        common = _common_error(problem)
+        return own if common is None else own + common.variance
 
     def count(self, problem: Problem) -> Tensor:
-        """Independent samples (R, K) that each sample is worth; 0 where nothing was measured."""
-        return problem.measured / self.thinning[problem.group]
+        """Independent samples (R, K) that each sample is worth; 0 where nothing was measured.
+
+        All samples of a block are together not more certain than the error that they have in
+        common.
+        """
+        thinning = self.thinning[problem.group]
+        common = _common_error(problem)
+        if common is None:
+            return problem.measured / thinning
+        ratio = (common.variance / self.scale[problem.group].square()).mean(dim=-1)
+        return problem.measured * (1 + ratio) / (thinning + common.block * ratio)
 
     def weights(self, problem: Problem, residual: Tensor) -> Tensor:
         """Robust weight (R, K) of each sample: about 1, less for outliers."""
@@ -66,7 +102,7 @@ class Noise:
     def precision(self, problem: Problem, residual: Tensor) -> Tensor:
         """Weight (R, K, d) of each output in reweighted least squares."""
         weight = self.weights(problem, residual) * self.count(problem)
-        return (weight[..., None] / self.scale[problem.group].square()).expand_as(residual)
+        return (weight[..., None] / self._variance(problem)).expand_as(residual)
 
     @classmethod
     def from_median(cls, problem: Problem, residual: Tensor, *, groups: int) -> Noise:
@@ -110,6 +146,10 @@ class Noise:
         """
         weights = self.weights(problem, residual)[..., None]
         square = weights * (residual.square() + variance)
+        if (error := _common_error(problem)) is not None:
+            # The expected square of the part of the residual that is not the common error.
+            part = self.scale[problem.group].square() / self._variance(problem)
+            square = part.square() * square + part * error.variance
         scale, thinning = [], []
         for k in range(len(self.scale)):
             part = (problem.measured * (problem.group == k))[..., None]
@@ -126,6 +166,12 @@ class Noise:
         scales = torch.stack(scale)
         smallest = max(floor, SMALLEST_SHARE * float(scales.amax()))
         return Noise(scales.clamp_min(smallest), torch.stack(thinning), self.loss)
+
+
+def _common_error(problem: Problem) -> CommonError | None:
+    """The known error of a problem besides its noise."""
+    found: CommonError | None = getattr(problem, "common", None)
+    return found
 
 
 def correlation_time(values: Tensor, counted: Tensor, *, rows: bool, limit: float) -> Tensor:

@@ -18,6 +18,8 @@ class Problem(Protocol):
         (R, K) long, the group of samples with a common noise scale that each sample belongs to.
     measured : Tensor
         (R, K), the share of a sample's outputs that was measured; 0 for a sample without any.
+    common : CommonError, optional
+        A known error besides the noise; by default there is none.
 
     """
 

@@ -125,7 +125,7 @@ def _costs(work: Work, source: str) -> dict[str, Any]:
     before = [part for part in costs if part not in answered]
     own = [f"{kind} {name}" for name in (source, *SOURCES[source].pool)]
 
-    notes = [job["notes"] for part in costs.values() for job in part if "notes" in job]
+    notes = [job["notes"] for part in costs.values() for job in part if job.get("notes")]
 
     def total(what: str, *parts: str) -> float | None:
         each = [_mean([job.get(what) for job in costs.get(part, [])]) for part in parts]

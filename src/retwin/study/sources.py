@@ -110,7 +110,8 @@ def inversion(trial: Trial) -> FittedDiagnoser:
     """The Bayesian inversion of faults, without training of a classifier."""
     residual = trial.residual("command")
     assert isinstance(residual, ResidualModel), "checked before the study begins"
-    return fit_inversion(trial.surrogate(), residual, trial.healthy, trial.case.faults)
+    case = trial.case
+    return fit_inversion(trial.surrogate(), residual, trial.healthy, case.faults, twin=case.twin)
 
 
 def lacking(name: str, case: Case, plan: StudyPlan) -> str:

@@ -169,7 +169,7 @@ class Work:
     # The work of each job.
 
     def do(self, job: Job, progress: Progress | None = None) -> None:
-        """Make the result of a job and record its costs, unless the result exists."""
+        """Make the result of a job, unless it exists; record its costs, its warnings among them."""
         path = self.files.path(job)
         if path.exists():
             return
@@ -183,8 +183,13 @@ class Work:
             "portrait": self._overlay,
         }[job.kind]
         started = time.perf_counter()
-        costs = make(self._trial(job, progress), path)
-        self.files.keep_costs(job, {"seconds": time.perf_counter() - started, **costs})
+        with warnings.catch_warnings(record=True) as given:
+            warnings.simplefilter("always", UserWarning)
+            costs = make(self._trial(job, progress), path)
+        costs["seconds"] = time.perf_counter() - started
+        notes = [costs.get("notes", ""), *dict.fromkeys(str(each.message) for each in given)]
+        costs["notes"] = "; ".join(filter(None, notes))
+        self.files.keep_costs(job, costs)
 
     def sees(self, source: str) -> str:
         """The real data that a source may use in this study, a key of `SEES`."""
@@ -229,15 +234,12 @@ class Work:
         return {}
 
     def _update(self, trial: Trial, path: Path) -> Costs:
-        """The update by Eq. 2 or Eq. 3; its warnings are recorded with the costs."""
-        with warnings.catch_warnings(record=True) as given:
-            warnings.simplefilter("always", UserWarning)
-            bayes = trial.job.name == "pi_bayes"
-            found = _bayes(trial, path) if bayes else _least_squares(trial, path)
-        # A search that was cut off is noted too; one that converged is no failure.
+        """The update by Eq. 2 or Eq. 3."""
+        bayes = trial.job.name == "pi_bayes"
+        found = _bayes(trial, path) if bayes else _least_squares(trial, path)
+        # A search that was cut off is noted; one that converged is no failure.
         cut_off = [each for each in found.reason.split("; ") if "exceeded" in each]
-        notes = "; ".join([*cut_off, *dict.fromkeys(str(each.message) for each in given)])
-        return {"twin_runs": found.twin_runs, **({"notes": notes} if notes else {})}
+        return {"twin_runs": found.twin_runs, "notes": "; ".join(cut_off)}
 
     def _diagnosis(self, trial: Trial, path: Path) -> Costs:
         """Train or make the diagnoser of a source, and predict the test trajectories."""
@@ -338,8 +340,12 @@ class Work:
 
     def _base(self, trial: Trial, residual: str) -> Surrogate:
         """The surrogate that the residual model of that name corrects."""
+        return trial.surrogate(self._updated(residual))
+
+    def _updated(self, residual: str) -> str:
+        """The update of the twin whose surrogate that residual model corrects; "" for none."""
         ((_, name),) = NEEDS["residual", residual]
-        return trial.surrogate(name)
+        return name
 
     def _fitted(
         self,
@@ -356,6 +362,7 @@ class Work:
             density,
             seed=trial.seed("residual"),
             calibrate_on=faults if self._uses_labels else "healthy",
+            twin=trial.updated(updated) if (updated := self._updated(name)) else self.case.twin,
             progress=trial.progress,
         )
 

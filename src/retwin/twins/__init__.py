@@ -50,6 +50,7 @@ _HOME = {
     "frozen_response": "faults",
     "keep_workers": "workers",
     "residual_scale": "noisy",
+    "sampler_from": "record_sampler",
     "simulate_in_chunks": "twin",
 }
 

@@ -27,6 +27,7 @@ _HOME = {
     "NPE": "identification",
     "Noise": "identification",
     "Optimum": "identification",
+    "OutsideTrainingWarning": "training_range",
     "Posterior": "identification",
     "PosteriorTwin": "identification",
     "Profile": "identification",

@@ -28,6 +28,7 @@ from retwin.update.corrections import measured_outputs
 from retwin.update.exact import exact_surrogate
 from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
+from retwin.update.training_range import training_checked
 
 __all__ = ["MAX_PER_CLASS", "CorrectedTwin", "generate"]
 
@@ -101,6 +102,8 @@ class CorrectedTwin:
         generator = torch.Generator().manual_seed(checked_seed(seed))
         correction = self.residual.correction
 
+        checked = checked_commands(commands, self.inputs).astype(np.float32, copy=False)
+
         @torch.no_grad()
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             context = self.residual.context(
@@ -117,15 +120,16 @@ class CorrectedTwin:
                 outputs = correction.apply(context, self.residual.mean(context))
             return context.nominal.numpy(), outputs.numpy()
 
-        return simulate_in_chunks(
-            self,
-            run,
-            checked_commands(commands, self.inputs).astype(np.float32, copy=False),
-            faults,
-            seed=seed,
-            progress=progress,
-            emulated=self.residual.emulated,
-        )
+        with training_checked(self.surrogate, checked):
+            return simulate_in_chunks(
+                self,
+                run,
+                checked,
+                faults,
+                seed=seed,
+                progress=progress,
+                emulated=self.residual.emulated,
+            )
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with `surrogate` and `residual` inside; a failure leaves no folder."""

@@ -14,16 +14,18 @@ from torch import Tensor, nn
 
 from retwin.arrays import row_blocks
 from retwin.catalog import NETWORKS, classes
-from retwin.checks import positive, require
+from retwin.checks import one_per, positive, require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.nets.networks import MLP, Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.twins.command_range import CommandRange
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
 from retwin.update.piecewise_linear import evaluate_piecewise_linear
+from retwin.update.training_range import training_checked
 
 __all__ = ["Surrogate", "fit_surrogate", "surrogate_training"]
 
@@ -43,6 +45,9 @@ MAX_SAMPLES = 200_000
 the error."""
 MAX_SEQUENCE_SAMPLES = 10_000_000
 """Largest number of samples, in whole trajectories, that a network with memory is trained on."""
+WITHIN = 4.0
+"""Standard deviations of the training commands within which commands are taken to lie, of a model
+that was saved without their range."""
 TRAINING = {
     "MLP": Training(max_epochs=20, batch_size=256, learning_rate=5e-3),
     "LSTM": Training(max_epochs=10, batch_size=32, learning_rate=5e-3),
@@ -68,6 +73,9 @@ class Surrogate(nn.Module):
     ----------
     fitted : Fit or None
         Record of the training; None before it.
+    trained : CommandRange or None
+        What the training commands contained; None before the training. Commands that they did not
+        contain are an `OutsideTrainingWarning`.
 
     """
 
@@ -83,11 +91,19 @@ class Surrogate(nn.Module):
         self.after = Standardise(len(outputs))
         self.network = network.build(len(inputs), len(outputs))
         self.fitted: Fit | None = None
+        self.trained: CommandRange | None = None
 
     @property
     def memoryless(self) -> bool:
         """Whether an output depends on the command at the same sample only."""
         return isinstance(self.config, MLP)
+
+    @property
+    def held_out_variance(self) -> Tensor:
+        """(d_y,) mean square of the error on held-out simulations of the twin."""
+        figures = {} if self.fitted is None else self.fitted.figures
+        errors = [figures.get(f"rmse_{name}", 0.0) for name in self.outputs.names]
+        return torch.tensor(errors, dtype=torch.float64).square()
 
     @property
     def unit(self) -> Tensor:
@@ -102,13 +118,18 @@ class Surrogate(nn.Module):
         """The outputs (n, T, d_y) for commands (n, T, d_u), both in physical units."""
         return self.after.inverse(self.network(self.before(commands)))
 
-    @torch.no_grad()
     def predict(self, commands: NDArray, *, progress: Progress | None = None) -> NDArray:
         """The outputs (n, T, d_y), float32, for commands (n, T, d_u), without gradient.
 
         A network without memory is evaluated once for a constant command, and at a few points of a
         ramp (`evaluate_piecewise_linear`), which agrees with `forward` up to rounding.
         """
+        with training_checked(self, commands):
+            return self._predicted(commands, progress)
+
+    @torch.no_grad()
+    def _predicted(self, commands: NDArray, progress: Progress | None = None) -> NDArray:
+        """As `predict`, without a check of the commands."""
         values = np.ascontiguousarray(commands, dtype=np.float32)
         out = np.empty((*values.shape[:2], len(self.outputs)), dtype=np.float32)
         if self.memoryless:
@@ -141,11 +162,12 @@ class Surrogate(nn.Module):
         """See `Twin.simulate`; a frozen response is the output of constant commands."""
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            nominal = self.predict(chunk.commands)
-            return nominal, self.predict(chunk.held_commands) if any(chunk.faults) else nominal
+            nominal = self._predicted(chunk.commands)
+            return nominal, self._predicted(chunk.held_commands) if any(chunk.faults) else nominal
 
         checked = checked_commands(commands, self.inputs).astype(np.float32, copy=False)
-        return simulate_in_chunks(self, run, checked, faults, seed=seed, progress=progress)
+        with training_checked(self, checked):
+            return simulate_in_chunks(self, run, checked, faults, seed=seed, progress=progress)
 
     def save(self, folder: str | Path) -> None:
         """Write the weights and the description; see `read_model` for the layout."""
@@ -155,6 +177,7 @@ class Surrogate(nn.Module):
             "outputs": vars(self.outputs),
             "rate": self.rate,
             "fitted": None if self.fitted is None else asdict(self.fitted),
+            "trained": None if self.trained is None else asdict(self.trained),
         }
         with write_model(folder, "surrogate", about, self.state_dict()):
             pass
@@ -176,6 +199,14 @@ class Surrogate(nn.Module):
             )
             surrogate.load_state_dict(weights)
             surrogate.fitted = Fit.of(about["fitted"])
+            # Files from before version 0.1.0 hold the mean and the deviation of the commands alone.
+            if about.get("trained") is not None:
+                surrogate.trained = CommandRange.from_json(about["trained"])
+                one_per("trained", surrogate.trained.low, len(surrogate.inputs), "command")
+            elif surrogate.fitted is not None:
+                before = surrogate.before
+                moments = before.mean.numpy(), before.scale.numpy()
+                surrogate.trained = CommandRange.around(*moments, deviations=WITHIN)
         return surrogate.eval()
 
 
@@ -255,6 +286,7 @@ def fit_surrogate(
         seed=seed,
         progress=progress,
     )
+    surrogate.trained = CommandRange.of(twin.commands, twin.rate)
     surrogate.fitted = replace(result, figures=_errors(surrogate, twin, test))
     return surrogate
 
@@ -262,7 +294,7 @@ def fit_surrogate(
 def _errors(surrogate: Surrogate, twin: Trajectories, test: NDArray) -> dict[str, float]:
     """RMSE and normalised RMSE of each output on the trajectories `test`."""
     valid = _not_padding(twin, test)
-    error = (surrogate.predict(twin.commands[test]) - twin.nominal[test])[valid]
+    error = (surrogate._predicted(twin.commands[test]) - twin.nominal[test])[valid]
     rmse = np.sqrt(np.square(error, dtype=np.float64).mean(axis=0))
     deviation = twin.nominal[test][valid].std(axis=0, dtype=np.float64)
     nrmse = np.divide(rmse, deviation, out=np.zeros_like(rmse), where=deviation > 0)

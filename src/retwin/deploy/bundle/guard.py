@@ -36,6 +36,7 @@ from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.update.corrected import CorrectedTwin, generate
 from retwin.update.surrogate import Surrogate
+from retwin.update.training_range import training_checked
 
 __all__ = ["Guard", "fit_guard"]
 
@@ -108,7 +109,8 @@ class Guard(nn.Module):
     def mismatch(self, surrogate: Surrogate, trajectories: Trajectories) -> NDArray:
         """Root mean square difference (n,) of nominal outputs and surrogate, in spreads."""
         every = slice(None, None, self.stride(surrogate))
-        predicted = surrogate.predict(trajectories.commands[:, every])
+        with training_checked(surrogate, trajectories.commands):
+            predicted = surrogate.predict(trajectories.commands[:, every])
         return self.domain.differences(trajectories.nominal[:, every], predicted)
 
     def assess(

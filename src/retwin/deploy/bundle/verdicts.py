@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
+from retwin.twins.command_range import TOLERANCE, excess
 from retwin.twins.twin import Twin
 
 __all__ = [
@@ -35,8 +36,6 @@ CHECKS = (
 """Names of the checks, in the order of their scores; the last checks the diagnoser's output."""
 COMMANDS, OUTPUTS = ("low", "high", "speed"), ("floor", "ceiling", "spread")
 """Fields of `Domain` that have one number per command, and per output."""
-TOLERANCE = 0.02
-"""Limit of how far a value may leave its range, as a share of the range's width."""
 MISSING_LIMIT = 0.25
 """Limit of the share of missing measurements."""
 LENGTH_LIMIT = 2.0
@@ -352,10 +351,9 @@ def are_probabilities(values: NDArray) -> NDArray:
 def _excess(values: NDArray, low: Any, high: Any, mask: NDArray | None = None) -> NDArray:
     """How far (n,) values (n, T, d) leave their range at most, in tolerated shares of its width."""
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-    over = np.maximum(low - values, values - high) / _nonzero(high - low)
     if mask is not None:
-        over = np.where(mask, over, 0.0)
-    farthest: NDArray = np.maximum(over, 0.0).max(axis=(1, 2)) / TOLERANCE
+        values = np.where(mask, values, low)
+    farthest: NDArray = excess(values, low, high).max(axis=1)
     return farthest
 
 

@@ -38,6 +38,7 @@ from retwin.serialisation.places import check_place
 from retwin.twins.samplers import RampSampler
 from retwin.update.corrections import SampledSensor
 from retwin.update.residual import Mixture, ResidualModel
+from retwin.update.surrogate import Surrogate
 
 __all__ = ["PARITY", "export_onnx"]
 
@@ -134,7 +135,11 @@ def _check_exportable(bundle: Bundle) -> None:
     surrogate, residual, diagnoser = bundle.twin.surrogate, bundle.twin.residual, bundle.diagnoser
     parts = (
         (
-            isinstance(surrogate.config, MLP | TCN),
+            isinstance(surrogate, Surrogate),
+            "twin in place of a surrogate: it is no network",
+        ),
+        (
+            isinstance(getattr(surrogate, "config", None), MLP | TCN),
             "surrogate without one: it has a state, which torch unrolls over all samples",
         ),
         (

@@ -29,6 +29,7 @@ from retwin.twins.twin import Twin, checked_stride
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Context, Correction, DelayOffset
 from retwin.update.residual import infer_discrepancy, segment
+from retwin.update.training_range import checked_once
 
 __all__ = ["measure_fidelity", "measure_widening"]
 
@@ -44,6 +45,7 @@ WINDOWS = 20
 """Windows of time in which the features of the classifier two-sample test are computed."""
 
 
+@checked_once
 def measure_fidelity(
     twin: Twin,
     trajectories: Trajectories,
@@ -136,6 +138,7 @@ def measure_fidelity(
     )
 
 
+@checked_once
 def measure_widening(
     twin: Twin,
     trajectories: Trajectories,

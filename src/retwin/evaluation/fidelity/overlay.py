@@ -18,6 +18,7 @@ from retwin.scores.distributions import quantiles
 from retwin.serialisation.files import write_atomically
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.residual import infer_discrepancy, segment
+from retwin.update.training_range import checked_once
 
 __all__ = ["Overlay", "predictive_overlay"]
 
@@ -85,6 +86,7 @@ class Overlay:
         )
 
 
+@checked_once
 def predictive_overlay(
     twin: CorrectedTwin,
     trajectories: Trajectories,

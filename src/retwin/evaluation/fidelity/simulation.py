@@ -14,6 +14,7 @@ from retwin.progress import Progress
 from retwin.scores.distributions import central_band, crps, inside, quantiles
 from retwin.serialisation.files import write_atomically
 from retwin.twins.twin import Twin
+from retwin.update.training_range import checked_once
 
 __all__ = ["Simulation", "record_means", "simulate_records", "simulation_scores"]
 
@@ -93,6 +94,7 @@ class Simulation:
             return cls(**{name: found[name] for name in _ARRAYS})
 
 
+@checked_once
 def simulate_records(
     twin: Twin,
     records: Trajectories,

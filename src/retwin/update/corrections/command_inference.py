@@ -76,6 +76,7 @@ def infer_commands(
     problem = replace(problem, own_delays=True)
     if not problem.valid.shape[1]:
         return _empty(problem)
+    uncertain, problem = problem, problem.where_certain
     start = problem.zero
     problem.per_segment(start)[..., 0] = first_delays(problem, start, problem.delay_range)
     first = _Belief.of(problem, start)
@@ -96,6 +97,9 @@ def infer_commands(
         rounds=MAX_ROUNDS,
         converged=_Belief.near,
     )
+    if uncertain.common is not None:
+        problem = uncertain
+        found = infer(Search(fit, fit.missed, fit.evidence), belief)
     problem = belief.whitened(problem).with_missed(found.fit.missed)
     last = fitted(problem, belief.prior(problem), belief.noise, found.fit.x)
     return _discrepancy(problem, last.solution, found.probability, belief, identified_below)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from retwin.data.segments import Segments
-from retwin.inference.noise import Noise
+from retwin.inference.noise import CommonError, Noise
 from retwin.inference.solver import Bounds
 from retwin.update.corrections.correction import Context, DifferentiableTwin
 from retwin.update.corrections.delays import delay_bounds
@@ -32,6 +32,9 @@ COMMON_ERROR = 0.25
 """Variance of the error that all samples of a segment have in common, relative to that of one
 sample: what rounding leaves, on average over sensors whose noise is a tenth to a quarter of their
 resolution. Outputs cannot tell it from an offset, so it is no estimate."""
+LARGE_ERROR = 2.0
+"""Error of the surrogate, in that of half of the samples, beyond which nothing is learned from a
+segment but its own z."""
 GAIN_STEP = 5e-3
 """Step of the finite differences of the gain, in standard deviations of a command."""
 TRAJECTORIES_PER_BATCH = 64
@@ -85,6 +88,9 @@ class CommandProblem:
         errors of a sample's outputs are independent and of one size.
     own_delays : bool
         Whether every actuator has a delay of its own besides the common one.
+    common : CommonError, optional
+        The surrogate's error, which all samples of a segment have in common; None for a surrogate
+        without any.
 
     """
 
@@ -104,6 +110,7 @@ class CommandProblem:
     delay_range: tuple[float, float]
     whitening: Tensor | None = None
     own_delays: bool = False
+    common: CommonError | None = None
 
     @classmethod
     def of(
@@ -132,7 +139,7 @@ class CommandProblem:
         settling = SETTLING * max(delay_range[1], 0.0)
         near = within(sample, segments.start + delay_range[0], segments.settle + settling)
         healthy = valid[..., None] & ~bent & (start < context.frozen[:, None])
-        return cls(
+        problem = cls(
             surrogate=context.surrogate,
             segments=segments,
             reference=context.faulty_commands.double(),
@@ -148,6 +155,12 @@ class CommandProblem:
             missed=torch.zeros(healthy.shape, dtype=torch.float64),
             delay_range=delay_range,
         )
+        if context.surrogate_variance is None:
+            return problem
+        inside = problem.inside
+        variance = inside.mT @ (context.surrogate_variance / unit.square())
+        block = (inside.mT @ inside.sum(dim=-1, keepdim=True))[..., 0]
+        return replace(problem, common=CommonError(variance, block))
 
     def __len__(self) -> int:
         return len(self.reference)
@@ -173,6 +186,20 @@ class CommandProblem:
         return replace(
             self, frozen=frozen, healthy=self.valid[..., None] & (start < frozen[:, None])
         )
+
+    @property
+    def where_certain(self) -> CommandProblem:
+        """The problem from which hyperparameters are learned, as if the surrogate were exact.
+
+        Segments in which it errs much more than in others count as not measured. An upper bound
+        of its error, taken for noise, would leave too little for the variance of the offsets.
+        """
+        if self.common is None:
+            return self
+        variance = self.common.variance.mean(dim=-1)
+        known = (self.measured > 0) & (self.common.block > 0)
+        limit = LARGE_ERROR**2 * variance[known].median() if known.any() else torch.inf
+        return replace(self, common=None, measured=self.measured * (variance <= limit))
 
     @property
     def memory(self) -> bool:

@@ -81,6 +81,9 @@ class Context:
         In Hz.
     corrected : Tensor, optional
         (n, T, d_y), the output of the operators before this one; None for the first.
+    surrogate_variance : Tensor, optional
+        (n, M, d_y), mean square of the surrogate's own error in each segment, in the outputs' units
+        squared; None for a surrogate without error.
 
     """
 
@@ -92,6 +95,7 @@ class Context:
     segments: Segments
     rate: float
     corrected: Tensor | None = None
+    surrogate_variance: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.commands)
@@ -120,8 +124,10 @@ class Context:
 
     def __getitem__(self, index: slice | NDArray) -> Context:
         """The context of some of the trajectories."""
+        variance = self.surrogate_variance
         return replace(
             self,
+            surrogate_variance=None if variance is None else variance[index],
             commands=self.commands[index],
             faulty_commands=self.faulty_commands[index],
             frozen=self.frozen[index],

@@ -156,7 +156,12 @@ class DelayOffset:
         known = KNOWN_DELAY * problem.width
         if self.known_delay is not None:
             known = self.known_delay * context.rate
-        return _discrepancy(problem, solution, *belief, unit, known)
+        found = _discrepancy(problem, solution, *belief, unit, known)
+        if context.surrogate_variance is None:
+            return found
+        # At rest the surrogate's error is an offset.
+        found.covariance.diagonal(dim1=-2, dim2=-1)[..., 1:] += context.surrogate_variance
+        return found
 
 
 def _learned(problem: PathProblem, residual: Tensor) -> tuple[Noise, GaussianPrior]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import overload
+from typing import TypeVar, overload
 
 import numpy as np
 import torch
@@ -32,15 +32,19 @@ from retwin.update.corrections.delay_range import bound_note
 from retwin.update.exact import exact_surrogate
 from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.refining import refine
-from retwin.update.residual.residual import segment
+from retwin.update.residual.residual import Residual, segment
 from retwin.update.residual.segment_fitting import fit_segments
 from retwin.update.residual.sequence import SequenceMixture, SequenceResidual
 from retwin.update.residual.sequence_fitting import fit_sequence
 from retwin.update.residual.settings import Density, Mixture
 from retwin.update.residual.targets import Targets
 from retwin.update.surrogate import Surrogate
+from retwin.update.surrogate_error import surrogate_variance
+from retwin.update.training_range import checked_once, training_checked
 
 __all__ = ["fit_residual", "infer_discrepancy"]
+
+R = TypeVar("R", bound=Residual)
 
 SMALLEST = 1e-12
 """Smallest value taken for the largest |z*|: a millionth of it still has a square in float32."""
@@ -48,6 +52,7 @@ BOUND_MARGIN = 1.25
 """Default bound b of Eq. 9, over the largest |z*|."""
 
 
+@checked_once
 def infer_discrepancy(
     surrogate: Surrogate | Twin,
     trajectories: Trajectories,
@@ -55,6 +60,7 @@ def infer_discrepancy(
     *,
     segments: Segments | None = None,
     faults: Sequence[Fault | None] | None = None,
+    twin: Twin | None = None,
 ) -> tuple[Context, Discrepancy]:
     """The discrepancies z* with which g explains measured trajectories best (for Eq. 7).
 
@@ -71,6 +77,8 @@ def infer_discrepancy(
     faults : sequence of Fault or None, optional
         The known fault of each trajectory. An operator with `severities` infers its severity
         together with z* (`Discrepancy.severity`).
+    twin : Twin, optional
+        The twin that the surrogate was trained on, see `fit_residual`.
 
     Returns
     -------
@@ -78,7 +86,7 @@ def infer_discrepancy(
         What g is applied to, and z* with its uncertainty.
 
     """
-    context = _context(exact_surrogate(surrogate), trajectories, segments, faults)
+    context = _context(exact_surrogate(surrogate), trajectories, segments, faults, twin)
     return context, correction.infer(context, *_measured(trajectories))
 
 
@@ -93,6 +101,7 @@ def fit_residual(
     calibrate_on: str | Mapping[str, Fault | None] = ...,
     bounds: NDArray | None = ...,
     segments: Segments | str = ...,
+    twin: Twin | None = ...,
     progress: Progress | None = ...,
 ) -> ResidualModel: ...
 
@@ -108,6 +117,7 @@ def fit_residual(
     calibrate_on: str | Mapping[str, Fault | None] = ...,
     bounds: NDArray | None = ...,
     segments: Segments | str = ...,
+    twin: Twin | None = ...,
     progress: Progress | None = ...,
 ) -> SequenceResidual: ...
 
@@ -122,6 +132,7 @@ def fit_residual(
     calibrate_on: str | Mapping[str, Fault | None] = "healthy",
     bounds: NDArray | None = None,
     segments: Segments | str = "commands",
+    twin: Twin | None = None,
     progress: Progress | None = None,
 ) -> ResidualModel | SequenceResidual:
     """Fit the residual model to measured trajectories, from outputs alone (Eq. 7–10).
@@ -150,6 +161,10 @@ def fit_residual(
     segments : Segments or str
         "commands", "path" (see `segment`), or the segments, one row per trajectory; the segments
         of generated trajectories are then from command events.
+    twin : Twin, optional
+        The twin that the surrogate was trained on. It simulates the calibration commands, and what
+        the surrogate errs there makes z less certain; without it, what the surrogate erred on
+        held-out simulations.
     progress : callable, optional
         Called with the share of the training that is done.
 
@@ -183,8 +198,9 @@ def fit_residual(
         got="commands that never change",
         remedy="give segments='path', or the segments themselves",
     )
-    context = _context(surrogate, used, parts, faults)
-    correction, found = fit_correction(correction, context, *_measured(used))
+    with training_checked(surrogate, used.commands) as outside:
+        context = _context(surrogate, used, parts, faults, twin)
+        correction, found = fit_correction(correction, context, *_measured(used))
     require(
         found.identified.any(),
         "calibration",
@@ -193,9 +209,13 @@ def fit_residual(
         remedy="check the mask; leave an output out that is never measured",
     )
     if isinstance(density, SequenceMixture):
-        return fit_sequence(
-            used, correction, density, context, found, seed=seed, bounds=bounds, progress=progress
-        )
+        return _noted(
+            fit_sequence(
+                used, correction, density, context, found,
+                seed=seed, bounds=bounds, progress=progress,
+            ),
+            outside,
+        )  # fmt: skip
     with isolated(seed):
         model = ResidualModel(
             correction, density, inputs=used.inputs, outputs=used.outputs, segmentation=rule
@@ -218,7 +238,15 @@ def fit_residual(
     onsets = Segments.from_commands(calibration.commands)
     model.timing = np.where(onsets.valid, onsets.start, np.nan)
     model.fitted = replace(result, figures=figures | result.figures)
-    return model.eval()
+    return _noted(model.eval(), outside)
+
+
+def _noted(model: R, outside: str) -> R:
+    """The model; its record states the commands that the surrogate was not trained on."""
+    if outside and model.fitted is not None:
+        reason = f"{model.fitted.reason}; commands outside the surrogate's training: {outside}"
+        model.fitted = replace(model.fitted, reason=reason)
+    return model
 
 
 def _context(
@@ -226,24 +254,22 @@ def _context(
     trajectories: Trajectories,
     segments: Segments | None,
     faults: Sequence[Fault | None] | None,
+    twin: Twin | None,
 ) -> Context:
     """What g is applied to; the severity of a known fault is arbitrary, since it is inferred."""
     commands = trajectories.commands
     parts = Segments.from_commands(commands) if segments is None else segments
     # Padding after the last sample is no steady part.
     parts = parts.until(trajectories.lengths)
-    if faults is None:
-        return Context.of(surrogate, commands, parts, rate=trajectories.rate)
     rate = trajectories.rate
-    drawn = draw_faults(faults, parts, seed=0, rate=rate)
-    return Context.of(
-        surrogate,
-        commands,
-        parts,
-        rate=rate,
-        faulty_commands=faulty_commands(commands, drawn, parts, rate=rate),
-        frozen=frozen_from(drawn, *commands.shape[1:], rate=rate),
-    )
+    faulty: dict[str, NDArray] = {}
+    if faults is not None:
+        drawn = draw_faults(faults, parts, seed=0, rate=rate)
+        faulty["faulty_commands"] = faulty_commands(commands, drawn, parts, rate=rate)
+        faulty["frozen"] = frozen_from(drawn, *commands.shape[1:], rate=rate)
+    context = Context.of(surrogate, commands, parts, rate=rate, **faulty)
+    variance = surrogate_variance(surrogate, twin, commands, parts)
+    return replace(context, surrogate_variance=variance)
 
 
 def _measured(trajectories: Trajectories) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,203 @@
+"""`CommandRange`: the values, the speeds and the frequencies that a set of commands contains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.signal import windows
+
+from retwin.arrays import row_blocks
+from retwin.checks import one_per
+from retwin.data.trajectories import Channels
+
+__all__ = ["TOLERANCE", "CommandRange", "excess", "power_spectra"]
+
+TOLERANCE = 0.02
+"""How far a value may leave its range, as a share of the range's width."""
+BAND_SHARE = 0.999
+"""Share of the power of all trajectories together that lies within the band."""
+SPEED_TOLERANCE = 0.1
+"""Share by which a speed may exceed the greatest one, which is the largest of few random ones."""
+POWER_TOLERANCE = 0.01
+"""Share of a trajectory's power that may lie above the band beyond what such trajectories have:
+a tenth of the amplitude."""
+SMALLEST_POWER = 1e-4
+"""Power, relative to the mean of all trajectories, below which a trajectory hardly varies: a
+hundredth of the amplitude. Its spectrum is that of rounding."""
+LEAKAGE = 2.0
+"""Half the width of a sine's peak in the spectrum of a Hann window, in frequency steps."""
+MAX_SPECTRA = 1000
+"""Largest number of trajectories whose spectra are computed, evenly chosen."""
+
+
+@dataclass(frozen=True)
+class CommandRange:
+    """What a set of commands contains, one number for each input channel.
+
+    Attributes
+    ----------
+    low, high : tuple of float
+        Least and greatest value, in the channel's unit.
+    speed : tuple of float
+        Greatest rate of change, in the unit per second.
+    band : tuple of float
+        Frequency in Hz below which 99.9 % of the power lies, the mean of each trajectory left out.
+    share : tuple of float
+        Greatest share of a trajectory's power that lies above the band.
+    power : tuple of float
+        Mean power of a trajectory, in the unit squared.
+    resolution : float
+        Frequency step of the spectra in Hz: one over the duration of a trajectory.
+
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    speed: tuple[float, ...]
+    band: tuple[float, ...]
+    share: tuple[float, ...]
+    power: tuple[float, ...]
+    resolution: float
+
+    def __post_init__(self) -> None:
+        for name in ARRAYS:
+            one_per(name, getattr(self, name), len(self.low), "input channel")
+
+    @classmethod
+    def of(cls, commands: NDArray, rate: float) -> CommandRange:
+        """Of commands (n, T, d_u) at `rate` Hz."""
+        blocks = (np.asarray(commands[rows], np.float64) for rows in row_blocks(commands))
+        ends = [(-b.min(axis=(0, 1)), b.max(axis=(0, 1)), _steps(b).max(axis=0)) for b in blocks]
+        low, high, change = np.max(ends, axis=0) * np.array([[-1.0], [1.0], [rate]])
+        frequency, spectra = power_spectra(commands, rate)
+        below = spectra.mean(axis=0).cumsum(axis=0)
+        index = (below < BAND_SHARE * below[-1]).sum(axis=0)
+        band, power, resolution = frequency[index], below[-1], float(frequency[1])
+        share = _above(frequency, spectra, band + LEAKAGE * resolution, power).max(axis=0)
+        numbers = dict(zip(ARRAYS, (low, high, change, band, share, power), strict=True))
+        return cls(**{k: _floats(v) for k, v in numbers.items()}, resolution=resolution)
+
+    @classmethod
+    def around(cls, mean: NDArray, deviation: NDArray, *, deviations: float) -> CommandRange:
+        """The values within so many standard deviations (d_u,), without a limit of the speed."""
+        free = (inf,) * len(mean)
+        low, high = mean - deviations * deviation, mean + deviations * deviation
+        return cls(_floats(low), _floats(high), free, free, free, free, 0.0)
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> CommandRange:
+        """The range from the values of `dataclasses.asdict`, with JSON lists."""
+        parts = {name: _floats(np.atleast_1d(values[name])) for name in ARRAYS}
+        return cls(**parts, resolution=float(values["resolution"]))
+
+    def scores(self, commands: NDArray, rate: float) -> NDArray:
+        """How far commands (n, T, d_u) leave the range in value, speed and spectrum, (n, 3, d_u).
+
+        Numbers above 1 are outside. Of more than a thousand trajectories some have no spectrum.
+        """
+        low, high, speed = (np.array(each) for each in (self.low, self.high, self.speed))
+        found = np.zeros((len(commands), 3, len(low)))
+        for rows in row_blocks(commands):
+            values = np.asarray(commands[rows], np.float64)
+            found[rows, 0] = excess(values, low, high)
+            limit = (1 + SPEED_TOLERANCE) * np.where(speed > 0, speed, inf)
+            found[rows, 1] = rate * _steps(values) / limit
+        if np.isfinite(self.band).all():
+            found[_chosen(len(commands)), 2] = self.shares(commands, rate) / (
+                np.array(self.share) + POWER_TOLERANCE
+            )
+        return found
+
+    def shares(self, commands: NDArray, rate: float) -> NDArray:
+        """Share of the power of each trajectory's commands that lies above the band, (n, d_u)."""
+        frequency, spectra = power_spectra(commands, rate)
+        margin = LEAKAGE * max(self.resolution, float(frequency[1]))
+        return _above(frequency, spectra, np.array(self.band) + margin, np.array(self.power))
+
+    def outside(self, commands: NDArray, rate: float, inputs: Channels) -> str:
+        """What of the commands is outside the range, by channel, in words; "" if nothing is."""
+        scores = self.scores(commands, rate)
+        wrong = scores > 1
+        texts = []
+        for channel, kind in np.argwhere(wrong.any(axis=0).T):
+            farthest = commands[[scores[:, kind, channel].argmax()]]
+            value, trained = (self._values, self._speeds, self._spectra)[kind](
+                farthest[..., channel], channel, rate
+            )
+            unit = inputs.units[channel]
+            unit = f" in {unit}" if unit not in ("", "1") and kind < 2 else ""
+            texts.append(f"{inputs.names[channel]} {value} (training: {trained}{unit})")
+        if not texts:
+            return ""
+        count = int(wrong.any(axis=(1, 2)).sum())
+        return f"{'; '.join(texts)}; in {count} of {len(commands)} trajectories"
+
+    def _values(self, values: NDArray, channel: int, rate: float) -> tuple[str, str]:
+        """The value of (1, T) that is farthest from the range of a channel, and that range."""
+        low, high = self.low[channel], self.high[channel]
+        values = values.astype(np.float64)
+        farthest = values.flat[np.maximum(low - values, values - high).argmax()]
+        return f"is {farthest:.4g}", f"{low:.4g} to {high:.4g}"
+
+    def _speeds(self, values: NDArray, channel: int, rate: float) -> tuple[str, str]:
+        """The greatest speed of (1, T), and that of the channel."""
+        fastest = rate * _steps(values.astype(np.float64)[..., None])[0, 0]
+        return f"changes by {fastest:.4g} per s", f"up to {self.speed[channel]:.4g}"
+
+    def _spectra(self, values: NDArray, channel: int, rate: float) -> tuple[str, str]:
+        """The share of the power of (1, T) above the channel's band, and that of training."""
+        every = np.broadcast_to(values[..., None], (*values.shape, len(self.low)))
+        share, band = self.shares(every, rate)[0, channel], self.band[channel]
+        return f"has {share:.1%} of its power above {band:.3g} Hz", f"{self.share[channel]:.1%}"
+
+
+ARRAYS = ("low", "high", "speed", "band", "share", "power")
+"""Fields of `CommandRange` with one number per channel."""
+
+
+def excess(values: NDArray, low: NDArray, high: NDArray) -> NDArray:
+    """How far (n, d) values (n, T, d) leave their ranges, in tolerated shares of their widths."""
+    width = high - low
+    over = np.maximum(low - values, values - high) / np.where(width > 0, width, 1.0)
+    found: NDArray = np.maximum(over, 0.0).max(axis=1) / TOLERANCE
+    return found
+
+
+def power_spectra(commands: NDArray, rate: float) -> tuple[NDArray, NDArray]:
+    """Frequencies (F,) in Hz, and the power (n, F, d_u) of each in commands about their mean.
+
+    The window is Hann's. Of more than a thousand trajectories that many are taken.
+    """
+    values = np.asarray(commands[_chosen(len(commands))], np.float32)
+    window = windows.hann(values.shape[1] + 2)[1:-1, None].astype(np.float32)
+    values = (values - values.mean(axis=1, keepdims=True)) * window
+    spectrum = np.abs(fft.rfft(values, axis=1)) ** 2 * (2 / len(window) / np.sum(window**2))
+    return fft.rfftfreq(len(window), 1 / rate), spectrum
+
+
+def _above(frequency: NDArray, spectra: NDArray, limit: NDArray, power: NDArray) -> NDArray:
+    """Share (n, d_u) of the power of each spectrum above a frequency (d_u,)."""
+    above = (spectra * (frequency[:, None] > limit)).sum(axis=1, dtype=np.float64)
+    whole = spectra.sum(axis=1, dtype=np.float64) + SMALLEST_POWER * power
+    return np.divide(above, whole, out=np.zeros_like(above), where=power > 0)
+
+
+def _chosen(count: int) -> NDArray:
+    """Indices of at most a thousand trajectories, evenly chosen."""
+    return np.unique(np.linspace(0, count - 1, min(count, MAX_SPECTRA)).round().astype(int))
+
+
+def _steps(values: NDArray) -> NDArray:
+    """Greatest change (n, d_u) of values (n, T, d_u) from one sample to the next."""
+    found: NDArray = np.abs(np.diff(values, axis=1)).max(axis=1, initial=0.0)
+    return found
+
+
+def _floats(values: NDArray) -> tuple[float, ...]:
+    return tuple(float(each) for each in values)
