@@ -14,13 +14,14 @@ from torch import Tensor, nn
 
 from retwin.arrays import row_blocks
 from retwin.catalog import NETWORKS, classes
-from retwin.checks import positive, require
+from retwin.checks import require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.nets.networks import MLP, Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
 from retwin.update.piecewise_linear import evaluate_piecewise_linear
@@ -167,7 +168,7 @@ class Surrogate(nn.Module):
         """
         about, weights = read_model(folder, "surrogate")
         with refusing(folder, expected="a surrogate model"):
-            positive("rate", about["rate"])
+            sample_rate("rate", about["rate"])
             surrogate = cls(
                 from_config(about["network"], classes(NETWORKS)),
                 inputs=Channels.of(about["inputs"]),
@@ -200,8 +201,8 @@ def fit_surrogate(
         Commands and nominal outputs of at least ten trajectories; `observed` is not used. What
         follows the last measurement of a trajectory is left out: a simulation that ended early
         has no outputs there. A tenth of them is held out for validation and another tenth for the
-        reported error, at most a thousand each. A network without memory is trained on at most 200,000 distinct samples,
-        drawn at random, one with memory on at most ten million.
+        reported error, at most a thousand each. A network without memory is trained on at most
+        200,000 distinct samples, drawn at random, one with memory on at most ten million.
     network : Network
         `MLP` (no memory, the default), `LSTM`, `TCN` or `StateSpace`.
     seed : int

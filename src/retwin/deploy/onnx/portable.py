@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import needs_extra, positive, require, whole
+from retwin.checks import needs_extra, require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.deploy.bundle.facts import Facts
@@ -26,6 +26,7 @@ from retwin.deploy.bundle.verdicts import (
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.files import refusing
+from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, checked_seed, simulate_in_chunks
 
@@ -163,7 +164,7 @@ class Portable:
         options.intra_op_num_threads = threads
         options.log_severity_level = 4  # errors are raised, and need not be printed too
         with open_sealed(folder, "portable") as about:
-            facts = Facts.of(about, positive("rate", about["rate"], unit="Hz"))
+            facts = Facts.of(about, sample_rate("rate", about["rate"]))
             sensor, classifier = about["sensor"], about["diagnoser"]
             sensor = None if sensor is None else Sensor.of(sensor, facts.steps)
             classifier = None if classifier is None else Classifier.of(classifier, facts.steps)
@@ -180,7 +181,7 @@ class Portable:
                 facts=facts,
                 inputs=Channels.of(about["inputs"]),
                 outputs=Channels.of(about["outputs"]),
-                rate=positive("rate", about["rate"], unit="Hz"),
+                rate=sample_rate("rate", about["rate"]),
                 domain=Domain.of(about["domain"]),
                 stride=whole("stride", about["stride"], least=1, most=facts.steps),
                 sensor=sensor,
