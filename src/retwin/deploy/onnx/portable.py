@@ -26,6 +26,7 @@ from retwin.deploy.bundle.verdicts import (
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.files import refusing
+from retwin.serialisation.sizes import Budget
 from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, checked_seed, simulate_in_chunks
@@ -38,7 +39,7 @@ __all__ = ["Portable", "padded_times", "settled_at"]
 GRAPHS = ("surrogate", "residual", "correction", "guard")
 """Names of the graphs that every export has."""
 EXPECTED = "a graph that retwin bundle export wrote"
-REMEDY = "make it anew with retwin bundle export"
+REMEDY = "make it anew with retwin bundle export, or give it less at once if memory is short"
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ class Portable:
 
         """
         runtime = needs_extra("onnxruntime", "onnx", "runs the graphs")
-        options = runtime.SessionOptions()
+        options = _bounded(runtime)
         options.intra_op_num_threads = threads
         options.log_severity_level = 4  # errors are raised, and need not be printed too
         with open_sealed(folder, "portable") as about:
@@ -374,6 +375,18 @@ class Graph:
     def width(self, name: str) -> int:
         """Size of the last axis of an input."""
         return int(self.inputs[name][-1])
+
+
+def _bounded(runtime: Any) -> Any:
+    """Options of sessions that take a share of the free memory in all: a graph may expand."""
+    kind = runtime.OrtAllocatorType.ORT_ARENA_ALLOCATOR
+    memory = runtime.OrtMemoryInfo("Cpu", kind, 0, runtime.OrtMemType.DEFAULT)
+    # The other settings of an arena are the defaults. A further call replaces it for new sessions.
+    arena = runtime.OrtArenaCfg(Budget("graphs").left, -1, -1, -1)
+    runtime.create_and_register_allocator(memory, arena)
+    options = runtime.SessionOptions()
+    options.add_session_config_entry("session.use_env_allocators", "1")
+    return options
 
 
 def _outputs(trajectories: Trajectories) -> dict[str, NDArray]:
