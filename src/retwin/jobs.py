@@ -16,6 +16,7 @@ from pebble import ProcessExpired
 
 from retwin.checks import needs_extra
 from retwin.errors import InputError
+from retwin.modules import add_known, known
 from retwin.processes import sendable_errors, worker_pool
 from retwin.progress import Progress
 
@@ -138,9 +139,9 @@ def _on_cluster(
     with client:
         executor = client.get_executor(pure=False)
         # The job is sent once. As the result of a task it is made again if its worker dies.
-        sent = client.submit(_same, job, pure=False)
+        sent = client.submit(_same, (known(), pickle.dumps(job)), pure=False)
         try:
-            yield lambda number: executor.submit(task, sent, number)
+            yield lambda number: executor.submit(_on_worker, task, sent, number)
         except distributed.KilledWorker as error:
             raise RuntimeError(f"workers of the cluster died of a chunk: {error}") from None
         except AssertionError as error:
@@ -162,8 +163,18 @@ def _in_worker(task: Callable[..., Result], job: object, number: int) -> Result:
         return task(job, number)
 
 
-def _same(job: Job) -> Job:
-    return job
+def _on_worker(task: Callable[..., Result], sent: tuple[dict[str, str], bytes], number: int) -> Any:
+    """As `_in_worker`, for a process that may not know the modules beside the user's case.
+
+    The job is unpickled here: what goes wrong is then an exception of the task, not of Dask.
+    """
+    modules, job = sent
+    add_known(modules)
+    return _in_worker(task, pickle.loads(job), number)
+
+
+def _same(sent: Job) -> Job:
+    return sent
 
 
 def _check_sendable(job: object) -> None:

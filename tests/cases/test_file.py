@@ -390,6 +390,35 @@ def test_worker_processes_find_the_module(read: Callable[..., rt.Case], tmp_path
     )
 
 
+@pytest.mark.slow
+def test_workers_of_a_cluster_find_the_module(read: Callable[..., rt.Case], tmp_path: Path) -> None:
+    from distributed import LocalCluster
+
+    # A class of that module, whose objects cannot be unpickled without it.
+    text = 'name = "toy"\ntwin = "toy_twin:TWIN"\n'
+    (tmp_path / "toy_twin.py").write_text(
+        "from toy_module import TWIN as INNER\n"
+        "class Own:\n"
+        "    inputs, outputs, rate = INNER.inputs, INNER.outputs, INNER.rate\n"
+        "    def simulate(self, *args, **options):\n"
+        "        return INNER.simulate(*args, **options)\n"
+        "TWIN = Own()\n"
+    )
+    case = read(text + "commands = { low = [0, 0], high = [1, 1], duration = 2, segments = 1 }\n")
+    plan = rt.deploy.SimulationPlan(case.twin, case.sampler, 0, 6, chunk=3)
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        address = cluster.scheduler_address
+        hidden = (tmp_path / "toy_twin.py").rename(tmp_path / "hidden.py")
+        with pytest.raises(OSError, match="toy_twin"):
+            rt.deploy.simulate_to(tmp_path / "made.zarr", plan, scheduler=address)
+        hidden.rename(tmp_path / "toy_twin.py")
+        rt.deploy.simulate_to(tmp_path / "made.zarr", plan, scheduler=address)
+    made = rt.load(tmp_path / "made.zarr")
+    np.testing.assert_allclose(
+        made.observed, 2 * made.commands[..., :1] + made.commands[..., 1:], rtol=1e-6
+    )
+
+
 def test_a_module_beside_the_case_is_found_alone(
     read: Callable[..., rt.Case], tmp_path: Path
 ) -> None:

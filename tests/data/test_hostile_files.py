@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from retwin import cases
 from retwin.data.io import load, save
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
@@ -139,6 +140,28 @@ def test_npz_files_that_grow(tmp_path: Path) -> None:
     refused(file, "has no limit")
     npz(file, "header.npy", array_header((10**8,)) + b"[" * 10**5)
     refused(file, "a.npz")
+
+
+def test_an_npz_file_with_a_hundred_thousand_entries(tmp_path: Path) -> None:
+    """Of 5 MB; the list of its entries alone takes more memory than is free."""
+    head = struct.pack("<4s6H3L5H2L", b"PK\1\2", 20, 20, *[0] * 3, 33, *[0] * 3, 1, *[0] * 6)
+    entries = (head + b"a") * 10**5
+    end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 0xFFFF, 0xFFFF, len(entries), 0, 0)
+    (tmp_path / "a.npz").write_bytes(entries + end)
+    refused(tmp_path / "a.npz", "a.npz: expected contents of at most 67.1 MB")
+
+
+def test_files_with_holes_that_are_larger_than_the_memory(tmp_path: Path) -> None:
+    """They take no place on the disk, and one line of them is a whole file."""
+    (tmp_path / "Healthy").mkdir()
+    for name in ("Healthy/1.csv", "a.mat", "case.toml", "model.json"):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(2**28)
+    refused(tmp_path, "expected contents of at most 67.1 MB", rate=1)
+    refused(tmp_path / "a.mat", "a.mat: expected contents of at most 67.1 MB", rate=1)
+    for read, name in ((cases.get, "case.toml"), (read_json, "model.json")):
+        with pytest.raises(InputError, match=r"contents of at most 67\.1 MB"):
+            read(str(tmp_path / name))
 
 
 def test_a_header_of_deep_json(tmp_path: Path) -> None:

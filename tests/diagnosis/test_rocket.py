@@ -114,5 +114,5 @@ def test_bad_input_is_refused(rocket: RocketDiagnoser) -> None:
             for name in ("commands", "nominal", "observed", "mask")
         }
     )
-    with pytest.raises(rt.InputError, match=r"trajectories\.steps: .*50 samples"):
+    with pytest.raises(rt.InputError, match=r"trajectories\.steps: .*60 samples"):
         rocket.predict_proba(short)

@@ -67,6 +67,22 @@ def test_bad_input_is_refused(twin_set: rt.Trajectories, tmp_path: Path) -> None
         rt.Surrogate.load(tmp_path / "nowhere")
 
 
+@pytest.mark.parametrize("network", [rt.MLP((4,)), rt.LSTM(4)], ids=repr)
+def test_outputs_after_an_early_end_are_not_learned(
+    network: rt.MLP | rt.LSTM, twin_set: rt.Trajectories
+) -> None:
+    """They are the last known ones, while the commands go on."""
+    few = twin_set[:30]
+    mask, nominal = few.mask.copy(), few.nominal.copy()
+    mask[::2, few.steps // 3 :] = False
+    nominal[~mask] = 7.0
+    weights = [
+        rt.fit_surrogate(each, network, seed=0, training=Training(max_epochs=1)).state_dict()
+        for each in (few.replace(mask=mask), few.replace(mask=mask, nominal=nominal))
+    ]
+    torch.testing.assert_close(weights[0], weights[1], rtol=0, atol=0)
+
+
 @pytest.mark.parametrize("damage", ["truncate", "not json", "other kind", "newer"])
 def test_damaged_models_are_refused(ibg: rt.Surrogate, tmp_path: Path, damage: str) -> None:
     ibg.save(tmp_path / "m")

@@ -21,7 +21,7 @@ from retwin import catalog
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, Record
 from retwin.cases.named_twin import imported, parametric_twin, read_twin
-from retwin.checks import one_of, positive, require
+from retwin.checks import one_of, require
 from retwin.data.io import load
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Channels, Trajectories
@@ -30,6 +30,7 @@ from retwin.nets.networks import Network
 from retwin.nets.training import Training
 from retwin.serialisation.configs import at, checked, fits, from_config, from_settings, key
 from retwin.serialisation.files import check_regular
+from retwin.times import sample_rate
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.fmu import FMUTwin
 from retwin.twins.limits import Limits
@@ -136,7 +137,7 @@ def read_case(path: str | Path) -> Case:
     sensor_rate = twin.rate if keys.sensor_rate is None else keys.sensor_rate
     faults = _faults(keys.faults, twin.inputs, folder, key(place, "faults"))
     network = _chosen(network, catalog.NETWORKS, key(place, "network"))
-    sensor_rate = positive(key(place, "sensor_rate"), sensor_rate, unit="Hz")
+    sensor_rate = sample_rate(key(place, "sensor_rate"), sensor_rate)
     with at(place):
         return Case(
             name=keys.name,

@@ -13,8 +13,9 @@ from functools import reduce
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import positive, require
+from retwin.checks import require
 from retwin.errors import InputError
+from retwin.times import sample_rate
 
 __all__ = ["Segments"]
 
@@ -109,7 +110,7 @@ class Segments:
             Shapes differ, or times are out of order, before 0 or after the end.
 
         """
-        rate = positive("rate", rate, unit="Hz")
+        rate = sample_rate("rate", rate)
         start = np.atleast_2d(np.asarray(start, dtype=float)) * rate
         settle = np.atleast_2d(np.asarray(settle, dtype=float)) * rate
         require(

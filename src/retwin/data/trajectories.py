@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.arrays import check_finite, check_shapes, floating, measured, named, row_blocks
-from retwin.checks import at_least, positive, require, whole
-from retwin.times import to_samples
+from retwin.checks import at_least, require, whole
+from retwin.times import sample_rate, to_samples
 
 __all__ = ["HEALTHY", "UNLABELLED", "Channels", "Provenance", "Trajectories"]
 
@@ -157,7 +157,7 @@ class Trajectories:
         check_finite("commands", commands)
         check_finite("nominal", nominal)
         observed, mask = measured(observed, self.mask)
-        rate = positive("rate", self.rate, unit="Hz")
+        rate = sample_rate("rate", self.rate)
         n = len(commands)
         labels = named("labels", self.labels, [UNLABELLED] * n)
         ids = named("ids", self.ids, [f"{i:05d}" for i in range(n)])

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retwin.arrays import row_blocks
-from retwin.checks import positive, require, whole
+from retwin.checks import require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.times import stride_of
+from retwin.times import sample_rate, stride_of
 
 __all__ = ["SETTLED", "Features", "class_index", "class_names", "class_order", "random_phase"]
 
@@ -24,6 +24,9 @@ SETTLED = 2
 delay of the response, and one because a value interpolated between two sensor samples depends on
 the earlier one."""
 
+KEPT = 100
+"""Samples of a trajectory that the features keep at least, unless their rate is given: a trajectory
+in some detail, while a network with memory learns in minutes."""
 MAX_STRIDE = 10**6
 """The largest stride that is read from a file, so that its phases fit the memory."""
 
@@ -70,19 +73,23 @@ class Features:
         trajectories : Trajectories
             Their output channels and sample rate are taken.
         rate : float, optional
-            Sample rate of the features in Hz; by default 10 Hz, or that of the trajectories if it
-            is lower.
+            Sample rate of the features in Hz; by default the lowest that keeps a hundred samples
+            of each trajectory.
         hide_start : bool
             See the class.
 
         Raises
         ------
         InputError
-            If the rate of the trajectories is no whole multiple of `rate`.
+            If the rate of the trajectories is no whole multiple of `rate`, or fewer than two
+            samples of them remain.
 
         """
-        lower = min(10.0, trajectories.rate) if rate is None else rate
-        stride = stride_of(trajectories.rate, lower)
+        steps = trajectories.steps
+        if rate is None:
+            stride = min(max(1, steps // KEPT), MAX_STRIDE)
+        else:
+            stride = stride_of(trajectories.rate, rate, steps=steps)
         return cls(trajectories.outputs, trajectories.rate, stride, hide_start)
 
     @classmethod
@@ -90,7 +97,7 @@ class Features:
         """From the plain values that `about` returned; other keys have no effect."""
         return cls(
             Channels.of(values["outputs"]),
-            positive("rate", values["rate"], unit="Hz"),
+            sample_rate("rate", values["rate"]),
             whole("stride", values["stride"], least=1, most=MAX_STRIDE),
             values.get("hide_start", False),
         )

@@ -50,8 +50,8 @@ def fit_diagnoser(
         Class names in the order of the probabilities; by default sorted. `FineTune` keeps those
         of its base.
     rate : float, optional
-        Sample rate of the features in Hz; by default 10 Hz, or the rate of the trajectories if it
-        is lower. `FineTune` keeps that of its base.
+        Sample rate of the features in Hz, such as the true one of the sensor; by default the
+        lowest that keeps a hundred samples of each trajectory. `FineTune` keeps that of its base.
     training : Training, optional
         Epochs, batch size and learning rate; by default those that suit the network. `Rocket` has
         none, since its weights have a closed form.

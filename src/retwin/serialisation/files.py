@@ -102,10 +102,21 @@ def recover(path: str | os.PathLike[str]) -> Path:
 
 
 def check_regular(path: str | os.PathLike[str]) -> Path:
-    """`path`; ValueError for a pipe or a device, from which reading may never end."""
+    """`path`, if what is there can be read into memory at once.
+
+    Raises
+    ------
+    ValueError
+        It is a pipe or a device, from which reading may never end.
+    InputError
+        It is larger than the free memory permits, as a file with holes may be.
+
+    """
     path = Path(path)
     if path.exists() and not path.is_file():
         raise ValueError(f"{path.name} is no regular file")
+    if path.exists():
+        Budget(path.name).take(path.stat().st_size)
     return path
 
 
@@ -121,7 +132,6 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
     """
     path = check_regular(path)
-    Budget(path.name).take(path.stat().st_size)
     return parse_json(path.read_bytes(), path.name)
 
 

@@ -82,7 +82,6 @@ def read_model(folder: str | Path, kind: str) -> tuple[dict[str, Any], dict[str,
         file = check_regular(folder / "weights.safetensors")
         weights = {}
         if file.exists():
-            Budget(str(file)).take(file.stat().st_size)
             weights = load_file(file)
     found = (about.get("schema"), about.get("kind")) if isinstance(about, dict) else (None, None)
     require(

@@ -9,10 +9,11 @@ import numpy as np
 
 from retwin.cases.case import Case
 from retwin.catalog import CALIBRATE_ON, CLASSIFIERS, PRESETS, SOURCES, make, resolve
-from retwin.checks import finite, one_of, positive, require, whole
+from retwin.checks import finite, one_of, require, whole
 from retwin.diagnosis import Rocket
 from retwin.nets.networks import Network
 from retwin.nets.training import Training
+from retwin.times import sample_rate
 from retwin.update.corrected import MAX_PER_CLASS
 
 __all__ = ["PAPER", "QUICK", "Preset", "StudyPlan"]
@@ -117,7 +118,7 @@ class StudyPlan:
         if self.per_class is not None:
             whole("per_class", self.per_class, least=1, most=MAX_PER_CLASS)
         if self.rate is not None:
-            positive("rate", self.rate, unit="Hz")
+            sample_rate("rate", self.rate)
         finite("encoder_noise", self.encoder_noise, least=0.0, unit="command units")
 
     def generated(self, case: Case) -> int:

@@ -24,6 +24,7 @@ from retwin.data.trajectories import Channels, Trajectories
 from retwin.isolation import IsolatedPool, ProcessEnded, isolated_pool
 from retwin.processes import scratch_folder
 from retwin.progress import Progress
+from retwin.times import sample_rate
 from retwin.twins import fmu_worker
 from retwin.twins.faults import Fault
 from retwin.twins.fmu_model import (
@@ -111,7 +112,7 @@ class FMUTwin:
     workers: int = 0
 
     def __post_init__(self) -> None:
-        positive("rate", self.rate, unit="Hz")
+        sample_rate("rate", self.rate)
         positive("timeout", self.timeout, unit="s")
         for name, rate in self.rates.items():
             require(

@@ -15,6 +15,7 @@ import numpy as np
 from retwin.checks import needs_extra, require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError, brief
+from retwin.serialisation.sizes import Budget
 from retwin.twins.limits import Limits
 
 __all__ = [
@@ -120,10 +121,13 @@ def read_description(path: Path) -> Any:
         got = "which is no zip file" if path.is_file() else "which is not there"
         raise refuse("an FMU, a zip file", got, "give the path of a .fmu file")
     try:
-        # Not validated against FMI's schema: many FMUs that run break it in some small way.
-        description = fmpy.read_model_description(path, validate=False)
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
+            Budget(path.name).take(archive.getinfo("modelDescription.xml").file_size)
+        # Not validated against FMI's schema: many FMUs that run break it in some small way.
+        description = fmpy.read_model_description(path, validate=False)
+    except InputError:
+        raise
     except Exception as error:  # FMPy raises nothing more special
         raise refuse(
             "an FMU with a readable modelDescription.xml",
@@ -165,11 +169,15 @@ def extract(path: Path, folder: str) -> None:
     Raises
     ------
     InputError
-        It cannot be unpacked.
+        It cannot be unpacked, or the disk has no room for it.
 
     """
     try:
+        with zipfile.ZipFile(path) as archive:
+            Budget(path.name, disk=folder).take(sum(e.file_size for e in archive.infolist()))
         _fmpy().extract(path, folder)
+    except InputError:
+        raise
     except Exception as error:  # FMPy raises nothing more special
         raise InputError(
             "path",

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pebble import ProcessExpired, ProcessPool
 
-from retwin.checks import positive, require
+from retwin.checks import require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
 from retwin.processes import sendable_errors, worker_pool
 from retwin.progress import Progress
+from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.twin import Chunk, simulate_in_chunks
@@ -99,7 +100,7 @@ class FunctionTwin:
             got="None",
             remedy="give nominal=, the same without noise",
         )
-        positive("rate", self.rate, unit="Hz")
+        sample_rate("rate", self.rate)
         require(
             self.workers >= 1 and (self.workers == 1 or not self.vectorised),
             "workers",

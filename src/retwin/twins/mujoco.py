@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.checks import finite, positive, require, whole
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
+from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.mujoco_model import (
@@ -102,7 +103,7 @@ class MuJoCoTwin:
     threads: int = 0
 
     def __post_init__(self) -> None:
-        positive("rate", self.rate, unit="Hz")
+        sample_rate("rate", self.rate)
         if self.step is not None:
             positive("step", self.step, unit="s")
         finite("settle", self.settle, least=0.0, unit="s", remedy="leave it out")

@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import positive, require
-from retwin.times import to_samples
+from retwin.checks import require
+from retwin.times import sample_rate, to_samples
 from retwin.twins.ramps import draw_onsets, ramps_and_holds
 from retwin.twins.time_step import Timed
 
@@ -356,7 +356,7 @@ class RecordedSampler(Timed):
             got="NaN or infinite ones" if shaped else f"shape {shape}",
             remedy="give Trajectories.commands of a set that has some",
         )
-        longest = shape[1] / positive("rate", self.rate, unit="Hz")
+        longest = shape[1] / sample_rate("rate", self.rate)
         object.__setattr__(self, "duration", float(self.duration or longest))
         self.check_steps()
         require(

@@ -5,8 +5,11 @@ from __future__ import annotations
 from math import inf
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from retwin.checks import positive, require
-from retwin.times import to_samples
+from retwin.serialisation.sizes import Budget
+from retwin.times import sample_rate, to_samples
 
 __all__ = ["Timed", "steps_per_sample"]
 
@@ -36,9 +39,10 @@ def steps_per_sample(rate: float, step: float) -> int:
         A rate or step that is not positive, or a step that does not divide the sample period.
 
     """
-    positive("rate", rate, unit="Hz")
+    sample_rate("rate", rate)
     positive("step", step, unit="s")
-    count = round(1.0 / (rate * step))
+    ratio = 1.0 / rate / step
+    count = round(ratio) if ratio < inf else 0
     require(
         count >= 1 and abs(count * step * rate - 1.0) <= TOLERANCE,
         "step",
@@ -68,8 +72,8 @@ class Timed:
         return to_samples(self.duration, self.rate)
 
     def check_steps(self) -> None:
-        """Raise InputError for a rate that is not positive, and for fewer than two samples."""
-        positive("rate", self.rate, unit="Hz")
+        """Raise InputError for a rate without sense, and for too few samples or too many."""
+        sample_rate("rate", self.rate)
         require(
             0 < self.duration < inf and self.steps >= 2,
             "duration",
@@ -77,3 +81,4 @@ class Timed:
             got=f"{self.duration!r} s",
             remedy="give the duration of a trajectory in seconds",
         )
+        Budget("duration").take(self.steps * np.dtype(float).itemsize)

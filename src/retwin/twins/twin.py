@@ -196,7 +196,9 @@ def checked_stride(
             got=given,
             remedy="load the file with its case, or convert it",
         )
-    return stride_of(trajectories.rate, rate, remedy="give the sensor's true rate")
+    return stride_of(
+        trajectories.rate, rate, steps=trajectories.steps, remedy="give the sensor's true rate"
+    )
 
 
 def checked_seed(seed: int) -> int:

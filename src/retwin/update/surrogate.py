@@ -14,13 +14,14 @@ from torch import Tensor, nn
 
 from retwin.arrays import row_blocks
 from retwin.catalog import NETWORKS, classes
-from retwin.checks import one_per, positive, require
+from retwin.checks import one_per, require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.nets.networks import MLP, Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.times import sample_rate
 from retwin.twins.command_range import CommandRange
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
@@ -190,7 +191,7 @@ class Surrogate(nn.Module):
         """
         about, weights = read_model(folder, "surrogate")
         with refusing(folder, expected="a surrogate model"):
-            positive("rate", about["rate"])
+            sample_rate("rate", about["rate"])
             surrogate = cls(
                 from_config(about["network"], classes(NETWORKS)),
                 inputs=Channels.of(about["inputs"]),
@@ -228,10 +229,11 @@ def fit_surrogate(
     Parameters
     ----------
     twin : Trajectories
-        Commands and nominal outputs of at least ten trajectories; `observed` is not used. A tenth
-        of them is held out for validation and another tenth for the reported error, at most a
-        thousand each. A network without memory is trained on at most 200,000 distinct samples,
-        drawn at random, one with memory on at most ten million.
+        Commands and nominal outputs of at least ten trajectories; `observed` is not used. What
+        follows the last measurement of a trajectory is left out: a simulation that ended early
+        has no outputs there. A tenth of them is held out for validation and another tenth for the
+        reported error, at most a thousand each. A network without memory is trained on at most
+        200,000 distinct samples, drawn at random, one with memory on at most ten million.
     network : Network
         `MLP` (no memory, the default), `LSTM`, `TCN` or `StateSpace`.
     seed : int
@@ -293,7 +295,7 @@ def fit_surrogate(
 
 def _errors(surrogate: Surrogate, twin: Trajectories, test: NDArray) -> dict[str, float]:
     """RMSE and normalised RMSE of each output on the trajectories `test`."""
-    valid = _not_padding(twin, test)
+    valid = _known(twin, test)
     error = (surrogate._predicted(twin.commands[test]) - twin.nominal[test])[valid]
     rmse = np.sqrt(np.square(error, dtype=np.float64).mean(axis=0))
     deviation = twin.nominal[test][valid].std(axis=0, dtype=np.float64)
@@ -305,9 +307,11 @@ def _errors(surrogate: Surrogate, twin: Trajectories, test: NDArray) -> dict[str
     return figures
 
 
-def _not_padding(twin: Trajectories, part: NDArray) -> NDArray:
-    """(len(part), T) bool, the samples within each trajectory's length."""
-    return np.arange(twin.steps) < twin.lengths[part][:, None]
+def _known(twin: Trajectories, part: NDArray) -> NDArray:
+    """(len(part), T) bool, the samples up to the last measurement; all where none was measured."""
+    measured = twin.mask[part].any(axis=2)
+    later = np.logical_or.accumulate(measured[:, ::-1], axis=1)[:, ::-1]
+    return later | ~measured.any(axis=1, keepdims=True)
 
 
 def _samples(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, ...]:
@@ -331,7 +335,7 @@ def _samples(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, ...]
 
 
 def _changes(twin: Trajectories, part: NDArray) -> Iterator[tuple[NDArray, NDArray]]:
-    """Per block of trajectories, their indices and the samples at which the command changes.
+    """Per block of trajectories, their indices and the known samples with another command.
 
     Samples are indexed over all trajectories of the block, in series.
     """
@@ -340,15 +344,16 @@ def _changes(twin: Trajectories, part: NDArray) -> Iterator[tuple[NDArray, NDArr
         some = part[rows]
         commands = twin.commands[some].reshape(-1, twin.commands.shape[2])
         before = np.concatenate([last[None].astype(commands.dtype), commands[:-1]])
-        yield some, np.flatnonzero((commands != before).any(axis=1))
+        changed = (commands != before).any(axis=1)
+        yield some, np.flatnonzero(changed & _known(twin, some).reshape(-1))
         last = commands[-1]
 
 
 def _sequences(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, ...]:
-    """Whole trajectories, at most MAX_SEQUENCE_SAMPLES, and which samples are no padding."""
+    """Whole trajectories, at most MAX_SEQUENCE_SAMPLES, and which samples are known."""
     part = part[: max(1, MAX_SEQUENCE_SAMPLES // twin.steps)]
     return (
         torch.tensor(twin.commands[part], dtype=torch.float32),
         torch.tensor(twin.nominal[part], dtype=torch.float32),
-        torch.as_tensor(_not_padding(twin, part)),
+        torch.as_tensor(_known(twin, part)),
     )

@@ -23,6 +23,7 @@ from retwin.deploy.onnx.export import PARITY, export_onnx
 from retwin.deploy.onnx.graphs import FeaturesGraph, SensorGraph
 from retwin.deploy.onnx.portable import Portable, settled_at
 from retwin.diagnosis.features import SETTLED, Features
+from retwin.serialisation import sizes
 from retwin.update.corrected import CorrectedTwin
 
 Exported = tuple[Path, dict[str, float]]
@@ -316,6 +317,29 @@ def test_a_forged_graph_is_refused(
     forged = Portable.load(folder)
     with pytest.raises(rt.InputError, match=rf"{name}\.onnx.*retwin bundle export"):
         forged.predict(emulated[:3])
+
+
+def test_a_graph_that_expands_is_refused(
+    exported: Exported, emulated: rt.Trajectories, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A few bytes on the disk that are 1.2 GB when the graph runs."""
+    monkeypatch.setattr(sizes, "memory", lambda: (2**30, 2**30))
+    folder = Path(shutil.copytree(exported[0], tmp_path / "copy"))
+    assert Portable.load(folder).predict(emulated[:3])
+    model = onnx.load(folder / "surrogate.onnx")
+    graph, name = model.graph, model.graph.output[0].name
+    graph.initializer.append(onnx.numpy_helper.from_array(np.array([3 * 10**8]), "size"))
+    for operator, given, made in (
+        ("ConstantOfShape", ["size"], "large"),
+        ("ReduceMax", ["large"], "zero"),
+        ("Add", [name, "zero"], "sum"),
+    ):
+        graph.node.append(onnx.helper.make_node(operator, given, [made]))
+    graph.output[0].name = "sum"
+    onnx.save(model, folder / "surrogate.onnx")
+    seal(folder)
+    with pytest.raises(rt.InputError, match=r"surrogate\.onnx.*memory"):
+        Portable.load(folder).predict(emulated[:3])
 
 
 @pytest.mark.parametrize("name", ["energy", "mismatch", "floor", "spread"])

@@ -11,13 +11,14 @@ import os
 from pathlib import Path
 
 from retwin.catalog import FORMATS, FormatEntry, resolve
-from retwin.checks import positive, require
+from retwin.checks import require
 from retwin.data.io.assembly import DataCase, settle
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.files import recover, write_atomically
 from retwin.serialisation.places import check_place
+from retwin.times import sample_rate
 
 __all__ = ["DataCase", "check_target", "load", "save"]
 
@@ -68,7 +69,7 @@ def load(
     """
     path = recover(path)
     if rate is not None:
-        rate = positive("rate", rate, unit="Hz")
+        rate = sample_rate("rate", rate)
     require(
         os.path.exists(path),
         "path",

@@ -109,7 +109,8 @@ def _in_order(path: Path, pattern: str) -> list[Path]:
 def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget) -> Raw:
     with file.open("rb") as blocks:
         for part in iter(lambda: blocks.read(BYTES_PER_BLOCK), b""):
-            budget.take(BYTES_PER_NUMBER * (1 + part.count(b",") + part.count(b"\n")))
+            numbers = 1 + part.count(b",") + part.count(b"\n")
+            budget.take(max(BYTES_PER_NUMBER * numbers, len(part)))  # a line may be a whole file
     try:
         with file.open(encoding="utf-8-sig") as lines, warnings.catch_warnings():
             warnings.simplefilter("error")  # numpy only warns when there is no row at all

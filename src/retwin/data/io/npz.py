@@ -19,6 +19,8 @@ from retwin.serialisation.sizes import Budget
 
 __all__ = ["read_npz", "write_npz"]
 
+BYTES_PER_BLOCK, BYTES_PER_ENTRY = 2**20, 1024
+"""Bytes of a file that are read together to count its entries, and the memory that one takes."""
 DATE = (1980, 1, 1, 0, 0, 0)
 """The date of each entry of the ZIP file, its earliest: the time of writing is not in the bytes."""
 
@@ -48,6 +50,10 @@ def read_npz(path: Path, *, max_bytes: int | None = None, **_: Any) -> Trajector
         schema.
 
     """
+    budget = Budget(path.name, max_bytes)
+    with path.open("rb") as blocks:  # zipfile reads the list of all entries when it opens a file
+        for part in iter(lambda: blocks.read(BYTES_PER_BLOCK), b""):
+            budget.take(BYTES_PER_ENTRY * part.count(b"PK\1\2"))
     expected = "a readable NPZ file without pickled objects"
     with (
         refusing(path.name, expected=expected, remedy="get or make the file again"),
@@ -61,7 +67,6 @@ def read_npz(path: Path, *, max_bytes: int | None = None, **_: Any) -> Trajector
             got="an NPZ file without",
             remedy="give a file that `retwin data convert` wrote",
         )
-        budget = Budget(path.name, max_bytes)
         header = parse_json(_array(archive, "header", budget).tobytes(), path.name)
         check_header(header, path.name)
         arrays = {name: _array(archive, name, budget) for name in NAMES}

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from retwin.checks import positive, whole
+from retwin.checks import whole
 from retwin.serialisation.configs import from_config, to_config
+from retwin.times import sample_rate
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.samplers import RampSampler
 
@@ -56,7 +57,7 @@ class Facts:
         remedy = "take it from the case"
         whole("facts.steps", self.steps, least=2, remedy=remedy)
         whole("facts.max_segments", self.max_segments, most=self.steps, remedy=remedy)
-        positive("facts.sensor_rate", self.sensor_rate, unit="Hz", remedy=remedy)
+        sample_rate("facts.sensor_rate", self.sensor_rate, remedy=remedy)
 
     @property
     def classes(self) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import needs_extra, positive, require, whole
+from retwin.checks import needs_extra, require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.deploy.bundle.facts import Facts
@@ -26,6 +26,8 @@ from retwin.deploy.bundle.verdicts import (
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.files import refusing
+from retwin.serialisation.sizes import Budget
+from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, checked_seed, simulate_in_chunks
 
@@ -37,7 +39,7 @@ __all__ = ["Portable", "padded_times", "settled_at"]
 GRAPHS = ("surrogate", "residual", "correction", "guard")
 """Names of the graphs that every export has."""
 EXPECTED = "a graph that retwin bundle export wrote"
-REMEDY = "make it anew with retwin bundle export"
+REMEDY = "make it anew with retwin bundle export, or give it less at once if memory is short"
 
 
 @dataclass(frozen=True)
@@ -159,11 +161,11 @@ class Portable:
 
         """
         runtime = needs_extra("onnxruntime", "onnx", "runs the graphs")
-        options = runtime.SessionOptions()
+        options = _bounded(runtime)
         options.intra_op_num_threads = threads
         options.log_severity_level = 4  # errors are raised, and need not be printed too
         with open_sealed(folder, "portable") as about:
-            facts = Facts.of(about, positive("rate", about["rate"], unit="Hz"))
+            facts = Facts.of(about, sample_rate("rate", about["rate"]))
             sensor, classifier = about["sensor"], about["diagnoser"]
             sensor = None if sensor is None else Sensor.of(sensor, facts.steps)
             classifier = None if classifier is None else Classifier.of(classifier, facts.steps)
@@ -180,7 +182,7 @@ class Portable:
                 facts=facts,
                 inputs=Channels.of(about["inputs"]),
                 outputs=Channels.of(about["outputs"]),
-                rate=positive("rate", about["rate"], unit="Hz"),
+                rate=sample_rate("rate", about["rate"]),
                 domain=Domain.of(about["domain"]),
                 stride=whole("stride", about["stride"], least=1, most=facts.steps),
                 sensor=sensor,
@@ -373,6 +375,18 @@ class Graph:
     def width(self, name: str) -> int:
         """Size of the last axis of an input."""
         return int(self.inputs[name][-1])
+
+
+def _bounded(runtime: Any) -> Any:
+    """Options of sessions that take a share of the free memory in all: a graph may expand."""
+    kind = runtime.OrtAllocatorType.ORT_ARENA_ALLOCATOR
+    memory = runtime.OrtMemoryInfo("Cpu", kind, 0, runtime.OrtMemType.DEFAULT)
+    # The other settings of an arena are the defaults. A further call replaces it for new sessions.
+    arena = runtime.OrtArenaCfg(Budget("graphs").left, -1, -1, -1)
+    runtime.create_and_register_allocator(memory, arena)
+    options = runtime.SessionOptions()
+    options.add_session_config_entry("session.use_env_allocators", "1")
+    return options
 
 
 def _outputs(trajectories: Trajectories) -> dict[str, NDArray]:
