@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -22,6 +23,14 @@ def pytest_runtest_makereport(item: pytest.Item):
     if report.skipped and os.environ.get("RETWIN_DATA") and item.get_closest_marker("real_data"):
         report.outcome = "failed"
         report.longrepr = "skipped although RETWIN_DATA is set"
+
+
+@pytest.fixture(autouse=True)
+def threads() -> Iterator[None]:
+    """No test changes the number of torch's threads: later ones would be many times slower."""
+    before = torch.get_num_threads()
+    yield
+    assert torch.get_num_threads() == before
 
 
 # A surrogate that is good to a millimetre takes a second; the default one is tried in one test.

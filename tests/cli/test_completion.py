@@ -14,20 +14,6 @@ from retwin import cases, catalog
 PROGRAM = Path(sys.executable).with_name("retwin")
 
 
-def completed(*typed: str, folder: Path, **environment: str) -> list[str]:
-    """What bash would offer for the last of these words."""
-    variables = {
-        **os.environ,
-        "_RETWIN_COMPLETE": "complete_bash",
-        "COMP_WORDS": " ".join(("retwin", *typed)),
-        "COMP_CWORD": str(len(typed)),
-        **environment,
-    }
-    done = subprocess.run([PROGRAM], env=variables, cwd=folder, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-    return done.stdout.split()
-
-
 @pytest.mark.parametrize("name", catalog.CASES)
 def test_the_recorded_case_of_the_catalog_is_that_of_the_case(name: str) -> None:
     case, recorded = cases.get(name), cases.data_case(name)
@@ -61,9 +47,20 @@ def test_the_recorded_case_of_the_catalog_is_that_of_the_case(name: str) -> None
     ],
     ids=" ".join,
 )
-def test_what_bash_offers(typed: tuple[str, ...], offered: list[str], tmp_path: Path) -> None:
+def test_what_bash_offers(
+    typed: tuple[str, ...],
+    offered: list[str],
+    call,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     (tmp_path / "mine.toml").write_text("[faults]\nleak = { kind = 'Stuck' }\n")
-    assert completed(*typed, folder=tmp_path) == offered
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("_RETWIN_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", " ".join(("retwin", *typed)))
+    monkeypatch.setenv("COMP_CWORD", str(len(typed)))
+    code, out, err = call()
+    assert (code, out.split(), err) == (0, offered, "")
 
 
 def test_a_shell_with_what_was_installed(tmp_path: Path) -> None:

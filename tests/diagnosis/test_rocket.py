@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ import retwin as rt
 from retwin.diagnosis import RocketDiagnoser
 from retwin.testing import check_diagnoser
 
-pytest.importorskip("numba")
-pytest.importorskip("sktime")
+# Not imported, which takes seconds in every worker.
+pytestmark = pytest.mark.skipif(
+    not (find_spec("numba") and find_spec("sktime")), reason="needs retwin[rocket]"
+)
 
 SMALL = rt.Rocket(504)
 

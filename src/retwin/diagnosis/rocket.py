@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import log_softmax, softmax
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from retwin.checks import needs_extra, require, whole
@@ -116,8 +117,7 @@ class Rocket:
         fitted_on, held_out = trajectories.split(0.8, seed=seed)
         before = Standardise(features.width)
         learnt = before.fit(features(fitted_on))(features(fitted_on))
-        transform = _minirocket(self.kernels, seed)
-        transform.fit(_channels(learnt))
+        transform = _minirocket(self.kernels, seed, _channels(learnt))
         convolved = _convolved(transform, learnt)
         if progress is not None:
             progress(0.4)
@@ -185,8 +185,8 @@ class RocketDiagnoser:
     @cached_property
     def _transform(self) -> Any:
         """Fitted to zeros of the right shape, then given its stored parameters."""
-        transform = _minirocket(len(self.weights["biases"]), seed=0)
-        transform.fit(_channels(torch.zeros(1, self.samples, self.features.width)))
+        zeros = torch.zeros(1, self.samples, self.features.width)
+        transform = _minirocket(len(self.weights["biases"]), 0, _channels(zeros))
         transform.parameters = tuple(self.weights[name].numpy() for name in PARAMETERS)
         return transform
 
@@ -283,11 +283,16 @@ def _channels(standard: Tensor) -> NDArray:
 
 def _convolved(transform: Any, standard: Tensor) -> NDArray:
     """The share of samples (n, kernels) at which each convolution is above its bias."""
-    return transform.transform(_channels(standard)).to_numpy().astype(np.float64)
+    # When numba starts its threads, it raises the number of torch's to that of the cores.
+    with threadpool_limits(limits=1):
+        return transform.transform(_channels(standard)).to_numpy().astype(np.float64)
 
 
-def _minirocket(kernels: int, seed: int) -> Any:
+def _minirocket(kernels: int, seed: int, channels: NDArray) -> Any:
+    """The transform, fitted to channels (n, 3 d_y, T')."""
     needs_extra("numba", "rocket", "compiles the kernels of MiniRocket")
     sktime = needs_extra("sktime.transformations.rocket", "rocket", "provides MiniRocket")
     # sktime takes seeds of 31 bits.
-    return sktime.MiniRocketMultivariate(num_kernels=kernels, random_state=seed % 2**31)
+    transform = sktime.MiniRocketMultivariate(num_kernels=kernels, random_state=seed % 2**31)
+    with threadpool_limits(limits=1):
+        return transform.fit(channels)

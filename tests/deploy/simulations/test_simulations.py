@@ -125,16 +125,16 @@ def test_commands_that_are_given_are_taken_in_turn(tmp_path: Path) -> None:
     given = SAMPLER.sample(10, rng=np.random.default_rng(0))
     twin = Toy()
     recorded = twin.simulate(given, seed=0)
-    for commands, suffix in ((given, ".zarr"), (recorded, ".npz")):
+    for commands, suffix, options in ((given, ".zarr", {"workers": 1}), (recorded, ".npz", {})):
         file = tmp_path / f"a{suffix}"
-        simulate_to(file, plan(commands=commands, n=25, faults={"Healthy": None}))
+        simulate_to(file, plan(commands=commands, n=25, faults={"Healthy": None}), **options)
         np.testing.assert_array_equal(rt.load(file).commands, given[np.arange(25) % 10])
     assert plan(commands=given, n=None).count == 10
 
 
 def test_npz_and_zarr_hold_the_same(tmp_path: Path) -> None:
-    for name in ("a.zarr", "a.npz"):
-        simulate_to(tmp_path / name, plan(twin=Toy(fails_above=60.0)))
+    for name, options in (("a.zarr", {"workers": 1}), ("a.npz", {})):
+        simulate_to(tmp_path / name, plan(twin=Toy(fails_above=60.0)), **options)
     one, other = (rt.load(tmp_path / name) for name in ("a.zarr", "a.npz"))
     for name in ("commands", "nominal", "observed", "mask", "labels", "ids"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
@@ -155,7 +155,7 @@ class Timed(Toy):
 
 
 def test_a_twin_with_onsets_hands_them_to_the_sampler(tmp_path: Path) -> None:
-    simulate_to(tmp_path / "a.zarr", plan(twin=Timed(), n=9))
+    simulate_to(tmp_path / "a.zarr", plan(twin=Timed(), n=9), workers=1)
     starts = rt.Segments.from_commands(rt.load(tmp_path / "a.zarr").commands).start
     np.testing.assert_allclose(starts, [[4, 17]] * 9, atol=1e-2)
 
@@ -306,9 +306,9 @@ def test_killed_at_the_end(
     with monkeypatch.context() as patch:
         patch.setattr(f"retwin.deploy.simulations.job.{step}", killed)
         with pytest.raises(KeyboardInterrupt):
-            simulate_to(tmp_path / "a.zarr", whole["plan"])
+            simulate_to(tmp_path / "a.zarr", whole["plan"], workers=1)
     before = calls(whole["calls"])
-    simulate_to(tmp_path / "a.zarr", whole["plan"])
+    simulate_to(tmp_path / "a.zarr", whole["plan"], workers=1)
     assert calls(whole["calls"]) == before
     assert sha256(tmp_path / "a.zarr") == whole["sha256"]
     assert os.listdir(tmp_path) == ["a.zarr"]
@@ -491,11 +491,11 @@ def test_commands_of_another_twin_are_refused() -> None:
 
 def test_clipping_is_asked_for(tmp_path: Path) -> None:
     beyond = np.full((3, 30, 2), 101.0)
-    simulate_to(tmp_path / "a.zarr", plan(commands=beyond, clip=True))
+    simulate_to(tmp_path / "a.zarr", plan(commands=beyond, clip=True), workers=1)
     assert rt.load(tmp_path / "a.zarr").commands.max() == 100.0
     wide = replace(SAMPLER, high=(200.0, 200.0))
     with pytest.raises(rt.InputError, match="from 0 to 100 V"):
-        simulate_to(tmp_path / "b.zarr", plan(commands=wide))
+        simulate_to(tmp_path / "b.zarr", plan(commands=wide), workers=1)
     assert os.listdir(tmp_path) == ["a.zarr"], "nothing is left half-written"
 
 
