@@ -127,9 +127,12 @@ def model(*, friction: float = 0.0, load: str = "", step: float = 0.01) -> str:
 
 def write_case(folder: Path) -> Path:
     """The files that the user has of the arm, and the name of the case."""
+    faults = {
+        "stuck": f'kind = "Stuck", onset = {ONSET}',
+        "bias": 'kind = "ActuatorBias", size = [0.15, 0.3]',
+    }
     lines = [
-        f'{label} = {{ kind = "{"Stuck" if kind == "stuck" else "ActuatorBias"}", '
-        f'actuator = "{JOINTS[k]}", {f"onset = {ONSET}" if kind == "stuck" else "size = [0.15, 0.3]"} }}'
+        f'{label} = {{ {faults[kind]}, actuator = "{JOINTS[k]}" }}'
         for label, (kind, k) in FAULTS.items()
     ]
     settings = {"rate": RATE, "duration": DURATION, "segments": SEGMENTS}
@@ -140,7 +143,7 @@ def write_case(folder: Path) -> Path:
     return folder / "six.toml"
 
 
-# --- the recorded arm, which the user does not see into --------------------------------------------
+# --- the recorded arm, which the user does not see into ------------------------------------------
 
 
 def record(count: int, label: str, seed: int) -> list[tuple[NDArray, NDArray]]:

@@ -41,12 +41,12 @@ def retwin(folder: Path, line: str, *, code: int = 0) -> Ended:
     """`retwin -q LINE` in that folder, which ends with that code."""
     out, err = io.StringIO(), io.StringIO()
     words = ["retwin", "-q", *line.split()]
-    with chdir(folder), redirect_stdout(out), redirect_stderr(err):
-        with mock.patch.object(sys, "argv", words), mock.patch.dict("os.environ", COLUMNS="200"):
-            try:
-                main()
-            except SystemExit as end:
-                found = int(end.code or 0)
+    given = mock.patch.object(sys, "argv", words), mock.patch.dict("os.environ", COLUMNS="200")
+    with chdir(folder), redirect_stdout(out), redirect_stderr(err), given[0], given[1]:
+        try:
+            main()
+        except SystemExit as end:
+            found = int(end.code or 0)
     ended = Ended(found, out.getvalue(), err.getvalue())
     assert ended.code == code, f"retwin {line}: {ended}"
     return ended
