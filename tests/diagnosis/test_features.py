@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.diagnosis.features import Features
+from retwin.diagnosis.features import Features, class_order
 
 
 def ramp(count: int, onset: int, length: int, steps: int = 400) -> rt.Trajectories:
@@ -84,3 +84,9 @@ def test_hiding_the_start_needs_commands() -> None:
     assert Features.at(without, 10.0)(without).shape == (2, 40, 2)
     with pytest.raises(rt.InputError, match=r"trajectories\.commands: .*recover them"):
         Features.at(without, 10.0, hide_start=True)(without)
+
+
+def test_one_class_is_refused_in_plain_words() -> None:
+    given = ramp(2, onset=40, length=80).replace(labels=np.array(["Healthy"] * 2))
+    with pytest.raises(rt.InputError, match=r"got labels \['Healthy'\]"):
+        class_order(given, ("Healthy", "Stuck"))

@@ -1,9 +1,11 @@
 """Odd arguments, and the real command line on each; run as a script.
 
 `python arguments.py SAMPLES WORK` gives every number of every command an odd value, and every name
-that a command writes to a place that cannot be written. It prints a line for every requirement that
-was not met: what is refused is refused with code 2, in one line, before any work, and leaves
-nothing. Everything is imported once; each case runs in a forked process of its own.
+that a command writes to a place that cannot be written. `python arguments.py SAMPLES WORK FIRST
+COUNT` mutates the words of all commands instead, with the seeds FIRST to FIRST + COUNT - 1. Both
+print a line for every requirement that was not met: what is refused is refused with code 2, in one
+line, before any work, and leaves nothing. Everything is imported once; each case runs in a forked
+process of its own.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import typer
 from mutation import broken, call, files_in
 
@@ -43,6 +46,13 @@ POSSIBLE = {
 """Options for which an odd number may be accepted."""
 LONG_WORK = ("bench", "data fetch", "demo", "diagnose fit", "fit", "study")
 """Commands that work for a long time, or download, on what they accept; it is not tried."""
+NOT_RUN = ("bench", "bundle export", "data fetch", "demo", "doctor", "study")
+"""Commands of which only the reading of words is tried with mutated ones: they work for a long
+time, or need a network."""
+ODD_WORDS = ("", "-", "--", "-1", "nan", HUGE, "x" * 300, "none", "..", "set", "study", "--seed")
+"""Words that replace one of a command."""
+CHARACTERS = "\x01\x1b $%*:=,.0-[\\é\u202e\udcff"
+"""Characters that replace one of a word; the last one is a byte that is no UTF-8."""
 NO_PLACE = ("/", "/proc/none", "reach.toml/none", LONG, f"none/{LONG}", "study", "")
 """Names at which nothing can be written: the last but one is the folder of another study."""
 
@@ -135,6 +145,61 @@ def cases() -> Iterator[tuple[str, list[str], bool]]:
                 yield name, words({place.name: odd}), False
 
 
+def mutated(words: list[str], options: Sequence[str], rng: np.random.Generator) -> list[str]:
+    """The words of a command, with one to three mutations of what follows its name."""
+    for _ in range(rng.integers(1, 4)):
+        at = int(rng.integers(len(words) + 1))
+        word = words[at % len(words)] if words else "x"
+        odd = (*ODD_WORDS, *options)[rng.integers(len(ODD_WORDS) + len(options))]
+        new = [
+            [],
+            [word, word],
+            [odd],
+            [odd, word],
+            [word[: len(word) // 2]],
+            [flipped(word, rng)],
+        ][rng.integers(6)]
+        words = [*words[:at], *new, *words[at + 1 :]]
+    return words
+
+
+def flipped(word: str, rng: np.random.Generator) -> str:
+    """The word with another character in one place."""
+    at = int(rng.integers(max(len(word), 1)))
+    return word[:at] + CHARACTERS[rng.integers(len(CHARACTERS))] + word[at + 1 :]
+
+
+def run_mutated(samples: Path, work: Path, first: int, count: int) -> Iterator[str]:
+    """Every requirement that mutated words of a command make it break."""
+    folder, output = work / "folder", work / "stderr"
+    shutil.copytree(samples, folder)
+    before = files_in(folder)
+    commands = dict(leaves(typer.main.get_command(app)))
+    names = sorted(commands)
+    for seed in range(first, first + count):
+        name = names[seed % len(names)]
+        options = [opt for each in commands[name].params for opt in each.opts if is_option(each)]
+        rest = mutated(sound(name, commands[name]), options, np.random.default_rng(seed))
+        words = [*name.split(), *(["--none-such"] if name in NOT_RUN else []), *rest]
+        ended = call(folder, words, output)
+        problem = broken(ended, before, ended.files - before)
+        if problem:
+            yield f"{seed}: retwin {' '.join(words)[:200]}: {problem}"
+        if ended.code == 0 or ended.files != before:
+            shutil.rmtree(folder)
+            shutil.copytree(samples, folder)
+
+
+def sound(name: str, command: Any) -> list[str]:
+    """Words with which a command works, without its name."""
+    made = BASE.get(name, "").split()
+    for each in command.params:
+        if is_target(each) and each.required:
+            value = f"new-{each.name}{suffix(name, each)}"
+            made += [each.opts[-1], value] if is_option(each) else [value]
+    return made
+
+
 def run(samples: Path, work: Path, chosen: Sequence[str]) -> Iterator[str]:
     """Every requirement that an odd argument of a command makes it break."""
     folder, output = work / "folder", work / "stderr"
@@ -144,9 +209,7 @@ def run(samples: Path, work: Path, chosen: Sequence[str]) -> Iterator[str]:
         if name not in chosen:
             continue
         ended = call(folder, words, output)
-        # torch keeps a cache in the folder of temporary files, which is this one here.
-        new = ("new-", "torchinductor_")
-        made = frozenset(name for name in ended.files if name.startswith(new))
+        made = frozenset(name for name in ended.files if name.startswith("new-"))
         problem = broken(ended, before, made)
         if not problem and ended.code == 0 and not possible:
             problem = "is accepted"
@@ -158,6 +221,8 @@ def run(samples: Path, work: Path, chosen: Sequence[str]) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    samples, work, *names = sys.argv[1:]
-    for failure in run(Path(samples), Path(work), names or list(BASE)):
+    samples, work, *rest = sys.argv[1:]
+    places = Path(samples), Path(work)
+    numbers = [int(each) for each in rest if each.isdigit()]
+    for failure in run_mutated(*places, *numbers) if numbers else run(*places, rest or list(BASE)):
         print(failure, flush=True)

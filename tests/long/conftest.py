@@ -26,7 +26,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("samples")
     for name in mutation.NAMES:
         (root / name).mkdir()
-    for name in ("case", "model"):
+    for name in ("case", "model", "npz", "csv", "bundle"):
         (root / name / "own_of_mutations.py").write_text(mutation.MODULE)
         (root / name / "case.toml").write_text(mutation.CASE)
     with pytest.MonkeyPatch.context() as patch:

@@ -80,14 +80,34 @@ class Format:
 
 SEALED = ("bundle verify sealed", "bundle predict sealed real.npz")
 FORMATS = {
-    "npz": Format("a.npz", ("data info a.npz",)),
-    "zarr": Format("a.zarr", ("data info a.zarr",)),
-    "mat": Format("a.mat", ("data info a.mat --rate 10",)),
-    "csv": Format("set", ("data info set --rate 10",)),
-    "case": Format("case.toml", ("twin info case.toml",)),
-    "model": Format("model", ("generate model --case case.toml --per-class 1 --out made.npz",)),
+    "npz": Format(
+        "a.npz",
+        (
+            "data info a.npz",
+            "data convert a.npz made.npz",
+            "data split a.npz --out-first made.npz --out-second other.npz",
+            "twin simulate case.toml --commands a.npz --out made.npz",
+        ),
+    ),
+    "zarr": Format("a.zarr", ("data info a.zarr", "data convert a.zarr made.npz")),
+    "mat": Format("a.mat", ("data info a.mat --rate 10", "data convert a.mat made.npz --rate 10")),
+    "csv": Format("set", ("data info set --rate 10", "data convert set made.npz --case case.toml")),
+    "case": Format(
+        "case.toml", ("twin info case.toml", "twin simulate case.toml --n 2 --out made.npz")
+    ),
+    "model": Format(
+        "model",
+        (
+            "generate model --case case.toml --per-class 1 --out made.npz",
+            "twin info model",
+            "twin simulate model --case case.toml --n 2 --out made.npz",
+        ),
+    ),
     "diagnoser": Format("cnn", ("diagnose predict cnn real.npz",)),
-    "bundle": Format("sealed", SEALED),
+    "bundle": Format(
+        "sealed",
+        (*SEALED, "bundle generate sealed --case case.toml --per-class 1 --out made.npz"),
+    ),
     "onnx": Format("sealed", SEALED),
     "results": Format("study/results.json", ("report study",)),
 }
@@ -222,7 +242,9 @@ def mapped() -> int:
 
 
 def files_in(folder: Path) -> frozenset[str]:
-    return frozenset(str(each.relative_to(folder)) for each in folder.rglob("*"))
+    """Names of all files, but for the cache that torch keeps where temporary files are."""
+    names = (str(each.relative_to(folder)) for each in folder.rglob("*"))
+    return frozenset(name for name in names if not name.startswith("torchinductor_"))
 
 
 def call(

@@ -37,3 +37,19 @@ def test_odd_arguments(together: Path, tmp_path: Path) -> None:
     assert len(list(arguments.cases())) >= 300
     (tmp_path / "work").mkdir()
     assert mutation.printed(arguments.__file__, together, tmp_path / "work") == []
+
+
+def mutated(together: Path, work: Path, first: int, count: int) -> list[str]:
+    """A line for each mutated list of words with which a requirement is not met."""
+    work.mkdir()
+    return mutation.printed(arguments.__file__, together, work, first, count)
+
+
+@pytest.mark.slow
+def test_some_mutated_words(together: Path, tmp_path: Path) -> None:
+    assert mutated(together, tmp_path / "work", 0, 150) == []
+
+
+@pytest.mark.long
+def test_mutated_words(together: Path, tmp_path: Path) -> None:
+    assert mutated(together, tmp_path / "work", 150, 2000) == []

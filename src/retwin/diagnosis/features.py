@@ -233,7 +233,7 @@ def class_order(
         expected=f"labelled trajectories of at least two of the classes {', '.join(order)}",
         got=f"unknown {sorted(unknown)}"
         if unknown
-        else f"labels {sorted(set(trajectories.labels))}",
+        else f"labels {sorted(set(trajectories.labels.tolist()))}",
         remedy="label every trajectory with a known class",
     )
     return order

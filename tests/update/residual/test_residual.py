@@ -278,6 +278,18 @@ def test_nothing_to_calibrate_on_is_refused(ibg: rt.Surrogate, emulated: rt.Traj
         rt.fit_residual(ibg, still, seed=0)
 
 
+@pytest.mark.parametrize("value", [3.4e38, 1e19, -1e12])
+def test_a_sentinel_is_refused_by_name(
+    value: float, ibg: rt.Surrogate, emulated: rt.Trajectories
+) -> None:
+    few = emulated.with_label("Healthy")[:3]
+    observed = few.observed.copy()
+    observed[1, 40, 2] = value
+    match = rf"calibration.observed: .*{few.outputs.names[2]} in {few.ids[1]}.*by NaN"
+    with pytest.raises(rt.InputError, match=match):
+        rt.fit_residual(ibg, few.replace(observed=observed), seed=0)
+
+
 def test_saved_and_loaded_is_the_same(
     rg: rt.ResidualModel, ibg: rt.Surrogate, emulated: rt.Trajectories, tmp_path: Path
 ) -> None:

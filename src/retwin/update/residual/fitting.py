@@ -50,6 +50,9 @@ SMALLEST = 1e-12
 """Smallest value taken for the largest |z*|: a millionth of it still has a square in float32."""
 BOUND_MARGIN = 1.25
 """Default bound b of Eq. 9, over the largest |z*|."""
+MAX_RATIO, MAX_VALUE = 1e6, 1e18
+"""Largest measurement, over the largest ideal output and in any case: float32 has seven digits, and
+the squares of larger numbers are infinite."""
 
 
 @checked_once
@@ -273,7 +276,24 @@ def _context(
 
 
 def _measured(trajectories: Trajectories) -> tuple[Tensor, Tensor]:
-    """Measured outputs and their mask, (n, T, d_y) each."""
+    """Measured outputs and their mask, (n, T, d_y) each.
+
+    Raises InputError for a value that no sensor gives, beside which the others would be lost.
+    """
+    scale = np.abs(trajectories.nominal).max(axis=(0, 1)).astype(float)
+    limit = np.where(scale > 0, MAX_RATIO * scale, np.inf).clip(max=MAX_VALUE)
+    i, _, k = np.argwhere(np.abs(trajectories.observed) > limit)[:1].T
+    require(
+        not len(i),
+        "calibration.observed",
+        expected=f"measurements below {MAX_RATIO:g} times the largest ideal output",
+        got=", ".join(
+            f"{np.abs(trajectories.observed[each, :, at]).max():.3g} of "
+            f"{trajectories.outputs.names[at]} in {trajectories.ids[each]}"
+            for each, at in zip(i, k, strict=True)
+        ),
+        remedy="replace the values that stand for a missing measurement by NaN",
+    )
     return torch.tensor(trajectories.observed), torch.tensor(trajectories.mask)
 
 
