@@ -99,9 +99,11 @@ def fit_segments(
         fits.append(replace(refit, reason=reason))
     # Events are too few to show whether they persist.
     model.persistence.copy_(persistence.masked_fill(model.events, 0.0))
-    # What held-out z need are deviations; those of the refitted model may be larger already. Of
-    # very few trajectories, deviations of the folds' models are chance: errors are then a bound.
-    needed = torch.minimum(spread * _deviation(unseen), _errors(unseen, model.scale))
+    # What held-out z need are deviations; those of the refitted model may be larger already.
+    needed = spread * _deviation(unseen)
+    if len(rows) == 1:
+        # Deviations that were learned from half a trajectory are chance: the errors are a bound.
+        needed = torch.minimum(needed, _errors(unseen, model.scale))
     ratio = needed / _deviation([(model, part) for _, part in unseen])
     factor = ratio.clamp_min(1.0) * _student(targets, persistence)
     model.spread.copy_(torch.where(model.events, 1.0, factor))
