@@ -22,7 +22,7 @@ TOLERANCE = 0.02
 """How far a value may leave its range, as a share of the range's width."""
 BAND_SHARE = 0.999
 """Share of the power of all trajectories together that lies within the band."""
-SPEED_TOLERANCE = 0.1
+SPEED_TOLERANCE = 0.25
 """Share by which a speed may exceed the greatest one, which is the largest of few random ones."""
 POWER_TOLERANCE = 0.01
 """Share of a trajectory's power that may lie above the band beyond what such trajectories have:

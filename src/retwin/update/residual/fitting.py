@@ -48,6 +48,8 @@ R = TypeVar("R", bound=Residual)
 
 SMALLEST = 1e-12
 """Smallest value taken for the largest |z*|: a millionth of it still has a square in float32."""
+LARGEST_SHARE = 0.5
+"""Share of the mean square of the residual above which the surrogate's error is warned of."""
 BOUND_MARGIN = 1.25
 """Default bound b of Eq. 9, over the largest |z*|."""
 MAX_RATIO, MAX_VALUE = 1e6, 1e18
@@ -203,6 +205,8 @@ def fit_residual(
     )
     with training_checked(surrogate, used.commands) as outside:
         context = _context(surrogate, used, parts, faults, twin)
+        if twin is not None:
+            _warn_of_error(context, used)
         correction, found = fit_correction(correction, context, *_measured(used))
     require(
         found.identified.any(),
@@ -242,6 +246,26 @@ def fit_residual(
     model.timing = np.where(onsets.valid, onsets.start, np.nan)
     model.fitted = replace(result, figures=figures | result.figures)
     return _noted(model.eval(), outside)
+
+
+def _warn_of_error(context: Context, used: Trajectories) -> None:
+    """Warn where the surrogate's own error is most of what outputs differ by."""
+    if context.surrogate_variance is None:
+        return
+    valid = torch.as_tensor(context.segments.valid)
+    error = context.surrogate_variance[valid].mean(dim=0).numpy()
+    difference = np.where(used.mask, used.observed - context.path.numpy(), np.nan)
+    share = error / np.nanmean(np.square(difference, dtype=np.float64), axis=(0, 1))
+    worst = int(np.nanargmax(share)) if np.isfinite(share).any() else 0
+    if share[worst] > LARGEST_SHARE:
+        warnings.warn(
+            f"surrogate: its own error is {np.sqrt(error[worst]):.3g} "
+            f"{used.outputs.units[worst]} in {used.outputs.names[worst]} on these commands, "
+            f"{share[worst]:.0%} of the mean square by which measured outputs differ from it; "
+            "little can be inferred. Train it for longer or on other commands (fit_surrogate), or "
+            "use the twin in its place",
+            stacklevel=3,
+        )
 
 
 def _noted(model: R, outside: str) -> R:
