@@ -66,7 +66,7 @@ def arm(folder: Path, runs: int) -> Rows:
 
 def oscillator(folder: Path, runs: int) -> Rows:
     """Simulations of eight test records."""
-    duffing.write_case(folder)
+    duffing.write_case(folder, tests=8)
     duffing.write_record(folder / "record.csv", 1)
     line = "duffing.toml --data record.csv --per-class 100"
     return studied(folder, line, runs, ("nrmse", "crps", "coverage90"))

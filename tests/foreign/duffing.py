@@ -12,8 +12,8 @@ import numpy as np
 
 RATE, RESONANCE = 610, 68.0
 NOISE = 0.002
-ROWS, TESTS = 8000, 8
-"""Rows of the table, of which the second half is the test records."""
+ROWS, LENGTH = 8000, 500
+"""Rows of the table, of which the second half is for tests, and rows of a test record."""
 
 MODULE = '''"""x'' + 2 d w x' + w^2 (x + b x^3) = w^2 u, by Runge-Kutta steps."""
 
@@ -59,7 +59,7 @@ x = {{ unit = "mm" }}
 [commands]
 kind = "MultisineSampler"
 duration = 0.5
-band = [2, {highest}]
+band = [2, 120]
 deviation = [0.2]
 
 [parameters]
@@ -81,18 +81,16 @@ test = [
 """
 
 
-def write_case(folder: Path, *, highest: float = 120.0, name: str = "duffing") -> Path:
-    """The files that the user has, with commands up to a frequency; the name of the case."""
+def write_case(folder: Path, *, tests: int = 4) -> None:
+    """The files that the user has, with so many test records."""
     (folder / "duffing_twin.py").write_text(MODULE)
-    file = folder / f"{name}.toml"
-    length = (ROWS - 4000) // TESTS
-    tests = (
-        f'    {{ columns = {{ force = "F", x = "X" }}, rows = [{first}, {first + length}], '
+    rows = (
+        f'    {{ columns = {{ force = "F", x = "X" }}, rows = [{first}, {first + LENGTH}], '
         "transient = 0.2 },"
-        for first in range(4000, ROWS, length)
+        for first in range(4000, 4000 + tests * LENGTH, LENGTH)
     )
-    file.write_text(CASE.format(rate=RATE, highest=highest, tests="\n".join(tests)))
-    return file
+    text = CASE.format(rate=RATE, tests="\n".join(rows))
+    (folder / "duffing.toml").write_text(text)
 
 
 def write_record(file: Path, seed: int) -> None:
