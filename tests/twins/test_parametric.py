@@ -143,6 +143,9 @@ def test_bad_parameters_are_named() -> None:
         "start": lambda: Parameter("x", "1", 0.0, 1.0, 3.0),
         "no name twice": lambda: ParametricTwin(GAIN.twin, (one, one)),
         "at least one": lambda: GAIN.holding("gain"),
+        "simulate takes values of its parameters, got FunctionTwin": lambda: ParametricTwin(
+            rt.FunctionTwin(np.copy, GAIN.inputs, GAIN.inputs, 10.0), (one,)
+        ),
         "some of gain": lambda: GAIN.simulate(RAMP, seed=0, parameters={"mass": 1.0}),
         "one for all, or one per trajectory, 3": lambda: GAIN.simulate(
             RAMP, seed=0, parameters={"gain": [1.0, 2.0]}

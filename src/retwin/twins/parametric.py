@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from inspect import signature
 from typing import Any, Protocol
 
 import numpy as np
@@ -152,6 +153,14 @@ class ParametricTwin(TwinWrapper):
     held: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        accepted = signature(self.twin.simulate).parameters.values()
+        require(
+            any(each.name == "parameters" or each.kind == each.VAR_KEYWORD for each in accepted),
+            "twin",
+            expected="one whose simulate takes values of its parameters",
+            got=type(self.twin).__name__,
+            remedy="give ParametricTwin.built a function from values by name to a twin",
+        )
         names = [each.name for each in self.parameters]
         require(
             names and len(set(names)) == len(names),

@@ -32,6 +32,22 @@ def test_known_parameters_are_found_within_their_errors(method) -> None:
     assert updated.objective == pytest.approx(np.linalg.norm(residual))
 
 
+@pytest.mark.parametrize("unit", [1e-12, 1e-9, 1e9])
+def test_the_unit_of_the_outputs_does_not_matter(unit: float) -> None:
+    found = {}
+    for each in (1.0, unit):
+        twin = parametric(lag, gain=(0.1 * each, 5.0 * each), share=(0.1, 0.98))
+        observed = measured(twin, 0.05 * each, seed=1, gain=GAIN * each, share=SHARE)
+        updated = identify(twin, observed, seed=0, method=LeastSquares(starts=2))
+        assert updated.identifiability.identified.all()
+        found[each] = [
+            number * scale
+            for name, scale in (("gain", 1 / each), ("share", 1.0))
+            for number in (updated.values[name], *updated.intervals[name])
+        ]
+    assert found[unit] == pytest.approx(found[1.0], rel=1e-5)
+
+
 def test_standard_errors_are_those_of_the_linear_model() -> None:
     observed = measured(LINE, 0.2, seed=2, a=1.0, b=-0.5)
     updated = identify(LINE, observed, seed=0, method=LeastSquares(2, "linear"))

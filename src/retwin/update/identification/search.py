@@ -240,23 +240,29 @@ class Search:
 
     def descend(self, start: NDArray) -> OptimizeResult:
         """The local optimum from a start."""
+        unit = self.misfit.spread or 1.0  # scipy compares the gradient with a constant
 
         # The derivative is computed at the point of the last residuals.
         @lru_cache(maxsize=1)
         def residuals(point: tuple[float, ...]) -> NDArray:
             return self.residuals(np.array([point]))[0]
 
-        return least_squares(
-            lambda point: residuals(tuple(point)),
+        def jacobian(point: NDArray) -> NDArray:
+            return self.jacobian(point, sides=1, residual=residuals(tuple(point))) / unit
+
+        found = least_squares(
+            lambda point: residuals(tuple(point)) / unit,
             start,
-            lambda point: self.jacobian(point, sides=1, residual=residuals(tuple(point))),
+            jacobian,
             bounds=(0.0, 1.0),
             ftol=TOLERANCE,
             xtol=TOLERANCE,
             loss=self.loss,
-            f_scale=self.scale,
+            f_scale=self.scale / unit,
             max_nfev=getattr(self.method, "evaluations", POLISH),
         )
+        found.fun, found.cost = found.fun * unit, found.cost * unit**2
+        return found
 
     def linearised(self, residual: NDArray) -> tuple[float, NDArray, float]:
         """The sum of losses, equivalent residuals for least squares, and the mean curvature.
