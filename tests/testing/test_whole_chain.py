@@ -268,7 +268,11 @@ PADDED = {
 }
 
 
-@pytest.fixture(params=PADDED)
+# The toy "polled" infers in the commands too.
+SLOW = {"command space": pytest.mark.slow}
+
+
+@pytest.fixture(params=[pytest.param(name, marks=SLOW.get(name, ())) for name in PADDED])
 def short(request: pytest.FixtureRequest) -> Toy:
     return PADDED[request.param]
 
