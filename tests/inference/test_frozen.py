@@ -154,8 +154,10 @@ def test_hypotheses_have_the_same_optimum(exact, case: rt.Case, value, noise) ->
     assert worse[some].max() < NATS
     away = distance(found.x, value("inversion_x"), value("inversion_variance"))
     assert away[some].max() < DEVIATIONS
+    # The limits of biases, which the search for missed segments respects, came later.
+    evidence = found.evidence + rows.prior.excess(found.x).sum(dim=1)
     torch.testing.assert_close(
-        found.evidence[some], value("inversion_plain_evidence")[some], rtol=0, atol=5e-3
+        evidence[some], value("inversion_plain_evidence")[some], rtol=0, atol=5e-3
     )
 
 

@@ -117,7 +117,7 @@ class Toy:
 
     @cached_property
     def surrogate(self) -> rt.Surrogate:
-        count = max(12, 4000 // self.steps)
+        count = max(40, 4000 // self.steps)
         made = self.case.twin.simulate(self.commands(count, 1), seed=0)
         epochs = max(30, 300_000 // (count * self.steps))
         brisk = Training(max_epochs=epochs, batch_size=512, learning_rate=2e-2, decay="cosine")

@@ -124,7 +124,9 @@ def invert(rows: Hypotheses, noise: Noise) -> Inversion:
     onsets = Onsets.of(rows, noise)
     held = rows.held(onsets.best)
     found = best_fit(held.problem, held.prior, noise, held.start, held.trajectory)
-    fit, evidence = found.fit, found.evidence
+    fit = found.fit
+    # What is beyond the limits of a bias counted in the search; `biases` integrates over them.
+    evidence = found.evidence + held.prior.excess(fit.x).sum(dim=1)
     bias, gain = biases(held, fit, COVERAGE)
     level, deviation = stuck_level(held, fit, onsets.best, noise)
     return Inversion(evidence + onsets.gain + gain, level, deviation, onsets, bias, fit)

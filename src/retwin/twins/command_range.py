@@ -30,6 +30,9 @@ a tenth of the amplitude."""
 SMALLEST_POWER = 1e-4
 """Power, relative to the mean of all trajectories, below which a trajectory hardly varies: a
 hundredth of the amplitude. Its spectrum is that of rounding."""
+CHANCE = 3.0
+"""A further draw of n leaves their range by more than 3 / n of its width in one of twenty cases at
+most: 1 - 0.05 ** (1 / n), for uniform values."""
 LEAKAGE = 2.0
 """Half the width of a sine's peak in the spectrum of a Hann window, in frequency steps."""
 MAX_SPECTRA = 1000
@@ -54,6 +57,8 @@ class CommandRange:
         Mean power of a trajectory, in the unit squared.
     resolution : float
         Frequency step of the spectra in Hz: one over the duration of a trajectory.
+    count : int
+        Trajectories: others like a few of these leave their range by chance; 0 for a given range.
 
     """
 
@@ -64,6 +69,7 @@ class CommandRange:
     share: tuple[float, ...]
     power: tuple[float, ...]
     resolution: float
+    count: int
 
     def __post_init__(self) -> None:
         for name in ARRAYS:
@@ -81,20 +87,29 @@ class CommandRange:
         band, power, resolution = frequency[index], below[-1], float(frequency[1])
         share = _above(frequency, spectra, band + LEAKAGE * resolution, power).max(axis=0)
         numbers = dict(zip(ARRAYS, (low, high, change, band, share, power), strict=True))
-        return cls(**{k: _floats(v) for k, v in numbers.items()}, resolution=resolution)
+        return cls(
+            **{k: _floats(v) for k, v in numbers.items()},
+            resolution=resolution,
+            count=len(commands),
+        )
 
     @classmethod
     def around(cls, mean: NDArray, deviation: NDArray, *, deviations: float) -> CommandRange:
         """The values within so many standard deviations (d_u,), without a limit of the speed."""
         free = (inf,) * len(mean)
         low, high = mean - deviations * deviation, mean + deviations * deviation
-        return cls(_floats(low), _floats(high), free, free, free, free, 0.0)
+        return cls(_floats(low), _floats(high), free, free, free, free, 0.0, 0)
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> CommandRange:
         """The range from the values of `dataclasses.asdict`, with JSON lists."""
         parts = {name: _floats(np.atleast_1d(values[name])) for name in ARRAYS}
-        return cls(**parts, resolution=float(values["resolution"]))
+        return cls(**parts, resolution=float(values["resolution"]), count=int(values["count"]))
+
+    @property
+    def chance(self) -> float:
+        """Share by which others like these trajectories may leave their range by chance."""
+        return min(1.0, CHANCE / self.count) if self.count else 0.0
 
     def scores(self, commands: NDArray, rate: float) -> NDArray:
         """How far commands (n, T, d_u) leave the range in value, speed and spectrum, (n, 3, d_u).
@@ -105,12 +120,14 @@ class CommandRange:
         found = np.zeros((len(commands), 3, len(low)))
         for rows in row_blocks(commands):
             values = np.asarray(commands[rows], np.float64)
-            found[rows, 0] = excess(values, low, high)
-            limit = (1 + SPEED_TOLERANCE) * np.where(speed > 0, speed, inf)
+            found[rows, 0] = excess(values, low, high) * TOLERANCE / (TOLERANCE + self.chance)
+            # Both the distance and the duration of a motion are drawn.
+            tolerance = (1 + SPEED_TOLERANCE) * (1 + 2 * self.chance)
+            limit = tolerance * np.where(speed > 0, speed, inf)
             found[rows, 1] = rate * _steps(values) / limit
         if np.isfinite(self.band).all():
             found[_chosen(len(commands)), 2] = self.shares(commands, rate) / (
-                np.array(self.share) + POWER_TOLERANCE
+                (1 + self.chance) * np.array(self.share) + POWER_TOLERANCE
             )
         return found
 
