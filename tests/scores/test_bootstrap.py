@@ -111,6 +111,12 @@ def test_runs_alone_give_student_s_test() -> None:
         assert drawn.interval == pytest.approx((ends.low, ends.high), abs=0.004)
 
 
+def test_a_difference_of_shares_stays_within_its_range() -> None:
+    values = [0.7, 1.0, 1.0, 1.0, 0.9]
+    drawn = Draws(*np.full((2, 1000), np.mean(values))).with_runs(values, seed=0, largest=1.0)
+    assert drawn.interval[1] == 1.0
+
+
 def test_undefined_draws_have_no_interval() -> None:
     nothing = Resampling(np.array([1, 1]), ("Healthy", "a"), 10, 0)
     found = nothing.of("healthy_recall", np.eye(2)[[[1, 1]]])

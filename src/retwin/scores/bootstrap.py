@@ -43,7 +43,7 @@ class Draws:
         """The draws of a difference; both must come from the same resampling, so are paired."""
         return Draws(self.low - other.high, self.high - other.low)
 
-    def with_runs(self, values: Sequence[float], *, seed: int) -> Draws:
+    def with_runs(self, values: Sequence[float], *, seed: int, largest: float = np.inf) -> Draws:
         """The same with the randomness of training.
 
         Parameters
@@ -52,6 +52,8 @@ class Draws:
             The value of each run, two at least: independent of each other.
         seed : int
             Seed of the draws.
+        largest : float
+            The largest absolute value that is possible: 1 for a difference of shares.
 
         Notes
         -----
@@ -63,7 +65,7 @@ class Draws:
         runs = np.asarray(values)
         error = runs.std(ddof=1) / np.sqrt(len(runs))
         drawn = error * np.random.default_rng(seed).standard_t(len(runs) - 1, size=len(self.low))
-        return Draws(self.low + drawn, self.high + drawn)
+        return Draws(*((each + drawn).clip(-largest, largest) for each in (self.low, self.high)))
 
     @property
     def interval(self) -> tuple[float, float] | None:

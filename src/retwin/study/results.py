@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.catalog import SOURCES
+from retwin.catalog import METRICS, SOURCES
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.fidelity import Fidelity, Overlay
 from retwin.results import SCHEMA, CurvePoint, Results, SourceResults
@@ -209,7 +209,9 @@ def _comparisons(
             ours, theirs = sources[a].runs(metric), sources[b].runs(metric)
             if runs >= MIN_RUNS:
                 seed = work.plan.seed_of("bootstrap", 1)
-                each = each.with_runs(np.subtract(ours, theirs).tolist(), seed=seed)
+                largest = np.inf if METRICS[metric].simulated else 1.0
+                difference = np.subtract(ours, theirs).tolist()
+                each = each.with_runs(difference, seed=seed, largest=largest)
             if each.interval is not None:
                 rows.append(
                     {
