@@ -62,7 +62,8 @@ def test_the_steps_one_by_one(call, files: Path, tmp_path: Path) -> None:
         90,
     )
     first = printed["trajectories"][0]
-    assert first.keys() == {"id", "diagnosis", "probability", "probabilities", "label"}
+    keys = {"id", "diagnosis", "probability", "probabilities", "label", "commands"}
+    assert first.keys() == keys
     assert first["probability"] == max(first["probabilities"].values())
     assert list(first["probabilities"]) == list(rt.cases.armpi().classes)
     code, out, err = call(

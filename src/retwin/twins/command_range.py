@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import inf
 from typing import Any
@@ -81,11 +81,14 @@ class CommandRange:
         blocks = (np.asarray(commands[rows], np.float64) for rows in row_blocks(commands))
         ends = [(-b.min(axis=(0, 1)), b.max(axis=(0, 1)), _steps(b).max(axis=0)) for b in blocks]
         low, high, change = np.max(ends, axis=0) * np.array([[-1.0], [1.0], [rate]])
-        frequency, spectra = power_spectra(commands, rate)
-        below = spectra.mean(axis=0).cumsum(axis=0)
+        mean = np.add.reduce([each.sum(axis=0) for each in _blocks(commands, rate)])
+        frequency = _frequencies(commands, rate)
+        below = mean.cumsum(axis=0) / len(_chosen(len(commands)))
         index = (below < BAND_SHARE * below[-1]).sum(axis=0)
         band, power, resolution = frequency[index], below[-1], float(frequency[1])
-        share = _above(frequency, spectra, band + LEAKAGE * resolution, power).max(axis=0)
+        limit = band + LEAKAGE * resolution
+        above = [_above(frequency, each, limit, power) for each in _blocks(commands, rate)]
+        share = np.concatenate(above).max(axis=0)
         numbers = dict(zip(ARRAYS, (low, high, change, band, share, power), strict=True))
         return cls(
             **{k: _floats(v) for k, v in numbers.items()},
@@ -133,9 +136,11 @@ class CommandRange:
 
     def shares(self, commands: NDArray, rate: float) -> NDArray:
         """Share of the power of each trajectory's commands that lies above the band, (n, d_u)."""
-        frequency, spectra = power_spectra(commands, rate)
-        margin = LEAKAGE * max(self.resolution, float(frequency[1]))
-        return _above(frequency, spectra, np.array(self.band) + margin, np.array(self.power))
+        frequency = _frequencies(commands, rate)
+        limit = np.array(self.band) + LEAKAGE * max(self.resolution, float(frequency[1]))
+        power = np.array(self.power)
+        above = [_above(frequency, each, limit, power) for each in _blocks(commands, rate)]
+        return np.concatenate(above)
 
     def outside(self, commands: NDArray, rate: float, inputs: Channels) -> str:
         """What of the commands is outside the range, by channel, in words; "" if nothing is."""
@@ -191,11 +196,22 @@ def power_spectra(commands: NDArray, rate: float) -> tuple[NDArray, NDArray]:
 
     The window is Hann's. Of more than a thousand trajectories that many are taken.
     """
-    values = np.asarray(commands[_chosen(len(commands))], np.float32)
-    window = windows.hann(values.shape[1] + 2)[1:-1, None].astype(np.float32)
-    values = (values - values.mean(axis=1, keepdims=True)) * window
-    spectrum = np.abs(fft.rfft(values, axis=1)) ** 2 * (2 / len(window) / np.sum(window**2))
-    return fft.rfftfreq(len(window), 1 / rate), spectrum
+    return _frequencies(commands, rate), np.concatenate(list(_blocks(commands, rate)))
+
+
+def _frequencies(commands: NDArray, rate: float) -> NDArray:
+    return fft.rfftfreq(commands.shape[1], 1 / rate)
+
+
+def _blocks(commands: NDArray, rate: float) -> Iterator[NDArray]:
+    """The power spectra (n, F, d_u) of the chosen trajectories, block by block."""
+    chosen = _chosen(len(commands))
+    window = windows.hann(commands.shape[1] + 2)[1:-1, None].astype(np.float32)
+    scale = 2 / len(window) / np.sum(window**2)
+    for rows in row_blocks(commands, len(chosen)):
+        values = np.asarray(commands[chosen[rows]], np.float32)
+        values = (values - values.mean(axis=1, keepdims=True)) * window
+        yield np.abs(fft.rfft(values, axis=1)) ** 2 * scale
 
 
 def _above(frequency: NDArray, spectra: NDArray, limit: NDArray, power: NDArray) -> NDArray:
