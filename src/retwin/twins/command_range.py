@@ -121,9 +121,11 @@ class CommandRange:
         """
         low, high, speed = (np.array(each) for each in (self.low, self.high, self.speed))
         found = np.zeros((len(commands), 3, len(low)))
+        # A constant command is not drawn.
+        tolerated = np.where(high > low, TOLERANCE / (TOLERANCE + self.chance), 1.0)
         for rows in row_blocks(commands):
             values = np.asarray(commands[rows], np.float64)
-            found[rows, 0] = excess(values, low, high) * TOLERANCE / (TOLERANCE + self.chance)
+            found[rows, 0] = excess(values, low, high) * tolerated
             # Both the distance and the duration of a motion are drawn.
             tolerance = (1 + SPEED_TOLERANCE) * (1 + 2 * self.chance)
             limit = tolerance * np.where(speed > 0, speed, inf)
