@@ -115,6 +115,7 @@ def offset_distribution(
     return distribution.blocks[1]
 
 
+@pytest.mark.slow
 def test_a_bimodal_heteroscedastic_distribution_is_recovered(
     fitted: dict[int, rt.ResidualModel], identity: rt.Surrogate
 ) -> None:
