@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ __all__ = [
     "check_finite",
     "check_shapes",
     "floating",
+    "floats",
     "interpolated",
     "measured",
     "named",
@@ -55,6 +56,11 @@ def floating(name: str, array: ArrayLike) -> NDArray:
         remedy="stack the trajectories into one three-dimensional array",
     )
     return array
+
+
+def floats(values: Iterable[float]) -> tuple[float, ...]:
+    """Numbers of any type as Python's, which JSON files hold and dataclasses compare."""
+    return tuple(float(each) for each in values)
 
 
 def check_shapes(commands: NDArray, nominal: NDArray, observed: NDArray) -> None:

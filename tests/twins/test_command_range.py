@@ -69,3 +69,24 @@ def test_rounding_and_constants_are_no_frequencies(trained: CommandRange) -> Non
     still = CommandRange.of(np.ones((3, 50, 2)), RATE)
     assert still.outside(np.ones((2, 50, 2)), RATE, INPUTS) == ""
     assert "a is 1.1" in still.outside(np.full((2, 50, 2), 1.1), RATE, INPUTS)
+
+
+def test_a_constant_channel_has_no_tolerance_in_its_unit() -> None:
+    """Of 10 mV, in V, 19 mV is nearly twice as much."""
+    still = CommandRange.of(np.full((3, 50, 2), 0.01), RATE)
+    assert "a is 0.019" in still.outside(np.full((2, 50, 2), 0.019), RATE, INPUTS)
+    assert still.outside(np.full((2, 50, 2), np.float32(0.01)), RATE, INPUTS) == "", "rounding"
+    zero = CommandRange.of(np.zeros((3, 50, 2)), RATE)
+    assert "b is -1e-06" in zero.outside(np.full((2, 50, 2), -1e-6), RATE, INPUTS)
+    assert zero.outside(np.zeros((2, 50, 2)), RATE, INPUTS) == ""
+
+
+def test_a_single_sample_has_a_range() -> None:
+    points = CommandRange.of(np.linspace(0, 1, 40).reshape(20, 1, 2), RATE)
+    assert points.outside(np.full((1, 1, 2), 0.5), RATE, INPUTS) == ""
+    assert "a is 2" in points.outside(np.full((1, 1, 2), 2.0), RATE, INPUTS)
+
+
+def test_a_single_sample_is_compared_with_trajectories(trained: CommandRange) -> None:
+    assert trained.outside(np.full((1, 1, 2), 0.5), RATE, INPUTS) == ""
+    assert "a is 2" in trained.outside(np.full((1, 1, 2), 2.0), RATE, INPUTS)

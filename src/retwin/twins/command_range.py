@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.signal import windows
 
-from retwin.arrays import row_blocks
+from retwin.arrays import floats, row_blocks
 from retwin.checks import one_per
 from retwin.data.trajectories import Channels
 
@@ -30,6 +30,8 @@ a tenth of the amplitude."""
 SMALLEST_POWER = 1e-4
 """Power, relative to the mean of all trajectories, below which a trajectory hardly varies: a
 hundredth of the amplitude. Its spectrum is that of rounding."""
+ROUNDING = 1e-6
+"""Relative difference of equal values at most: that of numbers in single precision."""
 CHANCE = 3.0
 """A further draw of n leaves their range by more than 3 / n of its width in one of twenty cases at
 most: 1 - 0.05 ** (1 / n), for uniform values."""
@@ -85,13 +87,13 @@ class CommandRange:
         frequency = _frequencies(commands, rate)
         below = mean.cumsum(axis=0) / len(_chosen(len(commands)))
         index = (below < BAND_SHARE * below[-1]).sum(axis=0)
-        band, power, resolution = frequency[index], below[-1], float(frequency[1])
+        band, power, resolution = frequency[index], below[-1], rate / commands.shape[1]
         limit = band + LEAKAGE * resolution
         above = [_above(frequency, each, limit, power) for each in _blocks(commands, rate)]
         share = np.concatenate(above).max(axis=0)
         numbers = dict(zip(ARRAYS, (low, high, change, band, share, power), strict=True))
         return cls(
-            **{k: _floats(v) for k, v in numbers.items()},
+            **{k: floats(v) for k, v in numbers.items()},
             resolution=resolution,
             count=len(commands),
         )
@@ -101,12 +103,12 @@ class CommandRange:
         """The values within so many standard deviations (d_u,), without a limit of the speed."""
         free = (inf,) * len(mean)
         low, high = mean - deviations * deviation, mean + deviations * deviation
-        return cls(_floats(low), _floats(high), free, free, free, free, 0.0, 0)
+        return cls(floats(low), floats(high), free, free, free, free, 0.0, 0)
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> CommandRange:
         """The range from the values of `dataclasses.asdict`, with JSON lists."""
-        parts = {name: _floats(np.atleast_1d(values[name])) for name in ARRAYS}
+        parts = {name: floats(np.atleast_1d(values[name])) for name in ARRAYS}
         return cls(**parts, resolution=float(values["resolution"]), count=int(values["count"]))
 
     @property
@@ -121,11 +123,14 @@ class CommandRange:
         """
         low, high, speed = (np.array(each) for each in (self.low, self.high, self.speed))
         found = np.zeros((len(commands), 3, len(low)))
-        # A constant command is not drawn.
-        tolerated = np.where(high > low, TOLERANCE / (TOLERANCE + self.chance), 1.0)
+        still = high <= low
+        tolerated = TOLERANCE / (TOLERANCE + self.chance)
         for rows in row_blocks(commands):
             values = np.asarray(commands[rows], np.float64)
-            found[rows, 0] = excess(values, low, high) * tolerated
+            # The training of a constant channel does not contain any other value.
+            changed = np.abs(values - low).max(axis=1) > ROUNDING * np.abs(low)
+            other = np.where(changed, inf, 0.0)
+            found[rows, 0] = np.where(still, other, excess(values, low, high) * tolerated)
             # Both the distance and the duration of a motion are drawn.
             tolerance = (1 + SPEED_TOLERANCE) * (1 + 2 * self.chance)
             limit = tolerance * np.where(speed > 0, speed, inf)
@@ -139,7 +144,7 @@ class CommandRange:
     def shares(self, commands: NDArray, rate: float) -> NDArray:
         """Share of the power of each trajectory's commands that lies above the band, (n, d_u)."""
         frequency = _frequencies(commands, rate)
-        limit = np.array(self.band) + LEAKAGE * max(self.resolution, float(frequency[1]))
+        limit = np.array(self.band) + LEAKAGE * max(self.resolution, rate / commands.shape[1])
         power = np.array(self.power)
         above = [_above(frequency, each, limit, power) for each in _blocks(commands, rate)]
         return np.concatenate(above)
@@ -232,7 +237,3 @@ def _steps(values: NDArray) -> NDArray:
     """Greatest change (n, d_u) of values (n, T, d_u) from one sample to the next."""
     found: NDArray = np.abs(np.diff(values, axis=1)).max(axis=1, initial=0.0)
     return found
-
-
-def _floats(values: NDArray) -> tuple[float, ...]:
-    return tuple(float(each) for each in values)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.arrays import floats
 from retwin.data.segments import Segments
 from retwin.twins.command_range import CommandRange, power_spectra
 from retwin.twins.limits import Limits
@@ -73,15 +74,15 @@ def sampler_from(
     mean = np.clip(values.mean(axis=(0, 1)), low, high)
     deviation = (1 + MARGIN) * values.std(axis=(0, 1))
     return MultisineSampler(
-        _floats(low),
-        _floats(high),
+        floats(low),
+        floats(high),
         rate,
         steps / rate,
         (lowest, max(highest, lowest)),
         corner=corner,
         weak=min(max(weak, LEAST_WEAK), 1.0),
-        mean=_floats(mean),
-        deviation=_floats(deviation),
+        mean=floats(mean),
+        deviation=floats(deviation),
     )
 
 
@@ -114,15 +115,11 @@ def _ramps(
     ramps = np.clip(ramps.round(), 1, steps // count)
     start = np.clip(np.median(values[:, 0], axis=0), low, high)
     return RampSampler(
-        _floats(low),
-        _floats(high),
+        floats(low),
+        floats(high),
         rate,
         steps / rate,
         count,
-        ramp_durations=_floats(np.unique(ramps) / rate),
-        start=_floats(start),
+        ramp_durations=floats(np.unique(ramps) / rate),
+        start=floats(start),
     )
-
-
-def _floats(values: NDArray) -> tuple[float, ...]:
-    return tuple(float(each) for each in values)

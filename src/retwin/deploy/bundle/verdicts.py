@@ -5,13 +5,14 @@ Only numpy is needed, so that the ONNX export uses the same checks as the bundle
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.arrays import floats
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
@@ -203,7 +204,7 @@ class Domain:
     def of(cls, values: Mapping[str, Any]) -> Domain:
         """The domain from the values of `dataclasses.asdict`, with JSON lists or tuples."""
         return cls(
-            **{name: _floats(values[name]) for name in (*COMMANDS, *OUTPUTS)},
+            **{name: floats(values[name]) for name in (*COMMANDS, *OUTPUTS)},
             mismatch=float(values["mismatch"]),
             energy=float(values["energy"]),
         )
@@ -218,12 +219,12 @@ class Domain:
             [getattr(each, end)(axis=(0, 1)) for each in measured] for end in ("min", "max")
         )
         return cls(
-            low=_floats(np.min([each.commands.min(axis=(0, 1)) for each in sets], axis=0)),
-            high=_floats(np.max([each.commands.max(axis=(0, 1)) for each in sets], axis=0)),
-            speed=_floats(np.max([each.max(axis=(0, 1)) for each in speeds], axis=0)),
-            floor=_floats(np.ma.min(floors, axis=0).filled(0.0)),
-            ceiling=_floats(np.ma.max(ceilings, axis=0).filled(0.0)),
-            spread=_floats(_nonzero(spread)),
+            low=floats(np.min([each.commands.min(axis=(0, 1)) for each in sets], axis=0)),
+            high=floats(np.max([each.commands.max(axis=(0, 1)) for each in sets], axis=0)),
+            speed=floats(np.max([each.max(axis=(0, 1)) for each in speeds], axis=0)),
+            floor=floats(np.ma.min(floors, axis=0).filled(0.0)),
+            ceiling=floats(np.ma.max(ceilings, axis=0).filled(0.0)),
+            spread=floats(_nonzero(spread)),
         )
 
     def differences(self, nominal: NDArray, predicted: NDArray) -> NDArray:
@@ -360,7 +361,3 @@ def _excess(values: NDArray, low: Any, high: Any, mask: NDArray | None = None) -
 def _nonzero(sizes: NDArray) -> NDArray:
     """The sizes, 1 for a channel that never varies."""
     return np.where(sizes > 0, sizes, 1.0)
-
-
-def _floats(values: Iterable[float]) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
