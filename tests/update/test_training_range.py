@@ -14,7 +14,7 @@ import pytest
 import retwin as rt
 from retwin.evaluation.fidelity import predictive_overlay
 from retwin.nets.training import Training
-from retwin.twins import RampSampler
+from retwin.twins import NoisyTwin, RampSampler
 from retwin.update import OutsideTrainingWarning
 
 CHANNELS = rt.Channels(("u", "v"), ("deg", "1")), rt.Channels(("x", "y"), ("m", "m"))
@@ -120,3 +120,9 @@ def test_faster_commands_and_an_exact_twin(surrogate: rt.Surrogate) -> None:
     with pytest.warns(OutsideTrainingWarning, match="changes by"):
         surrogate.predict(commands(3)[:, ::3])
     rt.infer_discrepancy(TWIN, measured(2.0), rt.DelayOffset())
+
+
+def test_a_surrogate_within_another_twin_checks_its_commands(surrogate: rt.Surrogate) -> None:
+    noisy = NoisyTwin(surrogate, np.array([0.001, 0.001]))
+    with pytest.warns(OutsideTrainingWarning, match="of the surrogate: u is"):
+        rt.measure_fidelity(noisy, measured(106 / 80), draws=20, seed=0)

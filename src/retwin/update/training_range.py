@@ -34,7 +34,8 @@ def training_checked(surrogate: Any, commands: NDArray) -> Iterator[str]:
     Parameters
     ----------
     surrogate : Surrogate
-        Another object, such as a twin in its place, has no training and is not checked.
+        Another object, such as a twin in its place, has no training and is not checked; a surrogate
+        that it contains checks the commands itself.
     commands : NDArray
         (n, T, d_u), at the surrogate's rate.
 
@@ -49,10 +50,11 @@ def training_checked(surrogate: Any, commands: NDArray) -> Iterator[str]:
         A command is outside, see `CommandRange`; the channel, the value, the range and the remedy.
 
     """
-    found = ""
     trained = getattr(surrogate, "trained", None)
-    if isinstance(trained, CommandRange) and len(commands) and not _CHECKED.get():
-        found = trained.outside(commands, surrogate.rate, surrogate.inputs)
+    if _CHECKED.get() or not isinstance(trained, CommandRange) or not len(commands):
+        yield ""
+        return
+    found = trained.outside(commands, surrogate.rate, surrogate.inputs)
     if found:
         warnings.warn(
             f"commands outside the training range of the surrogate: {found}; its outputs there are "
