@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import torch
 import retwin as rt
 from retwin.data.segments import Segments
 from retwin.nets.training import Training
-from retwin.twins import RampSampler
+from retwin.twins import RampSampler, TwinWrapper
 from retwin.update import OutsideTrainingWarning
 from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.surrogate_error import surrogate_variance
@@ -109,7 +110,9 @@ def test_the_error_is_that_on_the_commands(surrogate: rt.Surrogate) -> None:
     held_out = surrogate_variance(surrogate, None, sent, segments)
     np.testing.assert_allclose(held_out[2, 1].sqrt(), [figures["rmse_x"], figures["rmse_y"]])
     limited = rt.FunctionTwin(tip, *CHANNELS, rate=20.0, limits=rt.twins.Limits((0, 0), (1, 1)))
-    torch.testing.assert_close(surrogate_variance(surrogate, limited, sent, segments), held_out)
+    with pytest.warns(UserWarning, match="twin: it does not simulate these commands"):
+        without = surrogate_variance(surrogate, limited, sent, segments)
+    torch.testing.assert_close(without, held_out)
     assert surrogate_variance(TWIN, TWIN, sent, segments) is None, "an exact twin has no error"
 
 
@@ -130,3 +133,38 @@ def test_offsets_of_outputs_and_diagnoses_are_less_certain_too(
     certain = rt.diagnosis.InversionDiagnoser(surrogate, residual, faults, noise=diagnoser.noise)
     wide, narrow = (each.diagnose(near[:2]).bias for each in (back, certain))
     assert np.nanmean(wide.high - wide.low) > np.nanmean(narrow.high - narrow.low)
+
+
+def test_an_output_that_is_never_measured_is_refused_in_words(surrogate: rt.Surrogate) -> None:
+    near, _ = measured(0.95)
+    mask = near.mask.copy()
+    mask[..., 1] = False
+    half = near.replace(mask=mask)
+    with pytest.raises(rt.InputError, match="at which all outputs are measured"):
+        rt.fit_residual(surrogate, half, rt.CommandSpace(), seed=0, twin=TWIN)
+
+
+class Ending(TwinWrapper):
+    """The twin, whose simulations end after `stop` samples, before other numbers."""
+
+    def __init__(self, stop: int) -> None:
+        self.twin, self.stop = TWIN, stop
+
+    def simulate(self, *given: Any, **options: Any) -> rt.Trajectories:
+        made = self.twin.simulate(*given, **options)
+        mask = np.ones(made.nominal.shape, dtype=bool)
+        mask[:, self.stop :] = False
+        nominal = np.where(mask, made.nominal, np.float32(1e4))
+        return made.replace(nominal=nominal, observed=nominal, mask=mask)
+
+
+def test_after_the_end_of_a_simulation_the_error_is_that_of_held_out_ones(
+    surrogate: rt.Surrogate,
+) -> None:
+    sent = commands(3, 1.0, 2)
+    segments = Segments.from_commands(sent)
+    found = surrogate_variance(surrogate, Ending(int(segments.start[0, 2]) + 5), sent, segments)
+    exact = surrogate_variance(surrogate, TWIN, sent, segments)
+    torch.testing.assert_close(found[0, :2], exact[0, :2])
+    assert (found[0, 2] < 1e3).all()
+    torch.testing.assert_close(found[0, 3], surrogate.held_out_variance)

@@ -295,7 +295,7 @@ def fit_surrogate(
 
 def _errors(surrogate: Surrogate, twin: Trajectories, test: NDArray) -> dict[str, float]:
     """RMSE and normalised RMSE of each output on the trajectories `test`."""
-    valid = _known(twin, test)
+    valid = known_samples(twin, test)
     error = (surrogate._predicted(twin.commands[test]) - twin.nominal[test])[valid]
     rmse = np.sqrt(np.square(error, dtype=np.float64).mean(axis=0))
     deviation = twin.nominal[test][valid].std(axis=0, dtype=np.float64)
@@ -307,7 +307,7 @@ def _errors(surrogate: Surrogate, twin: Trajectories, test: NDArray) -> dict[str
     return figures
 
 
-def _known(twin: Trajectories, part: NDArray) -> NDArray:
+def known_samples(twin: Trajectories, part: NDArray) -> NDArray:
     """(len(part), T) bool, the samples up to the last measurement; all where none was measured."""
     measured = twin.mask[part].any(axis=2)
     later = np.logical_or.accumulate(measured[:, ::-1], axis=1)[:, ::-1]
@@ -345,7 +345,7 @@ def _changes(twin: Trajectories, part: NDArray) -> Iterator[tuple[NDArray, NDArr
         commands = twin.commands[some].reshape(-1, twin.commands.shape[2])
         before = np.concatenate([last[None].astype(commands.dtype), commands[:-1]])
         changed = (commands != before).any(axis=1)
-        yield some, np.flatnonzero(changed & _known(twin, some).reshape(-1))
+        yield some, np.flatnonzero(changed & known_samples(twin, some).reshape(-1))
         last = commands[-1]
 
 
@@ -355,5 +355,5 @@ def _sequences(twin: Trajectories, part: NDArray, seed: int) -> tuple[Tensor, ..
     return (
         torch.tensor(twin.commands[part], dtype=torch.float32),
         torch.tensor(twin.nominal[part], dtype=torch.float32),
-        torch.as_tensor(_known(twin, part)),
+        torch.as_tensor(known_samples(twin, part)),
     )

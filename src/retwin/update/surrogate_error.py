@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -11,7 +13,7 @@ from retwin.data.segments import Segments
 from retwin.errors import InputError
 from retwin.twins.twin import SimulationError, Twin
 from retwin.update.corrections.warp import within
-from retwin.update.surrogate import Surrogate
+from retwin.update.surrogate import Surrogate, known_samples
 
 __all__ = ["surrogate_variance"]
 
@@ -33,18 +35,32 @@ def surrogate_variance(
     segments : Segments
         M at most; 0 where a segment does not exist.
 
+    Warns
+    -----
+    UserWarning
+        The twin refuses the commands, with the reason.
+
     """
     if not isinstance(surrogate, Surrogate) or surrogate.fitted is None:
         return None
     valid = torch.as_tensor(segments.valid)[..., None]
+    held_out = surrogate.held_out_variance * valid
+    if twin is None:
+        return held_out
     try:
-        exact = None if twin is None else twin.simulate(commands, seed=0).nominal
-    except (InputError, SimulationError):
-        exact = None
-    if exact is None:
-        return surrogate.held_out_variance * valid
-    error = torch.as_tensor(surrogate.predict(commands) - exact, dtype=torch.float64)
+        simulated = twin.simulate(commands, seed=0)
+    except (InputError, SimulationError) as reason:
+        warnings.warn(
+            f"twin: it does not simulate these commands ({reason}), so that the error of the "
+            "surrogate is taken to be that on the simulations held out of its training",
+            stacklevel=3,
+        )
+        return held_out
+    error = torch.as_tensor(surrogate.predict(commands) - simulated.nominal, dtype=torch.float64)
     time = torch.arange(commands.shape[1], dtype=torch.float64)
     inside = within(time, segments.start, np.ceil(segments.stop) - 1) & valid
+    # A simulation that ends early has no outputs from there on.
+    inside = inside & torch.as_tensor(known_samples(simulated, np.arange(len(commands))))[:, None]
+    count = inside.sum(dim=-1)[..., None]
     square = inside.double() @ error.square()
-    return square / inside.sum(dim=-1).clamp_min(1)[..., None]
+    return torch.where(count > 0, square / count.clamp_min(1), held_out)

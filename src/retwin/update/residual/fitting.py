@@ -216,13 +216,10 @@ def fit_residual(
         remedy="check the mask; leave an output out that is never measured",
     )
     if isinstance(density, SequenceMixture):
-        return _noted(
-            fit_sequence(
-                used, correction, density, context, found,
-                seed=seed, bounds=bounds, progress=progress,
-            ),
-            outside,
-        )  # fmt: skip
+        sequence = fit_sequence(
+            used, correction, density, context, found, seed=seed, bounds=bounds, progress=progress
+        )
+        return _noted(sequence, outside)
     with isolated(seed):
         model = ResidualModel(
             correction, density, inputs=used.inputs, outputs=used.outputs, segmentation=rule
@@ -254,9 +251,12 @@ def _warn_of_error(context: Context, used: Trajectories) -> None:
         return
     valid = torch.as_tensor(context.segments.valid)
     error = context.surrogate_variance[valid].mean(dim=0).numpy()
-    difference = np.where(used.mask, used.observed - context.path.numpy(), np.nan)
-    share = error / np.nanmean(np.square(difference, dtype=np.float64), axis=(0, 1))
-    worst = int(np.nanargmax(share)) if np.isfinite(share).any() else 0
+    difference = np.where(used.mask, used.observed - context.path.numpy(), 0.0)
+    square = np.square(difference, dtype=np.float64).sum(axis=(0, 1))
+    count = used.mask.sum(axis=(0, 1))
+    # Of an output that is never measured there is no difference.
+    share = np.divide(error * count, square, out=np.zeros(len(error)), where=square > 0)
+    worst = int(share.argmax())
     if share[worst] > LARGEST_SHARE:
         warnings.warn(
             f"surrogate: its own error is {np.sqrt(error[worst]):.3g} "
