@@ -155,22 +155,19 @@ def _spread(held_out: list[tuple[ResidualModel, Targets]]) -> Tensor:
     predicted = [(model.predict(part.features), part) for model, part in held_out]
     model = held_out[0][0]
     spread = torch.ones(len(model.latent))
-    for head, block in model.parts():
-        if isinstance(head, BernoulliHead):
-            continue
-
-        def share(factor: float, block: slice = block) -> float:
-            inside, count = 0.0, 0
-            for distribution, part in predicted:
-                scores = distribution.widened(torch.full_like(spread, factor)).normal_scores(part.z)
-                used = part.used[..., block]
-                held = (scores[..., block].abs() <= QUANTILE)[:, used]
-                inside += float(held.float().mean(dim=0).sum())
-                count += int(used.sum())
-            return inside / count if count else 1.0
-
-        factors = SPREADS.tolist()
-        spread[block] = next((each for each in factors if share(each) >= LEVEL), factors[-1])
+    narrow = [block for head, block in model.parts() if not isinstance(head, BernoulliHead)]
+    for factor in SPREADS.tolist():
+        for block in narrow:
+            spread[block] = factor
+        held, used = [], []
+        for distribution, part in predicted:
+            scores = distribution.widened(torch.full_like(spread, factor)).normal_scores(part.z)
+            held.append((scores.abs() <= QUANTILE).float().mean(dim=0) * part.used)
+            used.append(part.used)
+        inside, count = (torch.cat(each).double().sum(dim=(0, 1)) for each in (held, used))
+        narrow = [block for block in narrow if inside[block].sum() < LEVEL * count[block].sum()]
+        if not narrow:
+            break
     return spread
 
 
