@@ -4,8 +4,7 @@ The emulated robot is calibrated on 6 healthy trajectories, as many as set A has
 other trajectories per class and seed. Stuck actuators freeze at a known sample, as in the published
 protocol, or at any sample of the first four fifths. Targets: macro-F1 and healthy recall of 0.9,
 ECE of at most 0.1, 90 % intervals with a coverage of 85 to 95 %, at most 1 second per trajectory on
-two cores. One constant was chosen on the emulated robot, with other seeds: the factor by which the
-distribution of the discrepancy is widened, since it is learned from few trajectories.
+two cores.
 """
 
 from __future__ import annotations
