@@ -216,10 +216,10 @@ def _simulated(system: Case, simulations: int, seed: int, measured: Trajectories
     outside = CommandRange.of(made.commands, rate).outside(real, rate, inputs)
     if not outside:
         return made
-    like = rt.twins.sampler_from(real, rate, limits=getattr(system.twin, "limits", None))
-    duration = min(like.duration, real.shape[1] / rate)
+    similar = rt.twins.sampler_from(real, rate, limits=getattr(system.twin, "limits", None))
+    duration = min(similar.duration, real.shape[1] / rate)
     count = max(1, simulations // 2)
-    added = [drawn(each, count) for each in (like, RecordedSampler(real, rate, duration))]
+    added = [drawn(each, count) for each in (similar, RecordedSampler(real, rate, duration))]
     note(
         f"The sampler of the case does not draw the real commands: {outside}. {2 * count} "
         "simulations of commands like these were added"
