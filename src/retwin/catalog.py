@@ -204,7 +204,11 @@ NEEDS: Mapping[Need, Sequence[Need]] = {
 
 SOURCES: Mapping[str, SourceEntry] = {
     "dt": SourceEntry(
-        "Digital twin", "none", diagnoser="retwin.study.sources:recorded_twin", role="plain"
+        "Digital twin",
+        "none",
+        diagnoser="retwin.study.sources:recorded_twin",
+        recorded=True,
+        role="plain",
     ),
     "twin": SourceEntry(
         "Digital twin",
@@ -245,12 +249,14 @@ SOURCES: Mapping[str, SourceEntry] = {
         "Domain-adversarial",
         "unlabelled",
         diagnoser="retwin.study.sources:adversarial",
+        recorded=True,
         network=True,
     ),
     "dann_transductive": SourceEntry(
         "Domain-adversarial, transductive",
         "transductive",
         diagnoser="retwin.study.sources:adversarial_transductive",
+        recorded=True,
         network=True,
     ),
     "mean_corrected": SourceEntry(

@@ -96,6 +96,8 @@ class SourceEntry:
         A function of a `Trial` that returns the diagnoser itself.
     pool : sequence of str
         The sources whose probabilities are pooled.
+    recorded : bool
+        Whether it learns the classes from the given trajectories of the twin.
     network : bool
         Whether the study's classifier must be a neural network.
     parametric : bool
@@ -116,6 +118,7 @@ class SourceEntry:
     twin: str = ""
     diagnoser: str = ""
     pool: Sequence[str] = ()
+    recorded: bool = False
     network: bool = False
     parametric: bool = False
     extra: str = ""

@@ -315,6 +315,13 @@ def test_bad_data_leave_nothing_behind(
         rt.run_study(case, PLAN, rt.StudyData(real=tmp_path / "other.npz"), tmp_path / "out")
     with pytest.raises(rt.InputError, match="at least 10 trajectories of the twin"):
         rt.run_study(case, rt.StudyPlan(per_class=1), rt.StudyData(), tmp_path / "out")
+    healthy = rt.generate(case.twin, replace(case, faults={"Healthy": None}), per_class=12, seed=0)
+    rt.save(healthy, tmp_path / "healthy.npz")
+    data = rt.StudyData(twin=tmp_path / "healthy.npz")
+    with pytest.raises(
+        rt.InputError, match="every class, from which dt would learn them, got none of Motor"
+    ):
+        rt.run_study(case, rt.StudyPlan(sources=("dt", "inversion")), data, tmp_path / "out")
     noisy = rt.StudyPlan(encoder_noise=1.0)
     with pytest.raises(rt.InputError, match="does not state how encoder noise"):
         rt.run_study(case.with_random_onset(), noisy, rt.StudyData(), tmp_path / "out")

@@ -271,6 +271,7 @@ def _prepare(
     twin = _twin(case, plan, data, report)
     remedy = "give more of them, or a larger per_class"
     at_least("twin-data", twin, MIN_TRAJECTORIES, "trajectories of the twin", remedy=remedy)
+    _check_classes(case, plan, twin)
     with write_atomically(out / "study.json") as part:
         text = json.dumps({"retwin": __version__, **found}, indent=1)
         part.write_text(text, encoding="utf-8")
@@ -314,6 +315,19 @@ def _check_healthy(plan: StudyPlan, real: Trajectories, roles: Roles) -> None:
             got="none",
             remedy="label healthy trajectories, give more of them, or calibrate on 'all'",
         )
+
+
+def _check_classes(case: Case, plan: StudyPlan, twin: Trajectories) -> None:
+    """Require trajectories of the twin of every class, if a source learns the classes from them."""
+    learning = [name for name in plan.sources if SOURCES[name].recorded]
+    absent = [label for label in case.classes if label not in twin.known_labels]
+    require(
+        not (learning and absent),
+        "twin-data",
+        expected=f"trajectories of every class, from which {', '.join(learning)} would learn them",
+        got=f"none of {', '.join(absent)}",
+        remedy="add them, or leave these sources out: the others need healthy trajectories only",
+    )
 
 
 def _twin(case: Case, plan: StudyPlan, data: StudyData, report: Report) -> Trajectories:
