@@ -207,6 +207,7 @@ def test_the_model_card_knows_what_went_wrong(study: Study, write: Write) -> Non
     arrays["probabilities/ibg_rg"] = answers
     results["sources"]["ibg_rg"]["confusion"][8] = [60, 0, 0, 0, 0, 0, 0, 0, 40]
     results["sources"]["ibg_rg"]["notes"] = ["one chain did not mix"]
+    results["sources"]["dt"]["notes"] = ["a command outside", "one chain did not mix"]
     reader = read(write(study))
     for given in (
         "motor_1 (deg)",
@@ -217,7 +218,8 @@ def test_the_model_card_knows_what_went_wrong(study: Study, write: Write) -> Non
         "Healthy diagnosed as M1 stuck real_a/003",
         "M4 bias recognised in 40%",
         "Noise x: generated and observed distributions differ KS distance 0.98, p 0.05",
-        "one chain did not mix",
+        "one chain did not mix reported while computing: Digital twin; IBG + RG",
+        "a command outside reported while computing: Digital twin",
         "which would not be known in the field",
     ):
         assert given in reader.text, given

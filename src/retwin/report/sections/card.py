@@ -11,7 +11,7 @@ from retwin.report.blocks import Cell, Column, Link, Section, Table
 from retwin.report.labels import class_name, counted, latent_names, quantity, real_data, source_name
 from retwin.report.study import Study
 from retwin.report.verdict import headline
-from retwin.results import ChannelNames, Dataset
+from retwin.results import ChannelNames, Dataset, Results
 from retwin.scores.classification import row_shares
 
 __all__ = ["card"]
@@ -40,7 +40,7 @@ def card(study: Study) -> Section:
             for name, figure in (fidelity.agreement if fidelity else {}).items()
             if figure.p is not None and figure.p <= SIGNIFICANT
         ],
-        "notes": each.notes,
+        "notes": _notes(results),
         "data": _data(study),
         "protocol": results.data.protocol.rstrip("."),
         "used": results.data.calibration.used,
@@ -49,6 +49,15 @@ def card(study: Study) -> Section:
         "command": results.provenance.get("command"),
     }
     return Section("card", "Model card", values)
+
+
+def _notes(results: Results) -> dict[str, str]:
+    """What was reported while sources were computed, and the names of these sources."""
+    notes: dict[str, list[str]] = {}
+    for source, each in results.sources.items():
+        for note in each.notes:
+            notes.setdefault(note, []).append(source_name(source))
+    return {note: "; ".join(names) for note, names in notes.items()}
 
 
 def _scope(study: Study, source: str) -> dict[str, str]:
