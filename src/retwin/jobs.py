@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, as_completed
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from pebble import ProcessExpired
 
@@ -27,6 +28,8 @@ ATTEMPTS = 3
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
+Answer: TypeAlias = tuple[Result, list[tuple[str, type[Warning]]]]
+"""What a worker sends: the result of a task, and the warnings that this process then gives."""
 
 
 def each(
@@ -100,17 +103,19 @@ def alone(twin: Any) -> Any:
 
 
 def _as_they_come(
-    submit: Callable[[int], Future[Result]], numbers: Sequence[int]
+    submit: Callable[[int], Future[Answer[Result]]], numbers: Sequence[int]
 ) -> Iterator[Result]:
     for _ in range(ATTEMPTS):
         futures = {submit(number): number for number in numbers}
         lost = []
         for future in as_completed(futures):
             try:
-                result = future.result()
+                result, given = future.result()
             except ProcessExpired:
                 lost.append(futures[future])
             else:
+                for message, category in given:
+                    warnings.warn(message, category, stacklevel=2)
                 yield result
         if not lost:
             return
@@ -124,7 +129,7 @@ def _as_they_come(
 @contextmanager
 def _on_cluster(
     address: str, task: Callable[..., Result], job: object
-) -> Iterator[Callable[[int], Future[Result]]]:
+) -> Iterator[Callable[[int], Future[Answer[Result]]]]:
     """Submit tasks to the Dask cluster whose scheduler is at `address`."""
     distributed = needs_extra("distributed", "scale", "speaks to a Dask scheduler")
     try:
@@ -158,9 +163,17 @@ def _on_cluster(
             executor.shutdown(wait=False)
 
 
-def _in_worker(task: Callable[..., Result], job: object, number: int) -> Result:
-    with sendable_errors():
-        return task(job, number)
+def _in_worker(task: Callable[..., Result], job: object, number: int) -> Answer[Result]:
+    with sendable_errors(), warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("default")
+        result = task(job, number)
+    return result, [(str(each.message), _sendable(each.category)) for each in given]
+
+
+def _sendable(category: type[Warning]) -> type[Warning]:
+    """The category of a warning, or a general one if the parent may not find its module."""
+    own = category.__module__.partition(".")[0] in ("builtins", "retwin")
+    return category if own else UserWarning
 
 
 def _on_worker(task: Callable[..., Result], sent: tuple[dict[str, str], bytes], number: int) -> Any:

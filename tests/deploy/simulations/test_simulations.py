@@ -11,6 +11,7 @@ import sys
 import time
 import tracemalloc
 import uuid
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -261,6 +262,25 @@ def test_a_worker_process_that_dies_is_replaced(tmp_path: Path) -> None:
     np.testing.assert_array_equal(
         rt.load(tmp_path / "a.zarr").observed, rt.load(tmp_path / "b.zarr").observed
     )
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_warnings_of_workers_are_warnings_of_the_caller(
+    workers: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.warns(UserWarning, match="the valve sticks") as given:
+        simulate_to(tmp_path / "a.zarr", plan(twin=Sticking(), n=24), workers=workers)
+    assert {each.category for each in given} == {UserWarning}
+    assert capfd.readouterr().err == ""
+
+
+@dataclass(frozen=True)
+class Sticking(Toy):
+    """Warns of each call."""
+
+    def simulate(self, commands: NDArray, **options: Any) -> rt.Trajectories:
+        warnings.warn("the valve sticks", UserWarning, stacklevel=1)
+        return super().simulate(commands, **options)
 
 
 @dataclass(frozen=True)
