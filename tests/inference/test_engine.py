@@ -33,6 +33,7 @@ class Linear:
     group: Tensor
     measured: Tensor
     curve: float = 0.0
+    common: None = None
 
     @classmethod
     def drawn(cls, rows: int, samples: int, *, seed: int, size: int = 2, latent: int = 3) -> Linear:

@@ -16,7 +16,7 @@ from torch import Tensor
 from retwin.inference.losses import Loss, StudentT
 from retwin.inference.problem import Problem
 
-__all__ = ["CommonError", "Noise", "correlation_time", "predicted_variance"]
+__all__ = ["Noise", "correlation_time", "predicted_variance"]
 
 HEAVY_TAILED = StudentT()
 """The loss of noise by default: glitches hardly count."""
@@ -24,27 +24,6 @@ MAX_CORRELATION = 0.95
 """Largest lag-one autocorrelation that is learned: beyond it the estimate is too uncertain."""
 SMALLEST_SHARE = 1e-6
 """Smallest scale relative to the largest one: it keeps exact outputs from infinite weight."""
-
-
-@dataclass(frozen=True, eq=False)
-class CommonError:
-    """A normal error of known variance that a block of samples has in common.
-
-    Attributes
-    ----------
-    variance : Tensor
-        (R, K, d), in the residual's unit squared.
-    block : Tensor
-        (R, K), the number of samples of the block that a sample belongs to.
-
-    """
-
-    variance: Tensor
-    block: Tensor
-
-    def __getitem__(self, rows: Tensor) -> CommonError:
-        """That of some rows."""
-        return CommonError(self.variance[rows], self.block[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +53,7 @@ class Noise:
     def _variance(self, problem: Problem) -> Tensor:
         """Variance (R, K, d) of each sample, (R, K, 1) if all outputs have the same."""
         own = self.scale[problem.group].square()
-        common = _common_error(problem)
+        common = problem.common
         return own if common is None else own + common.variance
 
     def count(self, problem: Problem) -> Tensor:
@@ -84,7 +63,7 @@ class Noise:
         common.
         """
         thinning = self.thinning[problem.group]
-        common = _common_error(problem)
+        common = problem.common
         if common is None:
             return problem.measured / thinning
         ratio = (common.variance / self.scale[problem.group].square()).mean(dim=-1)
@@ -146,7 +125,7 @@ class Noise:
         """
         weights = self.weights(problem, residual)[..., None]
         square = weights * (residual.square() + variance)
-        if (error := _common_error(problem)) is not None:
+        if (error := problem.common) is not None:
             # The expected square of the part of the residual that is not the common error.
             part = self.scale[problem.group].square() / self._variance(problem)
             square = part.square() * square + part * error.variance
@@ -166,12 +145,6 @@ class Noise:
         scales = torch.stack(scale)
         smallest = max(floor, SMALLEST_SHARE * float(scales.amax()))
         return Noise(scales.clamp_min(smallest), torch.stack(thinning), self.loss)
-
-
-def _common_error(problem: Problem) -> CommonError | None:
-    """The known error of a problem besides its noise."""
-    found: CommonError | None = getattr(problem, "common", None)
-    return found
 
 
 def correlation_time(values: Tensor, counted: Tensor, *, rows: bool, limit: float) -> Tensor:

@@ -2,11 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 from torch import Tensor
 
-__all__ = ["Problem"]
+__all__ = ["CommonError", "Problem"]
+
+
+@dataclass(frozen=True, eq=False)
+class CommonError:
+    """A normal error of known variance that a block of samples has in common.
+
+    Attributes
+    ----------
+    variance : Tensor
+        (R, K, d), in the residual's unit squared.
+    block : Tensor
+        (R, K), the number of samples of the block that a sample belongs to.
+
+    """
+
+    variance: Tensor
+    block: Tensor
+
+    def __getitem__(self, rows: Tensor) -> CommonError:
+        """That of some rows."""
+        return CommonError(self.variance[rows], self.block[rows])
 
 
 class Problem(Protocol):
@@ -19,7 +41,7 @@ class Problem(Protocol):
     measured : Tensor
         (R, K), the share of a sample's outputs that was measured; 0 for a sample without any.
     common : CommonError, optional
-        A known error besides the noise; by default there is none.
+        A known error besides the noise.
 
     """
 
@@ -31,6 +53,11 @@ class Problem(Protocol):
     @property
     def measured(self) -> Tensor:
         """(R, K)."""
+        ...
+
+    @property
+    def common(self) -> CommonError | None:
+        """None without such an error."""
         ...
 
     def __getitem__(self, rows: Tensor) -> Problem:

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from retwin.data.segments import Segments
-from retwin.inference.noise import CommonError, Noise
+from retwin.inference.noise import Noise
+from retwin.inference.problem import CommonError
 from retwin.inference.solver import Bounds
 from retwin.update.corrections.correction import Context, DifferentiableTwin
 from retwin.update.corrections.delays import delay_bounds

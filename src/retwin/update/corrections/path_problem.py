@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -43,6 +44,8 @@ class PathProblem:
 
     Attributes
     ----------
+    common : None
+        The surrogate's error, which the path contains, is added to the covariance of z.
     segments : Segments
         M at most.
     path : Tensor
@@ -70,6 +73,7 @@ class PathProblem:
     factor: Tensor
     group: Tensor
     delay_range: tuple[float, float]
+    common: ClassVar[None] = None
 
     @classmethod
     def of(
