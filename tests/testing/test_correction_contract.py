@@ -70,7 +70,10 @@ CORRECTIONS: dict[str, tuple[rt.Correction, Callable[[rt.Context], Tensor], str]
 SLOW = {"chain of command space": pytest.mark.slow}
 
 
-@pytest.fixture(params=[pytest.param(name, marks=SLOW.get(name, ())) for name in CORRECTIONS])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=SLOW.get(name, ())) for name in CORRECTIONS],
+)
 def subject(request: pytest.FixtureRequest) -> CorrectionSubject:
     correction, draw, name = CORRECTIONS[request.param]
     context = request.getfixturevalue(name)
