@@ -262,11 +262,12 @@ def test_a_surrogate_with_memory_gives_the_same(exact, commands: np.ndarray) -> 
 
         predict = staticmethod(exact.predict)
 
-    z = drawn((4, 5), missed=0.0)
-    plain = context_of(exact, commands[:4])
-    observed = rt.CommandSpace().apply(plain, z).double()
-    one = rt.CommandSpace().infer(plain, observed, polled(4))
-    other = rt.CommandSpace().infer(replace(plain, surrogate=Remembering()), observed, polled(4))
+    half = commands[:4, :500]
+    plain = context_of(exact, half)
+    z = drawn(plain.segments.start.shape, missed=0.0)
+    measured = rt.CommandSpace().apply(plain, z).double(), polled(4, 500)
+    one = rt.CommandSpace().infer(plain, *measured)
+    other = rt.CommandSpace().infer(replace(plain, surrogate=Remembering()), *measured)
     assert (one.z - other.z)[..., 1:5].abs().mean() < 0.2
     assert (one.z - other.z)[..., 0].abs().mean() < 0.1
     spread = [found.covariance[..., 0, 0].sqrt() for found in (one, other)]
