@@ -80,24 +80,22 @@ def file_of(name: str) -> str:
     return file_of(parent) if parent else ""
 
 
-GRAPH = {module: imports(path) for module, path in FILES.items()}
-
-
 def place_of(module: str) -> int:
     return ORDER[module.split(".")[0]]
 
 
 def test_no_room_imports_from_a_room_above_it_and_no_file_in_a_circle() -> None:
+    graph = {module: imports(path) for module, path in FILES.items()}
     upwards = [
         f"{module} -> {other}"
-        for module, others in GRAPH.items()
+        for module, others in graph.items()
         for other in others
         if place_of(other) > place_of(module)
     ]
     assert not upwards
     inside = {
         module: {other for other in others if not other.endswith("__init__")}
-        for module, others in GRAPH.items()
+        for module, others in graph.items()
     }
     try:
         TopologicalSorter(inside).prepare()
