@@ -101,10 +101,13 @@ def fit(
 ) -> None:
     """Fit surrogate and residual model; save the corrected twin."""
     import retwin as rt
+    from retwin.update.residual.fitting import calibrating
 
     check_place(out, folder=True, holds=("model.json", "surrogate", "residual"))
     system = _system(case, network, correction, density, refine)
     measured = _measured(system, real, data, max_bytes)
+    faults = system.faults if calibrate_on == "all" else calibrate_on
+    calibrating(measured, faults)  # before the surrogate is trained, which takes minutes
     size = system.per_class if simulations is None else simulations
     if twin_data is None:
         nominal = _simulated(system, size, seed, measured)
@@ -124,7 +127,7 @@ def fit(
             system.correction,
             system.density,
             seed=seed,
-            calibrate_on=system.faults if calibrate_on == "all" else calibrate_on,
+            calibrate_on=faults,
             twin=system.twin,
             progress=lambda s: show("residual model, 2 of 2", s),
         )

@@ -42,7 +42,7 @@ from retwin.update.surrogate import Surrogate
 from retwin.update.surrogate_error import surrogate_variance
 from retwin.update.training_range import checked_once, training_checked
 
-__all__ = ["fit_residual", "infer_discrepancy"]
+__all__ = ["calibrating", "fit_residual", "infer_discrepancy"]
 
 R = TypeVar("R", bound=Residual)
 
@@ -334,18 +334,13 @@ def _check_match(surrogate: Surrogate, calibration: Trajectories) -> None:
         )
 
 
-def _chosen(
-    calibration: Trajectories,
-    calibrate_on: str | Mapping[str, Fault | None],
-    severities: bool,
-    minimum: int,
-) -> tuple[NDArray, list[Fault | None] | None]:
-    """Indices of the trajectories to use, and their faults if their severities are inferred."""
+def calibrating(
+    calibration: Trajectories, calibrate_on: str | Mapping[str, Fault | None]
+) -> NDArray:
+    """Which trajectories (n,) bool `fit_residual` uses; InputError if it is none."""
     labels = calibration.labels
-    faults = None
     if isinstance(calibrate_on, Mapping):
         keep = np.isin(labels, list(calibrate_on))
-        faults = [calibrate_on[str(label)] for label in labels[keep]] if severities else None
     elif calibrate_on in ("healthy", "all"):
         keep = (labels == HEALTHY) | (calibrate_on == "all")
     else:
@@ -363,6 +358,20 @@ def _chosen(
         got=f"labels {sorted(calibration.known_labels) or 'none'}",
         remedy="label healthy trajectories, or calibrate on 'all'",
     )
+    return keep
+
+
+def _chosen(
+    calibration: Trajectories,
+    calibrate_on: str | Mapping[str, Fault | None],
+    severities: bool,
+    minimum: int,
+) -> tuple[NDArray, list[Fault | None] | None]:
+    """Indices of the trajectories to use, and their faults if their severities are inferred."""
+    keep = calibrating(calibration, calibrate_on)
+    faults = None
+    if isinstance(calibrate_on, Mapping) and severities:
+        faults = [calibrate_on[str(label)] for label in calibration.labels[keep]]
     if keep.sum() < minimum:
         warnings.warn(
             f"calibration: {keep.sum()} trajectories to calibrate on, at least three are needed to "
