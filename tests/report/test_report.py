@@ -65,8 +65,9 @@ def read(folder: Path) -> Reader:
     return reader
 
 
-def test_page_is_self_contained(study: Study, write: Write) -> None:
-    page = write_report(write(study))
+def test_page_is_self_contained_and_figures_are_beside_it(study: Study, write: Write) -> None:
+    folder = write(study)
+    page = write_report(folder)
     assert page.name == "report.html"
     assert page.stat().st_size <= 10e6
     text = page.read_text(encoding="utf-8")
@@ -78,11 +79,6 @@ def test_page_is_self_contained(study: Study, write: Write) -> None:
     assert "url(" not in style
     assert "@import" not in style
     assert "default-src 'none'" in text
-
-
-def test_figures(study: Study, write: Write) -> None:
-    folder = write(study)
-    write_report(folder)
     made = {path.stem: path.read_bytes() for path in (folder / "figures").glob("*.png")}
     assert set(made) == set(FIGURES) - {"simulation", "z"}
     assert all(each.startswith(PNG) for each in made.values())
