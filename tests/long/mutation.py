@@ -348,6 +348,9 @@ def printed(script: str, *words: object) -> list[str]:
 
 if __name__ == "__main__":
     samples, work, first, count, *names = sys.argv[1:]
+    # The heaviest modules, which else the first command imports and then this process again.
+    importlib.import_module("retwin.deploy.bundle.bundle")
+    importlib.import_module("retwin.report.page")
     for name in names:
         for failure in run(Path(samples), Path(work), int(first), int(count), name):
             print(failure, flush=True)
