@@ -27,8 +27,12 @@ def failures(samples: Path, work: Path, count: int, *names: str) -> list[str]:
     return mutation.printed(mutation.__file__, samples, work, 0, count, *names)
 
 
+@pytest.mark.slow
 def test_some_mutated_files(samples: Path, tmp_path: Path) -> None:
-    """Of every format but ONNX, whose export alone takes 14 s."""
+    """Of every format but ONNX, whose export alone takes 14 s.
+
+    The fast tier damages files of every format where they are read.
+    """
     names = [name for name in mutation.NAMES if name != "onnx"]
     assert failures(samples, tmp_path, -(-60 // len(names)), *names) == []
 
