@@ -117,6 +117,7 @@ def test_intervals_hold_from_any_number_of_trajectories(
     assert of_outputs >= (0.85 if count < 4 else 0.88)
 
 
+@pytest.mark.slow
 def test_persistence_is_found_from_four_trajectories(twin: rt.Surrogate) -> None:
     """0.7 comes back as 0.62 on average, 0 as 0.25: four trajectories determine neither."""
     found = {
