@@ -34,7 +34,11 @@ def found(name: str, *, deep: bool = False) -> Check:
     return check
 
 
-@pytest.mark.parametrize("options", [(), ("--deep",)], ids=["default", "deep"])
+# Deep, it loads every library of every extra.
+DEEP = pytest.param(("--deep",), id="deep", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("options", [pytest.param((), id="default"), DEEP])
 def test_this_very_machine(call, options: tuple[str, ...]) -> None:
     """All of it, drawing too; the tests run, so nothing that is needed can be broken."""
     code, out, err = call("--quiet", "doctor", *options, "--json")
