@@ -16,7 +16,7 @@ from retwin.arrays import floats
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
-from retwin.twins.command_range import TOLERANCE, excess
+from retwin.twins.command_range import TOLERANCE, excess, extremes
 from retwin.twins.twin import Twin
 
 __all__ = [
@@ -298,7 +298,7 @@ class Domain:
 
     def _magnitudes(self, trajectories: Trajectories, steps: int) -> dict[str, NDArray]:
         """The scores (n,) that need no network, by check."""
-        speed = np.abs(np.diff(trajectories.commands.astype(np.float64), axis=1)).max(axis=1)
+        speed = extremes(trajectories.commands)[2]
         measured = trajectories.mask.mean(axis=(1, 2))
         ratio = max(trajectories.steps / steps, steps / trajectories.steps)
         # The limit of nominal outputs is their mismatch. Excluded here is only what would overflow:
@@ -354,7 +354,8 @@ def _excess(values: NDArray, low: Any, high: Any, mask: NDArray | None = None) -
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     if mask is not None:
         values = np.where(mask, values, low)
-    farthest: NDArray = excess(values, low, high).max(axis=1)
+    least, greatest, _ = extremes(values)
+    farthest: NDArray = excess(least, greatest, low, high).max(axis=1)
     return farthest
 
 
