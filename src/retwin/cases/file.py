@@ -44,6 +44,7 @@ from retwin.twins.samplers import (
     RampSampler,
     RecordedSampler,
 )
+from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import Twin
 from retwin.update.corrections import Correction, DelayOffset
 from retwin.update.residual import Density, Mixture, SequenceMixture
@@ -115,6 +116,8 @@ def read_case(path: str | Path) -> Case:
             for name, value in keys.parameters.items()
         ]
         twin = parametric = parametric_twin(twin, free, inside)
+    elif isinstance(twin, StateTwin) and twin.free:
+        twin = parametric = twin.parametric()
     records = _records(keys.records, twin, folder, key(place, "records"))
     sampler = _sampler(keys.commands, twin, records, folder, key(place, "commands"))
     correction = keys.correction or ("delay_offset" if _has_segments(sampler) else "additive")

@@ -40,6 +40,8 @@ _HOME = {
     "RecordedSampler": "samplers",
     "Servo": "mujoco",
     "SimulationError": "twin",
+    "State": "state",
+    "StateTwin": "state_twin",
     "Stuck": "faults",
     "System": "system",
     "Twin": "twin",

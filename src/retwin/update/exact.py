@@ -23,7 +23,8 @@ __all__ = ["ExactSurrogate", "exact_surrogate"]
 class ExactSurrogate:
     """A twin with the methods of a surrogate that corrections and residual models use.
 
-    A twin that is a torch module is differentiated through its call. Of any other twin,
+    A twin that can be called with a tensor, such as a torch module or a `StateTwin`, is
+    differentiated through its call. Of any other twin, and of these where no gradient is needed,
     `CommandSpace` takes finite differences, each of which is a simulation.
 
     Parameters
@@ -63,14 +64,15 @@ class ExactSurrogate:
         return made.nominal.astype(np.float32)
 
     def __call__(self, commands: Tensor) -> Tensor:
-        """The same for a tensor; with gradient if the twin is a torch module."""
-        if isinstance(self.twin, nn.Module):
+        """The same for a tensor; with gradient if the twin can be called with one."""
+        differentiated = torch.is_grad_enabled() and commands.requires_grad
+        if isinstance(self.twin, nn.Module) or (differentiated and callable(self.twin)):
             found: Tensor = self.twin(commands)
             return found
         require(
-            not (torch.is_grad_enabled() and commands.requires_grad),
+            not differentiated,
             "surrogate",
-            expected="a twin that is a torch module, to be differentiated",
+            expected="a twin that can be called with a tensor, to be differentiated",
             got=type(self.twin).__name__,
             remedy="fit a surrogate to it (fit_surrogate), or leave refinement out",
         )

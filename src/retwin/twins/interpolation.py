@@ -1,0 +1,75 @@
+"""How commands pass from one sample to the next: held, along straight lines, or along a spline."""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # describing a twin needs no torch, which takes seconds to import
+    from torch import Tensor
+
+__all__ = ["INTERPOLATIONS", "cubic_coefficients"]
+
+INTERPOLATIONS = ("hold", "linear", "spline")
+"""Held until the next sample, as by a digital-to-analogue converter; straight lines; the natural
+cubic spline, for a signal that was band-limited before it was sampled."""
+REACH = 24
+"""Number of samples on either side on which a spline's slope depends: the weight of the next is
+5e-15 of the nearest one's."""
+
+
+def cubic_coefficients(commands: Tensor, interpolation: str) -> Tensor:
+    """Polynomials c0 + c1 s + c2 s² + c3 s³ of the commands from each sample, s = 0, to the next.
+
+    Parameters
+    ----------
+    commands : Tensor, shape (n, T, d_u)
+        Commands in double precision, T at least 2.
+    interpolation : str
+        One of `INTERPOLATIONS`.
+
+    Returns
+    -------
+    Tensor, shape (n, T, 4, d_u)
+        The coefficients, differentiable; the last sample is held.
+
+    """
+    import torch
+
+    held, zero = commands[:, :-1], torch.zeros_like(commands[:, 1:])
+    rise = commands[:, 1:] - held
+    parts = [held, zero, zero, zero]
+    if interpolation == "linear":
+        parts = [held, rise, zero, zero]
+    elif interpolation == "spline":
+        slope = _slopes(commands)
+        first, last = slope[:, :-1], slope[:, 1:]
+        parts = [held, first, 3 * rise - 2 * first - last, first + last - 2 * rise]
+    end = [commands[:, -1:], *[torch.zeros_like(commands[:, -1:])] * 3]
+    return torch.cat([torch.stack(parts, 2), torch.stack(end, 2)], dim=1)
+
+
+def _slopes(commands: Tensor) -> Tensor:
+    """The slopes (n, T, d_u), per sample, of the natural cubic spline.
+
+    Slopes d solve d[k-1] + 4 d[k] + d[k+1] = 3 (u[k+1] - u[k-1]). The inverse of the left side is
+    a filter with weights z^|j| / (2 sqrt 3), z = sqrt 3 - 2. Odd reflection at the ends makes the
+    second derivative 0 there.
+    """
+    import torch
+
+    steps = commands.shape[1]
+    wanted = steps + 2 * (REACH + 1)
+    while commands.shape[1] < wanted:
+        more = min(commands.shape[1] - 1, (wanted - commands.shape[1] + 1) // 2)
+        before = 2 * commands[:, :1] - commands[:, 1 : more + 1].flip(1)
+        after = 2 * commands[:, -1:] - commands[:, -more - 1 : -1].flip(1)
+        commands = torch.cat([before, commands, after], dim=1)
+    rises = 3 * (commands[:, 2:] - commands[:, :-2])
+    weight = 1 / (2 * sqrt(3))
+    slopes = weight * rises[:, REACH : REACH + steps]
+    for j in range(1, REACH + 1):
+        weight *= sqrt(3) - 2
+        both = (rises[:, REACH + sign * j : REACH + sign * j + steps] for sign in (-1, 1))
+        slopes = slopes.add(sum(both), alpha=weight)
+    return slopes

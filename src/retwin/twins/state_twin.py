@@ -1,0 +1,362 @@
+"""`StateTwin`: a twin that is a state-space model, from its equations alone."""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, fields
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from retwin.checks import at_least, one_of, require, whole
+from retwin.data.trajectories import Channels, Trajectories
+from retwin.progress import Progress
+from retwin.times import sample_rate
+from retwin.twins.faults import Fault
+from retwin.twins.interpolation import INTERPOLATIONS
+from retwin.twins.limits import Limits
+from retwin.twins.parameter_values import values_per_simulation
+from retwin.twins.parametric import Parameter, ParametricTwin
+from retwin.twins.state import State
+from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
+
+if TYPE_CHECKING:  # describing a twin needs no torch, which takes seconds to import
+    from torch import Tensor
+
+    from retwin.twins.compiled.model import Model
+    from retwin.twins.compiled.steps import Steps
+
+__all__ = ["StateTwin"]
+
+SAMPLES_PER_CHUNK = 2**20
+"""Number of samples, of all trajectories together, that are simulated at once: some 100 MB."""
+ACCURACY = 0.01
+"""Largest error of the steps through time, in standard deviations of an output, that passes without
+a warning. It is meant to be small against a discrepancy that is worth modelling."""
+FINER = 16
+"""How many times more sub-steps are tried before a simulation that is not finite is given up."""
+
+
+@dataclass(frozen=True)
+class StateTwin:
+    """A twin whose states follow equations that are written with torch.
+
+    `derivative` or `step`, and `output`, are functions of named tuples of scalars: the states x,
+    the commands u and the parameters p; a function of x and u alone may leave p out. They are
+    traced once. What they compute is then compiled for simulations, which are thousands of times
+    faster than the same in torch, and evaluated in torch where a gradient is needed; both agree to
+    1e-9. Branches are `torch.where`.
+
+    Parameters
+    ----------
+    states : sequence of State
+        The states, one at least.
+    output : callable
+        The outputs at a sample, in the order of `outputs`: a scalar, or several.
+    inputs, outputs : Channels
+        Channels of the commands and the outputs.
+    rate : float
+        Sample rate in Hz, above 0.
+    derivative : callable, optional
+        The time derivatives of the states, per second, in their order. They are integrated by the
+        classical Runge-Kutta method of fourth order.
+    step : callable, optional
+        The states one sample later, in place of `derivative`.
+    parameters : sequence of Parameter
+        Numbers of the equations, with their units, bounds, and starts, which are used by default.
+    substeps : int, default 1
+        Steps of the integration per sample.
+    interpolation : {"hold", "linear", "spline"}
+        The commands between samples, see `INTERPOLATIONS`; `step` has no such time.
+    limits : Limits, optional
+        Range of the commands.
+
+    Raises
+    ------
+    InputError
+        Not one of `derivative` and `step`, names twice, settings that `step` cannot have. When it
+        is first simulated: equations that cannot be traced.
+
+    Warns
+    -----
+    UserWarning
+        Twice the sub-steps change an output of the first trajectory by more than 1 % of its
+        standard deviation; or there is no C compiler.
+
+    Notes
+    -----
+    A stuck actuator is a held command. A trajectory whose states are not finite is named in a
+    `SimulationError`.
+
+    """
+
+    states: Sequence[State]
+    output: Callable[..., Any]
+    inputs: Channels
+    outputs: Channels
+    rate: float
+    _: KW_ONLY
+    derivative: Callable[..., Any] | None = None
+    step: Callable[..., Any] | None = None
+    parameters: Sequence[Parameter] = ()
+    substeps: int = 1
+    interpolation: str = "hold"
+    limits: Limits | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "states", tuple(self.states))
+        object.__setattr__(self, "parameters", tuple(self.parameters))
+        at_least("states", self.states, 1, "state", remedy="a system without memory is a function")
+        require(
+            (self.derivative is None) != (self.step is None),
+            "derivative",
+            expected="either derivative or step",
+            got="both" if self.step else "neither",
+            remedy="give the time derivatives of the states, or the states one sample later",
+        )
+        names = list(self.names)
+        require(
+            len(set(names)) == len(names),
+            "parameters",
+            expected="different names of parameters and states",
+            got=", ".join(names),
+            remedy="the start of a state is the parameter start_NAME; rename the other",
+        )
+        sample_rate("rate", self.rate)
+        whole("substeps", self.substeps, least=1)
+        one_of("interpolation", self.interpolation, INTERPOLATIONS)
+        require(
+            self.step is None or (self.substeps == 1 and self.interpolation == "hold"),
+            "step",
+            expected="substeps=1 and interpolation='hold'",
+            got=f"substeps={self.substeps}, interpolation={self.interpolation!r}",
+            remedy="leave both out: a step reaches from one sample to the next",
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields without the compiled model, which stays in its process."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, and then of the starts of the states."""
+        starts = (f"start_{state.name}" for state in self.states)
+        return (*(each.name for each in self.parameters), *starts)
+
+    @property
+    def fingerprint(self) -> str:
+        """The equations as C99, which identify the twin where the names of functions do not."""
+        return self.model.source
+
+    @cached_property
+    def model(self) -> Model:
+        """The traced equations.
+
+        Raises
+        ------
+        InputError
+            They cannot be traced, or return too few results.
+
+        """
+        from retwin.twins.compiled.model import trace_model
+
+        function = self.step or self.derivative
+        states, parameters = ([each.name for each in own] for own in (self.states, self.parameters))
+        return trace_model(
+            _of_three(function),
+            _of_three(self.output),
+            (states, self.inputs.names, parameters),
+            len(self.outputs),
+            discrete=self.step is not None,
+        )
+
+    @property
+    def free(self) -> tuple[Parameter, ...]:
+        """The parameters, and the unknown starts of the states."""
+        return (*self.parameters, *(each for state in self.states for each in state.unknown()))
+
+    def parametric(self) -> ParametricTwin:
+        """The twin with its parameters and unknown starts free, for identification.
+
+        Raises
+        ------
+        InputError
+            There is none.
+
+        """
+        return ParametricTwin(self, self.free)
+
+    def simulate(
+        self,
+        commands: NDArray,
+        *,
+        faults: Sequence[Fault | None] | None = None,
+        seed: int,
+        progress: Progress | None = None,
+        parameters: Mapping[str, ArrayLike] | None = None,
+    ) -> Trajectories:
+        """See `TakesParameters.simulate`; the parameters are `names`."""
+        commands = checked_commands(commands, self.inputs)
+        values = self._values(parameters, len(commands))
+
+        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+            own = values[chunk.index]
+            nominal = self._explained(chunk, chunk.commands, own)
+            if chunk.index.start == 0 and 0 not in chunk.failed:
+                self._check_accuracy(chunk.commands[:1], own[:1], nominal[:1])
+            held = chunk.held_commands
+            faulty = (held != chunk.commands).any(axis=(1, 2))
+            observed = nominal.copy()
+            if faulty.any():
+                observed[faulty] = self._explained(chunk, held, own, faulty)
+            return nominal, observed
+
+        size = max(1, SAMPLES_PER_CHUNK // commands.shape[1])
+        return simulate_in_chunks(
+            self, run, commands, faults, seed=seed, progress=progress, size=size
+        )
+
+    def hidden(
+        self, commands: NDArray, parameters: Mapping[str, ArrayLike] | None = None
+    ) -> NDArray:
+        """The states (n, T, d_x) at every sample, for commands (n, T, d_u) and `parameters`.
+
+        States of a simulation that diverges are not finite.
+        """
+        commands = checked_commands(commands, self.inputs)
+        values = self._values(parameters, len(commands))
+        return self._steps(self.substeps).run(commands, values)[1]
+
+    def sensitivities(
+        self, commands: NDArray, parameters: Mapping[str, ArrayLike] | None = None
+    ) -> tuple[NDArray, NDArray]:
+        """Outputs and their derivatives by all parameters, by forward sensitivities.
+
+        Parameters
+        ----------
+        commands : ndarray, shape (n, T, d_u)
+            Commands, as for `simulate`.
+        parameters : mapping of str to array_like, optional
+            See `simulate`.
+
+        Returns
+        -------
+        outputs : ndarray, shape (n, T, d_y)
+            Nominal outputs, not finite where the simulation diverges.
+        derivatives : ndarray, shape (n, T, d_y, k)
+            Their derivatives by the k parameters `names`, those of the simulation itself, not of
+            the exact solution of its equations.
+
+        """
+        commands = checked_commands(commands, self.inputs)
+        values = self._values(parameters, len(commands))
+        return self._steps(self.substeps).sensitivities(commands, values)
+
+    def __call__(
+        self, commands: Tensor, parameters: Mapping[str, Tensor | float] | None = None
+    ) -> Tensor:
+        """Nominal outputs in torch, with gradient by commands and parameters.
+
+        Parameters
+        ----------
+        commands : Tensor, shape (n, T, d_u)
+            Commands within the limits, which are not checked.
+        parameters : mapping of str to Tensor or float, optional
+            Some of `names`, each of shape () or (n,).
+
+        Returns
+        -------
+        Tensor, shape (n, T, d_y)
+            The outputs, computed in double precision, in that of the commands.
+
+        """
+        import torch
+
+        defaults = dict(zip(self.names, self._values(None, 1)[0], strict=True))
+        unknown = sorted(set(parameters or {}) - set(defaults))
+        require(
+            not unknown,
+            "parameters",
+            expected=f"some of {', '.join(self.names)}",
+            got=", ".join(unknown),
+            remedy="check the spelling",
+        )
+        like = commands.new_zeros(len(commands), dtype=torch.float64)
+        given = (defaults | dict(parameters or {})).values()
+        theta = torch.stack([torch.as_tensor(each).to(like) + like for each in given], 1)
+        return self._steps(self.substeps).in_torch(commands.to(like), theta)[0].to(commands)
+
+    def _values(self, parameters: Mapping[str, ArrayLike] | None, count: int) -> NDArray:
+        """The values (count, k) of all parameters `names`."""
+        starts = [each.start or 0.0 for each in self.parameters]
+        starts += [each.start for each in self.states]
+        own = values_per_simulation(parameters, count, allowed=self.names)
+        columns = zip(self.names, starts, strict=True)
+        return np.stack([own.get(name, np.full(count, start)) for name, start in columns], 1)
+
+    def _steps(self, substeps: int) -> Steps:
+        """The simulation with that many sub-steps."""
+        from retwin.twins.compiled.steps import Steps
+
+        return Steps(self.model, 1 / self.rate, substeps, self.interpolation)
+
+    def _explained(
+        self, chunk: Chunk, commands: NDArray, values: NDArray, rows: NDArray | None = None
+    ) -> NDArray:
+        """Outputs of a chunk's rows; those that are not finite are entered as failed."""
+        index = np.arange(len(commands)) if rows is None else np.flatnonzero(rows)
+        outputs, states = self._steps(self.substeps).run(commands[index], values[index])
+        finite = np.isfinite(states).all(axis=2) & np.isfinite(outputs).all(axis=2)
+        for place in np.flatnonzero(~finite.all(axis=1)):
+            row, finer = [index[place]], FINER * self.substeps
+            remedy = "check the parameters and the start, or the range of the equations"
+            again = self._steps(finer).run(commands[row], values[row])
+            if self.derivative is not None and all(np.isfinite(each).all() for each in again):
+                remedy = f"it is finite with {finer}: give more substeps"
+            time = np.argmin(finite[place]) / self.rate
+            reason = f"not finite from {time:g} s on with substeps={self.substeps}; {remedy}"
+            chunk.failed[int(index[place])] = reason
+            outputs[place] = 0.0
+        return outputs
+
+    def _check_accuracy(self, commands: NDArray, values: NDArray, outputs: NDArray) -> None:
+        """Warn where twice the sub-steps give other outputs (1, T, d_y)."""
+        if self.step is not None:
+            return
+        finer = self._steps(2 * self.substeps).run(commands, values)[0][0]
+        error = np.sqrt(np.mean((outputs[0] - finer) ** 2, axis=0))
+        # An output that hardly varies is compared with its size, of which rounding is a fraction.
+        allowed = ACCURACY * np.maximum(finer.std(axis=0), 1e-6 * np.abs(finer).max(axis=0))
+        worst = int(np.argmax(error - allowed))
+        if error[worst] <= allowed[worst]:
+            return
+        unit = self.outputs.units[worst]
+        warnings.warn(
+            f"{self.outputs.names[worst]} has an error of {error[worst]:.1g} {unit} with "
+            f"substeps={self.substeps}, over 1 % of its standard deviation; give more substeps",
+            stacklevel=2,
+        )
+
+
+def _of_three(function: Callable[..., Any] | None) -> Callable[..., Any]:
+    """A function of x, u and p, where the user's may leave out p."""
+    require(
+        callable(function),
+        "output",
+        expected="functions of x, u and p",
+        got=repr(function),
+        remedy="give functions that can be called",
+    )
+    assert function is not None
+    places = [
+        each
+        for each in inspect.signature(function).parameters.values()
+        if each.default is each.empty and each.kind is not each.VAR_KEYWORD
+    ]
+    if len(places) == 2 and all(each.kind is not each.VAR_POSITIONAL for each in places):
+        return lambda x, u, p: function(x, u)
+    return function
