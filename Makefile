@@ -50,7 +50,7 @@ docs: install
 bench: install
 	$(BIN)/retwin bench
 	for name in generation training fitting command_space bands inversion updating residual \
-		importing twins fmu scale bundle; do $(BIN)/python benchmarks/$$name.py || exit 1; done
+		importing twins fmu state_twin scale bundle; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 
 # Wheel and source distribution in dist/. The wheel, with its mandatory dependencies alone, runs the
 # demo in an empty environment; the source distribution, with all extras, passes the fast tests.
