@@ -72,7 +72,7 @@ class ExactSurrogate:
         require(
             not differentiated,
             "surrogate",
-            expected="a twin that can be called with a tensor, to be differentiated",
+            expected="a twin that is a torch module or a StateTwin, to be differentiated",
             got=type(self.twin).__name__,
             remedy="fit a surrogate to it (fit_surrogate), or leave refinement out",
         )
