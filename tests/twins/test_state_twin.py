@@ -170,6 +170,22 @@ def test_the_source_is_strict_c99(tmp_path) -> None:
         subprocess.run([*command, *strict, file, "-o", tmp_path / "o"], check=True)
 
 
+def test_a_small_network_is_traced_with_its_weights() -> None:
+    torch.manual_seed(0)
+    net = torch.nn.Sequential(
+        torch.nn.Linear(2, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1)
+    ).double()
+    twin = replace(
+        stiff_twin(1.0), derivative=lambda x, u, p: net(torch.stack([x.level, u.pump]))[0] - x.level
+    )
+    commands = noise(2, 50)
+    made = twin.simulate(commands, seed=0).observed
+    np.testing.assert_allclose(made, in_torch(twin, commands), rtol=1e-9, atol=1e-12)
+    now = torch.tensor([0.3, -0.2]).double()
+    (slope,) = twin.model.evaluate("slope", [now[0]], [now[1]], [now[0]])
+    assert slope.item() == pytest.approx((net(now)[0] - now[0]).item(), rel=1e-12)
+
+
 def test_interpolation_is_closed_form() -> None:
     commands = noise(2, 40)
     grid = np.linspace(0, 1, 5)[:-1]
@@ -259,7 +275,7 @@ def stiff_twin(rate: float, **settings) -> StateTwin:
 
 def test_a_stiff_twin_says_that_it_needs_substeps() -> None:
     commands = noise(2, 400)
-    with pytest.warns(UserWarning, match="level has an error of .* V with substeps=1"):
+    with pytest.warns(rt.twins.StepWarning, match="level has an error of .* V with substeps=1"):
         stiff_twin(26.0).simulate(commands, seed=0)
     with pytest.raises(rt.twins.SimulationError, match="finite with 16: give more substeps"):
         stiff_twin(200.0).simulate(commands, seed=0)

@@ -42,6 +42,7 @@ _HOME = {
     "SimulationError": "twin",
     "State": "state",
     "StateTwin": "state_twin",
+    "StepWarning": "state_twin",
     "Stuck": "faults",
     "System": "system",
     "Twin": "twin",

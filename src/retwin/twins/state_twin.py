@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # describing a twin needs no torch, which takes seconds to im
     from retwin.twins.compiled.model import Model
     from retwin.twins.compiled.steps import Steps
 
-__all__ = ["StateTwin"]
+__all__ = ["StateTwin", "StepWarning"]
 
 SAMPLES_PER_CHUNK = 2**20
 """Number of samples, of all trajectories together, that are simulated at once: some 100 MB."""
@@ -39,6 +39,10 @@ ACCURACY = 0.01
 a warning. It is meant to be small against a discrepancy that is worth modelling."""
 FINER = 16
 """How many times more sub-steps are tried before a simulation that is not finite is given up."""
+
+
+class StepWarning(UserWarning):
+    """The steps through time are too coarse for the equations."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +87,11 @@ class StateTwin:
 
     Warns
     -----
-    UserWarning
+    StepWarning
         Twice the sub-steps change an output of the first trajectory by more than 1 % of its
-        standard deviation; or there is no C compiler.
+        standard deviation.
+    UserWarning
+        There is no C compiler.
 
     Notes
     -----
@@ -338,6 +344,7 @@ class StateTwin:
         warnings.warn(
             f"{self.outputs.names[worst]} has an error of {error[worst]:.1g} {unit} with "
             f"substeps={self.substeps}, over 1 % of its standard deviation; give more substeps",
+            StepWarning,
             stacklevel=2,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -13,6 +14,7 @@ from retwin.checks import require, whole
 from retwin.data.trajectories import Trajectories
 from retwin.processes import sendable_errors, worker_pool
 from retwin.twins.parametric import ParametricTwin
+from retwin.twins.state_twin import StepWarning
 from retwin.twins.twin import SimulationError, checked_seed, checked_stride
 
 __all__ = ["Misfit", "misfit_of"]
@@ -158,7 +160,10 @@ def _outputs(
     values = {name: np.repeat(theta[:, i], each) for i, name in enumerate(twin.names)}
     repeated = np.tile(commands, (len(theta), 1, 1))
     try:
-        observed = twin.simulate(repeated, seed=seed, parameters=values).observed
+        with warnings.catch_warnings():
+            # A search passes values that no twin needs to be exact at.
+            warnings.simplefilter("ignore", StepWarning)
+            observed = twin.simulate(repeated, seed=seed, parameters=values).observed
     except SimulationError as error:
         # Parameters within the bounds can be beyond what the twin can simulate.
         observed = np.full((*repeated.shape[:2], len(twin.outputs)), np.nan)
