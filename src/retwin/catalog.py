@@ -67,6 +67,11 @@ CASES: Mapping[str, CaseEntry] = {
         "two cascaded tanks, without overflow",
         "retwin.cases.cascaded_tanks.recorded:RECORDED",
     ),
+    "silverbox": CaseEntry(
+        "retwin.cases.silver_box.case:silverbox",
+        "Silverbox, a linear twin of a cubic spring",
+        "retwin.cases.silver_box.recorded:RECORDED",
+    ),
     "tanks_overflow": CaseEntry(
         "retwin.cases.cascaded_tanks.case:tanks_overflow",
         "two cascaded tanks that overflow",
@@ -85,6 +90,10 @@ TWINS: Mapping[str, Entry] = {
     "armpi-emulated": Entry(
         "retwin.cases.armpi_fpv.emulator:EmulatedArmPi",
         "emulation of the real arm: delays, backlash, missed segments, polling",
+    ),
+    "silverbox": Entry(
+        "retwin.cases.silver_box.twin:SILVERBOX",
+        "Silverbox, a linear oscillator",
     ),
     "tanks": Entry(
         "retwin.cases.cascaded_tanks.twin:TanksTwin",

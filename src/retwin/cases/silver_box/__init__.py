@@ -1,0 +1,1 @@
+"""The Silverbox benchmark: its equations, records and case."""
