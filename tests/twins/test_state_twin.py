@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 
 import retwin as rt
 from retwin.testing import TWIN_CHECKS, TwinSubject
-from retwin.twins import Parameter, State, StateTwin
+from retwin.twins import Parameter, ParametricTwin, State, StateTwin
 from retwin.twins.compiled import kernel
 from retwin.twins.interpolation import INTERPOLATIONS, cubic_coefficients
 from retwin.update.identification import LeastSquares, identify
@@ -253,6 +253,17 @@ def test_identification_finds_the_parameters_and_the_unknown_start() -> None:
     found = identify(free, record, seed=0, method=LeastSquares(starts=1))
     for name, value in zip(free.names, found.twin.values, strict=True):
         assert value == pytest.approx(truth[name], rel=1e-3)
+    derivatives = free.sensitivities(record.commands, np.array(free.values))
+    assert derivatives.shape == (2, 200, 2, 4)
+    places = {"stiffness": 2.0, "damping": 0.01}
+    both = ParametricTwin(duffing(), (Parameter("size", "1", 0.0, 50.0, 20.0, places),))
+    commands, h = noise(1, 50), 1e-5
+    ends = [
+        both.simulate(commands, seed=0, parameters={"size": 20.0 + sign * h}).observed
+        for sign in (-1, 1)
+    ]
+    made = both.sensitivities(commands, np.array([20.0]))[..., 0]
+    np.testing.assert_allclose(made, (ends[1] - ends[0]) / (2 * h), atol=1e-8)
 
 
 def stiff(x, u, p):
@@ -370,7 +381,7 @@ hold_durations = [0.5, 1.0]
 """
 MODULE = """
 import retwin as rt
-from retwin.twins import Parameter, State, StateTwin
+from retwin.twins import Parameter, ParametricTwin, State, StateTwin
 
 tank = StateTwin(
     states=[State("level", "V", start=0.2)],

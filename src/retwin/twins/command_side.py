@@ -15,7 +15,8 @@ from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
 from retwin.twins.parameter_values import values_per_simulation
-from retwin.twins.parametric import TRAJECTORIES_PER_CHUNK, Parameter
+from retwin.twins.parametric import Parameter
+from retwin.twins.rebuilt import TRAJECTORIES_PER_CHUNK
 from retwin.twins.twin import (
     Chunk,
     Twin,

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from inspect import signature
 from typing import Any, Protocol
 
@@ -20,19 +19,15 @@ from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
-from retwin.twins.parameter_values import values_per_simulation
-from retwin.twins.twin import Chunk, Twin, checked_commands, simulate_in_chunks
-from retwin.twins.wrapper import TwinWrapper, simulate_chunk
+from retwin.twins.rebuilt import RebuiltTwin
+from retwin.twins.twin import Twin
+from retwin.twins.wrapper import TwinWrapper
 
 __all__ = [
     "Parameter",
     "ParametricTwin",
-    "RebuiltTwin",
     "TakesParameters",
 ]
-
-TRAJECTORIES_PER_CHUNK = 512
-"""Number of trajectories that are passed to the wrapped twin together."""
 
 
 class TakesParameters(Twin, Protocol):
@@ -294,16 +289,48 @@ class ParametricTwin(TwinWrapper):
         """
         self._check_known(parameters or {})
         now: dict[str, ArrayLike] = dict(zip(self.names, self.values, strict=True))
-        now |= parameters or {}
-        inner_values: dict[str, ArrayLike] = dict(self.held)
-        inner_values |= {
+        inner_values = self._inner(now | dict(parameters or {}))
+        return self.twin.simulate(
+            commands, faults=faults, seed=seed, progress=progress, parameters=inner_values
+        )
+
+    def sensitivities(self, commands: NDArray, values: NDArray) -> NDArray | None:
+        """Derivatives of the nominal outputs by the free parameters.
+
+        Parameters
+        ----------
+        commands : ndarray, shape (n, T, d_u)
+            Commands.
+        values : ndarray, shape (k,)
+            The point, in place of the present values.
+
+        Returns
+        -------
+        ndarray, shape (n, T, d_y, k), or None
+            The derivatives, not finite where the simulation diverges; None where the wrapped twin
+            has no `sensitivities`, as `StateTwin` has.
+
+        """
+        differentiated = getattr(self.twin, "sensitivities", None)
+        if differentiated is None:
+            return None
+        inner = self._inner(dict(zip(self.names, values, strict=True)))
+        every = differentiated(commands, inner)[1]
+        mixed = np.zeros((every.shape[-1], len(self.parameters)))
+        for column, each in enumerate(self.parameters):
+            for place, factor in each.places.items():
+                mixed[self.twin.names.index(place), column] = factor  # type: ignore[attr-defined]
+        made: NDArray = every @ mixed
+        return made
+
+    def _inner(self, now: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
+        """Values of the wrapped twin's parameters, for those of the free ones."""
+        values: dict[str, ArrayLike] = dict(self.held)
+        return values | {
             place: factor * np.asarray(now[each.name], dtype=float)
             for each in self.parameters
             for place, factor in each.places.items()
         }
-        return self.twin.simulate(
-            commands, faults=faults, seed=seed, progress=progress, parameters=inner_values
-        )
 
     def _check_known(self, names: Mapping[str, Any]) -> None:
         """Refuse names of parameters that are not free."""
@@ -314,75 +341,4 @@ class ParametricTwin(TwinWrapper):
             expected=f"some of {', '.join(self.names)}",
             got=", ".join(map(repr, unknown)),
             remedy="check the spelling, or declare it with a Parameter",
-        )
-
-
-@dataclass(frozen=True)
-class RebuiltTwin(TwinWrapper):
-    """A twin that is built anew for each combination of parameter values.
-
-    Trajectories with equal values are simulated together.
-
-    Parameters
-    ----------
-    build : callable
-        From values by name to a twin, whose channels, rate and limits do not depend on them.
-        Other processes must be able to import it.
-    defaults : mapping of str to float
-        Values of all parameters.
-
-    """
-
-    build: Callable[[Mapping[str, float]], Twin]
-    defaults: Mapping[str, float]
-
-    @cached_property
-    def twin(self) -> Twin:
-        """The twin at the defaults.
-
-        Raises
-        ------
-        InputError
-            `build` returns no twin.
-
-        """
-        made = self.build(dict(self.defaults))
-        require(
-            isinstance(made, Twin),
-            "build",
-            expected="a function that returns a twin",
-            got=type(made).__name__,
-            remedy="return a FunctionTwin, or any object that satisfies Twin",
-        )
-        return made
-
-    def simulate(
-        self,
-        commands: NDArray,
-        *,
-        faults: Sequence[Fault | None] | None = None,
-        seed: int,
-        progress: Progress | None = None,
-        parameters: Mapping[str, ArrayLike] | None = None,
-    ) -> Trajectories:
-        """See `TakesParameters.simulate`."""
-        commands = checked_commands(commands, self.inputs)
-        names = tuple(self.defaults)
-        values = values_per_simulation(parameters, len(commands), allowed=names)
-        table = np.stack(
-            [values.get(n, np.full(len(commands), self.defaults[n])) for n in names], 1
-        )
-
-        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
-            nominal = np.zeros((*chunk.commands.shape[:2], len(self.outputs)))
-            observed = np.zeros_like(nominal)
-            distinct, group = np.unique(table[chunk.index], axis=0, return_inverse=True)
-            for i, theta in enumerate(distinct):
-                rows = np.flatnonzero(group.ravel() == i)
-                twin = self.build(dict(zip(names, theta.tolist(), strict=True)))
-                nominal[rows], observed[rows] = simulate_chunk(twin, chunk, rows, seed=seed)
-            return nominal, observed
-
-        return simulate_in_chunks(
-            self, run, commands, faults, seed=seed, progress=progress, size=TRAJECTORIES_PER_CHUNK
         )

@@ -125,6 +125,18 @@ class Misfit:
         """Residuals (m, n, P, d_y) of simulated outputs; 0 where nothing was measured."""
         return np.where(self.seen, (self._measured - outputs) / self.unit, 0.0)
 
+    def derivatives(self, theta: NDArray) -> NDArray | None:
+        """Derivatives (n P d_y, k) of the residuals at parameters (k,).
+
+        None where the twin gives none that are finite.
+        """
+        made = self.twin.sensitivities(self._commands, theta)
+        if made is None or not np.isfinite(made).all():
+            return None
+        self.twin_runs += len(self._commands)
+        made = made[:, :: self.stride] / self.unit[:, None]
+        return np.where(self.seen[..., None], -made, 0.0).reshape(-1, len(theta))
+
     def rms_of(self, residual: NDArray) -> float:
         """Root mean square of residuals (n, P, d_y) over the measured samples."""
         return float(np.sqrt(np.sum(residual**2) / self.seen.sum()))
