@@ -227,6 +227,26 @@ def test_it_solves_the_equations() -> None:
     assert np.abs(held[0] - solved.y.T).max() > 1e-3
 
 
+@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
+def test_a_twin_without_commands_decays(interpolation: str) -> None:
+    twin = StateTwin(
+        (State("level", "V", 2.0),),
+        level,
+        rt.Channels((), ()),
+        LEVEL,
+        10.0,
+        derivative=lambda x, u, p: -p.rate * x.level,
+        parameters=(Parameter("rate", "1/s", 0.0, 5.0, 1.5),),
+        interpolation=interpolation,
+    )
+    commands, times = np.zeros((2, 30, 0)), np.arange(30) / 10
+    wanted = 2 * np.exp(-1.5 * times)
+    made, derivatives = twin.sensitivities(commands)
+    np.testing.assert_allclose(made[1, :, 0], wanted, rtol=1e-4)
+    np.testing.assert_allclose(made, in_torch(twin, commands), rtol=1e-9)
+    np.testing.assert_allclose(derivatives[0, :, 0, 0], -times * wanted, atol=1e-4)
+
+
 def test_a_trajectory_does_not_depend_on_the_batch_and_repeats() -> None:
     commands = noise(5, 60)
     whole = duffing().simulate(commands, seed=0).observed

@@ -55,8 +55,7 @@ class Model:
         for node in order:
             arguments = [values[each.index] for each in node.args]
             values[node.index] = getattr(torch, node.op)(*arguments)
-        shape = x[0] + u[0]
-        return [values[each.index].expand_as(shape) for each in getattr(self, what)]
+        return [values[each.index].expand_as(x[0]) for each in getattr(self, what)]
 
     @cached_property
     def _orders(self) -> dict[str, tuple[list[Node], dict[int, Tensor]]]:

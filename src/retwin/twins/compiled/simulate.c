@@ -28,7 +28,7 @@ static void slope_sensitive(const double *z, const double *u, const double *p, d
 static void advance(slope_of f, int size, const double *c, const double *p, double period,
                     long long substeps, double *z)
 {
-    double u[NU], k[4][NX * (1 + NQ)], at[NX * (1 + NQ)];
+    double u[NU + 1], k[4][NX * (1 + NQ)], at[NX * (1 + NQ)];
     if (DISCRETE) {
         command(c, 0.0, u);
         f(z, u, p, k[0]);
@@ -55,7 +55,7 @@ static void advance(slope_of f, int size, const double *c, const double *p, doub
 EXPORT void simulate(long long n, long long samples, long long substeps, double period,
                      const double *c, const double *p, const double *start, double *y, double *x)
 {
-    double z[NX], u[NU];
+    double z[NX], u[NU + 1];
     for (long long row = 0; row < n; row++, p += NP, start += NX) {
         for (int i = 0; i < NX; i++)
             z[i] = start[i];
@@ -75,7 +75,7 @@ EXPORT void sensitivities(long long n, long long samples, long long substeps, do
                           const double *c, const double *p, const double *start, double *y,
                           double *dy)
 {
-    double z[NX * (1 + NQ)], u[NU], hx[NY * NX], hp[NY * NP + 1];
+    double z[NX * (1 + NQ)], u[NU + 1], hx[NY * NX], hp[NY * NP + 1];
     for (long long row = 0; row < n; row++, p += NP, start += NX) {
         for (int i = 0; i < NX; i++) {
             z[i] = start[i];
