@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 import retwin as rt
+from retwin.evaluation.fidelity.simulation import simulate_records
 from retwin.testing import TWIN_CHECKS, TwinSubject
 from retwin.twins import Parameter, ParametricTwin, State, StateTwin
 from retwin.twins.compiled import kernel
@@ -381,6 +382,17 @@ def test_it_stands_in_for_a_surrogate_with_gradient() -> None:
     commands = torch.as_tensor(noise(1, 20)).requires_grad_()
     surrogate(commands).sum().backward()
     assert commands.grad.any()
+
+
+def test_a_record_is_simulated_once_and_scored_as_equal_draws(monkeypatch) -> None:
+    free = duffing(substeps=2).parametric()
+    records = free.simulate(noise(2, 50), seed=0)
+    records = records.replace(observed=records.observed + 0.1)
+    once = simulate_records(free, records, draws=20, seed=0)
+    monkeypatch.setattr(StateTwin, "deterministic", False)
+    often = simulate_records(free, records, draws=20, seed=0)
+    for name in ("mean", "bands", "crps"):
+        np.testing.assert_allclose(getattr(once, name), getattr(often, name), rtol=1e-9)
 
 
 CASE = """

@@ -272,7 +272,8 @@ class Work:
         seed = trial.seed("simulate")
         simulate_records(twin, records, draws=DRAWS, seed=seed, progress=trial.progress).save(path)
         seconds = time.perf_counter() - started
-        return {"generate": seconds, "trajectories": DRAWS * len(records)}
+        draws = 1 if getattr(twin, "deterministic", False) else DRAWS
+        return {"generate": seconds, "trajectories": draws * len(records)}
 
     def _fidelity(self, trial: Trial, path: Path) -> Costs:
         """Compare the twin of a source with the healthy test trajectories of the fold."""

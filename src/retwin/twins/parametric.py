@@ -204,6 +204,11 @@ class ParametricTwin(TwinWrapper):
         return getattr(self.twin, "nominal", None)
 
     @property
+    def deterministic(self) -> bool:
+        """Whether the wrapped twin declares that its outputs depend on no seed."""
+        return getattr(self.twin, "deterministic", False)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters."""
         return tuple(each.name for each in self.parameters)

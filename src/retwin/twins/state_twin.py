@@ -154,6 +154,11 @@ class StateTwin:
         return (*(each.name for each in self.parameters), *starts)
 
     @property
+    def deterministic(self) -> bool:
+        """True: the outputs depend on no seed."""
+        return True
+
+    @property
     def fingerprint(self) -> str:
         """The equations as C99, which identify the twin where the names of functions do not."""
         return self.model.source

@@ -59,8 +59,9 @@ class SimulationError(RuntimeError):
 class Twin(Protocol):
     """A simulator from commands to outputs: plain, learned or corrected.
 
-    A twin may also have `limits`, the `Limits` of its commands, and `fingerprint`, a text that
-    identifies it where its fields, and the files that they name, do not.
+    A twin may also have `limits`, the `Limits` of its commands; `fingerprint`, a text that
+    identifies it where its fields, and the files that they name, do not; and `deterministic`, true
+    if its outputs depend on no seed, so that one simulation of a record is enough.
     """
 
     @property
