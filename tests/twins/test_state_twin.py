@@ -305,7 +305,7 @@ def stiff_twin(rate: float, **settings) -> StateTwin:
     )
 
 
-def test_a_stiff_twin_says_that_it_needs_substeps() -> None:
+def test_a_stiff_twin_warns_that_it_needs_substeps() -> None:
     commands = noise(2, 400)
     with pytest.warns(rt.twins.StepWarning, match="level has an error of .* V with substeps=1"):
         stiff_twin(26.0).simulate(commands, seed=0)

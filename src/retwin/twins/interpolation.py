@@ -13,7 +13,7 @@ __all__ = ["INTERPOLATIONS", "cubic_coefficients"]
 INTERPOLATIONS = ("hold", "linear", "spline")
 """Held until the next sample, as by a digital-to-analogue converter; straight lines; the natural
 cubic spline, for a signal that was band-limited before it was sampled."""
-REACH = 24
+TAPS = 24
 """Number of samples on either side on which a spline's slope depends: the weight of the next is
 5e-15 of the nearest one's."""
 
@@ -59,7 +59,7 @@ def _slopes(commands: Tensor) -> Tensor:
     import torch
 
     steps = commands.shape[1]
-    wanted = steps + 2 * (REACH + 1)
+    wanted = steps + 2 * (TAPS + 1)
     while commands.shape[1] < wanted:
         more = min(commands.shape[1] - 1, (wanted - commands.shape[1] + 1) // 2)
         before = 2 * commands[:, :1] - commands[:, 1 : more + 1].flip(1)
@@ -67,9 +67,9 @@ def _slopes(commands: Tensor) -> Tensor:
         commands = torch.cat([before, commands, after], dim=1)
     rises = 3 * (commands[:, 2:] - commands[:, :-2])
     weight = 1 / (2 * sqrt(3))
-    slopes = weight * rises[:, REACH : REACH + steps]
-    for j in range(1, REACH + 1):
+    slopes = weight * rises[:, TAPS : TAPS + steps]
+    for j in range(1, TAPS + 1):
         weight *= sqrt(3) - 2
-        both = (rises[:, REACH + sign * j : REACH + sign * j + steps] for sign in (-1, 1))
+        both = (rises[:, TAPS + sign * j : TAPS + sign * j + steps] for sign in (-1, 1))
         slopes = slopes.add(sum(both), alpha=weight)
     return slopes

@@ -36,7 +36,7 @@ SAMPLES_PER_CHUNK = 2**20
 """Number of samples, of all trajectories together, that are simulated at once: some 100 MB."""
 ACCURACY = 0.01
 """Largest error of the steps through time, in standard deviations of an output, that passes without
-a warning. It is meant to be small against a discrepancy that is worth modelling."""
+a warning. It should be small compared with a discrepancy that is worth modelling."""
 FINER = 16
 """How many times more sub-steps are tried before a simulation that is not finite is given up."""
 
@@ -140,7 +140,7 @@ class StateTwin:
             "step",
             expected="substeps=1 and interpolation='hold'",
             got=f"substeps={self.substeps}, interpolation={self.interpolation!r}",
-            remedy="leave both out: a step reaches from one sample to the next",
+            remedy="leave both out: a step covers one sample period",
         )
 
     def __getstate__(self) -> dict[str, Any]:
