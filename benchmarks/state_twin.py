@@ -7,7 +7,7 @@ scaled), and what is spent once per process on tracing and compiling.
 The same oscillator with one step per sample and a held input, when the compiled step was chosen
 (two cores, one of them busy, 2026-11-22), in s:
 
-| | once | one record | with 7 sensitivities | 100 records | installed |
+| | once | one record | with sensitivities: 7, CasADi 5 | 100 records | installed |
 |---|---|---|---|---|---|
 | own C99, gcc | 0.03–0.3 | 0.002 | 0.008 | 0.46 | – |
 | CasADi 3.8.2, mapaccum of SX | 0.08 | 0.025 | 0.051 | 3.8 | 277 MB |
