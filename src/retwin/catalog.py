@@ -67,15 +67,15 @@ CASES: Mapping[str, CaseEntry] = {
         "two cascaded tanks, without overflow",
         "retwin.cases.cascaded_tanks.recorded:RECORDED",
     ),
-    "silverbox": CaseEntry(
-        "retwin.cases.silver_box.case:silverbox",
-        "Silverbox, a linear twin of a cubic spring",
-        "retwin.cases.silver_box.recorded:RECORDED",
-    ),
     "tanks_overflow": CaseEntry(
         "retwin.cases.cascaded_tanks.case:tanks_overflow",
         "two cascaded tanks that overflow",
         "retwin.cases.cascaded_tanks.recorded:RECORDED",
+    ),
+    "silverbox": CaseEntry(
+        "retwin.cases.silver_box.case:silverbox",
+        "Silverbox, a linear twin of a cubic spring",
+        "retwin.cases.silver_box.recorded:RECORDED",
     ),
 }
 
