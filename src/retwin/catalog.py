@@ -176,6 +176,7 @@ FORMATS: Mapping[str, FormatEntry] = {
 
 EXTRAS: Mapping[str, Extra] = {
     "bayes": Extra("Bayesian updating, the source pi_bayes", "sbi"),
+    "compiled": Extra("a C compiler for StateTwin, where the system has none", "ziglang"),
     "fetch": Extra("downloads of public data", "pooch"),
     "flows": Extra("normalising flows as the distribution of the discrepancy", "zuko"),
     "fmu": Extra("twins that are FMUs", "fmpy"),
