@@ -362,7 +362,7 @@ def test_the_how_to_is_true(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs" / "function.md").read_text("utf-8")
     blocks = re.findall(r"^```python\n(# (\S+\.py)\n.*?)^```", page, re.M | re.S)
     files = {name: code for code, name in blocks}
-    assert list(files) == ["tank.py", "noisy.py", "slow.py", "test_tank.py"]
+    assert list(files) == ["tank.py", "noisy.py", "slow.py", "tanks.py", "test_tank.py"]
     for name, code in files.items():
         (tmp_path / name).write_text(code)
         run = [*(["-m", "pytest", "-q"] if name.startswith("test") else []), name]
@@ -370,7 +370,7 @@ def test_the_how_to_is_true(tmp_path: Path) -> None:
             [sys.executable, *run], cwd=tmp_path, capture_output=True, text=True, check=False
         )
         assert done.returncode == 0, done.stdout + done.stderr
-        for line in re.findall(r"  # prints (.*)", code):
+        for line in re.findall(r"# prints (.*)", code):
             assert line in done.stdout
 
 
