@@ -425,7 +425,7 @@ def drawn_discrepancy(
     """Residuals that the corrected twin generates."""
     twin, measured = with_outputs(PADDED["delay and offset"], list(scale), offset)
     surrogate = rt.fit_surrogate(twin, rt.MLP((16,)), seed=0, training=QUICK)
-    # The errors of commands have the commands' units, whatever those of the outputs are.
+    # The errors of commands do not have the units of the outputs, which are what changes here.
     density = few_epochs(DENSITY) if isinstance(correction, rt.CommandSpace) else DENSITY
     rg = rt.fit_residual(surrogate, measured, correction, density, seed=5)
     made = rt.CorrectedTwin(surrogate, rg).simulate(measured.commands, seed=1)

@@ -178,8 +178,8 @@ class StateTwin:
         function = self.step or self.derivative
         states, parameters = ([each.name for each in own] for own in (self.states, self.parameters))
         return trace_model(
-            _of_three(function),
-            _of_three(self.output),
+            _with_parameters(function),
+            _with_parameters(self.output),
             (states, self.inputs.names, parameters),
             len(self.outputs),
             discrete=self.step is not None,
@@ -216,14 +216,14 @@ class StateTwin:
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             own = values[chunk.index]
-            nominal = self._explained(chunk, chunk.commands, own)
+            nominal = self._outputs(chunk, chunk.commands, own)
             if chunk.index.start == 0 and 0 not in chunk.failed:
                 self._check_accuracy(chunk.commands[:1], own[:1], nominal[:1])
             held = chunk.held_commands
             faulty = (held != chunk.commands).any(axis=(1, 2))
             observed = nominal.copy()
             if faulty.any():
-                observed[faulty] = self._explained(chunk, held, own, faulty)
+                observed[faulty] = self._outputs(chunk, held, own, faulty)
             return nominal, observed
 
         size = max(1, SAMPLES_PER_CHUNK // commands.shape[1])
@@ -303,8 +303,7 @@ class StateTwin:
 
     def _values(self, parameters: Mapping[str, ArrayLike] | None, count: int) -> NDArray:
         """The values (count, k) of all parameters `names`."""
-        starts = [each.start or 0.0 for each in self.parameters]
-        starts += [each.start for each in self.states]
+        starts = [*(each.start for each in self.parameters), *(each.start for each in self.states)]
         own = values_per_simulation(parameters, count, allowed=self.names)
         columns = zip(self.names, starts, strict=True)
         return np.stack([own.get(name, np.full(count, start)) for name, start in columns], 1)
@@ -315,7 +314,7 @@ class StateTwin:
 
         return Steps(self.model, 1 / self.rate, substeps, self.interpolation)
 
-    def _explained(
+    def _outputs(
         self, chunk: Chunk, commands: NDArray, values: NDArray, rows: NDArray | None = None
     ) -> NDArray:
         """Outputs of a chunk's rows; those that are not finite are entered as failed."""
@@ -354,7 +353,7 @@ class StateTwin:
         )
 
 
-def _of_three(function: Callable[..., Any] | None) -> Callable[..., Any]:
+def _with_parameters(function: Callable[..., Any] | None) -> Callable[..., Any]:
     """A function of x, u and p, where the user's may leave out p."""
     require(
         callable(function),

@@ -1,8 +1,8 @@
 """Tracing: what a function does with scalar tensors of torch becomes a `Program`.
 
-A tensor whose elements are nodes passes through the user's function. torch reduces whatever the
-function calls to its own few operators, and each of them is looked up here. An operator that is
-not, such as one that needs the number in a tensor, is refused by name.
+The user's function is called with tensors whose elements are nodes. torch expresses every call in
+its own few operators, and each of these has a rule here. An operator without a rule, such as one
+that needs the number in a tensor, is refused by name.
 """
 
 from __future__ import annotations
