@@ -134,7 +134,7 @@ def test_sensitivities_are_those_of_torch_and_of_differences(twin: StateTwin) ->
     commands = np.clip(noise(2, 60), -1, 1)
     made, derivatives = twin.sensitivities(commands)
     assert derivatives.shape == (*made.shape, len(twin.names))
-    values = twin._values(None, 2)
+    values = twin.values(None, 2)
     for column, name in enumerate(twin.names):
         ends = [{name: values[:, column] + sign * 1e-6} for sign in (-1, 1)]
         low, high = (twin.simulate(commands, seed=0, parameters=each).observed for each in ends)

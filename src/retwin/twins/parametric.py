@@ -294,7 +294,7 @@ class ParametricTwin(TwinWrapper):
         """
         self._check_known(parameters or {})
         now: dict[str, ArrayLike] = dict(zip(self.names, self.values, strict=True))
-        inner_values = self._inner(now | dict(parameters or {}))
+        inner_values = self.inner(now | dict(parameters or {}))
         return self.twin.simulate(
             commands, faults=faults, seed=seed, progress=progress, parameters=inner_values
         )
@@ -319,7 +319,7 @@ class ParametricTwin(TwinWrapper):
         differentiated = getattr(self.twin, "sensitivities", None)
         if differentiated is None:
             return None
-        inner = self._inner(dict(zip(self.names, values, strict=True)))
+        inner = self.inner(dict(zip(self.names, values, strict=True)))
         every = differentiated(commands, inner)[1]
         mixed = np.zeros((every.shape[-1], len(self.parameters)))
         for column, each in enumerate(self.parameters):
@@ -328,7 +328,7 @@ class ParametricTwin(TwinWrapper):
         made: NDArray = every @ mixed
         return made
 
-    def _inner(self, now: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
+    def inner(self, now: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
         """Values of the wrapped twin's parameters, for those of the free ones."""
         values: dict[str, ArrayLike] = dict(self.held)
         return values | {

@@ -178,8 +178,8 @@ class StateTwin:
         function = self.step or self.derivative
         states, parameters = ([each.name for each in own] for own in (self.states, self.parameters))
         return trace_model(
-            _with_parameters(function),
-            _with_parameters(self.output),
+            with_parameters(function),
+            with_parameters(self.output),
             (states, self.inputs.names, parameters),
             len(self.outputs),
             discrete=self.step is not None,
@@ -212,13 +212,13 @@ class StateTwin:
     ) -> Trajectories:
         """See `TakesParameters.simulate`; the parameters are `names`."""
         commands = checked_commands(commands, self.inputs)
-        values = self._values(parameters, len(commands))
+        values = self.values(parameters, len(commands))
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             own = values[chunk.index]
             nominal = self._outputs(chunk, chunk.commands, own)
             if chunk.index.start == 0 and 0 not in chunk.failed:
-                self._check_accuracy(chunk.commands[:1], own[:1], nominal[:1])
+                self.check_accuracy(chunk.commands[:1], own[:1], nominal[:1])
             held = chunk.held_commands
             faulty = (held != chunk.commands).any(axis=(1, 2))
             observed = nominal.copy()
@@ -239,8 +239,8 @@ class StateTwin:
         States of a simulation that diverges are not finite.
         """
         commands = checked_commands(commands, self.inputs)
-        values = self._values(parameters, len(commands))
-        return self._steps(self.substeps).run(commands, values)[1]
+        values = self.values(parameters, len(commands))
+        return self.steps().run(commands, values)[1]
 
     def sensitivities(
         self, commands: NDArray, parameters: Mapping[str, ArrayLike] | None = None
@@ -264,8 +264,8 @@ class StateTwin:
 
         """
         commands = checked_commands(commands, self.inputs)
-        values = self._values(parameters, len(commands))
-        return self._steps(self.substeps).sensitivities(commands, values)
+        values = self.values(parameters, len(commands))
+        return self.steps().sensitivities(commands, values)
 
     def __call__(
         self, commands: Tensor, parameters: Mapping[str, Tensor | float] | None = None
@@ -287,7 +287,7 @@ class StateTwin:
         """
         import torch
 
-        defaults = dict(zip(self.names, self._values(None, 1)[0], strict=True))
+        defaults = dict(zip(self.names, self.values(None, 1)[0], strict=True))
         unknown = sorted(set(parameters or {}) - set(defaults))
         require(
             not unknown,
@@ -299,32 +299,35 @@ class StateTwin:
         like = commands.new_zeros(len(commands), dtype=torch.float64)
         given = (defaults | dict(parameters or {})).values()
         theta = torch.stack([torch.as_tensor(each).to(like) + like for each in given], 1)
-        return self._steps(self.substeps).in_torch(commands.to(like), theta)[0].to(commands)
+        return self.steps().in_torch(commands.to(like), theta)[0].to(commands)
 
-    def _values(self, parameters: Mapping[str, ArrayLike] | None, count: int) -> NDArray:
+    def values(self, parameters: Mapping[str, ArrayLike] | None, count: int) -> NDArray:
         """The values (count, k) of all parameters `names`."""
         starts = [*(each.start for each in self.parameters), *(each.start for each in self.states)]
         own = values_per_simulation(parameters, count, allowed=self.names)
         columns = zip(self.names, starts, strict=True)
         return np.stack([own.get(name, np.full(count, start)) for name, start in columns], 1)
 
-    def _steps(self, substeps: int) -> Steps:
-        """The simulation with that many sub-steps."""
+    def steps(self, substeps: int | None = None) -> Steps:
+        """The simulation from sample to sample, with other sub-steps if these are given.
+
+        It takes the values (n, k) of all parameters `names`, and checks nothing.
+        """
         from retwin.twins.compiled.steps import Steps
 
-        return Steps(self.model, 1 / self.rate, substeps, self.interpolation)
+        return Steps(self.model, 1 / self.rate, substeps or self.substeps, self.interpolation)
 
     def _outputs(
         self, chunk: Chunk, commands: NDArray, values: NDArray, rows: NDArray | None = None
     ) -> NDArray:
         """Outputs of a chunk's rows; those that are not finite are entered as failed."""
         index = np.arange(len(commands)) if rows is None else np.flatnonzero(rows)
-        outputs, states = self._steps(self.substeps).run(commands[index], values[index])
+        outputs, states = self.steps().run(commands[index], values[index])
         finite = np.isfinite(states).all(axis=2) & np.isfinite(outputs).all(axis=2)
         for place in np.flatnonzero(~finite.all(axis=1)):
             row, finer = [index[place]], FINER * self.substeps
             remedy = "check the parameters and the start, or the range of the equations"
-            again = self._steps(finer).run(commands[row], values[row])
+            again = self.steps(finer).run(commands[row], values[row])
             if self.derivative is not None and all(np.isfinite(each).all() for each in again):
                 remedy = f"it is finite with {finer}: give more substeps"
             time = np.argmin(finite[place]) / self.rate
@@ -333,11 +336,25 @@ class StateTwin:
             outputs[place] = 0.0
         return outputs
 
-    def _check_accuracy(self, commands: NDArray, values: NDArray, outputs: NDArray) -> None:
-        """Warn where twice the sub-steps give other outputs (1, T, d_y)."""
+    def check_accuracy(self, commands: NDArray, values: NDArray, outputs: NDArray) -> None:
+        """Warn where twice the sub-steps give other outputs than these (1, T, d_y).
+
+        Parameters
+        ----------
+        commands, values : ndarray, shapes (1, T, d_u) and (1, k)
+            Those of the simulation; the values are of all parameters `names`.
+        outputs : ndarray, shape (1, T, d_y)
+            What it gave.
+
+        Warns
+        -----
+        StepWarning
+            See the class.
+
+        """
         if self.step is not None:
             return
-        finer = self._steps(2 * self.substeps).run(commands, values)[0][0]
+        finer = self.steps(2 * self.substeps).run(commands, values)[0][0]
         error = np.sqrt(np.mean((outputs[0] - finer) ** 2, axis=0))
         # An output that hardly varies is compared with its size, of which rounding is a fraction.
         allowed = ACCURACY * np.maximum(finer.std(axis=0), 1e-6 * np.abs(finer).max(axis=0))
@@ -353,7 +370,7 @@ class StateTwin:
         )
 
 
-def _with_parameters(function: Callable[..., Any] | None) -> Callable[..., Any]:
+def with_parameters(function: Callable[..., Any] | None) -> Callable[..., Any]:
     """A function of x, u and p, where the user's may leave out p."""
     require(
         callable(function),

@@ -22,6 +22,7 @@ __all__ = [
     "Chunk",
     "SimulationError",
     "Twin",
+    "check_channels",
     "checked_commands",
     "checked_seed",
     "checked_stride",
@@ -188,6 +189,17 @@ def checked_stride(
         got=f"{len(trajectories)}, {int((~healthy).sum())} of them with a fault",
         remedy=f"take {argument}.with_label({HEALTHY!r})",
     )
+    check_channels(twin, trajectories, argument)
+    return stride_of(
+        trajectories.rate, rate, steps=trajectories.steps, remedy="give the sensor's true rate"
+    )
+
+
+def check_channels(twin: Twin, trajectories: Trajectories, argument: str) -> None:
+    """Refuse trajectories whose channels or rate are not those of a twin.
+
+    Raises InputError, in which the trajectories have the name `argument`.
+    """
     for name in ("inputs", "outputs", "rate"):
         expected, given = getattr(twin, name), getattr(trajectories, name)
         require(
@@ -197,9 +209,6 @@ def checked_stride(
             got=given,
             remedy="load the file with its case, or convert it",
         )
-    return stride_of(
-        trajectories.rate, rate, steps=trajectories.steps, remedy="give the sensor's true rate"
-    )
 
 
 def checked_seed(seed: int) -> int:

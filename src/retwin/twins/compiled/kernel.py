@@ -80,16 +80,16 @@ def compiled(source: str) -> ctypes.CDLL | None:
 
 
 def call(
-    library: ctypes.CDLL, name: str, sizes: tuple[int, ...], period: float, *arrays: NDArray
+    library: ctypes.CDLL, name: str, sizes: tuple[int, ...], period: float, *arrays: NDArray | None
 ) -> None:
     """Call a function of a model with its sizes, the sample period in s, and double arrays.
 
-    The arrays must be contiguous and of the shapes that `simulate.c` gives.
+    The arrays must be contiguous and of the shapes that `simulate.c` gives; None is NULL.
     """
     function = getattr(library, name)
     function.restype = None
     function(
         *map(ctypes.c_longlong, sizes),
         ctypes.c_double(period),
-        *(ctypes.c_void_p(each.ctypes.data) for each in arrays),
+        *(ctypes.c_void_p(None if each is None else each.ctypes.data) for each in arrays),
     )

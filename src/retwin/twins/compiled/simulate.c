@@ -10,18 +10,30 @@ static void command(const double *c, double s, double *u)
         u[i] = c[i] + s * (c[NU + i] + s * (c[2 * NU + i] + s * c[3 * NU + i]));
 }
 
-/* The state with its sensitivities, z = x[NX], S[NX][NQ]: dS = f_x S + f_q. */
-static void slope_sensitive(const double *z, const double *u, const double *p, double *dz)
+/* The state with its derivatives by `columns` numbers, z = x[NX], S[NX][columns], the first of which
+ * are the model's parameters where `parameters` is not 0: dS = f_x S + f_p. */
+static void slope_with(const double *z, const double *u, const double *p, double *dz, int columns,
+                       int parameters)
 {
     double fx[NX * NX], fp[NX * NP + 1];
     slope_jacobian(z, u, p, dz, fx, fp);
     for (int i = 0; i < NX; i++)
-        for (int q = 0; q < NQ; q++) {
-            double sum = q < NP ? fp[i * NP + q] : 0.0;
+        for (int q = 0; q < columns; q++) {
+            double sum = parameters && q < NP ? fp[i * NP + q] : 0.0;
             for (int j = 0; j < NX; j++)
-                sum += fx[i * NX + j] * z[NX + j * NQ + q];
-            dz[NX + i * NQ + q] = sum;
+                sum += fx[i * NX + j] * z[NX + j * columns + q];
+            dz[NX + i * columns + q] = sum;
         }
+}
+
+static void slope_by_all(const double *z, const double *u, const double *p, double *dz)
+{
+    slope_with(z, u, p, dz, NQ, 1);
+}
+
+static void slope_by_state(const double *z, const double *u, const double *p, double *dz)
+{
+    slope_with(z, u, p, dz, NX, 0);
 }
 
 /* One sample: the model's own step, or Runge-Kutta steps of fourth order. */
@@ -51,9 +63,11 @@ static void advance(slope_of f, int size, const double *c, const double *p, doub
     }
 }
 
-/* c[n][samples][4][NU], p[n][NP], start[n][NX] to y[n][samples][NY], x[n][samples][NX]. */
+/* c[n][samples][4][NU], p[n][NP], start[n][NX] to y[n][samples][NY], x[n][samples][NX]. What
+ * `kicks`[n][samples][NX] adds to the states after each sample is process noise, NULL for none. */
 EXPORT void simulate(long long n, long long samples, long long substeps, double period,
-                     const double *c, const double *p, const double *start, double *y, double *x)
+                     const double *c, const double *p, const double *start, const double *kicks,
+                     double *y, double *x)
 {
     double z[NX], u[NU + 1];
     for (long long row = 0; row < n; row++, p += NP, start += NX) {
@@ -66,6 +80,8 @@ EXPORT void simulate(long long n, long long samples, long long substeps, double 
                 x[i] = z[i];
             if (t + 1 < samples)
                 advance(slope, NX, c, p, period, substeps, z);
+            for (int i = 0; kicks && i < NX; i++)
+                z[i] += *kicks++;
         }
     }
 }
@@ -92,7 +108,78 @@ EXPORT void sensitivities(long long n, long long samples, long long substeps, do
                         *dy += hx[i * NX + j] * z[NX + j * NQ + q];
                 }
             if (t + 1 < samples)
-                advance(slope_sensitive, NX * (1 + NQ), c, p, period, substeps, z);
+                advance(slope_by_all, NX * (1 + NQ), c, p, period, substeps, z);
+        }
+    }
+}
+
+/* Extended Kalman filter. Variances at the start v[NX], of the process noise of a sample q[NX] and of
+ * the measurement r[NY]; measured y[n][samples][NY], of which seen[n][samples][NY] is not 0; to
+ * mean[n][samples][NY] and covariance[n][samples][NY][NY] of y given all earlier samples, and to
+ * x[n][samples][NX] given these and the present one. */
+EXPORT void filter(long long n, long long samples, long long substeps, double period,
+                   const double *c, const double *p, const double *start, const double *v,
+                   const double *q, const double *r, const double *y, const double *seen,
+                   double *mean, double *covariance, double *x)
+{
+    double z[NX * (1 + NX)], u[NU + 1], hx[NY * NX], hp[NY * NP + 1], P[NX][NX], g[NX], FP[NX][NX];
+    double *F = z + NX;
+    for (long long row = 0; row < n; row++, p += NP, start += NX) {
+        for (int i = 0; i < NX; i++) {
+            z[i] = start[i];
+            for (int j = 0; j < NX; j++)
+                P[i][j] = i == j ? v[i] : 0.0;
+        }
+        for (long long t = 0; t < samples; t++) {
+            command(c, 0.0, u);
+            output_jacobian(z, u, p, mean, hx, hp);
+            for (int a = 0; a < NY; a++)
+                for (int b = 0; b < NY; b++) {
+                    double sum = a == b ? r[a] : 0.0;
+                    for (int i = 0; i < NX; i++)
+                        for (int j = 0; j < NX; j++)
+                            sum += hx[a * NX + i] * P[i][j] * hx[b * NX + j];
+                    covariance[a * NY + b] = sum;
+                }
+            for (int i = 0; i < NX; i++)
+                x[i] = z[i];
+            for (int a = 0; a < NY; a++) {
+                if (!seen[a])
+                    continue;
+                double variance = r[a], error = y[a] - mean[a];
+                for (int i = 0; i < NX; i++) {
+                    g[i] = 0.0;
+                    for (int j = 0; j < NX; j++)
+                        g[i] += P[i][j] * hx[a * NX + j];
+                    variance += hx[a * NX + i] * g[i];
+                    error -= hx[a * NX + i] * (x[i] - z[i]);
+                }
+                for (int i = 0; i < NX; i++) {
+                    x[i] += g[i] * error / variance;
+                    for (int j = 0; j < NX; j++)
+                        P[i][j] -= g[i] * g[j] / variance;
+                }
+            }
+            for (int i = 0; i < NX; i++) {
+                z[i] = x[i];
+                for (int j = 0; j < NX; j++)
+                    F[i * NX + j] = i == j ? 1.0 : 0.0;
+            }
+            if (t + 1 < samples)
+                advance(slope_by_state, NX * (1 + NX), c, p, period, substeps, z);
+            for (int i = 0; i < NX; i++)
+                for (int j = 0; j < NX; j++) {
+                    FP[i][j] = 0.0;
+                    for (int k = 0; k < NX; k++)
+                        FP[i][j] += F[i * NX + k] * P[k][j];
+                }
+            for (int i = 0; i < NX; i++)
+                for (int j = 0; j < NX; j++) {
+                    P[i][j] = i == j ? q[i] : 0.0;
+                    for (int k = 0; k < NX; k++)
+                        P[i][j] += FP[i][k] * F[j * NX + k];
+                }
+            c += 4 * NU, y += NY, seen += NY, mean += NY, covariance += NY * NY, x += NX;
         }
     }
 }

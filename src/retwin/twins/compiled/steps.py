@@ -42,19 +42,112 @@ class Steps:
     substeps: int
     interpolation: str
 
-    def run(self, commands: NDArray, theta: NDArray) -> tuple[NDArray, NDArray]:
-        """Outputs (n, T, d_y) and states (n, T, d_x) for commands (n, T, d_u)."""
+    def run(
+        self, commands: NDArray, theta: NDArray, kicks: NDArray | None = None
+    ) -> tuple[NDArray, NDArray]:
+        """Outputs (n, T, d_y) and states (n, T, d_x) for commands (n, T, d_u).
+
+        `kicks` (n, T, d_x), contiguous, are added to the states after each sample: process noise.
+        """
         library = compiled(self.model.source)
         if library is None:
             with torch.no_grad():
-                given = (torch.tensor(each, dtype=torch.float64) for each in (commands, theta))
-                outputs, states = self.in_torch(*given)
+                outputs, states = self.in_torch(_double(commands), _double(theta), kicks)
             return outputs.numpy(), states.numpy()
-        widths = (len(self.model.outputs), len(self.model.slope))
-        made = tuple(np.empty((*commands.shape[:2], width)) for width in widths)
+        made = tuple(np.empty((*commands.shape[:2], width)) for width in self._widths)
         sizes = (*commands.shape[:2], self.substeps)
-        call(library, "simulate", sizes, self.period, *self._arrays(commands, theta), *made)
+        given = self._arrays(commands, theta)
+        call(library, "simulate", sizes, self.period, *given, kicks, *made)
         return made[0], made[1]
+
+    def filter(
+        self,
+        commands: NDArray,
+        theta: NDArray,
+        measured: tuple[NDArray, NDArray],
+        variances: tuple[NDArray, NDArray, NDArray],
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """The extended Kalman filter.
+
+        Parameters
+        ----------
+        commands, theta : NDArray
+            See `run`.
+        measured : tuple of NDArray
+            Outputs (n, T, d_y), and whether each was measured.
+        variances : tuple of NDArray
+            Of the states at the first sample (d_x,), of the process noise that each sample adds
+            (d_x,), and of the measurement noise (d_y,), above 0.
+
+        Returns
+        -------
+        mean, covariance, states : NDArray
+            Mean (n, T, d_y) and covariance (n, T, d_y, d_y) of the outputs given all earlier
+            samples, and the states (n, T, d_x) given the present one too.
+
+        """
+        library = compiled(self.model.source)
+        shape, (outputs, states) = commands.shape[:2], self._widths
+        if library is None:
+            return self._filtered(commands, theta, measured, variances)
+        made = tuple(
+            np.empty((*shape, *each)) for each in ((outputs,), (outputs, outputs), (states,))
+        )
+        given = (*self._arrays(commands, theta), *variances, *measured)
+        given = tuple(np.ascontiguousarray(each, np.float64) for each in given)
+        call(library, "filter", (*shape, self.substeps), self.period, *given, *made)
+        return made[0], made[1], made[2]
+
+    def _filtered(
+        self,
+        commands: NDArray,
+        theta: NDArray,
+        measured: tuple[NDArray, NDArray],
+        variances: tuple[NDArray, NDArray, NDArray],
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """See `filter`, for one trajectory after the other."""
+        rows = [
+            self._filtered_row(*(_double(each) for each in row), *map(_double, variances))
+            for row in zip(commands, theta, *measured, strict=True)
+        ]
+        mean, covariance, states = (np.stack(each) for each in zip(*rows, strict=True))
+        return mean, covariance, states
+
+    def _filtered_row(
+        self,
+        commands: Tensor,
+        theta: Tensor,
+        outputs: Tensor,
+        seen: Tensor,
+        start: Tensor,
+        process: Tensor,
+        noise: Tensor,
+    ) -> list[NDArray]:
+        """See `filter`, for one trajectory."""
+        c = cubic_coefficients(commands[None], self.interpolation)
+        p, first = self._parted(theta[:, None].unbind(0))
+        x, spread = torch.cat(list(first)), torch.diag(start)
+        made = []
+        for t, (y, known) in enumerate(zip(outputs, seen > 0, strict=True)):
+
+            def output(z: Tensor, t: int = t) -> Tensor:
+                u = c[:, t, 0].unbind(1)
+                return torch.cat(self.model.evaluate("outputs", z[:, None].unbind(0), u, p))
+
+            def after(z: Tensor, t: int = t) -> Tensor:
+                return torch.cat(self._advanced(c[:, t], list(z[:, None].unbind(0)), p))
+
+            slope = torch.autograd.functional.jacobian(output, x)
+            mean, predicted = output(x), slope @ spread @ slope.T + torch.diag(noise)
+            gain = torch.linalg.solve(predicted[known][:, known], slope[known] @ spread).T
+            x = x + gain @ (y - mean)[known]
+            spread = spread - gain @ slope[known] @ spread
+            made.append((mean, predicted, x))
+            if t + 1 < len(outputs):
+                forward = torch.autograd.functional.jacobian(after, x)
+                x = after(x)
+                spread = forward @ spread @ forward.T + torch.diag(process)
+        return [torch.stack(each).numpy() for each in zip(*made, strict=True)]
 
     def sensitivities(self, commands: NDArray, theta: NDArray) -> tuple[NDArray, NDArray]:
         """Outputs (n, T, d_y) and their derivatives (n, T, d_y, k) by `theta`."""
@@ -67,7 +160,7 @@ class Steps:
             given = self._arrays(commands, theta)
             call(library, "sensitivities", sizes, self.period, *given, *made)
             return made
-        at, inputs = (torch.tensor(each, dtype=torch.float64) for each in (theta, commands))
+        at, inputs = _double(theta), _double(commands)
         columns = [
             torch.autograd.functional.jvp(
                 lambda own: self.in_torch(inputs, own)[0], at, unit.expand_as(at).clone()
@@ -76,7 +169,9 @@ class Steps:
         ]
         return columns[0][0].numpy(), torch.stack([each for _, each in columns], -1).numpy()
 
-    def in_torch(self, commands: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
+    def in_torch(
+        self, commands: Tensor, theta: Tensor, kicks: NDArray | None = None
+    ) -> tuple[Tensor, Tensor]:
         """The same as `run` for double tensors, with gradient by both."""
         c = cubic_coefficients(commands, self.interpolation)
         p, start = self._parted(theta.unbind(1))
@@ -88,6 +183,8 @@ class Steps:
             states.append(torch.stack(x, 1))
             if t + 1 < c.shape[1]:
                 x = self._advanced(c[:, t], x, p)
+            if kicks is not None:
+                x = [own + kick for own, kick in zip(x, _double(kicks[:, t].T), strict=True)]
         return torch.stack(outputs, 1), torch.stack(states, 1)
 
     def _advanced(self, c: Tensor, x: list[Tensor], p: Sequence[Tensor]) -> list[Tensor]:
@@ -111,13 +208,21 @@ class Steps:
 
     def _arrays(self, commands: NDArray, theta: NDArray) -> list[NDArray]:
         """Coefficients of the commands, parameters and starts, as the compiled model takes them."""
-        given = torch.tensor(commands, dtype=torch.float64)
-        c = cubic_coefficients(given, self.interpolation).numpy()
+        c = cubic_coefficients(_double(commands), self.interpolation).numpy()
         columns = self._parted(list(theta.T))
         starts = [np.stack(own, 1) if own else np.zeros((len(theta), 0)) for own in columns]
         return [np.ascontiguousarray(each, np.float64) for each in (c, *starts)]
+
+    @property
+    def _widths(self) -> tuple[int, int]:
+        """Numbers of outputs and of states."""
+        return len(self.model.outputs), len(self.model.slope)
 
     def _parted(self, columns: Sequence) -> tuple[Sequence, Sequence]:
         """What belongs to the parameters, and to the starts."""
         count = len(self.model.variables["p"])
         return columns[:count], columns[count:]
+
+
+def _double(values: NDArray) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)

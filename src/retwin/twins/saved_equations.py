@@ -1,0 +1,121 @@
+"""The equations of a `StateTwin` as JSON: operations on numbers, which run no code when read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from math import inf, isfinite
+from typing import Any
+
+from retwin.checks import require
+from retwin.data.trajectories import Channels
+from retwin.twins.compiled.model import Model
+from retwin.twins.compiled.program import OPERATIONS, Node, Program
+from retwin.twins.limits import Limits
+from retwin.twins.parametric import Parameter
+from retwin.twins.state import State
+from retwin.twins.state_twin import StateTwin
+
+__all__ = ["equations_from", "equations_of"]
+
+
+def equations_of(twin: StateTwin) -> dict[str, Any]:
+    """The twin as JSON values."""
+    model = twin.model
+    nodes = model.program.needed([*model.slope, *model.outputs])
+    place = {node.index: i for i, node in enumerate(nodes)}
+    return {
+        "operations": [
+            [node.op, [place[each.index] for each in node.args], node.value] for node in nodes
+        ],
+        "slope": [place[each.index] for each in model.slope],
+        "results": [place[each.index] for each in model.outputs],
+        "discrete": model.discrete,
+        "states": [asdict(each) for each in twin.states],
+        "parameters": [{**asdict(each), "places": {}} for each in twin.parameters],
+        "inputs": [twin.inputs.names, twin.inputs.units],
+        "outputs": [twin.outputs.names, twin.outputs.units],
+        "rate": twin.rate,
+        "substeps": twin.substeps,
+        "interpolation": twin.interpolation,
+        "limits": None if twin.limits is None else _bounded(twin.limits),
+    }
+
+
+def equations_from(about: dict[str, Any]) -> StateTwin:
+    """The twin that `equations_of` described.
+
+    Raises
+    ------
+    InputError, KeyError, TypeError, ValueError
+        The description is damaged.
+
+    """
+    states = tuple(State(**each) for each in about["states"])
+    parameters = tuple(Parameter(**each) for each in about["parameters"])
+    inputs, outputs = (
+        Channels(*(tuple(part) for part in about[name])) for name in ("inputs", "outputs")
+    )
+    program = Program()
+    widths = zip("xup", (len(states), len(inputs), len(parameters)), strict=True)
+    variables = {
+        letter: tuple(program.variable(f"{letter}[{i}]") for i in range(width))
+        for letter, width in widths
+    }
+    known = {node.value: node for group in variables.values() for node in group}
+    nodes: list[Node] = []
+    for op, args, value in about["operations"]:
+        require(
+            (op in OPERATIONS or op == "constant" or (op == "variable" and value in known))
+            and all(isinstance(i, int) and 0 <= i < len(nodes) for i in args),
+            "operations",
+            expected="known operations on earlier ones",
+            got=f"{op} of {args}",
+            remedy="save the model again",
+        )
+        earlier = [nodes[i] for i in args]
+        if op in OPERATIONS:
+            nodes.append(program.node(op, *earlier))
+        else:
+            nodes.append(known[value] if op == "variable" else program.constant(value))
+    slope, results = ([nodes[i] for i in about[name]] for name in ("slope", "results"))
+    model = Model(program, variables, slope, results, bool(about["discrete"]))
+    return StateTwin(
+        states,
+        _Evaluated(model, "outputs"),
+        inputs,
+        outputs,
+        float(about["rate"]),
+        **{"step" if model.discrete else "derivative": _Evaluated(model, "slope")},
+        parameters=parameters,
+        substeps=about["substeps"],
+        interpolation=about["interpolation"],
+        limits=None if about["limits"] is None else _limits(**about["limits"]),
+    )
+
+
+def _bounded(limits: Limits) -> dict[str, Any]:
+    """Limits as JSON, which has no infinity."""
+    low, high = (
+        [each if isfinite(each) else None for each in s] for s in (limits.low, limits.high)
+    )
+    return {"low": low, "high": high, "outside": limits.outside}
+
+
+def _limits(low: list, high: list, outside: Any) -> Limits:
+    return Limits(
+        tuple(-inf if each is None else each for each in low),
+        tuple(inf if each is None else each for each in high),
+        outside,
+    )
+
+
+class _Evaluated:
+    """A part of a model as a function of named tuples, as a user would write it."""
+
+    def __init__(self, model: Model, part: str) -> None:
+        self.model = model
+        self.part = part
+
+    def __call__(self, x: Sequence[Any], u: Sequence[Any], p: Sequence[Any]) -> Any:
+        return tuple(self.model.evaluate(self.part, x, u, p))

@@ -1,0 +1,20 @@
+"""Corrections inside the state equations of a twin, learned from its outputs alone.
+
+Corrections of outputs and commands are in `retwin.update.corrections`.
+"""
+
+from retwin.update.dynamics.corrected import Domain
+from retwin.update.dynamics.fitting import Dynamics, FittedDynamics, fit_dynamics
+from retwin.update.dynamics.library import Library
+from retwin.update.dynamics.prediction import Prediction
+from retwin.update.dynamics.twin import DynamicsTwin
+
+__all__ = [
+    "Domain",
+    "Dynamics",
+    "DynamicsTwin",
+    "FittedDynamics",
+    "Library",
+    "Prediction",
+    "fit_dynamics",
+]

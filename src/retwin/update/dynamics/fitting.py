@@ -1,0 +1,303 @@
+"""`fit_dynamics`: the discrepancy inside a twin's state equations, from outputs alone."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from retwin.checks import require, whole
+from retwin.data.trajectories import Trajectories
+from retwin.errors import InputError
+from retwin.progress import Progress
+from retwin.twins.parametric import ParametricTwin
+from retwin.twins.state_twin import StateTwin
+from retwin.twins.twin import checked_stride
+from retwin.update.dynamics.corrected import CorrectedEquations, correctable
+from retwin.update.dynamics.estimation import Estimation, HeldOut, Point, correlation_time, root
+from retwin.update.dynamics.library import Library
+from retwin.update.dynamics.noise import fit_noise, folds, widening
+from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of
+
+__all__ = ["Dynamics", "FittedDynamics", "fit_dynamics"]
+
+STRONGEST = 100.0
+"""Variance of the error of an effective sample that is assumed first, over that of the samples of
+the twin without discrepancy: a prior so strong that the discrepancy begins near 0."""
+STEP = (2.0, 3.0)
+"""Least and largest ratio of that variance to the next one: larger steps leave the optimum that the
+search follows."""
+CONSISTENT = 0.9
+"""Ratio of the observed to the assumed variance from which they agree."""
+MAX_STRENGTHS = 30
+"""Number of variances at most."""
+ERROR_STEPS = 2
+"""Times that the error of each output is estimated anew where the twin alone is fitted."""
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """Settings of the discrepancy inside state equations.
+
+    Parameters
+    ----------
+    library : Library
+        Terms of which the discrepancy of each corrected equation is a weighted sum.
+    states : sequence of str
+        The states whose equations are corrected; by default all whose equation is no definition,
+        such as position' = velocity.
+    folds : int, default 10
+        Parts of the calibration record, each made of blocks of all trajectories, that are held out
+        in turn to calibrate bands.
+
+    """
+
+    library: Library = Library()  # noqa: RUF009 - frozen
+    states: Sequence[str] = ()
+    folds: int = 10
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "states", tuple(self.states))
+        whole("folds", self.folds, least=2)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedDynamics:
+    """A twin with corrected dynamics, and what was learned.
+
+    Attributes
+    ----------
+    twin : DynamicsTwin
+        The corrected twin.
+    parameters, errors : dict of str to float
+        The twin's own parameters theta, and their standard errors, which allow for errors of the
+        outputs that are correlated within the parts that are held out.
+    terms : dict of str to float
+        The root mean square of each term over the calibration record, in that of the time
+        derivative of its state; the largest first.
+    figures : dict of str to float
+        `rms_before` and `rms_after` of free simulation over the calibration record, in output units
+        (relative to each output's standard deviation where units differ), `held_out`, `widening`.
+    seconds : float
+        Duration.
+    reason : str
+        What the result does not cover: parameters at bounds, and the warnings.
+
+    """
+
+    twin: DynamicsTwin
+    parameters: dict[str, float]
+    errors: dict[str, float]
+    terms: dict[str, float]
+    figures: dict[str, float]
+    seconds: float
+    reason: str
+
+
+def fit_dynamics(
+    twin: StateTwin | ParametricTwin,
+    observed: Trajectories,
+    settings: Dynamics = Dynamics(),
+    *,
+    progress: Progress | None = None,
+) -> FittedDynamics:
+    """Learn what a twin's state equations lack, from measured outputs alone.
+
+    The parameters theta of the twin, the coefficients psi of a discrepancy inside its state
+    equations, and the unknown starts of the states are estimated together on free simulation.
+    Coefficients have a Gaussian prior about 0, and theta has none, so that what theta can explain
+    is not explained by the discrepancy. The assumed error variance, which sets the strength of that
+    prior, is the one that is observed. Process and measurement noise then maximise the likelihood
+    of an extended Kalman filter, and bands are widened to hold held-out blocks.
+
+    Parameters
+    ----------
+    twin : StateTwin or ParametricTwin
+        The equations, with their parameters or with those alone that are to be free; best after
+        `identify`, since the search begins there.
+    observed : Trajectories
+        Healthy calibration trajectories with commands; masked samples are not used.
+    settings : Dynamics
+        The form of the discrepancy.
+    progress : callable, optional
+        Called with the share of the work that is done.
+
+    Returns
+    -------
+    FittedDynamics
+        Its `twin` is a `DynamicsTwin`.
+
+    Raises
+    ------
+    InputError
+        A twin that is no `StateTwin`, other channels or another rate, no healthy trajectory, too
+        few samples, an unknown state, or a twin whose simulation is not finite.
+
+    Warns
+    -----
+    UserWarning
+        A parameter is at its bound.
+
+    """
+    began = time.perf_counter()
+    base, free, values = state_twin_of(twin)
+    checked_stride(base, observed, None, "observed")
+    report = progress or (lambda share: None)
+    at_rest = unknowns_of(base, free, values)
+    require(
+        observed.mask.sum() > at_rest.count + len(at_rest.free) + settings.folds,
+        "observed",
+        expected="more measured samples than parameters",
+        got=int(observed.mask.sum()),
+        remedy="give more or longer trajectories, or free fewer parameters",
+    )
+    alone, point = _without_discrepancy(base, observed, at_rest)
+    report(0.05)
+    fitted = _with_starts(base, at_rest, point)
+    states = correctable(fitted, settings.states)
+    equations = CorrectedEquations.distinct(
+        fitted,
+        settings.library,
+        states,
+        (alone.simulated(point)[1], alone.commands),
+        at_rest.matrix,
+    )
+    estimation, found = _chosen(equations, alone, point, lambda share: report(0.05 + 0.8 * share))
+    held_out = estimation.held_out(found, folds(estimation.seen, settings.folds))
+    report(0.9)
+    made = _assembled(equations, estimation, found, held_out)
+    report(1.0)
+    notes = _at_bounds(estimation.unknowns, found)
+    if notes:
+        warnings.warn(notes, stacklevel=2)
+    k = at_rest.count
+    variance = np.diag(estimation.covariance(found))[: len(found.shared)]
+    deviation = np.sqrt(np.maximum(variance, held_out.variance))
+    return FittedDynamics(
+        twin=made,
+        parameters=dict(zip(at_rest.names, found.shared[:k].tolist(), strict=True)),
+        errors=dict(zip(at_rest.names, deviation[:k].tolist(), strict=True)),
+        terms=_sizes(equations, estimation, found),
+        figures={
+            "rms_before": alone.rms(alone.residual(point)),
+            "rms_after": estimation.rms(estimation.residual(found)),
+            "held_out": estimation.rms(held_out.errors),
+            "widening": made.widening,
+            "strength": float(np.mean(estimation.variance / alone.power(alone.residual(point)))),
+        },
+        seconds=time.perf_counter() - began,
+        reason=notes,
+    )
+
+
+def _without_discrepancy(
+    base: StateTwin, observed: Trajectories, unknowns: Unknowns
+) -> tuple[Estimation, Point]:
+    """The fit of the twin itself."""
+    starts = np.tile(unknowns.start[unknowns.free], (len(observed), 1))
+    point = Point(unknowns.mean, starts)
+    estimation = Estimation(base, observed, unknowns, observed.mask, np.ones(len(base.outputs)))
+    for _ in range(ERROR_STEPS):
+        residual = estimation.residual(point)
+        if not np.isfinite(residual).all():
+            raise InputError(
+                "twin",
+                expected="a simulation of the commands that is finite",
+                got="one that is not, at the present parameters",
+                remedy="identify the twin first, or choose other starts of its parameters",
+            )
+        estimation = replace(estimation, variance=estimation.power(residual))
+        point = estimation.minimised(point)
+    return estimation, point
+
+
+def _with_starts(base: StateTwin, unknowns: Unknowns, point: Point) -> StateTwin:
+    """The twin whose parameters start at a point."""
+    values = unknowns.offset + unknowns.matrix @ point.shared
+    parameters = (
+        replace(each, start=value, low=min(each.low, value), high=max(each.high, value))
+        for each, value in zip(base.parameters, values.tolist(), strict=True)
+    )
+    return replace(base, parameters=tuple(parameters))
+
+
+def _chosen(
+    equations: CorrectedEquations,
+    alone: Estimation,
+    point: Point,
+    report: Callable[[float], None],
+) -> tuple[Estimation, Point]:
+    """The fit whose assumed errors are those that are observed.
+
+    The prior of the discrepancy begins strong, as if errors were large, and becomes weaker step by
+    step, which leads the search along.
+    """
+    unknowns = alone.unknowns.with_coefficients(equations.names)
+    estimation = replace(alone, twin=equations.corrected, unknowns=unknowns)
+    now = Point(np.pad(point.shared, (0, len(equations.names))), point.starts)
+    power = alone.power(alone.residual(point))
+    strength = STRONGEST
+    for number in range(MAX_STRENGTHS):
+        own = replace(estimation, variance=strength * power)
+        now = own.minimised(now)
+        report(1 - 0.8 ** (number + 1))
+        residual = own.residual(now)
+        observed = correlation_time(residual) * float(np.mean(own.power(residual) / power))
+        if observed >= CONSISTENT * strength:
+            break
+        strength = float(np.clip(observed, strength / STEP[1], strength / STEP[0]))
+    return own, now
+
+
+def _assembled(
+    equations: CorrectedEquations,
+    estimation: Estimation,
+    found: Point,
+    held_out: HeldOut,
+) -> DynamicsTwin:
+    """The twin as a distribution, see `Estimation.held_out`."""
+    unknowns = estimation.unknowns
+    start, deviation = unknowns.start.copy(), np.zeros(len(unknowns.start))
+    start[unknowns.free] = found.starts.mean(axis=0)
+    deviation[unknowns.free] = found.starts.std(axis=0)
+    values = unknowns.offset + unknowns.matrix @ found.shared
+    by_free = np.eye(len(start))[:, unknowns.free]
+    factor = block_diag(unknowns.matrix, by_free) @ root(estimation.covariance(found))
+    names = [each.name for each in equations.twin.states]
+    indices = [names.index(name) for name in equations.states]
+    made = DynamicsTwin(
+        equations.corrected,
+        np.concatenate([values, start]),
+        factor,
+        deviation,
+        np.zeros(len(start)),
+        estimation.power(estimation.residual(found)),
+        1.0,
+        equations.domain,
+        equations.states,
+        estimation.observed.emulated,
+    )
+    noisy = fit_noise(made, estimation.observed, indices)
+    return replace(noisy, widening=widening(noisy, estimation, held_out))
+
+
+def _at_bounds(unknowns: Unknowns, found: Point) -> str:
+    k = unknowns.count
+    at = (found.shared <= unknowns.low[:k]) | (found.shared >= unknowns.high[:k])
+    names = [name for name, bound in zip(unknowns.names, at, strict=True) if bound]
+    return f"at a bound, and perhaps beyond it: {', '.join(names)}" if names else ""
+
+
+def _sizes(equations: CorrectedEquations, estimation: Estimation, found: Point) -> dict[str, float]:
+    """The root mean square of each term over the calibration record, the largest first."""
+    states = estimation.simulated(found)[1].reshape(-1, len(estimation.unknowns.start))
+    values = equations.values(states, estimation.commands.reshape(len(states), -1))
+    coefficients = found.shared[-len(equations.names) :]
+    sizes = np.abs(coefficients) * np.sqrt(np.mean(values**2, axis=0))
+    order = np.argsort(-sizes)
+    return {equations.names[i]: float(sizes[i]) for i in order}

@@ -1,0 +1,117 @@
+"""`Library`: readable terms of which the discrepancy of a state equation is a weighted sum."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations_with_replacement, product
+from math import comb, prod
+from typing import Any
+
+import torch
+
+from retwin.arrays import floats
+from retwin.checks import require, whole
+
+__all__ = ["Library", "Term"]
+
+STEEPNESS = 0.05
+"""Width of the smooth sign function of Coulomb friction, in half ranges of its variable."""
+MAX_MONOMIALS = 200
+"""Number of monomials of an equation above which their degree is lowered."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """A function of the variables of an equation.
+
+    Attributes
+    ----------
+    name : str
+        How it is written in tables.
+    value : callable
+        From the scaled variables, scalar tensors, to a scalar tensor.
+
+    """
+
+    name: str
+    value: Callable[[Sequence[Any]], Any]
+
+
+@dataclass(frozen=True)
+class Library:
+    """Terms whose weighted sum is the discrepancy of a state equation.
+
+    The variables are scaled: an excursion of 1 is half the range that they had in calibration.
+
+    Parameters
+    ----------
+    degree : int, default 3
+        Highest degree of the monomials, which include products of different variables. It is
+        lowered for equations of so many variables that there would be more than 200.
+    knots : sequence of float
+        Places of hinges max(0, v - knot) and max(0, -v - knot) of each variable v, from 0 to 1: a
+        piecewise linear function, for saturation, dead zones and overflow. They are 0 in the
+        middle, where the twin's own equations hold best.
+    friction : bool, default True
+        Whether Coulomb and quadratic friction, sign(v) and v |v|, of each state are included.
+
+    """
+
+    degree: int = 3
+    knots: Sequence[float] = (0.0, 0.4, 0.8)
+    friction: bool = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "knots", floats(self.knots))
+        whole("degree", self.degree, least=0)
+        require(
+            all(0 <= knot <= 1 for knot in self.knots),
+            "knots",
+            expected="places from 0 to 1, the end of the range in calibration",
+            got=", ".join(f"{knot:g}" for knot in self.knots),
+            remedy="a hinge outside that range is not determined by the data",
+        )
+
+    def terms(self, variables: Sequence[str], states: int) -> list[Term]:
+        """The terms of an equation with such variables, of which the first `states` are states."""
+        places = range(len(variables))
+        degree = self.degree
+        while degree > 1 and comb(len(variables) + degree, degree) > MAX_MONOMIALS:
+            degree -= 1
+        found = [
+            Term(_product(variables, chosen), partial(_monomial, chosen=chosen))
+            for order in range(degree + 1)
+            for chosen in combinations_with_replacement(places, order)
+        ]
+        for i, name in enumerate(variables):
+            for sign, knot in product((1, -1), self.knots):
+                shifted = f"{'-' if sign < 0 else ''}{name}{f' - {knot:g}' if knot else ''}"
+                hinge = partial(_hinge, i=i, sign=sign, knot=knot)
+                found.append(Term(f"max(0, {shifted})", hinge))
+            if self.friction and i < states:
+                found.append(Term(f"sign({name})", partial(_sign, i=i)))
+                found.append(Term(f"{name} |{name}|", partial(_quadratic, i=i)))
+        return found
+
+
+def _monomial(v: Sequence[Any], chosen: Sequence[int]) -> Any:
+    return prod(v[i] for i in chosen)
+
+
+def _hinge(v: Sequence[Any], i: int, sign: int, knot: float) -> Any:
+    return torch.relu(sign * v[i] - knot)
+
+
+def _sign(v: Sequence[Any], i: int) -> Any:
+    return torch.tanh(v[i] / STEEPNESS)
+
+
+def _quadratic(v: Sequence[Any], i: int) -> Any:
+    return v[i] * torch.abs(v[i])
+
+
+def _product(variables: Sequence[str], chosen: Sequence[int]) -> str:
+    powers = [(name, chosen.count(i)) for i, name in enumerate(variables) if i in chosen]
+    return " ".join(name if power == 1 else f"{name}^{power}" for name, power in powers) or "1"

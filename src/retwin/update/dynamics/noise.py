@@ -1,0 +1,84 @@
+"""How wide the distributions of corrected dynamics are, one step ahead and in free simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import ndtri
+
+from retwin.data.trajectories import Trajectories
+from retwin.update.dynamics.estimation import Estimation, HeldOut
+from retwin.update.dynamics.twin import DynamicsTwin
+
+__all__ = ["fit_noise", "folds", "widening"]
+
+RATIO = 0.1
+"""Deviations at the start of the search: of the process noise, over the usual step of a sample, and
+of the measurement noise, over the error of free simulation."""
+SMALLEST = 1e-6
+"""Lowest of these ratios."""
+LEVEL = 0.9
+"""Probability of the intervals that are calibrated."""
+EVALUATIONS = 60
+"""Calls of the filter per scale at most."""
+
+
+def fit_noise(twin: DynamicsTwin, observed: Trajectories, corrected: Sequence[int]) -> DynamicsTwin:
+    """The twin with the variances of w and v that maximise the likelihood of one-step predictions.
+
+    Process noise acts on the corrected states, whose equations may be wrong.
+    """
+    step = twin.domain.speed if twin.equations.step else twin.domain.speed / twin.rate
+    indices = np.array(corrected, dtype=int)
+    count = len(indices)
+
+    def at(logs: NDArray) -> DynamicsTwin:
+        process = np.zeros(len(step))
+        process[indices] = (step[indices] * np.exp(logs[:count])) ** 2
+        return replace(twin, process=process, noise=twin.noise * np.exp(2 * logs[count:]))
+
+    def cost(logs: NDArray) -> float:
+        value = -float(np.sum(at(logs).predictive(observed).log_density()))
+        return value if np.isfinite(value) else np.inf
+
+    start = np.full(count + len(twin.noise), np.log(RATIO))
+    found = minimize(
+        cost,
+        start,
+        method="Nelder-Mead",
+        bounds=[(np.log(SMALLEST), -np.log(RATIO))] * len(start),
+        options={"maxfev": EVALUATIONS * len(start), "xatol": 0.02, "fatol": 0.1},
+    )
+    made = at(found.x)
+    # A common scale changes no prediction, but all intervals.
+    error = np.abs(made.predictive(observed).standardised())
+    scale = (np.nanquantile(error, LEVEL) / ndtri((1 + LEVEL) / 2)) ** 2
+    return replace(made, process=scale * made.process, noise=scale * made.noise)
+
+
+def folds(seen: NDArray, count: int) -> list[NDArray]:
+    """Parts (n, T) of the record: each trajectory is cut into `count` blocks of samples.
+
+    A fold has one block of each trajectory, another one in each, so that it holds all phases of a
+    record without holding out the start of all trajectories.
+    """
+    trajectories, samples, _ = seen.shape
+    block = np.arange(samples) * count // samples
+    own = (block + np.arange(trajectories)[:, None]) % count
+    return [own == fold for fold in range(count)]
+
+
+def widening(twin: DynamicsTwin, estimation: Estimation, held_out: HeldOut) -> float:
+    """Factor of deviations, with which bands hold as many held-out samples as they should."""
+    # Without measurements, the filter gives the variance by process and measurement noise.
+    alone = replace(
+        twin, factor=np.zeros_like(twin.factor), start_deviation=np.zeros_like(twin.start_deviation)
+    )
+    blind = estimation.observed.replace(mask=np.zeros(estimation.seen.shape, dtype=bool))
+    deviation = np.sqrt(held_out.variances + alone.predictive(blind).deviation ** 2)
+    ratio = (np.abs(held_out.errors) / deviation)[estimation.seen]
+    return float(np.quantile(ratio, LEVEL) / ndtri((1 + LEVEL) / 2))

@@ -1,0 +1,87 @@
+"""`Prediction`: the distribution of each sample given all earlier ones, by a Kalman filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtri
+from scipy.stats import norm
+
+from retwin.data.trajectories import Trajectories
+
+__all__ = ["Prediction"]
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Gaussian distributions of the outputs of a record, each given all earlier samples.
+
+    After a gap, or after the last measured sample, they are those of a simulation that starts from
+    what is known then.
+
+    Attributes
+    ----------
+    record : Trajectories
+        The n trajectories that were predicted.
+    mean : NDArray
+        (n, T, d_y).
+    covariance : NDArray
+        (n, T, d_y, d_y), with measurement noise.
+    states : NDArray
+        (n, T, d_x), the most probable states given all samples up to the present one.
+
+    """
+
+    record: Trajectories
+    mean: NDArray
+    covariance: NDArray
+    states: NDArray
+
+    @property
+    def deviation(self) -> NDArray:
+        """Standard deviations (n, T, d_y)."""
+        made: NDArray = np.sqrt(np.diagonal(self.covariance, axis1=2, axis2=3))
+        return made
+
+    def quantile(self, level: ArrayLike) -> NDArray:
+        """Quantiles of each output: (..., n, T, d_y) for levels (...)."""
+        levels = np.asarray(level, dtype=float)[..., None, None, None]
+        made: NDArray = self.mean + ndtri(levels) * self.deviation
+        return made
+
+    def pit(self) -> NDArray:
+        """Probability-integral transforms (n, T, d_y) of the measured outputs; NaN for others.
+
+        They are uniform and independent if the distributions are those of the data.
+        """
+        made: NDArray = norm.cdf(self.standardised())
+        return made
+
+    def coverage(self, share: float = 0.9) -> NDArray:
+        """Share (d_y,) of the measured samples inside the central interval of that probability."""
+        inside = np.abs(self.standardised()) <= ndtri((1 + share) / 2)
+        counted: NDArray = self.record.mask.sum(axis=(0, 1))
+        made: NDArray = (inside & self.record.mask).sum(axis=(0, 1)) / counted
+        return made
+
+    def log_density(self) -> NDArray:
+        """Log density (n, T) of the measured outputs of each sample, jointly; 0 for none."""
+        seen = self.record.mask
+        both = seen[..., :, None] & seen[..., None, :]
+        # An output that was not measured is replaced by one of known density: 0 of variance 1.
+        covariance = np.where(both, self.covariance, np.eye(seen.shape[2]))
+        error = np.where(seen, self.record.observed - self.mean, 0.0)
+        weighted = np.linalg.solve(covariance, error[..., None])[..., 0]
+        constant = seen.sum(axis=2) * np.log(2 * np.pi)
+        made: NDArray = -0.5 * (
+            np.sum(error * weighted, axis=2) + np.linalg.slogdet(covariance)[1] + constant
+        )
+        return made
+
+    def standardised(self) -> NDArray:
+        """Errors (n, T, d_y) in standard deviations; NaN where nothing was measured."""
+        error = (self.record.observed - self.mean) / self.deviation
+        made: NDArray = np.where(self.record.mask, error, np.nan)
+        return made

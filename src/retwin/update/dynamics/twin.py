@@ -1,0 +1,306 @@
+"""`DynamicsTwin`: a twin with corrected state equations, as a distribution."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from retwin.checks import require
+from retwin.data.trajectories import Channels, Trajectories
+from retwin.progress import Progress
+from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.twins.faults import Fault
+from retwin.twins.limits import Limits
+from retwin.twins.saved_equations import equations_from, equations_of
+from retwin.twins.state_twin import SAMPLES_PER_CHUNK, StateTwin
+from retwin.twins.twin import Chunk, check_channels, checked_commands, simulate_in_chunks
+from retwin.twins.wrapper import chunk_generator
+from retwin.update.dynamics.corrected import Domain
+from retwin.update.dynamics.prediction import Prediction
+from retwin.update.training_range import OutsideTrainingWarning
+
+__all__ = ["DynamicsTwin"]
+
+KIND = "dynamics"
+"""Kind of the saved model."""
+BEYOND = 0.05
+"""How far, in widths of the domain, states may leave it without a warning."""
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicsTwin:
+    """A twin with a learned discrepancy inside its state equations, and with noise.
+
+        x[k+1] = F(x[k], u[k]; theta) + delta(x[k], u[k]; psi) + w[k],   y[k] = h(x[k]) + v[k]
+
+    Each simulated trajectory has parameters theta and psi drawn from their posterior, a start of
+    its own, process noise w and measurement noise v. The nominal outputs are the most probable
+    ones, without noise.
+
+    Attributes
+    ----------
+    equations : StateTwin
+        The corrected equations; theta and psi are its parameters.
+    values : NDArray
+        (q + d_x,), their most probable values, and those of the states at the first sample.
+    factor : NDArray
+        (q + d_x, r), of the posterior covariance of `values`, factor @ factor.T.
+    start_deviation : NDArray
+        (d_x,), by which starts differ between trajectories.
+    process, noise : NDArray
+        (d_x,) and (d_y,), variances of w and v.
+    widening : float
+        Factor of the deviations from the most probable outputs, from held-out blocks.
+    domain : Domain
+        The range of states and commands in calibration.
+    corrected : tuple of str
+        The states whose equations have a discrepancy.
+    emulated : bool
+        Whether the calibration data were emulated.
+    case : str
+        The name of the case that it was fitted for; the command line reads it.
+
+    """
+
+    equations: StateTwin
+    values: NDArray
+    factor: NDArray
+    start_deviation: NDArray
+    process: NDArray
+    noise: NDArray
+    widening: float
+    domain: Domain
+    corrected: tuple[str, ...]
+    emulated: bool = False
+    case: str = ""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields, with equations that need no code."""
+        return {**vars(self), "equations": equations_of(self.equations)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        state["equations"] = equations_from(state["equations"])
+        for name, value in state.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def inputs(self) -> Channels:
+        """Command channels."""
+        return self.equations.inputs
+
+    @property
+    def outputs(self) -> Channels:
+        """Output channels."""
+        return self.equations.outputs
+
+    @property
+    def rate(self) -> float:
+        """Sample rate in Hz."""
+        return self.equations.rate
+
+    @property
+    def limits(self) -> Limits | None:
+        """Range of the commands."""
+        return self.equations.limits
+
+    def simulate(
+        self,
+        commands: NDArray,
+        *,
+        faults: Sequence[Fault | None] | None = None,
+        seed: int,
+        progress: Progress | None = None,
+    ) -> Trajectories:
+        """See `Twin.simulate`. A stuck actuator is a held command.
+
+        Warns
+        -----
+        OutsideTrainingWarning
+            Most probable states leave the range that they had in calibration.
+        StepWarning
+            See `StateTwin`.
+
+        """
+        beyond = np.zeros(len(self.process))
+
+        def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
+            held = np.asarray(chunk.held_commands, np.float64)
+            nominal, states = self._most_probable(np.asarray(chunk.commands, np.float64))
+            finite = np.isfinite(states).all(axis=(1, 2))
+            if chunk.index.start == 0 and finite[0]:
+                first = np.asarray(chunk.commands[:1], np.float64)
+                self.equations.check_accuracy(first, self.values[None], nominal[:1])
+            if finite.any():
+                np.maximum(beyond, self.domain.excess(states[finite]).max(axis=0), out=beyond)
+            return nominal, self._drawn(held, chunk_generator(seed, chunk, 2))
+
+        checked = checked_commands(commands, self.inputs)
+        size = max(1, SAMPLES_PER_CHUNK // checked.shape[1])
+        made = simulate_in_chunks(
+            self,
+            run,
+            checked,
+            faults,
+            seed=seed,
+            progress=progress,
+            size=size,
+            emulated=self.emulated,
+        )
+        self._warn(beyond)
+        return made
+
+    def predictive(self, record: Trajectories) -> Prediction:
+        """The distribution of each sample of a record given all earlier ones.
+
+        An extended Kalman filter at the most probable parameters. Samples that are masked are not
+        used, so a record whose mask ends after a warm-up is simulated from there on.
+
+        Parameters
+        ----------
+        record : Trajectories
+            Measured outputs, with their commands.
+
+        Returns
+        -------
+        Prediction
+            Gaussian distributions.
+
+        Raises
+        ------
+        InputError
+            Other channels or another rate than those of the twin.
+
+        """
+        check_channels(self, record, "record")
+        commands = checked_commands(record.commands, self.inputs).astype(np.float64)
+        theta = np.tile(self.values, (len(record), 1))
+        measured = np.where(record.mask, record.observed, 0.0)
+        states = len(self.process)
+        start = self.start_deviation**2 + np.sum(self.factor[-states:] ** 2, axis=1)
+        variances = (start, self.process, self.noise)
+        made = self.equations.steps().filter(commands, theta, (measured, record.mask), variances)
+        return Prediction(record, *made)
+
+    def slope(self, states: NDArray, commands: NDArray) -> NDArray:
+        """Most probable time derivatives of the states, or the states one sample later.
+
+        Parameters
+        ----------
+        states, commands : ndarray, shapes (K, d_x) and (K, d_u)
+            Where they are evaluated.
+
+        Returns
+        -------
+        ndarray, shape (K, d_x)
+            Per s, or the states themselves for a twin with a `step`.
+
+        """
+        x, u = (
+            list(torch.tensor(each, dtype=torch.float64).unbind(1)) for each in (states, commands)
+        )
+        p = [torch.full_like(x[0], each) for each in self.values[: -len(self.process)]]
+        made: NDArray = torch.stack(self.equations.model.evaluate("slope", x, u, p), 1).numpy()
+        return made
+
+    def _most_probable(self, commands: NDArray) -> tuple[NDArray, NDArray]:
+        """Outputs and states without noise."""
+        theta = np.tile(self.values, (len(commands), 1))
+        return self.equations.steps().run(commands, theta)
+
+    def _drawn(self, commands: NDArray, rng: np.random.Generator) -> NDArray:
+        """Outputs (n, T, d_y) with drawn parameters, starts and noise.
+
+        The outputs are linear in the parameters about the most probable ones: so the distribution
+        is that of the approximation by which the posterior was found, and no draw diverges (Immer,
+        Korzepa and Bauer, "Improving predictions of Bayesian neural nets via local linearization",
+        2021).
+        """
+        count, samples = commands.shape[:2]
+        states = len(self.process)
+        steps, theta = self.equations.steps(), np.tile(self.values, (count, 1))
+        kicks = np.sqrt(self.process) * rng.normal(size=(count, samples, states))
+        made = steps.run(commands, theta, kicks)[0]
+        made += np.sqrt(self.noise) * rng.normal(size=made.shape)
+        moves = rng.normal(size=(count, self.factor.shape[1])) @ self.factor.T
+        moves[:, -states:] += self.start_deviation * rng.normal(size=(count, states))
+        distinct, own = np.unique(commands, axis=0, return_inverse=True)
+        for i, each in enumerate(distinct):
+            centre, by_all = (
+                found[0] for found in steps.sensitivities(each[None], self.values[None])
+            )
+            rows = np.flatnonzero(own.ravel() == i)
+            moved = np.moveaxis(by_all @ moves[rows].T, -1, 0)
+            made[rows] = centre + self.widening * (made[rows] - centre + moved)
+        return made
+
+    def _warn(self, beyond: NDArray) -> None:
+        worst = int(np.argmax(beyond))
+        if beyond[worst] <= BEYOND:
+            return
+        warnings.warn(
+            f"{self.equations.states[worst].name} leaves the range that it had in calibration by "
+            f"{100 * beyond[worst]:.0f} % of its width; there the discrepancy is extrapolated",
+            OutsideTrainingWarning,
+            stacklevel=3,
+        )
+
+    def save(self, folder: str | Path) -> None:
+        """Write the equations, as operations on numbers, with all values."""
+        about: dict[str, Any] = {
+            "equations": equations_of(self.equations),
+            "widening": self.widening,
+            "corrected": list(self.corrected),
+            "emulated": self.emulated,
+            "case": self.case,
+        }
+        arrays = {name: getattr(self, name) for name in ARRAYS}
+        arrays |= {
+            f"domain_{name}": value for name, value in vars(self.domain).items() if name in DOMAIN
+        }
+        with write_model(folder, KIND, about, {k: torch.tensor(v) for k, v in arrays.items()}):
+            pass
+
+    @classmethod
+    def load(cls, folder: str | Path) -> DynamicsTwin:
+        """Read what `save` wrote; no code of the twin is needed.
+
+        Raises InputError if the folder holds no such model or is damaged.
+        """
+        about, weights = read_model(folder, KIND)
+        with refusing(folder, expected="corrected dynamics"):
+            equations = equations_from(about["equations"])
+            arrays = {name: weights[name].numpy() for name in ARRAYS}
+            domain = Domain(*(weights[f"domain_{name}"].numpy() for name in DOMAIN))
+            count = (len(equations.parameters), len(equations.states), len(equations.outputs))
+            shapes = [arrays[name].shape for name in ARRAYS]
+            both = count[0] + count[1]
+            wanted = [(both,), (both, shapes[1][-1]), *[(count[1],)] * 2, (count[2],)]
+            require(
+                shapes == wanted and all(np.isfinite(each).all() for each in arrays.values()),
+                "weights",
+                expected=f"finite arrays of the shapes {wanted}",
+                got=shapes,
+                remedy="save the model again",
+            )
+            return cls(
+                equations,
+                **arrays,
+                widening=float(about["widening"]),
+                domain=domain,
+                corrected=tuple(about["corrected"]),
+                emulated=about["emulated"],
+                case=about["case"],
+            )
+
+
+ARRAYS = ("values", "factor", "start_deviation", "process", "noise")
+"""Attributes that are saved as arrays."""
+DOMAIN = ("low", "high", "speed")
+"""Attributes of the domain."""
