@@ -201,6 +201,7 @@ _OUTPUT = ("residual", "output")
 _COMMAND = ("residual", "command")
 _LEAST_SQUARES = ("update", "pi_ls")
 _BAYES = ("update", "pi_bayes")
+_DYNAMICS = ("update", "dynamics")
 _IDENTIFIED = ("surrogate", "pi_ls")
 _IDENTIFIED_OUTPUT = ("residual", "pi_ls")
 
@@ -289,6 +290,12 @@ SOURCES: Mapping[str, SourceEntry] = {
         twin="retwin.study.sources:identified_corrected",
         parametric=True,
         simulates=True,
+    ),
+    "dynamics": SourceEntry(
+        "Corrected dynamics",
+        "healthy",
+        (_DYNAMICS,),
+        twin="retwin.study.sources:corrected_dynamics",
     ),
     "ibg_rg_command": SourceEntry(
         "IBG + RG, command space",

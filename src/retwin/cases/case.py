@@ -20,6 +20,7 @@ from retwin.twins.parametric import ParametricTwin
 from retwin.twins.samplers import CommandSampler
 from retwin.twins.twin import Twin
 from retwin.update.corrections import Correction
+from retwin.update.dynamics import Dynamics
 from retwin.update.residual import Density, Mixture, SequenceMixture
 
 __all__ = ["Body", "Case"]
@@ -105,6 +106,8 @@ class Case:
     records : callable or None
         Splits a file into the calibration set and the test set of a benchmark; None if a file holds
         one set.
+    dynamics : Dynamics
+        The form of a discrepancy inside the state equations, for twins that are a `StateTwin`.
 
     Raises
     ------
@@ -133,6 +136,7 @@ class Case:
     per_class: int = 400
     density: Density | SequenceMixture = Mixture()  # noqa: RUF009 - frozen
     records: Callable[[Path], tuple[Trajectories, Trajectories]] | None = None
+    dynamics: Dynamics = Dynamics()  # noqa: RUF009 - frozen
 
     def __post_init__(self) -> None:
         require(

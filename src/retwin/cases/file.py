@@ -47,6 +47,7 @@ from retwin.twins.samplers import (
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import Twin
 from retwin.update.corrections import Correction, DelayOffset
+from retwin.update.dynamics import Dynamics
 from retwin.update.residual import Density, Mixture, SequenceMixture
 
 __all__ = ["check_density", "read_case"]
@@ -84,6 +85,7 @@ class CaseFile:
     correction: Correction | str | None = None
     output_correction: Correction | str | None = None
     density: Density | SequenceMixture | str | None = None
+    dynamics: Dynamics = Dynamics()  # noqa: RUF009 - frozen
     network: Network | str | None = None
     training: Training | None = None
     records: _Columns | str | None = None
@@ -157,6 +159,7 @@ def read_case(path: str | Path) -> Case:
             training=keys.training,
             density=density,
             records=records,
+            dynamics=keys.dynamics,
         )
 
 

@@ -19,6 +19,7 @@ from retwin.twins.noisy import NoisyTwin, residual_scale
 from retwin.twins.randomised import RandomisedTwin
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
+from retwin.update.dynamics import has_states
 from retwin.update.residual import ResidualModel, SequenceMixture
 
 __all__ = ["lacking", "not_installed"]
@@ -60,6 +61,11 @@ def least_squares_twin(trial: Trial) -> Twin:
 def posterior_twin(trial: Trial) -> Twin:
     """The twin with parameters drawn from their posterior (Eq. 3)."""
     return trial.updated("pi_bayes")
+
+
+def corrected_dynamics(trial: Trial) -> Twin:
+    """The twin with a learned discrepancy inside its state equations."""
+    return trial.updated("dynamics")
 
 
 def adversarial(trial: Trial) -> FittedDiagnoser:
@@ -141,6 +147,8 @@ def lacking(name: str, case: Case, plan: StudyPlan) -> str:
         return f"a case with a correction besides the one at its outputs; {case.name!r} has none"
     if name == "inversion" and isinstance(case.density, SequenceMixture):
         return "a correction per segment"
+    if name == "dynamics" and not has_states(case.twin):
+        return f"a case whose twin is a StateTwin; that of {case.name!r} is none"
     if source.parametric and case.parametric is None:
         return f"a case that declares the free parameters of its twin; {case.name!r} does not"
     if source.network and isinstance(plan.classifier_config, Rocket):

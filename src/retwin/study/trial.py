@@ -21,6 +21,7 @@ from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import Twin
 from retwin.update.corrected import generate
 from retwin.update.corrections import Correction
+from retwin.update.dynamics import DynamicsTwin
 from retwin.update.identification import PosteriorTwin
 from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
@@ -91,8 +92,10 @@ class Trial:
         return NetworkDiagnoser.load(self.files.diagnoser(self.job.before("diagnosis", source)))
 
     def updated(self, method: str) -> Twin:
-        """The twin whose parameters were updated to one value each, or to a posterior."""
+        """The twin that was updated: its parameters, their posterior, or its state equations."""
         folder = self._made("update", method)
+        if method == "dynamics":
+            return DynamicsTwin.load(folder)
         if method == "pi_bayes":
             return PosteriorTwin.load(folder, self.parametric)
         return self.parametric.with_values(read_about(folder, "parameters")["values"])

@@ -38,6 +38,7 @@ from retwin.study.trial import Trial
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin, generate
+from retwin.update.dynamics import fit_dynamics
 from retwin.update.identification import NPE, Posterior, Updated, identify
 from retwin.update.residual import Density, Mixture, Residual, SequenceMixture, fit_residual
 from retwin.update.surrogate import Surrogate, fit_surrogate
@@ -234,7 +235,16 @@ class Work:
         return {}
 
     def _update(self, trial: Trial, path: Path) -> Costs:
-        """The update by Eq. 2 or Eq. 3."""
+        """The update by Eq. 2 or Eq. 3, or of the state equations."""
+        if trial.job.name == "dynamics":
+            made = fit_dynamics(
+                self.case.twin,  # type: ignore[arg-type]  # checked before the study begins
+                trial.healthy,
+                self.case.dynamics,
+                progress=trial.progress,
+            )
+            made.twin.save(path)
+            return {"notes": made.reason}
         bayes = trial.job.name == "pi_bayes"
         found = _bayes(trial, path) if bayes else _least_squares(trial, path)
         # A search that was cut off is noted; one that converged is no failure.

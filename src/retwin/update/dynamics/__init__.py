@@ -8,6 +8,7 @@ from retwin.update.dynamics.fitting import Dynamics, FittedDynamics, fit_dynamic
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.prediction import Prediction
 from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.dynamics.unknowns import has_states
 
 __all__ = [
     "Domain",
@@ -17,4 +18,5 @@ __all__ = [
     "Library",
     "Prediction",
     "fit_dynamics",
+    "has_states",
 ]

@@ -13,7 +13,7 @@ from retwin.checks import require
 from retwin.twins.parametric import Parameter, ParametricTwin
 from retwin.twins.state_twin import StateTwin
 
-__all__ = ["Unknowns", "state_twin_of", "unknowns_of"]
+__all__ = ["Unknowns", "has_states", "state_twin_of", "unknowns_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +68,12 @@ class Unknowns:
             low=np.insert(self.low, k, np.full(extra, -np.inf)),
             high=np.insert(self.high, k, np.full(extra, np.inf)),
         )
+
+
+def has_states(twin: object) -> bool:
+    """Whether a twin is a `StateTwin`, or a `ParametricTwin` of one."""
+    inner = twin.twin if isinstance(twin, ParametricTwin) else twin
+    return isinstance(inner, StateTwin)
 
 
 def state_twin_of(
