@@ -74,11 +74,6 @@ def folds(seen: NDArray, count: int) -> list[NDArray]:
 
 def widening(twin: DynamicsTwin, estimation: Estimation, held_out: HeldOut) -> float:
     """Factor of deviations, with which bands hold as many held-out samples as they should."""
-    # Without measurements, the filter gives the variance by process and measurement noise.
-    alone = replace(
-        twin, factor=np.zeros_like(twin.factor), start_deviation=np.zeros_like(twin.start_deviation)
-    )
-    blind = estimation.observed.replace(mask=np.zeros(estimation.seen.shape, dtype=bool))
-    deviation = np.sqrt(held_out.variances + alone.predictive(blind).deviation ** 2)
+    deviation = np.sqrt(held_out.variances + twin.noise_variance(estimation.commands))
     ratio = (np.abs(held_out.errors) / deviation)[estimation.seen]
     return float(np.quantile(ratio, LEVEL) / ndtri((1 + LEVEL) / 2))

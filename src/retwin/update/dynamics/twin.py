@@ -160,7 +160,8 @@ class DynamicsTwin:
         """The distribution of each sample of a record given all earlier ones.
 
         An extended Kalman filter at the most probable parameters. Samples that are masked are not
-        used, so a record whose mask ends after a warm-up is simulated from there on.
+        used, so a record whose mask ends after a warm-up is simulated from there on. An unknown
+        start has the variance of a uniform distribution between its bounds.
 
         Parameters
         ----------
@@ -182,11 +183,23 @@ class DynamicsTwin:
         commands = checked_commands(record.commands, self.inputs).astype(np.float64)
         theta = np.tile(self.values, (len(record), 1))
         measured = np.where(record.mask, record.observed, 0.0)
-        states = len(self.process)
-        start = self.start_deviation**2 + np.sum(self.factor[-states:] ** 2, axis=1)
+        bounds = [(each.low or 0.0, each.high or 0.0) for each in self.equations.states]
+        start = np.square(np.diff(bounds, axis=1)[:, 0]) / 12
         variances = (start, self.process, self.noise)
         made = self.equations.steps().filter(commands, theta, (measured, record.mask), variances)
         return Prediction(record, *made)
+
+    def noise_variance(self, commands: NDArray) -> NDArray:
+        """Variances (n, T, d_y) of the outputs by process and measurement noise alone."""
+        theta, shape = (
+            np.tile(self.values, (len(commands), 1)),
+            (*commands.shape[:2], len(self.noise)),
+        )
+        variances = (np.zeros(len(self.process)), self.process, self.noise)
+        unseen = (np.zeros(shape), np.zeros(shape))
+        found = self.equations.steps().filter(commands, theta, unseen, variances)[1]
+        made: NDArray = np.diagonal(found, axis1=2, axis2=3)
+        return made
 
     def slope(self, states: NDArray, commands: NDArray) -> NDArray:
         """Most probable time derivatives of the states, or the states one sample later.
