@@ -287,10 +287,9 @@ def _metrics(results: Results) -> list[str]:
 
 
 def _over_runs(values: list[float]) -> str:
-    if not np.isfinite(values).all():
-        return "–"
-    mean = f"{np.mean(values):.3f}"
-    return mean if len(values) < 2 else f"{mean} ± {np.std(values, ddof=1):.3f}"
+    from retwin.report.labels import mean_and_deviation
+
+    return mean_and_deviation(values) if np.isfinite(values).all() else "–"
 
 
 def _differences(results: Results) -> list[str]:

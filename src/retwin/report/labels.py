@@ -137,11 +137,22 @@ def reason(comparison: Comparison) -> str:
     return NO_VERDICT.get(comparison.no_verdict, "")
 
 
+SMALL = 0.01
+"""Values below this are shown with more decimals."""
+
+
 def number(value: float | None, digits: int = 3) -> str:
     """Fixed digits with a true minus; a dash for what is not defined."""
     if value is None or not math.isfinite(value):
         return "–"
     return f"{round(value, digits) + 0.0:.{digits}f}".replace("-", "−")
+
+
+def decimals(value: float) -> int:
+    """Three decimals, and more where a small value would have less than three digits left."""
+    if value == 0 or not math.isfinite(value) or abs(value) >= SMALL:
+        return 3
+    return 2 - math.floor(math.log10(abs(value)))
 
 
 def signed(value: float, digits: int = 3) -> str:
@@ -163,8 +174,9 @@ def mean_and_deviation(values: Sequence[float] | NDArray) -> str:
     finite = np.asarray(values, dtype=float)
     finite = finite[np.isfinite(finite)]
     if len(finite) < 2:
-        return number(float(finite[0]) if len(finite) else None)
-    return f"{number(float(finite.mean()))} ± {number(float(finite.std(ddof=1)))}"
+        return number(float(finite[0]), decimals(finite[0])) if len(finite) else number(None)
+    mean, digits = float(finite.mean()), decimals(finite.mean())
+    return f"{number(mean, digits)} ± {number(float(finite.std(ddof=1)), digits)}"
 
 
 def p_value(p: float | None) -> str:
