@@ -10,6 +10,7 @@ from torch import Tensor
 from retwin.errors import InputError
 from retwin.inference.priors import GaussianPrior
 from retwin.nets.mixtures import Bernoullis, GaussianMixture
+from retwin.nets.student import Student
 from retwin.update.corrections import Chain, CommandSpace, Context, Correction, SampledSensor
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.delay_range import range_in_samples
@@ -64,7 +65,9 @@ def command_problem(
 
 @torch.no_grad()
 def healthy_prior(residual: ResidualModel, context: Context) -> LatentPrior:
-    """The prior of a healthy trajectory: the residual model's distribution by its moments.
+    """The prior of a healthy trajectory: a normal distribution near the residual model's.
+
+    It has the moments of the latter, or where that is Student's t, 90 % intervals as wide.
 
     Errors of a trajectory's segments are correlated as far as the residual model has learned
     that they persist.
@@ -89,6 +92,8 @@ def healthy_prior(residual: ResidualModel, context: Context) -> LatentPrior:
 
 def _covariance(distribution: Any) -> Tensor:
     """Covariance (..., D, D) of a block of z, double precision; without a formula, from draws."""
+    if isinstance(distribution, Student):
+        return _covariance(distribution.normal)
     if isinstance(distribution, GaussianMixture):
         weights = distribution.mixture_distribution.probs.double()[..., None, None]
         means, factor = distribution.means.double(), distribution.factor.double()

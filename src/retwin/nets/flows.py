@@ -30,7 +30,7 @@ class FlowDistribution(Distribution):
     shift, scale : Tensor
         (D,), z is its standard value times `scale` plus `shift`.
     wider : Tensor or float
-        (D,), standard deviation of the noise that the flow transforms.
+        (..., D), standard deviation of the noise that the flow transforms.
 
     """
 
@@ -43,7 +43,7 @@ class FlowDistribution(Distribution):
         self.flow = flow
         self.shift = shift
         self.scale = scale
-        self.wider = torch.as_tensor(wider, dtype=scale.dtype).expand_as(scale)
+        self.wider = torch.as_tensor(wider, dtype=scale.dtype)
         super().__init__(flow.batch_shape, flow.event_shape, validate_args=False)
 
     def expand(
@@ -69,7 +69,7 @@ class FlowDistribution(Distribution):
         noise = self.flow.transform(standard)
         narrower = 0.5 * noise.square() * (1 - self.wider.square().reciprocal())
         density = self.flow.log_prob(standard) + narrower.sum(dim=-1)
-        return density - (self.scale * self.wider).log().sum()
+        return density - (self.scale * self.wider).log().sum(dim=-1)
 
     def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
         """A draw (..., D) as a function of normal noise (..., D); `uniform` is not used."""
@@ -80,7 +80,7 @@ class FlowDistribution(Distribution):
         return self.flow.transform((value - self.shift) / self.scale) / self.wider
 
     def widened(self, factor: Tensor) -> FlowDistribution:
-        """The same with the deviations of the noise multiplied by `factor` (D,)."""
+        """The same with the deviations of the noise multiplied by `factor` (..., D)."""
         return FlowDistribution(self.flow, self.shift, self.scale, factor * self.wider)
 
     def _quasi_random_draws(self) -> Tensor:

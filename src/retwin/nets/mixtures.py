@@ -17,7 +17,14 @@ from torch.distributions import (
     constraints,
 )
 
-__all__ = ["BernoulliHead", "Bernoullis", "Blocks", "GaussianMixture", "MixtureHead"]
+__all__ = [
+    "PIT_RANGE",
+    "BernoulliHead",
+    "Bernoullis",
+    "Blocks",
+    "GaussianMixture",
+    "MixtureHead",
+]
 
 FLOOR = 0.05
 """Smallest standard deviation of a component, in standard units. It keeps a component from
@@ -85,11 +92,11 @@ class GaussianMixture(MixtureSameFamily):
         return mean + (factor @ normal[..., None])[..., 0]
 
     def widened(self, factor: Tensor) -> GaussianMixture:
-        """The same with all deviations from the mean multiplied by `factor` (D,)."""
-        middle = self.mean[..., None, :]
+        """The same with all deviations from the mean multiplied by `factor` (..., D)."""
+        middle, factor = self.mean[..., None, :], factor[..., None, :]
         means = middle + factor * (self.means - middle)
         logits = self.mixture_distribution.logits
-        return GaussianMixture(logits, means, factor[:, None] * self.factor)
+        return GaussianMixture(logits, means, factor[..., None] * self.factor)
 
     def marginal_cdf(self, value: Tensor) -> Tensor:
         """The marginal probabilities P(z_d <= value_d), (..., D): the PIT of `value`."""

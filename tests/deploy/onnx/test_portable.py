@@ -117,6 +117,7 @@ def noise_of_torch(twin: CorrectedTwin, count: int, movements: int, steps: int, 
     }
     if residual.persistence.any():
         noise["trajectory_noise"] = torch.randn(count, 1, size, generator=generator)
+    noise["trajectory_uniform"] = torch.rand(count, 1, len(residual.sizes), generator=generator)
     when = sensor.polls(count, steps, generator, twin.rate)
     shape = *when.shape, len(twin.outputs)
     level = torch.rand(shape, generator=generator, dtype=torch.float64).float()
@@ -166,7 +167,12 @@ def test_its_noise_is_uniform_and_normal(portable: Portable) -> None:
     for name, values in noise.items():
         np.testing.assert_array_equal(values, again[name])
     assert set(noise["phase"].flat) <= set(portable.sensor.phases)
-    known = {"uniform": "uniform", "error_level": "uniform", "glitch_level": "uniform"}
+    known = {
+        "uniform": "uniform",
+        "trajectory_uniform": "uniform",
+        "error_level": "uniform",
+        "glitch_level": "uniform",
+    }
     known |= {"segment_noise": "norm", "trajectory_noise": "norm", "glitch_noise": "norm"}
     for name, distribution in known.items():
         assert not np.array_equal(noise[name], other[name])

@@ -202,6 +202,7 @@ def _correction_graphs(
         "uniform": torch.rand(*shape, len(residual.sizes), generator=generator),
         "segment_noise": torch.randn(*shape, size, generator=generator),
         "trajectory_noise": torch.randn(EXAMPLES, 1, size, generator=generator),
+        "trajectory_uniform": torch.rand(EXAMPLES, 1, len(residual.sizes), generator=generator),
     }
     ends = {name: times[name] for name in ("start", "settle", "stop")}
     drawing = ResidualGraph(residual, twin.rate)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from retwin.data.segments import Segments
 from retwin.diagnosis import NetworkDiagnoser
 from retwin.diagnosis.features import Features
+from retwin.nets.student import shared_factor
 from retwin.update.corrections import Chain, Context, Correction, SampledSensor
 from retwin.update.residual import ResidualModel
 from retwin.update.residual.model import describe
@@ -67,6 +68,7 @@ class ResidualGraph(nn.Module):
         uniform: Tensor,
         segment_noise: Tensor,
         trajectory_noise: Tensor,
+        trajectory_uniform: Tensor,
     ) -> Tensor:
         """Draw z.
 
@@ -84,6 +86,8 @@ class ResidualGraph(nn.Module):
             Standard normal noise of each segment.
         trajectory_noise : Tensor, shape (n, 1, d_z)
             Standard normal noise that all segments of a trajectory share.
+        trajectory_uniform : Tensor, shape (n, 1, blocks)
+            Uniform noise in [0, 1), which selects the factor of the deviations of a trajectory.
 
         Returns
         -------
@@ -96,7 +100,7 @@ class ResidualGraph(nn.Module):
         distribution = self.residual.distribution(describe(context))
         shared = self.residual.persistence
         noise = shared.sqrt() * trajectory_noise + (1 - shared).sqrt() * segment_noise
-        z = distribution.from_noise(uniform, noise)
+        z = distribution.from_noise(shared_factor(trajectory_uniform, uniform), noise)
         return z.clamp(-self.residual.bounds, self.residual.bounds)
 
 

@@ -284,10 +284,10 @@ class Portable:
     def _noise(self, count: int, rng: np.random.Generator) -> dict[str, NDArray]:
         """The noise of the residual model and the sensor for `count` trajectories, by graph input.
 
-        All of it is independent. `uniform` (n, M, blocks), `error_level` (n, R, d_y) and
-        `glitch_level` (n, R, 1) are uniform on [0, 1); `segment_noise` (n, M, d_z),
-        `trajectory_noise` (n, 1, d_z) and `glitch_noise` (n, R, d_y) are standard normal; `phase`
-        (n, 1) is one of the sensor's phases.
+        All of it is independent. `uniform` (n, M, blocks), `trajectory_uniform` (n, 1, blocks),
+        `error_level` (n, R, d_y) and `glitch_level` (n, R, 1) are uniform on [0, 1);
+        `segment_noise` (n, M, d_z), `trajectory_noise` (n, 1, d_z) and `glitch_noise` (n, R, d_y)
+        are standard normal; `phase` (n, 1) is one of the sensor's phases.
         """
         residual = self.graphs["residual"]
         blocks, size = residual.width("uniform"), residual.width("segment_noise")
@@ -297,6 +297,9 @@ class Portable:
             "segment_noise": rng.standard_normal((*shape, size), np.float32),
             "trajectory_noise": rng.standard_normal((count, 1, size), np.float32),
         }
+        # Development versions before 0.1.0 exported graphs without it.
+        if "trajectory_uniform" in residual.inputs:
+            noise["trajectory_uniform"] = rng.random((count, 1, blocks), np.float32)
         if self.sensor is None:
             return noise
         samples = count, -(-self.facts.steps // self.sensor.every)

@@ -12,6 +12,7 @@ from retwin.checks import require
 from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import BernoulliHead, Blocks
 from retwin.nets.networks import Standardise
+from retwin.nets.student import Student, shared_factor
 from retwin.update.corrections import Context, Correction
 from retwin.update.residual.residual import Residual
 from retwin.update.residual.settings import Density
@@ -100,10 +101,17 @@ class ResidualModel(Residual):
 
     def distribution(self, features: Tensor) -> Blocks:
         """The distribution q_ψ for features (..., F) of segments, see `describe`."""
-        return self.predict(features).widened(self.spread)
+        blocks = self.predict(features).widened(self.spread).blocks
+        parts = zip(self.heads, blocks, self.degrees, strict=True)
+        return Blocks(
+            [
+                block if isinstance(head, BernoulliHead) else Student(block, degrees)
+                for head, block, degrees in parts
+            ]
+        )
 
     def predict(self, features: Tensor) -> Blocks:
-        """The distribution that the network predicts, before its calibration by `spread`."""
+        """The distribution that the network predicts, before its calibration."""
         encoded = self.encoder(self.before(features))
         parts = zip(
             self.heads, self.shift.split(self.sizes), self.scale.split(self.sizes), strict=True
@@ -119,8 +127,8 @@ class ResidualModel(Residual):
         """Draws of z (n, M, d_z), clipped at b, since the penalty on z̄ does not bound samples.
 
         The noise of the segments of a trajectory has a common part, so that the normal scores of z
-        correlate by `persistence`. The marginal distribution of each segment's z is unchanged.
-        Draws are differentiable.
+        correlate by `persistence`, and they share the factor of `Student`. The marginal
+        distribution of each segment's z is unchanged. Draws are differentiable.
         """
         shape = distribution.batch_shape
         uniform = torch.rand(*shape, len(distribution.blocks), generator=generator).to(self.bounds)
@@ -128,7 +136,9 @@ class ResidualModel(Residual):
         if self.persistence.any():
             common = torch.randn(shape[0], 1, len(self.latent), generator=generator).to(own)
             own = self.persistence.sqrt() * common + (1 - self.persistence).sqrt() * own
-        return distribution.from_noise(uniform, own).clamp(-self.bounds, self.bounds)
+        shared = torch.rand(shape[0], 1, len(distribution.blocks), generator=generator).to(own)
+        z = distribution.from_noise(shared_factor(shared, uniform), own)
+        return z.clamp(-self.bounds, self.bounds)
 
 
 def describe(context: Context) -> Tensor:

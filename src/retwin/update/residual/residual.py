@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import asdict
 from pathlib import Path
@@ -52,6 +53,8 @@ class Residual(nn.Module, ABC):
     persistence : Tensor
         (d_z,), correlation of the normal scores of z, between the segments of a trajectory or from
         one sample to the next.
+    degrees : list of float
+        Degrees of freedom of the width of each block of z, see `Student`; infinite if it is known.
     emulated : bool
         Whether it was fitted to an emulated system instead of the real one.
     timing : NDArray
@@ -86,6 +89,7 @@ class Residual(nn.Module, ABC):
         self.segmentation = segmentation
         self.latent = correction.latent(inputs, outputs)
         self.sizes = [head.width for head in correction.heads(inputs, outputs)]
+        self.degrees = [math.inf] * len(self.sizes)
         self.emulated = False
         self.timing: NDArray = np.empty((0, 0))
         self.fitted: Fit | None = None
@@ -136,6 +140,7 @@ class Residual(nn.Module, ABC):
             "inputs": vars(self.inputs),
             "outputs": vars(self.outputs),
             "segmentation": self.segmentation,
+            "degrees": [None if math.isinf(each) else each for each in self.degrees],
             "emulated": self.emulated,
             "timing": [[None if np.isnan(t) else t for t in row] for row in self.timing],
             "fitted": None if self.fitted is None else asdict(self.fitted),
@@ -160,6 +165,9 @@ class Residual(nn.Module, ABC):
         )
         # Models per segment had no `spread` in development versions before 0.1.0.
         model.load_state_dict({"spread": torch.ones_like(model.spread), **weights})
+        # Development versions before 0.1.0 had their uncertainty in `spread`.
+        degrees = about.get("degrees", [None] * len(model.sizes))
+        model.degrees = [math.inf if each is None else float(each) for each in degrees]
         model.emulated = about["emulated"]
         model.timing = np.atleast_2d(np.array(about.get("timing", []), dtype=float))
         model.fitted = Fit.of(about["fitted"])

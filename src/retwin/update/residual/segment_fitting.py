@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +14,7 @@ from scipy import stats
 from torch import Tensor
 
 from retwin.nets.mixtures import BernoulliHead
+from retwin.nets.student import widening
 from retwin.nets.training import Fit, Training, train
 from retwin.progress import Progress
 from retwin.update.residual.model import ResidualModel
@@ -48,9 +50,8 @@ def fit_segments(
     A fifth of the trajectories, or one, is held out for early stopping. Where that is too few to
     calibrate on, further folds are held out in turn, each by a model of its own; the model is then
     trained on all trajectories, for as many epochs as were best on average. Its deviations are
-    widened to those with which 90 % intervals hold 90 % of held-out z, and by the ratio of the
-    quantiles of Student's t distribution and of the normal one, since these deviations are
-    estimated from few trajectories.
+    widened to those with which 90 % intervals hold 90 % of held-out z. Since they are estimated
+    from few trajectories, they have degrees of freedom, see `Student`.
 
     Parameters
     ----------
@@ -105,10 +106,12 @@ def fit_segments(
         # Deviations that were learned from half a trajectory are chance: the errors are a bound.
         needed = torch.minimum(needed, _errors(unseen, model.scale))
     ratio = needed / _deviation([(model, part) for _, part in unseen])
-    factor = ratio.clamp_min(1.0) * _student(targets, persistence)
-    model.spread.copy_(torch.where(model.events, 1.0, factor))
+    model.spread.copy_(torch.where(model.events, 1.0, ratio.clamp_min(1.0)))
+    model.degrees = _degrees(model, targets, persistence)
     if bounds is None:
-        model.bounds.mul_(model.spread)
+        # Bounds are multiplied as 90 % intervals are.
+        wider = torch.tensor([widening(each) for each in model.degrees])
+        model.bounds.mul_(model.spread * wider.repeat_interleave(torch.tensor(model.sizes)))
     figures = {"spread": float(spread.max()), "folds": float(len(folds))}
     return replace(fits[-1], figures=figures), rows[folds[0]] if len(rows) > 1 else rows[:0]
 
@@ -235,17 +238,21 @@ def _intraclass(score: Tensor, count: Tensor) -> float:
     return float(weights @ PERSISTENCES / weights.sum())
 
 
-def _student(targets: Targets, persistence: Tensor) -> Tensor:
-    """Ratio (d_z,) of the quantiles of Student's t and of the normal distribution.
+def _degrees(model: ResidualModel, targets: Targets, persistence: Tensor) -> list[float]:
+    """Degrees of freedom of the width of each block, those of one component on average.
 
-    Its degrees of freedom are those of a variance from correlated values: the squares of normal
-    scores of correlation r correlate by r².
+    They are those of a variance from correlated values: the squares of normal scores of correlation
+    r correlate by r². The components of a block are not added up: each has a variance of its own,
+    and where a covariance is estimated, Student's t has no more degrees than for one of them.
     """
     count = targets.used.sum(dim=(0, 1))
     size = count / targets.used.any(dim=1).sum(dim=0).clamp_min(1)
     effective = count / (1 + (size - 1).clamp_min(0) * persistence.square())
-    quantile = stats.t.ppf((1 + LEVEL) / 2, (effective - 1).clamp_min(1).numpy())
-    return torch.as_tensor(quantile / QUANTILE, dtype=torch.float32)
+    free = (effective - 1).clamp_min(1).double()
+    return [
+        math.inf if isinstance(head, BernoulliHead) else float(free[block].mean())
+        for head, block in model.parts()
+    ]
 
 
 @torch.no_grad()
