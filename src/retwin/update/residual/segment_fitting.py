@@ -109,9 +109,9 @@ def fit_segments(
     model.spread.copy_(torch.where(model.events, 1.0, ratio.clamp_min(1.0)))
     model.degrees = _degrees(model, targets, persistence)
     if bounds is None:
-        # Bounds are multiplied as 90 % intervals are.
+        # The largest of few |z*| is uncertain as the width is. The spread corrects the network.
         wider = torch.tensor([widening(each) for each in model.degrees])
-        model.bounds.mul_(model.spread * wider.repeat_interleave(torch.tensor(model.sizes)))
+        model.bounds.mul_(wider.repeat_interleave(torch.tensor(model.sizes)))
     figures = {"spread": float(spread.max()), "folds": float(len(folds))}
     return replace(fits[-1], figures=figures), rows[folds[0]] if len(rows) > 1 else rows[:0]
 
