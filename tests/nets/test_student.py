@@ -7,8 +7,10 @@ import pytest
 import torch
 from scipy import stats
 
+from retwin.nets.flows import FlowHead
 from retwin.nets.mixtures import GaussianMixture
 from retwin.nets.student import Student, shared_factor
+from retwin.nets.training import isolated
 
 pytestmark = pytest.mark.numerical
 
@@ -77,6 +79,25 @@ def test_draws_have_its_distribution(degrees: float) -> None:
     box = float(Student(bimodal(), degrees).log_prob(cells).exp().mean()) * 6.0
     inside = (drawn[:, 0].abs() < 1.5) & (drawn[:, 1].abs() < 1.0)
     assert float(inside.float().mean()) == pytest.approx(box, abs=4 * (0.25 / 4000) ** 0.5)
+
+
+def test_a_flow_becomes_heavy_tailed_too() -> None:
+    """The PIT of draws is uniform, and the density is the derivative of the distribution."""
+    with isolated(0):
+        head = FlowHead(3, 1, transforms=1, bins=4)
+    flow = head(torch.ones(3), torch.tensor([1.0]), torch.tensor([2.0]))
+    generator = torch.Generator().manual_seed(0)
+    student = Student(flow, 2.0)
+    with torch.no_grad():
+        uniform = torch.rand(2000, generator=generator)
+        noise = torch.randn(2000, 1, generator=generator)
+        drawn = student.expand((2000,)).from_noise(uniform, noise)
+        value = torch.linspace(-5.0, 7.0, 2001)[:, None]
+        level = torch.special.ndtr(student.normal_scores(value))[:, 0]
+        density = student.log_prob(value).exp()
+    assert stats.kstest(student.normal_scores(drawn)[:, 0].detach(), "norm").pvalue > 1e-3
+    area = torch.cumulative_trapezoid(density, value[:, 0])
+    torch.testing.assert_close(level[1:] - level[0], area, atol=2e-3, rtol=0)
 
 
 def test_segments_of_a_trajectory_share_the_factor() -> None:

@@ -52,12 +52,12 @@ class Student(Distribution):
 
     @property
     def mean(self) -> Tensor:
-        """The mean (..., D) of the block."""
+        """The mean (..., D) of the block, as if that of a flow did not depend on its width."""
         return self.block.mean
 
     @property
     def variance(self) -> Tensor:
-        """The variance (..., D) of each component, finite since the largest factor is."""
+        """The variance (..., D), finite since the largest factor is; of a flow approximately."""
         return self.block.variance * _factors(self.degrees).square().mean().to(self.mean)
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from retwin.nets.mixtures import Blocks, GaussianMixture
 from retwin.nets.student import Student
 from retwin.nets.training import Training, isolated
 from retwin.scores.energy import energy_score
+from retwin.update.residual.loading import load_residual
 from retwin.update.residual.refining import refine
 
 pytestmark = pytest.mark.numerical
@@ -300,7 +302,24 @@ def test_saved_and_loaded_is_the_same(
     draws = [m.sample(context, generator=torch.Generator().manual_seed(1)) for m in (rg, back)]
     assert torch.equal(*draws)
     assert back.fitted == rg.fitted
+    assert back.degrees == rg.degrees
     np.testing.assert_array_equal(back.timing, rg.timing)
+
+
+def test_models_from_before_student_s_distribution_open(
+    rg: rt.ResidualModel, tmp_path: Path
+) -> None:
+    """Their `spread` contains the uncertainty of the width; damaged degrees are refused."""
+    rg.save(tmp_path / "rg")
+    file = tmp_path / "rg" / "model.json"
+    about = json.loads(file.read_text())
+    degrees = about.pop("degrees")
+    file.write_text(json.dumps(about))
+    assert rt.ResidualModel.load(tmp_path / "rg").degrees == [np.inf] * len(rg.sizes)
+    for damaged in ([0.5, *degrees[1:]], degrees[1:], ["1", *degrees[1:]]):
+        file.write_text(json.dumps(about | {"degrees": damaged}))
+        with pytest.raises(rt.InputError):
+            load_residual(tmp_path / "rg")
 
 
 def test_calibration_data_must_be_of_the_same_system(

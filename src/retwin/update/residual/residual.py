@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retwin.catalog import DENSITIES, NETWORKS, classes
-from retwin.checks import one_of
+from retwin.checks import finite, one_of
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
 from retwin.nets.mixtures import Blocks
@@ -167,7 +167,10 @@ class Residual(nn.Module, ABC):
         model.load_state_dict({"spread": torch.ones_like(model.spread), **weights})
         # Development versions before 0.1.0 had their uncertainty in `spread`.
         degrees = about.get("degrees", [None] * len(model.sizes))
-        model.degrees = [math.inf if each is None else float(each) for each in degrees]
+        model.degrees = [
+            math.inf if each is None else finite("degrees", each, least=1)
+            for each, _ in zip(degrees, model.sizes, strict=True)
+        ]
         model.emulated = about["emulated"]
         model.timing = np.atleast_2d(np.array(about.get("timing", []), dtype=float))
         model.fitted = Fit.of(about["fitted"])
