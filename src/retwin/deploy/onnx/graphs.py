@@ -100,7 +100,9 @@ class ResidualGraph(nn.Module):
         distribution = self.residual.distribution(describe(context))
         shared = self.residual.persistence
         noise = shared.sqrt() * trajectory_noise + (1 - shared).sqrt() * segment_noise
-        z = distribution.from_noise(shared_factor(trajectory_uniform, uniform), noise)
+        if self.residual.heavy_tailed:
+            uniform = shared_factor(trajectory_uniform, uniform)
+        z = distribution.from_noise(uniform, noise)
         return z.clamp(-self.residual.bounds, self.residual.bounds)
 
 

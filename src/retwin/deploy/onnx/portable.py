@@ -297,7 +297,7 @@ class Portable:
             "segment_noise": rng.standard_normal((*shape, size), np.float32),
             "trajectory_noise": rng.standard_normal((count, 1, size), np.float32),
         }
-        # Development versions before 0.1.0 exported graphs without it.
+        # Without it the width of the residual model is known.
         if "trajectory_uniform" in residual.inputs:
             noise["trajectory_uniform"] = rng.random((count, 1, blocks), np.float32)
         if self.sensor is None:

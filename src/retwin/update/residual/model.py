@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -99,15 +100,16 @@ class ResidualModel(Residual):
         kinds = [isinstance(head, BernoulliHead) for head in self.heads]
         return torch.tensor(kinds).repeat_interleave(torch.tensor(self.sizes))
 
+    @property
+    def heavy_tailed(self) -> bool:
+        """Whether the width of a block is uncertain, see `Student`."""
+        return not all(map(math.isinf, self.degrees))
+
     def distribution(self, features: Tensor) -> Blocks:
         """The distribution q_ψ for features (..., F) of segments, see `describe`."""
-        blocks = self.predict(features).widened(self.spread).blocks
-        parts = zip(self.heads, blocks, self.degrees, strict=True)
+        parts = zip(self.predict(features).widened(self.spread).blocks, self.degrees, strict=True)
         return Blocks(
-            [
-                block if isinstance(head, BernoulliHead) else Student(block, degrees)
-                for head, block, degrees in parts
-            ]
+            [block if math.isinf(degrees) else Student(block, degrees) for block, degrees in parts]
         )
 
     def predict(self, features: Tensor) -> Blocks:
@@ -136,9 +138,10 @@ class ResidualModel(Residual):
         if self.persistence.any():
             common = torch.randn(shape[0], 1, len(self.latent), generator=generator).to(own)
             own = self.persistence.sqrt() * common + (1 - self.persistence).sqrt() * own
-        shared = torch.rand(shape[0], 1, len(distribution.blocks), generator=generator).to(own)
-        z = distribution.from_noise(shared_factor(shared, uniform), own)
-        return z.clamp(-self.bounds, self.bounds)
+        if self.heavy_tailed:
+            shared = torch.rand(shape[0], 1, len(distribution.blocks), generator=generator)
+            uniform = shared_factor(shared.to(own), uniform)
+        return distribution.from_noise(uniform, own).clamp(-self.bounds, self.bounds)
 
 
 def describe(context: Context) -> Tensor:
