@@ -174,6 +174,10 @@ def test_one_trajectory_and_one_segment_give_a_wide_distribution(twin: rt.Surrog
     deviations = one.spread.numpy() * widths
     assert (deviations > 1.5).all()
     data, _ = machine.measured(1, 0)
+    _, found = rt.infer_discrepancy(twin, data, rt.DelayOffset())
+    # Bounds are those of the data, and do not depend on what the network predicts.
+    largest = found.z.abs().amax(dim=(0, 1)).numpy()
+    np.testing.assert_allclose(one.bounds, 1.25 * largest * widths, rtol=0.01)
     short = data.replace(
         commands=data.commands[:, :STEPS],
         nominal=data.nominal[:, :STEPS],
