@@ -26,6 +26,8 @@ PALETTE = (
     ("#8b3a2b", "#d98f80"),
 )
 """Okabe and Ito's colours (light, dark) at a contrast of 3 or more with the page's background."""
+SYMBOLS = ("circle", "square", "diamond")
+"""Symbols of points, by plotly's names."""
 DASHES = ("solid", "dash", "dot", "dashdot")
 """Line styles, by plotly's names."""
 CHROME = {
@@ -60,14 +62,14 @@ def colour_of(source: str) -> str:
 
 
 def symbol(source: str) -> str:
-    """The symbol of the source's points: "circle", or "square" in the palette's second cycle."""
-    return "circle" if _place(source) < len(PALETTE) else "square"
+    """The symbol of the source's points, another one in each cycle of the palette."""
+    return SYMBOLS[_place(source) // len(PALETTE)]
 
 
 def dash(source: str) -> str:
     """The style of the source's lines, which differs from that of others of the same colour."""
     place = _place(source)
-    return DASHES[(place + 2 * (place // len(PALETTE))) % len(DASHES)]
+    return DASHES[(place + place // len(PALETTE)) % len(DASHES)]
 
 
 def hexadecimal(colour: str) -> str:
@@ -78,4 +80,4 @@ def hexadecimal(colour: str) -> str:
 def _place(source: str) -> int:
     names = list(SOURCES)
     place = names.index(source) if source in SOURCES else sum(source.encode())
-    return place % (2 * len(PALETTE))
+    return place % (len(SYMBOLS) * len(PALETTE))
