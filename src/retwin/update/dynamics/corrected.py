@@ -71,13 +71,19 @@ class Domain:
         half = np.maximum(self.high - self.centre, self.centre - self.low)
         return np.where(half > 0, half, 1.0)
 
-    def excess(self, states: NDArray) -> NDArray:
-        """How far states (n, T, d_x) leave the domain (n, d_x), in widths of it."""
-        count = states.shape[2]
-        width = np.maximum(self.high - self.low, 1e-300)[:count]
-        above = states.max(axis=1) - self.high[:count]
-        below = self.low[:count] - states.min(axis=1)
-        made: NDArray = np.maximum(np.maximum(above, below), 0.0) / width
+    def excess(self, states: NDArray, commands: NDArray) -> NDArray:
+        """How far states (n, T, d_x) and commands (n, T, d_u) leave the domain, in widths of it.
+
+        (d_x + d_u,), the most of all trajectories; those with states that are not finite do not
+        count.
+        """
+        finite = np.isfinite(states).all(axis=(1, 2))
+        if not finite.any():
+            return np.zeros(len(self.low))
+        both = np.concatenate([states[finite], commands[finite]], axis=2)
+        width = np.where(self.high > self.low, self.high - self.low, self.scale)
+        beyond = np.maximum(both.max(axis=(0, 1)) - self.high, self.low - both.min(axis=(0, 1)))
+        made: NDArray = np.maximum(beyond, 0.0) / width
         return made
 
 

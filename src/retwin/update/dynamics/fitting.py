@@ -17,7 +17,7 @@ from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
-from retwin.update.dynamics.corrected import CorrectedEquations, correctable
+from retwin.update.dynamics.corrected import CorrectedEquations, Domain, correctable
 from retwin.update.dynamics.estimation import Estimation, HeldOut, Point, correlation_time, root
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.noise import fit_noise, folds, widening
@@ -268,6 +268,7 @@ def _assembled(
     values = unknowns.offset + unknowns.matrix @ found.shared
     by_free = np.eye(len(start))[:, unknowns.free]
     factor = block_diag(unknowns.matrix, by_free) @ root(estimation.covariance(found))
+    states = estimation.simulated(found)[1]
     names = [each.name for each in equations.twin.states]
     indices = [names.index(name) for name in equations.states]
     made = DynamicsTwin(
@@ -278,7 +279,7 @@ def _assembled(
         np.zeros(len(start)),
         estimation.power(estimation.residual(found)),
         1.0,
-        equations.domain,
+        Domain.visited(states, estimation.commands, equations.domain.speed),
         equations.states,
         estimation.observed.emulated,
     )

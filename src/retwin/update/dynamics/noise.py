@@ -42,7 +42,7 @@ def fit_noise(twin: DynamicsTwin, observed: Trajectories, corrected: Sequence[in
         return replace(twin, process=process, noise=twin.noise * np.exp(2 * logs[count:]))
 
     def cost(logs: NDArray) -> float:
-        value = -float(np.sum(at(logs).predictive(observed).log_density()))
+        value = -float(np.sum(at(logs).filtered(observed).log_density()))
         return value if np.isfinite(value) else np.inf
 
     start = np.full(count + len(twin.noise), np.log(RATIO))
@@ -55,7 +55,7 @@ def fit_noise(twin: DynamicsTwin, observed: Trajectories, corrected: Sequence[in
     )
     made = at(found.x)
     # A common scale changes no prediction, but all intervals.
-    error = np.abs(made.predictive(observed).standardised())
+    error = np.abs(made.filtered(observed).standardised())
     scale = (np.nanquantile(error, LEVEL) / ndtri((1 + LEVEL) / 2)) ** 2
     return replace(made, process=scale * made.process, noise=scale * made.noise)
 

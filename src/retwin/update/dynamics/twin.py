@@ -31,7 +31,7 @@ __all__ = ["DynamicsTwin"]
 KIND = "dynamics"
 """Kind of the saved model."""
 BEYOND = 0.05
-"""How far, in widths of the domain, states may leave it without a warning."""
+"""How far, in widths of the domain, states and commands may leave it without a warning."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,22 +123,20 @@ class DynamicsTwin:
         Warns
         -----
         OutsideTrainingWarning
-            Most probable states leave the range that they had in calibration.
+            Most probable states, or commands, leave the range that they had in calibration.
         StepWarning
             See `StateTwin`.
 
         """
-        beyond = np.zeros(len(self.process))
+        beyond = np.zeros(len(self.domain.low))
 
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             held = np.asarray(chunk.held_commands, np.float64)
-            nominal, states = self._most_probable(np.asarray(chunk.commands, np.float64))
-            finite = np.isfinite(states).all(axis=(1, 2))
-            if chunk.index.start == 0 and finite[0]:
-                first = np.asarray(chunk.commands[:1], np.float64)
-                self.equations.check_accuracy(first, self.values[None], nominal[:1])
-            if finite.any():
-                np.maximum(beyond, self.domain.excess(states[finite]).max(axis=0), out=beyond)
+            clean = np.asarray(chunk.commands, np.float64)
+            nominal, states = self._most_probable(clean)
+            np.maximum(beyond, self.domain.excess(states, clean), out=beyond)
+            if chunk.index.start == 0 and np.isfinite(states[0]).all():
+                self.equations.check_accuracy(clean[:1], self.values[None], nominal[:1])
             return nominal, self._drawn(held, chunk_generator(seed, chunk, 2))
 
         checked = checked_commands(commands, self.inputs)
@@ -178,8 +176,19 @@ class DynamicsTwin:
         InputError
             Other channels or another rate than those of the twin.
 
+        Warns
+        -----
+        OutsideTrainingWarning
+            See `simulate`.
+
         """
         check_channels(self, record, "record")
+        made = self.filtered(record)
+        self._warn(self.domain.excess(made.states, record.commands))
+        return made
+
+    def filtered(self, record: Trajectories) -> Prediction:
+        """See `predictive`; without checks."""
         commands = checked_commands(record.commands, self.inputs).astype(np.float64)
         theta = np.tile(self.values, (len(record), 1))
         measured = np.where(record.mask, record.observed, 0.0)
@@ -254,11 +263,13 @@ class DynamicsTwin:
         return made
 
     def _warn(self, beyond: NDArray) -> None:
+        """Warn where a state or a command leaves the domain by so much (d_x + d_u,)."""
         worst = int(np.argmax(beyond))
         if beyond[worst] <= BEYOND:
             return
+        names = (*(each.name for each in self.equations.states), *self.inputs.names)
         warnings.warn(
-            f"{self.equations.states[worst].name} leaves the range that it had in calibration by "
+            f"{names[worst]} leaves the range that it had in calibration by "
             f"{100 * beyond[worst]:.0f} % of its width; there the discrepancy is extrapolated",
             OutsideTrainingWarning,
             stacklevel=3,
