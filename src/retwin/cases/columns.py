@@ -1,16 +1,18 @@
-"""Records in one CSV table: a column for each channel, and parts of its rows."""
+"""Records in CSV tables: the columns of each channel, parts of the rows, and their times."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
 from math import inf
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.cases.time_column import TimeColumn
 from retwin.checks import finite, require
 from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError
@@ -22,17 +24,22 @@ __all__ = ["ColumnRecords", "Record"]
 
 @dataclass(frozen=True)
 class Record:
-    """One record in a table.
+    """One record in a table, or one in each of several.
 
     Parameters
     ----------
-    columns : mapping of str to str
-        The column of each channel.
+    columns : mapping of str to str or sequence of str
+        The column of each channel, or several of which it is the mean. True and False are 1 and 0.
     rows : tuple of int, optional
         First row, counted from 0 after the header, and the row at which it ends; by default all.
     transient : float, default 0.0
         Duration in s at the begin whose outputs are masked, while the real system still moves from
         a state that the twin does not start in. Its commands count.
+    files : str or sequence of str, optional
+        Files, or patterns such as `2020-*.csv`, in the folder that is read: a record in each.
+    time : TimeColumn or str, optional
+        The column of the rows' times, for rows that are not one sample each: those come to the
+        sample rate as `TimeColumn` describes.
 
     Raises
     ------
@@ -41,9 +48,11 @@ class Record:
 
     """
 
-    columns: Mapping[str, str]
+    columns: Mapping[str, str | tuple[str, ...]]
     rows: tuple[int, int] | None = None
     transient: float = 0.0
+    files: str | tuple[str, ...] = ()
+    time: TimeColumn | str | None = None
 
     def __post_init__(self) -> None:
         finite("transient", self.transient, least=0.0, unit="s", remedy="leave it out")
@@ -55,11 +64,60 @@ class Record:
             remedy="count from 0 after the header",
         )
 
+    @property
+    def clock(self) -> TimeColumn | None:
+        """How rows come to the sample rate; None where each is a sample."""
+        return TimeColumn(self.time) if isinstance(self.time, str) else self.time
+
+    def columns_of(self, channels: Channels) -> list[tuple[str, ...]]:
+        """The columns of each channel."""
+        return [_several(self.columns[name]) for name in channels.names]
+
+    @property
+    def every_column(self) -> list[str]:
+        """The columns of all channels."""
+        return list(dict.fromkeys(chain(*map(_several, self.columns.values()))))
+
     def overlaps(self, other: Record, channels: Channels) -> bool:
-        """Whether both have rows of one column of these channels."""
-        own, others = ({each.columns[name] for name in channels.names} for each in (self, other))
+        """Whether both have rows of one column of these channels, in one file."""
+        own, others = (set(chain(*each.columns_of(channels))) for each in (self, other))
         (first, end), (begin, stop) = self.rows or (0, inf), other.rows or (0, inf)
-        return bool(own & others) and first < stop and begin < end
+        same = set(_several(self.files)) & set(_several(other.files)) or self.files == other.files
+        return bool(own & others and same) and first < stop and begin < end
+
+    def found_in(self, path: Path) -> list[tuple[Path, Record]]:
+        """The files of the record, each with the record in it alone.
+
+        Raises
+        ------
+        InputError
+            A folder is needed or given against the declared files, or has no such file.
+
+        """
+        patterns = _several(self.files)
+        require(
+            bool(patterns) == path.is_dir(),
+            str(path),
+            expected="a folder with the files of the records" if patterns else "one file",
+            got="a folder" if path.is_dir() else "no folder",
+            remedy='name the files of a folder in each record, files = ["*.csv"]',
+        )
+        found = [] if patterns else [path]
+        for pattern in patterns:
+            files = sorted(path.glob(pattern)) if set("*?[") & set(pattern) else [path / pattern]
+            require(
+                files and all(file.is_file() for file in files),
+                str(path),
+                expected=f"files {pattern}",
+                got="none",
+                remedy="check the names of the record's files, and the folder",
+            )
+            found += files
+        return [(file, replace(self, files=str(file))) for file in dict.fromkeys(found)]
+
+
+def _several(names: str | Sequence[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 Records = Mapping[str, str] | Record | Sequence[Mapping[str, str] | Record]
@@ -68,10 +126,11 @@ Records = Mapping[str, str] | Record | Sequence[Mapping[str, str] | Record]
 
 @dataclass(frozen=True)
 class ColumnRecords:
-    """A function of a CSV file with a header that gives calibration records and test records.
+    """A function of CSV files with a header that gives calibration records and test records.
 
-    Each is one healthy trajectory. It ends where its commands end; an output that is missing before
-    is masked. `nominal` is the output of the twin. Shorter records of a set are padded.
+    It takes one file, or the folder of the files that the records name. Each record is one healthy
+    trajectory. It ends where its commands end; an output that is missing before is masked.
+    `nominal` is the output of the twin. Shorter records of a set are padded.
 
     Parameters
     ----------
@@ -84,7 +143,8 @@ class ColumnRecords:
     ------
     InputError
         There is not one column for each input and output, or both sets have the same measurements.
-        When called: the file cannot be read or lacks a column, or a command is no number.
+        When called: a file cannot be read or lacks a column, a command is no number, or as
+        `TimeColumn.seconds`.
 
     """
 
@@ -110,62 +170,95 @@ class ColumnRecords:
                 remedy='write for each channel NAME = "COLUMN"',
             )
             object.__setattr__(self, name, tuple(records))
-        shared = [
-            each
-            for each in self._records("test")
-            if any(each.overlaps(own, self.twin.outputs) for own in self._records("calibration"))
-        ]
-        require(
-            not shared,
-            "test",
-            expected="measurements that are in no calibration record",
-            got=f"the same columns, {', '.join(shared[0].columns.values())}" if shared else "",
-            remedy="give other columns, or each a part of the rows: rows = [FIRST, END]",
-        )
+        self._check_separate(*(self._records(name) for name in ("calibration", "test")))
+
+    @property
+    def in_folder(self) -> bool:
+        """Whether the records name the files of a folder."""
+        return any(each.files for name in ("calibration", "test") for each in self._records(name))
 
     def _records(self, name: str) -> tuple[Record, ...]:
         records: tuple[Record, ...] = getattr(self, name)
         return records
 
-    def __call__(self, path: str | Path) -> tuple[Trajectories, Trajectories]:
-        """The calibration records and the test records in a CSV file."""
-        path = Path(path)
-        every = (*self._records("calibration"), *self._records("test"))
-        table = _read(path, list(dict.fromkeys(c for each in every for c in each.columns.values())))
-        source = Provenance(path.name, sha256(path))
-        return self._set(table, "calibration", source), self._set(table, "test", source)
+    def _check_separate(self, calibration: Sequence[Record], test: Sequence[Record]) -> None:
+        """Refuse measurements that are in both sets."""
+        outputs = self.twin.outputs
+        shared = [each for each in test if any(each.overlaps(own, outputs) for own in calibration)]
+        require(
+            not shared,
+            "test",
+            expected="measurements that are in no calibration record",
+            got=f"the same columns, {', '.join(shared[0].every_column)}" if shared else "",
+            remedy="give other columns, or each a part of the rows: rows = [FIRST, END]",
+        )
 
-    def _set(self, table: Mapping[str, NDArray], name: str, source: Provenance) -> Trajectories:
-        """The records of that name, padded to the length of the longest."""
-        records = self._records(name)
-        ids = [name] if len(records) == 1 else [f"{name}-{i + 1}" for i in range(len(records))]
-        made = [self._record(table, *each, source) for each in zip(records, ids, strict=True)]
-        steps = max(each.steps for each in made)
-        return Trajectories.concatenate([each.padded(steps) for each in made])
+    def __call__(self, path: str | Path) -> tuple[Trajectories, Trajectories]:
+        """The calibration records and the test records in a CSV file or a folder of these."""
+        path = Path(path)
+        calibration, test = (
+            [found for each in self._records(name) for found in each.found_in(path)]
+            for name in ("calibration", "test")
+        )
+        self._check_separate(*([record for _, record in each] for each in (calibration, test)))
+        wanted: dict[Path, dict[str, Callable[[str], float]]] = {}
+        for file, record in (*calibration, *test):
+            cells = wanted.setdefault(file, {})
+            cells |= dict.fromkeys(record.every_column, _number)
+            if record.clock:
+                cells[record.clock.column] = record.clock.number
+        tables = {file: _read(file, cells) for file, cells in wanted.items()}
+        sources = {file: Provenance(file.name, sha256(file)) for file in tables}
+
+        def made(name: str, found: Sequence[tuple[Path, Record]]) -> Trajectories:
+            ids = [name] if len(found) == 1 else [f"{name}-{i + 1}" for i in range(len(found))]
+            records = [
+                self._record(tables[file], record, own, sources[file])
+                for own, (file, record) in zip(ids, found, strict=True)
+            ]
+            steps = max(each.steps for each in records)
+            return Trajectories.concatenate([each.padded(steps) for each in records])
+
+        return made("calibration", calibration), made("test", test)
 
     def _record(
         self, table: Mapping[str, NDArray], record: Record, name: str, source: Provenance
     ) -> Trajectories:
+        """One record in a table, as a trajectory of that name."""
         rows = slice(*(record.rows or (None,)))
+        clock, rate, seconds = record.clock, self.twin.rate, np.empty(0)
+        if clock is not None:
+            place = f"{source.name}, {name} record"
+            seconds = clock.seconds(table[clock.column][rows], rate, place)
 
-        def values(channels: Channels) -> NDArray:
-            columns = [table[record.columns[each]][rows] for each in channels.names]
+        def values(channels: Channels, held: bool) -> NDArray:
+            columns = [
+                np.mean([table[each][rows] for each in several], axis=0)
+                for several in record.columns_of(channels)
+            ]
             count = len(next(iter(table.values()))[rows])
-            return np.array(columns).T.reshape(1, count, len(channels))
+            found = np.array(columns).T.reshape(count, len(channels))
+            if clock is not None:
+                found = clock.sampled(seconds, found, rate, held=held)
+            return found[None]
 
-        commands, observed = values(self.twin.inputs), values(self.twin.outputs)
+        held = clock is not None and clock.commands == "hold"
+        commands, observed = values(self.twin.inputs, held), values(self.twin.outputs, False)
         # Without commands, a record ends where its measurements end.
         known = np.isfinite(commands[0]).all(axis=1)
         ends = known if len(self.twin.inputs) else np.isfinite(observed[0]).any(axis=1)
         steps = int(np.flatnonzero(ends).max(initial=-1)) + 1
+        first = int(np.append(known, False).argmin())
+        missing = f", none at {first / rate:g} s" if clock and first < steps else ""
         require(
             steps >= 2 and known[:steps].all(),
             source.name,
             expected="a number for every command until the record ends, two rows at least",
-            got=f"{int(known.sum())} of {steps} rows of the {name} record",
-            remedy="fill in the missing commands, which are known inputs",
+            got=f"{int(known.sum())} of {steps} rows of the {name} record{missing}",
+            remedy="fill in the missing commands, which are known inputs, or give the rows before "
+            "and after them as two records",
         )
-        observed[:, : round(record.transient * self.twin.rate)] = np.nan
+        observed[:, : round(record.transient * rate)] = np.nan
         require(
             np.isfinite(observed[:, :steps]).any(),
             source.name,
@@ -178,7 +271,7 @@ class ColumnRecords:
             commands=commands,
             nominal=self.twin.simulate(commands, seed=0).nominal,
             observed=observed[:, :steps],
-            rate=self.twin.rate,
+            rate=rate,
             labels=np.array([HEALTHY]),
             ids=np.array([name]),
             inputs=self.twin.inputs,
@@ -187,16 +280,24 @@ class ColumnRecords:
         )
 
 
-def _read(path: Path, names: list[str]) -> dict[str, NDArray]:
-    """Columns of a CSV file; NaN where a cell is empty."""
+def _number(cell: str) -> float:
+    """The number in a cell; NaN in an empty one."""
+    truth = {"true": 1.0, "false": 0.0}.get(cell.strip().lower())
+    return float(cell or "nan") if truth is None else truth
+
+
+def _read(path: Path, cells: Mapping[str, Callable[[str], float]]) -> dict[str, NDArray]:
+    """Columns of a CSV file, each by a function of its cells."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as lines:
             rows = list(csv.DictReader(lines, strict=True))
-        return {name: np.array([float(row[name] or "nan") for row in rows]) for name in names}
-    except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
+        return {
+            name: np.array([number(row[name]) for row in rows]) for name, number in cells.items()
+        }
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, csv.Error) as error:
         raise InputError(
             str(path),
-            expected=f"a CSV file with a header and numbers in columns {', '.join(names)}",
+            expected=f"a CSV file with a header and numbers in columns {', '.join(cells)}",
             got=f"{type(error).__name__}: {error}",
             remedy="name the columns as the file does",
         ) from None

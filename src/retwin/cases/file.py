@@ -308,7 +308,8 @@ def _recorded(
     )
     with at(key(place, "file")):
         path = folder / str(file)
-        if records is not None and path.suffix.lower() == ".csv":
+        folder_of_records = getattr(records, "in_folder", False) and path.is_dir()
+        if records is not None and (path.suffix.lower() == ".csv" or folder_of_records):
             found, _ = records(path)
         else:
             found = load(path)

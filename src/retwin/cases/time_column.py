@@ -1,0 +1,147 @@
+"""`TimeColumn`: when the rows of a table were recorded, and how they come to a sample rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import one_of, positive, require
+
+__all__ = ["TimeColumn"]
+
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "iso": 1.0}
+"""Units of times, in s."""
+BRIDGED = 2.5
+"""Longest interval that is bridged by default, in sample periods: one lost sample."""
+SAME = 1e-3
+"""Difference of times, in sample periods, that is rounding."""
+WRONG_UNIT = 100.0
+"""Ratio of the interval between rows to the sample period at which the unit is refused; units
+differ by a factor of 1000."""
+
+
+@dataclass(frozen=True)
+class TimeColumn:
+    """The times of a table's rows, and how its values come to the samples of a record.
+
+    The first row is the first sample. Measurements are interpolated along straight lines, between
+    samples that are at most `max_gap` apart; elsewhere they are missing.
+
+    Parameters
+    ----------
+    column : str
+        The column of the times, which increase.
+    unit : {"s", "ms", "us", "ns", "iso"}
+        Their unit, or ISO 8601 text; without a time zone it is UTC.
+    commands : {"hold", "linear"}
+        The commands between rows: held, so that a sample is the mean until the next one (a pulse
+        keeps its area), or straight lines.
+    max_gap : float, optional
+        The longest interval in s between values of a channel that is bridged; by default 2.5 times
+        the sample period or the median interval, whichever is longer.
+
+    Raises
+    ------
+    InputError
+        An unknown unit or kind of command, or an interval that is not positive.
+
+    """
+
+    column: str
+    unit: Literal["s", "ms", "us", "ns", "iso"] = "s"
+    commands: Literal["hold", "linear"] = "hold"
+    max_gap: float | None = None
+
+    def __post_init__(self) -> None:
+        one_of("unit", self.unit, UNITS, remedy="give the unit of the times")
+        one_of("commands", self.commands, ("hold", "linear"))
+        if self.max_gap is not None:
+            positive("max_gap", self.max_gap, unit="s", remedy="leave it out")
+
+    def number(self, cell: str) -> float:
+        """The time in a cell, in the column's unit, or for ISO text in s since 1970.
+
+        Raises
+        ------
+        ValueError
+            It is no time.
+
+        """
+        if self.unit != "iso":
+            return float(cell)
+        time = datetime.fromisoformat(cell.strip())
+        return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
+
+    def seconds(self, times: NDArray, rate: float, place: str) -> NDArray:
+        """Times (T,) in s since the first one.
+
+        Raises
+        ------
+        InputError
+            There are fewer than two, one is missing, repeated, or before the one above, or their
+            unit does not suit the sample rate in Hz. The message names `place`.
+
+        """
+        known = np.isfinite(times)
+        require(
+            len(times) >= 2 and known.all(),
+            place,
+            expected=f"two rows at least, with a time in column {self.column!r} of each",
+            got=f"{int(known.sum())} times in {len(times)} rows",
+            remedy="check column and rows",
+        )
+        steps = np.diff(times) * UNITS[self.unit]
+        row = int(np.argmax(steps <= 0))
+        require(
+            steps[row] > 0,
+            place,
+            expected=f"times in column {self.column!r} that increase",
+            got=f"{'the same time' if steps[row] == 0 else 'an earlier time'} in data row {row + 1}"
+            f", {steps[row]:g} s after the row before",
+            remedy="sort the rows by time, and keep one of those that were logged twice",
+        )
+        ratio = float(np.median(steps)) * rate
+        require(
+            1 / WRONG_UNIT < ratio < WRONG_UNIT,
+            place,
+            expected=f"times about {1 / rate:g} s apart, the sample period",
+            got=f"a median of {ratio / rate:g} s with unit {self.unit!r}",
+            remedy=f"give the unit of column {self.column!r}: {', '.join(UNITS)}",
+        )
+        elapsed: NDArray = (times - times[0]) * UNITS[self.unit]
+        return elapsed
+
+    def sampled(self, seconds: NDArray, values: NDArray, rate: float, *, held: bool) -> NDArray:
+        """Values (T, d) at times (T,) in s, as samples (N, d) at a rate in Hz; NaN where missing.
+
+        `held` values are constant until the next, others change along straight lines.
+        """
+        near = SAME / rate
+        grid = np.arange(int((seconds[-1] + near) * rate) + 1) / rate
+        made = np.full((len(grid), values.shape[1]), np.nan)
+        longest = self.max_gap or BRIDGED * max(1 / rate, float(np.median(np.diff(seconds))))
+        for channel, own in zip(made.T, values.T, strict=True):
+            known = np.isfinite(own)
+            if not known.any():
+                continue
+            at, own = seconds[known], own[known]
+            before = np.searchsorted(at, grid + near, side="right") - 1
+            after = np.searchsorted(at, grid - near)
+            bridged = (before >= 0) & (after < len(at))
+            bridged[bridged] = (at[after[bridged]] - at[before[bridged]]) <= longest
+            found = _means(at, own, grid, 1 / rate) if held else np.interp(grid, at, own)
+            channel[bridged] = found[bridged]
+        return made
+
+
+def _means(at: NDArray, values: NDArray, grid: NDArray, period: float) -> NDArray:
+    """Means over a period from each time of the grid, of values that are held from `at` on."""
+    until = np.append(at, max(at[-1], grid[-1]) + period)
+    area = np.concatenate([[0.0], np.cumsum(values * np.diff(until))])
+    means = (np.interp(grid + period, until, area) - np.interp(grid, until, area)) / period
+    clipped: NDArray = np.clip(means, values.min(), values.max())  # against rounding
+    return clipped
