@@ -77,6 +77,11 @@ CASES: Mapping[str, CaseEntry] = {
         "Silverbox, a linear twin of a cubic spring",
         "retwin.cases.silver_box.recorded:RECORDED",
     ),
+    "incubator": CaseEntry(
+        "retwin.cases.styrofoam_incubator.case:incubator",
+        "incubator, a heater in a box of styrofoam",
+        "retwin.cases.styrofoam_incubator.recorded:RECORDED",
+    ),
 }
 
 TWINS: Mapping[str, Entry] = {
@@ -90,6 +95,10 @@ TWINS: Mapping[str, Entry] = {
     "armpi-emulated": Entry(
         "retwin.cases.armpi_fpv.emulator:EmulatedArmPi",
         "emulation of the real arm: delays, backlash, missed segments, polling",
+    ),
+    "incubator": Entry(
+        "retwin.cases.styrofoam_incubator.twin:INCUBATOR",
+        "incubator, a heater and the air in a box",
     ),
     "silverbox": Entry(
         "retwin.cases.silver_box.twin:SILVERBOX",

@@ -70,7 +70,7 @@ def test_cases_are_found_by_name() -> None:
     ):
         with pytest.raises(
             rt.InputError,
-            match=r"armpi, tanks, tanks_overflow, silverbox, a file \*.toml, or package",
+            match=r"armpi, tanks, tanks_overflow, silverbox, incubator, a file \*.toml, or package",
         ):
             rt.cases.get(name)
 

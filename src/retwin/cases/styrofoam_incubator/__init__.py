@@ -1,0 +1,1 @@
+"""The incubator: its equations, records and case."""
