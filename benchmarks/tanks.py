@@ -33,7 +33,7 @@ from record import record
 
 import retwin as rt
 from retwin.cases.cascaded_tanks.case import VOLTAGES, benchmark, tanks
-from retwin.cases.cascaded_tanks.twin import tanks_parametric
+from retwin.cases.cascaded_tanks.twin import OVERFLOWING_TANKS
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.identification import LeastSquares, identify
 
@@ -68,7 +68,7 @@ def fitted(estimation: rt.Trajectories, base: str) -> tuple[rt.Twin, CorrectedTw
     if base == "overflow":
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="not identified")
-            free = tanks_parametric(overflow=True)
+            free = OVERFLOWING_TANKS.parametric()
             found = identify(free, estimation, seed=0, method=LeastSquares(starts=2))
         twin = found.twin
         print(found.values)

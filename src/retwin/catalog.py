@@ -105,7 +105,7 @@ TWINS: Mapping[str, Entry] = {
         "Silverbox, a linear oscillator",
     ),
     "tanks": Entry(
-        "retwin.cases.cascaded_tanks.twin:TanksTwin",
+        "retwin.cases.cascaded_tanks.twin:TANKS",
         "two cascaded tanks, the upper level hidden",
     ),
 }

@@ -25,13 +25,11 @@ _HOME = {
     "EmulatedArmPi": "armpi_fpv.emulator",
     "KinematicTwin": "armpi_fpv.closed_form",
     "Record": "columns",
-    "TanksTwin": "cascaded_tanks.twin",
     "TimeColumn": "time_column",
     "animate": "animation",
     "armpi_parametric": "armpi_fpv.parameters",
     "read_case": "file",
     "recover_commands": "armpi_fpv.recovery",
-    "tanks_parametric": "cascaded_tanks.twin",
 }
 _CASES = {
     name: entry.target.removeprefix(f"{__name__}.").partition(":")[0]

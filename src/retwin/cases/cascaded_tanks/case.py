@@ -15,30 +15,31 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from retwin.cases.cascaded_tanks.twin import RATE, TanksTwin, tanks_parametric
+from retwin.cases.cascaded_tanks.twin import OVERFLOWING_TANKS, RATE, TANKS
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords
 from retwin.data.trajectories import HEALTHY
 from retwin.nets.networks import LSTM
 from retwin.nets.training import Training
 from retwin.twins.samplers import MultisineSampler
+from retwin.twins.twin import Twin
 from retwin.update.corrections import Additive
 from retwin.update.residual import SequenceMixture
 
 __all__ = ["VOLTAGES", "benchmark", "tanks", "tanks_overflow"]
 
-FITTED = TanksTwin()
-OVERFLOWING = TanksTwin(
-    overflow=True,
-    pump=0.0577365,
-    upper=0.0147705,
-    lower=0.0888148,
-    start_upper=17.91089,
-    start_lower=5.22955,
-    edge=23.88144,
-    spill=0.752142,
-    upper_power=0.814118,
-    lower_power=0.352169,
+OVERFLOWING = OVERFLOWING_TANKS.parametric().with_values(
+    {
+        "pump": 0.0648524,
+        "upper": 0.00648950,
+        "lower": 0.100076,
+        "edge": 33.97667,
+        "spill": 0.702221,
+        "upper_power": 1.0,
+        "lower_power": 0.350039,
+        "start_upper": 26.79919,
+        "start_lower": 5.232571,
+    }
 )
 """The complete physics, with parameters identified on the estimation record (docs/tanks.md)."""
 
@@ -57,12 +58,12 @@ VOLTAGES = MultisineSampler(
 """Voltages like the benchmark's, mostly slow; each trajectory is a third of a period."""
 
 
-def benchmark(twin: TanksTwin) -> ColumnRecords:
+def benchmark(twin: Twin) -> ColumnRecords:
     """Records of `dataBenchmark.csv`: estimation for calibration, validation for the test.
 
     Parameters
     ----------
-    twin : TanksTwin
+    twin : Twin
         The twin that gives the nominal output.
 
     Returns
@@ -87,18 +88,18 @@ def tanks() -> Case:
         name="tanks",
         title="Cascaded tanks",
         faults={HEALTHY: None},
-        twin=FITTED,
+        twin=TANKS,
         emulator=None,
         sampler=VOLTAGES,
         correction=Additive(),
         output_correction=Additive(),
         sensor_rate=RATE,
-        parametric=tanks_parametric(overflow=True),
+        parametric=OVERFLOWING_TANKS.parametric(),
         network=LSTM(64),
         training=Training(max_epochs=120, batch_size=8, learning_rate=5e-3),
         per_class=800,
         density=SequenceMixture(block=64, margin=32),
-        records=benchmark(FITTED),
+        records=benchmark(TANKS),
     )
 
 

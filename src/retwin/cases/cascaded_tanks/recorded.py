@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from retwin.cases.cascaded_tanks.twin import TanksTwin
+from retwin.cases.cascaded_tanks.twin import TANKS
 from retwin.cases.recorded import RecordedCase
 from retwin.data.trajectories import HEALTHY
 
 __all__ = ["RECORDED"]
 
-RECORDED = RecordedCase((HEALTHY,), TanksTwin())
+RECORDED = RecordedCase((HEALTHY,), TANKS)
 """What files of the tanks' trajectories need of their case."""

@@ -7,6 +7,8 @@ air's temperature is the mean of two sensors.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, Record
 from retwin.cases.styrofoam_incubator.twin import INCUBATOR
@@ -19,7 +21,11 @@ from retwin.update.residual import SequenceMixture
 
 __all__ = ["WARM_UP", "incubator", "measurements"]
 
-COLUMNS = {"heater": "heater_on", "room": "t1", "air": ("t2", "t3")}
+COLUMNS: Mapping[str, str | tuple[str, ...]] = {
+    "heater": "heater_on",
+    "room": "t1",
+    "air": ("t2", "t3"),
+}
 CONTROLLED = ("2020-12-21_controller_1.csv", "2020-12-22_controller_2.csv")
 LID = 220
 """Row of the record of 2021-01-22 at which the lid is first open."""
