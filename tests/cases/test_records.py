@@ -100,6 +100,7 @@ def test_what_was_not_measured_is_missing(tmp_path: Path) -> None:
         ([0, 0.1, 0.2, 0.3], {"unit": "iso"}, "Invalid isoformat string"),
         ([0, 0.1, "nan", 0.3], {}, "3 times in 4 rows"),
         ([0, 0.1, 1.2, 1.3], {}, r"none at 0.2 s.*the rows before and after them as two"),
+        ([0, 0.1, 0.2, 1e9], {}, r"an interval of 1e\+09 s before data row 3"),
         ([0, 0.1, 0.2, 0.3], {"column": "when"}, "numbers in columns .* KeyError: 'when'"),
     ],
 )
@@ -125,10 +126,14 @@ def test_records_of_a_folder(tmp_path: Path) -> None:
     assert calibration.commands[:, 0, 0].tolist() == [0, 1]
     assert test.commands[:, 0, 0].tolist() == [3, 2]
     assert [each.name for each in test.provenance] == ["day-3.csv", "day-2.csv"]
+    with pytest.raises(rt.InputError, match="columns: expected the column of each channel"):
+        Record({"u": "in", "y": ()})
     for refused, message in [
         (lambda: split("day-*.csv", "day-3.csv"), "measurements that are in no calibration record"),
         (lambda: split("day-0.csv", "*.txt"), r"expected files \*\.txt, got none"),
         (lambda: split("day-0.csv", "day-9.csv"), r"expected files day-9\.csv, got none"),
+        (lambda: split("/nowhere/*.csv", "day-1.csv"), r"expected files /nowhere/\*\.csv"),
+        (lambda: split("**.txt", "day-1.csv"), r"expected files \*\*\.txt, got none"),
         (lambda: split((), "day-1.csv"), "one file, got a folder"),
         (lambda: split("a", "b", tmp_path / "day-0.csv"), "a folder with the files"),
         (lambda: split("day-0.csv", "day-1.csv", transient=9), "after its transient, got none"),

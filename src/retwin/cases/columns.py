@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from glob import glob
 from itertools import chain
 from math import inf
 from pathlib import Path
@@ -28,14 +29,14 @@ class Record:
 
     Parameters
     ----------
-    columns : mapping of str to str or sequence of str
+    columns : mapping of str to str or tuple of str
         The column of each channel, or several of which it is the mean. True and False are 1 and 0.
     rows : tuple of int, optional
         First row, counted from 0 after the header, and the row at which it ends; by default all.
     transient : float, default 0.0
         Duration in s at the begin whose outputs are masked, while the real system still moves from
         a state that the twin does not start in. Its commands count.
-    files : str or sequence of str, optional
+    files : str or tuple of str, optional
         Files, or patterns such as `2020-*.csv`, in the folder that is read: a record in each.
     time : TimeColumn or str, optional
         The column of the rows' times, for rows that are not one sample each: those come to the
@@ -44,7 +45,8 @@ class Record:
     Raises
     ------
     InputError
-        Rows out of order, or a transient that is no finite number of at least 0.
+        Rows out of order, a transient that is no finite number of at least 0, or a channel without
+        a column.
 
     """
 
@@ -62,6 +64,13 @@ class Record:
             expected="the first row, at least 0, and a later one at which the record ends",
             got=self.rows,
             remedy="count from 0 after the header",
+        )
+        require(
+            all(map(_several, self.columns.values())),
+            "columns",
+            expected="the column of each channel, or several",
+            got=dict(self.columns),
+            remedy='write for each channel NAME = "COLUMN", or a list for their mean',
         )
 
     @property
@@ -104,7 +113,9 @@ class Record:
         )
         found = [] if patterns else [path]
         for pattern in patterns:
-            files = sorted(path.glob(pattern)) if set("*?[") & set(pattern) else [path / pattern]
+            there = (path / pattern).is_file()
+            names = [pattern] if there else sorted(glob(pattern, root_dir=path))
+            files = [path / name for name in names]
             require(
                 files and all(file.is_file() for file in files),
                 str(path),
@@ -120,7 +131,8 @@ def _several(names: str | Sequence[str]) -> tuple[str, ...]:
     return (names,) if isinstance(names, str) else tuple(names)
 
 
-Records = Mapping[str, str] | Record | Sequence[Mapping[str, str] | Record]
+Columns = Mapping[str, str | tuple[str, ...]]
+Records = Columns | Record | Sequence[Columns | Record]
 """Records as a user gives them; columns alone stand for a record."""
 
 
@@ -136,7 +148,7 @@ class ColumnRecords:
     ----------
     twin : Twin
         Its channels and sample rate are those of the records.
-    calibration, test : Record, mapping of str to str, or a sequence of these
+    calibration, test : Record, mapping of str to str or tuple of str, or a sequence of these
         The records; the column of each channel stands for a record of all rows.
 
     Raises

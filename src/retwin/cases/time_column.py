@@ -82,8 +82,9 @@ class TimeColumn:
         Raises
         ------
         InputError
-            There are fewer than two, one is missing, repeated, or before the one above, or their
-            unit does not suit the sample rate in Hz. The message names `place`.
+            There are fewer than two, one is missing, repeated, or before the one above, they hardly
+            cover the record, or their unit does not suit the sample rate in Hz. The message names
+            `place`.
 
         """
         known = np.isfinite(times)
@@ -113,6 +114,15 @@ class TimeColumn:
             remedy=f"give the unit of column {self.column!r}: {', '.join(UNITS)}",
         )
         elapsed: NDArray = (times - times[0]) * UNITS[self.unit]
+        row = int(np.argmax(steps))
+        require(
+            elapsed[-1] * rate < WRONG_UNIT * len(times),
+            place,
+            expected="rows that cover the record",
+            got=f"an interval of {steps[row]:g} s before data row {row + 1}, in column "
+            f"{self.column!r}",
+            remedy="give the rows before and after it as two records",
+        )
         return elapsed
 
     def sampled(self, seconds: NDArray, values: NDArray, rate: float, *, held: bool) -> NDArray:
