@@ -162,12 +162,14 @@ class CorrectedEquations:
     def equations(self) -> list[tuple[int, list[int], list[Term]]]:
         """Per corrected state: its index, indices of its variables, and its terms."""
         names = [each.name for each in self.twin.states]
+        # A command may have the name of a state.
+        commands = [f"command {each}" if each in names else each for each in self.twin.inputs.names]
         made = []
         for state in self.states:
             i = names.index(state)
             used = variables_of(self.twin, i)
             places = sorted({i, *used})
-            own = [[*names, *self.twin.inputs.names][place] for place in places]
+            own = [[*names, *commands][place] for place in places]
             count = sum(place < len(names) for place in places)
             terms = [
                 term
