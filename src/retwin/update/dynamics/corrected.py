@@ -26,6 +26,9 @@ from retwin.update.dynamics.library import Library, Term
 
 __all__ = ["CorrectedEquations", "Domain"]
 
+EXTRAPOLATED = 0.25
+"""How far beyond its range in calibration, in widths of that, a variable of the discrepancy is
+extrapolated. From there on it is held, since polynomials diverge."""
 LINEAR = {"variable", "constant", "add", "sub", "neg"}
 """Operations of an equation that only defines a state."""
 COMPARED = 5000
@@ -70,6 +73,13 @@ class Domain:
         """Half widths (d_x + d_u,) about the centre; 1 for a constant."""
         half = np.maximum(self.high - self.centre, self.centre - self.low)
         return np.where(half > 0, half, 1.0)
+
+    @cached_property
+    def ends(self) -> tuple[NDArray, NDArray]:
+        """Scaled values (d_x + d_u,) at which variables of the discrepancy are held."""
+        low, high = ((each - self.centre) / self.scale for each in (self.low, self.high))
+        beyond = EXTRAPOLATED * (high - low)
+        return low - beyond, high + beyond
 
     def excess(self, states: NDArray, commands: NDArray) -> NDArray:
         """How far states (n, T, d_x) and commands (n, T, d_u) leave the domain, in widths of it.
@@ -201,13 +211,14 @@ class CorrectedEquations:
             with_parameters(each) for each in (twin.derivative or twin.step, twin.output)
         )
         centre, scale = self.domain.centre.tolist(), self.domain.scale.tolist()
+        low, high = (each.tolist() for each in self.domain.ends)
 
         def corrected(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
             both = [*x, *u]
             slope = list(function(x, u, named(*p[:own])))
             coefficients = iter(p[own:])
             for i, places, terms in self.equations:
-                v = [(both[j] - centre[j]) / scale[j] for j in places]
+                v = [((both[j] - centre[j]) / scale[j]).clamp(low[j], high[j]) for j in places]
                 total = sum(next(coefficients) * term.value(v) for term in terms)
                 slope[i] = slope[i] + float(self.domain.speed[i]) * total
             return tuple(slope)

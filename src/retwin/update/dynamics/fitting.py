@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,13 +47,15 @@ class Dynamics:
     Parameters
     ----------
     library : Library
-        Terms of which the discrepancy of each corrected equation is a weighted sum.
+        Terms of which the discrepancy of each corrected equation is a weighted sum, at most: the
+        constant alone and monomials of low degree alone are tried too, and the terms are those
+        that predict held-out blocks best.
     states : sequence of str
         The states whose equations are corrected; by default all whose equation is no definition,
         such as position' = velocity.
     folds : int, default 10
         Parts of the calibration record, each made of blocks of all trajectories, that are held out
-        in turn to calibrate bands.
+        in turn to choose the terms and to calibrate bands.
 
     """
 
@@ -82,7 +84,9 @@ class FittedDynamics:
         derivative of its state; the largest first.
     figures : dict of str to float
         `rms_before` and `rms_after` of free simulation over the calibration record, in output units
-        (relative to each output's standard deviation where units differ), `held_out`, `widening`.
+        (relative to each output's standard deviation where units differ), `held_out`, that of
+        blocks left out, `widening`, of the bands, `library`, the number of the chosen one of
+        `Library.nested`, and `strength`, the assumed variance of errors over that of the twin.
     seconds : float
         Duration.
     reason : str
@@ -160,16 +164,19 @@ def fit_dynamics(
     report(0.05)
     fitted = _with_starts(base, at_rest, point)
     states = correctable(fitted, settings.states)
-    equations = CorrectedEquations.distinct(
-        fitted,
-        settings.library,
-        states,
-        (alone.simulated(point)[1], alone.commands),
-        at_rest.matrix,
-    )
-    estimation, found = _chosen(equations, alone, point, lambda share: report(0.05 + 0.8 * share))
-    held_out = estimation.held_out(found, folds(estimation.seen, settings.folds))
-    report(0.9)
+    visited = (alone.simulated(point)[1], alone.commands)
+    libraries, tried = settings.library.nested(), []
+    for number, library in enumerate(libraries):
+        equations = CorrectedEquations.distinct(fitted, library, states, visited, at_rest.matrix)
+        estimation, found = _followed(equations, alone, point)
+        held_out = estimation.held_out(found, folds(estimation.seen, settings.folds))
+        error = estimation.rms(held_out.errors)
+        tried.append(
+            (error if np.isfinite(error) else np.inf, equations, estimation, found, held_out)
+        )
+        report(0.05 + 0.8 * (number + 1) / len(libraries))
+    chosen = int(np.argmin([each[0] for each in tried]))
+    _, equations, estimation, found, held_out = tried[chosen]
     made = _assembled(equations, estimation, found, held_out)
     report(1.0)
     notes = _at_bounds(estimation.unknowns, found)
@@ -188,6 +195,7 @@ def fit_dynamics(
             "rms_after": estimation.rms(estimation.residual(found)),
             "held_out": estimation.rms(held_out.errors),
             "widening": made.widening,
+            "library": float(chosen),
             "strength": float(np.mean(estimation.variance / alone.power(alone.residual(point)))),
         },
         seconds=time.perf_counter() - began,
@@ -226,11 +234,8 @@ def _with_starts(base: StateTwin, unknowns: Unknowns, point: Point) -> StateTwin
     return replace(base, parameters=tuple(parameters))
 
 
-def _chosen(
-    equations: CorrectedEquations,
-    alone: Estimation,
-    point: Point,
-    report: Callable[[float], None],
+def _followed(
+    equations: CorrectedEquations, alone: Estimation, point: Point
 ) -> tuple[Estimation, Point]:
     """The fit whose assumed errors are those that are observed.
 
@@ -242,10 +247,9 @@ def _chosen(
     now = Point(np.pad(point.shared, (0, len(equations.names))), point.starts)
     power = alone.power(alone.residual(point))
     strength = STRONGEST
-    for number in range(MAX_STRENGTHS):
+    for _ in range(MAX_STRENGTHS):
         own = replace(estimation, variance=strength * power)
         now = own.minimised(now)
-        report(1 - 0.8 ** (number + 1))
         residual = own.residual(now)
         observed = correlation_time(residual) * float(np.mean(own.power(residual) / power))
         if observed >= CONSISTENT * strength:

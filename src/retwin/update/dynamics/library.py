@@ -18,6 +18,8 @@ __all__ = ["Library", "Term"]
 
 STEEPNESS = 0.05
 """Width of the smooth sign function of Coulomb friction, in half ranges of its variable."""
+SIMPLE = 2
+"""Degree up to which libraries of monomials alone are tried before the whole one."""
 MAX_MONOMIALS = 200
 """Number of monomials of an equation above which their degree is lowered."""
 
@@ -73,6 +75,11 @@ class Library:
             got=", ".join(f"{knot:g}" for knot in self.knots),
             remedy="a hinge outside that range is not determined by the data",
         )
+
+    def nested(self) -> list[Library]:
+        """Libraries of which each contains the one before; the last is this one."""
+        smooth = [Library(degree, (), False) for degree in range(min(self.degree, SIMPLE) + 1)]
+        return [*(each for each in smooth if each != self), self]
 
     def terms(self, variables: Sequence[str], states: int) -> list[Term]:
         """The terms of an equation with such variables, of which the first `states` are states."""
