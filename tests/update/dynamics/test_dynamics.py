@@ -163,6 +163,18 @@ def test_one_step_predictions_hold_what_they_promise(noisy: FittedDynamics) -> N
     assert rms(found.mean - unseen.observed) < 0.7 * rms(unseen.nominal - unseen.observed)
 
 
+def test_the_start_of_a_record_is_inferred_from_its_first_samples(fitted: FittedDynamics) -> None:
+    start = {"start_position": 0.3}
+    unseen = record(seed=30, count=1, size=6.0, **TRUTH, **start)
+    begun = fitted.twin.started(unseen.between(0, 2.0))
+    assert begun.values[-2] == pytest.approx(0.3, abs=4 * np.linalg.norm(begun.factor[-2]))
+    assert 1e-5 < np.linalg.norm(begun.factor[-2]) < 0.01
+    error = begun.simulate(unseen.commands, seed=0).nominal - unseen.nominal
+    assert rms(error) < 3 * NOISE
+    with pytest.raises(InputError, match="one trajectory"):
+        fitted.twin.started(record(**TRUTH))
+
+
 def test_missing_samples_are_not_used(noisy: FittedDynamics) -> None:
     unseen = with_process_noise(50, count=2, size=6.0)
     mask = unseen.mask.copy()

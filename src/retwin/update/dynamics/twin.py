@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,9 @@ from retwin.twins.state_twin import SAMPLES_PER_CHUNK, StateTwin
 from retwin.twins.twin import Chunk, check_channels, checked_commands, simulate_in_chunks
 from retwin.twins.wrapper import chunk_generator
 from retwin.update.dynamics.corrected import Domain
+from retwin.update.dynamics.estimation import Estimation, Point, root
 from retwin.update.dynamics.prediction import Prediction
+from retwin.update.dynamics.unknowns import Unknowns
 from retwin.update.training_range import OutsideTrainingWarning
 
 __all__ = ["DynamicsTwin"]
@@ -153,6 +155,69 @@ class DynamicsTwin:
         )
         self._warn(beyond)
         return made
+
+    def started(self, record: Trajectories) -> DynamicsTwin:
+        """The twin with the unknown starts of one record, inferred from its first samples.
+
+        The parameters are held. It simulates this record only.
+
+        Parameters
+        ----------
+        record : Trajectories
+            One trajectory; its measured samples are a warm-up (`Trajectories.between`).
+
+        Returns
+        -------
+        DynamicsTwin
+            With the most probable starts, and their uncertainty.
+
+        Raises
+        ------
+        InputError
+            Not one trajectory, other channels or another rate, nothing measured, or states whose
+            starts are all known.
+
+        """
+        check_channels(self, record, "record")
+        unknowns = self._starts()
+        require(
+            len(record) == 1 and record.mask.any() and len(unknowns.free) > 0,
+            "record",
+            expected="one trajectory with measured samples, for a twin with unknown starts",
+            got=f"{len(record)} with {int(record.mask.sum())} samples, {len(unknowns.free)} starts",
+            remedy="give the first samples of one record; bounds make a start unknown",
+        )
+        commands = record.commands.astype(np.float64)
+        variance = self.noise_variance(commands).mean(axis=(0, 1))
+        estimation = Estimation(self.equations, record, unknowns, record.mask, variance)
+        found = estimation.minimised(Point(np.zeros(0), unknowns.start[None, unknowns.free]))
+        states = len(self.process)
+        values, factor = self.values.copy(), self.factor.copy()
+        values[-states:][unknowns.free] = found.starts[0]
+        factor[-states:] = 0.0
+        own = np.zeros((len(values), len(unknowns.free)))
+        own[len(values) - states + unknowns.free] = root(estimation.covariance(found))
+        factor = np.concatenate([factor, own], axis=1)
+        return replace(self, values=values, factor=factor, start_deviation=np.zeros(states))
+
+    def _starts(self) -> Unknowns:
+        """The starts as the only unknowns."""
+        states = self.equations.states
+        free = np.array([i for i, each in enumerate(states) if each.low is not None], dtype=int)
+        ends = np.array([[states[i].low, states[i].high] for i in free], dtype=float).reshape(-1, 2)
+        parameters = self.values[: -len(states)]
+        return Unknowns(
+            names=(),
+            offset=parameters,
+            matrix=np.zeros((len(parameters), 0)),
+            mean=np.zeros(0),
+            deviation=np.zeros(0),
+            low=ends[:, 0],
+            high=ends[:, 1],
+            start=self.values[-len(states) :],
+            free=free,
+            start_deviation=(ends[:, 1] - ends[:, 0]) / 2,
+        )
 
     def predictive(self, record: Trajectories) -> Prediction:
         """The distribution of each sample of a record given all earlier ones.
