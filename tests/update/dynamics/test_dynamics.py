@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -356,3 +358,14 @@ def test_progress_ends_at_one() -> None:
         fit_dynamics(LINEAR, record(count=2, **TRUTH), progress=shares.append)
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
+
+
+def test_the_page_of_corrected_dynamics() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "dynamics.md").read_text("utf-8")
+    names: dict = {"__name__": "shown"}
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(code, "docs/dynamics.md", "exec"), names)
+    found = names["fitted"]
+    assert found.figures["rms_after"] < 0.02 * found.figures["rms_before"]
+    assert next(iter(found.terms)) == "velocity: position^3"
+    assert 0.75 < names["inside"].mean() <= 1
