@@ -14,7 +14,7 @@ from retwin.checks import require
 from retwin.cli.completion import one_of
 from retwin.cli.options import CaseArgument, Json, MaxBytes, Model, OtherCase, PerClass, Seed
 from retwin.cli.plans import Workers, carry_out
-from retwin.cli.reading import read, saved
+from retwin.cli.reading import read, updated_twin
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -33,6 +33,8 @@ data_option, model_option = (
     for panel in ("Data", "Model; by default the case's")
 )
 
+LARGEST = 8
+"""Number of terms of the state equations that are printed."""
 ModelFolder = Annotated[
     Path, typer.Option(metavar="FOLDER", help="Where to save the corrected twin.")
 ]
@@ -82,6 +84,15 @@ Refine = Annotated[
     bool, model_option("--refine", metavar="", help="Fine-tune on outputs afterwards.")
 ]
 
+StateEquations = Annotated[
+    bool,
+    model_option(
+        "--dynamics",
+        metavar="",
+        help="Correct the state equations; no surrogate. For a StateTwin.",
+    ),
+]
+
 
 def fit(
     case: CaseArgument,
@@ -95,17 +106,25 @@ def fit(
     correction: Correction = None,
     density: Density = None,
     refine: Refine = False,
+    dynamics: StateEquations = False,
     seed: Seed = 0,
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
-    """Fit surrogate and residual model; save the corrected twin."""
+    """Fit surrogate and residual model, or the state equations; save the corrected twin."""
     import retwin as rt
     from retwin.update.residual.fitting import calibrating
 
-    check_place(out, folder=True, holds=("model.json", "surrogate", "residual"))
+    check_place(
+        out, folder=True, holds=("model.json", "weights.safetensors", "surrogate", "residual")
+    )
     system = _system(case, network, correction, density, refine)
     measured = _measured(system, real, data, max_bytes)
+    # The path is absolute, since a model is also used from other folders.
+    name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
+    if dynamics:
+        _fit_dynamics(system, measured, out, name, as_json=as_json)
+        return
     faults = system.faults if calibrate_on == "all" else calibrate_on
     calibrating(measured, faults)  # before the surrogate is trained, which takes minutes
     size = system.per_class if simulations is None else simulations
@@ -131,10 +150,49 @@ def fit(
             twin=system.twin,
             progress=lambda s: show("residual model, 2 of 2", s),
         )
-    # The path is absolute, since a model is also used from other folders.
-    name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
     rt.CorrectedTwin(ibg, rg, case=name).save(out)
     _print_fit(ibg, rg, out, as_json=as_json)
+
+
+def _fit_dynamics(
+    system: Case, measured: Trajectories, out: Path, name: str, *, as_json: bool
+) -> None:
+    """Learn what the state equations lack, save the twin, and print what was learned."""
+    from retwin.update import fit_dynamics
+
+    with bar("fit") as show:
+        found = fit_dynamics(
+            system.twin,
+            measured,
+            system.dynamics,
+            progress=lambda s: show("state equations", s),
+        )
+    replace(found.twin, case=name).save(out)
+    parameters = [
+        (each, f"{value:.4g} ± {found.errors[each]:.2g}")
+        for each, value in found.parameters.items()
+    ]
+    terms = [(each, f"{size:.3f}") for each, size in list(found.terms.items())[:LARGEST]]
+    figures = found.figures
+    answer(
+        {
+            "saved": str(out),
+            "parameters": found.parameters,
+            "errors": found.errors,
+            "terms": found.terms,
+            "figures": figures,
+            "reason": found.reason,
+        },
+        f"Free simulation of the calibration record: RMS error {figures['rms_before']:.3g} with "
+        f"the twin alone, {figures['rms_after']:.3g} with its equations corrected, "
+        f"{figures['held_out']:.3g} in blocks left out.",
+        table(("parameter", "value"), parameters, numbers=("value",)),
+        "",
+        "The largest terms, over the usual time derivative of their state:",
+        table(("term", "size"), terms, numbers=("size",)),
+        as_json=as_json,
+    )
+    note(f"Saved {out}")
 
 
 def _system(
@@ -290,7 +348,7 @@ def generate(
     import retwin as rt
 
     kind = check_target(out)
-    updated = rt.CorrectedTwin.load(saved(model))
+    updated = updated_twin(model)
     require(
         case or updated.case,
         "case",

@@ -9,11 +9,13 @@ from retwin.checks import require
 from retwin.cli.terminal import bar
 from retwin.data.io import DataCase, load
 from retwin.data.trajectories import Trajectories
+from retwin.serialisation.models import kind_of
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
+    from retwin.update import CorrectedTwin, DynamicsTwin
 
-__all__ = ["case_named", "data_case", "read", "saved"]
+__all__ = ["case_named", "data_case", "read", "saved", "updated_twin"]
 
 
 def case_named(name: str | None) -> Case | None:
@@ -40,6 +42,17 @@ def saved(folder: Path) -> Path:
         remedy="check the name",
     )
     return folder
+
+
+def updated_twin(folder: Path) -> CorrectedTwin | DynamicsTwin:
+    """The updated twin in the folder of a saved model.
+
+    Raises InputError for any other kind.
+    """
+    from retwin.update import CorrectedTwin, DynamicsTwin
+
+    kind = DynamicsTwin if kind_of(saved(folder)) == "dynamics" else CorrectedTwin
+    return kind.load(folder)
 
 
 def read(

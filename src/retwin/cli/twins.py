@@ -15,7 +15,7 @@ from retwin.cli.animate import animate
 from retwin.cli.completion import complete_faults, complete_twins, one_of
 from retwin.cli.options import Json, MaxBytes, Seed
 from retwin.cli.plans import Scheduler, Workers, carry_out
-from retwin.cli.reading import read
+from retwin.cli.reading import read, updated_twin
 from retwin.cli.terminal import answer, example, table
 from retwin.data.io import check_target
 from retwin.errors import InputError
@@ -264,9 +264,7 @@ def _model(folder: Path) -> Twin:
         from retwin.update.surrogate import Surrogate
 
         return Surrogate.load(folder)
-    from retwin.update.corrected import CorrectedTwin
-
-    return CorrectedTwin.load(folder)  # raises InputError for any other kind
+    return updated_twin(folder)
 
 
 def _names(given: str) -> tuple[str, ...]:

@@ -5,22 +5,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from math import inf, isfinite
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from retwin.checks import require
 from retwin.data.trajectories import Channels
-from retwin.twins.compiled.model import Model
 from retwin.twins.compiled.program import OPERATIONS, Node, Program
 from retwin.twins.limits import Limits
 from retwin.twins.parametric import Parameter
 from retwin.twins.state import State
-from retwin.twins.state_twin import StateTwin
+
+if TYPE_CHECKING:  # describing a twin needs no torch, which takes seconds to import
+    from retwin.twins.compiled.model import Model
 
 __all__ = ["equations_from", "equations_of"]
 
+Kind = TypeVar("Kind")
 
-def equations_of(twin: StateTwin) -> dict[str, Any]:
-    """The twin as JSON values."""
+
+def equations_of(twin: Any) -> dict[str, Any]:
+    """A `StateTwin` as JSON values."""
     model = twin.model
     nodes = model.program.needed([*model.slope, *model.outputs])
     place = {node.index: i for i, node in enumerate(nodes)}
@@ -32,7 +35,7 @@ def equations_of(twin: StateTwin) -> dict[str, Any]:
         "results": [place[each.index] for each in model.outputs],
         "discrete": model.discrete,
         "states": [asdict(each) for each in twin.states],
-        "parameters": [{**asdict(each), "places": {}} for each in twin.parameters],
+        "parameters": [asdict(each) for each in twin.parameters],
         "inputs": [twin.inputs.names, twin.inputs.units],
         "outputs": [twin.outputs.names, twin.outputs.units],
         "rate": twin.rate,
@@ -42,8 +45,8 @@ def equations_of(twin: StateTwin) -> dict[str, Any]:
     }
 
 
-def equations_from(about: dict[str, Any]) -> StateTwin:
-    """The twin that `equations_of` described.
+def equations_from(kind: type[Kind], about: dict[str, Any]) -> Kind:
+    """The twin of that class, `StateTwin`, that `equations_of` described.
 
     Raises
     ------
@@ -51,6 +54,8 @@ def equations_from(about: dict[str, Any]) -> StateTwin:
         The description is damaged.
 
     """
+    from retwin.twins.compiled.model import Model
+
     states = tuple(State(**each) for each in about["states"])
     parameters = tuple(Parameter(**each) for each in about["parameters"])
     inputs, outputs = (
@@ -80,7 +85,7 @@ def equations_from(about: dict[str, Any]) -> StateTwin:
             nodes.append(known[value] if op == "variable" else program.constant(value))
     slope, results = ([nodes[i] for i in about[name]] for name in ("slope", "results"))
     model = Model(program, variables, slope, results, bool(about["discrete"]))
-    return StateTwin(
+    return kind(  # type: ignore[call-arg]  # which this module does not import
         states,
         _Evaluated(model, "outputs"),
         inputs,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, fields
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,7 @@ from retwin.twins.interpolation import INTERPOLATIONS
 from retwin.twins.limits import Limits
 from retwin.twins.parameter_values import values_per_simulation
 from retwin.twins.parametric import Parameter, ParametricTwin
+from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.twins.state import State
 from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
 
@@ -143,9 +144,9 @@ class StateTwin:
             remedy="leave both out: a step covers one sample period",
         )
 
-    def __getstate__(self) -> dict[str, Any]:
-        """The fields without the compiled model, which stays in its process."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+    def __reduce__(self) -> tuple[Any, ...]:
+        """The equations as operations on numbers, since functions of any kind have these."""
+        return equations_from, (StateTwin, equations_of(self))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 import warnings
 from dataclasses import replace
@@ -279,11 +280,18 @@ def test_a_forged_model_is_refused(fitted: FittedDynamics, tmp_path, operation: 
 
 
 def test_equations_come_back_from_json() -> None:
-    again = equations_from(json.loads(json.dumps(equations_of(OSCILLATOR))))
+    again = equations_from(StateTwin, json.loads(json.dumps(equations_of(OSCILLATOR))))
     commands = forces(2, 5)
     made = OSCILLATOR.simulate(commands, seed=0).observed
     np.testing.assert_array_equal(again.simulate(commands, seed=0).observed, made)
-    assert again.fingerprint == equations_from(equations_of(again)).fingerprint
+    assert again.fingerprint == equations_from(StateTwin, equations_of(again)).fingerprint
+
+
+def test_equations_of_lambdas_reach_worker_processes() -> None:
+    twin = replace(OSCILLATOR, output=lambda x, u: x.position)
+    commands = forces(2, 5)
+    again = pickle.loads(pickle.dumps(twin)).simulate(commands, seed=0).observed
+    np.testing.assert_array_equal(again, twin.simulate(commands, seed=0).observed)
 
 
 def test_it_is_a_twin(fitted: FittedDynamics) -> None:

@@ -83,15 +83,6 @@ class DynamicsTwin:
     emulated: bool = False
     case: str = ""
 
-    def __getstate__(self) -> dict[str, Any]:
-        """The fields, with equations that need no code."""
-        return {**vars(self), "equations": equations_of(self.equations)}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        state["equations"] = equations_from(state["equations"])
-        for name, value in state.items():
-            object.__setattr__(self, name, value)
-
     @property
     def inputs(self) -> Channels:
         """Command channels."""
@@ -364,7 +355,7 @@ class DynamicsTwin:
         """
         about, weights = read_model(folder, KIND)
         with refusing(folder, expected="corrected dynamics"):
-            equations = equations_from(about["equations"])
+            equations = equations_from(StateTwin, about["equations"])
             arrays = {name: weights[name].numpy() for name in ARRAYS}
             domain = Domain(*(weights[f"domain_{name}"].numpy() for name in DOMAIN))
             count = (len(equations.parameters), len(equations.states), len(equations.outputs))

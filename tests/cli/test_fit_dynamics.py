@@ -1,0 +1,115 @@
+"""Corrected dynamics by the command line alone, of a case with a twin in its own module."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import retwin as rt
+from retwin.update import DynamicsTwin
+
+MODULE = """
+import retwin as rt
+from retwin.twins import Parameter, State, StateTwin
+
+
+def draining(x, u, p):
+    return (p.gain * u.valve - p.leak * x.level,)
+
+
+tank = StateTwin(
+    (State("level", "m"),),
+    lambda x, u: x.level,
+    rt.Channels(("valve",), ("1",)),
+    rt.Channels(("level",), ("m",)),
+    1.0,
+    derivative=draining,
+    parameters=(
+        Parameter("gain", "m", 0.05, 0.2, 0.1),
+        Parameter("leak", "1/s", 0.01, 0.1, 0.05),
+    ),
+)
+"""
+
+CASE = """
+name = "tank"
+twin = "state_module:tank"
+commands = { kind = "HoldSampler", duration = 100, hold_durations = [5, 30], low = [0], high = [1] }
+[records]
+calibration = { valve = "u1", level = "y1" }
+test = { valve = "u2", level = "y2" }
+[dynamics]
+library = { degree = 3, knots = [], friction = false }
+folds = 8
+"""
+
+
+def measured(rng: np.random.Generator, samples: int = 400) -> tuple[np.ndarray, np.ndarray]:
+    """Commands and levels of a tank whose outflow grows with the square of the level."""
+    valve = np.repeat(rng.random(samples // 10), 10)
+    level, levels = 0.0, []
+    for u in valve:
+        levels.append(level)
+        for _ in range(10):
+            level += 0.1 * (0.1 * u - 0.04 * level - 0.05 * level**2)
+    return valve, np.array(levels) + 1e-3 * rng.normal(size=samples)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    tmp_path = tmp_path_factory.mktemp("tank")
+    rng = np.random.default_rng(0)
+    columns = np.column_stack([*measured(rng), *measured(rng)])
+    np.savetxt(tmp_path / "d.csv", columns, delimiter=",", header="u1,y1,u2,y2", comments="")
+    (tmp_path / "state_module.py").write_text(MODULE)
+    (tmp_path / "case.toml").write_text(CASE)
+    return tmp_path
+
+
+def test_state_equations_are_fitted_and_generate(folder: Path, tmp_path: Path, call) -> None:
+    case, data, out = folder / "case.toml", folder / "d.csv", tmp_path / "model"
+    code, printed, _ = call("fit", case, "--data", data, "--dynamics", "--out", out, "--json")
+    assert code == 0
+    found = json.loads(printed)
+    assert found["figures"]["rms_after"] < 0.2 * found["figures"]["rms_before"]
+    assert next(iter(found["terms"])).startswith("level: ")
+    assert DynamicsTwin.load(out).case == str(case.resolve())
+    code, _, said = call("generate", out, "--out", tmp_path / "g.npz", "--per-class", 4)
+    assert (code, len(rt.load(tmp_path / "g.npz"))) == (0, 4), said
+    code, printed, _ = call("twin", "info", out)
+    assert (code, "level" in printed) == (0, True)
+
+
+def test_a_study_compares_them(folder: Path, tmp_path: Path, call) -> None:
+    case, data, out = folder / "case.toml", folder / "d.csv", tmp_path / "study"
+    given = ("--sources", "twin,pi_ls,dynamics", "--runs", 1, "--processes", 1)
+    code, _, said = call("study", case, "--data", data, *given, "--out", out)
+    assert code == 0, said
+    sources = json.loads((out / "results.json").read_text())["sources"]
+    error = {name: sources[name]["rmse"][0] for name in ("twin", "pi_ls", "dynamics")}
+    assert error["dynamics"] < 0.3 * min(error["twin"], error["pi_ls"])
+    assert 0.75 < sources["dynamics"]["coverage90"][0] <= 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("folds = 8", "folds = 1", "folds"),
+        ("degree = 3", "degree = -1", "degree"),
+        ("folds = 8", "fold = 8", "fold"),
+        ("knots = []", "knots = [2.0]", "knots"),
+        ("folds = 8", 'states = ["nope"]', "states"),
+    ],
+)
+def test_wrong_settings_are_refused_by_name(
+    folder: Path, tmp_path: Path, call, old: str, new: str, named: str
+) -> None:
+    case, out = folder / "wrong.toml", tmp_path / "model"
+    case.write_text(CASE.replace(old, new))
+    given = ("fit", case, "--data", folder / "d.csv", "--dynamics", "--out", out)
+    code, _, said = call(*given)
+    assert (code, named in said) == (2, True), said
+    assert not out.exists()
