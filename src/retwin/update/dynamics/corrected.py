@@ -244,7 +244,7 @@ class CorrectedEquations:
             for _, places, terms in self.equations
             for term in terms
         ]
-        made: NDArray = torch.stack(columns, 1).numpy()
+        made = np.zeros((len(states), 0)) if not columns else torch.stack(columns, 1).numpy()
         return made
 
 
@@ -253,6 +253,8 @@ def _by_parameters(twin: StateTwin, equation: int, states: NDArray, commands: ND
     import torch
 
     x, u = (list(torch.tensor(each).unbind(1)) for each in (states, commands))
+    if not twin.parameters:
+        return np.zeros((len(states), 0))
     values = twin.values(None, 1)[0, : len(twin.parameters)].tolist()
     p = [torch.full_like(x[0], value, requires_grad=True) for value in values]
     slope = twin.model.evaluate("slope", x, u, p)[equation]

@@ -193,7 +193,7 @@ class Estimation:
         scale = 1 / np.sqrt(self.variance)
         for i, (error, by_own) in enumerate(zip(residual, slope, strict=True)):
             own = np.r_[0:k, k + i * m : k + (i + 1) * m]
-            jacobian = (by_own * scale[:, None]).reshape(-1, k + m)
+            jacobian = (by_own * scale[:, None]).reshape(error.size, k + m)
             curvature[np.ix_(own, own)] += jacobian.T @ jacobian
             gradient[own] += jacobian.T @ (error * scale).ravel()
         # A coordinate at its bound is held where the objective would take it further.
@@ -206,6 +206,8 @@ class Estimation:
     def minimised(self, point: Point) -> Point:
         """The most probable point, from a start at which the simulation is finite."""
         start = point.flat
+        if not start.size:
+            return point
         curvature = self.expanded(start)[2]
         # In these units the curvature at the start has ones on its diagonal.
         unit = 1 / np.sqrt(np.maximum(np.diag(curvature), 1e-300))
@@ -263,7 +265,7 @@ class Estimation:
         scaled, moves = unit[:, None] * curvature * unit, []
         for fold in folds:
             jacobian = slope[fold][..., :k] * unit
-            weighted = (jacobian * scale[:, None]).reshape(-1, k)
+            weighted = (jacobian * scale[:, None]).reshape(residual[fold].size, k)
             covariance = np.linalg.pinv(scaled - weighted.T @ weighted, hermitian=True)
             step = covariance @ (weighted.T @ (residual[fold] * scale).ravel())
             errors[fold] += jacobian @ step

@@ -302,7 +302,7 @@ def _sizes(equations: CorrectedEquations, estimation: Estimation, found: Point) 
     """The root mean square of each term over the calibration record, the largest first."""
     states = estimation.simulated(found)[1].reshape(-1, len(estimation.unknowns.start))
     values = equations.values(states, estimation.commands.reshape(len(states), -1))
-    coefficients = found.shared[-len(equations.names) :]
+    coefficients = found.shared[len(found.shared) - len(equations.names) :]
     sizes = np.abs(coefficients) * np.sqrt(np.mean(values**2, axis=0))
     order = np.argsort(-sizes)
     return {equations.names[i]: float(sizes[i]) for i in order}

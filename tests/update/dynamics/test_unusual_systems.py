@@ -1,0 +1,53 @@
+"""Corrected dynamics of unusual twins and records: an answer that is finite, or a refusal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import retwin as rt
+from retwin.twins import Parameter, State, StateTwin
+from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
+
+INPUT = rt.Channels(("u",), ("V",))
+OUTPUT = rt.Channels(("y",), ("m",))
+QUICK = Dynamics(library=Library(1, (), False))
+RNG = np.random.default_rng(0)
+COMMANDS = np.cumsum(RNG.normal(size=(2, 120, 1)), axis=1) / 5
+
+
+def measured(twin: StateTwin, deviation: float = 1e-3) -> rt.Trajectories:
+    made = twin.simulate(COMMANDS, seed=0)
+    noise = deviation * np.random.default_rng(1).normal(size=made.observed.shape)
+    return made.replace(observed=made.observed + noise)
+
+
+def lag(derivative, *parameters: Parameter, start: State = State("x", "m")) -> StateTwin:
+    return StateTwin(
+        (start,),
+        lambda x, u: x.x,
+        INPUT,
+        OUTPUT,
+        20.0,
+        derivative=derivative,
+        parameters=parameters,
+    )
+
+
+def is_finite(twin: DynamicsTwin) -> bool:
+    simulated = twin.simulate(COMMANDS, seed=0)
+    return bool(np.isfinite(twin.widening) and np.isfinite(simulated.observed).all())
+
+
+def test_a_twin_without_free_parameters_is_corrected() -> None:
+    known = lag(lambda x, u: (u.u - 2 * x.x,))
+    found = fit_dynamics(known, measured(lag(lambda x, u: (u.u - 3 * x.x,))))
+    assert found.parameters == {}
+    assert found.figures["rms_after"] < 1.1e-3 < 10e-3 < found.figures["rms_before"]
+
+
+def test_a_twin_whose_parameters_explain_every_term_is_fitted() -> None:
+    twin = lag(lambda x, u, p: (u.u - 2 * x.x + p.offset,), Parameter("offset", "m/s", -1, 1, 0.1))
+    found = fit_dynamics(twin, measured(twin), Dynamics(library=Library(0, (), False)))
+    assert found.terms == {}
+    assert is_finite(found.twin)
