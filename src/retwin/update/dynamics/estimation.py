@@ -34,6 +34,8 @@ TOLERANCE = 1e-2
 """Norm of the gradient, in nats per prior or posterior deviation, at which the search ends."""
 WIDEST = 1e6
 """Largest trust region, in posterior deviations at the start of the search."""
+RESOLUTION = 1e-12
+"""Smallest variance that counts, over that of an output: about that of single precision."""
 WINDOW = 5
 """Lags over which the autocorrelation is summed, in correlation times."""
 
@@ -157,15 +159,18 @@ class Estimation:
 
     @cached_property
     def spread(self) -> NDArray:
-        """Variances (d_y,) of the measured outputs, above 0."""
+        """Variances (d_y,) of the measured outputs; their mean squares where they do not vary, or 1."""
         values = np.where(self.seen, self.measured, np.nan)
-        made: NDArray = np.maximum(np.nanvar(values, axis=(0, 1)), 1e-300)
+        square = np.nanmean(values**2, axis=(0, 1))
+        variance = np.nanvar(values, axis=(0, 1))
+        constant = np.where(square > 0, square, 1.0)
+        made: NDArray = np.where(variance > RESOLUTION * square, variance, constant)
         return made
 
     def power(self, residual: NDArray) -> NDArray:
         """Mean squares (d_y,) of a residual (n, T, d_y), above 0."""
         count = np.maximum(self.seen.sum(axis=(0, 1)), 1)
-        made: NDArray = np.maximum(np.sum(residual**2, axis=(0, 1)) / count, 1e-12 * self.spread)
+        made: NDArray = np.maximum(np.sum(residual**2, axis=(0, 1)) / count, RESOLUTION * self.spread)
         return made
 
     def rms(self, residual: NDArray) -> float:

@@ -57,7 +57,8 @@ def fit_noise(twin: DynamicsTwin, observed: Trajectories, corrected: Sequence[in
     # A common scale changes no prediction, but all intervals.
     error = np.abs(made.filtered(observed).standardised())
     scale = (np.nanquantile(error, LEVEL) / ndtri((1 + LEVEL) / 2)) ** 2
-    return replace(made, process=scale * made.process, noise=scale * made.noise)
+    noise = np.maximum(scale * made.noise, SMALLEST**2 * twin.noise)
+    return replace(made, process=scale * made.process, noise=noise)
 
 
 def folds(seen: NDArray, count: int) -> list[NDArray]:
@@ -76,4 +77,4 @@ def widening(twin: DynamicsTwin, estimation: Estimation, held_out: HeldOut) -> f
     """Factor of deviations, with which bands hold as many held-out samples as they should."""
     deviation = np.sqrt(held_out.variances + twin.noise_variance(estimation.commands))
     ratio = (np.abs(held_out.errors) / deviation)[estimation.seen]
-    return float(np.quantile(ratio, LEVEL) / ndtri((1 + LEVEL) / 2))
+    return max(float(np.quantile(ratio, LEVEL) / ndtri((1 + LEVEL) / 2)), SMALLEST)
