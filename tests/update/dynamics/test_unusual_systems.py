@@ -51,3 +51,47 @@ def test_a_twin_whose_parameters_explain_every_term_is_fitted() -> None:
     found = fit_dynamics(twin, measured(twin), Dynamics(library=Library(0, (), False)))
     assert found.terms == {}
     assert is_finite(found.twin)
+
+
+def test_an_exact_twin_and_exact_outputs_have_finite_bands() -> None:
+    twin = lag(lambda x, u, p: (u.u - p.rate * x.x,), Parameter("rate", "1/s", 0.1, 9.0, 2.0))
+    record = measured(twin, deviation=0.0)
+    found = fit_dynamics(twin, record, QUICK)
+    assert is_finite(found.twin)
+    assert np.isfinite(found.twin.predictive(record).covariance).all()
+
+
+@pytest.mark.parametrize("level", [0.0, 0.1])
+def test_an_output_that_never_changes_is_fitted(level: float) -> None:
+    twin = lag(
+        lambda x, u, p: (p.rate * (level - x.x) + 0 * u.u,),
+        Parameter("rate", "1/s", 0.1, 9.0, 2.0),
+        start=State("x", "m", level),
+    )
+    assert is_finite(fit_dynamics(twin, measured(twin, deviation=0.0), QUICK).twin)
+
+
+def test_an_output_that_was_never_measured_is_refused() -> None:
+    twin = StateTwin(
+        (State("x", "m"),),
+        lambda x, u: (x.x, 2 * x.x),
+        INPUT,
+        rt.Channels(("y", "z"), ("m", "V")),
+        20.0,
+        derivative=lambda x, u: (u.u - 2 * x.x,),
+    )
+    record = measured(twin)
+    mask = np.ones(record.observed.shape, dtype=bool)
+    mask[..., 1] = False
+    with pytest.raises(rt.InputError, match="every output, got none of z"):
+        fit_dynamics(twin, record.replace(mask=mask), QUICK)
+
+
+def test_a_start_at_its_bound_is_a_warning() -> None:
+    def slope(x, u):
+        return (u.u - 2 * x.x,)
+
+    narrow = lag(slope, start=State("x", "m", 0.0, -0.1, 0.1))
+    with pytest.warns(UserWarning, match="at a bound.*start_x"):
+        found = fit_dynamics(narrow, measured(lag(slope, start=State("x", "m", 0.8))), QUICK)
+    assert "start_x" in found.reason

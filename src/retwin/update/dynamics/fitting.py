@@ -90,7 +90,7 @@ class FittedDynamics:
     seconds : float
         Duration.
     reason : str
-        What the result does not cover: parameters at bounds, and the warnings.
+        What the result does not cover: parameters and starts that are at bounds.
 
     """
 
@@ -140,18 +140,30 @@ def fit_dynamics(
     ------
     InputError
         A twin that is no `StateTwin`, other channels or another rate, no healthy trajectory, too
-        few samples, an unknown state, or a twin whose simulation is not finite.
+        few samples, an output that was never measured, an unknown state, or a twin whose simulation is not finite.
 
     Warns
     -----
     UserWarning
-        A parameter is at its bound.
+        A parameter, or the start of a state, is at its bound.
 
     """
     began = time.perf_counter()
     base, free, values = state_twin_of(twin)
     checked_stride(base, observed, None, "observed")
     report = progress or (lambda share: None)
+    missing = [
+        name
+        for name, seen in zip(base.outputs.names, observed.mask.any(axis=(0, 1)), strict=True)
+        if not seen
+    ]
+    require(
+        not missing,
+        "observed",
+        expected="measured samples of every output",
+        got=f"none of {', '.join(missing)}",
+        remedy="leave that output out of the twin and of the record, since its noise is unknown",
+    )
     at_rest = unknowns_of(base, free, values)
     require(
         observed.mask.sum() > at_rest.count + len(at_rest.free) + settings.folds,
@@ -179,7 +191,7 @@ def fit_dynamics(
     _, equations, estimation, found, held_out = tried[chosen]
     made = _assembled(equations, estimation, found, held_out)
     report(1.0)
-    notes = _at_bounds(estimation.unknowns, found)
+    notes = _at_bounds(estimation, found)
     if notes:
         warnings.warn(notes, stacklevel=2)
     k = at_rest.count
@@ -291,10 +303,14 @@ def _assembled(
     return replace(noisy, widening=widening(noisy, estimation, held_out))
 
 
-def _at_bounds(unknowns: Unknowns, found: Point) -> str:
-    k = unknowns.count
-    at = (found.shared <= unknowns.low[:k]) | (found.shared >= unknowns.high[:k])
-    names = [name for name, bound in zip(unknowns.names, at, strict=True) if bound]
+def _at_bounds(estimation: Estimation, found: Point) -> str:
+    unknowns, k = estimation.unknowns, estimation.unknowns.count
+    own = [f"start_{estimation.twin.states[i].name}" for i in unknowns.free]
+    values = np.vstack([np.tile(found.shared, (len(found.starts), 1)).T, found.starts.T])
+    at = (values <= unknowns.low[:, None]) | (values >= unknowns.high[:, None])
+    names = [
+        name for name, bound in zip([*unknowns.names, *own], at.any(axis=1), strict=True) if bound
+    ]
     return f"at a bound, and perhaps beyond it: {', '.join(names)}" if names else ""
 
 
