@@ -68,7 +68,9 @@ def test_an_output_that_never_changes_is_fitted(level: float) -> None:
         Parameter("rate", "1/s", 0.1, 9.0, 2.0),
         start=State("x", "m", level),
     )
-    assert is_finite(fit_dynamics(twin, measured(twin, deviation=0.0), QUICK).twin)
+    with pytest.warns(UserWarning, match="not determined by the record: rate"):
+        found = fit_dynamics(twin, measured(twin, deviation=0.0), QUICK)
+    assert is_finite(found.twin)
 
 
 def test_an_output_that_was_never_measured_is_refused() -> None:
@@ -95,3 +97,16 @@ def test_a_start_at_its_bound_is_a_warning() -> None:
     with pytest.warns(UserWarning, match="at a bound.*start_x"):
         found = fit_dynamics(narrow, measured(lag(slope, start=State("x", "m", 0.8))), QUICK)
     assert "start_x" in found.reason
+
+
+def test_parameters_that_the_record_does_not_determine_have_no_error_of_zero() -> None:
+    def slope(x, u, p):
+        return (p.gain * p.scale * u.u - p.rate * x.x + 0 * p.idle,)
+
+    names = {"rate": 2.0, "gain": 1.0, "scale": 1.0, "idle": 1.0}
+    twin = lag(slope, *(Parameter(name, "1", 0.1, 9.0, value) for name, value in names.items()))
+    with pytest.warns(UserWarning, match="not determined by the record: gain, scale, idle"):
+        found = fit_dynamics(twin, measured(twin), QUICK)
+    assert np.isinf([found.errors[name] for name in ("gain", "scale", "idle")]).all()
+    assert 0 < found.errors["rate"] < 0.1
+    assert is_finite(found.twin)

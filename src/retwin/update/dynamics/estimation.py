@@ -247,6 +247,15 @@ class Estimation:
         made: NDArray = mean @ (unit[:, None] * scaled * unit) @ mean.T
         return made
 
+    def undetermined(self, point: Point) -> NDArray:
+        """Which shared coordinates (k,) can change without a change of the objective."""
+        curvature = self.expanded(point.flat)[2]
+        unit = 1 / np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+        values, directions = np.linalg.eigh(unit[:, None] * curvature * unit)
+        free = np.abs(directions[:, values <= RESOLUTION * len(values)])
+        made: NDArray = (free > np.sqrt(RESOLUTION)).any(axis=1)[: self.unknowns.count]
+        return made
+
     def held_out(self, point: Point, folds: Sequence[NDArray]) -> HeldOut:
         """What each fold tells when it is left out of the estimation.
 

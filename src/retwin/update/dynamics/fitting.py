@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from retwin.checks import require, whole
@@ -78,7 +79,8 @@ class FittedDynamics:
         The corrected twin.
     parameters, errors : dict of str to float
         The twin's own parameters theta, and their standard errors, which allow for errors of the
-        outputs that are correlated within the parts that are held out.
+        outputs that are correlated within the parts that are held out; infinite for those that
+        the record does not determine.
     terms : dict of str to float
         The root mean square of each term over the calibration record, in that of the time
         derivative of its state; the largest first.
@@ -90,7 +92,8 @@ class FittedDynamics:
     seconds : float
         Duration.
     reason : str
-        What the result does not cover: parameters and starts that are at bounds.
+        What the result does not cover: parameters and starts that are at bounds, and parameters
+        that the record does not determine.
 
     """
 
@@ -145,7 +148,8 @@ def fit_dynamics(
     Warns
     -----
     UserWarning
-        A parameter, or the start of a state, is at its bound.
+        A parameter, or the start of a state, is at its bound, or the record does not determine a
+        parameter.
 
     """
     began = time.perf_counter()
@@ -191,12 +195,14 @@ def fit_dynamics(
     _, equations, estimation, found, held_out = tried[chosen]
     made = _assembled(equations, estimation, found, held_out)
     report(1.0)
-    notes = _at_bounds(estimation, found)
+    unknown = estimation.undetermined(found)[: at_rest.count]
+    notes = _notes(estimation, found, unknown)
     if notes:
         warnings.warn(notes, stacklevel=2)
     k = at_rest.count
     variance = np.diag(estimation.covariance(found))[: len(found.shared)]
     deviation = np.sqrt(np.maximum(variance, held_out.variance))
+    deviation[: len(unknown)][unknown] = np.inf
     return FittedDynamics(
         twin=made,
         parameters=dict(zip(at_rest.names, found.shared[:k].tolist(), strict=True)),
@@ -303,7 +309,8 @@ def _assembled(
     return replace(noisy, widening=widening(noisy, estimation, held_out))
 
 
-def _at_bounds(estimation: Estimation, found: Point) -> str:
+def _notes(estimation: Estimation, found: Point, unknown: NDArray) -> str:
+    """Which parameters (k,) are unknown, and what is at a bound."""
     unknowns, k = estimation.unknowns, estimation.unknowns.count
     own = [f"start_{estimation.twin.states[i].name}" for i in unknowns.free]
     values = np.vstack([np.tile(found.shared, (len(found.starts), 1)).T, found.starts.T])
@@ -311,7 +318,9 @@ def _at_bounds(estimation: Estimation, found: Point) -> str:
     names = [
         name for name, bound in zip([*unknowns.names, *own], at.any(axis=1), strict=True) if bound
     ]
-    return f"at a bound, and perhaps beyond it: {', '.join(names)}" if names else ""
+    free = [name for name, each in zip(unknowns.names, unknown, strict=False) if each]
+    groups = {"at a bound, and perhaps beyond it": names, "not determined by the record": free}
+    return "; ".join(f"{what}: {', '.join(each)}" for what, each in groups.items() if each)
 
 
 def _sizes(equations: CorrectedEquations, estimation: Estimation, found: Point) -> dict[str, float]:
