@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+from safetensors.torch import load_file, save_file
 
 import retwin as rt
 from retwin.twins import Parameter, State, StateTwin
@@ -11,6 +14,7 @@ from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
 
 INPUT = rt.Channels(("u",), ("V",))
 OUTPUT = rt.Channels(("y",), ("m",))
+STATE = State("x", "m")
 QUICK = Dynamics(library=Library(1, (), False))
 RNG = np.random.default_rng(0)
 COMMANDS = np.cumsum(RNG.normal(size=(2, 120, 1)), axis=1) / 5
@@ -22,7 +26,7 @@ def measured(twin: StateTwin, deviation: float = 1e-3) -> rt.Trajectories:
     return made.replace(observed=made.observed + noise)
 
 
-def lag(derivative, *parameters: Parameter, start: State = State("x", "m")) -> StateTwin:
+def lag(derivative, *parameters: Parameter, start: State = STATE) -> StateTwin:
     return StateTwin(
         (start,),
         lambda x, u: x.x,
@@ -110,3 +114,48 @@ def test_parameters_that_the_record_does_not_determine_have_no_error_of_zero() -
     assert np.isinf([found.errors[name] for name in ("gain", "scale", "idle")]).all()
     assert 0 < found.errors["rate"] < 0.1
     assert is_finite(found.twin)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> DynamicsTwin:
+    known = lag(lambda x, u: (u.u - 2 * x.x,))
+    return fit_dynamics(known, measured(known), QUICK).twin
+
+
+def test_predictions_that_are_not_finite_are_refused() -> None:
+    unstable = lag(lambda x, u: (u.u - 2 * x.x + 0.01 * x.x**3,))
+    record = measured(unstable)
+    grown = fit_dynamics(unstable, record, QUICK).twin
+    with pytest.raises(rt.InputError, match=r"trajectories \[0, 1\] with which it does not"):
+        grown.predictive(record.replace(commands=1e60 + 0 * COMMANDS))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("noise", -1.0),
+        ("noise", 0.0),
+        ("process", -1.0),
+        ("start_deviation", -1.0),
+        ("domain_low", np.nan),
+        ("domain_low", 1e9),
+        ("domain_speed", np.nan),
+    ],
+)
+def test_forged_weights_are_refused(fitted: DynamicsTwin, tmp_path, name: str, value) -> None:
+    fitted.save(tmp_path / "model")
+    file = tmp_path / "model" / "weights.safetensors"
+    weights = load_file(file)
+    weights[name] = weights[name].clone().fill_(value)
+    save_file(weights, file)
+    with pytest.raises(rt.InputError):
+        DynamicsTwin.load(tmp_path / "model")
+
+
+@pytest.mark.parametrize("widening", [float("nan"), -1.0, "1"])
+def test_a_forged_widening_is_refused(fitted: DynamicsTwin, tmp_path, widening) -> None:
+    fitted.save(tmp_path / "model")
+    file = tmp_path / "model" / "model.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "widening": widening}))
+    with pytest.raises(rt.InputError):
+        DynamicsTwin.load(tmp_path / "model")

@@ -244,8 +244,7 @@ class CorrectedEquations:
             for _, places, terms in self.equations
             for term in terms
         ]
-        made = np.zeros((len(states), 0)) if not columns else torch.stack(columns, 1).numpy()
-        return made
+        return torch.stack(columns, 1).numpy() if columns else np.zeros((len(states), 0))
 
 
 def _by_parameters(twin: StateTwin, equation: int, states: NDArray, commands: NDArray) -> NDArray:

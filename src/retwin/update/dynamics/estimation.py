@@ -159,7 +159,7 @@ class Estimation:
 
     @cached_property
     def spread(self) -> NDArray:
-        """Variances (d_y,) of the measured outputs; their mean squares where they do not vary, or 1."""
+        """Variances (d_y,) of the outputs; the mean square of one that does not vary, or 1."""
         values = np.where(self.seen, self.measured, np.nan)
         square = np.nanmean(values**2, axis=(0, 1))
         variance = np.nanvar(values, axis=(0, 1))
@@ -170,7 +170,9 @@ class Estimation:
     def power(self, residual: NDArray) -> NDArray:
         """Mean squares (d_y,) of a residual (n, T, d_y), above 0."""
         count = np.maximum(self.seen.sum(axis=(0, 1)), 1)
-        made: NDArray = np.maximum(np.sum(residual**2, axis=(0, 1)) / count, RESOLUTION * self.spread)
+        made: NDArray = np.maximum(
+            np.sum(residual**2, axis=(0, 1)) / count, RESOLUTION * self.spread
+        )
         return made
 
     def rms(self, residual: NDArray) -> float:

@@ -143,7 +143,8 @@ def fit_dynamics(
     ------
     InputError
         A twin that is no `StateTwin`, other channels or another rate, no healthy trajectory, too
-        few samples, an output that was never measured, an unknown state, or a twin whose simulation is not finite.
+        few samples, an output that was never measured, an unknown state, or a twin whose simulation
+        is not finite.
 
     Warns
     -----
@@ -311,7 +312,7 @@ def _assembled(
 
 def _notes(estimation: Estimation, found: Point, unknown: NDArray) -> str:
     """Which parameters (k,) are unknown, and what is at a bound."""
-    unknowns, k = estimation.unknowns, estimation.unknowns.count
+    unknowns = estimation.unknowns
     own = [f"start_{estimation.twin.states[i].name}" for i in unknowns.free]
     values = np.vstack([np.tile(found.shared, (len(found.starts), 1)).T, found.starts.T])
     at = (values <= unknowns.low[:, None]) | (values >= unknowns.high[:, None])

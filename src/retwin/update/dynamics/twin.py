@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import finite, require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.models import read_model, refusing, write_model
@@ -230,7 +230,8 @@ class DynamicsTwin:
         Raises
         ------
         InputError
-            Other channels or another rate than those of the twin.
+            Other channels or another rate than those of the twin, or a trajectory with which the
+            filter is not finite.
 
         Warns
         -----
@@ -240,6 +241,15 @@ class DynamicsTwin:
         """
         check_channels(self, record, "record")
         made = self.filtered(record)
+        parts = (made.mean, made.covariance, made.states)
+        good = np.all([np.isfinite(each).reshape(len(record), -1).all(1) for each in parts], 0)
+        require(
+            good.all(),
+            "record",
+            expected="commands and outputs with which the filter stays finite",
+            got=f"trajectories {np.flatnonzero(~good)[:5].tolist()} with which it does not",
+            remedy="leave them out, or give more substeps",
+        )
         self._warn(self.domain.excess(made.states, record.commands))
         return made
 
@@ -356,8 +366,8 @@ class DynamicsTwin:
         about, weights = read_model(folder, KIND)
         with refusing(folder, expected="corrected dynamics"):
             equations = equations_from(StateTwin, about["equations"])
-            arrays = {name: weights[name].numpy() for name in ARRAYS}
-            domain = Domain(*(weights[f"domain_{name}"].numpy() for name in DOMAIN))
+            arrays = {name: weights[name].double().numpy() for name in ARRAYS}
+            domain = Domain(*(weights[f"domain_{name}"].double().numpy() for name in DOMAIN))
             count = (len(equations.parameters), len(equations.states), len(equations.outputs))
             shapes = [arrays[name].shape for name in ARRAYS]
             both = count[0] + count[1]
@@ -369,10 +379,26 @@ class DynamicsTwin:
                 got=shapes,
                 remedy="save the model again",
             )
+            variances = (arrays["start_deviation"], arrays["process"], arrays["noise"])
+            widening = finite("widening", about["widening"], least=0.0)
+            ends = np.stack([domain.low, domain.high])
+            require(
+                all((each >= 0).all() for each in variances)
+                and (arrays["noise"] > 0).all()
+                and ends.shape == (2, count[1] + len(equations.inputs))
+                and domain.speed.shape == (count[1],)
+                and np.isfinite(ends).all()
+                and np.isfinite(domain.speed).all()
+                and (ends[0] <= ends[1]).all(),
+                "weights",
+                expected="variances above 0 and a domain of all states and commands",
+                got="others",
+                remedy="save the model again",
+            )
             return cls(
                 equations,
                 **arrays,
-                widening=float(about["widening"]),
+                widening=widening,
                 domain=domain,
                 corrected=tuple(about["corrected"]),
                 emulated=about["emulated"],
