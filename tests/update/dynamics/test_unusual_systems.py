@@ -159,3 +159,11 @@ def test_a_forged_widening_is_refused(fitted: DynamicsTwin, tmp_path, widening) 
     file.write_text(json.dumps({**json.loads(file.read_text()), "widening": widening}))
     with pytest.raises(rt.InputError):
         DynamicsTwin.load(tmp_path / "model")
+
+
+@pytest.mark.parametrize(
+    ("argument", "value"), [("library", {"degree": 2}), ("states", "x"), ("states", ("x", "x"))]
+)
+def test_wrong_settings_are_refused(argument: str, value) -> None:
+    with pytest.raises(rt.InputError, match=f"^{argument}: "):
+        Dynamics(**{argument: value})

@@ -65,6 +65,20 @@ class Dynamics:
     folds: int = 10
 
     def __post_init__(self) -> None:
+        require(
+            isinstance(self.library, Library),
+            "library",
+            expected="a Library",
+            got=type(self.library).__name__,
+            remedy="give Library(degree=..., knots=..., friction=...)",
+        )
+        require(
+            not isinstance(self.states, str) and len(set(self.states)) == len(self.states),
+            "states",
+            expected="different names of states",
+            got=repr(self.states),
+            remedy="give each once, in a tuple",
+        )
         object.__setattr__(self, "states", tuple(self.states))
         whole("folds", self.folds, least=2)
 
