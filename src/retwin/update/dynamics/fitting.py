@@ -171,11 +171,8 @@ def fit_dynamics(
     base, free, values = state_twin_of(twin)
     checked_stride(base, observed, None, "observed")
     report = progress or (lambda share: None)
-    missing = [
-        name
-        for name, seen in zip(base.outputs.names, observed.mask.any(axis=(0, 1)), strict=True)
-        if not seen
-    ]
+    names = base.outputs.names
+    missing = [name for i, name in enumerate(names) if not observed.mask[..., i].any()]
     require(
         not missing,
         "observed",
@@ -330,9 +327,7 @@ def _notes(estimation: Estimation, found: Point, unknown: NDArray) -> str:
     own = [f"start_{estimation.twin.states[i].name}" for i in unknowns.free]
     values = np.vstack([np.tile(found.shared, (len(found.starts), 1)).T, found.starts.T])
     at = (values <= unknowns.low[:, None]) | (values >= unknowns.high[:, None])
-    names = [
-        name for name, bound in zip([*unknowns.names, *own], at.any(axis=1), strict=True) if bound
-    ]
+    names = [name for name, each in zip([*unknowns.names, *own], at, strict=True) if each.any()]
     free = [name for name, each in zip(unknowns.names, unknown, strict=False) if each]
     groups = {"at a bound, and perhaps beyond it": names, "not determined by the record": free}
     return "; ".join(f"{what}: {', '.join(each)}" for what, each in groups.items() if each)
