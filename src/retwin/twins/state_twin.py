@@ -38,6 +38,8 @@ SAMPLES_PER_CHUNK = 2**20
 ACCURACY = 0.01
 """Largest error of the steps through time, in standard deviations of an output, that passes without
 a warning. It should be small compared with a discrepancy that is worth modelling."""
+MOST_SUBSTEPS = 10_000
+"""Sub-steps of a sample, above which equations are too stiff for an explicit method."""
 FINER = 16
 """How many times more sub-steps are tried before a simulation that is not finite is given up."""
 
@@ -74,7 +76,7 @@ class StateTwin:
     parameters : sequence of Parameter
         Numbers of the equations, with their units, bounds, and starts, which are used by default.
     substeps : int, default 1
-        Steps of the integration per sample.
+        Steps of the integration per sample, up to 10 000.
     interpolation : {"hold", "linear", "spline"}
         The commands between samples, see `INTERPOLATIONS`; `step` has no such time.
     limits : Limits, optional
@@ -134,7 +136,7 @@ class StateTwin:
             remedy="the start of a state is the parameter start_NAME; rename the other",
         )
         sample_rate("rate", self.rate)
-        whole("substeps", self.substeps, least=1)
+        whole("substeps", self.substeps, least=1, most=MOST_SUBSTEPS)
         one_of("interpolation", self.interpolation, INTERPOLATIONS)
         require(
             self.step is None or (self.substeps == 1 and self.interpolation == "hold"),

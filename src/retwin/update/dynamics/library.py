@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from retwin.arrays import floats
-from retwin.checks import require, whole
+from retwin.checks import one_of, require, whole
 
 __all__ = ["Library", "Term"]
 
@@ -68,6 +68,7 @@ class Library:
     def __post_init__(self) -> None:
         object.__setattr__(self, "knots", floats(self.knots))
         whole("degree", self.degree, least=0)
+        one_of("friction", self.friction, (True, False))
         require(
             all(0 <= knot <= 1 for knot in self.knots),
             "knots",

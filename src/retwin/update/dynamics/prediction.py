@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 from scipy.stats import norm
 
+from retwin.checks import finite, require
 from retwin.data.trajectories import Trajectories
 
 __all__ = ["Prediction"]
@@ -47,8 +48,15 @@ class Prediction:
 
     def quantile(self, level: ArrayLike) -> NDArray:
         """Quantiles of each output: (..., n, T, d_y) for levels (...)."""
-        levels = np.asarray(level, dtype=float)[..., None, None, None]
-        made: NDArray = self.mean + ndtri(levels) * self.deviation
+        levels = np.asarray(level, dtype=float)
+        require(
+            ((levels > 0) & (levels < 1)).all(),
+            "level",
+            expected="probabilities between 0 and 1",
+            got=level,
+            remedy="give 0.95, not 95",
+        )
+        made: NDArray = self.mean + ndtri(levels[..., None, None, None]) * self.deviation
         return made
 
     def pit(self) -> NDArray:
@@ -60,10 +68,15 @@ class Prediction:
         return made
 
     def coverage(self, share: float = 0.9) -> NDArray:
-        """Share (d_y,) of the measured samples inside the central interval of that probability."""
+        """Share (d_y,) of the measured samples inside the central interval of that probability.
+
+        NaN for an output of which no sample is measured.
+        """
+        finite("share", share, least=0.0, most=1.0)
         inside = np.abs(self.standardised()) <= ndtri((1 + share) / 2)
         counted: NDArray = self.record.mask.sum(axis=(0, 1))
-        made: NDArray = (inside & self.record.mask).sum(axis=(0, 1)) / counted
+        held = (inside & self.record.mask).sum(axis=(0, 1))
+        made: NDArray = np.where(counted > 0, held / np.maximum(counted, 1), np.nan)
         return made
 
     def log_density(self) -> NDArray:
