@@ -7,7 +7,7 @@ from dataclasses import asdict
 from math import inf, isfinite
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from retwin.checks import require
+from retwin.checks import one_of, require
 from retwin.data.trajectories import Channels
 from retwin.twins.compiled.program import OPERATIONS, Node, Program
 from retwin.twins.limits import Limits
@@ -84,7 +84,8 @@ def equations_from(kind: type[Kind], about: dict[str, Any]) -> Kind:
         else:
             nodes.append(known[value] if op == "variable" else program.constant(value))
     slope, results = ([nodes[i] for i in about[name]] for name in ("slope", "results"))
-    model = Model(program, variables, slope, results, bool(about["discrete"]))
+    discrete = one_of("discrete", about["discrete"], (True, False))
+    model = Model(program, variables, slope, results, discrete)
     return kind(  # type: ignore[call-arg]  # which this module does not import
         states,
         _Evaluated(model, "outputs"),

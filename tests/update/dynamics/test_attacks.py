@@ -64,3 +64,25 @@ def test_a_forged_model_cannot_take_forever(fitted: DynamicsTwin, tmp_path, subs
     file.write_text(json.dumps(about))
     with pytest.raises(InputError, match="substeps"):
         DynamicsTwin.load(tmp_path / "model")
+
+
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (("equations", "slope"), [0, 1]),
+        (("equations", "slope"), []),
+        (("equations", "results"), []),
+        (("equations", "discrete"), "false"),
+        (("corrected",), ["nope"]),
+        (("emulated",), "no"),
+    ],
+)
+def test_a_forged_description_is_refused(fitted: DynamicsTwin, tmp_path, keys, value) -> None:
+    fitted.save(tmp_path / "model")
+    file = tmp_path / "model" / "model.json"
+    about = json.loads(file.read_text())
+    part = about if len(keys) == 1 else about[keys[0]]
+    part[keys[-1]] = value
+    file.write_text(json.dumps(about))
+    with pytest.raises(InputError):
+        DynamicsTwin.load(tmp_path / "model")

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retwin.checks import finite, require
+from retwin.checks import finite, one_of, require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.models import read_model, refusing, write_model
@@ -22,7 +22,7 @@ from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.twins.state_twin import SAMPLES_PER_CHUNK, StateTwin
 from retwin.twins.twin import Chunk, check_channels, checked_commands, simulate_in_chunks
 from retwin.twins.wrapper import chunk_generator
-from retwin.update.dynamics.corrected import Domain
+from retwin.update.dynamics.corrected import Domain, correctable
 from retwin.update.dynamics.estimation import Estimation, Point, root
 from retwin.update.dynamics.prediction import Prediction
 from retwin.update.dynamics.unknowns import Unknowns
@@ -336,7 +336,7 @@ class DynamicsTwin:
         names = (*(each.name for each in self.equations.states), *self.inputs.names)
         warnings.warn(
             f"{names[worst]} leaves the range that it had in calibration by "
-            f"{100 * beyond[worst]:.0f} % of its width; there the discrepancy is extrapolated",
+            f"{100 * beyond[worst]:.3g} % of its width; there the discrepancy is extrapolated",
             OutsideTrainingWarning,
             stacklevel=3,
         )
@@ -366,6 +366,8 @@ class DynamicsTwin:
         about, weights = read_model(folder, KIND)
         with refusing(folder, expected="corrected dynamics"):
             equations = equations_from(StateTwin, about["equations"])
+            assert equations.model, "traced here, which refuses wrong numbers of results"
+            corrected = correctable(equations, about["corrected"])
             arrays = {name: weights[name].double().numpy() for name in ARRAYS}
             domain = Domain(*(weights[f"domain_{name}"].double().numpy() for name in DOMAIN))
             count = (len(equations.parameters), len(equations.states), len(equations.outputs))
@@ -400,8 +402,8 @@ class DynamicsTwin:
                 **arrays,
                 widening=widening,
                 domain=domain,
-                corrected=tuple(about["corrected"]),
-                emulated=about["emulated"],
+                corrected=corrected,
+                emulated=one_of("emulated", about["emulated"], (True, False)),
                 case=about["case"],
             )
 
