@@ -111,7 +111,7 @@ def fit(
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
-    """Fit surrogate and residual model, or the state equations; save the corrected twin."""
+    """Fit surrogate and residual model; save the corrected twin."""
     import retwin as rt
     from retwin.update.residual.fitting import calibrating
 
