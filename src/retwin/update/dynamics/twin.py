@@ -298,9 +298,11 @@ class DynamicsTwin:
         return made
 
     def _most_probable(self, commands: NDArray) -> tuple[NDArray, NDArray]:
-        """Outputs and states without noise."""
-        theta = np.tile(self.values, (len(commands), 1))
-        return self.equations.steps().run(commands, theta)
+        """Outputs and states without noise; equal commands are simulated once."""
+        distinct, own = np.unique(commands, axis=0, return_inverse=True)
+        theta = np.tile(self.values, (len(distinct), 1))
+        outputs, states = self.equations.steps().run(distinct, theta)
+        return outputs[own.ravel()], states[own.ravel()]
 
     def _drawn(self, commands: NDArray, rng: np.random.Generator) -> NDArray:
         """Outputs (n, T, d_y) with drawn parameters, starts and noise.
