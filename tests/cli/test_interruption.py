@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 import shlex
+import signal
+import time
 from pathlib import Path
 
 import pytest
 
+from retwin.cli.terminal import interrupted_by_term
 from retwin.serialisation.places import in_use
 
 
@@ -89,3 +92,14 @@ def test_a_fit_leaves_nothing_half_written(start, own: Path) -> None:
     line = running.interrupt(lambda: "fit: surrogate, 1 of 2" in running.stderr)
     assert "to begin anew, nothing is left half-written: retwin fit long.toml" in line
     assert {file.name for file in own.iterdir()} - before <= {"__pycache__"}
+
+
+class InterruptedWhenDeleted:
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_an_interrupt_that_python_ignores_is_repeated() -> None:
+    with interrupted_by_term(), pytest.raises(KeyboardInterrupt):
+        InterruptedWhenDeleted()
+        time.sleep(10)

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import shlex
 import signal
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -280,11 +282,26 @@ def resumable() -> Iterator[None]:
 
 @contextmanager
 def interrupted_by_term() -> Iterator[None]:
-    """Let SIGTERM act as Ctrl-C in the block."""
+    """Let SIGTERM act as Ctrl-C in the block, and repeat an interrupt that Python ignored.
+
+    Python prints and forgets an exception that is raised while an object is deleted.
+    """
+    hook, main = sys.unraisablehook, threading.main_thread().ident
+
+    def repeat(ignored: sys.UnraisableHookArgs) -> None:
+        if os.name != "posix" or not issubclass(ignored.exc_type, KeyboardInterrupt):
+            return hook(ignored)
+        # Later, since an interrupt within this function would be ignored as well.
+        later = threading.Timer(0.05, signal.pthread_kill, [main, signal.SIGTERM])
+        later.daemon = True
+        return later.start()
+
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    sys.unraisablehook = repeat
     try:
         yield
     finally:
+        sys.unraisablehook = hook
         signal.signal(signal.SIGTERM, before)
 
 
