@@ -142,7 +142,7 @@ def noisy() -> FittedDynamics:
     return fit_dynamics(LINEAR, with_process_noise(0), Dynamics(Library(degree=2, knots=())))
 
 
-def test_noise_is_told_apart(noisy: FittedDynamics) -> None:
+def test_process_and_measurement_noise_are_separated(noisy: FittedDynamics) -> None:
     assert np.sqrt(noisy.twin.process) == pytest.approx([0.0, 0.01], rel=0.25)
     assert np.sqrt(noisy.twin.noise) == pytest.approx([NOISE], rel=0.35)
 

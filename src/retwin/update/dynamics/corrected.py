@@ -74,12 +74,17 @@ class Domain:
         half = np.maximum(self.high - self.centre, self.centre - self.low)
         return np.where(half > 0, half, 1.0)
 
-    @cached_property
-    def ends(self) -> tuple[NDArray, NDArray]:
-        """Scaled values (d_x + d_u,) at which variables of the discrepancy are held."""
-        low, high = ((each - self.centre) / self.scale for each in (self.low, self.high))
-        beyond = EXTRAPOLATED * (high - low)
-        return low - beyond, high + beyond
+    def scaled(self, variables: Sequence[Any]) -> list[Any]:
+        """States and commands, tensors, as variables of the discrepancy."""
+        beyond = EXTRAPOLATED * (self.high - self.low)
+        ends = (
+            (each - self.centre) / self.scale for each in (self.low - beyond, self.high + beyond)
+        )
+        columns = (self.centre.tolist(), self.scale.tolist(), *(each.tolist() for each in ends))
+        return [
+            ((each - centre) / scale).clamp(low, high)
+            for each, centre, scale, low, high in zip(variables, *columns, strict=True)
+        ]
 
     def excess(self, states: NDArray, commands: NDArray) -> NDArray:
         """How far states (n, T, d_x) and commands (n, T, d_u) leave the domain, in widths of it.
@@ -210,15 +215,13 @@ class CorrectedEquations:
         function, output = (
             with_parameters(each) for each in (twin.derivative or twin.step, twin.output)
         )
-        centre, scale = self.domain.centre.tolist(), self.domain.scale.tolist()
-        low, high = (each.tolist() for each in self.domain.ends)
 
         def corrected(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
-            both = [*x, *u]
+            variables = self.domain.scaled([*x, *u])
             slope = list(function(x, u, named(*p[:own])))
             coefficients = iter(p[own:])
             for i, places, terms in self.equations:
-                v = [((both[j] - centre[j]) / scale[j]).clamp(low[j], high[j]) for j in places]
+                v = [variables[j] for j in places]
                 total = sum(next(coefficients) * term.value(v) for term in terms)
                 slope[i] = slope[i] + float(self.domain.speed[i]) * total
             return tuple(slope)
@@ -237,8 +240,8 @@ class CorrectedEquations:
         """The values (K, k) of all terms at states (K, d_x) and commands (K, d_u)."""
         import torch
 
-        both = np.concatenate([states, commands], axis=1)
-        scaled = torch.as_tensor((both - self.domain.centre) / self.domain.scale).unbind(1)
+        both = torch.as_tensor(np.concatenate([states, commands], axis=1))
+        scaled = self.domain.scaled(both.unbind(1))
         columns = [
             term.value([scaled[j] for j in places]) * torch.ones_like(scaled[0])
             for _, places, terms in self.equations

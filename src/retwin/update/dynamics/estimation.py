@@ -215,9 +215,7 @@ class Estimation:
         start = point.flat
         if not start.size:
             return point
-        curvature = self.expanded(start)[2]
-        # In these units the curvature at the start has ones on its diagonal.
-        unit = 1 / np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+        unit = self._scaled_curvature(point)[1]
 
         @lru_cache(maxsize=2)
         def expanded(z: bytes) -> tuple[float, NDArray, NDArray]:
@@ -241,9 +239,8 @@ class Estimation:
 
     def covariance(self, point: Point) -> NDArray:
         """Posterior covariance (k + m, k + m) of coordinates and mean starts, by Laplace."""
-        curvature = self.expanded(point.flat)[2]
-        unit = 1 / np.sqrt(np.maximum(np.diag(curvature), 1e-300))
-        scaled = np.linalg.pinv(unit[:, None] * curvature * unit, hermitian=True)
+        curvature, unit = self._scaled_curvature(point)
+        scaled = np.linalg.pinv(curvature, hermitian=True)
         count, k, m = len(self.observed), self.unknowns.count, len(self.unknowns.free)
         mean = block_diag(np.eye(k), np.tile(np.eye(m), count) / count)
         made: NDArray = mean @ (unit[:, None] * scaled * unit) @ mean.T
@@ -251,15 +248,13 @@ class Estimation:
 
     def undetermined(self, point: Point) -> NDArray:
         """Which shared coordinates (k,) can change without a change of the objective."""
-        curvature = self.expanded(point.flat)[2]
-        unit = 1 / np.sqrt(np.maximum(np.diag(curvature), 1e-300))
-        values, directions = np.linalg.eigh(unit[:, None] * curvature * unit)
+        values, directions = np.linalg.eigh(self._scaled_curvature(point)[0])
         free = np.abs(directions[:, values <= RESOLUTION * len(values)])
         made: NDArray = (free > np.sqrt(RESOLUTION)).any(axis=1)[: self.unknowns.count]
         return made
 
     def held_out(self, point: Point, folds: Sequence[NDArray]) -> HeldOut:
-        """What each fold tells when it is left out of the estimation.
+        """The errors of each fold, and the estimates, without that fold.
 
         One Gauss-Newton step from the optimum of all samples leads to that without a fold. The
         starts stay: without the first samples of a trajectory hardly anything determines them.
@@ -274,11 +269,11 @@ class Estimation:
         """
         residual, slope = self.linearised(point)
         k = self.unknowns.count
-        curvature = self.expanded(point.flat)[2][:k, :k]
-        unit = 1 / np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+        curvature, unit = (each[..., :k] for each in self._scaled_curvature(point))
+        scaled = curvature[:k]
         scale = 1 / np.sqrt(self.variance)
         errors, variances = residual.copy(), np.zeros(residual.shape)
-        scaled, moves = unit[:, None] * curvature * unit, []
+        moves = []
         for fold in folds:
             jacobian = slope[fold][..., :k] * unit
             weighted = (jacobian * scale[:, None]).reshape(residual[fold].size, k)
@@ -288,6 +283,12 @@ class Estimation:
             moves.append(unit * step)
             variances[fold] = np.sum((jacobian @ covariance) * jacobian, axis=-1)
         return HeldOut(np.where(self.seen, errors, 0.0), variances, np.array(moves))
+
+    def _scaled_curvature(self, point: Point) -> tuple[NDArray, NDArray]:
+        """The curvature (P, P) in units (P,) in which its diagonal is 1, and these units."""
+        curvature = self.expanded(point.flat)[2]
+        unit = 1 / np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+        return unit[:, None] * curvature * unit, unit
 
     @cached_property
     def _bounds(self) -> tuple[NDArray, NDArray]:
@@ -317,14 +318,14 @@ def root(covariance: NDArray) -> NDArray:
 def correlation_time(residual: NDArray) -> float:
     """Samples per effective one: the integrated autocorrelation time of residuals (n, T, d_y).
 
-    The sum over lags ends at five times its own value (Sokal, "Monte Carlo methods in statistical
+    Unlike that of a first-order autoregression, it holds for residuals that oscillate. The sum over
+    lags ends at five times its own value (Sokal, "Monte Carlo methods in statistical
     mechanics", in Functional Integration, 1997).
     """
     samples = residual.shape[1]
     scale = np.sqrt(np.mean(residual**2, axis=(0, 1)))
-    spectrum = (
-        np.abs(np.fft.rfft(residual / np.where(scale > 0, scale, 1.0), 2 * samples, axis=1)) ** 2
-    )
+    scaled = residual / np.where(scale > 0, scale, 1.0)
+    spectrum = np.abs(np.fft.rfft(scaled, 2 * samples, axis=1)) ** 2
     covariance = np.fft.irfft(spectrum, axis=1)[:, :samples].sum(axis=(0, 2))
     if covariance[0] <= 0:
         return 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -134,7 +134,7 @@ def fit_dynamics(
     Coefficients have a Gaussian prior about 0, and theta has none, so that what theta can explain
     is not explained by the discrepancy. The assumed error variance, which sets the strength of that
     prior, is the one that is observed. Process and measurement noise then maximise the likelihood
-    of an extended Kalman filter, and bands are widened to hold held-out blocks.
+    of an extended Kalman filter, and bands are scaled to hold held-out blocks.
 
     Parameters
     ----------
@@ -180,50 +180,44 @@ def fit_dynamics(
         got=f"none of {', '.join(missing)}",
         remedy="leave that output out of the twin and of the record, since its noise is unknown",
     )
-    at_rest = unknowns_of(base, free, values)
+    unknowns = unknowns_of(base, free, values)
     require(
-        observed.mask.sum() > at_rest.count + len(at_rest.free) + settings.folds,
+        observed.mask.sum() > unknowns.count + len(unknowns.free) + settings.folds,
         "observed",
         expected="more measured samples than parameters",
         got=int(observed.mask.sum()),
         remedy="give more or longer trajectories, or free fewer parameters",
     )
-    alone, point = _without_discrepancy(base, observed, at_rest)
+    alone, point = _without_discrepancy(base, observed, unknowns)
     report(0.05)
-    fitted = _with_starts(base, at_rest, point)
-    states = correctable(fitted, settings.states)
-    visited = (alone.simulated(point)[1], alone.commands)
-    libraries, tried = settings.library.nested(), []
-    for number, library in enumerate(libraries):
-        equations = CorrectedEquations.distinct(fitted, library, states, visited, at_rest.matrix)
+    tried = []
+    for equations in _candidates(alone, point, settings):
         estimation, found = _followed(equations, alone, point)
         held_out = estimation.held_out(found, folds(estimation.seen, settings.folds))
-        error = estimation.rms(held_out.errors)
-        tried.append(
-            (error if np.isfinite(error) else np.inf, equations, estimation, found, held_out)
-        )
-        report(0.05 + 0.8 * (number + 1) / len(libraries))
-    chosen = int(np.argmin([each[0] for each in tried]))
-    _, equations, estimation, found, held_out = tried[chosen]
+        tried.append((equations, estimation, found, held_out))
+        report(1 - 0.95 * 0.6 ** len(tried))
+    errors = [own.rms(held_out.errors) for _, own, _, held_out in tried]
+    chosen = int(np.argmin(np.nan_to_num(errors, nan=np.inf)))
+    equations, estimation, found, held_out = tried[chosen]
     made = _assembled(equations, estimation, found, held_out)
     report(1.0)
-    unknown = estimation.undetermined(found)[: at_rest.count]
+    unknown = estimation.undetermined(found)[: unknowns.count]
     notes = _notes(estimation, found, unknown)
     if notes:
         warnings.warn(notes, stacklevel=2)
-    k = at_rest.count
+    k = unknowns.count
     variance = np.diag(estimation.covariance(found))[: len(found.shared)]
     deviation = np.sqrt(np.maximum(variance, held_out.variance))
     deviation[: len(unknown)][unknown] = np.inf
     return FittedDynamics(
         twin=made,
-        parameters=dict(zip(at_rest.names, found.shared[:k].tolist(), strict=True)),
-        errors=dict(zip(at_rest.names, deviation[:k].tolist(), strict=True)),
+        parameters=dict(zip(unknowns.names, found.shared[:k].tolist(), strict=True)),
+        errors=dict(zip(unknowns.names, deviation[:k].tolist(), strict=True)),
         terms=_sizes(equations, estimation, found),
         figures={
             "rms_before": alone.rms(alone.residual(point)),
             "rms_after": estimation.rms(estimation.residual(found)),
-            "held_out": estimation.rms(held_out.errors),
+            "held_out": errors[chosen],
             "widening": made.widening,
             "library": float(chosen),
             "strength": float(np.mean(estimation.variance / alone.power(alone.residual(point)))),
@@ -262,6 +256,18 @@ def _with_starts(base: StateTwin, unknowns: Unknowns, point: Point) -> StateTwin
         for each, value in zip(base.parameters, values.tolist(), strict=True)
     )
     return replace(base, parameters=tuple(parameters))
+
+
+def _candidates(
+    alone: Estimation, point: Point, settings: Dynamics
+) -> Iterator[CorrectedEquations]:
+    """The corrected equations with each library that is tried, at the parameters of a point."""
+    unknowns = alone.unknowns
+    twin = _with_starts(alone.twin, unknowns, point)
+    states = correctable(twin, settings.states)
+    visited = (alone.simulated(point)[1], alone.commands)
+    for library in settings.library.nested():
+        yield CorrectedEquations.distinct(twin, library, states, visited, unknowns.matrix)
 
 
 def _followed(

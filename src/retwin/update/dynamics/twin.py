@@ -25,13 +25,17 @@ from retwin.twins.wrapper import chunk_generator
 from retwin.update.dynamics.corrected import Domain, correctable
 from retwin.update.dynamics.estimation import Estimation, Point, root
 from retwin.update.dynamics.prediction import Prediction
-from retwin.update.dynamics.unknowns import Unknowns
+from retwin.update.dynamics.unknowns import unknowns_of
 from retwin.update.training_range import OutsideTrainingWarning
 
 __all__ = ["DynamicsTwin"]
 
 KIND = "dynamics"
 """Kind of the saved model."""
+ARRAYS = ("values", "factor", "start_deviation", "process", "noise")
+"""Attributes that are saved as arrays."""
+DOMAIN = ("low", "high", "speed")
+"""Attributes of the domain."""
 BEYOND = 0.05
 """How far, in widths of the domain, states and commands may leave it without a warning."""
 
@@ -150,7 +154,8 @@ class DynamicsTwin:
     def started(self, record: Trajectories) -> DynamicsTwin:
         """The twin with the unknown starts of one record, inferred from its first samples.
 
-        The parameters are held. It simulates this record only.
+        The parameters are held, and the errors of samples count as independent. It simulates this
+        record only.
 
         Parameters
         ----------
@@ -170,7 +175,8 @@ class DynamicsTwin:
 
         """
         check_channels(self, record, "record")
-        unknowns = self._starts()
+        present = dict(zip(self.equations.names, self.values.tolist(), strict=True))
+        unknowns = unknowns_of(self.equations, (), present)
         require(
             len(record) == 1 and record.mask.any() and len(unknowns.free) > 0,
             "record",
@@ -190,25 +196,6 @@ class DynamicsTwin:
         own[len(values) - states + unknowns.free] = root(estimation.covariance(found))
         factor = np.concatenate([factor, own], axis=1)
         return replace(self, values=values, factor=factor, start_deviation=np.zeros(states))
-
-    def _starts(self) -> Unknowns:
-        """The starts as the only unknowns."""
-        states = self.equations.states
-        free = np.array([i for i, each in enumerate(states) if each.low is not None], dtype=int)
-        ends = np.array([[states[i].low, states[i].high] for i in free], dtype=float).reshape(-1, 2)
-        parameters = self.values[: -len(states)]
-        return Unknowns(
-            names=(),
-            offset=parameters,
-            matrix=np.zeros((len(parameters), 0)),
-            mean=np.zeros(0),
-            deviation=np.zeros(0),
-            low=ends[:, 0],
-            high=ends[:, 1],
-            start=self.values[-len(states) :],
-            free=free,
-            start_deviation=(ends[:, 1] - ends[:, 0]) / 2,
-        )
 
     def predictive(self, record: Trajectories) -> Prediction:
         """The distribution of each sample of a record given all earlier ones.
@@ -266,10 +253,8 @@ class DynamicsTwin:
 
     def noise_variance(self, commands: NDArray) -> NDArray:
         """Variances (n, T, d_y) of the outputs by process and measurement noise alone."""
-        theta, shape = (
-            np.tile(self.values, (len(commands), 1)),
-            (*commands.shape[:2], len(self.noise)),
-        )
+        theta = np.tile(self.values, (len(commands), 1))
+        shape = (*commands.shape[:2], len(self.noise))
         variances = (np.zeros(len(self.process)), self.process, self.noise)
         unseen = (np.zeros(shape), np.zeros(shape))
         found = self.equations.steps().filter(commands, theta, unseen, variances)[1]
@@ -353,9 +338,7 @@ class DynamicsTwin:
             "case": self.case,
         }
         arrays = {name: getattr(self, name) for name in ARRAYS}
-        arrays |= {
-            f"domain_{name}": value for name, value in vars(self.domain).items() if name in DOMAIN
-        }
+        arrays |= {f"domain_{name}": getattr(self.domain, name) for name in DOMAIN}
         with write_model(folder, KIND, about, {k: torch.tensor(v) for k, v in arrays.items()}):
             pass
 
@@ -368,11 +351,11 @@ class DynamicsTwin:
         about, weights = read_model(folder, KIND)
         with refusing(folder, expected="corrected dynamics"):
             equations = equations_from(StateTwin, about["equations"])
-            assert equations.model, "traced here, which refuses wrong numbers of results"
             corrected = correctable(equations, about["corrected"])
             arrays = {name: weights[name].double().numpy() for name in ARRAYS}
             domain = Domain(*(weights[f"domain_{name}"].double().numpy() for name in DOMAIN))
-            count = (len(equations.parameters), len(equations.states), len(equations.outputs))
+            traced = equations.model
+            count = (len(equations.parameters), len(traced.slope), len(traced.outputs))
             shapes = [arrays[name].shape for name in ARRAYS]
             both = count[0] + count[1]
             wanted = [(both,), (both, shapes[1][-1]), *[(count[1],)] * 2, (count[2],)]
@@ -408,9 +391,3 @@ class DynamicsTwin:
                 emulated=one_of("emulated", about["emulated"], (True, False)),
                 case=about["case"],
             )
-
-
-ARRAYS = ("values", "factor", "start_deviation", "process", "noise")
-"""Attributes that are saved as arrays."""
-DOMAIN = ("low", "high", "speed")
-"""Attributes of the domain."""
