@@ -8,25 +8,25 @@ optimum of
     sum of (y - simulated)^2 / (2 variance) + sum of (x - mean)^2 / (2 deviation^2)
 
 in nats (Nocedal and Wright, Numerical Optimization, 2006, chapters 4 and 10). The variance is that
-of an effective sample, since residuals are autocorrelated.
+of an effective sample, since residuals are autocorrelated. Sensitivities are computed for a few
+trajectories at a time, and only sums of their products are kept.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
-from scipy.optimize import minimize
 
 from retwin.data.trajectories import Trajectories
 from retwin.twins.state_twin import StateTwin
+from retwin.update.dynamics.arrow import Arrow, trust_region_step
 from retwin.update.dynamics.unknowns import Unknowns
 
-__all__ = ["Estimation", "HeldOut", "Point", "correlation_time", "root"]
+__all__ = ["Estimation", "HeldOut", "Linearised", "Point", "correlation_time", "root"]
 
 MAX_STEPS = 60
 """Steps of the trust-region method at most."""
@@ -38,6 +38,11 @@ RESOLUTION = 1e-12
 """Smallest variance that counts, over that of an output: about that of single precision."""
 WINDOW = 5
 """Lags over which the autocorrelation is summed, in correlation times."""
+ACCEPTED = 0.15
+"""Ratio of the decrease of the objective to that of its quadratic approximation, from which a step
+is made."""
+CHUNK = 2**20
+"""Number of derivatives that are computed at once, unless one trajectory has more: 8 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +65,37 @@ class Point:
     def flat(self) -> NDArray:
         """(k + n m,)."""
         return np.concatenate([self.shared, self.starts.ravel()])
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """The simulation at a point, and sums over its samples of products of derivatives.
+
+    Derivatives are those of the outputs by the P parameters and starts of the simulation.
+
+    Attributes
+    ----------
+    point : Point
+        Where it is, inside the bounds.
+    residual : NDArray
+        (n, T, d_y), measured minus simulated outputs, 0 where a sample does not count.
+    products : NDArray
+        (d_y, P, P + 1), of derivatives with each other and with the residual, over all samples.
+    own : NDArray
+        (d_y, n, m, P + 1), of derivatives by unknown starts with the same, over a trajectory.
+
+    """
+
+    point: Point
+    residual: NDArray
+    products: NDArray
+    own: NDArray
+
+    @property
+    def finite(self) -> bool:
+        """Whether the simulation and its derivatives are."""
+        parts = (self.residual, self.products, self.own)
+        return all(bool(np.isfinite(each).all()) for each in parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,15 +183,41 @@ class Estimation:
         """Measured minus simulated outputs (n, T, d_y); 0 where a sample does not count."""
         return np.where(self.seen, self.measured - self.simulated(point)[0], 0.0)
 
-    def linearised(self, point: Point) -> tuple[NDArray, NDArray]:
-        """The residual, and its derivatives (n, T, d_y, k + m) by coordinates and own starts."""
-        outputs, by_all = self.twin.steps().sensitivities(self.commands, self.theta(point))
-        unknowns, parameters = self.unknowns, len(self.unknowns.offset)
-        by_shared = by_all[..., :parameters] @ unknowns.matrix
-        by_start = by_all[..., parameters + unknowns.free]
-        slope = -np.concatenate([by_shared, by_start], axis=-1)
-        seen = self.seen[..., None]
-        return np.where(self.seen, self.measured - outputs, 0.0), np.where(seen, slope, 0.0)
+    def _derivatives(self, point: Point) -> Iterator[tuple[slice, NDArray, NDArray]]:
+        """Some trajectories, their residual (c, T, d_y), and derivatives (c, T, d_y, P) of outputs.
+
+        Both are 0 where a sample does not count.
+        """
+        theta, steps = self.theta(point), self.twin.steps()
+        size = max(1, CHUNK // (self.seen[0].size * theta.shape[1]))
+        for first in range(0, len(theta), size):
+            rows = slice(first, first + size)
+            outputs, slope = steps.sensitivities(self.commands[rows], theta[rows])
+            seen = self.seen[rows]
+            if not seen.all():
+                slope[~seen] = 0.0
+            yield rows, np.where(seen, self.measured[rows] - outputs, 0.0), slope
+
+    def linearised(self, point: Point) -> Linearised:
+        """The simulation at a point, with sums of products of derivatives."""
+        starts = len(self.unknowns.offset) + self.unknowns.free
+        width = len(self.unknowns.offset) + len(self.unknowns.start)
+        residual = np.full(self.seen.shape, np.nan)
+        products = np.zeros((len(self.variance), width, width + 1))
+        own = np.zeros((len(self.variance), len(self.observed), len(starts), width + 1))
+        for rows, error, slope in self._derivatives(point):
+            residual[rows] = error
+            with np.errstate(over="ignore", invalid="ignore"):
+                for i in range(len(products)):
+                    by_all = np.ascontiguousarray(slope[:, :, i])
+                    flat, by_start = by_all.reshape(-1, width), by_all[..., starts].swapaxes(1, 2)
+                    products[i, :, :-1] += flat.T @ flat
+                    products[i, :, -1] += flat.T @ error[..., i].ravel()
+                    own[i, rows, :, :-1] = by_start @ by_all
+                    own[i, rows, :, -1:] = by_start @ error[..., i, None]
+            if not np.isfinite(products).all():
+                break
+        return Linearised(point, residual, products, own)
 
     @cached_property
     def spread(self) -> NDArray:
@@ -182,78 +244,92 @@ class Estimation:
             power = power / self.spread
         return float(np.sqrt(np.average(power, weights=self.seen.sum(axis=(0, 1)))))
 
-    def expanded(self, flat: NDArray) -> tuple[float, NDArray, NDArray]:
-        """The objective at a flat point, its gradient (P,) and Gauss-Newton curvature (P, P).
-
-        Where the simulation is not finite, the objective is infinite, and the others are 0 and the
-        identity.
-        """
-        inside = np.clip(flat, *self._bounds)
-        residual, slope = self.linearised(self.point(inside))
-        k, m, size = self.unknowns.count, len(self.unknowns.free), len(flat)
-        if not (np.isfinite(residual).all() and np.isfinite(slope).all()):
-            return np.inf, np.zeros(size), np.eye(size)
-        mean, precision = self._prior
-        value = 0.5 * float(np.sum(residual**2 / self.variance))
-        value += 0.5 * float(np.sum(precision * (flat - mean) ** 2))
-        gradient, curvature = precision * (flat - mean), np.diag(precision)
-        scale = 1 / np.sqrt(self.variance)
-        for i, (error, by_own) in enumerate(zip(residual, slope, strict=True)):
-            own = np.r_[0:k, k + i * m : k + (i + 1) * m]
-            jacobian = (by_own * scale[:, None]).reshape(error.size, k + m)
-            curvature[np.ix_(own, own)] += jacobian.T @ jacobian
-            gradient[own] += jacobian.T @ (error * scale).ravel()
-        # A coordinate at its bound is held where the objective would take it further.
-        held = (inside != flat) & (gradient * (flat - inside) < 0)
-        gradient[held] = 0.0
-        curvature[held] = curvature[:, held] = 0.0
-        curvature[held, held] = 1.0
-        return value, gradient, curvature
-
-    def minimised(self, point: Point) -> Point:
+    def minimised(self, at: Linearised) -> Linearised:
         """The most probable point, from a start at which the simulation is finite."""
-        start = point.flat
-        if not start.size:
-            return point
-        unit = self._scaled_curvature(point)[1]
+        flat = at.point.flat
+        if not flat.size:
+            return at
+        value, gradient, curvature = self._expanded(at, flat)
+        unit = _unit(curvature)
+        radius = WIDEST / 1e3
+        for _ in range(MAX_STEPS):
+            if np.linalg.norm(unit * gradient) < TOLERANCE:
+                break
+            scaled = curvature.scaled(unit)
+            step = trust_region_step(scaled, unit * gradient, radius)
+            expected = -float(step @ (unit * gradient + scaled.times(step) / 2))
+            if expected <= 0:
+                break
+            there = flat + unit * step
+            tried = self.linearised(self.point(np.clip(there, *self._bounds)))
+            found = self._expanded(tried, there)
+            ratio, length = (value - found[0]) / expected, float(np.linalg.norm(step))
+            if ratio < 0.25:
+                radius = length / 4
+            elif ratio > 0.75:
+                radius = max(radius, min(2 * length, WIDEST))
+            if ratio > ACCEPTED:
+                at, flat, (value, gradient, curvature) = tried, there, found
+        return at
 
-        @lru_cache(maxsize=2)
-        def expanded(z: bytes) -> tuple[float, NDArray, NDArray]:
-            value, gradient, curvature = self.expanded(start + unit * np.frombuffer(z))
-            return value, unit * gradient, unit[:, None] * curvature * unit
+    def _expanded(self, at: Linearised, flat: NDArray) -> tuple[float, NDArray, Arrow]:
+        """The objective at a flat point, its gradient (k + n m,) and Gauss-Newton curvature.
 
-        found = minimize(
-            lambda z: expanded(z.tobytes())[0],
-            np.zeros(len(start)),
-            method="trust-exact",
-            jac=lambda z: expanded(z.tobytes())[1],
-            hess=lambda z: expanded(z.tobytes())[2],
-            options={
-                "initial_trust_radius": WIDEST / 1e3,
-                "max_trust_radius": WIDEST,
-                "gtol": TOLERANCE,
-                "maxiter": MAX_STEPS,
-            },
+        `at` is the point inside the bounds that is next to it. Where the simulation is not finite,
+        the objective is infinite.
+        """
+        mean, precision = self._prior
+        prior = precision * (flat - mean)
+        if not at.finite:
+            return np.inf, prior, self._curvature(at)
+        weight = 1 / self.variance
+        squares = np.sum(at.residual**2, axis=(0, 1))
+        value = 0.5 * float(weight @ squares + prior @ (flat - mean))
+        parameters = len(self.unknowns.offset)
+        shared = self.unknowns.matrix.T @ (weight @ at.products[:, :parameters, -1])
+        own = np.tensordot(weight, at.own[..., -1], 1)
+        gradient = prior - np.concatenate([shared, own.ravel()])
+        # A coordinate at its bound is held where the objective would take it further.
+        outside = flat - at.point.flat
+        held = (outside != 0) & (gradient * outside < 0)
+        gradient[held] = 0.0
+        return value, gradient, self._curvature(at).scaled(1.0 - held).plus(1.0 * held)
+
+    def _curvature(self, at: Linearised) -> Arrow:
+        """The Gauss-Newton curvature of the objective."""
+        unknowns, weight = self.unknowns, 1 / self.variance
+        parameters = len(unknowns.offset)
+        products, own = (np.tensordot(weight, each[..., :-1], 1) for each in (at.products, at.own))
+        arrow = Arrow(
+            unknowns.matrix.T @ products[:parameters, :parameters] @ unknowns.matrix,
+            own[..., :parameters] @ unknowns.matrix,
+            own[..., parameters + unknowns.free],
         )
-        return self.point(np.clip(start + unit * found.x, *self._bounds))
+        return arrow.plus(self._prior[1])
 
-    def covariance(self, point: Point) -> NDArray:
+    def covariance(self, at: Linearised) -> NDArray:
         """Posterior covariance (k + m, k + m) of coordinates and mean starts, by Laplace."""
-        curvature, unit = self._scaled_curvature(point)
-        scaled = np.linalg.pinv(curvature, hermitian=True)
-        count, k, m = len(self.observed), self.unknowns.count, len(self.unknowns.free)
-        mean = block_diag(np.eye(k), np.tile(np.eye(m), count) / count)
-        made: NDArray = mean @ (unit[:, None] * scaled * unit) @ mean.T
+        curvature = self._curvature(at)
+        unit = _unit(curvature)
+        complement, follow, inverse = curvature.scaled(unit).reduced()
+        k = len(complement)
+        own = unit[k:].reshape(follow.shape[:2])[..., None]
+        by_shared = np.concatenate([np.diag(unit[:k]), -np.sum(own * follow, axis=0) / len(own)])
+        limit = RESOLUTION * max(k, 1)
+        shared = np.linalg.pinv(complement, limit, hermitian=True)
+        made: NDArray = by_shared @ shared @ by_shared.T
+        made[k:, k:] += np.sum(own * inverse * own.swapaxes(1, 2), axis=0) / len(own) ** 2
         return made
 
-    def undetermined(self, point: Point) -> NDArray:
+    def undetermined(self, at: Linearised) -> NDArray:
         """Which shared coordinates (k,) can change without a change of the objective."""
-        values, directions = np.linalg.eigh(self._scaled_curvature(point)[0])
+        curvature = self._curvature(at)
+        values, directions = np.linalg.eigh(curvature.scaled(_unit(curvature)).reduced()[0])
         free = np.abs(directions[:, values <= RESOLUTION * len(values)])
-        made: NDArray = (free > np.sqrt(RESOLUTION)).any(axis=1)[: self.unknowns.count]
+        made: NDArray = (free > np.sqrt(RESOLUTION)).any(axis=1)
         return made
 
-    def held_out(self, point: Point, folds: Sequence[NDArray]) -> HeldOut:
+    def held_out(self, at: Linearised, folds: Sequence[NDArray]) -> HeldOut:
         """The errors of each fold, and the estimates, without that fold.
 
         One Gauss-Newton step from the optimum of all samples leads to that without a fold. The
@@ -261,34 +337,38 @@ class Estimation:
 
         Parameters
         ----------
-        point : Point
+        at : Linearised
             The optimum.
         folds : sequence of NDArray
             Parts (n, T) of the samples.
 
         """
-        residual, slope = self.linearised(point)
         k = self.unknowns.count
-        curvature, unit = (each[..., :k] for each in self._scaled_curvature(point))
-        scaled = curvature[:k]
+        curvature = self._curvature(at)
+        unit = _unit(curvature)[:k]
+        by_unit = self.unknowns.matrix * unit
         scale = 1 / np.sqrt(self.variance)
-        errors, variances = residual.copy(), np.zeros(residual.shape)
-        moves = []
-        for fold in folds:
-            jacobian = slope[fold][..., :k] * unit
-            weighted = (jacobian * scale[:, None]).reshape(residual[fold].size, k)
-            covariance = np.linalg.pinv(scaled - weighted.T @ weighted, hermitian=True)
-            step = covariance @ (weighted.T @ (residual[fold] * scale).ravel())
-            errors[fold] += jacobian @ step
-            moves.append(unit * step)
-            variances[fold] = np.sum((jacobian @ covariance) * jacobian, axis=-1)
-        return HeldOut(np.where(self.seen, errors, 0.0), variances, np.array(moves))
 
-    def _scaled_curvature(self, point: Point) -> tuple[NDArray, NDArray]:
-        """The curvature (P, P) in units (P,) in which its diagonal is 1, and these units."""
-        curvature = self.expanded(point.flat)[2]
-        unit = 1 / np.sqrt(np.maximum(np.diag(curvature), 1e-300))
-        return unit[:, None] * curvature * unit, unit
+        def parts() -> Iterator[tuple[int, slice, NDArray, NDArray]]:
+            for rows, error, slope in self._derivatives(at.point):
+                for i, fold in enumerate(folds):
+                    held = slope[fold[rows]][..., : len(by_unit)]
+                    yield i, rows, error[fold[rows]], held @ by_unit
+
+        left = np.tile(unit[:, None] * curvature.shared * unit, (len(folds), 1, 1))
+        gradients = np.zeros((len(folds), k))
+        for i, _, error, jacobian in parts():
+            weighted = (jacobian * scale[:, None]).reshape(-1, k)
+            left[i] -= weighted.T @ weighted
+            gradients[i] -= weighted.T @ (error * scale).ravel()
+        covariances = np.linalg.pinv(left, hermitian=True)
+        steps = np.einsum("fij,fj->fi", covariances, gradients)
+        errors, variances = at.residual.copy(), np.zeros(at.residual.shape)
+        for i, rows, error, jacobian in parts():
+            fold = folds[i][rows]
+            errors[rows][fold] = error - jacobian @ steps[i]
+            variances[rows][fold] = np.sum((jacobian @ covariances[i]) * jacobian, axis=-1)
+        return HeldOut(np.where(self.seen, errors, 0.0), variances, unit * steps)
 
     @cached_property
     def _bounds(self) -> tuple[NDArray, NDArray]:
@@ -306,6 +386,12 @@ class Estimation:
         mean = np.concatenate([unknowns.mean, np.tile(unknowns.start[unknowns.free], count)])
         own = np.tile(unknowns.start_deviation, count)
         return mean, 1 / np.concatenate([unknowns.deviation, own]) ** 2
+
+
+def _unit(curvature: Arrow) -> NDArray:
+    """Units (k + n m,) of the unknowns in which the diagonal of a curvature is 1."""
+    made: NDArray = 1 / np.sqrt(np.maximum(curvature.diagonal, 1e-300))
+    return made
 
 
 def root(covariance: NDArray) -> NDArray:

@@ -13,13 +13,19 @@ from scipy.linalg import block_diag
 
 from retwin.checks import require, whole
 from retwin.data.trajectories import Trajectories
-from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
 from retwin.update.dynamics.corrected import CorrectedEquations, Domain, correctable
-from retwin.update.dynamics.estimation import Estimation, HeldOut, Point, correlation_time, root
+from retwin.update.dynamics.estimation import (
+    Estimation,
+    HeldOut,
+    Linearised,
+    Point,
+    correlation_time,
+    root,
+)
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.noise import fit_noise, folds, widening
 from retwin.update.dynamics.twin import DynamicsTwin
@@ -188,11 +194,11 @@ def fit_dynamics(
         got=int(observed.mask.sum()),
         remedy="give more or longer trajectories, or free fewer parameters",
     )
-    alone, point = _without_discrepancy(base, observed, unknowns)
+    alone, fitted = _without_discrepancy(base, observed, unknowns)
     report(0.05)
     tried = []
-    for equations in _candidates(alone, point, settings):
-        estimation, found = _followed(equations, alone, point)
+    for equations in _candidates(alone, fitted.point, settings):
+        estimation, found = _followed(equations, alone, fitted)
         held_out = estimation.held_out(found, folds(estimation.seen, settings.folds))
         tried.append((equations, estimation, found, held_out))
         report(1 - 0.95 * 0.6 ** len(tried))
@@ -202,25 +208,25 @@ def fit_dynamics(
     made = _assembled(equations, estimation, found, held_out)
     report(1.0)
     unknown = estimation.undetermined(found)[: unknowns.count]
-    notes = _notes(estimation, found, unknown)
+    notes = _notes(estimation, found.point, unknown)
     if notes:
         warnings.warn(notes, stacklevel=2)
     k = unknowns.count
-    variance = np.diag(estimation.covariance(found))[: len(found.shared)]
+    variance = np.diag(estimation.covariance(found))[: len(found.point.shared)]
     deviation = np.sqrt(np.maximum(variance, held_out.variance))
     deviation[: len(unknown)][unknown] = np.inf
     return FittedDynamics(
         twin=made,
-        parameters=dict(zip(unknowns.names, found.shared[:k].tolist(), strict=True)),
+        parameters=dict(zip(unknowns.names, found.point.shared[:k].tolist(), strict=True)),
         errors=dict(zip(unknowns.names, deviation[:k].tolist(), strict=True)),
-        terms=_sizes(equations, estimation, found),
+        terms=_sizes(equations, estimation, found.point),
         figures={
-            "rms_before": alone.rms(alone.residual(point)),
-            "rms_after": estimation.rms(estimation.residual(found)),
+            "rms_before": alone.rms(fitted.residual),
+            "rms_after": estimation.rms(found.residual),
             "held_out": errors[chosen],
             "widening": made.widening,
             "library": float(chosen),
-            "strength": float(np.mean(estimation.variance / alone.power(alone.residual(point)))),
+            "strength": float(np.mean(estimation.variance / alone.power(fitted.residual))),
         },
         seconds=time.perf_counter() - began,
         reason=notes,
@@ -229,23 +235,22 @@ def fit_dynamics(
 
 def _without_discrepancy(
     base: StateTwin, observed: Trajectories, unknowns: Unknowns
-) -> tuple[Estimation, Point]:
+) -> tuple[Estimation, Linearised]:
     """The fit of the twin itself."""
     starts = np.tile(unknowns.start[unknowns.free], (len(observed), 1))
-    point = Point(unknowns.mean, starts)
     estimation = Estimation(base, observed, unknowns, observed.mask, np.ones(len(base.outputs)))
+    found = estimation.linearised(Point(unknowns.mean, starts))
+    require(
+        found.finite,
+        "twin",
+        expected="a simulation of the commands that is finite",
+        got="one that is not, at the present parameters",
+        remedy="identify the twin first, or choose other starts of its parameters",
+    )
     for _ in range(ERROR_STEPS):
-        residual = estimation.residual(point)
-        if not np.isfinite(residual).all():
-            raise InputError(
-                "twin",
-                expected="a simulation of the commands that is finite",
-                got="one that is not, at the present parameters",
-                remedy="identify the twin first, or choose other starts of its parameters",
-            )
-        estimation = replace(estimation, variance=estimation.power(residual))
-        point = estimation.minimised(point)
-    return estimation, point
+        estimation = replace(estimation, variance=estimation.power(found.residual))
+        found = estimation.minimised(found)
+    return estimation, found
 
 
 def _with_starts(base: StateTwin, unknowns: Unknowns, point: Point) -> StateTwin:
@@ -271,8 +276,8 @@ def _candidates(
 
 
 def _followed(
-    equations: CorrectedEquations, alone: Estimation, point: Point
-) -> tuple[Estimation, Point]:
+    equations: CorrectedEquations, alone: Estimation, fitted: Linearised
+) -> tuple[Estimation, Linearised]:
     """The fit whose assumed errors are those that are observed.
 
     The prior of the discrepancy begins strong, as if errors were large, and becomes weaker step by
@@ -280,14 +285,14 @@ def _followed(
     """
     unknowns = alone.unknowns.with_coefficients(equations.names)
     estimation = replace(alone, twin=equations.corrected, unknowns=unknowns)
-    now = Point(np.pad(point.shared, (0, len(equations.names))), point.starts)
-    power = alone.power(alone.residual(point))
+    shared = np.pad(fitted.point.shared, (0, len(equations.names)))
+    now = estimation.linearised(Point(shared, fitted.point.starts))
+    power = alone.power(fitted.residual)
     strength = STRONGEST
     for _ in range(MAX_STRENGTHS):
         own = replace(estimation, variance=strength * power)
         now = own.minimised(now)
-        residual = own.residual(now)
-        observed = correlation_time(residual) * float(np.mean(own.power(residual) / power))
+        observed = correlation_time(now.residual) * float(np.mean(own.power(now.residual) / power))
         if observed >= CONSISTENT * strength:
             break
         strength = float(np.clip(observed, strength / STEP[1], strength / STEP[0]))
@@ -297,18 +302,18 @@ def _followed(
 def _assembled(
     equations: CorrectedEquations,
     estimation: Estimation,
-    found: Point,
+    found: Linearised,
     held_out: HeldOut,
 ) -> DynamicsTwin:
     """The twin as a distribution, see `Estimation.held_out`."""
     unknowns = estimation.unknowns
     start, deviation = unknowns.start.copy(), np.zeros(len(unknowns.start))
-    start[unknowns.free] = found.starts.mean(axis=0)
-    deviation[unknowns.free] = found.starts.std(axis=0)
-    values = unknowns.offset + unknowns.matrix @ found.shared
+    start[unknowns.free] = found.point.starts.mean(axis=0)
+    deviation[unknowns.free] = found.point.starts.std(axis=0)
+    values = unknowns.offset + unknowns.matrix @ found.point.shared
     by_free = np.eye(len(start))[:, unknowns.free]
     factor = block_diag(unknowns.matrix, by_free) @ root(estimation.covariance(found))
-    states = estimation.simulated(found)[1]
+    states = estimation.simulated(found.point)[1]
     names = [each.name for each in equations.twin.states]
     indices = [names.index(name) for name in equations.states]
     made = DynamicsTwin(
@@ -317,7 +322,7 @@ def _assembled(
         factor,
         deviation,
         np.zeros(len(start)),
-        estimation.power(estimation.residual(found)),
+        estimation.power(found.residual),
         1.0,
         Domain.visited(states, estimation.commands, equations.domain.speed),
         equations.states,

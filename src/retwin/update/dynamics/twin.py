@@ -187,10 +187,11 @@ class DynamicsTwin:
         commands = record.commands.astype(np.float64)
         variance = self.noise_variance(commands).mean(axis=(0, 1))
         estimation = Estimation(self.equations, record, unknowns, record.mask, variance)
-        found = estimation.minimised(Point(np.zeros(0), unknowns.start[None, unknowns.free]))
+        start = Point(np.zeros(0), unknowns.start[None, unknowns.free])
+        found = estimation.minimised(estimation.linearised(start))
         states = len(self.process)
         values, factor = self.values.copy(), self.factor.copy()
-        values[-states:][unknowns.free] = found.starts[0]
+        values[-states:][unknowns.free] = found.point.starts[0]
         factor[-states:] = 0.0
         own = np.zeros((len(values), len(unknowns.free)))
         own[len(values) - states + unknowns.free] = root(estimation.covariance(found))

@@ -1,0 +1,131 @@
+"""`Arrow`: the curvature of an objective whose unknowns are shared, or belong to one trajectory.
+
+Its matrix has the shape of an arrow: a block of the shared unknowns, a block per trajectory, and
+what couples each of these with the first. The trajectories are eliminated one by one by the Schur
+complement, so that time and memory are proportional to their number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Arrow", "trust_region_step"]
+
+SINGULAR = 1e-12
+"""Share of the largest curvature that is added to all, since some directions may have none."""
+MAX_DAMPINGS = 50
+"""Newton steps at most to the damping of a step; a few suffice."""
+RIM = 1.1
+"""Longest step over the radius of its trust region."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arrow:
+    """A symmetric matrix of k shared unknowns and then m of each of n trajectories.
+
+    Attributes
+    ----------
+    shared : NDArray
+        (k, k), of the shared unknowns.
+    cross : NDArray
+        (n, m, k), of those of a trajectory and the shared ones.
+    own : NDArray
+        (n, m, m), of those of a trajectory.
+
+    """
+
+    shared: NDArray
+    cross: NDArray
+    own: NDArray
+
+    @property
+    def diagonal(self) -> NDArray:
+        """(k + n m,)."""
+        own = np.diagonal(self.own, axis1=1, axis2=2)
+        return np.concatenate([np.diag(self.shared), own.ravel()])
+
+    def plus(self, diagonal: NDArray) -> Arrow:
+        """The sum with a diagonal matrix (k + n m,)."""
+        shared, own = self._parted(diagonal)
+        return Arrow(
+            self.shared + np.diag(shared),
+            self.cross,
+            self.own + own[..., None] * np.eye(own.shape[1]),
+        )
+
+    def scaled(self, unit: NDArray) -> Arrow:
+        """The matrix for unknowns in such units (k + n m,)."""
+        shared, own = self._parted(unit)
+        return Arrow(
+            shared[:, None] * self.shared * shared,
+            own[..., None] * self.cross * shared,
+            own[..., None] * self.own * own[:, None],
+        )
+
+    def reduced(self) -> tuple[NDArray, NDArray, NDArray]:
+        """The Schur complement and what leads back from it.
+
+        Returns
+        -------
+        complement : NDArray
+            (k, k), of the shared unknowns where those of the trajectories follow.
+        follow : NDArray
+            (n, m, k), by how much they follow, with the sign reversed.
+        inverse : NDArray
+            (n, m, m), of `own`.
+
+        """
+        inverse = np.linalg.inv(self.own)
+        follow = inverse @ self.cross
+        return self.shared - np.tensordot(self.cross, follow, ([0, 1], [0, 1])), follow, inverse
+
+    def solve(self, right: NDArray) -> NDArray:
+        """The solution (k + n m,) of linear equations."""
+        complement, follow, inverse = self.reduced()
+        shared, own = self._parted(right)
+        x = np.linalg.solve(complement, shared - np.einsum("nmk,nm->k", follow, own))
+        y = np.einsum("nij,nj->ni", inverse, own) - follow @ x
+        return np.concatenate([x, y.ravel()])
+
+    def times(self, vector: NDArray) -> NDArray:
+        """The product (k + n m,) with a vector."""
+        shared, own = self._parted(vector)
+        x = self.shared @ shared + np.einsum("nmk,nm->k", self.cross, own)
+        y = self.cross @ shared + np.einsum("nij,nj->ni", self.own, own)
+        return np.concatenate([x, y.ravel()])
+
+    def _parted(self, vector: NDArray) -> tuple[NDArray, NDArray]:
+        """The shared part (k,) and that of the trajectories (n, m)."""
+        k = len(self.shared)
+        return vector[:k], vector[k:].reshape(self.own.shape[:2])
+
+
+def trust_region_step(curvature: Arrow, gradient: NDArray, radius: float) -> NDArray:
+    """The step that minimises a quadratic function within a trust region of all unknowns.
+
+    Newton's method on 1 / length finds the damping with which the step ends at the region's rim;
+    it begins below, from where it cannot overshoot (Nocedal and Wright, Numerical Optimization,
+    2006, algorithm 4.3).
+
+    Parameters
+    ----------
+    curvature : Arrow
+        Positive semidefinite.
+    gradient : NDArray
+        (k + n m,).
+    radius : float
+        Length of the longest step, up to 10 %.
+
+    """
+    damping = SINGULAR * float(curvature.diagonal.max())
+    for _ in range(MAX_DAMPINGS):
+        damped = curvature.plus(np.full(len(gradient), damping))
+        step = -damped.solve(gradient)
+        length = float(np.linalg.norm(step))
+        if length <= RIM * radius:
+            break
+        damping += length**2 / float(step @ damped.solve(step)) * (length / radius - 1)
+    return step
