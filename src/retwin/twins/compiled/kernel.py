@@ -9,17 +9,22 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 
+import torch
 from numpy.typing import NDArray
 
 __all__ = ["call", "compiled", "compilers"]
 
-FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
+FLAGS = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """Without contraction and reassociation, results are those of torch up to single roundings."""
+NATIVE = "-march=native"
+"""For all instructions of this processor, which not every compiler can find out."""
 COMPILED = 64
 """Number of models whose compiled form is kept in this process."""
 TIMEOUT = 120
@@ -52,13 +57,13 @@ def compiled(source: str) -> ctypes.CDLL | None:
 
     """
     reasons = []
-    for command in compilers():
+    for command, native in product(compilers(), ([NATIVE], [])):
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             file, library = Path(folder, "model.c"), Path(folder, "model.so")
             file.write_text(source, "utf-8")
             try:
                 subprocess.run(
-                    [*command, *FLAGS, str(file), "-o", str(library), "-lm"],
+                    [*command, *FLAGS, *native, str(file), "-o", str(library), "-lm"],
                     check=True,
                     capture_output=True,
                     timeout=TIMEOUT,
@@ -80,16 +85,45 @@ def compiled(source: str) -> ctypes.CDLL | None:
 
 
 def call(
-    library: ctypes.CDLL, name: str, sizes: tuple[int, ...], period: float, *arrays: NDArray | None
+    library: ctypes.CDLL,
+    name: str,
+    sizes: tuple[int, ...],
+    period: float,
+    common: Sequence[NDArray],
+    rows: Sequence[NDArray | None],
 ) -> None:
-    """Call a function of a model with its sizes, the sample period in s, and double arrays.
+    """Call a function of a model, for all trajectories.
 
-    The arrays must be contiguous and of the shapes that `simulate.c` gives; None is NULL.
+    They are divided between the threads of torch, which changes no result.
+
+    Parameters
+    ----------
+    library : CDLL
+        See `compiled`.
+    name : str
+        The function.
+    sizes : tuple of int
+        The number n of trajectories, and the other sizes.
+    period : float
+        The sample period in s.
+    common : sequence of NDArray
+        Double arrays of all trajectories, of the shapes that `simulate.c` gives, contiguous.
+    rows : sequence of NDArray or None
+        Those with a first axis of n; None is NULL.
+
     """
     function = getattr(library, name)
     function.restype = None
-    function(
-        *map(ctypes.c_longlong, sizes),
-        ctypes.c_double(period),
-        *(ctypes.c_void_p(None if each is None else each.ctypes.data) for each in arrays),
-    )
+    count = max(1, min(sizes[0], torch.get_num_threads()))
+    ends = [sizes[0] * i // count for i in range(count + 1)]
+
+    def part(first: int, last: int) -> None:
+        own = (None if each is None else each[first:last] for each in rows)
+        function(
+            *map(ctypes.c_longlong, (last - first, *sizes[1:])),
+            ctypes.c_double(period),
+            *(ctypes.c_void_p(None if a is None else a.ctypes.data) for a in (*common, *own)),
+        )
+
+    with ThreadPoolExecutor(count) as pool:
+        list(pool.map(part, ends[:-1], ends[1:]))

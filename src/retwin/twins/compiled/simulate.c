@@ -118,8 +118,8 @@ EXPORT void sensitivities(long long n, long long samples, long long substeps, do
  * mean[n][samples][NY] and covariance[n][samples][NY][NY] of y given all earlier samples, and to
  * x[n][samples][NX] given these and the present one. */
 EXPORT void filter(long long n, long long samples, long long substeps, double period,
-                   const double *c, const double *p, const double *start, const double *v,
-                   const double *q, const double *r, const double *y, const double *seen,
+                   const double *v, const double *q, const double *r, const double *c,
+                   const double *p, const double *start, const double *y, const double *seen,
                    double *mean, double *covariance, double *x)
 {
     double z[NX * (1 + NX)], u[NU + 1], hx[NY * NX], hp[NY * NP + 1], P[NX][NX], g[NX], FP[NX][NX];

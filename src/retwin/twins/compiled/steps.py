@@ -57,7 +57,7 @@ class Steps:
         made = tuple(np.empty((*commands.shape[:2], width)) for width in self._widths)
         sizes = (*commands.shape[:2], self.substeps)
         given = self._arrays(commands, theta)
-        call(library, "simulate", sizes, self.period, *given, kicks, *made)
+        call(library, "simulate", sizes, self.period, (), (*given, kicks, *made))
         return made[0], made[1]
 
     def filter(
@@ -93,9 +93,12 @@ class Steps:
         made = tuple(
             np.empty((*shape, *each)) for each in ((outputs,), (outputs, outputs), (states,))
         )
-        given = (*self._arrays(commands, theta), *variances, *measured)
-        given = tuple(np.ascontiguousarray(each, np.float64) for each in given)
-        call(library, "filter", (*shape, self.substeps), self.period, *given, *made)
+        common, seen = (
+            [np.ascontiguousarray(each, np.float64) for each in own]
+            for own in (variances, measured)
+        )
+        rows = (*self._arrays(commands, theta), *seen, *made)
+        call(library, "filter", (*shape, self.substeps), self.period, common, rows)
         return made[0], made[1], made[2]
 
     def _filtered(
@@ -158,7 +161,7 @@ class Steps:
             made = (outputs, np.empty((*outputs.shape, count)))
             sizes = (*commands.shape[:2], self.substeps)
             given = self._arrays(commands, theta)
-            call(library, "sensitivities", sizes, self.period, *given, *made)
+            call(library, "sensitivities", sizes, self.period, (), (*given, *made))
             return made
         at, inputs = _double(theta), _double(commands)
         columns = [

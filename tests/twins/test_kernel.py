@@ -1,0 +1,64 @@
+"""The compiled form of a model: its compiler and its threads."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+import retwin as rt
+from retwin.twins import State, StateTwin
+from retwin.twins.compiled import kernel
+
+LAG = StateTwin(
+    (State("level", "V"),),
+    lambda x, u: x.level,
+    rt.Channels(("pump",), ("V",)),
+    rt.Channels(("level",), ("V",)),
+    10.0,
+    derivative=lambda x, u: (u.pump - torch.sin(x.level),),
+)
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("threads")
+def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, used = np.random.default_rng(0), []
+    commands, kicks = rng.normal(size=(5, 40, 1)), 0.1 * rng.normal(size=(5, 40, 1))
+    measured = rng.normal(size=(5, 40, 1)), rng.random((5, 40, 1)) < 0.8
+    theta, variances = rng.normal(size=(5, 1)), (np.ones(1), np.ones(1), np.ones(1))
+    pool = kernel.ThreadPoolExecutor
+    monkeypatch.setattr(kernel, "ThreadPoolExecutor", lambda n: (used.append(n), pool(n))[1])
+
+    def made(count: int) -> list[bytes]:
+        torch.set_num_threads(count)
+        steps = LAG.steps()
+        arrays = (
+            *steps.run(commands, theta, kicks),
+            *steps.sensitivities(commands, theta),
+            *steps.filter(commands, theta, measured, variances),
+        )
+        return [each.tobytes() for each in arrays]
+
+    assert made(1) == made(2) == made(8)
+    assert used == [1] * 3 + [2] * 3 + [5] * 3
+
+
+def test_a_compiler_that_does_not_know_the_processor_is_used(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(kernel, "NATIVE", "-march=unheard-of")
+    kernel.compiled.cache_clear()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert kernel.compiled(LAG.model.source) is not None
+    kernel.compiled.cache_clear()
