@@ -12,7 +12,8 @@ import retwin as rt
 from retwin.twins import Parameter, State, StateTwin
 from retwin.update.dynamics import estimation as module
 from retwin.update.dynamics.arrow import Arrow, trust_region_step
-from retwin.update.dynamics.estimation import Estimation, Linearised, Point
+from retwin.update.dynamics.estimation import Estimation
+from retwin.update.dynamics.linearised import Linearised, Point
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 
 POSITION = State("position", "m", 0.1, -1.0, 1.0)

@@ -18,15 +18,9 @@ from retwin.twins.parametric import ParametricTwin
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
 from retwin.update.dynamics.corrected import CorrectedEquations, Domain, correctable
-from retwin.update.dynamics.estimation import (
-    Estimation,
-    HeldOut,
-    Linearised,
-    Point,
-    correlation_time,
-    root,
-)
+from retwin.update.dynamics.estimation import Estimation, correlation_time, root
 from retwin.update.dynamics.library import Library
+from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
 from retwin.update.dynamics.noise import fit_noise, folds, widening
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of

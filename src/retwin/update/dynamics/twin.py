@@ -23,7 +23,8 @@ from retwin.twins.state_twin import SAMPLES_PER_CHUNK, StateTwin
 from retwin.twins.twin import Chunk, check_channels, checked_commands, simulate_in_chunks
 from retwin.twins.wrapper import chunk_generator
 from retwin.update.dynamics.corrected import Domain, correctable
-from retwin.update.dynamics.estimation import Estimation, Point, root
+from retwin.update.dynamics.estimation import Estimation, root
+from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.prediction import Prediction
 from retwin.update.dynamics.unknowns import unknowns_of
 from retwin.update.training_range import OutsideTrainingWarning
