@@ -18,6 +18,7 @@ from retwin.progress import Progress
 from retwin.twins.faults import Fault, Stuck
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.samplers import CommandSampler
+from retwin.twins.system_faults import TimedFault
 from retwin.twins.twin import Twin
 from retwin.update.corrections import Correction
 from retwin.update.dynamics import Dynamics
@@ -147,7 +148,7 @@ class Case:
             remedy="give both the same rate",
         )
         for fault in self.faults.values():
-            if isinstance(fault, Stuck):
+            if isinstance(fault, Stuck | TimedFault):
                 fault.onset_range(self.sampler.steps, self.rate)
 
     @property

@@ -24,14 +24,14 @@ from retwin.cases.named_twin import imported, parametric_twin, read_twin
 from retwin.checks import one_of, require
 from retwin.data.io import load
 from retwin.data.segments import Segments
-from retwin.data.trajectories import HEALTHY, Channels, Trajectories
+from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 from retwin.nets.networks import Network
 from retwin.nets.training import Training
 from retwin.serialisation.configs import at, checked, fits, from_config, from_settings, key
 from retwin.serialisation.files import check_regular
 from retwin.times import sample_rate
-from retwin.twins.faults import ActuatorBias, Fault, Stuck
+from retwin.twins.faults import Fault
 from retwin.twins.fmu import FMUTwin
 from retwin.twins.limits import Limits
 from retwin.twins.mujoco import MuJoCoTwin
@@ -45,6 +45,7 @@ from retwin.twins.samplers import (
     RecordedSampler,
 )
 from retwin.twins.state_twin import StateTwin
+from retwin.twins.system_faults import FAULTS, check_faults
 from retwin.twins.twin import Twin
 from retwin.update.corrections import Correction, DelayOffset
 from retwin.update.dynamics import Dynamics
@@ -55,7 +56,6 @@ __all__ = ["check_density", "read_case"]
 MAX_DEPTH = 100
 """The largest number of dots in a key; reading takes memory by the square of it."""
 SAMPLERS: tuple[type, ...] = (RampSampler, HoldSampler, MultisineSampler, RecordedSampler)
-FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
 Records = Callable[[Path], tuple[Trajectories, Trajectories]]
 """A function that splits a file into calibration records and test records."""
 
@@ -140,7 +140,7 @@ def read_case(path: str | Path) -> Case:
         remedy="leave it out, or choose another correction",
     )
     sensor_rate = twin.rate if keys.sensor_rate is None else keys.sensor_rate
-    faults = _faults(keys.faults, twin.inputs, folder, key(place, "faults"))
+    faults = _faults(keys.faults, twin, folder, key(place, "faults"))
     network = _chosen(network, catalog.NETWORKS, key(place, "network"))
     sensor_rate = sample_rate(key(place, "sensor_rate"), sensor_rate)
     with at(place):
@@ -243,20 +243,26 @@ def _own(name: str, folder: Path, place: str, protocol: type) -> Any:
 
 
 def _faults(
-    tables: Mapping[str, Any], inputs: Channels, folder: Path, place: str
+    tables: Mapping[str, Any], twin: Twin, folder: Path, place: str
 ) -> dict[str, Fault | None]:
-    """Class name to fault, healthy first; an actuator may be named as its channel is."""
+    """Class name to fault, healthy first; actuators and outputs may be named as channels are.
+
+    Raises InputError for a fault that the twin cannot have.
+    """
     made: dict[str, Fault | None] = {HEALTHY: None}
     for name, value in tables.items():
         inside = key(place, name)
         if isinstance(value, str):
             made[name] = _own(value, folder, inside, Fault)
             continue
-        actuator = value.get("actuator")
-        if isinstance(actuator, str):
-            channel = one_of(key(inside, "actuator"), actuator, inputs.names)
-            value = {**value, "actuator": inputs.names.index(channel)}
-        made[name] = from_config(value, FAULTS, place=inside)
+        for part, channels in (("actuator", twin.inputs), ("output", twin.outputs)):
+            if isinstance(value.get(part), str):
+                channel = one_of(key(inside, part), value[part], channels.names)
+                value = {**value, part: channels.names.index(channel)}
+        made[name] = fault = from_config(value, FAULTS, place=inside)
+        with at(inside):
+            shiftable = getattr(twin, "shiftable", ())
+            check_faults([fault], len(twin.inputs), len(twin.outputs), shiftable)
     return made
 
 

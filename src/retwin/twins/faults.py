@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ __all__ = [
     "Fault",
     "Stuck",
     "draw_faults",
+    "ends_of",
     "faulty_commands",
     "frozen_from",
     "frozen_response",
@@ -101,6 +102,13 @@ class Fault(Protocol):
         ...
 
 
+def ends_of(value: Any) -> tuple[float, float]:
+    """Ends of what is a number or a pair (low, high) of them; NaN for anything else."""
+    ends = value if isinstance(value, Sequence) else (value,) * 2
+    numbers = len(ends) == 2 and all(isinstance(end, Real) for end in ends)
+    return (float(ends[0]), float(ends[1])) if numbers else (math.nan, math.nan)
+
+
 @dataclass(frozen=True)
 class Stuck:
     """The actuator's response is held from an onset on.
@@ -128,7 +136,7 @@ class Stuck:
     label: str = "Stuck"
 
     def __post_init__(self) -> None:
-        low, high = self._range
+        low, high = ends_of(self.onset)
         require(
             0 <= low <= high < math.inf,
             "onset",
@@ -140,24 +148,17 @@ class Stuck:
         onset = (low, high) if isinstance(self.onset, Sequence) else low
         object.__setattr__(self, "onset", onset)
 
-    @property
-    def _range(self) -> tuple[float, float]:
-        """Earliest and latest onset in s; NaN for anything else."""
-        ends = self.onset if isinstance(self.onset, Sequence) else (self.onset,) * 2
-        numbers = len(ends) == 2 and all(isinstance(end, Real) for end in ends)
-        return (float(ends[0]), float(ends[1])) if numbers else (math.nan, math.nan)
-
     def onset_range(self, steps: int, rate: float) -> tuple[int, int]:
         """First and last sample at which it can begin in a trajectory of so many samples.
 
         Raises InputError if the earliest onset is after the end.
         """
-        low, high = (to_samples(each, rate) for each in self._range)
+        low, high = (to_samples(each, rate) for each in ends_of(self.onset))
         require(
             low < steps,
             "onset",
             expected=f"a time in s within the trajectory, which lasts {steps / rate:g} s",
-            got=f"{self._range[0]:g} s",
+            got=f"{ends_of(self.onset)[0]:g} s",
             remedy="give an earlier one, in seconds and not in samples",
         )
         return low, min(high, steps - 1)

@@ -23,6 +23,7 @@ from retwin.twins.parameter_values import values_per_simulation
 from retwin.twins.parametric import Parameter, ParametricTwin
 from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.twins.state import State
+from retwin.twins.system_faults import parameter_changes
 from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
 
 if TYPE_CHECKING:  # describing a twin needs no torch, which takes seconds to import
@@ -189,6 +190,11 @@ class StateTwin:
         )
 
     @property
+    def shiftable(self) -> tuple[str, ...]:
+        """Names of the parameters, which can change during a simulation."""
+        return tuple(each.name for each in self.parameters)
+
+    @property
     def free(self) -> tuple[Parameter, ...]:
         """The parameters, and the unknown starts of the states."""
         return (*self.parameters, *(each for state in self.states for each in state.unknown()))
@@ -222,11 +228,11 @@ class StateTwin:
             nominal = self._outputs(chunk, chunk.commands, own)
             if chunk.index.start == 0 and 0 not in chunk.failed:
                 self.check_accuracy(chunk.commands[:1], own[:1], nominal[:1])
-            held = chunk.held_commands
-            faulty = (held != chunk.commands).any(axis=(1, 2))
+            held, changes = chunk.held_commands, self.changes(chunk.faults, commands.shape[1])
+            faulty = (held != chunk.commands).any(axis=(1, 2)) | changes.any(axis=(1, 2))
             observed = nominal.copy()
             if faulty.any():
-                observed[faulty] = self._outputs(chunk, held, own, faulty)
+                observed[faulty] = self._outputs(chunk, held, own, changes, faulty)
             return nominal, observed
 
         size = max(1, SAMPLES_PER_CHUNK // commands.shape[1])
@@ -311,6 +317,10 @@ class StateTwin:
         columns = zip(self.names, starts, strict=True)
         return np.stack([own.get(name, np.full(count, start)) for name, start in columns], 1)
 
+    def changes(self, faults: Sequence[Fault | None], steps: int) -> NDArray:
+        """What faults, one per simulation, add to the parameters at each sample: (n, T, q)."""
+        return parameter_changes(faults, self.shiftable, steps, self.rate)
+
     def steps(self, substeps: int | None = None) -> Steps:
         """The simulation from sample to sample, with other sub-steps if these are given.
 
@@ -321,16 +331,26 @@ class StateTwin:
         return Steps(self.model, 1 / self.rate, substeps or self.substeps, self.interpolation)
 
     def _outputs(
-        self, chunk: Chunk, commands: NDArray, values: NDArray, rows: NDArray | None = None
+        self,
+        chunk: Chunk,
+        commands: NDArray,
+        values: NDArray,
+        changes: NDArray | None = None,
+        rows: NDArray | None = None,
     ) -> NDArray:
         """Outputs of a chunk's rows; those that are not finite are entered as failed."""
         index = np.arange(len(commands)) if rows is None else np.flatnonzero(rows)
-        outputs, states = self.steps().run(commands[index], values[index])
+
+        def simulated(of: NDArray, substeps: int) -> tuple[NDArray, NDArray]:
+            own = None if changes is None else changes[of]
+            return self.steps(substeps).run(commands[of], values[of], changes=own)
+
+        outputs, states = simulated(index, self.substeps)
         finite = np.isfinite(states).all(axis=2) & np.isfinite(outputs).all(axis=2)
         for place in np.flatnonzero(~finite.all(axis=1)):
-            row, finer = [index[place]], FINER * self.substeps
+            finer = FINER * self.substeps
             remedy = "check the parameters and the start, or the range of the equations"
-            again = self.steps(finer).run(commands[row], values[row])
+            again = simulated(index[place : place + 1], finer)
             if self.derivative is not None and all(np.isfinite(each).all() for each in again):
                 remedy = f"it is finite with {finer}: give more substeps"
             time = np.argmin(finite[place]) / self.rate

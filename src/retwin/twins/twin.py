@@ -17,6 +17,7 @@ from retwin.progress import Progress
 from retwin.times import stride_of
 from retwin.twins.faults import Fault, draw_faults, faulty_commands, frozen_from, frozen_response
 from retwin.twins.limits import Limits
+from retwin.twins.system_faults import check_faults, measured_with
 
 __all__ = [
     "Chunk",
@@ -61,8 +62,9 @@ class Twin(Protocol):
     """A simulator from commands to outputs: plain, learned or corrected.
 
     A twin may also have `limits`, the `Limits` of its commands; `fingerprint`, a text that
-    identifies it where its fields, and the files that they name, do not; and `deterministic`, true
-    if its outputs depend on no seed, so that one simulation of a record is enough.
+    identifies it where its fields, and the files that they name, do not; `deterministic`, true
+    if its outputs depend on no seed, so that one simulation of a record is enough; and `shiftable`,
+    names of its parameters that can change during a simulation (`ParameterShift`).
     """
 
     @property
@@ -271,20 +273,6 @@ def nominal_outputs(
     return outputs
 
 
-def _check_actuators(faults: Sequence[Fault | None], inputs: Channels) -> None:
-    """A fault of one actuator must name one that exists."""
-    count = len(inputs)
-    wrong = (fault for fault in faults if not 0 <= getattr(fault, "actuator", 0) < count)
-    first = next(wrong, None)
-    require(
-        first is None,
-        "faults",
-        expected=f"an actuator from 0 to {count - 1}",
-        got=first,
-        remedy=f"count the command channels from 0: {', '.join(inputs.names)}",
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Chunk:
     """A few trajectories that are simulated together.
@@ -382,7 +370,8 @@ def simulate_in_chunks(
     if limits is not None:
         commands = limits.keep(commands, twin.inputs)
     seed = checked_seed(seed)
-    _check_actuators(faults or (), twin.inputs)
+    shiftable = getattr(twin, "shiftable", ())
+    check_faults(faults or (), len(twin.inputs), len(twin.outputs), shiftable)
     segments = Segments.from_commands(commands)
     faults = [None] * len(commands) if faults is None else faults
     drawn = draw_faults(faults, segments, seed, rate=twin.rate)
@@ -395,7 +384,8 @@ def simulate_in_chunks(
         own_commands, own_faults, own_segments = commands[index], drawn[index], segments[index]
         effective = faulty_commands(own_commands, own_faults, own_segments, rate=twin.rate)
         chunk = Chunk(index, own_commands, effective, own_faults, own_segments, twin.rate)
-        nominal[index], observed[index] = run(chunk)
+        nominal[index], healthy = run(chunk)
+        observed[index] = measured_with(healthy, own_faults, twin.rate)
         reasons = _not_finite(twin, nominal[index], observed[index]) | chunk.failed
         failed |= {begin + i: reason for i, reason in sorted(reasons.items())}
         for i, samples in chunk.known.items():

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
+from retwin.twins.system_faults import without_sensor_faults
 from retwin.twins.twin import Chunk, SimulationError, Twin
 
 __all__ = ["TwinWrapper", "chunk_generator", "simulate_chunk"]
@@ -55,6 +56,11 @@ class TwinWrapper:
         """Range of the commands; None where the wrapped twin declares none."""
         return getattr(self.twin, "limits", None)
 
+    @property
+    def shiftable(self) -> tuple[str, ...]:
+        """Parameters that can change during a simulation."""
+        return getattr(self.twin, "shiftable", ())
+
 
 def simulate_chunk(
     twin: Twin,
@@ -96,6 +102,7 @@ def simulate_chunk(
     """
     commands = chunk.commands[rows] if commands is None else commands
     faults = [chunk.faults[i] for i in rows] if faults is None else faults
+    faults = without_sensor_faults(faults)
     key = (INNER_TWIN, chunk.index.start + int(rows[0]))
     inner_seed = int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1)[0])
     options: dict[str, Any] = {"parameters": parameters} if parameters else {}

@@ -9,13 +9,12 @@ from typing import Any
 from retwin.checks import whole
 from retwin.serialisation.configs import from_config, to_config
 from retwin.times import sample_rate
-from retwin.twins.faults import ActuatorBias, Fault, Stuck
+from retwin.twins.faults import Fault
 from retwin.twins.samplers import RampSampler
+from retwin.twins.system_faults import FAULTS
 
 __all__ = ["SAMPLERS", "Facts"]
 
-FAULTS = (Stuck, ActuatorBias)
-"""Kinds of faults that a bundle can describe; no others are constructed from a file."""
 SAMPLERS = (RampSampler,)
 """Kinds of command samplers that a bundle can describe; others remain code of the case."""
 

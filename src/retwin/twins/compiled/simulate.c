@@ -63,23 +63,35 @@ static void advance(slope_of f, int size, const double *c, const double *p, doub
     }
 }
 
+/* The parameters p[NP] at the present sample, by what the next of `changes` adds; NULL for none. */
+static const double *at_present(const double *p, const double **changes, double *changed)
+{
+    if (!*changes)
+        return p;
+    for (int i = 0; i < NP; i++)
+        changed[i] = p[i] + *(*changes)++;
+    return changed;
+}
+
 /* c[n][samples][4][NU], p[n][NP], start[n][NX] to y[n][samples][NY], x[n][samples][NX]. What
- * `kicks`[n][samples][NX] adds to the states after each sample is process noise, NULL for none. */
+ * `kicks`[n][samples][NX] adds to the states after each sample is process noise, NULL for none;
+ * `changes`[n][samples][NP] are added to the parameters until the next sample, NULL for none. */
 EXPORT void simulate(long long n, long long samples, long long substeps, double period,
                      const double *c, const double *p, const double *start, const double *kicks,
-                     double *y, double *x)
+                     const double *changes, double *y, double *x)
 {
-    double z[NX], u[NU + 1];
+    double z[NX], u[NU + 1], changed[NP + 1];
     for (long long row = 0; row < n; row++, p += NP, start += NX) {
         for (int i = 0; i < NX; i++)
             z[i] = start[i];
         for (long long t = 0; t < samples; t++, c += 4 * NU, y += NY, x += NX) {
+            const double *now = at_present(p, &changes, changed);
             command(c, 0.0, u);
-            output(z, u, p, y);
+            output(z, u, now, y);
             for (int i = 0; i < NX; i++)
                 x[i] = z[i];
             if (t + 1 < samples)
-                advance(slope, NX, c, p, period, substeps, z);
+                advance(slope, NX, c, now, period, substeps, z);
             for (int i = 0; kicks && i < NX; i++)
                 z[i] += *kicks++;
         }
@@ -116,13 +128,14 @@ EXPORT void sensitivities(long long n, long long samples, long long substeps, do
 /* Extended Kalman filter. Variances at the start v[NX], of the process noise of a sample q[NX] and of
  * the measurement r[NY]; measured y[n][samples][NY], of which seen[n][samples][NY] is not 0; to
  * mean[n][samples][NY] and covariance[n][samples][NY][NY] of y given all earlier samples, and to
- * x[n][samples][NX] given these and the present one. */
+ * x[n][samples][NX] given these and the present one; `changes` as for `simulate`. */
 EXPORT void filter(long long n, long long samples, long long substeps, double period,
                    const double *v, const double *q, const double *r, const double *c,
                    const double *p, const double *start, const double *y, const double *seen,
-                   double *mean, double *covariance, double *x)
+                   const double *changes, double *mean, double *covariance, double *x)
 {
     double z[NX * (1 + NX)], u[NU + 1], hx[NY * NX], hp[NY * NP + 1], P[NX][NX], g[NX], FP[NX][NX];
+    double changed[NP + 1];
     double *F = z + NX;
     for (long long row = 0; row < n; row++, p += NP, start += NX) {
         for (int i = 0; i < NX; i++) {
@@ -131,8 +144,9 @@ EXPORT void filter(long long n, long long samples, long long substeps, double pe
                 P[i][j] = i == j ? v[i] : 0.0;
         }
         for (long long t = 0; t < samples; t++) {
+            const double *now = at_present(p, &changes, changed);
             command(c, 0.0, u);
-            output_jacobian(z, u, p, mean, hx, hp);
+            output_jacobian(z, u, now, mean, hx, hp);
             for (int a = 0; a < NY; a++)
                 for (int b = 0; b < NY; b++) {
                     double sum = a == b ? r[a] : 0.0;
@@ -166,7 +180,7 @@ EXPORT void filter(long long n, long long samples, long long substeps, double pe
                     F[i * NX + j] = i == j ? 1.0 : 0.0;
             }
             if (t + 1 < samples)
-                advance(slope_by_state, NX * (1 + NX), c, p, period, substeps, z);
+                advance(slope_by_state, NX * (1 + NX), c, now, period, substeps, z);
             for (int i = 0; i < NX; i++)
                 for (int j = 0; j < NX; j++) {
                     FP[i][j] = 0.0;

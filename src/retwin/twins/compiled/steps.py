@@ -43,21 +43,26 @@ class Steps:
     interpolation: str
 
     def run(
-        self, commands: NDArray, theta: NDArray, kicks: NDArray | None = None
+        self,
+        commands: NDArray,
+        theta: NDArray,
+        kicks: NDArray | None = None,
+        changes: NDArray | None = None,
     ) -> tuple[NDArray, NDArray]:
         """Outputs (n, T, d_y) and states (n, T, d_x) for commands (n, T, d_u).
 
         `kicks` (n, T, d_x), contiguous, are added to the states after each sample: process noise.
+        `changes` (n, T, q), contiguous, are added to the q parameters until the next sample.
         """
         library = compiled(self.model.source)
         if library is None:
             with torch.no_grad():
-                outputs, states = self.in_torch(_double(commands), _double(theta), kicks)
+                outputs, states = self.in_torch(_double(commands), _double(theta), kicks, changes)
             return outputs.numpy(), states.numpy()
         made = tuple(np.empty((*commands.shape[:2], width)) for width in self._widths)
         sizes = (*commands.shape[:2], self.substeps)
         given = self._arrays(commands, theta)
-        call(library, "simulate", sizes, self.period, (), (*given, kicks, *made))
+        call(library, "simulate", sizes, self.period, (), (*given, kicks, changes, *made))
         return made[0], made[1]
 
     def filter(
@@ -66,12 +71,13 @@ class Steps:
         theta: NDArray,
         measured: tuple[NDArray, NDArray],
         variances: tuple[NDArray, NDArray, NDArray],
+        changes: NDArray | None = None,
     ) -> tuple[NDArray, NDArray, NDArray]:
         """The extended Kalman filter.
 
         Parameters
         ----------
-        commands, theta : NDArray
+        commands, theta, changes : NDArray
             See `run`.
         measured : tuple of NDArray
             Outputs (n, T, d_y), and whether each was measured.
@@ -89,7 +95,7 @@ class Steps:
         library = compiled(self.model.source)
         shape, (outputs, states) = commands.shape[:2], self._widths
         if library is None:
-            return self._filtered(commands, theta, measured, variances)
+            return self._filtered(commands, theta, measured, variances, changes)
         made = tuple(
             np.empty((*shape, *each)) for each in ((outputs,), (outputs, outputs), (states,))
         )
@@ -97,7 +103,7 @@ class Steps:
             [np.ascontiguousarray(each, np.float64) for each in own]
             for own in (variances, measured)
         )
-        rows = (*self._arrays(commands, theta), *seen, *made)
+        rows = (*self._arrays(commands, theta), *seen, changes, *made)
         call(library, "filter", (*shape, self.substeps), self.period, common, rows)
         return made[0], made[1], made[2]
 
@@ -107,11 +113,14 @@ class Steps:
         theta: NDArray,
         measured: tuple[NDArray, NDArray],
         variances: tuple[NDArray, NDArray, NDArray],
+        changes: NDArray | None,
     ) -> tuple[NDArray, NDArray, NDArray]:
         """See `filter`, for one trajectory after the other."""
+        if changes is None:
+            changes = np.zeros((*commands.shape[:2], len(self.model.variables["p"])))
         rows = [
             self._filtered_row(*(_double(each) for each in row), *map(_double, variances))
-            for row in zip(commands, theta, *measured, strict=True)
+            for row in zip(commands, theta, *measured, changes, strict=True)
         ]
         mean, covariance, states = (np.stack(each) for each in zip(*rows, strict=True))
         return mean, covariance, states
@@ -122,22 +131,24 @@ class Steps:
         theta: Tensor,
         outputs: Tensor,
         seen: Tensor,
+        changes: Tensor,
         start: Tensor,
         process: Tensor,
         noise: Tensor,
     ) -> list[NDArray]:
         """See `filter`, for one trajectory."""
         c = cubic_coefficients(commands[None], self.interpolation)
-        p, first = self._parted(theta[:, None].unbind(0))
+        constant, first = self._parted(theta[:, None].unbind(0))
         x, spread = torch.cat(list(first)), torch.diag(start)
         made = []
         for t, (y, known) in enumerate(zip(outputs, seen > 0, strict=True)):
+            now = [own + change for own, change in zip(constant, changes[t], strict=True)]
 
-            def output(z: Tensor, t: int = t) -> Tensor:
+            def output(z: Tensor, t: int = t, p: Sequence[Tensor] = now) -> Tensor:
                 u = c[:, t, 0].unbind(1)
                 return torch.cat(self.model.evaluate("outputs", z[:, None].unbind(0), u, p))
 
-            def after(z: Tensor, t: int = t) -> Tensor:
+            def after(z: Tensor, t: int = t, p: Sequence[Tensor] = now) -> Tensor:
                 return torch.cat(self._advanced(c[:, t], list(z[:, None].unbind(0)), p))
 
             slope = torch.autograd.functional.jacobian(output, x)
@@ -173,13 +184,21 @@ class Steps:
         return columns[0][0].numpy(), torch.stack([each for _, each in columns], -1).numpy()
 
     def in_torch(
-        self, commands: Tensor, theta: Tensor, kicks: NDArray | None = None
+        self,
+        commands: Tensor,
+        theta: Tensor,
+        kicks: NDArray | None = None,
+        changes: NDArray | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The same as `run` for double tensors, with gradient by both."""
         c = cubic_coefficients(commands, self.interpolation)
         p, start = self._parted(theta.unbind(1))
+        constant = p
         x, outputs, states = list(start), [], []
         for t in range(c.shape[1]):
+            if changes is not None:
+                now = _double(changes[:, t].T)
+                p = [own + change for own, change in zip(constant, now, strict=True)]
             outputs.append(
                 torch.stack(self.model.evaluate("outputs", x, c[:, t, 0].unbind(1), p), 1)
             )

@@ -108,6 +108,11 @@ class DynamicsTwin:
         """Range of the commands."""
         return self.equations.limits
 
+    @property
+    def shiftable(self) -> tuple[str, ...]:
+        """Parameters that can change during a simulation."""
+        return self.equations.shiftable
+
     def simulate(
         self,
         commands: NDArray,
@@ -135,7 +140,8 @@ class DynamicsTwin:
             np.maximum(beyond, self.domain.excess(states, clean), out=beyond)
             if chunk.index.start == 0 and np.isfinite(states[0]).all():
                 self.equations.check_accuracy(clean[:1], self.values[None], nominal[:1])
-            return nominal, self._drawn(held, chunk_generator(seed, chunk, 2))
+            changes = self.equations.changes(chunk.faults, clean.shape[1])
+            return nominal, self._drawn(held, changes, chunk_generator(seed, chunk, 2))
 
         checked = checked_commands(commands, self.inputs)
         size = max(1, SAMPLES_PER_CHUNK // checked.shape[1])
@@ -291,28 +297,35 @@ class DynamicsTwin:
         outputs, states = self.equations.steps().run(distinct, theta)
         return outputs[own.ravel()], states[own.ravel()]
 
-    def _drawn(self, commands: NDArray, rng: np.random.Generator) -> NDArray:
+    def _drawn(self, commands: NDArray, changes: NDArray, rng: np.random.Generator) -> NDArray:
         """Outputs (n, T, d_y) with drawn parameters, starts and noise.
 
         The outputs are linear in the parameters about the most probable ones: so the distribution
         is that of the approximation by which the posterior was found, and no draw diverges (Immer,
         Korzepa and Bauer, "Improving predictions of Bayesian neural nets via local linearization",
-        2021).
+        2021). `changes` (n, T, q) of the parameters over time do not change these derivatives.
         """
         count, samples = commands.shape[:2]
         states = len(self.process)
         steps, theta = self.equations.steps(), np.tile(self.values, (count, 1))
         kicks = np.sqrt(self.process) * rng.normal(size=(count, samples, states))
-        made = steps.run(commands, theta, kicks)[0]
+        changed = np.array([each.any() for each in changes])
+        made = steps.run(commands, theta, kicks, changes if changed.any() else None)[0]
         made += np.sqrt(self.noise) * rng.normal(size=made.shape)
         moves = rng.normal(size=(count, self.factor.shape[1])) @ self.factor.T
         moves[:, -states:] += self.start_deviation * rng.normal(size=(count, states))
         distinct, own = np.unique(commands, axis=0, return_inverse=True)
         for i, each in enumerate(distinct):
-            centre, by_all = (
+            nominal, by_all = (
                 found[0] for found in steps.sensitivities(each[None], self.values[None])
             )
             rows = np.flatnonzero(own.ravel() == i)
+            centre = np.tile(nominal, (len(rows), 1, 1))
+            if changed[rows].any():
+                faulty = rows[changed[rows]]
+                centre[changed[rows]] = steps.run(
+                    commands[faulty], theta[faulty], changes=changes[faulty]
+                )[0]
             moved = np.moveaxis(by_all @ moves[rows].T, -1, 0)
             made[rows] = centre + self.widening * (made[rows] - centre + moved)
         return made
