@@ -14,13 +14,15 @@ from retwin.diagnosis.diagnoser import (
     TrainedDiagnoser,
     load_diagnoser,
 )
+from retwin.diagnosis.estimate import Estimate
 from retwin.diagnosis.features import Features
 from retwin.diagnosis.fine_tuning import FineTune
 from retwin.diagnosis.fitting import Classifier, fit_diagnoser
-from retwin.diagnosis.inversion import Diagnosis, Estimate, InversionDiagnoser, fit_inversion
+from retwin.diagnosis.inversion import Diagnosis, InversionDiagnoser, fit_inversion
 from retwin.diagnosis.network import NetworkDiagnoser
 from retwin.diagnosis.pooled import PooledDiagnoser
 from retwin.diagnosis.rocket import Rocket, RocketDiagnoser
+from retwin.diagnosis.state_inversion import StateDiagnosis, StateInversionDiagnoser
 
 __all__ = [
     "DANN",
@@ -37,6 +39,8 @@ __all__ = [
     "PooledDiagnoser",
     "Rocket",
     "RocketDiagnoser",
+    "StateDiagnosis",
+    "StateInversionDiagnoser",
     "TrainedDiagnoser",
     "fit_diagnoser",
     "fit_inversion",

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.diagnosis.estimate import Estimate
 from retwin.diagnosis.hypotheses import Hypotheses, checked
 from retwin.diagnosis.latent_prior import command_problem, command_space, healthy_prior
 from retwin.diagnosis.missed_segments import best_fit, fitted_noise
@@ -41,7 +42,7 @@ from retwin.update.surrogate import Surrogate
 from retwin.update.surrogate_error import surrogate_variance
 from retwin.update.training_range import outside_training
 
-__all__ = ["Diagnosis", "Estimate", "Inversion", "InversionDiagnoser", "fit_inversion", "invert"]
+__all__ = ["Diagnosis", "Inversion", "InversionDiagnoser", "fit_inversion", "invert"]
 
 TRAJECTORIES_PER_BATCH = 16
 """Trajectories inverted together, which bounds memory."""
@@ -49,15 +50,6 @@ ROUNDS = 5
 """Rounds of expectation-maximisation of the noise."""
 COVERAGE = 0.9
 """Coverage of all intervals."""
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """A severity and its central 90 % interval; NaN where a class has none."""
-
-    value: NDArray
-    low: NDArray
-    high: NDArray
 
 
 @dataclass(frozen=True, eq=False)

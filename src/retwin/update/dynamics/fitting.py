@@ -190,16 +190,16 @@ def fit_dynamics(
     )
     alone, fitted = _without_discrepancy(base, observed, unknowns)
     report(0.05)
-    tried = []
+    tried, parts = [], folds(observed.mask, settings.folds)
     for equations in _candidates(alone, fitted.point, settings):
         estimation, found = _followed(equations, alone, fitted)
-        held_out = estimation.held_out(found, folds(estimation.seen, settings.folds))
+        held_out = estimation.held_out(found, parts)
         tried.append((equations, estimation, found, held_out))
         report(1 - 0.95 * 0.6 ** len(tried))
     errors = [own.rms(held_out.errors) for _, own, _, held_out in tried]
     chosen = int(np.argmin(np.nan_to_num(errors, nan=np.inf)))
     equations, estimation, found, held_out = tried[chosen]
-    made = _assembled(equations, estimation, found, held_out)
+    made = _assembled(equations, estimation, found, held_out, parts)
     report(1.0)
     unknown = estimation.undetermined(found)[: unknowns.count]
     notes = _notes(estimation, found.point, unknown)
@@ -298,6 +298,7 @@ def _assembled(
     estimation: Estimation,
     found: Linearised,
     held_out: HeldOut,
+    parts: Sequence[NDArray],
 ) -> DynamicsTwin:
     """The twin as a distribution, see `Estimation.held_out`."""
     unknowns = estimation.unknowns
@@ -322,7 +323,8 @@ def _assembled(
         equations.states,
         estimation.observed.emulated,
     )
-    noisy = fit_noise(made, estimation.observed, indices)
+    moves = np.pad(held_out.moves @ unknowns.matrix.T, ((0, 0), (0, len(start))))
+    noisy = fit_noise(made, estimation.observed, indices, parts, moves)
     return replace(noisy, widening=widening(noisy, estimation, held_out))
 
 

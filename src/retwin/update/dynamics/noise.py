@@ -13,6 +13,7 @@ from scipy.special import ndtri
 from retwin.data.trajectories import Trajectories
 from retwin.update.dynamics.estimation import Estimation
 from retwin.update.dynamics.linearised import HeldOut
+from retwin.update.dynamics.prediction import Prediction
 from retwin.update.dynamics.twin import DynamicsTwin
 
 __all__ = ["fit_noise", "folds", "widening"]
@@ -31,10 +32,32 @@ EVALUATIONS = 60
 """Calls of the filter per scale at most."""
 
 
-def fit_noise(twin: DynamicsTwin, observed: Trajectories, corrected: Sequence[int]) -> DynamicsTwin:
+def fit_noise(
+    twin: DynamicsTwin,
+    observed: Trajectories,
+    corrected: Sequence[int],
+    parts: Sequence[NDArray],
+    moves: NDArray,
+) -> DynamicsTwin:
     """The twin with the variances of w and v that maximise the likelihood of one-step predictions.
 
-    Process noise acts on the corrected states, whose equations may be wrong.
+    Process noise acts on the corrected states, whose equations may be wrong. Each part of the
+    record is predicted with the parameters that are estimated without it: with those that are
+    fitted to it, it would seem to have less noise than other records.
+
+    Parameters
+    ----------
+    twin : DynamicsTwin
+        The twin; its process noise is ignored.
+    observed : Trajectories
+        The n trajectories.
+    corrected : sequence of int
+        Indices of the corrected states.
+    parts : sequence of NDArray
+        K parts (n, T) of the samples.
+    moves : NDArray
+        (K, q + d_x), by how much the values of the twin differ without each part.
+
     """
     step = twin.domain.speed if twin.equations.step else twin.domain.speed / twin.rate
     indices = np.array(corrected, dtype=int)
@@ -50,7 +73,7 @@ def fit_noise(twin: DynamicsTwin, observed: Trajectories, corrected: Sequence[in
         return replace(twin, process=process, noise=twin.noise * np.exp(2 * logs[count:]))
 
     def cost(logs: NDArray) -> float:
-        value = -float(np.sum(at(logs).filtered(part).log_density()))
+        value = -float(np.sum(_predicted(at(logs), observed, parts, moves).log_density()))
         return value if np.isfinite(value) else np.inf
 
     start = np.full(count + len(twin.noise), np.log(RATIO))
@@ -63,10 +86,24 @@ def fit_noise(twin: DynamicsTwin, observed: Trajectories, corrected: Sequence[in
     )
     made = at(found.x)
     # A common scale changes no prediction, but all intervals.
-    error = np.abs(made.filtered(observed).standardised())
+    error = np.abs(_predicted(made, observed, parts, moves).standardised())
     scale = (np.nanquantile(error, LEVEL) / ndtri((1 + LEVEL) / 2)) ** 2
     noise = np.maximum(scale * made.noise, SMALLEST**2 * twin.noise)
     return replace(made, process=scale * made.process, noise=noise)
+
+
+def _predicted(
+    twin: DynamicsTwin, observed: Trajectories, parts: Sequence[NDArray], moves: NDArray
+) -> Prediction:
+    """One-step predictions of each part with the parameters that are estimated without it."""
+    commands = observed.commands.astype(np.float64)
+    measured = np.where(observed.mask, observed.observed, 0.0)
+    every = [np.empty((*measured.shape, *more)) for more in ((), (measured.shape[2],))]
+    for part, move in zip(parts, moves, strict=True):
+        found = twin.filter(commands, measured, observed.mask, moves=move)
+        for whole, own in zip(every, found, strict=False):
+            whole[part] = own[part]
+    return Prediction(observed, *every, found[2])
 
 
 def folds(seen: NDArray, count: int) -> list[NDArray]:

@@ -12,7 +12,7 @@ from scipy.stats import norm
 from retwin.checks import finite, require
 from retwin.data.trajectories import Trajectories
 
-__all__ = ["Prediction"]
+__all__ = ["Prediction", "log_density", "root_of", "whitened"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,20 +81,34 @@ class Prediction:
 
     def log_density(self) -> NDArray:
         """Log density (n, T) of the measured outputs of each sample, jointly; 0 for none."""
-        seen = self.record.mask
-        both = seen[..., :, None] & seen[..., None, :]
-        # An output that was not measured is replaced by one of known density: 0 of variance 1.
-        covariance = np.where(both, self.covariance, np.eye(seen.shape[2]))
-        error = np.where(seen, self.record.observed - self.mean, 0.0)
-        weighted = np.linalg.solve(covariance, error[..., None])[..., 0]
-        constant = seen.sum(axis=2) * np.log(2 * np.pi)
-        made: NDArray = -0.5 * (
-            np.sum(error * weighted, axis=2) + np.linalg.slogdet(covariance)[1] + constant
-        )
-        return made
+        return log_density(self.record.observed - self.mean, self.covariance, self.record.mask)
 
     def standardised(self) -> NDArray:
         """Errors (n, T, d_y) in standard deviations; NaN where nothing was measured."""
         error = (self.record.observed - self.mean) / self.deviation
         made: NDArray = np.where(self.record.mask, error, np.nan)
         return made
+
+
+def log_density(error: NDArray, covariance: NDArray, seen: NDArray) -> NDArray:
+    """Log density (n, T) of Gaussian errors (n, T, d_y), of which those `seen` count, jointly."""
+    factor = root_of(covariance, seen)
+    white = whitened(error, factor, seen)
+    constant = seen.sum(axis=2) * np.log(2 * np.pi)
+    logs = np.log(np.diagonal(factor, axis1=2, axis2=3)).sum(axis=2)
+    made: NDArray = -0.5 * (np.sum(white**2, axis=2) + constant) - logs
+    return made
+
+
+def root_of(covariance: NDArray, seen: NDArray) -> NDArray:
+    """Lower factors (n, T, d_y, d_y) of covariances; an output that is not seen has variance 1."""
+    both = seen[..., :, None] & seen[..., None, :]
+    made: NDArray = np.linalg.cholesky(np.where(both, covariance, np.eye(seen.shape[2])))
+    return made
+
+
+def whitened(error: NDArray, factor: NDArray, seen: NDArray) -> NDArray:
+    """Errors (n, T, d_y) that are independent and of variance 1; 0 for those that are not seen."""
+    own = np.where(seen, error, 0.0)[..., None]
+    made: NDArray = np.linalg.solve(factor, own)[..., 0]
+    return made

@@ -251,13 +251,52 @@ class DynamicsTwin:
     def filtered(self, record: Trajectories) -> Prediction:
         """See `predictive`; without checks."""
         commands = checked_commands(record.commands, self.inputs).astype(np.float64)
-        theta = np.tile(self.values, (len(record), 1))
         measured = np.where(record.mask, record.observed, 0.0)
+        return Prediction(record, *self.filter(commands, measured, record.mask))
+
+    def filter(
+        self,
+        commands: NDArray,
+        measured: NDArray,
+        seen: NDArray,
+        *,
+        changes: NDArray | None = None,
+        noise: tuple[NDArray, NDArray] | None = None,
+        known_start: bool = True,
+        moves: NDArray | float = 0.0,
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """The extended Kalman filter on arrays; nothing is checked.
+
+        Parameters
+        ----------
+        commands, measured, seen : ndarray, shapes (n, T, d_u), (n, T, d_y), (n, T, d_y)
+            Commands, outputs, and whether these were measured.
+        changes : ndarray, shape (n, T, q), optional
+            What is added to the parameters at each sample.
+        noise : tuple of ndarray, optional
+            Variances of process and measurement noise, in place of the twin's.
+        known_start : bool, default True
+            Whether the first sample is the start of a record as in calibration; otherwise the
+            states may be anywhere in their range in calibration.
+        moves : ndarray, shape (n, q + d_x), optional
+            What is added to `values`.
+
+        Returns
+        -------
+        mean, covariance, states : ndarray
+            See `Prediction`.
+
+        """
+        theta, count = np.tile(self.values, (len(commands), 1)), len(self.process)
         bounds = [(each.low or 0.0, each.high or 0.0) for each in self.equations.states]
-        start = np.square(np.diff(bounds, axis=1)[:, 0]) / 12
-        variances = (start, self.process, self.noise)
-        made = self.equations.steps().filter(commands, theta, (measured, record.mask), variances)
-        return Prediction(record, *made)
+        low, high = np.array(bounds, dtype=float).T
+        if not known_start:
+            low, high = self.domain.low[:count], self.domain.high[:count]
+            theta[:, -count:] = (low + high) / 2
+        theta = theta + moves
+        variances = ((high - low) ** 2 / 12, *(noise or (self.process, self.noise)))
+        steps = self.equations.steps()
+        return steps.filter(commands, theta, (measured, seen), variances, changes)
 
     def noise_variance(self, commands: NDArray) -> NDArray:
         """Variances (n, T, d_y) of the outputs by process and measurement noise alone."""

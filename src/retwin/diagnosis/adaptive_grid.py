@@ -1,0 +1,150 @@
+"""Integrals over the size, the onset and the end of a fault, by a grid that refines itself.
+
+The likelihood of a record is narrow in these quantities and can have several modes. The likelihood
+is evaluated at the centres of the cells of a grid, and the cells that contribute most are halved
+along each side until the integral changes no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Integral", "integrated"]
+
+CELLS = {1: 48, 2: 12, 3: 8}
+"""Cells along each side at first, by the number of quantities that are open."""
+NEGLIGIBLE = 8.0
+"""How many nats below the largest contribution a cell is refined no further: 3e-4 of it."""
+LEAST = 24
+"""Number of cells that are refined at least, since a maximum may lie off all centres."""
+TOLERANCE = 0.05
+"""Change of the log integral in nats, below which there is no further round."""
+ROUNDS = 30
+"""Rounds at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Integral:
+    """The posterior of K quantities that are uniform between limits beforehand.
+
+    Attributes
+    ----------
+    evidence : float
+        Log of the likelihood's mean over the prior.
+    best : NDArray
+        (K,), where the likelihood is largest.
+    low, mean, high : NDArray
+        (K,), the mean of each quantity, and its central interval; NaN where nothing has a
+        likelihood.
+
+    """
+
+    evidence: float
+    best: NDArray
+    low: NDArray
+    mean: NDArray
+    high: NDArray
+
+
+def integrated(
+    log_likelihood: Callable[[NDArray], NDArray], limits: NDArray, whole: NDArray, coverage: float
+) -> Integral:
+    """Integrate a likelihood over a box.
+
+    Parameters
+    ----------
+    log_likelihood : callable
+        From points (J, K) to logarithms (J,); minus infinity where there is no prior probability.
+    limits : ndarray, shape (K, 2)
+        Lowest and highest value of each quantity; equal ones are known.
+    whole : ndarray of bool, shape (K,)
+        Which quantities are whole numbers.
+    coverage : float
+        Probability of the intervals.
+
+    """
+    is_open = limits[:, 1] > limits[:, 0]
+    # A whole number stands for the interval of length 1 about it.
+    outer = limits + np.where((whole & is_open)[:, None], [-0.5, 0.5], 0.0)
+    sides = outer[:, 1] - outer[:, 0]
+    count = CELLS.get(int(is_open.sum()), 1)
+    edges = [
+        _edges(*ends, count if free else 1, only)
+        for ends, free, only in zip(outer, is_open, whole, strict=True)
+    ]
+    cells = np.array(list(product(*[pairwise(each) for each in edges])))
+
+    def centre_of(of: NDArray) -> NDArray:
+        """Points (..., K) in the middle of cells (..., K, 2)."""
+        middle = of.mean(axis=-1)
+        made: NDArray = np.where(whole, np.round(middle), middle)
+        return made
+
+    def volume(of: NDArray) -> NDArray:
+        """Log shares (J,) of the box that cells (J, K, 2) fill."""
+        share = np.where(is_open, of[..., 1] - of[..., 0], 1.0) / np.where(is_open, sides, 1.0)
+        made: NDArray = np.log(share).sum(axis=1)
+        return made
+
+    def log_mass(of: NDArray) -> NDArray:
+        """The log integrals (J,) over cells (J, K, 2)."""
+        return log_likelihood(centre_of(of)) + volume(of)
+
+    mass = log_mass(cells)
+    total = _total(mass)
+    for _ in range(ROUNDS if is_open.any() else 0):
+        order = np.argsort(-mass)
+        chosen = order[: max(LEAST, int((mass > mass.max() - NEGLIGIBLE).sum()))]
+        parts = np.concatenate([_halves(each, whole) for each in cells[chosen]])
+        if len(parts) == len(chosen):
+            break
+        cells = np.concatenate([np.delete(cells, chosen, axis=0), parts])
+        mass = np.concatenate([np.delete(mass, chosen), log_mass(parts)])
+        before, total = total, _total(mass)
+        if abs(total - before) < TOLERANCE:
+            break
+    if not np.isfinite(total):
+        return Integral(-np.inf, *[np.full(len(limits), np.nan)] * 4)
+    weight = np.exp(mass - total)
+    summaries = [_summary(weight, cells[:, k], coverage) for k in range(len(limits))]
+    best = centre_of(cells[np.argmax(mass - volume(cells))])
+    return Integral(total, best, *np.clip(np.array(summaries).T, *limits.T))
+
+
+def _total(mass: NDArray) -> float:
+    best = mass.max()
+    return float(best + np.log(np.exp(mass - best).sum())) if np.isfinite(best) else -np.inf
+
+
+def _edges(low: float, high: float, count: int, whole: bool) -> NDArray:
+    """Edges of the cells of one side; a cell of whole numbers contains one at least."""
+    made = np.linspace(low, high, count + 1)
+    return np.unique(np.round(made - 0.5) + 0.5) if whole and high > low else made
+
+
+def _halves(cell: NDArray, whole: NDArray) -> NDArray:
+    """The parts (J, K, 2) of a cell (K, 2) that is halved along each side."""
+    sides = []
+    for (low, high), only in zip(cell, whole, strict=True):
+        middle = np.floor((low + high) / 2) + 0.5 if only else (low + high) / 2
+        inside = low < middle < high
+        sides.append([(low, middle), (middle, high)] if inside else [(low, high)])
+    return np.array(list(product(*sides)))
+
+
+def _summary(weight: NDArray, ends: NDArray, coverage: float) -> tuple[float, float, float]:
+    """Lower end, mean and upper end of a quantity that is uniform in each cell (J, 2)."""
+    mean = float(weight @ ends.mean(axis=1))
+    edges = np.unique(ends)
+    width = np.maximum(ends[:, 1] - ends[:, 0], 1e-300)
+    # The distribution function at each edge: every cell contributes the part of it below.
+    below = weight @ np.clip((edges - ends[:, :1]) / width[:, None], 0.0, 1.0)
+    low, high = (
+        float(np.interp(level, below, edges)) for level in ((1 - coverage) / 2, (1 + coverage) / 2)
+    )
+    return low, mean, high

@@ -1,0 +1,435 @@
+"""`StateInversionDiagnoser`: which fault of a system with states explains its outputs.
+
+No training. The evidence for a fault is the likelihood of the measured outputs, each given all
+earlier ones, by the extended Kalman filter of the corrected dynamics, as a mean over the sizes,
+onsets and ends that the fault can have, and over the posterior of the twin's parameters. What no
+fault explains is `unknown`: process and measurement noise that are larger than in calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from retwin.checks import require
+from retwin.data.trajectories import Trajectories
+from retwin.diagnosis.adaptive_grid import Integral, integrated
+from retwin.diagnosis.estimate import Estimate
+from retwin.progress import Progress
+from retwin.serialisation.configs import from_config, to_config
+from retwin.serialisation.models import read_model, write_model
+from retwin.twins.faults import Fault, ends_of
+from retwin.twins.system_faults import (
+    FAULTS,
+    ActuatorGain,
+    ParameterShift,
+    SensorBias,
+    SensorDrift,
+    SensorFreeze,
+    SizedFault,
+    TimedFault,
+    check_faults,
+    parameter_changes,
+)
+from retwin.twins.twin import check_channels
+from retwin.update.dynamics import DynamicsTwin
+from retwin.update.dynamics.prediction import root_of, whitened
+
+__all__ = ["UNKNOWN", "StateDiagnosis", "StateInversionDiagnoser"]
+
+UNKNOWN = "unknown"
+"""Name of what is none of the classes."""
+COVERAGE = 0.9
+"""Coverage of all intervals."""
+LEVELS = (0.03, 0.1, 0.3, 1.0)
+"""Standard deviations of what is unknown: of process noise per sample, in usual steps of a state,
+or of measurement noise, in standard deviations of an output in the record."""
+FROZEN = np.array([1.0, 1e-2, 1e-4])
+"""Standard deviations of a sensor that is frozen, in those of its noise in calibration."""
+STEP = 0.1
+"""Differences of parameters, in posterior deviations, by which predictions are differentiated."""
+SMALLEST = 0.1
+"""Smallest effect of parameters that counts: a change of the log density by 0.005 nats."""
+ROWS = 256
+"""Simulations that are filtered together, which bounds memory."""
+
+
+NOTHING = np.full(3, np.nan)
+"""The size, onset and end of no fault."""
+
+
+@dataclass(frozen=True, eq=False)
+class StateDiagnosis:
+    """The diagnosis of n trajectories; severities as if each class were the true one.
+
+    Attributes
+    ----------
+    classes : tuple of str
+        Names, C.
+    probabilities : NDArray
+        (n, C), each row sums to one: what holds if one of the classes is the true one.
+    unknown : NDArray
+        (n,), the probability that none of them is.
+    evidence : NDArray
+        (n, C + 1), log marginal likelihood of the outputs for each class and for `unknown`.
+    size, onset, end : Estimate
+        (n, C), size of each fault in the unit of what it changes, and its times in s; NaN where a
+        class has none.
+
+    """
+
+    classes: tuple[str, ...]
+    probabilities: NDArray
+    unknown: NDArray
+    evidence: NDArray
+    size: Estimate
+    onset: Estimate
+    end: Estimate
+
+    @property
+    def labels(self) -> NDArray:
+        """The most probable class of each trajectory (n,), or "unknown"."""
+        names = np.array([*self.classes, UNKNOWN])
+        made: NDArray = names[self.evidence.argmax(axis=1)]
+        return made
+
+
+class StateInversionDiagnoser:
+    """Class probabilities from the evidence for each fault of a system; see `fit_inversion`.
+
+    Parameters
+    ----------
+    twin : DynamicsTwin
+        The corrected dynamics of the healthy system (`fit_dynamics`).
+    faults : mapping of str to Fault or None
+        Class name to fault, None for healthy, in the order of the probabilities. What a fault
+        leaves open, as a pair (low, high), is inferred.
+
+    Raises
+    ------
+    InputError
+        There are fewer than two classes, none is healthy, or a fault that the twin cannot have.
+
+    """
+
+    def __init__(self, twin: DynamicsTwin, faults: Mapping[str, Fault | None]) -> None:
+        require(
+            len(faults) > 1 and sum(each is None for each in faults.values()) == 1,
+            "faults",
+            expected="one healthy class, None, and faults",
+            got=faults,
+            remedy='give for instance {"Healthy": None, "leak": ParameterShift(...)}',
+        )
+        for fault in faults.values():
+            require(
+                fault is None or isinstance(fault, TimedFault),
+                "faults",
+                expected=f"None, or one of {', '.join(each.__name__ for each in _KINDS)}",
+                got=repr(fault),
+                remedy="leave out what cannot be inverted, or train a diagnoser",
+            )
+        check_faults(list(faults.values()), len(twin.inputs), len(twin.outputs), twin.shiftable)
+        self.twin = twin
+        self.faults = dict(faults)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Class names, in the order of the probabilities."""
+        return tuple(self.faults)
+
+    def predict_proba(self, trajectories: Trajectories) -> NDArray:
+        """Probabilities (n, classes), see `Diagnoser`."""
+        return self.diagnose(trajectories).probabilities
+
+    def diagnose(
+        self,
+        trajectories: Trajectories,
+        *,
+        known_start: bool = True,
+        progress: Progress | None = None,
+    ) -> StateDiagnosis:
+        """Probabilities, sizes and times of every fault; classes are equally probable beforehand.
+
+        Parameters
+        ----------
+        trajectories : Trajectories
+            n records, or windows of records (`Trajectories.between`).
+        known_start : bool, default True
+            Whether they start as those in calibration do. The states at the start of a window may
+            be anywhere in their range in calibration.
+        progress : callable, optional
+            Called with the finished fraction, from 0 to 1.
+
+        Returns
+        -------
+        StateDiagnosis
+            The diagnosis.
+
+        Raises
+        ------
+        InputError
+            The channels or the sample rate are not those of the twin, or a trajectory is shorter
+            than the earliest onset of a fault.
+
+        """
+        check_channels(self.twin, trajectories, "trajectories")
+        found = []
+        for i in range(len(trajectories)):
+            record = _Record.of(self.twin, trajectories[i : i + 1], known_start)
+            row = [record.integral(fault) for fault in self.faults.values()]
+            row.append(Integral(record.unknown(self.faults.values(), row), *[NOTHING] * 4))
+            found.append(row)
+            if progress is not None:
+                progress((i + 1) / len(trajectories))
+        evidence = np.array([[each.evidence for each in row] for row in found])
+        require(
+            np.isfinite(evidence).any(axis=1).all(),
+            "trajectories",
+            expected="outputs with which the filter stays finite",
+            got=f"{int((~np.isfinite(evidence).any(axis=1)).sum())} with which it does not",
+            remedy="check their units",
+        )
+        parts = np.array([[(e.mean, e.low, e.high) for e in row[:-1]] for row in found])
+        size, onset, end = (Estimate(*np.moveaxis(parts[..., k], 2, 0)) for k in range(3))
+        known = evidence[:, :-1]
+        share = np.exp(evidence - logsumexp(evidence, axis=1, keepdims=True))
+        return StateDiagnosis(
+            self.classes,
+            np.exp(known - logsumexp(known, axis=1, keepdims=True)),
+            share[:, -1],
+            evidence,
+            size,
+            onset,
+            end,
+        )
+
+    def save(self, folder: str | Path) -> None:
+        """Write one folder with the twin inside, or nothing."""
+        faults = [
+            [name, None if fault is None else to_config(fault, FAULTS)]
+            for name, fault in self.faults.items()
+        ]
+        with write_model(folder, "state inversion", {"faults": faults}, {}) as inside:
+            self.twin.save(inside / "twin")
+
+    @classmethod
+    def load(cls, folder: str | Path) -> StateInversionDiagnoser:
+        """Read what `save` wrote; InputError when it is no such inversion or damaged."""
+        about, _ = read_model(folder, "state inversion")
+        twin = DynamicsTwin.load(Path(folder) / "twin")
+        faults = {
+            name: None if config is None else from_config(config, FAULTS)
+            for name, config in about["faults"]
+        }
+        return cls(twin, faults)
+
+
+_Given = tuple[NDArray, NDArray, NDArray, NDArray | None]
+_KINDS = tuple(kind for kind in FAULTS if issubclass(kind, TimedFault))
+
+
+@dataclass(frozen=True, eq=False)
+class _Record:
+    """One trajectory, with the filter of a twin.
+
+    Attributes
+    ----------
+    twin : DynamicsTwin
+        The corrected dynamics.
+    commands, measured, seen : NDArray
+        (T, d_u), (T, d_y) and (T, d_y) bool.
+    known_start : bool
+        See `StateInversionDiagnoser.diagnose`.
+
+    """
+
+    twin: DynamicsTwin
+    commands: NDArray
+    measured: NDArray
+    seen: NDArray
+    known_start: bool
+
+    @classmethod
+    def of(cls, twin: DynamicsTwin, trajectory: Trajectories, known_start: bool) -> _Record:
+        seen = trajectory.mask[0]
+        measured = np.where(seen, trajectory.observed[0].astype(np.float64), 0.0)
+        return cls(twin, trajectory.commands[0].astype(np.float64), measured, seen, known_start)
+
+    def integral(self, fault: Fault | None) -> Integral:
+        """The evidence for a fault, and the posterior of its size, onset and end."""
+        steps, rate = len(self.commands), self.twin.rate
+        if fault is None:
+            return Integral(float(self._under(None, NOTHING[None])[0]), *[NOTHING] * 4)
+        assert isinstance(fault, TimedFault), "checked"
+        sizes = ends_of(fault.size) if isinstance(fault, SizedFault) else (1.0, 1.0)
+        limits = np.array([sizes, fault.onset_range(steps, rate), fault.end_range(steps, rate)])
+
+        def log_likelihood(points: NDArray) -> NDArray:
+            _, onset, end = points.T
+            # As it is drawn: the onset, and then an end after it.
+            first = np.maximum(limits[2, 0], onset + 1)
+            choices = np.maximum(limits[2, 1], onset + 1) - first + 1
+            own = np.log((limits[2, 1] - limits[2, 0] + 1) / choices)
+            possible = (end >= first) | (limits[2, 0] == limits[2, 1])
+            return np.where(possible, own + self._under(fault, points), -np.inf)
+
+        found = integrated(log_likelihood, limits, np.array([False, True, True]), COVERAGE)
+        missing = np.array(
+            [not isinstance(fault, SizedFault), False, fault.end is None], dtype=bool
+        )
+        scale = np.array([1.0, rate, rate])
+        ends = (np.where(missing, np.nan, e / scale) for e in (found.low, found.mean, found.high))
+        return Integral(found.evidence, found.best, *ends)
+
+    def unknown(self, faults: Iterable[Fault | None], found: Iterable[Integral]) -> float:
+        """The evidence for something else besides one of the faults, or besides none.
+
+        It adds noise to what the twin predicts with the most probable size and times of the fault.
+        """
+        pairs = list(zip(faults, found, strict=True))
+        made = []
+        for noise in self._noises():
+            by_noise = self._slopes(noise)
+            for fault, own in pairs:
+                made.append(own.evidence)
+                if np.isfinite(own.evidence):
+                    given, _ = self._inputs(fault, own.best[None])
+                    more = self._log_density(*given, noise=noise, slopes=by_noise)
+                    less = self._log_density(*given, slopes=self._by_parameters)
+                    made[-1] += float(more[0] - less[0])
+        return float(logsumexp(made) - np.log(len(made)))
+
+    def _noises(self) -> list[tuple[NDArray, NDArray]]:
+        """Variances of process and measurement noise, of which one is larger than the twin's."""
+        twin, record = self.twin, np.where(self.seen, self.measured, np.nan)
+        step = twin.domain.speed if twin.equations.step else twin.domain.speed / twin.rate
+        usual = np.nan_to_num(np.nanstd(record, axis=0))
+        more = [(twin.process + (level * step) ** 2, twin.noise) for level in LEVELS]
+        return more + [(twin.process, twin.noise + (level * usual) ** 2) for level in LEVELS]
+
+    def _under(self, fault: TimedFault | None, points: NDArray) -> NDArray:
+        """Log likelihoods (J,) under a fault of these sizes, onsets and ends (J, 3), in samples."""
+        made = []
+        for rows in range(0, len(points), ROWS):
+            given, gain = self._inputs(fault, points[rows : rows + ROWS])
+            made.append(gain + self._log_density(*given, slopes=self._by_parameters))
+        return np.concatenate(made)
+
+    def _inputs(self, fault: TimedFault | None, points: NDArray) -> tuple[_Given, NDArray]:
+        """What the filter takes under a fault at points (J, 3), and log densities (J,) besides."""
+        steps, rate = len(self.commands), self.twin.rate
+        shape = (len(points), 1, 1)
+        commands, measured = np.tile(self.commands, shape), np.tile(self.measured, shape)
+        seen, gain, changes = np.tile(self.seen, shape), np.zeros(len(points)), None
+        made = [_fixed(fault, *point, rate) for point in points] if fault is not None else []
+        if isinstance(fault, ParameterShift):
+            changes = parameter_changes(made, self.twin.shiftable, steps, rate)
+        for i, each in enumerate(made):
+            match each:
+                case ActuatorGain(actuator=actuator):
+                    commands[i, :, actuator] *= 1 + each.profile(steps, rate)
+                case SensorFreeze(output=output):
+                    gain[i] = self._frozen(output, each.active(steps, rate), seen[i])
+                case SensorBias(output=output) | SensorDrift(output=output):
+                    measured[i, :, output] -= each.profile(steps, rate)
+        return (commands, measured, seen, changes), gain
+
+    def _frozen(self, output: int, active: NDArray, seen: NDArray) -> float:
+        """Log density of a frozen sensor's samples, which are removed from those `seen` (T, d_y).
+
+        It repeats the sample of the onset, with a noise that cannot be smaller than what the steps
+        of its digits make.
+        """
+        places = np.flatnonzero(active & seen[:, output])
+        if len(places) < 2:
+            return 0.0
+        error = self.measured[places[1:], output] - self.measured[places[0], output]
+        seen[places[1:], output] = False
+        least = _digit(self.measured[self.seen[:, output], output]) / np.sqrt(12)
+        deviation = np.maximum(FROZEN * np.sqrt(self.twin.noise[output]), least)
+        each = -0.5 * np.sum((error / deviation[:, None]) ** 2, axis=1)
+        each -= len(error) * np.log(deviation * np.sqrt(2 * np.pi))
+        return float(logsumexp(each) - np.log(len(FROZEN)))
+
+    def _log_density(
+        self,
+        commands: NDArray,
+        measured: NDArray,
+        seen: NDArray,
+        changes: NDArray | None,
+        *,
+        slopes: NDArray,
+        noise: tuple[NDArray, NDArray] | None = None,
+    ) -> NDArray:
+        """Log densities (J,) of what was measured; minus infinity where they are not finite.
+
+        They are means over the posterior of the twin's parameters, on which the predictions depend
+        linearly, with `slopes` (T, d_y, r), those of the healthy system.
+        """
+        mean, covariance, _ = self.twin.filter(
+            commands, measured, seen, changes=changes, noise=noise, known_start=self.known_start
+        )
+        made = np.full(len(commands), -np.inf)
+        finite = np.isfinite(mean).all(axis=(1, 2)) & np.isfinite(covariance).all(axis=(1, 2, 3))
+        good = np.flatnonzero(finite)
+        if not len(good):
+            return made
+        own, factor = seen[good], root_of(covariance[good], seen[good])
+        errors = whitened((measured - mean)[good], factor, own).reshape(len(good), -1)
+        slopes = np.where(own[..., None], slopes, 0.0)
+        slopes = np.linalg.solve(factor, slopes).reshape(len(good), errors.shape[1], -1)
+        curvature = np.eye(slopes.shape[2]) + slopes.swapaxes(1, 2) @ slopes
+        gradient = (slopes.swapaxes(1, 2) @ errors[..., None])[..., 0]
+        gain = np.sum(gradient * np.linalg.solve(curvature, gradient[..., None])[..., 0], axis=1)
+        gain -= np.linalg.slogdet(curvature)[1]
+        logs = 2 * np.log(np.diagonal(factor, axis1=2, axis2=3)).sum(axis=(1, 2))
+        constant = own.sum(axis=(1, 2)) * np.log(2 * np.pi)
+        made[good] = 0.5 * (gain - np.sum(errors**2, axis=1) - logs - constant)
+        return made
+
+    @cached_property
+    def _by_parameters(self) -> NDArray:
+        """Those of the twin with its own noise."""
+        return self._slopes(None)
+
+    def _slopes(self, noise: tuple[NDArray, NDArray] | None) -> NDArray:
+        """Derivatives (T, d_y, r) of predictions by the twin's parameters, in posterior deviations.
+
+        By central differences along the columns of the factor of their covariance, and then along
+        the r directions that matter.
+        """
+        moves = self.twin.factor.T.copy()
+        if not self.known_start:
+            moves[:, -len(self.twin.process) :] = 0.0
+        count = len(moves)
+        mean, covariance, _ = self.twin.filter(
+            *(np.tile(e, (2 * count, 1, 1)) for e in (self.commands, self.measured, self.seen)),
+            noise=noise,
+            known_start=self.known_start,
+            moves=np.concatenate([moves, -moves]) * STEP,
+        )
+        made = np.moveaxis((mean[:count] - mean[count:]) / (2 * STEP), 0, -1)
+        made = np.where(np.isfinite(made) & self.seen[..., None], made, 0.0)
+        factor = root_of(covariance[:1], self.seen[None])[0]
+        scaled = np.linalg.solve(factor, made).reshape(-1, count)
+        _, values, directions = np.linalg.svd(scaled, full_matrices=False)
+        return made @ directions[values > SMALLEST].T
+
+
+def _digit(values: NDArray) -> float:
+    """The smallest step between values, beyond rounding."""
+    steps = np.diff(np.unique(values))
+    steps = steps[steps > 1e-9 * np.abs(values).max()]
+    return float(steps.min()) if len(steps) else 0.0
+
+
+def _fixed(fault: TimedFault, size: float, onset: float, end: float, rate: float) -> TimedFault:
+    """The fault with this size, from and to these samples."""
+    own = {"size": float(size)} if isinstance(fault, SizedFault) else {}
+    return replace(fault, onset=onset / rate, end=max(end, onset + 1) / rate, **own)
