@@ -147,6 +147,9 @@ NETWORKS: Mapping[str, Entry] = {
 CLASSIFIERS: Mapping[str, Entry] = {
     "cnn": Entry("retwin.nets.networks:CNN", "convolutional network"),
     "lstm": Entry("retwin.nets.networks:LSTMClassifier", "LSTM, last step (the paper's)"),
+    "state inversion": Entry(
+        "retwin.diagnosis.state_inversion:StateInversionDiagnoser", "fault inversion with states"
+    ),
     "rocket": Entry("retwin.diagnosis.rocket:Rocket", "MiniRocket and a ridge", "rocket"),
 }
 """Classifiers that are trained on generated trajectories."""
@@ -154,6 +157,9 @@ CLASSIFIERS: Mapping[str, Entry] = {
 DIAGNOSERS: Mapping[str, Entry] = {
     "diagnoser": Entry("retwin.diagnosis.network:NetworkDiagnoser", "neural network"),
     "inversion": Entry("retwin.diagnosis.inversion:InversionDiagnoser", "fault inversion"),
+    "state inversion": Entry(
+        "retwin.diagnosis.state_inversion:StateInversionDiagnoser", "fault inversion with states"
+    ),
     "rocket": Entry("retwin.diagnosis.rocket:RocketDiagnoser", "MiniRocket and a ridge", "rocket"),
 }
 """By the kind in the model.json of a saved diagnoser: the class whose `load` reads it."""
@@ -325,6 +331,12 @@ SOURCES: Mapping[str, SourceEntry] = {
         "healthy",
         (_SURROGATE, _COMMAND),
         diagnoser="retwin.study.sources:inversion",
+    ),
+    "inversion_dynamics": SourceEntry(
+        "Fault inversion, corrected dynamics",
+        "healthy",
+        (_DYNAMICS,),
+        diagnoser="retwin.study.sources:inversion_dynamics",
     ),
     "inversion_cnn": SourceEntry(
         "Inversion with classifier", "healthy", pool=("inversion", "ibg_rg_command")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -14,12 +14,16 @@ from numpy.typing import NDArray
 from retwin import catalog
 from retwin.checks import require
 from retwin.cli.completion import one_of
-from retwin.cli.options import CaseOption, Json, MaxBytes, Measured, Probabilities, Real, Seed
-from retwin.cli.reading import case_named, data_case, read, saved
+from retwin.cli.options import CaseOption, Json, MaxBytes, Measured, Probabilities, Seed
+from retwin.cli.reading import case_named, data_case, read, saved, updated_twin
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data.trajectories import Trajectories
+from retwin.errors import InputError
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.places import check_place
+
+if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
+    from retwin.diagnosis import Diagnoser
 
 __all__ = ["EMULATED", "app", "diagnoses", "write_probabilities"]
 
@@ -77,10 +81,16 @@ def fit(
 @app.command(epilog=example("retwin diagnose invert model real.mat --out physics"))
 def invert(
     model: Annotated[
-        Path, typer.Argument(metavar="MODEL", help="A corrected twin, in command space.")
+        Path,
+        typer.Argument(metavar="MODEL", help="A corrected twin, in command space or of dynamics."),
     ],
-    real: Real,
     out: Out,
+    real: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[REAL]", help="What it was calibrated on; corrected dynamics need none."
+        ),
+    ] = None,
     random_onset: Annotated[
         bool,
         typer.Option("--random-onset", metavar="", help="Infer the onset of stuck motors."),
@@ -89,18 +99,28 @@ def invert(
 ) -> None:
     """Derive a diagnoser from a corrected twin; only healthy trajectories are used."""
     import retwin as rt
+    from retwin.update import DynamicsTwin
 
-    parts = ("model.json", "weights.safetensors", "surrogate", "residual")
+    parts = ("model.json", "weights.safetensors", "surrogate", "residual", "twin")
     check_place(out, folder=True, holds=parts)
-    updated = rt.CorrectedTwin.load(saved(model))
+    updated = updated_twin(model)
     system = rt.cases.get(updated.case)
     if random_onset:
         system = system.with_random_onset()
-    calibration = read(real, system, max_bytes=max_bytes)
-    diagnoser = rt.fit_inversion(
-        updated.surrogate, updated.residual, calibration, system.faults, twin=system.twin
-    )
-    diagnoser.save(out)
+    if isinstance(updated, DynamicsTwin):
+        rt.fit_inversion(updated, None, None, system.faults).save(out)
+    elif real is None:
+        raise InputError(
+            "real",
+            expected="the trajectories on which the twin was calibrated",
+            got="nothing",
+            remedy="give their file after the model",
+        )
+    else:
+        calibration = read(real, system, max_bytes=max_bytes)
+        rt.fit_inversion(
+            updated.surrogate, updated.residual, calibration, system.faults, twin=system.twin
+        ).save(out)
     note(f"Saved {out}")
 
 
@@ -121,30 +141,60 @@ def predict(
         check_place(out)
     diagnoser = rt.load_diagnoser(saved(model))
     trajectories = read(file, data_case(case), max_bytes=max_bytes)
-    probabilities = diagnoser.predict_proba(trajectories)
+    probabilities, severities = _diagnosed(diagnoser, trajectories)
     _check_finite(trajectories, probabilities)
     labels = trajectories.labels.tolist()
     labelled = bool(trajectories.known_labels) and "" not in labels
     scores = rt.evaluate(diagnoser, trajectories) if labelled else None
     diagnosed = diagnoses(trajectories, diagnoser.classes, probabilities)
     outside = outside_training(getattr(diagnoser, "surrogate", None), trajectories).tolist()
-    for each, label, beyond in zip(diagnosed, labels, outside, strict=True):
+    for each, label, beyond, own in zip(diagnosed, labels, outside, severities, strict=True):
         each["label"] = label or None
         each["commands"] = "outside" if beyond else "ok"
-    shown = ("trajectory", "diagnosis", "probability", "label", *["commands"] * any(outside))
-    rows = [
-        (e["id"], e["diagnosis"], f"{e['probability']:.2f}", e["label"] or "", e["commands"])
-        for e in diagnosed
-    ]
+        each |= own
+    columns = {"trajectory": "id", "diagnosis": "diagnosis", "probability": "probability"}
+    columns |= {name: name for name in (*severities[0], "label", *["commands"] * any(outside))}
+    rows = [[_shown(each[name]) for name in columns.values()] for each in diagnosed]
+    numbers = ("probability", *severities[0])
     answer(
         {"emulated": trajectories.emulated, "trajectories": diagnosed, "scores": scores},
-        table(shown, [row[: len(shown)] for row in rows], numbers=("probability",)),
+        table(tuple(columns), rows, numbers=numbers),
         *([EMULATED] if trajectories.emulated else []),
         *([str(scores)] if scores is not None else []),
         as_json=as_json,
     )
     if out is not None:
         write_probabilities(out, diagnoser.classes, diagnosed)
+
+
+def _diagnosed(
+    diagnoser: Diagnoser, trajectories: Trajectories
+) -> tuple[NDArray, list[dict[str, float | None]]]:
+    """Class probabilities, and, of an inversion with states, the severity of each diagnosis."""
+    from retwin.diagnosis import StateInversionDiagnoser
+
+    if not isinstance(diagnoser, StateInversionDiagnoser):
+        return diagnoser.predict_proba(trajectories), [{}] * len(trajectories)
+    with bar("diagnose") as show:
+        found = diagnoser.diagnose(trajectories, progress=lambda share: show("faults", share))
+    own = (np.arange(len(trajectories)), found.probabilities.argmax(axis=1))
+    columns = {
+        "unknown": found.unknown,
+        "size": found.size.value[own],
+        "onset in s": found.onset.value[own],
+    }
+    made = [
+        {name: None if np.isnan(each[i]) else float(each[i]) for name, each in columns.items()}
+        for i in range(len(trajectories))
+    ]
+    return found.probabilities, made
+
+
+def _shown(value: object) -> str:
+    """A value of a table: numbers with three digits, nothing for None."""
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return "" if value is None else str(value)
 
 
 def diagnoses(

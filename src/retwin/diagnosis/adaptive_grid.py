@@ -1,8 +1,8 @@
 """Integrals over the size, the onset and the end of a fault, by a grid that refines itself.
 
 The likelihood of a record is narrow in these quantities and can have several modes. The likelihood
-is evaluated at the centres of the cells of a grid, and the cells that contribute most are halved
-along each side until the integral changes no more.
+is evaluated at the centres of the cells of a grid. The cells that contribute most, and those beside
+the best one, are halved along each side until the integral changes no more.
 """
 
 from __future__ import annotations
@@ -20,10 +20,12 @@ CELLS = {1: 48, 2: 12, 3: 8}
 """Cells along each side at first, by the number of quantities that are open."""
 NEGLIGIBLE = 8.0
 """How many nats below the largest contribution a cell is refined no further: 3e-4 of it."""
-LEAST = 24
+LEAST = 12
 """Number of cells that are refined at least, since a maximum may lie off all centres."""
 TOLERANCE = 0.05
 """Change of the log integral in nats, below which there is no further round."""
+LARGEST = 0.03
+"""Share of one cell, below which there is no further round: intervals are no finer than a cell."""
 ROUNDS = 30
 """Rounds at most."""
 
@@ -74,7 +76,7 @@ def integrated(
     sides = outer[:, 1] - outer[:, 0]
     count = CELLS.get(int(is_open.sum()), 1)
     edges = [
-        _edges(*ends, count if free else 1, only)
+        _edges(ends, count if free else 1, only)
         for ends, free, only in zip(outer, is_open, whole, strict=True)
     ]
     cells = np.array(list(product(*[pairwise(each) for each in edges])))
@@ -98,15 +100,18 @@ def integrated(
     mass = log_mass(cells)
     total = _total(mass)
     for _ in range(ROUNDS if is_open.any() else 0):
-        order = np.argsort(-mass)
-        chosen = order[: max(LEAST, int((mass > mass.max() - NEGLIGIBLE).sum()))]
+        best = cells[np.argmax(mass)]
+        # The likelihood may end abruptly, so that a maximum lies at the edge of a poor cell.
+        beside = ((cells[..., 0] <= best[:, 1]) & (cells[..., 1] >= best[:, 0])).all(axis=1)
+        lowest = min(np.sort(mass)[-min(LEAST, len(mass))], mass.max() - NEGLIGIBLE)
+        chosen = np.flatnonzero(beside | (mass >= lowest))
         parts = np.concatenate([_halves(each, whole) for each in cells[chosen]])
         if len(parts) == len(chosen):
             break
         cells = np.concatenate([np.delete(cells, chosen, axis=0), parts])
         mass = np.concatenate([np.delete(mass, chosen), log_mass(parts)])
         before, total = total, _total(mass)
-        if abs(total - before) < TOLERANCE:
+        if abs(total - before) < TOLERANCE and mass.max() < total + np.log(LARGEST):
             break
     if not np.isfinite(total):
         return Integral(-np.inf, *[np.full(len(limits), np.nan)] * 4)
@@ -121,10 +126,10 @@ def _total(mass: NDArray) -> float:
     return float(best + np.log(np.exp(mass - best).sum())) if np.isfinite(best) else -np.inf
 
 
-def _edges(low: float, high: float, count: int, whole: bool) -> NDArray:
+def _edges(ends: NDArray, count: int, whole: bool) -> NDArray:
     """Edges of the cells of one side; a cell of whole numbers contains one at least."""
-    made = np.linspace(low, high, count + 1)
-    return np.unique(np.round(made - 0.5) + 0.5) if whole and high > low else made
+    made = np.linspace(ends[0], ends[1], count + 1)
+    return np.unique(np.round(made - 0.5) + 0.5) if whole and ends[1] > ends[0] else made
 
 
 def _halves(cell: NDArray, whole: NDArray) -> NDArray:

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import NormalDist
+from typing import overload
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ from retwin.diagnosis.latent_prior import command_problem, command_space, health
 from retwin.diagnosis.missed_segments import best_fit, fitted_noise
 from retwin.diagnosis.onsets import Onsets
 from retwin.diagnosis.severity import biases, stuck_level
+from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.inference.noise import Noise
 from retwin.progress import Progress
@@ -36,6 +38,7 @@ from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.twin import Twin
 from retwin.update.corrections import Context, sample_mask
 from retwin.update.corrections.missed_segments import Fit
+from retwin.update.dynamics import DynamicsTwin
 from retwin.update.exact import exact_surrogate
 from retwin.update.residual import Residual, ResidualModel
 from retwin.update.surrogate import Surrogate
@@ -252,7 +255,16 @@ FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
 """The faults that can be inverted, and that a model folder may name."""
 
 
-@torch.no_grad()
+@overload
+def fit_inversion(
+    surrogate: DynamicsTwin,
+    residual: None,
+    calibration: Trajectories | None,
+    faults: Mapping[str, Fault | None],
+) -> StateInversionDiagnoser: ...
+
+
+@overload
 def fit_inversion(
     surrogate: Surrogate | Twin,
     residual: Residual,
@@ -260,20 +272,33 @@ def fit_inversion(
     faults: Mapping[str, Fault | None],
     *,
     twin: Twin | None = None,
-) -> InversionDiagnoser:
-    """A diagnoser by physics: only its noise is learned, from healthy trajectories.
+) -> InversionDiagnoser: ...
+
+
+@torch.no_grad()
+def fit_inversion(
+    surrogate: Surrogate | Twin,
+    residual: Residual | None,
+    calibration: Trajectories | None,
+    faults: Mapping[str, Fault | None],
+    *,
+    twin: Twin | None = None,
+) -> InversionDiagnoser | StateInversionDiagnoser:
+    """A diagnoser by physics: at most its noise is learned, from healthy trajectories.
 
     Parameters
     ----------
     surrogate : Surrogate or Twin
         Of the updated twin, or a twin in its place (see `ExactSurrogate`), with which the diagnoser
-        cannot be saved.
-    residual : Residual
-        Of the updated twin, a `ResidualModel` with `CommandSpace`.
-    calibration : Trajectories
-        Those that the residual model was fitted to; the healthy ones are used.
+        cannot be saved. A `DynamicsTwin` is everything that its inversion needs.
+    residual : Residual or None
+        Of the updated twin, a `ResidualModel` with `CommandSpace`; None with a `DynamicsTwin`.
+    calibration : Trajectories or None
+        Those that the residual model was fitted to; the healthy ones are used. None with a
+        `DynamicsTwin`, which has learned its noise.
     faults : mapping of str to Fault or None
-        Class name to fault, as a case has them.
+        Class name to fault, as a case has them: of actuators, or, with a `DynamicsTwin`, of
+        parameters, sensors and actuators (`retwin.twins.ParameterShift` and others).
     twin : Twin, optional
         The twin that the surrogate was trained on. It simulates the commands, and what the
         surrogate errs there makes diagnoses less certain; without it, what the surrogate erred on
@@ -282,15 +307,32 @@ def fit_inversion(
     Raises
     ------
     InputError
-        There is no healthy trajectory, and whatever `InversionDiagnoser` refuses.
+        There is no healthy trajectory, and whatever `InversionDiagnoser` or
+        `StateInversionDiagnoser` refuses.
 
     """
+    if isinstance(surrogate, DynamicsTwin):
+        require(
+            residual is None,
+            "residual",
+            expected="None, since corrected dynamics have a distribution",
+            got=type(residual).__name__,
+            remedy="leave it out",
+        )
+        return StateInversionDiagnoser(surrogate, faults)
     if not isinstance(residual, ResidualModel):
         raise InputError(
             "residual",
             expected="a residual model with one z per segment",
             got=type(residual).__name__,
             remedy="fit it with CommandSpace",
+        )
+    if calibration is None:
+        raise InputError(
+            "calibration",
+            expected="trajectories",
+            got="None",
+            remedy="give those that the residual model was fitted to",
         )
     healthy = calibration.with_label(HEALTHY)
     require(

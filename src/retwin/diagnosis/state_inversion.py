@@ -136,7 +136,9 @@ class StateInversionDiagnoser:
             )
         check_faults(list(faults.values()), len(twin.inputs), len(twin.outputs), twin.shiftable)
         self.twin = twin
-        self.faults = dict(faults)
+        self.faults = {
+            name: each if isinstance(each, TimedFault) else None for name, each in faults.items()
+        }
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -261,12 +263,11 @@ class _Record:
         measured = np.where(seen, trajectory.observed[0].astype(np.float64), 0.0)
         return cls(twin, trajectory.commands[0].astype(np.float64), measured, seen, known_start)
 
-    def integral(self, fault: Fault | None) -> Integral:
+    def integral(self, fault: TimedFault | None) -> Integral:
         """The evidence for a fault, and the posterior of its size, onset and end."""
         steps, rate = len(self.commands), self.twin.rate
         if fault is None:
             return Integral(float(self._under(None, NOTHING[None])[0]), *[NOTHING] * 4)
-        assert isinstance(fault, TimedFault), "checked"
         sizes = ends_of(fault.size) if isinstance(fault, SizedFault) else (1.0, 1.0)
         limits = np.array([sizes, fault.onset_range(steps, rate), fault.end_range(steps, rate)])
 
@@ -287,7 +288,7 @@ class _Record:
         ends = (np.where(missing, np.nan, e / scale) for e in (found.low, found.mean, found.high))
         return Integral(found.evidence, found.best, *ends)
 
-    def unknown(self, faults: Iterable[Fault | None], found: Iterable[Integral]) -> float:
+    def unknown(self, faults: Iterable[TimedFault | None], found: Iterable[Integral]) -> float:
         """The evidence for something else besides one of the faults, or besides none.
 
         It adds noise to what the twin predicts with the most probable size and times of the fault.
@@ -327,7 +328,7 @@ class _Record:
         shape = (len(points), 1, 1)
         commands, measured = np.tile(self.commands, shape), np.tile(self.measured, shape)
         seen, gain, changes = np.tile(self.seen, shape), np.zeros(len(points)), None
-        made = [_fixed(fault, *point, rate) for point in points] if fault is not None else []
+        made = [_fixed(fault, point, rate) for point in points] if fault is not None else []
         if isinstance(fault, ParameterShift):
             changes = parameter_changes(made, self.twin.shiftable, steps, rate)
         for i, each in enumerate(made):
@@ -429,7 +430,8 @@ def _digit(values: NDArray) -> float:
     return float(steps.min()) if len(steps) else 0.0
 
 
-def _fixed(fault: TimedFault, size: float, onset: float, end: float, rate: float) -> TimedFault:
-    """The fault with this size, from and to these samples."""
-    own = {"size": float(size)} if isinstance(fault, SizedFault) else {}
-    return replace(fault, onset=onset / rate, end=max(end, onset + 1) / rate, **own)
+def _fixed(fault: TimedFault, point: NDArray, rate: float) -> TimedFault:
+    """The fault with the size, and from and to the samples, of a point (3,)."""
+    size, onset, end = point.tolist()
+    timed = replace(fault, onset=onset / rate, end=max(end, onset + 1) / rate)
+    return replace(timed, size=size) if isinstance(timed, SizedFault) else timed

@@ -19,7 +19,7 @@ from retwin.twins.noisy import NoisyTwin, residual_scale
 from retwin.twins.randomised import RandomisedTwin
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
-from retwin.update.dynamics import has_states
+from retwin.update.dynamics import DynamicsTwin, has_states
 from retwin.update.residual import ResidualModel, SequenceMixture
 
 __all__ = ["lacking", "not_installed"]
@@ -120,6 +120,13 @@ def inversion(trial: Trial) -> FittedDiagnoser:
     return fit_inversion(trial.surrogate(), residual, trial.healthy, case.faults, twin=case.twin)
 
 
+def inversion_dynamics(trial: Trial) -> FittedDiagnoser:
+    """The inversion of faults by the filter of the corrected dynamics."""
+    updated = trial.updated("dynamics")
+    assert isinstance(updated, DynamicsTwin), "that is what the update makes"
+    return fit_inversion(updated, None, None, trial.case.faults)
+
+
 def lacking(name: str, case: Case, plan: StudyPlan) -> str:
     """What a study lacks for a source.
 
@@ -147,7 +154,7 @@ def lacking(name: str, case: Case, plan: StudyPlan) -> str:
         return f"a case with a correction besides the one at its outputs; {case.name!r} has none"
     if name == "inversion" and isinstance(case.density, SequenceMixture):
         return "a correction per segment"
-    if name == "dynamics" and not has_states(case.twin):
+    if ("update", "dynamics") in source.needs and not has_states(case.twin):
         return f"a case whose twin is a StateTwin; that of {case.name!r} is none"
     if source.parametric and case.parametric is None:
         return f"a case that declares the free parameters of its twin; {case.name!r} does not"

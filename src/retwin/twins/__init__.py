@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # one kind of twin does not load what another kind needs
 
 _HOME = {
     "ActuatorBias": "faults",
+    "ActuatorGain": "system_faults",
     "Chunk": "twin",
     "CommandSampler": "samplers",
     "CommandSide": "command_side",
@@ -34,10 +35,14 @@ _HOME = {
     "MultisineSampler": "samplers",
     "NoisyTwin": "noisy",
     "Parameter": "parametric",
+    "ParameterShift": "system_faults",
     "ParametricTwin": "parametric",
     "RampSampler": "samplers",
     "RandomisedTwin": "randomised",
     "RecordedSampler": "samplers",
+    "SensorBias": "system_faults",
+    "SensorDrift": "system_faults",
+    "SensorFreeze": "system_faults",
     "Servo": "mujoco",
     "SimulationError": "twin",
     "State": "state",

@@ -219,6 +219,11 @@ class ParametricTwin(TwinWrapper):
         low, high = zip(*((each.low, each.high) for each in self.parameters), strict=True)
         return np.array(low, dtype=float), np.array(high, dtype=float)
 
+    @property
+    def shiftable(self) -> tuple[str, ...]:
+        """Parameters of the wrapped twin that can change during a simulation."""
+        return getattr(self.twin, "shiftable", ())
+
     def with_values(self, values: ArrayLike | Mapping[str, float]) -> ParametricTwin:
         """The same twin at other values.
 

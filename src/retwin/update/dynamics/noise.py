@@ -18,11 +18,15 @@ from retwin.update.dynamics.twin import DynamicsTwin
 
 __all__ = ["fit_noise", "folds", "widening"]
 
-RATIO = 0.1
-"""Deviations at the start of the search: of the process noise, over the usual step of a sample, and
-of the measurement noise, over the error of free simulation."""
+PROCESS = (1e-3, 1e-2, 1e-1, 1.0)
+"""Deviations of the process noise with which the search may begin, over the usual step of a
+sample."""
+NOISE = (1e-2, 1e-1, 1.0)
+"""Those of the measurement noise, over the error of free simulation."""
 SMALLEST = 1e-6
-"""Lowest of these ratios."""
+"""Lowest of these ratios, and the reciprocal of the highest."""
+IMPOSSIBLE = 1e100
+"""Cost where the filter is not finite."""
 LEVEL = 0.9
 """Probability of the intervals that are calibrated."""
 ENOUGH = 100_000
@@ -73,20 +77,41 @@ def fit_noise(
         return replace(twin, process=process, noise=twin.noise * np.exp(2 * logs[count:]))
 
     def cost(logs: NDArray) -> float:
-        value = -float(np.sum(_predicted(at(logs), observed, parts, moves).log_density()))
-        return value if np.isfinite(value) else np.inf
+        value = -float(np.sum(_predicted(at(logs), observed, parts, kept).log_density()))
+        return value if np.isfinite(value) else IMPOSSIBLE
 
-    start = np.full(count + len(twin.noise), np.log(RATIO))
+    # A linear step to the parameters without a part may lead where the equations diverge.
+    usual = at(np.zeros(count + len(twin.noise)))
+    finite = [
+        np.isfinite(_predicted(usual, observed, [part], move[None]).mean[part]).all()
+        for part, move in zip(parts, moves, strict=True)
+    ]
+    kept = np.where(np.array(finite)[:, None], moves, 0.0)
+    # The likelihood has plateaus and several maxima: the search begins at the best point of a grid,
+    # along the diagonal and then along each coordinate, and with wide steps.
+    width = count + len(twin.noise)
+    start = min(
+        (np.repeat(np.log([a, b]), [count, len(twin.noise)]) for a in PROCESS for b in NOISE),
+        key=cost,
+    )
+    for i in range(width):
+        values = np.log(PROCESS if i < count else NOISE)
+        start = min((np.where(np.arange(width) == i, value, start) for value in values), key=cost)
     found = minimize(
         cost,
         start,
         method="Nelder-Mead",
-        bounds=[(np.log(SMALLEST), -np.log(RATIO))] * len(start),
-        options={"maxfev": EVALUATIONS * len(start), "xatol": 0.02, "fatol": 0.1},
+        bounds=[(np.log(SMALLEST), -np.log(SMALLEST))] * width,
+        options={
+            "initial_simplex": start + np.vstack([np.zeros(width), np.eye(width)]),
+            "maxfev": EVALUATIONS * width,
+            "xatol": 0.02,
+            "fatol": 0.1,
+        },
     )
     made = at(found.x)
     # A common scale changes no prediction, but all intervals.
-    error = np.abs(_predicted(made, observed, parts, moves).standardised())
+    error = np.abs(_predicted(made, observed, parts, kept).standardised())
     scale = (np.nanquantile(error, LEVEL) / ndtri((1 + LEVEL) / 2)) ** 2
     noise = np.maximum(scale * made.noise, SMALLEST**2 * twin.noise)
     return replace(made, process=scale * made.process, noise=noise)
@@ -98,12 +123,11 @@ def _predicted(
     """One-step predictions of each part with the parameters that are estimated without it."""
     commands = observed.commands.astype(np.float64)
     measured = np.where(observed.mask, observed.observed, 0.0)
-    every = [np.empty((*measured.shape, *more)) for more in ((), (measured.shape[2],))]
+    mean, covariance = (np.zeros((*measured.shape, *more)) for more in ((), measured.shape[2:]))
     for part, move in zip(parts, moves, strict=True):
         found = twin.filter(commands, measured, observed.mask, moves=move)
-        for whole, own in zip(every, found, strict=False):
-            whole[part] = own[part]
-    return Prediction(observed, *every, found[2])
+        mean[part], covariance[part] = found[0][part], found[1][part]
+    return Prediction(observed, mean, covariance, found[2])
 
 
 def folds(seen: NDArray, count: int) -> list[NDArray]:
