@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import multivariate_normal
+from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 import retwin as rt
 from retwin.diagnosis import Diagnosis, InversionDiagnoser, fit_inversion
+from retwin.diagnosis.inversion import lower_bound
 from retwin.diagnosis.severity import draw_biases
 from retwin.inference.losses import StudentT
 from retwin.inference.noise import Noise
@@ -277,6 +279,25 @@ def test_the_emulated_arm_is_diagnosed(diagnosis: Diagnosis, arm: tuple) -> None
 
 
 @pytest.mark.slow
+def test_a_fault_that_is_left_out_is_unknown(
+    diagnosis: Diagnosis, inversion: InversionDiagnoser, arm: tuple
+) -> None:
+    """The evidence for a class does not depend on the others: one is left out by its column."""
+    areas = []
+    assert np.mean(diagnosis.unknown < 0.5) >= 0.9
+    for left in range(1, len(diagnosis.classes)):
+        kept = np.delete(diagnosis.evidence, left, axis=1)
+        own = arm[0].labels == diagnosis.classes[left]
+        areas.append(roc_auc_score(own, -kept.max(axis=1)))
+    assert np.mean(areas) >= 0.9
+    some = arm[0][arm[0].labels == "Motor_1_Stuck"]
+    faults = {name: fault for name, fault in inversion.faults.items() if name != "Motor_1_Stuck"}
+    parts = {"noise": inversion.noise, "bound": inversion.bound}
+    others = InversionDiagnoser(inversion.surrogate, inversion.residual, faults, **parts)
+    assert (others.diagnose(some).labels == "unknown").mean() >= 0.5
+
+
+@pytest.mark.slow
 def test_intervals_of_severities_cover(diagnosis: Diagnosis, arm: tuple) -> None:
     """The limits are ten standard deviations and more away from what 11 retrainings give.
 
@@ -386,3 +407,12 @@ def test_what_the_page_shows_runs(capsys: pytest.CaptureFixture[str]) -> None:
     exec(compile(code, "docs/inversion.md", "exec"), names)
     assert "stands at" in capsys.readouterr().out
     assert (names["found"].probabilities[:, names["own"]] > 0.5).all()
+
+
+def test_the_bound_holds_99_of_100_further_values() -> None:
+    rng = np.random.default_rng(0)
+    draws = rng.normal(3, 2, (20000, 5))
+    below = np.mean([values[0] < lower_bound(values[1:]) for values in draws])
+    # 0.01 with a standard error of 0.0007: six of them.
+    assert below == pytest.approx(0.01, abs=0.0042)
+    assert lower_bound(np.ones(1)) == -np.inf

@@ -5,7 +5,9 @@ The emulated box has a nonlinear loss, which its twin lacks.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -220,3 +222,14 @@ def test_records_of_another_system_are_refused(diagnoser, records) -> None:
     late = {"Healthy": None, "late": replace(FAULTS["leak"], onset=500.0)}
     with pytest.raises(InputError, match="onset"):
         StateInversionDiagnoser(diagnoser.twin, late).diagnose(records[0][:1])
+
+
+def test_the_page_of_faults() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "faults.md").read_text("utf-8")
+    names: dict = {"__name__": "shown"}
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(code, "docs/faults.md", "exec"), names)
+    found, drawn = names["found"], names["records"].labels[5:]
+    assert np.diag(found.probabilities).min() > 0.9
+    assert (found.unknown < 0.5).all()
+    assert len(drawn) == len(found.classes)

@@ -135,6 +135,7 @@ def predict(
 ) -> None:
     """Diagnose trajectories, and score the diagnoses if the labels are known."""
     import retwin as rt
+    from retwin.evaluation.diagnosers import scored
     from retwin.update.training_range import outside_training
 
     if out is not None:
@@ -145,7 +146,8 @@ def predict(
     _check_finite(trajectories, probabilities)
     labels = trajectories.labels.tolist()
     labelled = bool(trajectories.known_labels) and "" not in labels
-    scores = rt.evaluate(diagnoser, trajectories) if labelled else None
+    classes = diagnoser.classes
+    scores = scored(trajectories, probabilities, classes) if labelled else None
     diagnosed = diagnoses(trajectories, diagnoser.classes, probabilities)
     outside = outside_training(getattr(diagnoser, "surrogate", None), trajectories).tolist()
     for each, label, beyond, own in zip(diagnosed, labels, outside, severities, strict=True):
@@ -170,19 +172,17 @@ def predict(
 def _diagnosed(
     diagnoser: Diagnoser, trajectories: Trajectories
 ) -> tuple[NDArray, list[dict[str, float | None]]]:
-    """Class probabilities, and, of an inversion with states, the severity of each diagnosis."""
-    from retwin.diagnosis import StateInversionDiagnoser
+    """Class probabilities, and what an inversion gives besides for the most probable class."""
+    from retwin.diagnosis import InversionDiagnoser, StateDiagnosis, StateInversionDiagnoser
 
-    if not isinstance(diagnoser, StateInversionDiagnoser):
-        return diagnoser.predict_proba(trajectories), [{}] * len(trajectories)
+    if not isinstance(diagnoser, InversionDiagnoser | StateInversionDiagnoser):
+        return diagnoser.predict_proba(trajectories), [{} for _ in range(len(trajectories))]
     with bar("diagnose") as show:
         found = diagnoser.diagnose(trajectories, progress=lambda share: show("faults", share))
-    own = (np.arange(len(trajectories)), found.probabilities.argmax(axis=1))
-    columns = {
-        "unknown": found.unknown,
-        "size": found.size.value[own],
-        "onset in s": found.onset.value[own],
-    }
+    columns = {"unknown": found.unknown}
+    if isinstance(found, StateDiagnosis):
+        own = (np.arange(len(trajectories)), found.probabilities.argmax(axis=1))
+        columns |= {"size": found.size.value[own], "onset in s": found.onset.value[own]}
     made = [
         {name: None if np.isnan(each[i]) else float(each[i]) for name, each in columns.items()}
         for i in range(len(trajectories))

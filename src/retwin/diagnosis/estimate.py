@@ -6,7 +6,10 @@ from dataclasses import dataclass
 
 from numpy.typing import NDArray
 
-__all__ = ["Estimate"]
+__all__ = ["UNKNOWN", "Estimate"]
+
+UNKNOWN = "unknown"
+"""Name of what is none of the classes."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,8 @@ explain them best give the severity of the fault.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import NormalDist
 from typing import overload
@@ -18,15 +17,18 @@ from typing import overload
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from scipy.special import expit, logsumexp
+from scipy.stats import t as student
+from torch import Tensor
 
 from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, Trajectories
-from retwin.diagnosis.estimate import Estimate
+from retwin.diagnosis.estimate import UNKNOWN, Estimate
 from retwin.diagnosis.hypotheses import Hypotheses, checked
 from retwin.diagnosis.latent_prior import command_problem, command_space, healthy_prior
 from retwin.diagnosis.missed_segments import best_fit, fitted_noise
 from retwin.diagnosis.onsets import Onsets
+from retwin.diagnosis.samples import Samples
 from retwin.diagnosis.severity import biases, stuck_level
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
@@ -36,7 +38,6 @@ from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.twin import Twin
-from retwin.update.corrections import Context, sample_mask
 from retwin.update.corrections.missed_segments import Fit
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.exact import exact_surrogate
@@ -75,6 +76,8 @@ class Diagnosis:
         (n, C, M), error of a biased actuator in each segment, in its command's unit.
     outside : NDArray
         (n,) bool, whether the commands are outside the training range of the surrogate.
+    unknown : NDArray
+        (n,), the probability that none of the classes is the true one.
 
     """
 
@@ -85,6 +88,14 @@ class Diagnosis:
     onset: Estimate
     bias: Estimate
     outside: NDArray
+    unknown: NDArray
+
+    @property
+    def labels(self) -> NDArray:
+        """The most probable class of each trajectory (n,), or "unknown"."""
+        names = np.array(self.classes)[self.probabilities.argmax(axis=1)]
+        made: NDArray = np.where(self.unknown > 0.5, UNKNOWN, names)
+        return made
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +155,9 @@ class InversionDiagnoser:
     surrogate_variance : Tensor, optional
         (d_y,), mean square of the surrogate's own error, in the outputs' units squared; by default
         it has none.
+    bound : float, optional
+        Evidence per measured sample below which a trajectory is unknown (see `lower_bound`); by
+        default none is.
 
     Raises
     ------
@@ -161,6 +175,7 @@ class InversionDiagnoser:
         *,
         noise: Noise,
         surrogate_variance: Tensor | None = None,
+        bound: float = -np.inf,
     ) -> None:
         self.surrogate = exact_surrogate(surrogate)
         self.residual = residual
@@ -168,6 +183,7 @@ class InversionDiagnoser:
         self.noise = noise
         none = torch.zeros(len(residual.outputs), dtype=torch.float64)
         self.surrogate_variance = none if surrogate_variance is None else surrogate_variance
+        self.bound = bound
         command_space(residual.correction)
 
     @property
@@ -191,7 +207,7 @@ class InversionDiagnoser:
             The channels or the sample rate are not those of the surrogate.
 
         """
-        given = _Samples.of(self.surrogate, self.residual, trajectories)
+        given = Samples.of(self.surrogate, self.residual, trajectories)
         given = given.with_error(self.surrogate_variance)
         faults = tuple(self.faults.values())
         parts = []
@@ -203,6 +219,7 @@ class InversionDiagnoser:
                 progress(min(1.0, (begin + TRAJECTORIES_PER_BATCH) / len(trajectories)))
         evidence, level, onset, bias = (np.concatenate(each) for each in zip(*parts, strict=True))
         share = np.exp(evidence - evidence.max(axis=1, keepdims=True))
+        measured = given.mask.any(dim=2).sum(dim=1).clamp_min(1).numpy()
         severities = (level, onset / trajectories.rate, bias)
         levels, onsets, offsets = (Estimate(*np.moveaxis(each, -1, 0)) for each in severities)
         return Diagnosis(
@@ -213,6 +230,7 @@ class InversionDiagnoser:
             onsets,
             offsets,
             outside_training(self.surrogate, trajectories),
+            expit(self.bound * measured - logsumexp(evidence, axis=1)),
         )
 
     def save(self, folder: str | Path) -> None:
@@ -227,6 +245,8 @@ class InversionDiagnoser:
             "thinning": self.noise.thinning,
             "surrogate_variance": self.surrogate_variance,
         }
+        if np.isfinite(self.bound):
+            learned["bound"] = torch.tensor(self.bound, dtype=torch.float64)
         with write_model(folder, "inversion", about, learned) as inside:
             self.surrogate.save(inside / "surrogate")
             self.residual.save(inside / "residual")
@@ -248,6 +268,7 @@ class InversionDiagnoser:
             noise=Noise(weights["scale"], weights["thinning"]),
             # Development versions before 0.1.0 did not write it.
             surrogate_variance=weights.get("surrogate_variance"),
+            bound=float(weights.get("bound", -np.inf)),
         )
 
 
@@ -343,7 +364,7 @@ def fit_inversion(
         remedy="label healthy trajectories",
     )
     surrogate = exact_surrogate(surrogate)
-    given = _Samples.of(surrogate, residual, healthy)
+    given = Samples.of(surrogate, residual, healthy)
     segments = given.context.segments
     found = surrogate_variance(surrogate, twin, healthy.commands, segments)
     variance = (
@@ -351,72 +372,29 @@ def fit_inversion(
     )
     context, observed, mask = given.with_error(variance)[:]
     problem = command_problem(residual, context, observed, mask)
+    noise = fitted_noise(problem, healthy_prior(residual, context), rounds=ROUNDS)
+    known = invert(Hypotheses.of((None,), residual, context, observed, mask), noise)
+    each = known.evidence.numpy() / mask.any(dim=2).sum(dim=1).clamp_min(1).numpy()
     return InversionDiagnoser(
         surrogate,
         residual,
         faults,
-        noise=fitted_noise(problem, healthy_prior(residual, context), rounds=ROUNDS),
+        noise=noise,
         surrogate_variance=variance,
+        bound=lower_bound(each),
     )
 
 
-class _Precise:
-    """A surrogate in double precision: no output depends on the batch that it is computed in."""
+def lower_bound(values: NDArray) -> float:
+    """What a further value exceeds with a probability of 0.99, from n normal ones.
 
-    def __init__(self, surrogate: Surrogate) -> None:
-        self.memoryless = surrogate.memoryless
-        self.predict = surrogate.predict
-        self.model = copy.deepcopy(surrogate).double()
-
-    def __call__(self, commands: Tensor) -> Tensor:
-        return self.model(commands.double()).to(commands.dtype)
-
-
-@dataclass(frozen=True, eq=False)
-class _Samples:
-    """The inputs of a diagnosis: the commands' context, and outputs where they were sampled."""
-
-    context: Context
-    observed: Tensor
-    mask: Tensor
-
-    @classmethod
-    def of(
-        cls, surrogate: Surrogate, residual: ResidualModel, trajectories: Trajectories
-    ) -> _Samples:
-        """Those of `trajectories`, which must have the channels and the rate of the surrogate."""
-        for name in ("inputs", "outputs", "rate"):
-            expected, got = getattr(surrogate, name), getattr(trajectories, name)
-            require(
-                expected == got,
-                f"trajectories.{name}",
-                expected=f"what the surrogate was trained on, {expected}",
-                got=got,
-                remedy="resample or rename, or load the file with its case",
-            )
-        context = residual.context(surrogate, np.ascontiguousarray(trajectories.commands))
-        observed = torch.as_tensor(trajectories.observed.astype(np.float64))
-        mask = torch.as_tensor(trajectories.mask.copy())
-        # One by one: the timing of a trajectory's samples must not depend on the others.
-        one_by_one = [slice(i, i + 1) for i in range(len(mask))]
-        sampled = [
-            sample_mask(residual.correction, observed[i], mask[i], trajectories.rate)
-            for i in one_by_one
-        ]
-        if isinstance(surrogate, nn.Module):
-            context = replace(context, surrogate=_Precise(surrogate))
-        return cls(context, observed, torch.cat(sampled))
-
-    def with_error(self, variance: Tensor) -> _Samples:
-        """The same for a surrogate whose error has this variance (d_y,) in every segment."""
-        if not variance.any():
-            return self
-        shape = (*self.context.segments.valid.shape, len(variance))
-        every = variance.double().expand(shape)
-        return replace(self, context=replace(self.context, surrogate_variance=every))
-
-    def __getitem__(self, rows: slice) -> tuple[Context, Tensor, Tensor]:
-        return self.context[rows], self.observed[rows], self.mask[rows]
+    Minus infinity for a single one, which has no spread.
+    """
+    count = len(values)
+    if count < 2:
+        return -np.inf
+    spread = np.std(values, ddof=1) * np.sqrt(1 + 1 / count)
+    return float(np.mean(values) - student.ppf(0.99, count - 1) * spread)
 
 
 def _severities(rows: Hypotheses, found: Inversion, classes: int) -> tuple[NDArray, ...]:

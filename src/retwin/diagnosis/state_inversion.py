@@ -20,7 +20,7 @@ from scipy.special import logsumexp
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.adaptive_grid import Integral, integrated
-from retwin.diagnosis.estimate import Estimate
+from retwin.diagnosis.estimate import UNKNOWN, Estimate
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
@@ -41,10 +41,8 @@ from retwin.twins.twin import check_channels
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.dynamics.prediction import root_of, whitened
 
-__all__ = ["UNKNOWN", "StateDiagnosis", "StateInversionDiagnoser"]
+__all__ = ["StateDiagnosis", "StateInversionDiagnoser"]
 
-UNKNOWN = "unknown"
-"""Name of what is none of the classes."""
 COVERAGE = 0.9
 """Coverage of all intervals."""
 LEVELS = (0.03, 0.1, 0.3, 1.0)

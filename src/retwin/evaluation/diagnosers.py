@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +12,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.diagnosis import Diagnoser
 from retwin.scores.classification import Scores, score
 
-__all__ = ["evaluate", "finite_probabilities"]
+__all__ = ["evaluate", "finite_probabilities", "scored"]
 
 
 def evaluate(diagnoser: Diagnoser, test: Trajectories) -> Scores:
@@ -35,16 +37,21 @@ def evaluate(diagnoser: Diagnoser, test: Trajectories) -> Scores:
         raises it.
 
     """
-    unknown = set(test.labels.tolist()) - set(diagnoser.classes)
+    return scored(test, finite_probabilities(diagnoser, test), diagnoser.classes)
+
+
+def scored(test: Trajectories, probabilities: NDArray, classes: Sequence[str]) -> Scores:
+    """Scores of probabilities (n, classes) of labelled trajectories; see `evaluate`."""
+    unknown = set(test.labels.tolist()) - set(classes)
     require(
         not unknown,
         "test",
-        expected=f"labels among {', '.join(diagnoser.classes)}",
+        expected=f"labels among {', '.join(classes)}",
         got=sorted(unknown),
         remedy="label every trajectory with a class the diagnoser was trained on",
     )
-    truth = np.array([diagnoser.classes.index(label) for label in test.labels])
-    return score(truth, finite_probabilities(diagnoser, test), diagnoser.classes)
+    truth = np.array([list(classes).index(label) for label in test.labels])
+    return score(truth, probabilities, classes)
 
 
 def finite_probabilities(diagnoser: Diagnoser, trajectories: Trajectories) -> NDArray:
