@@ -15,6 +15,7 @@ from dataclasses import asdict
 import numpy as np
 import torch
 from record import record
+from sklearn.metrics import roc_auc_score
 
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import UNIT
@@ -64,6 +65,7 @@ def measured(
     return {
         **{name: scores[name] for name in shown},
         **severities(found, truth, faults, hidden["angles"][:, -1]),
+        **left_out(found, truth),
         "fit (s)": fitted,
         "diagnose, per trajectory (s)": seconds / len(made),
         "threads": float(torch.get_num_threads()),
@@ -87,6 +89,20 @@ def severities(
         "level, 90 % intervals, coverage": covered(found.level, stuck, truth, level).mean(),
         "onset, median error (s)": np.median(error(found.onset, stuck, truth, onset)),
         "onset, 90 % intervals, coverage": covered(found.onset, stuck, truth, onset).mean(),
+    }
+
+
+def left_out(found: Diagnosis, truth: np.ndarray) -> dict[str, float]:
+    """How well each fault, left out of the hypotheses, is told as unknown from all classes."""
+    areas = [
+        roc_auc_score(truth == fault, -np.delete(found.evidence, fault, axis=1).max(axis=1))
+        for fault in range(1, len(found.classes))
+    ]
+    known = np.mean(found.unknown > 0.5)
+    return {
+        "called unknown": float(known),
+        "AUROC of a fault left out, mean": float(np.mean(areas)),
+        "AUROC of a fault left out, lowest": float(np.min(areas)),
     }
 
 
