@@ -102,4 +102,4 @@ def test_a_study_of_a_system_with_states_and_faults(call, oven) -> None:
     assert code == 0, err
     results = json.loads(Path("study/results.json").read_text())
     assert set(results["sources"]) == set(sources.split(","))
-    assert results["sources"]["inversion_dynamics"]["metrics"]["macro_f1"]["mean"] >= 0.8
+    assert results["sources"]["inversion_dynamics"]["scores"]["macro_f1"]["mean"] >= 0.8

@@ -48,6 +48,8 @@ COVERAGE = 0.9
 LEVELS = (0.03, 0.1, 0.3, 1.0)
 """Standard deviations of what is unknown: of process noise per sample, in usual steps of a state,
 or of measurement noise, in standard deviations of an output in the record."""
+TOLERANCE = 0.1
+"""Share of a fault's effect by which it may differ from that of its equation."""
 FROZEN = np.array([1.0, 1e-2, 1e-4])
 """Standard deviations of a sensor that is frozen, in those of its noise in calibration."""
 STEP = 0.1
@@ -183,8 +185,9 @@ class StateInversionDiagnoser:
         for i in range(len(trajectories)):
             record = _Record.of(self.twin, trajectories[i : i + 1], known_start)
             row = [record.integral(fault) for fault in self.faults.values()]
-            row.append(Integral(record.unknown(self.faults.values(), row), *[NOTHING] * 4))
-            found.append(row)
+            unknown = record.unknown(self.faults.values(), row)
+            row = [record.tolerated(*each) for each in zip(self.faults.values(), row, strict=True)]
+            found.append([*row, Integral(unknown, *[NOTHING] * 4)])
             if progress is not None:
                 progress((i + 1) / len(trajectories))
         evidence = np.array([[each.evidence for each in row] for row in found])
@@ -230,6 +233,7 @@ class StateInversionDiagnoser:
         return cls(twin, faults)
 
 
+_Noise = tuple[NDArray, NDArray]
 _Given = tuple[NDArray, NDArray, NDArray, NDArray | None]
 _KINDS = tuple(kind for kind in FAULTS if issubclass(kind, TimedFault))
 
@@ -286,25 +290,56 @@ class _Record:
         ends = (np.where(missing, np.nan, e / scale) for e in (found.low, found.mean, found.high))
         return Integral(found.evidence, found.best, *ends)
 
+    def tolerated(self, fault: TimedFault | None, found: Integral) -> Integral:
+        """The same with the evidence for a fault whose effect differs somewhat from its equation.
+
+        The difference is noise, as probable beforehand as none.
+        """
+        if fault is None or not np.isfinite(found.evidence):
+            return found
+        states, outputs = self._effect(fault, found.best)
+        noise = (
+            self.twin.process + (TOLERANCE * states) ** 2,
+            self.twin.noise + (TOLERANCE * outputs) ** 2,
+        )
+        gain = self._gain(fault, found.best, noise, self._slopes(noise))
+        return replace(found, evidence=found.evidence + float(np.logaddexp(0, gain) - np.log(2)))
+
     def unknown(self, faults: Iterable[TimedFault | None], found: Iterable[Integral]) -> float:
         """The evidence for something else besides one of the faults, or besides none.
 
         It adds noise to what the twin predicts with the most probable size and times of the fault.
         """
-        pairs = list(zip(faults, found, strict=True))
+        pairs = [each for each in zip(faults, found, strict=True) if np.isfinite(each[1].evidence)]
         made = []
         for noise in self._noises():
-            by_noise = self._slopes(noise)
+            slopes = self._slopes(noise)
             for fault, own in pairs:
-                made.append(own.evidence)
-                if np.isfinite(own.evidence):
-                    given, _ = self._inputs(fault, own.best[None])
-                    more = self._log_density(*given, noise=noise, slopes=by_noise)
-                    less = self._log_density(*given, slopes=self._by_parameters)
-                    made[-1] += float(more[0] - less[0])
-        return float(logsumexp(made) - np.log(len(made)))
+                made.append(own.evidence + self._gain(fault, own.best, noise, slopes))
+        return float(logsumexp(made) - np.log(len(made))) if made else -np.inf
 
-    def _noises(self) -> list[tuple[NDArray, NDArray]]:
+    def _gain(
+        self, fault: TimedFault | None, point: NDArray, noise: _Noise, slopes: NDArray
+    ) -> float:
+        """By how much another noise, with the slopes of its filter, raises a log density."""
+        given, _ = self._inputs(fault, point[None])
+        more = self._log_density(*given, noise=noise, slopes=slopes)
+        less = self._log_density(*given, slopes=self._by_parameters)
+        return float(more[0] - less[0])
+
+    def _effect(self, fault: TimedFault, point: NDArray) -> tuple[NDArray, NDArray]:
+        """Root mean square effects of a fault on states, per sample, and on measured outputs."""
+        twin = self.twin
+        (commands, measured, seen, changes), _ = self._inputs(fault, point[None])
+        x = twin.filter(commands, measured, seen, changes=changes, known_start=self.known_start)[2]
+        own = None if changes is None else changes[0]
+        slopes = twin.slope(x[0], commands[0], own) - twin.slope(x[0], self.commands)
+        steps = slopes if twin.equations.step else slopes / twin.rate
+        active = _fixed(fault, point, twin.rate).active(len(self.commands), twin.rate)
+        both = (steps[active], (measured[0] - self.measured)[active])
+        return tuple(np.sqrt(np.mean(each**2, axis=0)) for each in both)
+
+    def _noises(self) -> list[_Noise]:
         """Variances of process and measurement noise, of which one is larger than the twin's."""
         twin, record = self.twin, np.where(self.seen, self.measured, np.nan)
         step = twin.domain.speed if twin.equations.step else twin.domain.speed / twin.rate
@@ -364,7 +399,7 @@ class _Record:
         changes: NDArray | None,
         *,
         slopes: NDArray,
-        noise: tuple[NDArray, NDArray] | None = None,
+        noise: _Noise | None = None,
     ) -> NDArray:
         """Log densities (J,) of what was measured; minus infinity where they are not finite.
 
@@ -397,7 +432,7 @@ class _Record:
         """Those of the twin with its own noise."""
         return self._slopes(None)
 
-    def _slopes(self, noise: tuple[NDArray, NDArray] | None) -> NDArray:
+    def _slopes(self, noise: _Noise | None) -> NDArray:
         """Derivatives (T, d_y, r) of predictions by the twin's parameters, in posterior deviations.
 
         By central differences along the columns of the factor of their covariance, and then along

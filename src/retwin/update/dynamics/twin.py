@@ -308,13 +308,15 @@ class DynamicsTwin:
         made: NDArray = np.diagonal(found, axis1=2, axis2=3)
         return made
 
-    def slope(self, states: NDArray, commands: NDArray) -> NDArray:
+    def slope(self, states: NDArray, commands: NDArray, changes: NDArray | None = None) -> NDArray:
         """Most probable time derivatives of the states, or the states one sample later.
 
         Parameters
         ----------
         states, commands : ndarray, shapes (K, d_x) and (K, d_u)
             Where they are evaluated.
+        changes : ndarray, shape (K, q), optional
+            What is added to the parameters.
 
         Returns
         -------
@@ -325,7 +327,8 @@ class DynamicsTwin:
         x, u = (
             list(torch.tensor(each, dtype=torch.float64).unbind(1)) for each in (states, commands)
         )
-        p = [torch.full_like(x[0], each) for each in self.values[: -len(self.process)]]
+        values = np.tile(self.values[: -len(self.process)], (len(states), 1))
+        p = list(torch.tensor(values if changes is None else values + changes).unbind(1))
         made: NDArray = torch.stack(self.equations.model.evaluate("slope", x, u, p), 1).numpy()
         return made
 
