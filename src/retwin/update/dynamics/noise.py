@@ -29,9 +29,9 @@ IMPOSSIBLE = 1e100
 """Cost where the filter is not finite."""
 LEVEL = 0.9
 """Probability of the intervals that are calibrated."""
-ENOUGH = 100_000
+ENOUGH = 20_000
 """Number of samples from which the likelihood is computed, unless one trajectory has more. They
-determine a variance to 0.5 %, and bands are scaled to all samples."""
+determine a variance to 1 %, and bands are scaled to all samples."""
 EVALUATIONS = 60
 """Calls of the filter per scale at most."""
 
@@ -66,10 +66,11 @@ def fit_noise(
     step = twin.domain.speed if twin.equations.step else twin.domain.speed / twin.rate
     indices = np.array(corrected, dtype=int)
     count = len(indices)
-    some = max(1, min(len(observed), ENOUGH // observed.steps))
-    part = observed[np.linspace(0, len(observed) - 1, some).round().astype(int)]
-    if not part.mask.any(axis=(0, 1)).all():  # an output that few trajectories have
-        part = observed
+    number = max(1, min(len(observed), ENOUGH // observed.steps))
+    some = np.linspace(0, len(observed) - 1, number).round().astype(int)
+    if not observed[some].mask.any(axis=(0, 1)).all():  # an output that few trajectories have
+        some = np.arange(len(observed))
+    few, own = observed[some], [each[some] for each in parts]
 
     def at(logs: NDArray) -> DynamicsTwin:
         process = np.zeros(len(step))
@@ -77,7 +78,7 @@ def fit_noise(
         return replace(twin, process=process, noise=twin.noise * np.exp(2 * logs[count:]))
 
     def cost(logs: NDArray) -> float:
-        value = -float(np.sum(_predicted(at(logs), observed, parts, kept).log_density()))
+        value = -float(np.sum(_predicted(at(logs), few, own, kept).log_density()))
         return value if np.isfinite(value) else IMPOSSIBLE
 
     # A linear step to the parameters without a part may lead where the equations diverge.
