@@ -409,12 +409,12 @@ class _Record:
         mean, covariance, _ = self.twin.filter(
             commands, measured, seen, changes=changes, noise=noise, known_start=self.known_start
         )
-        made = np.full(len(commands), -np.inf)
-        finite = np.isfinite(mean).all(axis=(1, 2)) & np.isfinite(covariance).all(axis=(1, 2, 3))
+        made, factor = np.full(len(commands), -np.inf), root_of(covariance, seen)
+        finite = np.isfinite(mean).all(axis=(1, 2)) & np.isfinite(factor).all(axis=(1, 2, 3))
         good = np.flatnonzero(finite)
         if not len(good):
             return made
-        own, factor = seen[good], root_of(covariance[good], seen[good])
+        own, factor = seen[good], factor[good]
         errors = whitened((measured - mean)[good], factor, own).reshape(len(good), -1)
         slopes = np.where(own[..., None], slopes, 0.0)
         slopes = np.linalg.solve(factor, slopes).reshape(len(good), errors.shape[1], -1)
@@ -452,6 +452,8 @@ class _Record:
         made = np.where(np.isfinite(made) & self.seen[..., None], made, 0.0)
         factor = root_of(covariance[:1], self.seen[None])[0]
         scaled = np.linalg.solve(factor, made).reshape(-1, count)
+        if not np.isfinite(scaled).all():
+            return made[..., :0]
         _, values, directions = np.linalg.svd(scaled, full_matrices=False)
         return made @ directions[values > SMALLEST].T
 

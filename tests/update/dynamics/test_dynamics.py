@@ -21,6 +21,7 @@ from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.update import Dynamics, DynamicsTwin, Library, OutsideTrainingWarning, fit_dynamics
 from retwin.update.dynamics import FittedDynamics
 from retwin.update.dynamics.estimation import correlation_time
+from retwin.update.dynamics.prediction import log_density
 
 FORCE = rt.Channels(("force",), ("N",))
 POSITION = rt.Channels(("position",), ("m",))
@@ -377,3 +378,12 @@ def test_the_page_of_corrected_dynamics() -> None:
     assert found.figures["rms_after"] < 0.02 * found.figures["rms_before"]
     assert next(iter(found.terms)) == "velocity: position^3"
     assert 0.75 < names["inside"].mean() <= 1
+
+
+def test_a_filter_that_diverges_has_no_density() -> None:
+    covariance = np.ones((1, 4, 2, 2)) + np.eye(2)
+    covariance[0, 1] = np.inf
+    covariance[0, 2] = -np.eye(2)
+    density = log_density(np.zeros((1, 4, 2)), covariance, np.ones((1, 4, 2), dtype=bool))[0]
+    wanted = -np.log(2 * np.pi) - 0.5 * np.log(3)
+    np.testing.assert_allclose(density, [wanted, np.nan, np.nan, wanted])

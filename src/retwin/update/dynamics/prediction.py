@@ -101,10 +101,20 @@ def log_density(error: NDArray, covariance: NDArray, seen: NDArray) -> NDArray:
 
 
 def root_of(covariance: NDArray, seen: NDArray) -> NDArray:
-    """Lower factors (n, T, d_y, d_y) of covariances; an output that is not seen has variance 1."""
-    both = seen[..., :, None] & seen[..., None, :]
-    made: NDArray = np.linalg.cholesky(np.where(both, covariance, np.eye(seen.shape[2])))
-    return made
+    """Lower factors (n, T, d_y, d_y) of covariances; an output that is not seen has variance 1.
+
+    NaN where a covariance is not finite or not positive definite, as where a filter diverges.
+    """
+    both, unit = seen[..., :, None] & seen[..., None, :], np.eye(seen.shape[2])
+    own = np.where(both, covariance, unit)
+    good = np.asarray(np.isfinite(own).all(axis=(2, 3)))
+    try:
+        made = np.linalg.cholesky(np.where(good[..., None, None], own, unit))
+    except np.linalg.LinAlgError:
+        own = np.where(good[..., None, None], own, unit)
+        good &= np.linalg.eigvalsh(own).min(axis=2) > 0
+        made = np.linalg.cholesky(np.where(good[..., None, None], own, unit))
+    return np.where(good[..., None, None], made, np.nan)
 
 
 def whitened(error: NDArray, factor: NDArray, seen: NDArray) -> NDArray:
