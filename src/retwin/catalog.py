@@ -147,9 +147,6 @@ NETWORKS: Mapping[str, Entry] = {
 CLASSIFIERS: Mapping[str, Entry] = {
     "cnn": Entry("retwin.nets.networks:CNN", "convolutional network"),
     "lstm": Entry("retwin.nets.networks:LSTMClassifier", "LSTM, last step (the paper's)"),
-    "state inversion": Entry(
-        "retwin.diagnosis.state_inversion:StateInversionDiagnoser", "fault inversion with states"
-    ),
     "rocket": Entry("retwin.diagnosis.rocket:Rocket", "MiniRocket and a ridge", "rocket"),
 }
 """Classifiers that are trained on generated trajectories."""
