@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scoringrules
-from scipy.stats import ks_2samp, kstest
+from scipy.stats import ks_2samp, kstest, norm
 
 from retwin.errors import InputError
 from retwin.scores.distributions import (
@@ -17,6 +17,7 @@ from retwin.scores.distributions import (
     grouped_quantile,
     inside,
     ks_distance,
+    log_score,
     pit_histograms,
     quantiles,
     share_as_far,
@@ -105,3 +106,21 @@ def test_the_p_value_of_exchangeable_distances_is_uniform() -> None:
     p = [share_as_far(RNG.normal(size=100)) for _ in range(500)]
     assert kstest(p, "uniform").pvalue > 0.01
     assert share_as_far(np.array([5.0, 1.0, np.nan, 2.0])) == pytest.approx(1 / 3)
+
+
+def test_the_log_score_is_that_of_a_normal_and_infinite_without_spread() -> None:
+    draws = RNG.normal(2.0, 3.0, size=(20_000, 2))
+    draws[:, 1] = 1.0
+    found = log_score(np.array([4.0, 1.0]), draws)
+    assert found[0] == pytest.approx(-norm.logpdf(4.0, 2.0, 3.0), abs=0.02)
+    assert found[1] == np.inf
+    assert np.isnan(log_score(np.array([np.nan, np.nan]), draws)).all()
+
+
+def test_the_log_score_is_least_for_the_true_distribution() -> None:
+    observed = RNG.normal(size=4000)
+    scores = {
+        spread: log_score(observed, spread * RNG.normal(size=(500, 4000))).mean()
+        for spread in (0.5, 0.8, 1.0, 1.3, 2.0)
+    }
+    assert min(scores, key=scores.__getitem__) == 1.0

@@ -9,6 +9,8 @@ from __future__ import annotations
 from retwin._lazy import names
 
 _HOME = {
+    "Binned": "residuals",
+    "Correlogram": "residuals",
     "Cost": "decisions",
     "Decision": "decisions",
     "Draws": "bootstrap",
@@ -18,6 +20,7 @@ _HOME = {
     "Roc": "roc",
     "Scores": "classification",
     "SegmentError": "segments",
+    "autocorrelation": "residuals",
     "bootstrap_means": "bootstrap",
     "calibration_error": "calibration",
     "calibration_floor": "calibration",
@@ -27,10 +30,12 @@ _HOME = {
     "compare_runs": "comparison",
     "compliance": "comparison",
     "confusion": "classification",
+    "cross_correlation": "residuals",
     "crps": "distributions",
     "cumulative_counts": "distributions",
     "decide": "decisions",
     "energy_score": "energy",
+    "error_by_amplitude": "residuals",
     "further_group_quantile": "distributions",
     "grouped_quantile": "distributions",
     "grouped_share_interval": "intervals",
@@ -38,6 +43,8 @@ _HOME = {
     "inside": "distributions",
     "jackknife_interval": "intervals",
     "ks_distance": "distributions",
+    "ljung_box": "residuals",
+    "log_score": "distributions",
     "median_error_trajectory": "segments",
     "micro_roc": "roc",
     "no_verdict": "comparison",
@@ -45,10 +52,12 @@ _HOME = {
     "pit_histograms": "distributions",
     "quantiles": "distributions",
     "reliability": "calibration",
+    "rms_over_time": "residuals",
     "row_shares": "classification",
     "score": "classification",
     "share_as_far": "distributions",
     "share_interval": "intervals",
+    "spectra": "residuals",
     "weighted_score": "classification",
 }
 

@@ -1,4 +1,4 @@
-"""Scores of predictive distributions that are given as draws: CRPS, PIT, coverage.
+"""Scores of predictive distributions that are given as draws: CRPS, log score, PIT, coverage.
 
 All functions are pure functions of arrays. The draws of an ensemble are along the first axis.
 """
@@ -21,6 +21,7 @@ __all__ = [
     "grouped_quantile",
     "inside",
     "ks_distance",
+    "log_score",
     "pit_histograms",
     "quantiles",
     "share_as_far",
@@ -98,6 +99,39 @@ def crps(observed: NDArray, draws: NDArray) -> NDArray:
 
     found: NDArray = scoringrules.crps_ensemble(observed, draws, m_axis=0, estimator="pwm")
     return found
+
+
+def log_score(observed: NDArray, draws: NDArray) -> NDArray:
+    """Negative log density of each value, in nats, of a normal with the draws' mean and variance.
+
+    Draws of any source have a mean and a variance, so that all are treated alike, and the score is
+    proper for these two moments. A change of the unit adds the same constant for every source.
+
+    Parameters
+    ----------
+    observed : NDArray
+        Values (...).
+    draws : NDArray
+        Draws (m, ...) of each, two at least.
+
+    Returns
+    -------
+    NDArray
+        Scores (...), lower is better; infinite where all draws are equal, NaN where a value is
+        missing.
+
+    References
+    ----------
+    Dawid and Sebastiani, "Coherent dispersion criteria for optimal experimental design", Annals of
+    Statistics 27 (1999); Gneiting and Raftery, "Strictly proper scoring rules, prediction, and
+    estimation", JASA 102 (2007), section 4.
+
+    """
+    variance = draws.var(axis=0, ddof=1)
+    spread = np.where(variance > 0, variance, np.nan)
+    square = np.square(observed - draws.mean(axis=0)) / spread
+    score = 0.5 * (np.log(2 * np.pi * spread) + square)
+    return np.where(np.isnan(observed) | (variance > 0), score, np.inf)
 
 
 def pit_histograms(
