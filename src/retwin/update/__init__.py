@@ -18,6 +18,7 @@ _HOME = {
     "DelayOffset": "corrections",
     "Density": "residual",
     "Discrepancy": "corrections",
+    "Curve": "dynamics",
     "Dynamics": "dynamics",
     "DynamicsTwin": "dynamics",
     "Evolution": "identification",

@@ -4,6 +4,7 @@ Corrections of outputs and commands are in `retwin.update.corrections`.
 """
 
 from retwin.update.dynamics.corrected import Domain
+from retwin.update.dynamics.curves import Curve
 from retwin.update.dynamics.fitting import Dynamics, FittedDynamics, fit_dynamics
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.prediction import Prediction
@@ -11,6 +12,7 @@ from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import has_states
 
 __all__ = [
+    "Curve",
     "Domain",
     "Dynamics",
     "DynamicsTwin",

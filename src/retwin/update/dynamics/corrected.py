@@ -47,6 +47,8 @@ class Domain:
     ----------
     low, high : NDArray
         (d_x + d_u,), of the states and then the commands.
+    mean : NDArray
+        (d_x + d_u,), their means.
     speed : NDArray
         (d_x,), root mean square of the time derivatives of the states, or of their steps.
 
@@ -54,13 +56,15 @@ class Domain:
 
     low: NDArray
     high: NDArray
+    mean: NDArray
     speed: NDArray
 
     @classmethod
     def visited(cls, states: NDArray, commands: NDArray, speed: NDArray) -> Domain:
         """The domain of states (n, T, d_x) and commands (n, T, d_u)."""
         both = np.concatenate([states, commands], axis=2)
-        return cls(both.min(axis=(0, 1)), both.max(axis=(0, 1)), speed)
+        low, high, mean = (make(both, axis=(0, 1)) for make in (np.min, np.max, np.mean))
+        return cls(low, high, np.clip(mean, low, high), speed)
 
     @cached_property
     def centre(self) -> NDArray:

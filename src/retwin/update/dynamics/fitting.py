@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +96,9 @@ class FittedDynamics:
         The twin's own parameters theta, and their standard errors, which allow for errors of the
         outputs that are correlated within the parts that are held out; infinite for those that
         the record does not determine.
+    correlations : dict of (str, str) to float
+        Posterior correlations of the parameters, with each other and with the coefficients of the
+        terms; the strongest first. Those of parameters that are not determined are left out.
     terms : dict of str to float
         The root mean square of each term over the calibration record, in that of the time
         derivative of its state; the largest first.
@@ -114,6 +118,7 @@ class FittedDynamics:
     twin: DynamicsTwin
     parameters: dict[str, float]
     errors: dict[str, float]
+    correlations: dict[tuple[str, str], float]
     terms: dict[str, float]
     figures: dict[str, float]
     seconds: float
@@ -206,13 +211,15 @@ def fit_dynamics(
     if notes:
         warnings.warn(notes, stacklevel=2)
     k = unknowns.count
-    variance = np.diag(estimation.covariance(found))[: len(found.point.shared)]
-    deviation = np.sqrt(np.maximum(variance, held_out.variance))
+    count = len(found.point.shared)
+    covariance = estimation.covariance(found)[:count, :count]
+    deviation = np.sqrt(np.maximum(np.diag(covariance), held_out.variance))
     deviation[: len(unknown)][unknown] = np.inf
     return FittedDynamics(
         twin=made,
         parameters=dict(zip(unknowns.names, found.point.shared[:k].tolist(), strict=True)),
         errors=dict(zip(unknowns.names, deviation[:k].tolist(), strict=True)),
+        correlations=_correlations(estimation.unknowns.names, covariance, unknown),
         terms=_sizes(equations, estimation, found.point),
         figures={
             "rms_before": alone.rms(fitted.residual),
@@ -338,6 +345,22 @@ def _notes(estimation: Estimation, found: Point, unknown: NDArray) -> str:
     free = [name for name, each in zip(unknowns.names, unknown, strict=False) if each]
     groups = {"at a bound, and perhaps beyond it": names, "not determined by the record": free}
     return "; ".join(f"{what}: {', '.join(each)}" for what, each in groups.items() if each)
+
+
+def _correlations(
+    names: Sequence[str], covariance: NDArray, unknown: NDArray
+) -> dict[tuple[str, str], float]:
+    """Correlations of the determined parameters (k,) with all shared coordinates behind them."""
+    scale = np.sqrt(np.diag(covariance))
+    known = [
+        i for i, each in enumerate(scale) if each > 0 and not (i < len(unknown) and unknown[i])
+    ]
+    made = {
+        (names[i], names[j]): float(covariance[i, j] / scale[i] / scale[j])
+        for i, j in combinations(known, 2)
+        if i < len(unknown)
+    }
+    return dict(sorted(made.items(), key=lambda each: -abs(each[1])))
 
 
 def _sizes(equations: CorrectedEquations, estimation: Estimation, found: Point) -> dict[str, float]:

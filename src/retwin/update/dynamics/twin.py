@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from retwin.twins.state_twin import SAMPLES_PER_CHUNK, StateTwin
 from retwin.twins.twin import Chunk, check_channels, checked_commands, simulate_in_chunks
 from retwin.twins.wrapper import chunk_generator
 from retwin.update.dynamics.corrected import Domain, correctable
+from retwin.update.dynamics.curves import Curve, curve_of
 from retwin.update.dynamics.estimation import Estimation, root
 from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.prediction import Prediction
@@ -35,7 +36,7 @@ KIND = "dynamics"
 """Kind of the saved model."""
 ARRAYS = ("values", "factor", "start_deviation", "process", "noise")
 """Attributes that are saved as arrays."""
-DOMAIN = ("low", "high", "speed")
+DOMAIN = ("low", "high", "mean", "speed")
 """Attributes of the domain."""
 BEYOND = 0.05
 """How far, in widths of the domain, states and commands may leave it without a warning."""
@@ -332,6 +333,33 @@ class DynamicsTwin:
         made: NDArray = torch.stack(self.equations.model.evaluate("slope", x, u, p), 1).numpy()
         return made
 
+    def curve(
+        self, equation: str, variable: str, *, relative_to: Mapping[str, float] | None = None
+    ) -> Curve:
+        """The learned discrepancy of a state equation over one variable, with its uncertainty.
+
+        Parameters
+        ----------
+        equation : str
+            A state of `corrected`.
+        variable : str
+            A state or a command on which that equation depends ("command NAME" for a command with
+            the name of a state). The others are at their means over the calibration.
+        relative_to : mapping of str to float, optional
+            Parameters of the twin without discrepancy that the corrected equation is compared with,
+            those left out as estimated. By default, delta alone: all as estimated. Parameters and
+            delta share the work, so what is known best is the difference to given parameters.
+
+        Raises
+        ------
+        InputError
+            Another equation, variable or parameter.
+
+        """
+        posterior = (self.values[: -len(self.process)], self.factor[: -len(self.process)])
+        axes = (equation, variable)
+        return curve_of(self.equations, posterior, self.domain, self.corrected, axes, relative_to)
+
     def _most_probable(self, commands: NDArray) -> tuple[NDArray, NDArray]:
         """Outputs and states without noise; equal commands are simulated once."""
         distinct, own = np.unique(commands, axis=0, return_inverse=True)
@@ -425,15 +453,15 @@ class DynamicsTwin:
             )
             variances = (arrays["start_deviation"], arrays["process"], arrays["noise"])
             widening = finite("widening", about["widening"], least=0.0)
-            ends = np.stack([domain.low, domain.high])
+            ends = np.stack([domain.low, domain.mean, domain.high])
             require(
                 all((each >= 0).all() for each in variances)
                 and (arrays["noise"] > 0).all()
-                and ends.shape == (2, count[1] + len(equations.inputs))
+                and ends.shape == (3, count[1] + len(equations.inputs))
                 and domain.speed.shape == (count[1],)
                 and np.isfinite(ends).all()
                 and np.isfinite(domain.speed).all()
-                and (ends[0] <= ends[1]).all(),
+                and (np.diff(ends, axis=0) >= 0).all(),
                 "weights",
                 expected="variances above 0 and a domain of all states and commands",
                 got="others",

@@ -1,0 +1,134 @@
+"""`Curve`: what the discrepancy of a state equation is, over one of its variables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from retwin.checks import one_of
+from retwin.twins.state_twin import StateTwin
+from retwin.update.dynamics.corrected import EXTRAPOLATED, Domain, variables_of
+
+__all__ = ["Curve", "curve_of", "variable_names"]
+
+POINTS = 121
+"""Places at which a curve is evaluated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """The discrepancy of a state equation over one variable, the others at their means.
+
+    Attributes
+    ----------
+    equation, variable : str
+        The state whose equation it is, and the state or command on the axis.
+    units : (str, str)
+        Of the variable, and of the discrepancy.
+    values : NDArray
+        (K,), of the variable: over the domain, and a quarter of its width beyond either end.
+    discrepancy, deviation : NDArray
+        (K,), the most probable one and its posterior standard deviation.
+    low, high : float
+        Ends of the domain, the range of the variable in calibration.
+
+    """
+
+    equation: str
+    variable: str
+    units: tuple[str, str]
+    values: NDArray
+    discrepancy: NDArray
+    deviation: NDArray
+    low: float
+    high: float
+
+    @property
+    def inside(self) -> NDArray:
+        """Whether each value is in the domain (K,)."""
+        made: NDArray = (self.low <= self.values) & (self.values <= self.high)
+        return made
+
+    def band(self, level: float = 0.9) -> tuple[NDArray, NDArray]:
+        """Ends (K,) of the central interval of that probability, at each value by itself."""
+        half = ndtri((1 + level) / 2) * self.deviation
+        return self.discrepancy - half, self.discrepancy + half
+
+
+def variable_names(equations: StateTwin) -> list[str]:
+    """Names of the states and then of the commands; a command may have the name of a state."""
+    names = [each.name for each in equations.states]
+    return [*names, *(f"command {u}" if u in names else u for u in equations.inputs.names)]
+
+
+def curve_of(
+    equations: StateTwin,
+    posterior: tuple[NDArray, NDArray],
+    domain: Domain,
+    corrected: tuple[str, ...],
+    axes: tuple[str, str],
+    relative_to: Mapping[str, float] | None,
+) -> Curve:
+    """The curve of corrected equations, see `DynamicsTwin.curve`.
+
+    Parameters
+    ----------
+    equations, domain, corrected
+        See `DynamicsTwin`.
+    posterior : tuple of NDArray
+        `values` (q,) and `factor` (q, r) of the parameters.
+    axes : (str, str)
+        Equation and variable.
+    relative_to : mapping of str to float, optional
+        Parameters of the twin without discrepancy.
+
+    """
+    equation, variable = axes
+    one_of("equation", equation, corrected)
+    states = [each.name for each in equations.states]
+    index, names = states.index(equation), variable_names(equations)
+    one_of("variable", variable, [names[i] for i in variables_of(equations, index)])
+    place = names.index(variable)
+    parameters = [each.name for each in equations.parameters]
+    learned = np.array([n.startswith(tuple(f"{s}: " for s in corrected)) for n in parameters], bool)
+    own = [name for name, each in zip(parameters, learned, strict=True) if not each]
+    values, factor = posterior
+    before = np.where(learned, 0.0, values)
+    for name, value in (relative_to or {}).items():
+        before[parameters.index(one_of("relative_to", name, own))] = value
+
+    low, high = float(domain.low[place]), float(domain.high[place])
+    beyond = EXTRAPOLATED * (high - low)
+    grid = np.linspace(low - beyond, high + beyond, POINTS)
+    both = np.tile(domain.mean, (POINTS, 1))
+    both[:, place] = grid
+    x, u = (torch.tensor(each) for each in np.split(both, [len(states)], axis=1))
+
+    def slope(p: list[torch.Tensor]) -> torch.Tensor:
+        return equations.model.evaluate("slope", list(x.unbind(1)), list(u.unbind(1)), p)[index]
+
+    p = [torch.full_like(x[:, 0], each, requires_grad=True) for each in values.tolist()]
+    after = slope(p)
+    found = torch.autograd.grad(after.sum(), p, allow_unused=True)
+    zero = torch.zeros_like(x[:, 0])
+    by_all = torch.stack([zero if each is None else each for each in found], 1).numpy()
+    uncertain = by_all if relative_to is not None else by_all * learned
+    unit = equations.states[index].unit
+    return Curve(
+        equation,
+        variable,
+        (
+            [*(each.unit for each in equations.states), *equations.inputs.units][place],
+            unit if equations.step else f"{unit}/s",
+        ),
+        grid,
+        (after.detach() - slope([torch.full_like(zero, each) for each in before.tolist()])).numpy(),
+        np.linalg.norm(uncertain @ factor, axis=1),
+        low,
+        high,
+    )
