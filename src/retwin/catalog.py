@@ -387,9 +387,15 @@ METRICS: Mapping[str, Metric] = {
         compared=True,
         family=True,
     ),
+    "nll": Metric("NLL", -1, headline=True, head="NLL", simulated=True),
     "coverage50": Metric("Coverage of the 50 % band", 0, simulated=True),
     "coverage90": Metric(
-        "Coverage of the 90 % band", 0, head="in 90 %\nband", selected=True, simulated=True
+        "Coverage of the 90 % band",
+        0,
+        headline=True,
+        head="in 90 %\nband",
+        selected=True,
+        simulated=True,
     ),
 }
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from retwin.catalog import SOURCES
-from retwin.report.labels import class_name, duration, number, p_value, signed
+from retwin.report.labels import class_name, digits, duration, number, p_value, signed, span
 from retwin.report.style import CHROME, PALETTE, colour_index, dash, symbol
+from retwin.results import Comparison
 
 
 def contrast(one: str, other: str) -> float:
@@ -44,8 +45,8 @@ def test_labels() -> None:
     assert class_name("Motor_1_Stuck") == "M1 stuck"
     assert class_name("Motor_3_Steady_state_error") == "M3 bias"
     assert class_name("Healthy") == "Healthy"
-    assert (number(-0.5), number(float("nan")), number(-0.0001)) == ("−0.500", "–", "0.000")
-    assert (signed(0.1), signed(0.0001), signed(-0.1)) == ("+0.100", "0.000", "−0.100")
+    assert (number(-0.5), number(float("nan")), number(-0.0001, 3)) == ("−0.500", "–", "0.000")
+    assert (signed(0.1), signed(0.0001, 3), signed(-0.1)) == ("+0.100", "0.000", "−0.100")
     assert (p_value(0.0002), p_value(0.04), p_value(None)) == ("< 0.001", "0.040", "–")
     assert [duration(each) for each in (0.02, 5, 300, 30600, None)] == [
         "20 ms",
@@ -54,3 +55,14 @@ def test_labels() -> None:
         "8.5 h",
         "–",
     ]
+
+
+def test_digits_show_the_difference() -> None:
+    """0.98 mV beside 1.02 mV is not 0.001 V beside 0.001 V."""
+    assert (number(0.00098), number(0.00102)) == ("0.000980", "0.00102")
+    assert span((0.00098, 0.00102)) == "0.00098 to 0.00102"
+    small = Comparison(a="a", b="b", metric="rmse", mean_diff=-4e-5, bootstrap_ci95=(-6e-5, -1e-6))
+    assert signed(small.mean_diff, digits(small)) == "−0.0000400"
+    assert span(small.interval, digits(small), sign=True) == "−0.0000600 to −0.0000010"
+    wide = Comparison(a="a", b="b", metric="rmse", mean_diff=-4e-5, bootstrap_ci95=(-0.2, 0.1))
+    assert signed(wide.mean_diff, digits(wide)) == "0.000"

@@ -294,13 +294,14 @@ def _over_runs(values: list[float]) -> str:
 
 def _differences(results: Results) -> list[str]:
     """The difference of each source from the plain twin, with its interval and verdict."""
-    from retwin.report.labels import reason
+    from retwin.report.labels import digits, reason
     from retwin.report.verdict import outcome_of
 
     first, metric = next(iter(results.sources)), "macro_f1" if results.classes else "nrmse"
     return [
-        f"{row.a} - {first}, {COLUMNS[metric]}: {row.mean_diff:+.3f} "
-        f"(95 % bootstrap interval {row.interval[0]:+.3f} to {row.interval[1]:+.3f}): "
+        f"{row.a} - {first}, {COLUMNS[metric]}: {row.mean_diff:+.{digits(row)}f} "
+        f"(95 % bootstrap interval {row.interval[0]:+.{digits(row)}f} "
+        f"to {row.interval[1]:+.{digits(row)}f}): "
         f"{VERDICTS.get(outcome_of(row)) or 'no verdict, since ' + reason(row)}"
         for row in results.comparisons
         if row.b == first and row.metric == metric and row.interval is not None

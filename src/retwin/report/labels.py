@@ -21,6 +21,8 @@ __all__ = [
     "SELECTED",
     "class_name",
     "counted",
+    "decimals",
+    "digits",
     "duration",
     "in_sentence",
     "latent_names",
@@ -141,30 +143,39 @@ SMALL = 0.01
 """Values below this are shown with more decimals."""
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """Fixed digits with a true minus; a dash for what is not defined."""
+def number(value: float | None, digits: int | None = None) -> str:
+    """With a true minus and so many `decimals`; a dash for what is not defined."""
     if value is None or not math.isfinite(value):
         return "–"
+    digits = decimals(value) if digits is None else digits
     return f"{round(value, digits) + 0.0:.{digits}f}".replace("-", "−")
 
 
-def decimals(value: float) -> int:
-    """Three decimals, and more where a small value would have less than three digits left."""
-    if value == 0 or not math.isfinite(value) or abs(value) >= SMALL:
+def decimals(*values: float) -> int:
+    """Three decimals, and more where the largest value would have less than three digits left."""
+    largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
+    if largest == 0 or largest >= SMALL:
         return 3
-    return 2 - math.floor(math.log10(abs(value)))
+    return 2 - math.floor(math.log10(largest))
 
 
-def signed(value: float, digits: int = 3) -> str:
+def digits(each: Comparison) -> int:
+    """Decimals of a difference and of its interval."""
+    return decimals(each.mean_diff, *(each.interval or ()))
+
+
+def signed(value: float, digits: int | None = None) -> str:
     """With its sign, also when positive."""
+    digits = decimals(value) if digits is None else digits
     text = number(value, digits)
     return f"+{text}" if round(value, digits) > 0 else text
 
 
-def span(interval: Sequence[float] | None, digits: int = 3, *, sign: bool = False) -> str:
+def span(interval: Sequence[float] | None, digits: int | None = None, *, sign: bool = False) -> str:
     """`0.69 to 0.81`."""
     if interval is None:
         return "–"
+    digits = decimals(*interval) if digits is None else digits
     show = signed if sign else number
     return f"{show(interval[0], digits)} to {show(interval[1], digits)}"
 
@@ -181,7 +192,7 @@ def mean_and_deviation(values: Sequence[float] | NDArray) -> str:
 
 def p_value(p: float | None) -> str:
     """Three digits, or `< 0.001`."""
-    return "< 0.001" if p is not None and p < 0.001 else number(p)
+    return "< 0.001" if p is not None and p < 0.001 else number(p, 3)
 
 
 def duration(seconds: float | None) -> str:

@@ -50,6 +50,7 @@ FIGURES = (
 FILTERS = {
     "class_name": labels.class_name,
     "counted": labels.counted,
+    "digits": labels.digits,
     "duration": labels.duration,
     "in_sentence": labels.in_sentence,
     "mean_and_deviation": labels.mean_and_deviation,

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.scores.distributions import central_band, crps, inside, quantiles
+from retwin.scores.distributions import central_band, crps, inside, log_score, quantiles
 from retwin.serialisation.files import write_atomically
 from retwin.twins.twin import Twin
 from retwin.update.training_range import checked_once
 
 __all__ = ["Simulation", "record_means", "simulate_records", "simulation_scores"]
 
-_ARRAYS = ("ids", "observed", "mean", "bands", "crps")
+_ARRAYS = ("ids", "observed", "mean", "bands", "crps", "nll")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +38,8 @@ class Simulation:
     crps : NDArray
         CRPS (n, T, d) in the outputs' units, without the bias of a finite ensemble; NaN where
         nothing was measured.
+    nll : NDArray
+        Negative log density (n, T, d), see `retwin.scores.log_score`.
 
     """
 
@@ -46,6 +48,7 @@ class Simulation:
     mean: NDArray
     bands: NDArray
     crps: NDArray
+    nll: NDArray
 
     @property
     def random(self) -> bool:
@@ -53,13 +56,13 @@ class Simulation:
         return bool(np.any(self.bands[:, 0] < self.bands[:, -1]))
 
     def per_sample(self) -> NDArray:
-        """Squared error, CRPS, and whether a value is inside the 50 and the 90 % band.
+        """Squared error, CRPS, whether a value is inside the 50 and the 90 % band, and the NLL.
 
         Returns
         -------
         NDArray
-            (n, T, d, 4); NaN where nothing was measured. Both shares of a deterministic twin are
-            NaN.
+            (n, T, d, 5); NaN where nothing was measured. Both shares of a deterministic twin are
+            NaN; so is the NLL of a twin whose draws do not vary at some measured sample.
 
         """
         error = np.square(self.mean - self.observed)
@@ -67,7 +70,8 @@ class Simulation:
         hits = [inside(self.observed, *each) for each in bounds]
         if not self.random:
             hits = [np.full_like(error, np.nan)] * 2
-        return np.stack([error, self.crps, *hits], axis=-1)
+        nll = np.full_like(self.nll, np.nan) if np.isinf(self.nll).any() else self.nll
+        return np.stack([error, self.crps, *hits, nll], axis=-1)
 
     @classmethod
     def joined(cls, parts: Sequence[Simulation], ids: NDArray) -> Simulation:
@@ -129,7 +133,7 @@ def simulate_records(
     once = getattr(twin, "deterministic", False)
     seeds = np.random.SeedSequence(seed).generate_state(len(records)).tolist()
     measured = np.where(records.mask, records.observed, np.nan).astype(np.float64)
-    means, bands, scores = [], [], []
+    means, bands, scores, densities = [], [], [], []
     for i, twin_seed in enumerate(seeds):
         commands = np.repeat(records.commands[[i]], 1 if once else draws, axis=0)
         made = twin.simulate(commands, seed=twin_seed).observed.astype(np.float64)
@@ -138,9 +142,11 @@ def simulate_records(
         means.append(made.mean(axis=0))
         bands.append(quantiles(made))
         scores.append(crps(measured[i], made))
+        densities.append(log_score(measured[i], made))
         if progress is not None:
             progress((i + 1) / len(records))
-    return Simulation(records.ids, measured, *map(np.stack, (means, bands, scores)))
+    arrays = map(np.stack, (means, bands, scores, densities))
+    return Simulation(records.ids, measured, *arrays)
 
 
 def record_means(values: NDArray) -> NDArray:
@@ -158,7 +164,7 @@ def simulation_scores(means: NDArray, records: Trajectories) -> dict[str, NDArra
     Parameters
     ----------
     means : NDArray
-        Means (..., d, 4) of what `Simulation.per_sample` returns.
+        Means (..., d, 5) of what `Simulation.per_sample` returns.
     records : Trajectories
         The measured records, for the standard deviation and the units of their outputs.
 
@@ -166,17 +172,19 @@ def simulation_scores(means: NDArray, records: Trajectories) -> dict[str, NDArra
     -------
     dict of str to NDArray
         `rmse` and `crps` (...), NaN where the outputs have different units; `nrmse`, the RMSE
-        divided by each output's standard deviation; `coverage50` and `coverage90`.
+        divided by each output's standard deviation; `coverage50` and `coverage90`; `nll` in nats
+        per sample.
 
     """
     observed = np.where(records.mask, records.observed, np.nan)
     deviation = np.nanstd(observed.astype(float), axis=(0, 1))
     comparable = 1.0 if records.outputs.comparable else np.nan
-    square, score, half, wide = np.moveaxis(means, -1, 0)
+    square, score, half, wide, density = np.moveaxis(means, -1, 0)
     return {
         "rmse": comparable * np.sqrt(square.mean(axis=-1)),
         "nrmse": (np.sqrt(square) / deviation).mean(axis=-1),
         "crps": comparable * score.mean(axis=-1),
         "coverage50": half.mean(axis=-1),
         "coverage90": wide.mean(axis=-1),
+        "nll": density.mean(axis=-1),
     }

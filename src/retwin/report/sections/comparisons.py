@@ -11,6 +11,8 @@ from retwin.report.blocks import Cell, Column, Forest, Section, Table
 from retwin.report.labels import (
     MANY,
     SELECTED,
+    decimals,
+    digits,
     in_sentence,
     metric_name,
     number,
@@ -45,6 +47,7 @@ def comparisons(study: Study) -> Section | None:
         "metric": metric_name(metric),
         "pairs": _pairs(found),
         "many": many,
+        "hundredths": _factor(metric) > 1,
         "reasons": sorted({reason(each) for each in found} - {""}),
     }
     return Section("comparisons", "Comparisons", values)
@@ -52,15 +55,23 @@ def comparisons(study: Study) -> Section | None:
 
 def _matrix(study: Study, found: Sequence[Comparison], metric: str) -> Table:
     """The difference of each row's source from each column's, with its outcome."""
+    factor = _factor(metric)
+    own = [e for e in found if e.metric == metric]
+    shown = 0 if factor > 1 else decimals(*(e.mean_diff for e in own))
     rows = []
     for place, source in enumerate(study.sources):
-        pairs = [e.with_first(source) for e in found if e.metric == metric and source in (e.a, e.b)]
-        cells = {e.b: Cell(signed(100 * e.mean_diff, 0), tone=outcome_of(e)) for e in pairs}
+        pairs = [e.with_first(source) for e in own if source in (e.a, e.b)]
+        cells = {e.b: Cell(signed(factor * e.mean_diff, shown), tone=outcome_of(e)) for e in pairs}
         name = Cell(f"{place + 1}. {source_name(source)}", source=source)
         rows.append([name, *(cells.get(other, Cell("")) for other in study.sources)])
     others = [Column(str(place + 1), group="minus") for place in range(len(study.sources))]
     title = f"Pairwise differences in {in_sentence(metric_name(metric))}"
     return Table(title, [Column("Source", numeric=False), *others], rows)
+
+
+def _factor(metric: str) -> float:
+    """Scores of diagnoses are shown in hundredths; those of simulations have a unit."""
+    return 1.0 if METRICS[metric].simulated else 100.0
 
 
 def _pairs(found: Sequence[Comparison]) -> Table:
@@ -109,8 +120,8 @@ def _row(each: Comparison, low: float, high: float) -> list[Cell]:
     return [
         Cell(metric_name(each.metric)),
         Cell({"open": "undecided", "": "no verdict"}.get(result, result), tone=result),
-        Cell(signed(each.mean_diff)),
-        Cell(span(each.interval, sign=True)),
+        Cell(signed(each.mean_diff, digits(each))),
+        Cell(span(each.interval, digits(each), sign=True)),
         Cell("", forest=forest, source=each.a),
         Cell(p_value(each.p_verdict)),
         Cell(f"{number(each.t, 2)} ({number(each.df, 1)})" if each.t is not None else "–"),

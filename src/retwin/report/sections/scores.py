@@ -15,6 +15,8 @@ from retwin.report.labels import (
     MAIN,
     MANY,
     SELECTED,
+    decimals,
+    duration,
     mean_and_deviation,
     metric_name,
     number,
@@ -42,6 +44,11 @@ def scores(study: Study) -> Section | None:
     if not shown:
         return None
     values = _table_values(study, shown, "Scores of all sources")
+    if not study.results.classes:
+        table = values["table"]
+        costs = [Cell(duration(source.update_s)) for source in study.sources.values()]
+        rows = [[*row, cost] for row, cost in zip(table.rows, costs, strict=True)]
+        values["table"] = Table(table.title, [*table.columns, Column("Update")], rows)
     many = len(study.sources) > MANY
     drawn = [name for name in shown if not (many and study.results.classes) or name in SELECTED]
     drawn = [name for name in drawn if METRICS[name].better > 0]
@@ -88,7 +95,7 @@ def _table_values(
         for metric in metrics:
             interval = source.interval(metric)
             text = mean_and_deviation(source.runs(metric))
-            below = f"[{span(interval)}]" if interval else ""
+            below = f"[{span(interval, decimals(source.mean(metric)))}]" if interval else ""
             row.append(Cell(text, below, best=name in best[metric]))
             if _in_paper(results, metric):
                 row.append(Cell(results.published.get(name, {}).get(metric, "–")))
