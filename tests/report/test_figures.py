@@ -88,7 +88,7 @@ def test_figures_are_valid_for_both_renderers(study: Content) -> None:
         return "#123456" if isinstance(value, str) and value.startswith("@") else value
 
     sections = sections_of(study_of(study))
-    assert len(sections) == len(SECTIONS) - 1, "all but that of a case without classes"
+    assert len(sections) == len(SECTIONS) - 3, "all but those of a case without classes"
     shown = [figure for section in sections for figure in section.figures]
     assert [figure.name for figure in shown] == [
         "scores",

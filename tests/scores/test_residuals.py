@@ -11,6 +11,7 @@ from scipy.stats import kstest
 from retwin.scores import (
     autocorrelation,
     cross_correlation,
+    decorrelated_after,
     error_by_amplitude,
     ljung_box,
     rms_over_time,
@@ -61,6 +62,14 @@ def test_an_autoregression_has_its_correlations(gaps: bool) -> None:
     np.testing.assert_allclose(found.values[:5], 0.8 ** found.lags[:5], atol=0.04)
     assert ljung_box(found)[1] < 1e-12
     assert found.largest == 0
+
+
+def test_slow_residuals_are_shown_at_more_lags() -> None:
+    rng = np.random.default_rng(2)
+    white, slow = (decorrelated_after(coloured(rng, (2, 4000), pole)) for pole in (0.0, 0.99))
+    assert white == round(10 * np.log10(8000))
+    assert 150 < slow <= 1000
+    assert decorrelated_after(np.ones((1, 100))) == 25
 
 
 def test_pairs_are_of_one_record_only() -> None:

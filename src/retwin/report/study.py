@@ -125,6 +125,17 @@ class Study:
         for name in self.results.sources:
             self._require(f"simulation/{name}/mean", full)
             self._require(f"simulation/{name}/bands", (full[0], 5, *full[1:]))
+        commands = self.arrays.get("simulation/commands")
+        if commands is not None:
+            self._require("simulation/commands", (*full[:2], None))
+            self._require("simulation/range", (2, commands.shape[2] + full[2]))
+        values = self.arrays.get("delta/values")
+        if values is not None:
+            self._require("delta/values", (None, None))
+            for name in ("discrepancy", "deviation"):
+                self._require(f"delta/{name}", values.shape, needed=True)
+            self._require("delta/range", (len(values), 2), needed=True)
+            self._require("delta/about", (len(values), 4), needed=True)
 
     @property
     def sources(self) -> dict[str, SourceResults]:

@@ -34,6 +34,7 @@ _HOME = {
     "crps": "distributions",
     "cumulative_counts": "distributions",
     "decide": "decisions",
+    "decorrelated_after": "residuals",
     "energy_score": "energy",
     "error_by_amplitude": "residuals",
     "further_group_quantile": "distributions",

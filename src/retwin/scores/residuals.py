@@ -18,6 +18,7 @@ __all__ = [
     "Correlogram",
     "autocorrelation",
     "cross_correlation",
+    "decorrelated_after",
     "error_by_amplitude",
     "ljung_box",
     "rms_over_time",
@@ -97,6 +98,17 @@ def default_lags(residual: NDArray) -> int:
     """Number of lags: 10 log10 of the number of measured samples, at most a quarter of a record."""
     count = max(int(np.isfinite(residual).sum()), 1)
     return max(1, min(round(10 * np.log10(count)), residual.shape[1] // 4))
+
+
+def decorrelated_after(residual: NDArray) -> int:
+    """Lags that show the correlation of a residual: twice those until it is within its limits.
+
+    At least `default_lags`, and at most a quarter of a record.
+    """
+    found = autocorrelation(residual, residual.shape[1] // 4)
+    within = np.flatnonzero(~found.outside)
+    first = int(found.lags[within[0]]) if len(within) else len(found.lags)
+    return max(default_lags(residual), min(2 * first, len(found.lags)))
 
 
 def autocorrelation(residual: NDArray, lags: int | None = None) -> Correlogram:

@@ -16,10 +16,14 @@ from retwin.diagnosis.pooled import pool_probabilities
 from retwin.evaluation.fidelity import Simulation, record_means, simulation_scores
 from retwin.scores.bootstrap import Draws, Resampling, bootstrap_means
 from retwin.scores.classification import METRICS, confusion, score
+from retwin.study.files import Job
 from retwin.study.work import Work
+from retwin.update.dynamics import DynamicsTwin, state_twin_of
 
 __all__ = ["Answers", "Diagnoses", "Simulations", "answers"]
 
+CURVES = 6
+"""Curves of a discrepancy that the page has room for."""
 RESAMPLINGS = 10_000
 """Bootstrap draws, as docs/theory.md states."""
 
@@ -148,7 +152,13 @@ class Simulations:
 
     `arrays.npz` holds, of the first run, `simulation/SOURCE/mean` (n, T, d) and `/bands`
     (n, 5, T, d), and of the records `simulation/commands`, `/nominal`, `/observed` (n, T, d), NaN
-    where not measured, `/ids` (n,) and `/rate` in Hz.
+    where not measured, `/ids` (n,) and `/rate` in Hz. `simulation/range` (2, d_u + d) is the range
+    of commands and outputs in calibration, the narrowest of the folds.
+
+    With the source `dynamics` there are the curves of the first run and fold of what it learned,
+    compared with the twin as given, at most `CURVES`: `delta/values`, `/discrepancy`, `/deviation`
+    (c, K), `/range` (c, 2), and `/about` (c, 4), which are equation, variable and the units of
+    `values` and `discrepancy`.
     """
 
     work: Work
@@ -213,4 +223,37 @@ class Simulations:
             key: each.astype(np.float32) for key, each in found.items()
         }
         about = {"ids": self._records.ids, "rate": np.array(self._records.rate)}
-        return {f"simulation/{name}": each for name, each in {**single, **about}.items()}
+        about |= {"range": self._range()}
+        made = {f"simulation/{name}": each for name, each in {**single, **about}.items()}
+        return made | (self._curves() if "dynamics" in self.work.plan.sources else {})
+
+    def _range(self) -> NDArray:
+        """Least and greatest commands and measured outputs (2, d_u + d) of the calibration."""
+        real, ends = self.work.files.real_data(), []
+        for calibration, _ in self.work.roles.folds:
+            own = real[list(calibration)]
+            both = [own.commands, np.where(own.mask, own.observed, np.nan)]
+            flat = np.concatenate(both, axis=2).reshape(-1, sum(each.shape[2] for each in both))
+            ends.append([np.nanmin(flat, axis=0), np.nanmax(flat, axis=0)])
+        low, high = np.moveaxis(np.array(ends), 1, 0)
+        return np.stack([low.max(axis=0), high.min(axis=0)]).astype(np.float32)
+
+    def _curves(self) -> dict[str, NDArray]:
+        """See `Simulations`; those that vary most, over the usual derivative of their state."""
+        twin = DynamicsTwin.load(self.work.files.path(Job("update", 0, 0, "dynamics")))
+        base, _, values = state_twin_of(self.work.case.twin)  # type: ignore[arg-type]  # checked
+        given = {each.name: values[each.name] for each in base.parameters}
+        states = [each.name for each in base.states]
+        curves = [twin.curve(*axes, relative_to=given) for axes in twin.axes]
+        sizes = [
+            np.ptp(each.discrepancy[each.inside]) / twin.domain.speed[states.index(each.equation)]
+            for each in curves
+        ]
+        shown = [curves[i] for i in np.argsort(-np.array(sizes), kind="stable")[:CURVES]]
+        arrays = {
+            name: np.array([getattr(each, name) for each in shown], dtype=np.float32)
+            for name in ("values", "discrepancy", "deviation")
+        }
+        arrays["range"] = np.array([[each.low, each.high] for each in shown], dtype=np.float32)
+        arrays["about"] = np.array([[c.equation, c.variable, *c.units] for c in shown])
+        return {f"delta/{name}": each for name, each in arrays.items()}

@@ -14,12 +14,14 @@ from retwin.report.sections.comparisons import comparisons
 from retwin.report.sections.confusion import confusion
 from retwin.report.sections.costs import time
 from retwin.report.sections.decisions import decisions
+from retwin.report.sections.delta import delta
 from retwin.report.sections.discrepancy import discrepancy
 from retwin.report.sections.explorer import explorer
 from retwin.report.sections.fidelity import fidelity
 from retwin.report.sections.learning import learning
 from retwin.report.sections.paper import paper
 from retwin.report.sections.reliability import reliability
+from retwin.report.sections.residuals import residuals
 from retwin.report.sections.roc import roc
 from retwin.report.sections.scores import further_scores, scores
 from retwin.report.sections.simulation import simulation
@@ -37,6 +39,8 @@ SECTIONS: tuple[Callable[[Study], Section | None], ...] = (
     reliability,
     decisions,
     simulation,
+    residuals,
+    delta,
     discrepancy,
     fidelity,
     learning,

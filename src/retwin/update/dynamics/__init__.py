@@ -9,7 +9,7 @@ from retwin.update.dynamics.fitting import Dynamics, FittedDynamics, fit_dynamic
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.prediction import Prediction
 from retwin.update.dynamics.twin import DynamicsTwin
-from retwin.update.dynamics.unknowns import has_states
+from retwin.update.dynamics.unknowns import has_states, state_twin_of
 
 __all__ = [
     "Curve",
@@ -21,4 +21,5 @@ __all__ = [
     "Prediction",
     "fit_dynamics",
     "has_states",
+    "state_twin_of",
 ]

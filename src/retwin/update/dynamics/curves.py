@@ -14,7 +14,7 @@ from retwin.checks import one_of
 from retwin.twins.state_twin import StateTwin
 from retwin.update.dynamics.corrected import EXTRAPOLATED, Domain, variables_of
 
-__all__ = ["Curve", "curve_of", "variable_names"]
+__all__ = ["Curve", "axes_of", "curve_of"]
 
 POINTS = 121
 """Places at which a curve is evaluated."""
@@ -60,10 +60,14 @@ class Curve:
         return self.discrepancy - half, self.discrepancy + half
 
 
-def variable_names(equations: StateTwin) -> list[str]:
-    """Names of the states and then of the commands; a command may have the name of a state."""
-    names = [each.name for each in equations.states]
-    return [*names, *(f"command {u}" if u in names else u for u in equations.inputs.names)]
+def axes_of(equations: StateTwin, corrected: tuple[str, ...]) -> list[tuple[str, str]]:
+    """The corrected equations with each variable on which they depend."""
+    states, names = [each.name for each in equations.states], _variables(equations)
+    return [
+        (state, names[i])
+        for state in corrected
+        for i in variables_of(equations, states.index(state))
+    ]
 
 
 def curve_of(
@@ -90,10 +94,9 @@ def curve_of(
     """
     equation, variable = axes
     one_of("equation", equation, corrected)
+    one_of("variable", variable, [name for _, name in axes_of(equations, (equation,))])
     states = [each.name for each in equations.states]
-    index, names = states.index(equation), variable_names(equations)
-    one_of("variable", variable, [names[i] for i in variables_of(equations, index)])
-    place = names.index(variable)
+    index, place = states.index(equation), _variables(equations).index(variable)
     parameters = [each.name for each in equations.parameters]
     learned = np.array([n.startswith(tuple(f"{s}: " for s in corrected)) for n in parameters], bool)
     own = [name for name, each in zip(parameters, learned, strict=True) if not each]
@@ -132,3 +135,9 @@ def curve_of(
         low,
         high,
     )
+
+
+def _variables(equations: StateTwin) -> list[str]:
+    """Names of the states and then of the commands; a command may have the name of a state."""
+    names = [each.name for each in equations.states]
+    return [*names, *(f"command {u}" if u in names else u for u in equations.inputs.names)]

@@ -23,7 +23,7 @@ from retwin.twins.state_twin import SAMPLES_PER_CHUNK, StateTwin
 from retwin.twins.twin import Chunk, check_channels, checked_commands, simulate_in_chunks
 from retwin.twins.wrapper import chunk_generator
 from retwin.update.dynamics.corrected import Domain, correctable
-from retwin.update.dynamics.curves import Curve, curve_of
+from retwin.update.dynamics.curves import Curve, axes_of, curve_of
 from retwin.update.dynamics.estimation import Estimation, root
 from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.prediction import Prediction
@@ -332,6 +332,11 @@ class DynamicsTwin:
         p = list(torch.tensor(values if changes is None else values + changes).unbind(1))
         made: NDArray = torch.stack(self.equations.model.evaluate("slope", x, u, p), 1).numpy()
         return made
+
+    @property
+    def axes(self) -> list[tuple[str, str]]:
+        """Equations and variables that `curve` takes."""
+        return axes_of(self.equations, self.corrected)
 
     def curve(
         self, equation: str, variable: str, *, relative_to: Mapping[str, float] | None = None

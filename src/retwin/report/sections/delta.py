@@ -1,0 +1,52 @@
+"""What the source `dynamics` has learned, as curves over states and commands."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from retwin.report.blocks import Section
+from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row, Spans
+from retwin.report.study import Study
+from retwin.report.style import colour_of
+
+__all__ = ["delta"]
+
+SOURCE = "dynamics"
+WIDTH = 1.6449
+"""Standard deviations of a central 90 % interval."""
+
+
+def delta(study: Study) -> Section | None:
+    """The difference of the corrected state equations from those of the twin as given."""
+    arrays = study.arrays
+    if "delta/values" not in arrays:
+        return None
+    colour, panels = colour_of(SOURCE), []
+    for i, (equation, variable, unit, slope) in enumerate(arrays["delta/about"].tolist()):
+        x, y = (arrays[f"delta/{name}"][i].astype(float) for name in ("values", "discrepancy"))
+        half = WIDTH * arrays["delta/deviation"][i]
+        low, high = arrays["delta/range"][i].tolist()
+        marks: list[Mark] = [
+            Spans([(float(x[0]), low), (high, float(x[-1]))]),
+            Band(x, y - half, y + half, "90 % band", colour, 0.25),
+            Line(x[[0, -1]], np.zeros(2), "the twin as given", "muted", "dot", 1, hover=False),
+            Line(x, y, "learned", colour, width=2),
+        ]
+        title = f"Equation of {equation}, over {variable}"
+        panels.append(
+            Panel(
+                Axis(variable, unit, (float(x[0]), float(x[-1]))),
+                [Row(Axis(f"change of the rate of {equation}", slope), marks)],
+                f"Learned discrepancy: {title}",
+                title,
+                height=300,
+            )
+        )
+    keys = [
+        Key("learned", colour),
+        Key("90 % band", colour, "bar"),
+        Key("the twin as given", "muted", "dot"),
+        Key("outside the range of the calibration", "grid", "bar"),
+    ]
+    figure = Figure("delta", panels, keys, SOURCE)
+    return Section("delta", "What was learned", {"figure": figure}, [figure])
