@@ -76,6 +76,10 @@ def test_state_equations_are_fitted_and_generate(folder: Path, tmp_path: Path, c
     found = json.loads(printed)
     assert found["figures"]["rms_after"] < 0.2 * found["figures"]["rms_before"]
     assert next(iter(found["terms"])).startswith("level: ")
+    assert {"gain", "leak"} <= {name for *pair, _ in found["correlations"] for name in pair}
+    white = found["one_step_errors"]["level"]
+    assert white["p"] > 1e-3
+    assert abs(white["autocorrelation"]) < 0.2
     assert DynamicsTwin.load(out).case == str(case.resolve())
     code, _, said = call("generate", out, "--out", tmp_path / "g.npz", "--per-class", 4)
     assert (code, len(rt.load(tmp_path / "g.npz"))) == (0, 4), said
@@ -92,6 +96,18 @@ def test_a_study_compares_them(folder: Path, tmp_path: Path, call) -> None:
     error = {name: sources[name]["rmse"][0] for name in ("twin", "pi_ls", "dynamics")}
     assert error["dynamics"] < 0.3 * min(error["twin"], error["pi_ls"])
     assert 0.75 < sources["dynamics"]["coverage90"][0] <= 1
+    assert (sources["twin"]["nll"], sources["dynamics"]["nll"][0] < -2) == ([None], True)
+    page = (out / "report.html").read_text()
+    assert all(f'<section id="{section}">' in page for section in ("residuals", "delta"))
+    with np.load(out / "arrays.npz") as arrays:
+        low, high = arrays["simulation/range"]
+        shape = arrays["delta/values"].shape
+        assert arrays["delta/about"].tolist() == [
+            ["level", "level", "m", "m/s"],
+            ["level", "valve", "1", "m/s"],
+        ]
+    assert (low[0], high[0]) == pytest.approx((0, 1), abs=0.1)
+    assert shape == (2, 121)
 
 
 @pytest.mark.parametrize(

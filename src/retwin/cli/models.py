@@ -23,6 +23,7 @@ from retwin.serialisation.places import check_place
 if TYPE_CHECKING:
     from retwin.cases.case import Case
     from retwin.twins.samplers import CommandSampler
+    from retwin.update.dynamics import FittedDynamics, Prediction
     from retwin.update.residual import ResidualModel, SequenceResidual
     from retwin.update.surrogate import Surrogate
 
@@ -35,6 +36,8 @@ data_option, model_option = (
 
 LARGEST = 8
 """Number of terms of the state equations that are printed."""
+SIGNIFICANT = 0.05
+"""p-value below which errors are not taken for white noise."""
 ModelFolder = Annotated[
     Path, typer.Option(metavar="FOLDER", help="Where to save the corrected twin.")
 ]
@@ -169,9 +172,10 @@ def _fit_dynamics(
         )
     replace(found.twin, case=name).save(out)
     parameters = [
-        (each, f"{value:.4g} ± {found.errors[each]:.2g}")
+        (each, f"{value:.4g} ± {found.errors[each]:.2g}", _strongest(found, each))
         for each, value in found.parameters.items()
     ]
+    white = _white(found.twin.predictive(measured))
     terms = [(each, f"{size:.3f}") for each, size in list(found.terms.items())[:LARGEST]]
     figures = found.figures
     answer(
@@ -179,20 +183,51 @@ def _fit_dynamics(
             "saved": str(out),
             "parameters": found.parameters,
             "errors": found.errors,
+            "correlations": [[*pair, each] for pair, each in found.correlations.items()],
             "terms": found.terms,
+            "one_step_errors": white,
             "figures": figures,
             "reason": found.reason,
         },
         f"Free simulation of the calibration record: RMS error {figures['rms_before']:.3g} with "
         f"the twin alone, {figures['rms_after']:.3g} with its equations corrected, "
         f"{figures['held_out']:.3g} in blocks left out.",
-        table(("parameter", "value"), parameters, numbers=("value",)),
+        table(("parameter", "value", "strongest correlation"), parameters, numbers=("value",)),
+        "",
+        *(
+            f"One-step errors of {name} are {'not ' * (each['p'] < SIGNIFICANT)}white noise: the "
+            f"largest autocorrelation is {each['autocorrelation']:.2g} at {each['lag']:.3g} s "
+            f"(95 % limit {each['limit']:.2g}, Ljung and Box p = {each['p']:.2g})."
+            for name, each in white.items()
+        ),
         "",
         "The largest terms, over the usual time derivative of their state:",
         table(("term", "size"), terms, numbers=("size",)),
         as_json=as_json,
     )
     note(f"Saved {out}")
+
+
+def _strongest(found: FittedDynamics, parameter: str) -> str:
+    """The strongest correlation of a parameter, and with what."""
+    pairs = ((pair, each) for pair, each in found.correlations.items() if parameter in pair)
+    pair, value = next(pairs, ((parameter, parameter), 0.0))
+    other = pair[pair[0] == parameter]
+    return f"{value:+.2f} with {other}" if other != parameter else "–"
+
+
+def _white(prediction: Prediction) -> dict[str, dict[str, float]]:
+    """The largest autocorrelation of the one-step errors of each output, and a test."""
+    record = prediction.record
+    return {
+        name: {
+            "autocorrelation": float(found.values[found.largest]),
+            "lag": float(found.lags[found.largest] / record.rate),
+            "limit": float(found.limits[found.largest]),
+            "p": p,
+        }
+        for name, (found, p) in zip(record.outputs.names, prediction.whiteness(), strict=True)
+    }
 
 
 def _system(

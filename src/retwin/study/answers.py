@@ -234,7 +234,7 @@ class Simulations:
             own = real[list(calibration)]
             both = [own.commands, np.where(own.mask, own.observed, np.nan)]
             flat = np.concatenate(both, axis=2).reshape(-1, sum(each.shape[2] for each in both))
-            ends.append([np.nanmin(flat, axis=0), np.nanmax(flat, axis=0)])
+            ends.append([np.fmin.reduce(flat), np.fmax.reduce(flat)])
         low, high = np.moveaxis(np.array(ends), 1, 0)
         return np.stack([low.max(axis=0), high.min(axis=0)]).astype(np.float32)
 

@@ -73,13 +73,14 @@ def residuals(study: Study) -> Section | None:
         _amplitudes(drawn, outputs, commands, keys),
         _times(drawn, outputs, commands, rate, keys),
     ]
+    figures = [each for each in figures if each.panels]
     values = {
         "table": _table(errors, outputs, commands, rate),
-        "figures": {each.name: each for each in figures if each.panels},
+        "figures": {each.name: each for each in figures},
         "limited": len(outputs) > OUTPUTS or len(commands) > COMMANDS,
         "ranged": "simulation/range" in study.arrays,
     }
-    return Section("residuals", "Residual diagnostics", values, list(values["figures"].values()))
+    return Section("residuals", "Residual diagnostics", values, figures)
 
 
 def _channels(study: Study, kind: str) -> list[Channel]:
@@ -133,7 +134,7 @@ def _table(
             lags = decorrelated_after(next(iter(errors.values()))[i])
             crossed = [(u, cross_correlation(error, u.values, lags)) for u in commands]
             command, cross = max(crossed, key=lambda pair: _excess(pair[1]))
-            rms, mean, beyond = _rms(error), float(np.nanmean(error)), _rms(error[outside])
+            (rms, mean), (beyond, _) = _moments(error), _moments(error[outside])
             rows.append(
                 [
                     Cell(source_name(source), source=source),
@@ -155,9 +156,10 @@ def _outside(channels: Sequence[Channel]) -> NDArray:
     return made
 
 
-def _rms(error: NDArray) -> float:
+def _moments(error: NDArray) -> tuple[float, float]:
+    """Root mean square and mean; NaN where nothing was measured."""
     seen = error[np.isfinite(error)]
-    return float(np.sqrt(np.mean(seen**2))) if len(seen) else np.nan
+    return (float(np.sqrt(np.mean(seen**2))), float(seen.mean())) if len(seen) else (np.nan,) * 2
 
 
 def _excess(found: Correlogram) -> float:
@@ -300,7 +302,7 @@ def _times(
     keys: list[Key],
 ) -> Figure:
     panels = []
-    outside = _outside([*outputs, *commands]).any(axis=0)
+    outside: NDArray = np.any(_outside([*outputs, *commands]), axis=0)
     for i, output in enumerate(outputs[:OUTPUTS]):
         found = {source: rms_over_time(each[i], BLOCKS) for source, each in errors.items()}
         edges = next(iter(found.values()))[0] / rate
@@ -348,10 +350,15 @@ def _points(x: NDArray, y: NDArray, source: str) -> Points:
 
 
 def _log(label: str, unit: str, values: object) -> Axis:
-    """A logarithmic axis with ticks at 1, 2 and 5, or at powers of 10 where there are many."""
+    """A logarithmic axis with ticks at 1, 2 and 5, or at powers of 10 where there are many.
+
+    It is linear where no value is above 0.
+    """
     every = np.asarray(values, dtype=float)
     positive = every[np.isfinite(every) & (every > 0)]
-    low, high = (np.log10(positive.min()), np.log10(positive.max())) if positive.size else (0, 0)
+    if not positive.size:
+        return Axis(label, unit)
+    low, high = np.log10(positive.min()), np.log10(positive.max())
     powers = np.arange(np.floor(low), np.ceil(high) + 1)
     steps = (1.0, 2.0, 5.0) if high - low < 2 else (1.0,)
     places = np.array([step * 10.0**power for power in powers for step in steps])

@@ -11,6 +11,7 @@ from scipy.stats import norm
 
 from retwin.checks import finite, require
 from retwin.data.trajectories import Trajectories
+from retwin.scores.residuals import Correlogram, autocorrelation, ljung_box
 
 __all__ = ["Prediction", "log_density", "root_of", "whitened"]
 
@@ -78,6 +79,14 @@ class Prediction:
         held = (inside & self.record.mask).sum(axis=(0, 1))
         made: NDArray = np.where(counted > 0, held / np.maximum(counted, 1), np.nan)
         return made
+
+    def whiteness(self) -> list[tuple[Correlogram, float]]:
+        """Autocorrelation of the errors of each output, and the p-value of Ljung and Box's test.
+
+        Errors of predictions by the right distributions are white noise.
+        """
+        found = [autocorrelation(each) for each in np.moveaxis(self.standardised(), -1, 0)]
+        return [(each, ljung_box(each)[1]) for each in found]
 
     def log_density(self) -> NDArray:
         """Log density (n, T) of the measured outputs of each sample, jointly; 0 for none."""
