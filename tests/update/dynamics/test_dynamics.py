@@ -378,6 +378,7 @@ def test_the_page_of_corrected_dynamics() -> None:
     assert found.figures["rms_after"] < 0.02 * found.figures["rms_before"]
     assert next(iter(found.terms)) == "velocity: position^3"
     assert 0.75 < names["inside"].mean() <= 1
+    assert names["error"] < 0.05
 
 
 def test_a_filter_that_diverges_has_no_density() -> None:
