@@ -60,6 +60,7 @@ def test_labels() -> None:
 def test_digits_show_the_difference() -> None:
     """0.98 mV beside 1.02 mV is not 0.001 V beside 0.001 V."""
     assert (number(0.00098), number(0.00102)) == ("0.000980", "0.00102")
+    assert (number(0.0106), number(0.0114), number(0.45)) == ("0.0106", "0.0114", "0.450")
     assert span((0.00098, 0.00102)) == "0.00098 to 0.00102"
     small = Comparison(a="a", b="b", metric="rmse", mean_diff=-4e-5, bootstrap_ci95=(-6e-5, -1e-6))
     assert signed(small.mean_diff, digits(small)) == "−0.0000400"

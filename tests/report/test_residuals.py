@@ -77,7 +77,7 @@ def test_the_table_finds_what_the_twin_lacks(simulated: Content) -> None:
     section = residuals(study_of(simulated))
     assert section is not None
     twin, exact = section.values["table"].rows
-    assert [cell.text for cell in exact[:2]] == ["Least squares (Eq. 2)", "0.010"]
+    assert float(exact[1].text) == pytest.approx(0.01, rel=0.05)
     assert float(exact[4].text) > 0.05
     assert float(twin[5].text.replace("−", "-")) == pytest.approx(1, abs=0.05)
     assert twin[5].below.startswith("valve, 0.1 s earlier; limit 0.0")

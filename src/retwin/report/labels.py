@@ -139,7 +139,7 @@ def reason(comparison: Comparison) -> str:
     return NO_VERDICT.get(comparison.no_verdict, "")
 
 
-SMALL = 0.01
+SMALL = 0.1
 """Values below this are shown with more decimals."""
 
 

@@ -143,7 +143,7 @@ def _table(
                     Cell(*_at_lag(own, rate)),
                     Cell(p_value(ljung_box(own)[1])),
                     Cell(*_at_lag(cross, rate, command.name)),
-                    Cell(number(beyond, decimals(rms)), f"{100 * outside.mean():.0f} % of time"),
+                    Cell(number(beyond, decimals(rms)), f"{100 * outside.mean():.2g} % of time"),
                 ]
             )
     title = "Residuals of all sources"
@@ -214,16 +214,20 @@ def _cross_correlations(
         lags = decorrelated_after(next(iter(errors.values()))[i])
         for command in commands[:COMMANDS]:
             marks: list[Mark] = []
+            reach = 0.0
             for source, each in errors.items():
                 found = _thinned(cross_correlation(each[i], command.values, lags))
                 x, colour = found.lags / rate, colour_of(source)
                 name = f"95 % limits, {source_name(source)}"
                 marks.append(Band(x, -found.limits, found.limits, name, colour, 0.18))
                 marks.append(_line(x, found.values, source))
+                both = np.concatenate([np.abs(found.values), found.limits])
+                reach = float(max(reach, *both[np.isfinite(both)], 0.0))
+            y = Axis("correlation", limits=(-1.1 * reach, 1.1 * reach) if reach > 0 else None)
             panels.append(
                 Panel(
                     Axis("time by which the command is earlier", "s"),
-                    [Row(Axis("correlation", limits=(-1.05, 1.05), step=0.5), marks)],
+                    [Row(y, marks)],
                     f"Correlation of the error of {output.name} with {command.name}",
                     f"{output.name}, {command.name}",
                     height=300,
