@@ -83,7 +83,8 @@ def test_the_table_finds_what_the_twin_lacks(simulated: Content) -> None:
     assert twin[5].below.startswith("valve, 0.1 s earlier; limit 0.0")
     assert float(exact[5].text.replace("−", "-")) == pytest.approx(0, abs=0.1)
     assert float(twin[6].text) > 1.5 * float(twin[1].text), "it extrapolates"
-    assert twin[6].below == "3 % of time"
+    share = float(twin[6].below.removesuffix(" % of the samples"))
+    assert share == pytest.approx(100 / 20 * 2 / 3, abs=0.5)
 
 
 def test_the_figures_show_it(simulated: Content) -> None:

@@ -135,6 +135,7 @@ def _table(
             crossed = [(u, cross_correlation(error, u.values, lags)) for u in commands]
             command, cross = max(crossed, key=lambda pair: _excess(pair[1]))
             (rms, mean), (beyond, _) = _moments(error), _moments(error[outside])
+            share = np.mean(outside[np.isfinite(error)]) if np.isfinite(rms) else 0.0
             rows.append(
                 [
                     Cell(source_name(source), source=source),
@@ -143,7 +144,7 @@ def _table(
                     Cell(*_at_lag(own, rate)),
                     Cell(p_value(ljung_box(own)[1])),
                     Cell(*_at_lag(cross, rate, command.name)),
-                    Cell(number(beyond, decimals(rms)), f"{100 * outside.mean():.2g} % of time"),
+                    Cell(number(beyond, decimals(rms)), f"{100 * share:.2g} % of the samples"),
                 ]
             )
     title = "Residuals of all sources"
