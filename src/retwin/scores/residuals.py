@@ -215,8 +215,8 @@ def cross_correlation(residual: NDArray, command: NDArray, lags: int | None = No
         ]
         values = both[0] / both[1] / scale
         limits = ndtri((1 + LEVEL) / 2) * np.sqrt(time / both[1])
-    reach = (len(values) - 1) // 2
-    return Correlogram(np.arange(-reach, reach + 1), values, limits)
+    last = (len(values) - 1) // 2
+    return Correlogram(np.arange(-last, last + 1), values, limits)
 
 
 def spectra(

@@ -215,7 +215,7 @@ def _cross_correlations(
         lags = decorrelated_after(next(iter(errors.values()))[i])
         for command in commands[:COMMANDS]:
             marks: list[Mark] = []
-            reach = 0.0
+            largest = 0.0
             for source, each in errors.items():
                 found = _thinned(cross_correlation(each[i], command.values, lags))
                 x, colour = found.lags / rate, colour_of(source)
@@ -223,8 +223,8 @@ def _cross_correlations(
                 marks.append(Band(x, -found.limits, found.limits, name, colour, 0.18))
                 marks.append(_line(x, found.values, source))
                 both = np.concatenate([np.abs(found.values), found.limits])
-                reach = float(max(reach, *both[np.isfinite(both)], 0.0))
-            y = Axis("correlation", limits=(-1.1 * reach, 1.1 * reach) if reach > 0 else None)
+                largest = float(max(largest, *both[np.isfinite(both)], 0.0))
+            y = Axis("correlation", limits=(-1.1 * largest, 1.1 * largest) if largest > 0 else None)
             panels.append(
                 Panel(
                     Axis("time by which the command is earlier", "s"),
