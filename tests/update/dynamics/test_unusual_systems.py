@@ -139,6 +139,8 @@ def test_predictions_that_are_not_finite_are_refused() -> None:
         ("start_deviation", -1.0),
         ("domain_low", np.nan),
         ("domain_low", 1e9),
+        ("domain_mean", np.nan),
+        ("domain_mean", 1e9),
         ("domain_speed", np.nan),
     ],
 )
