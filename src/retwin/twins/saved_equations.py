@@ -84,9 +84,16 @@ def equations_from(kind: type[Kind], about: dict[str, Any]) -> Kind:
         else:
             nodes.append(known[value] if op == "variable" else program.constant(value))
     slope, results = ([nodes[i] for i in about[name]] for name in ("slope", "results"))
+    require(
+        (len(slope), len(results)) == (len(states), len(outputs)),
+        "operations",
+        expected=f"{len(states)} states and {len(outputs)} outputs as results",
+        got=f"{len(slope)} and {len(results)}",
+        remedy="save the model again",
+    )
     discrete = one_of("discrete", about["discrete"], (True, False))
     model = Model(program, variables, slope, results, discrete)
-    return kind(  # type: ignore[call-arg]  # which this module does not import
+    twin = kind(  # type: ignore[call-arg]  # which this module does not import
         states,
         _Evaluated(model, "outputs"),
         inputs,
@@ -98,6 +105,9 @@ def equations_from(kind: type[Kind], about: dict[str, Any]) -> Kind:
         interpolation=about["interpolation"],
         limits=None if about["limits"] is None else _limits(**about["limits"]),
     )
+    # Traced again, the same operations would take a hundred times as long to load.
+    vars(twin)["model"] = model
+    return twin
 
 
 def _bounded(limits: Limits) -> dict[str, Any]:

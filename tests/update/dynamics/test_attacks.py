@@ -10,6 +10,7 @@ import pytest
 import retwin as rt
 from retwin.errors import InputError
 from retwin.twins import Parameter, State, StateTwin
+from retwin.twins.compiled import model
 from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
 
 COMMANDS = np.cumsum(np.random.default_rng(0).normal(size=(2, 120, 1)), axis=1) / 5
@@ -86,3 +87,29 @@ def test_a_forged_description_is_refused(fitted: DynamicsTwin, tmp_path, keys, v
     file.write_text(json.dumps(about))
     with pytest.raises(InputError):
         DynamicsTwin.load(tmp_path / "model")
+
+
+def test_a_long_forged_model_is_loaded_without_tracing(
+    fitted: DynamicsTwin, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tracing takes 0.2 ms per operation: minutes for a file of some MB."""
+    fitted.save(tmp_path / "model")
+    file = tmp_path / "model" / "model.json"
+    about = json.loads(file.read_text())
+    equations = about["equations"]
+    for _ in range(30_000):
+        equations["operations"].append(["sin", [len(equations["operations"]) - 1], ""])
+    equations["slope"] = [len(equations["operations"]) - 1]
+    file.write_text(json.dumps(about))
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("the equations were traced")
+
+    monkeypatch.setattr(model, "trace_model", refuse)
+    DynamicsTwin.load(tmp_path / "model")
+
+
+@pytest.mark.parametrize("observed", [None, COMMANDS, "record.npz"])
+def test_what_is_no_record_is_refused(observed: object) -> None:
+    with pytest.raises(InputError, match="observed: expected Trajectories, got"):
+        fit_dynamics(LAG, observed)  # type: ignore[arg-type]
