@@ -129,3 +129,10 @@ def test_wrong_settings_are_refused_by_name(
     code, _, said = call(*given)
     assert (code, named in said) == (2, True), said
     assert not out.exists()
+
+
+def test_states_that_the_twin_has_not_are_refused_when_the_case_is_read(folder: Path) -> None:
+    file = folder / "unknown.toml"
+    file.write_text(CASE.replace("folds = 8", 'states = ["nope"]'))
+    with pytest.raises(rt.InputError, match=r"dynamics\.states.*one of level, got 'nope'"):
+        rt.cases.get(str(file))

@@ -10,7 +10,7 @@ from typing import Protocol
 from numpy.typing import NDArray
 
 from retwin.cases.recorded import RecordedCase
-from retwin.checks import require
+from retwin.checks import one_of, require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.nets.networks import MLP, Network
 from retwin.nets.training import Training
@@ -21,7 +21,7 @@ from retwin.twins.samplers import CommandSampler
 from retwin.twins.system_faults import TimedFault
 from retwin.twins.twin import Twin
 from retwin.update.corrections import Correction
-from retwin.update.dynamics import Dynamics
+from retwin.update.dynamics import Dynamics, state_names
 from retwin.update.residual import Density, Mixture, SequenceMixture
 
 __all__ = ["Body", "Case"]
@@ -147,6 +147,8 @@ class Case:
             got=f"{self.sampler.rate:g} Hz",
             remedy="give both the same rate",
         )
+        for name in self.dynamics.states:
+            one_of("dynamics.states", name, state_names(self.twin) or (name,))
         for fault in self.faults.values():
             if isinstance(fault, Stuck | TimedFault):
                 fault.onset_range(self.sampler.steps, self.rate)

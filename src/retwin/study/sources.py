@@ -19,7 +19,7 @@ from retwin.twins.noisy import NoisyTwin, residual_scale
 from retwin.twins.randomised import RandomisedTwin
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
-from retwin.update.dynamics import DynamicsTwin, has_states
+from retwin.update.dynamics import DynamicsTwin, state_names
 from retwin.update.residual import ResidualModel, SequenceMixture
 
 __all__ = ["lacking", "not_installed"]
@@ -154,7 +154,7 @@ def lacking(name: str, case: Case, plan: StudyPlan) -> str:
         return f"a case with a correction besides the one at its outputs; {case.name!r} has none"
     if name == "inversion" and isinstance(case.density, SequenceMixture):
         return "a correction per segment"
-    if ("update", "dynamics") in source.needs and not has_states(case.twin):
+    if ("update", "dynamics") in source.needs and not state_names(case.twin):
         return f"a case whose twin is a StateTwin; that of {case.name!r} is none"
     if source.parametric and case.parametric is None:
         return f"a case that declares the free parameters of its twin; {case.name!r} does not"

@@ -9,7 +9,7 @@ from retwin.update.dynamics.fitting import Dynamics, FittedDynamics, fit_dynamic
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.prediction import Prediction
 from retwin.update.dynamics.twin import DynamicsTwin
-from retwin.update.dynamics.unknowns import has_states, state_twin_of
+from retwin.update.dynamics.unknowns import state_names, state_twin_of
 
 __all__ = [
     "Curve",
@@ -20,6 +20,6 @@ __all__ = [
     "Library",
     "Prediction",
     "fit_dynamics",
-    "has_states",
+    "state_names",
     "state_twin_of",
 ]

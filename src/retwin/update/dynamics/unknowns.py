@@ -13,7 +13,7 @@ from retwin.checks import require
 from retwin.twins.parametric import Parameter, ParametricTwin
 from retwin.twins.state_twin import StateTwin
 
-__all__ = ["Unknowns", "has_states", "state_twin_of", "unknowns_of"]
+__all__ = ["Unknowns", "state_names", "state_twin_of", "unknowns_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +70,10 @@ class Unknowns:
         )
 
 
-def has_states(twin: object) -> bool:
-    """Whether a twin is a `StateTwin`, or a `ParametricTwin` of one."""
+def state_names(twin: object) -> tuple[str, ...]:
+    """Names of the states of a `StateTwin`, or of a `ParametricTwin` of one; none of others."""
     inner = twin.twin if isinstance(twin, ParametricTwin) else twin
-    return isinstance(inner, StateTwin)
+    return tuple(each.name for each in inner.states) if isinstance(inner, StateTwin) else ()
 
 
 def state_twin_of(
