@@ -15,6 +15,7 @@ import pytest
 from retwin.checks import (
     at_least,
     finite,
+    instance,
     needs_extra,
     one_of,
     one_per,
@@ -132,3 +133,9 @@ def test_an_error_keeps_its_parts_between_processes() -> None:
     again = pickle.loads(pickle.dumps(error))
     assert str(again) == str(error) == "rate: expected a number, got 'x'; give it in Hz"
     assert again.remedy == error.remedy
+
+
+def test_an_object_of_another_class_is_refused() -> None:
+    assert instance("n", 3, int, remedy="count") == 3
+    with pytest.raises(InputError, match="^n: expected int, got NoneType; count$"):
+        instance("n", None, int, remedy="count")

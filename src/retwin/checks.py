@@ -15,7 +15,17 @@ from typing import Any, TypeVar
 
 from retwin.errors import InputError
 
-__all__ = ["at_least", "finite", "needs_extra", "one_of", "one_per", "positive", "require", "whole"]
+__all__ = [
+    "at_least",
+    "finite",
+    "instance",
+    "needs_extra",
+    "one_of",
+    "one_per",
+    "positive",
+    "require",
+    "whole",
+]
 
 T = TypeVar("T")
 
@@ -27,6 +37,14 @@ def require(condition: object, argument: str, *, expected: str, got: object, rem
     """
     if not condition:
         raise InputError(argument, expected=expected, got=str(got), remedy=remedy)
+
+
+def instance(argument: str, value: Any, kind: type[T], *, remedy: str) -> T:
+    """`value`, if it is an object of a class; another one is an `InputError`."""
+    got = type(value).__name__
+    require(isinstance(value, kind), argument, expected=kind.__name__, got=got, remedy=remedy)
+    made: T = value
+    return made
 
 
 def one_of(argument: str, value: T, choices: Iterable[T], *, remedy: str = "") -> T:

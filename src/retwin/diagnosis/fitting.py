@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from retwin.checks import require
+from retwin.checks import instance, require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.diagnoser import Method, TrainedDiagnoser
 from retwin.diagnosis.network import fit_network
@@ -71,6 +71,9 @@ def fit_diagnoser(
         channels or another rate.
 
     """
+    instance(
+        "trajectories", trajectories, Trajectories, remedy="load recorded ones, or simulate a twin"
+    )
     adapts = isinstance(classifier, Method) and classifier.adapts
     require(
         (target is not None) == adapts,

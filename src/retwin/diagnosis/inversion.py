@@ -21,7 +21,7 @@ from scipy.special import expit, logsumexp
 from scipy.stats import t as student
 from torch import Tensor
 
-from retwin.checks import require
+from retwin.checks import instance, require
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis.estimate import UNKNOWN, Estimate
 from retwin.diagnosis.hypotheses import Hypotheses, checked
@@ -348,13 +348,8 @@ def fit_inversion(
             got=type(residual).__name__,
             remedy="fit it with CommandSpace",
         )
-    if calibration is None:
-        raise InputError(
-            "calibration",
-            expected="trajectories",
-            got="None",
-            remedy="give those that the residual model was fitted to",
-        )
+    remedy = "give those that the residual model was fitted to"
+    calibration = instance("calibration", calibration, Trajectories, remedy=remedy)
     healthy = calibration.with_label(HEALTHY)
     require(
         len(healthy),

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import instance, require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis import Diagnoser
 from retwin.scores.classification import Scores, score
@@ -37,6 +37,7 @@ def evaluate(diagnoser: Diagnoser, test: Trajectories) -> Scores:
         raises it.
 
     """
+    instance("test", test, Trajectories, remedy="load recorded ones, or simulate a twin")
     return scored(test, finite_probabilities(diagnoser, test), diagnoser.classes)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from retwin.arrays import check_finite
-from retwin.checks import require, whole
+from retwin.checks import instance, require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Provenance, Trajectories
 from retwin.progress import Progress
@@ -183,6 +183,7 @@ def checked_stride(
         not divide that of the trajectories.
 
     """
+    instance(argument, trajectories, Trajectories, remedy="load recorded ones, or simulate a twin")
     healthy = np.isin(trajectories.labels, (HEALTHY, UNLABELLED))
     require(
         len(trajectories) > 0 and healthy.all(),
@@ -202,6 +203,7 @@ def check_channels(twin: Twin, trajectories: Trajectories, argument: str) -> Non
 
     Raises InputError, in which the trajectories have the name `argument`.
     """
+    instance(argument, trajectories, Trajectories, remedy="load recorded ones, or simulate a twin")
     for name in ("inputs", "outputs", "rate"):
         expected, given = getattr(twin, name), getattr(trajectories, name)
         require(

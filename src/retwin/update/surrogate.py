@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from retwin.arrays import row_blocks
 from retwin.catalog import NETWORKS, classes
-from retwin.checks import one_per, require
+from retwin.checks import instance, one_per, require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.nets.networks import MLP, Network, Standardise
 from retwin.nets.training import Fit, Training, isolated, train
@@ -255,6 +255,7 @@ def fit_surrogate(
         Fewer than ten trajectories, or trajectories without commands.
 
     """
+    instance("twin", twin, Trajectories, remedy="simulate the twin, and give what it returns")
     channels = twin.commands.shape[2]
     require(
         len(twin) >= MIN_TRAJECTORIES and channels,

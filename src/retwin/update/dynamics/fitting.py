@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from retwin.checks import require, whole
+from retwin.checks import instance, require, whole
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
@@ -66,13 +66,8 @@ class Dynamics:
     folds: int = 10
 
     def __post_init__(self) -> None:
-        require(
-            isinstance(self.library, Library),
-            "library",
-            expected="a Library",
-            got=type(self.library).__name__,
-            remedy="give Library(degree=..., knots=..., friction=...)",
-        )
+        remedy = "give Library(degree=..., knots=..., friction=...)"
+        instance("library", self.library, Library, remedy=remedy)
         require(
             not isinstance(self.states, str) and len(set(self.states)) == len(self.states),
             "states",

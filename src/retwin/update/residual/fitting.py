@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from retwin.checks import require
+from retwin.checks import instance, require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
@@ -186,6 +186,9 @@ def fit_residual(
 
     """
     surrogate = exact_surrogate(surrogate)
+    instance(
+        "calibration", calibration, Trajectories, remedy="load recorded ones, or simulate a twin"
+    )
     _check_match(surrogate, calibration)
     stepwise = correction.resolution == "step" or isinstance(density, SequenceMixture)
     keep, faults = _chosen(
