@@ -137,5 +137,5 @@ def test_an_error_keeps_its_parts_between_processes() -> None:
 
 def test_an_object_of_another_class_is_refused() -> None:
     assert instance("n", 3, int, remedy="count") == 3
-    with pytest.raises(InputError, match="^n: expected int, got NoneType; count$"):
+    with pytest.raises(InputError, match=r"^n: expected int, got NoneType; count$"):
         instance("n", None, int, remedy="count")
