@@ -163,15 +163,18 @@ class Estimation:
             power = power / self.spread
         return float(np.sqrt(np.average(power, weights=self.seen.sum(axis=(0, 1)))))
 
-    def minimised(self, at: Linearised) -> Linearised:
-        """The most probable point, from a start at which the simulation is finite."""
+    def minimised(self, at: Linearised, steps: int = MAX_STEPS) -> Linearised:
+        """The most probable point, from a start at which the simulation is finite.
+
+        The search ends after so many steps at most.
+        """
         flat = at.point.flat
         if not flat.size:
             return at
         value, gradient, curvature = self._expanded(at, flat)
         unit = _unit(curvature)
         radius = WIDEST / 1e3
-        for _ in range(MAX_STEPS):
+        for _ in range(steps):
             if np.linalg.norm(unit * gradient) < TOLERANCE:
                 break
             scaled = curvature.scaled(unit)

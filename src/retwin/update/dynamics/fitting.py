@@ -21,12 +21,12 @@ from retwin.twins.twin import checked_stride
 from retwin.update.dynamics.corrected import CorrectedEquations, Domain, correctable
 from retwin.update.dynamics.estimation import Estimation, correlation_time, root
 from retwin.update.dynamics.library import Library
-from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
+from retwin.update.dynamics.linearised import Linearised, Point
 from retwin.update.dynamics.noise import fit_noise, folds, widening
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of
 
-__all__ = ["Dynamics", "FittedDynamics", "fit_dynamics"]
+__all__ = ["Dynamics", "FittedDynamics", "assembled", "fit_dynamics"]
 
 STRONGEST = 100.0
 """Variance of the error of an effective sample that is assumed first, over that of the samples of
@@ -199,7 +199,9 @@ def fit_dynamics(
     errors = [own.rms(held_out.errors) for _, own, _, held_out in tried]
     chosen = int(np.argmin(np.nan_to_num(errors, nan=np.inf)))
     equations, estimation, found, held_out = tried[chosen]
-    made = _assembled(equations, estimation, found, held_out, parts)
+    corrected = equations.states, equations.domain.speed
+    made = assembled(estimation, found, *corrected, parts, held_out.moves)
+    made = replace(made, widening=widening(made, estimation, held_out))
     report(1.0)
     unknown = estimation.undetermined(found)[: unknowns.count]
     notes = _notes(estimation, found.point, unknown)
@@ -295,14 +297,30 @@ def _followed(
     return own, now
 
 
-def _assembled(
-    equations: CorrectedEquations,
+def assembled(
     estimation: Estimation,
     found: Linearised,
-    held_out: HeldOut,
+    corrected: tuple[str, ...],
+    speed: NDArray,
     parts: Sequence[NDArray],
+    moves: NDArray,
 ) -> DynamicsTwin:
-    """The twin as a distribution, see `Estimation.held_out`."""
+    """The twin of an estimation as a distribution, its bands not yet calibrated.
+
+    Parameters
+    ----------
+    estimation, found
+        The equations, and their optimum.
+    corrected : tuple of str
+        The states whose equations may be wrong, so that they have process noise.
+    speed : NDArray
+        (d_x,), see `Domain`.
+    parts : sequence of NDArray
+        K parts (n, T) of the samples, by which the noise is fitted.
+    moves : NDArray
+        (K, k), by how much the shared coordinates differ without each part.
+
+    """
     unknowns = estimation.unknowns
     start, deviation = unknowns.start.copy(), np.zeros(len(unknowns.start))
     start[unknowns.free] = found.point.starts.mean(axis=0)
@@ -311,23 +329,22 @@ def _assembled(
     by_free = np.eye(len(start))[:, unknowns.free]
     factor = block_diag(unknowns.matrix, by_free) @ root(estimation.covariance(found))
     states = estimation.simulated(found.point)[1]
-    names = [each.name for each in equations.twin.states]
-    indices = [names.index(name) for name in equations.states]
+    names = [each.name for each in estimation.twin.states]
+    indices = [names.index(name) for name in corrected]
     made = DynamicsTwin(
-        equations.corrected,
+        estimation.twin,
         np.concatenate([values, start]),
         factor,
         deviation,
         np.zeros(len(start)),
         estimation.power(found.residual),
         1.0,
-        Domain.visited(states, estimation.commands, equations.domain.speed),
-        equations.states,
+        Domain.visited(states, estimation.commands, speed),
+        corrected,
         estimation.observed.emulated,
     )
-    moves = np.pad(held_out.moves @ unknowns.matrix.T, ((0, 0), (0, len(start))))
-    noisy = fit_noise(made, estimation.observed, indices, parts, moves)
-    return replace(noisy, widening=widening(noisy, estimation, held_out))
+    by_values = np.pad(moves @ unknowns.matrix.T, ((0, 0), (0, len(start))))
+    return fit_noise(made, estimation.observed, indices, parts, by_values)
 
 
 def _notes(estimation: Estimation, found: Point, unknown: NDArray) -> str:
