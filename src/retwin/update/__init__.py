@@ -10,6 +10,7 @@ from retwin._lazy import names
 
 _HOME = {
     "Additive": "corrections",
+    "BlackBox": "blackbox",
     "Chain": "corrections",
     "CommandSpace": "corrections",
     "Context": "corrections",
@@ -47,6 +48,7 @@ _HOME = {
     "Updated": "identification",
     "calibration_ranks": "identification",
     "command_space": "corrections",
+    "fit_black_box": "blackbox",
     "fit_correction": "corrections",
     "fit_dynamics": "dynamics",
     "fit_residual": "residual",

@@ -1,0 +1,66 @@
+"""Black-box models of outputs by commands, without a twin: rivals of corrected twins.
+
+Belongs here: models whose equations know nothing of the system. Not here: corrections of twins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from retwin.checks import one_of
+from retwin.data.trajectories import Trajectories
+from retwin.progress import Progress
+from retwin.twins.twin import checked_seed
+from retwin.update.blackbox.arx import fit_arx
+from retwin.update.blackbox.estimate import BlackBox
+from retwin.update.blackbox.narx import fit_narx
+from retwin.update.blackbox.neural import fit_neural_ss
+
+__all__ = ["BLACK_BOXES", "BlackBox", "fit_black_box"]
+
+BLACK_BOXES: Mapping[str, Callable[[Trajectories, int, Progress | None], BlackBox]] = {
+    "arx": fit_arx,
+    "narx": fit_narx,
+    "neural_ss": fit_neural_ss,
+}
+"""By name, which is that of the source in a study too."""
+
+
+def fit_black_box(
+    observed: Trajectories, kind: str, *, seed: int = 0, progress: Progress | None = None
+) -> BlackBox:
+    """A model of the outputs by the commands, from calibration records alone.
+
+    Its order and the strength of its prior are those with the least error of held-out blocks in
+    free simulation. Bands are calibrated by the same blocks.
+
+    Parameters
+    ----------
+    observed : Trajectories
+        Healthy calibration trajectories with commands; masked samples are not used.
+    kind : str
+        "arx", a linear model; "narx", a polynomial of past samples; "neural_ss", a linear
+        state-space model with a small network inside its equations.
+    seed : int
+        Of the first weights of a network, at least 0.
+    progress : callable, optional
+        Called with the share of the work that is done.
+
+    Returns
+    -------
+    BlackBox
+        Its `twin` simulates from commands.
+
+    Raises
+    ------
+    InputError
+        An unknown kind; no trajectory, one with a fault, no command channel, or an output that was
+        never measured or never changes; or no order that has enough consecutive samples and whose
+        free simulation stays finite.
+
+    """
+    fit = BLACK_BOXES[one_of("kind", kind, BLACK_BOXES)]
+    with np.errstate(over="ignore", invalid="ignore"):  # of models that diverge, and are not chosen
+        return fit(observed, checked_seed(seed), progress)

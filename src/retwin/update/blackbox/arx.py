@@ -1,0 +1,165 @@
+"""The best linear model: ARX by least squares, then output error by free simulation.
+
+    y[k] = c + sum over i of A_i y[k-i] + sum over i of B_i u[k-i],   i up to n, from 0 for u
+
+It is simulated in observer form, whose states are as few as possible:
+
+    y[k] = x_1[k] + B_0 u[k],   x_i[k+1] = A_i y[k] + B_i u[k] + x_{i+1}[k] (+ c for i = 1)
+
+References
+----------
+L. Ljung, "System identification: theory for the user" (1999), chapters 4 and 7.
+
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from retwin.data.trajectories import Trajectories
+from retwin.progress import Progress
+from retwin.twins.parametric import Parameter
+from retwin.twins.state import State
+from retwin.twins.state_twin import StateTwin
+from retwin.update.blackbox.estimate import (
+    BlackBox,
+    Fit,
+    best_order,
+    check_records,
+    cross_validated,
+    estimation_of,
+    followed,
+)
+from retwin.update.blackbox.lags import Lags, least_squares
+from retwin.update.dynamics.estimation import Point
+
+__all__ = ["Linear", "best_linear", "fit_arx"]
+
+MAX_ORDER = 8
+"""Largest number of past samples that is tried."""
+WIDEST = 1e9
+"""Bound of coefficients."""
+START = 10.0
+"""Bound of the states at the first sample, over their largest value at rest."""
+
+
+def fit_arx(observed: Trajectories, seed: int, progress: Progress | None) -> BlackBox:
+    """The linear model of the order that predicts held-out blocks best; it needs no seed."""
+    began = time.perf_counter()
+    linear, fit = best_linear(observed, progress)
+    names = [each.name for each in fit.estimation.twin.states]
+    return fit.model(linear.lags.order, began, names[: len(observed.outputs)])
+
+
+def best_linear(observed: Trajectories, progress: Progress | None = None) -> tuple[Linear, Fit]:
+    """The linear model of the best order, and its fit."""
+    check_records(observed)
+    order, fit = best_order(
+        range(1, MAX_ORDER + 1), lambda n: Linear(Lags(observed, n, 1)).fit(), progress
+    )
+    return Linear(Lags(observed, order, 1)), fit
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Linear models of past samples, in scaled units.
+
+    Attributes
+    ----------
+    lags : Lags
+        The past samples; the degree is 1.
+
+    """
+
+    lags: Lags
+
+    @cached_property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers of outputs, of commands, and of past samples."""
+        observed = self.lags.observed
+        return len(observed.outputs), len(observed.inputs), self.lags.order
+
+    def parts(self, theta: Any) -> tuple[Any, list[Any], list[Any]]:
+        """c, the A_i from i = 1 and the B_i from i = 0, of coefficients (d_y, k)."""
+        width, inputs, n = self.sizes
+        begin = 1 + n * width
+        by_outputs = [theta[:, 1 + i * width : 1 + (i + 1) * width] for i in range(n)]
+        by_commands = [
+            theta[:, begin + i * inputs : begin + (i + 1) * inputs] for i in range(n + 1)
+        ]
+        return theta[:, 0], by_outputs, [by_commands[n], *by_commands[:n]]
+
+    def twin(self, theta: NDArray) -> StateTwin:
+        """The model in observer form, its parameters beginning at coefficients (d_y, k)."""
+        observed, scales = self.lags.observed, self.lags.scales
+        width, _, n = self.sizes
+        centre, scale = torch.tensor(scales.commands.centre), torch.tensor(scales.commands.scale)
+        level, height = torch.tensor(scales.outputs.centre), torch.tensor(scales.outputs.scale)
+
+        def scaled(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
+            constant, a, b = self.parts(torch.stack(list(p)).reshape(theta.shape))
+            given = (torch.stack(list(u)) - centre) / scale
+            states = torch.stack(list(x)).reshape(n, width)
+            return states[0] + b[0] @ given, given, states, constant, a, b
+
+        def output(x: Any, u: Any, p: Any) -> Any:
+            return tuple((level + height * scaled(x, u, p)[0]).unbind())
+
+        def step(x: Any, u: Any, p: Any) -> Any:
+            y, given, states, constant, a, b = scaled(x, u, p)
+            following = []
+            for i in range(n):
+                each = a[i] @ y + b[i + 1] @ given
+                each = each + (constant if i == 0 else 0.0)
+                following += (each + states[i + 1] if i + 1 < n else each).unbind()
+            return tuple(following)
+
+        starts = self.starts(theta)
+        bound = START * (1.0 + float(np.abs(starts).max()))
+        terms = [each.name for each in self.lags.terms]
+        names = [f"{own}: {term}" for own in observed.outputs.names for term in terms]
+        return StateTwin(
+            [
+                State(f"x{i + 1}", "1", float(each), -bound, bound)
+                for i, each in enumerate(starts.mean(axis=0))
+            ],
+            output,
+            observed.inputs,
+            observed.outputs,
+            observed.rate,
+            step=step,
+            parameters=[
+                Parameter(name, "1", -WIDEST, WIDEST, float(value))
+                for name, value in zip(names, theta.ravel(), strict=True)
+            ],
+        )
+
+    def starts(self, theta: NDArray) -> NDArray:
+        """States (records, n d_y) at the first samples, as if each record had been at rest."""
+        (y, u), scales = self.lags.first, self.lags.scales
+        y = (y - scales.outputs.centre) / scales.outputs.scale
+        u = (u - scales.commands.centre) / scales.commands.scale
+        constant, a, b = self.parts(theta)
+        later, found = np.zeros_like(y), list[NDArray]()
+        for i in reversed(range(len(a))):
+            later = later + y @ a[i].T + u @ b[i + 1].T + (constant if i == 0 else 0.0)
+            found.insert(0, later)
+        return np.concatenate(found, axis=1)
+
+    def fit(self) -> Fit | None:
+        """The model; None where samples are too few or a simulation diverges."""
+        return cross_validated(self.lags.observed.mask, self.without) if self.lags.enough else None
+
+    def without(self, part: NDArray) -> Fit | None:
+        """The model without a part (n, T) of the samples; None where its simulation diverges."""
+        kept = self.lags.rows.without(part)
+        theta = np.stack([least_squares(kept.values, y) for y in kept.outputs.T])
+        estimation = estimation_of(self.twin(theta), self.lags.observed, part)
+        return followed(estimation, Point(theta.ravel(), self.starts(theta)))

@@ -1,0 +1,317 @@
+"""What all black-box models share: checks, estimation on free simulation, and the result.
+
+A black-box model is a `StateTwin` whose equations know nothing of the system. So it is estimated,
+simulated, saved and used as a twin with corrected dynamics is.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import require
+from retwin.data.trajectories import Trajectories
+from retwin.errors import InputError
+from retwin.progress import Progress
+from retwin.twins.state_twin import StateTwin
+from retwin.twins.twin import checked_stride
+from retwin.update.dynamics.estimation import Estimation, Point, correlation_time
+from retwin.update.dynamics.fitting import assembled
+from retwin.update.dynamics.noise import widening
+from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
+
+__all__ = [
+    "BlackBox",
+    "Fit",
+    "best_order",
+    "check_records",
+    "cross_validated",
+    "estimation_of",
+    "followed",
+    "held_out_errors",
+    "held_out_parts",
+    "with_best_prior",
+]
+
+FOLDS = 10
+"""Parts of the calibration record, each made of blocks of all trajectories, that are held out."""
+MANY = 100_000
+"""Samples that are fitted again and again, without each part in turn; of longer records fewer
+parts are held out."""
+WORTH = 0.99
+"""Ratio of held-out errors below which a larger order is better."""
+PATIENCE = 2
+"""Orders, or strengths of a prior, that are tried beyond the best one."""
+STRONGEST = 1000.0
+"""Variance of the error of an effective sample that is assumed first, over that of the model where
+it begins: a prior so strong that nonlinear terms begin near 0."""
+STEP = 10.0
+"""Ratio of that variance to the next one."""
+MAX_STRENGTHS = 8
+"""Number of variances at most."""
+SEARCH = 25
+"""Steps of the search with each variance at most."""
+MAX_PASSES = 6
+"""Times that the error of the outputs is estimated anew."""
+SAME = 0.1
+"""Logarithm of the ratio of two variances below which they agree."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlackBox:
+    """A fitted black-box model.
+
+    Attributes
+    ----------
+    twin : DynamicsTwin
+        The model, as a distribution of outputs.
+    figures : dict of str to float
+        `order`, the number of past samples that the model has, or that its linear part has;
+        `parameters`, their number; `rms`, the error of free simulation over the calibration record,
+        and `held_out`, that of blocks left out, in output units, or relative to each output's
+        standard deviation where units differ.
+    seconds : float
+        Duration.
+
+    """
+
+    twin: DynamicsTwin
+    figures: dict[str, float]
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A model at its most probable parameters.
+
+    Attributes
+    ----------
+    estimation : Estimation
+        The equations, and the variance of the error of an effective sample.
+    point : Point
+        The optimum.
+    errors : NDArray
+        (n, T, d_y), of samples by models that were fitted without them; NaN of others.
+
+    """
+
+    estimation: Estimation
+    point: Point
+    errors: NDArray
+
+    @property
+    def held_out(self) -> float:
+        """Root mean square of `errors`; infinite if a simulation diverges."""
+        tested = self._tested
+        error = tested.rms(np.where(tested.seen, self.errors, 0.0))
+        return error if np.isfinite(error) else np.inf
+
+    @property
+    def _tested(self) -> Estimation:
+        return replace(self.estimation, seen=~np.isnan(self.errors))
+
+    def searched(self, variance: NDArray) -> Fit:
+        """The most probable point nearby with another variance of the errors."""
+        estimation = replace(self.estimation, variance=variance)
+        found = estimation.minimised(estimation.linearised(self.point), SEARCH)
+        return replace(self, estimation=estimation, point=found.point)
+
+    def model(self, order: int, began: float, corrected: Sequence[str]) -> BlackBox:
+        """The model as a distribution; the equations of the states `corrected` have noise."""
+        estimation, point = self.estimation, self.point
+        steps = np.diff(estimation.simulated(point)[1], axis=1)
+        speed = np.sqrt(np.mean(steps**2, axis=(0, 1)))
+        found = estimation.linearised(point)
+        speed, whole = np.where(speed > 0, speed, 1.0), [np.full(estimation.seen.shape[:2], True)]
+        unmoved = np.zeros((1, estimation.unknowns.count))
+        made = assembled(estimation, found, tuple(corrected), speed, whole, unmoved)
+        uncertain = estimation.held_out(found, held_out_parts(estimation.seen))
+        made = replace(
+            made, widening=widening(made, self._tested, replace(uncertain, errors=self.errors))
+        )
+        figures = {
+            "order": float(order),
+            "parameters": float(estimation.unknowns.count),
+            "rms": estimation.rms(estimation.residual(point)),
+            "held_out": self.held_out,
+        }
+        return BlackBox(made, figures, time.perf_counter() - began)
+
+
+def check_records(observed: Trajectories) -> None:
+    """Refuse records from which no model of the outputs by the commands can be learned.
+
+    Raises
+    ------
+    InputError
+        No trajectory, one with a fault, no command channel, or an output that was never measured
+        or that never changes.
+
+    """
+    checked_stride(observed, observed, None, "observed")  # type: ignore[arg-type]  # its channels
+    fixed = [
+        name
+        for i, name in enumerate(observed.outputs.names)
+        if np.unique(observed.observed[..., i][observed.mask[..., i]]).size < 2
+    ]
+    require(
+        not fixed and len(observed.inputs) > 0,
+        "observed",
+        expected="commands, and outputs that are measured and that change",
+        got=f"outputs that do not: {', '.join(fixed)}" if fixed else "no commands",
+        remedy="leave such outputs out, and record the commands",
+    )
+
+
+def best_order(
+    orders: Sequence[int], fit: Callable[[int], Fit | None], progress: Progress | None
+) -> tuple[int, Fit]:
+    """The order with the least error of held-out blocks in free simulation, and its fit.
+
+    Raises
+    ------
+    InputError
+        No order can be fitted.
+
+    """
+    best: tuple[int, Fit] | None = None
+    for done, order in enumerate(orders, 1):
+        found = fit(order)
+        error = np.inf if found is None else found.held_out
+        if found is not None and error < (WORTH * best[1].held_out if best else np.inf):
+            best = order, found
+        if progress is not None:
+            progress(0.9 * done / len(orders))
+        if best is not None and order - best[0] >= PATIENCE:
+            break
+    if best is None:
+        raise InputError(
+            "observed",
+            expected="records by which a model of past samples can be simulated",
+            got="records with which every order diverges in free simulation, or in which too few "
+            "samples follow each other",
+            remedy="give longer records, with all outputs measured at consecutive samples",
+        )
+    return best
+
+
+def held_out_parts(seen: NDArray) -> list[NDArray]:
+    """The parts (n, T) of a record that are held out in turn.
+
+    Each trajectory is cut into blocks, of which a part has one, another one in each. The first
+    block is in no part, since without it hardly anything determines the states at the start.
+    """
+    trajectories, samples, _ = seen.shape
+    block = np.arange(samples) * (FOLDS + 1) // samples
+    own = (block - 1 + np.arange(trajectories)[:, None]) % FOLDS
+    count = int(np.clip(MANY // max(1, seen.sum()), 1, FOLDS))
+    return [(own == part) & (block > 0) for part in range(count)]
+
+
+def cross_validated(seen: NDArray, fitted: Callable[[NDArray], Fit | None]) -> Fit | None:
+    """The fit to all samples, with the errors of parts by fits without them.
+
+    Parameters
+    ----------
+    seen : NDArray
+        (n, T, d_y) bool, the measured samples.
+    fitted : callable
+        From a part (n, T) that is left out to the fit without it; None where that diverges.
+
+    """
+    parts = held_out_parts(seen)
+    found = [fitted(part) for part in (np.zeros(seen.shape[:2], dtype=bool), *parts)]
+    good = [each for each in found if each is not None]
+    if len(good) < len(found):
+        return None
+    return replace(good[0], errors=held_out_errors(good[1:], parts, seen))
+
+
+def held_out_errors(fits: Sequence[Fit], parts: Sequence[NDArray], seen: NDArray) -> NDArray:
+    """Errors (n, T, d_y) of each part by the fit without it, NaN of samples in no part."""
+    errors = np.full(seen.shape, np.nan)
+    for fit, part in zip(fits, parts, strict=True):
+        place = part[..., None] & seen
+        residual = replace(fit.estimation, seen=seen).residual(fit.point)
+        errors[place] = np.where(np.isfinite(residual), residual, np.inf)[place]
+    return errors
+
+
+def estimation_of(twin: StateTwin, observed: Trajectories, part: NDArray) -> Estimation:
+    """The estimation of all parameters and starts without a part (n, T), with unit variances."""
+    base, free, values = state_twin_of(twin)
+    unknowns, seen = unknowns_of(base, free, values), observed.mask & ~part[..., None]
+    return Estimation(base, observed, unknowns, seen, np.ones(len(base.outputs)))
+
+
+def with_best_prior(
+    start: Callable[[NDArray], Fit], seen: NDArray, report: Progress | None = None
+) -> Fit | None:
+    """The fit to all samples whose prior has the strength that predicts held-out parts best.
+
+    The assumed error of the outputs begins large, which makes the prior strong, and falls from step
+    to step, until parts are no longer predicted better by the fits without them.
+
+    Parameters
+    ----------
+    start : callable
+        From a part (n, T) that is left out to the model where it begins, with its prior.
+    seen : NDArray
+        (n, T, d_y) bool, the measured samples.
+    report : callable, optional
+        Called with the share of the work that is done.
+
+    Returns
+    -------
+    Fit or None
+        None where the simulation diverges at the start.
+
+    """
+    parts = held_out_parts(seen)
+    whole, fits = start(np.zeros(seen.shape[:2], dtype=bool)), [start(part) for part in parts]
+    if not all(each.estimation.linearised(each.point).finite for each in fits):
+        return None
+    variance = STRONGEST * observed_variance(fits[0].estimation, fits[0].point)
+    best, least, since = fits[0], np.inf, 0
+    for strength in range(MAX_STRENGTHS):
+        fits = [each.searched(variance) for each in fits]
+        found = replace(whole, errors=held_out_errors(fits, parts, seen))
+        since += 1
+        if found.held_out < least:
+            whole, best, least, since = found, fits[0], found.held_out, 0
+        if report is not None:
+            report((strength + 1) / (MAX_STRENGTHS + 1))
+        if since == PATIENCE:
+            break
+        variance = variance / STEP
+    whole = replace(whole, point=best.point).searched(best.estimation.variance)
+    observed = observed_variance(whole.estimation, whole.point)
+    return replace(whole, estimation=replace(whole.estimation, variance=observed))
+
+
+def observed_variance(estimation: Estimation, point: Point) -> NDArray:
+    """The variance (d_y,) of the error of an effective sample at a point."""
+    residual = estimation.residual(point)
+    return estimation.power(residual) * correlation_time(residual)
+
+
+def followed(estimation: Estimation, point: Point) -> Fit | None:
+    """The fit whose assumed errors are those that are observed; None where the start diverges."""
+    if not np.isfinite(estimation.residual(point)).all():
+        return None
+    for _ in range(MAX_PASSES):
+        variance = observed_variance(estimation, point)
+        settled = np.all(np.abs(np.log(variance / estimation.variance)) < SAME)
+        estimation = replace(estimation, variance=variance)
+        if settled:
+            break
+        found = estimation.linearised(point)
+        if not found.finite:
+            return None
+        point = estimation.minimised(found).point
+    return Fit(estimation, point, np.full(estimation.seen.shape, np.nan))
