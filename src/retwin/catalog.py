@@ -309,6 +309,27 @@ SOURCES: Mapping[str, SourceEntry] = {
         (_DYNAMICS,),
         twin="retwin.study.sources:corrected_dynamics",
     ),
+    "arx": SourceEntry(
+        "Linear model (ARX)",
+        "healthy",
+        (("update", "arx"),),
+        twin="retwin.study.sources:black_box",
+        simulates=True,
+    ),
+    "narx": SourceEntry(
+        "Polynomial NARX",
+        "healthy",
+        (("update", "narx"),),
+        twin="retwin.study.sources:black_box",
+        simulates=True,
+    ),
+    "neural_ss": SourceEntry(
+        "Neural state space",
+        "healthy",
+        (("update", "neural_ss"),),
+        twin="retwin.study.sources:black_box",
+        simulates=True,
+    ),
     "ibg_rg_command": SourceEntry(
         "IBG + RG, command space",
         "healthy",

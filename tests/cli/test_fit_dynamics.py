@@ -89,12 +89,14 @@ def test_state_equations_are_fitted_and_generate(folder: Path, tmp_path: Path, c
 
 def test_a_study_compares_them(folder: Path, tmp_path: Path, call) -> None:
     case, data, out = folder / "case.toml", folder / "d.csv", tmp_path / "study"
-    given = ("--sources", "twin,pi_ls,dynamics", "--runs", 1, "--processes", 1)
+    compared = ("twin", "pi_ls", "dynamics", "arx", "narx")
+    given = ("--sources", ",".join(compared), "--runs", 1, "--processes", 1)
     code, _, said = call("study", case, "--data", data, *given, "--out", out)
     assert code == 0, said
     sources = json.loads((out / "results.json").read_text())["sources"]
-    error = {name: sources[name]["rmse"][0] for name in ("twin", "pi_ls", "dynamics")}
+    error = {name: sources[name]["rmse"][0] for name in compared}
     assert error["dynamics"] < 0.3 * min(error["twin"], error["pi_ls"])
+    assert error["narx"] < 0.5 * error["arx"]
     assert 0.75 < sources["dynamics"]["coverage90"][0] <= 1
     assert (sources["twin"]["nll"], sources["dynamics"]["nll"][0] < -2) == ([None], True)
     page = (out / "report.html").read_text()

@@ -68,6 +68,11 @@ def corrected_dynamics(trial: Trial) -> Twin:
     return trial.updated("dynamics")
 
 
+def black_box(trial: Trial) -> Twin:
+    """A model of the measured outputs by the commands, without the twin."""
+    return trial.updated(trial.job.name)
+
+
 def adversarial(trial: Trial) -> FittedDiagnoser:
     """A domain-adversarial network on the unlabelled calibration set."""
     return _adversarial(trial, trial.unlabelled)

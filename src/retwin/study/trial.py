@@ -19,6 +19,7 @@ from retwin.study.files import Files, Job
 from retwin.study.plan import StudyPlan
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import Twin
+from retwin.update.blackbox import BLACK_BOXES
 from retwin.update.corrected import generate
 from retwin.update.corrections import Correction
 from retwin.update.dynamics import DynamicsTwin
@@ -92,9 +93,12 @@ class Trial:
         return NetworkDiagnoser.load(self.files.diagnoser(self.job.before("diagnosis", source)))
 
     def updated(self, method: str) -> Twin:
-        """The twin that was updated: its parameters, their posterior, or its state equations."""
+        """The twin that was updated: its parameters, their posterior, or its state equations.
+
+        A black-box model, which takes its place, is one of state equations.
+        """
         folder = self._made("update", method)
-        if method == "dynamics":
+        if method == "dynamics" or method in BLACK_BOXES:
             return DynamicsTwin.load(folder)
         if method == "pi_bayes":
             return PosteriorTwin.load(folder, self.parametric)

@@ -37,6 +37,7 @@ from retwin.study.plan import StudyPlan
 from retwin.study.trial import Trial
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Twin
+from retwin.update.blackbox import BLACK_BOXES, fit_black_box
 from retwin.update.corrected import CorrectedTwin, generate
 from retwin.update.dynamics import fit_dynamics
 from retwin.update.identification import NPE, Posterior, Updated, identify
@@ -235,7 +236,12 @@ class Work:
         return {}
 
     def _update(self, trial: Trial, path: Path) -> Costs:
-        """The update by Eq. 2 or Eq. 3, or of the state equations."""
+        """The update by Eq. 2 or Eq. 3, of the state equations, or by a model without a twin."""
+        if trial.job.name in BLACK_BOXES:
+            seed, progress = trial.seed("update"), trial.progress
+            fitted = fit_black_box(trial.healthy, trial.job.name, seed=seed, progress=progress)
+            fitted.twin.save(path)
+            return {}
         if trial.job.name == "dynamics":
             made = fit_dynamics(
                 self.case.twin,  # type: ignore[arg-type]  # checked before the study begins
