@@ -39,11 +39,14 @@ class Scales:
         """The scales of records."""
         y = np.where(observed.mask, observed.observed, np.nan).astype(np.float64)
         u = observed.commands.astype(np.float64)
-        parts = (
-            (np.nanmin(each, axis=(0, 1)), np.nanmax(each, axis=(0, 1)), np.ones(each.shape[2]))
+        ranges = [
+            [make(each, axis=(0, 1)) for make in (np.nanmin, np.nanmax, np.nanmean)]
             for each in (y, u)
+        ]
+        outputs, commands = (
+            Domain(low, high, mean, np.ones(len(low))) for low, high, mean in ranges
         )
-        return cls(*(Domain(*part) for part in parts))
+        return cls(outputs, commands)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,11 +120,11 @@ class Lags:
     def domain(self) -> Domain:
         """Ranges of the variables."""
         y, u = self.scales.outputs, self.scales.commands
-        low, high = (
+        low, high, mean = (
             np.concatenate([*[a] * self.order, *[b] * (self.order + 1)])
-            for a, b in ((y.low, u.low), (y.high, u.high))
+            for a, b in ((y.low, u.low), (y.high, u.high), (y.mean, u.mean))
         )
-        return Domain(low, high, np.ones(len(self.names)))
+        return Domain(low, high, mean, np.ones(len(self.names)))
 
     @cached_property
     def terms(self) -> list[Term]:
