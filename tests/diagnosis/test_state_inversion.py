@@ -193,6 +193,31 @@ def test_missing_samples_do_not_count(diagnoser, records) -> None:
     assert one.probabilities[0, 0] > 0.5
 
 
+def test_an_output_that_is_not_measured_does_not_count(diagnoser, records) -> None:
+    made = records[0][KNOWN : KNOWN + 1]
+    mask = made.mask.copy()
+    mask[..., 1] = False
+    found = diagnoser.diagnose(made.replace(mask=mask))
+    assert found.probabilities[0, 0] > 0.5
+    assert np.isfinite(found.evidence).all()
+
+
+@pytest.mark.parametrize(("value", "message"), [(3.4e38, "finite"), (np.nan, "measured samples")])
+def test_outputs_of_no_use_are_refused(diagnoser, records, value: float, message: str) -> None:
+    made = records[0][:1]
+    wrong = np.where(np.arange(STEPS)[:, None] == 7, value, made.observed)
+    mask = np.full_like(made.mask, np.isfinite(value))
+    with pytest.raises(InputError, match=message):
+        diagnoser.diagnose(made.replace(observed=np.nan_to_num(wrong, nan=0.0), mask=mask))
+
+
+def test_commands_beyond_the_calibration_are_marked(diagnoser, records) -> None:
+    made = records[0][:1]
+    beyond = made.replace(commands=1.5 * made.commands)
+    assert diagnoser.twin.outside(beyond.commands).tolist() == [True]
+    assert diagnoser.twin.outside(made.commands).tolist() == [False]
+
+
 def test_it_is_saved(diagnoser, records, tmp_path) -> None:
     diagnoser.save(tmp_path / "physics")
     again = rt.load_diagnoser(tmp_path / "physics")

@@ -136,7 +136,6 @@ def predict(
     """Diagnose trajectories, and score the diagnoses if the labels are known."""
     import retwin as rt
     from retwin.evaluation.diagnosers import scored
-    from retwin.update.training_range import outside_training
 
     if out is not None:
         check_place(out)
@@ -149,7 +148,7 @@ def predict(
     classes = diagnoser.classes
     scores = scored(trajectories, probabilities, classes) if labelled else None
     diagnosed = diagnoses(trajectories, diagnoser.classes, probabilities)
-    outside = outside_training(getattr(diagnoser, "surrogate", None), trajectories).tolist()
+    outside = _outside(diagnoser, trajectories).tolist()
     for each, label, beyond, own in zip(diagnosed, labels, outside, severities, strict=True):
         each["label"] = label or None
         each["commands"] = "outside" if beyond else "ok"
@@ -188,6 +187,16 @@ def _diagnosed(
         for i in range(len(trajectories))
     ]
     return found.probabilities, made
+
+
+def _outside(diagnoser: Diagnoser, trajectories: Trajectories) -> NDArray:
+    """Which trajectories (n,) have commands beyond those that the diagnoser's twin has learned."""
+    from retwin.diagnosis import StateInversionDiagnoser
+    from retwin.update.training_range import outside_training
+
+    if isinstance(diagnoser, StateInversionDiagnoser):
+        return diagnoser.twin.outside(trajectories.commands)
+    return outside_training(getattr(diagnoser, "surrogate", None), trajectories)
 
 
 def _shown(value: object) -> str:

@@ -81,6 +81,8 @@ class StateDiagnosis:
     size, onset, end : Estimate
         (n, C), size of each fault in the unit of what it changes, and its times in s; NaN where a
         class has none.
+    outside : NDArray
+        (n,) bool, whether commands leave the range that they had in calibration.
 
     """
 
@@ -91,6 +93,7 @@ class StateDiagnosis:
     size: Estimate
     onset: Estimate
     end: Estimate
+    outside: NDArray
 
     @property
     def labels(self) -> NDArray:
@@ -181,6 +184,14 @@ class StateInversionDiagnoser:
 
         """
         check_channels(self.twin, trajectories, "trajectories")
+        empty = trajectories.ids[~trajectories.mask.any(axis=(1, 2))].tolist()
+        require(
+            not empty,
+            "trajectories",
+            expected="measured samples in each",
+            got=f"none in {', '.join(empty[:5])}",
+            remedy="leave them out",
+        )
         found = []
         for i in range(len(trajectories)):
             record = _Record.of(self.twin, trajectories[i : i + 1], known_start)
@@ -210,6 +221,7 @@ class StateInversionDiagnoser:
             size,
             onset,
             end,
+            self.twin.outside(trajectories.commands),
         )
 
     def save(self, folder: str | Path) -> None:
@@ -325,7 +337,7 @@ class _Record:
         given, _ = self._inputs(fault, point[None])
         more = self._log_density(*given, noise=noise, slopes=slopes)
         less = self._log_density(*given, slopes=self._by_parameters)
-        return float(more[0] - less[0])
+        return float(more[0] - less[0]) if np.isfinite(more[0]) else -np.inf
 
     def _effect(self, fault: TimedFault, point: NDArray) -> tuple[NDArray, NDArray]:
         """Root mean square effects of a fault on states, per sample, and on measured outputs."""
@@ -341,9 +353,10 @@ class _Record:
 
     def _noises(self) -> list[_Noise]:
         """Variances of process and measurement noise, of which one is larger than the twin's."""
-        twin, record = self.twin, np.where(self.seen, self.measured, np.nan)
+        twin = self.twin
         step = twin.domain.speed if twin.equations.step else twin.domain.speed / twin.rate
-        usual = np.nan_to_num(np.nanstd(record, axis=0))
+        columns = zip(self.measured.T, self.seen.T, strict=True)
+        usual = np.array([own[seen].std() if seen.any() else 0.0 for own, seen in columns])
         more = [(twin.process + (level * step) ** 2, twin.noise) for level in LEVELS]
         return more + [(twin.process, twin.noise + (level * usual) ** 2) for level in LEVELS]
 
@@ -424,8 +437,9 @@ class _Record:
         gain -= np.linalg.slogdet(curvature)[1]
         logs = 2 * np.log(np.diagonal(factor, axis1=2, axis2=3)).sum(axis=(1, 2))
         constant = own.sum(axis=(1, 2)) * np.log(2 * np.pi)
-        made[good] = 0.5 * (gain - np.sum(errors**2, axis=1) - logs - constant)
-        return made
+        with np.errstate(over="ignore", invalid="ignore"):
+            made[good] = 0.5 * (gain - np.sum(errors**2, axis=1) - logs - constant)
+        return np.where(np.isnan(made), -np.inf, made)
 
     @cached_property
     def _by_parameters(self) -> NDArray:

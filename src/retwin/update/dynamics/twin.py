@@ -299,6 +299,13 @@ class DynamicsTwin:
         steps = self.equations.steps()
         return steps.filter(commands, theta, (measured, seen), variances, changes)
 
+    def outside(self, commands: NDArray) -> NDArray:
+        """Whether commands (n, T, d_u) leave the range that they had in calibration: (n,) bool."""
+        low, high = (each[len(self.process) :] for each in (self.domain.low, self.domain.high))
+        margin = BEYOND * np.where(high > low, high - low, np.maximum(np.abs(high), 1.0))
+        made: NDArray = ((commands < low - margin) | (commands > high + margin)).any(axis=(1, 2))
+        return made
+
     def noise_variance(self, commands: NDArray) -> NDArray:
         """Variances (n, T, d_y) of the outputs by process and measurement noise alone."""
         theta = np.tile(self.values, (len(commands), 1))
