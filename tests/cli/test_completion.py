@@ -32,7 +32,7 @@ def test_the_recorded_case_of_the_catalog_is_that_of_the_case(name: str) -> None
             ("study", "armpi", "--sources", "ibg,dt,ibg_"),
             ["ibg,dt,ibg_rg", "ibg,dt,ibg_rg_command"],
         ),
-        (("study", "armpi", "--sources", "a"), ["all"]),
+        (("study", "armpi", "--sources", "al"), ["all"]),
         (("study", "armpi", "--preset", ""), ["quick", "paper"]),
         (("diagnose", "fit", "made.npz", "--classifier", "r"), ["rocket"]),
         (("fit", "armpi", "--density", "f"), ["flow"]),

@@ -87,6 +87,7 @@ def test_state_equations_are_fitted_and_generate(folder: Path, tmp_path: Path, c
     assert (code, "level" in printed) == (0, True)
 
 
+@pytest.mark.slow
 def test_a_study_compares_them(folder: Path, tmp_path: Path, call) -> None:
     case, data, out = folder / "case.toml", folder / "d.csv", tmp_path / "study"
     compared = ("twin", "pi_ls", "dynamics", "arx", "narx")

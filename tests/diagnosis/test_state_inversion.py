@@ -148,6 +148,7 @@ def test_sizes_and_onsets_are_in_their_intervals(diagnosis, records) -> None:
     assert np.sum(inside["onset"]) >= 7
 
 
+@pytest.mark.slow
 def test_a_fault_that_is_not_known_is_unknown(diagnoser, records) -> None:
     made = records[0][KNOWN:]
     faults = {name: each for name, each in FAULTS.items() if name != "weak"}

@@ -22,6 +22,8 @@ NEGLIGIBLE = 8.0
 """How many nats below the largest contribution a cell is refined no further: 3e-4 of it."""
 LEAST = 12
 """Number of cells that are refined at least, since a maximum may lie off all centres."""
+MOST = 500
+"""Number of cells that are refined at most, for likelihoods that hardly depend on anything."""
 TOLERANCE = 0.05
 """Change of the log integral in nats, below which there is no further round."""
 LARGEST = 0.03
@@ -99,12 +101,14 @@ def integrated(
 
     mass = log_mass(cells)
     total = _total(mass)
-    for _ in range(ROUNDS if is_open.any() else 0):
+    for _ in range(ROUNDS if is_open.any() and np.isfinite(total) else 0):
         best = cells[np.argmax(mass)]
         # The likelihood may end abruptly, so that a maximum lies at the edge of a poor cell.
         beside = ((cells[..., 0] <= best[:, 1]) & (cells[..., 1] >= best[:, 0])).all(axis=1)
         lowest = min(np.sort(mass)[-min(LEAST, len(mass))], mass.max() - NEGLIGIBLE)
-        chosen = np.flatnonzero(beside | (mass >= lowest))
+        order = np.argsort(np.where(beside, -np.inf, -mass))
+        wanted = beside | ((mass >= lowest) & np.isfinite(mass))
+        chosen = order[: min(int(wanted.sum()), MOST)]
         parts = np.concatenate([_halves(each, whole) for each in cells[chosen]])
         if len(parts) == len(chosen):
             break

@@ -56,6 +56,8 @@ STEP = 0.1
 """Differences of parameters, in posterior deviations, by which predictions are differentiated."""
 SMALLEST = 0.1
 """Smallest effect of parameters that counts: a change of the log density by 0.005 nats."""
+IMPLAUSIBLE = 1e6
+"""Error of a prediction, in standard deviations, from which on an output is no measurement."""
 ROWS = 256
 """Simulations that are filtered together, which bounds memory."""
 
@@ -195,6 +197,14 @@ class StateInversionDiagnoser:
         found = []
         for i in range(len(trajectories)):
             record = _Record.of(self.twin, trajectories[i : i + 1], known_start)
+            error = record.largest_error()
+            require(
+                error < IMPLAUSIBLE,
+                "trajectories",
+                expected="finite outputs that the twin's sensors could measure",
+                got=f"one {error:.1g} standard deviations away in {trajectories.ids[i]}",
+                remedy="check their units, and mask values that stand for missing ones",
+            )
             row = [record.integral(fault) for fault in self.faults.values()]
             unknown = record.unknown(self.faults.values(), row)
             row = [record.tolerated(*each) for each in zip(self.faults.values(), row, strict=True)]
@@ -276,6 +286,13 @@ class _Record:
         seen = trajectory.mask[0]
         measured = np.where(seen, trajectory.observed[0].astype(np.float64), 0.0)
         return cls(twin, trajectory.commands[0].astype(np.float64), measured, seen, known_start)
+
+    def largest_error(self) -> float:
+        """The largest error of a prediction for the healthy system, in standard deviations."""
+        given = (self.commands[None], self.measured[None], self.seen[None])
+        mean, covariance, _ = self.twin.filter(*given, known_start=self.known_start)
+        errors = whitened(self.measured - mean, root_of(covariance, given[2]), given[2])
+        return float(np.abs(errors).max()) if np.isfinite(errors).all() else np.inf
 
     def integral(self, fault: TimedFault | None) -> Integral:
         """The evidence for a fault, and the posterior of its size, onset and end."""

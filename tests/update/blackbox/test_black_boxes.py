@@ -103,6 +103,7 @@ def test_a_network_learns_a_saturation() -> None:
     assert error(network, test) < 0.3 * error(alone, test)
 
 
+@pytest.mark.slow
 def test_the_seed_determines_a_network() -> None:
     few = record(saturating, count=1, samples=100)
     made = [fit_black_box(few, "neural_ss", seed=seed).twin.values for seed in (0, 0, 1)]
@@ -133,6 +134,7 @@ def test_records_of_several_lengths_and_starts_are_fitted() -> None:
     assert rms(after.nominal - begun.nominal) < NOISE
 
 
+@pytest.mark.slow
 def test_two_outputs_and_two_commands() -> None:
     first, second = record(linear, count=1), record(bilinear, seed=3, count=1)
     parts = {
