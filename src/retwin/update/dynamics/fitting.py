@@ -21,13 +21,15 @@ from retwin.twins.twin import checked_stride
 from retwin.update.dynamics.corrected import CorrectedEquations, Domain, correctable
 from retwin.update.dynamics.estimation import Estimation, correlation_time, root
 from retwin.update.dynamics.library import Library
-from retwin.update.dynamics.linearised import Linearised, Point
+from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
 from retwin.update.dynamics.noise import fit_noise, folds, widening
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of
 
 __all__ = ["Dynamics", "FittedDynamics", "assembled", "fit_dynamics"]
 
+NONLINEAR = 1.5
+"""Ratio of the errors of a simulation to those of a linear step, from which on the step is none."""
 STRONGEST = 100.0
 """Variance of the error of an effective sample that is assumed first, over that of the samples of
 the twin without discrepancy: a prior so strong that the discrepancy begins near 0."""
@@ -200,7 +202,8 @@ def fit_dynamics(
     chosen = int(np.argmin(np.nan_to_num(errors, nan=np.inf)))
     equations, estimation, found, held_out = tried[chosen]
     corrected = equations.states, equations.domain.speed
-    made = assembled(estimation, found, *corrected, parts, held_out.moves)
+    moves = _trusted(estimation, found.point, held_out, parts)
+    made = assembled(estimation, found, *corrected, parts, moves)
     made = replace(made, widening=widening(made, estimation, held_out))
     report(1.0)
     unknown = estimation.undetermined(found)[: unknowns.count]
@@ -345,6 +348,22 @@ def assembled(
     )
     by_values = np.pad(moves @ unknowns.matrix.T, ((0, 0), (0, len(start))))
     return fit_noise(made, estimation.observed, indices, parts, by_values)
+
+
+def _trusted(
+    estimation: Estimation, found: Point, held_out: HeldOut, parts: Sequence[NDArray]
+) -> NDArray:
+    """The moves (K, k) of the estimates without each part; 0 where they are no linear step.
+
+    The errors of the simulation itself then differ from those of the linear step.
+    """
+    moves = np.zeros(held_out.moves.shape)
+    for k, (part, move) in enumerate(zip(parts, held_out.moves, strict=True)):
+        residual = estimation.residual(Point(found.shared + move, found.starts))[part]
+        linear = held_out.errors[part]
+        if np.sum(residual**2) <= NONLINEAR**2 * np.sum(linear**2):
+            moves[k] = move
+    return moves
 
 
 def _notes(estimation: Estimation, found: Point, unknown: NDArray) -> str:
