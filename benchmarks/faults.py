@@ -3,8 +3,8 @@
 The emulated tanks drain by other powers of their levels than the twin's square roots, with process
 and measurement noise. Six healthy records calibrate; five of each class are diagnosed: a leak, a
 clogged valve, a weak pump, a frozen sensor, with open sizes and onsets. Then each fault in turn is
-left out of the hypotheses, and its records have to be told from all others by the evidence for
-"unknown". Target: a mean AUROC of 0.90 over the faults left out.
+left out of the hypotheses, and its records have to be distinguished from all others by the evidence
+for "unknown". Target: a mean AUROC of 0.90 over the faults left out.
 """
 
 from __future__ import annotations
