@@ -67,6 +67,7 @@ def oven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> rt.Trajectories:
     return real
 
 
+@pytest.mark.slow
 def test_faults_are_diagnosed_with_their_size(call, oven) -> None:
     for words in (
         ("fit", "oven.toml", "--dynamics", "--real", "healthy.npz", "--out", "model"),

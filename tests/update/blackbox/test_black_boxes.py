@@ -96,6 +96,7 @@ def test_a_polynomial_system_is_recovered(narx: BlackBox) -> None:
     assert error(narx, test) < 0.5 * NOISE < 5 * NOISE < error(alone, test)
 
 
+@pytest.mark.slow
 def test_a_network_learns_a_saturation() -> None:
     calibration, test = record(saturating, count=1), record(saturating, seed=1)
     alone = fit_black_box(calibration, "arx")
