@@ -93,7 +93,7 @@ def mat(path: Path, cells: list[np.ndarray], labels: list[str], key: str = "X_te
 
 GOOD = np.zeros((1000, 6))
 SCORES = ("macro_f1", "balanced_accuracy", "auroc", "healthy_recall")
-ERRORS = ("rmse", "nrmse", "crps", "coverage90")
+ERRORS = ("rmse", "nrmse", "crps", "nll", "coverage90")
 
 
 def spoilt(value: float, column: int) -> np.ndarray:
