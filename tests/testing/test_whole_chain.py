@@ -214,6 +214,7 @@ def updated(toy: Toy, calibration: rt.Trajectories) -> rt.CorrectedTwin:
 ARRAYS = ("commands", "nominal", "observed", "mask", "labels", "ids")
 
 
+@pytest.mark.slow
 def same(one: rt.Trajectories, other: rt.Trajectories) -> bool:
     """To the byte, and of the same channels and rate."""
     arrays = all(np.array_equal(getattr(one, a), getattr(other, a)) for a in ARRAYS)

@@ -79,6 +79,7 @@ def test_a_linear_system_is_recovered(arx: BlackBox) -> None:
     assert response == pytest.approx(0.3 / 0.2, rel=0.02), "the gain at rest"
 
 
+@pytest.mark.slow
 def test_bands_hold_as_many_samples_as_they_should(arx: BlackBox) -> None:
     test = record(linear, seed=1)
     made = arx.twin.simulate(np.repeat(test.commands[:1], 300, axis=0), seed=0).observed
