@@ -24,11 +24,13 @@ __all__ = [
     "ActuatorBias",
     "Fault",
     "Stuck",
+    "checked_onset",
     "draw_faults",
     "ends_of",
     "faulty_commands",
     "frozen_from",
     "frozen_response",
+    "onset_samples",
 ]
 
 
@@ -109,6 +111,35 @@ def ends_of(value: Any) -> tuple[float, float]:
     return (float(ends[0]), float(ends[1])) if numbers else (math.nan, math.nan)
 
 
+def checked_onset(onset: float | tuple[float, float]) -> tuple[float, float]:
+    """Earliest and latest onset in s; InputError for anything but times from 0 on, in order."""
+    low, high = ends_of(onset)
+    require(
+        0 <= low <= high < math.inf,
+        "onset",
+        expected="a time in s from 0 on, or a pair (low, high) of them, in order",
+        got=repr(onset),
+        remedy="count the seconds from the first sample",
+    )
+    return low, high
+
+
+def onset_samples(onset: float | tuple[float, float], steps: int, rate: float) -> tuple[int, int]:
+    """First and last sample of an onset, in a trajectory of so many samples.
+
+    Raises InputError if the earliest onset is after the end.
+    """
+    low, high = (to_samples(each, rate) for each in ends_of(onset))
+    require(
+        low < steps,
+        "onset",
+        expected=f"a time in s within the trajectory, which lasts {steps / rate:g} s",
+        got=f"{ends_of(onset)[0]:g} s",
+        remedy="give an earlier one, in seconds and not in samples",
+    )
+    return low, min(high, steps - 1)
+
+
 @dataclass(frozen=True)
 class Stuck:
     """The actuator's response is held from an onset on.
@@ -136,14 +167,7 @@ class Stuck:
     label: str = "Stuck"
 
     def __post_init__(self) -> None:
-        low, high = ends_of(self.onset)
-        require(
-            0 <= low <= high < math.inf,
-            "onset",
-            expected="a time in s from 0 on, or a pair (low, high) of them, in order",
-            got=repr(self.onset),
-            remedy="count the seconds from the first sample",
-        )
+        low, high = checked_onset(self.onset)
         # Decimals: in files a whole number is an onset in samples, as before version 0.1.0.
         onset = (low, high) if isinstance(self.onset, Sequence) else low
         object.__setattr__(self, "onset", onset)
@@ -153,15 +177,7 @@ class Stuck:
 
         Raises InputError if the earliest onset is after the end.
         """
-        low, high = (to_samples(each, rate) for each in ends_of(self.onset))
-        require(
-            low < steps,
-            "onset",
-            expected=f"a time in s within the trajectory, which lasts {steps / rate:g} s",
-            got=f"{ends_of(self.onset)[0]:g} s",
-            remedy="give an earlier one, in seconds and not in samples",
-        )
-        return low, min(high, steps - 1)
+        return onset_samples(self.onset, steps, rate)
 
     def drawn(self, rng: np.random.Generator, *, steps: int, segments: int, rate: float) -> Stuck:
         """The same fault with its onset drawn; see `Fault.drawn`."""

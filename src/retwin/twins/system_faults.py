@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.data.segments import Segments
 from retwin.times import to_samples
-from retwin.twins.faults import ActuatorBias, Fault, Stuck, ends_of
+from retwin.twins.faults import (
+    ActuatorBias,
+    Fault,
+    Stuck,
+    checked_onset,
+    ends_of,
+    onset_samples,
+)
 
 __all__ = [
     "FAULTS",
@@ -63,14 +70,7 @@ class TimedFault:
     label: str = "Fault"
 
     def __post_init__(self) -> None:
-        low, high = ends_of(self.onset)
-        require(
-            0 <= low <= high < math.inf,
-            "onset",
-            expected="a time in s from 0 on, or a pair (low, high) of them, in order",
-            got=repr(self.onset),
-            remedy="count the seconds from the first sample",
-        )
+        low, high = checked_onset(self.onset)
         if self.end is None:
             return
         first, last = ends_of(self.end)
@@ -87,15 +87,7 @@ class TimedFault:
 
         Raises InputError if the earliest onset is after the end of the trajectory.
         """
-        low, high = (to_samples(each, rate) for each in ends_of(self.onset))
-        require(
-            low < steps,
-            "onset",
-            expected=f"a time in s within the trajectory, which lasts {steps / rate:g} s",
-            got=f"{ends_of(self.onset)[0]:g} s",
-            remedy="give an earlier one, in seconds and not in samples",
-        )
-        return low, min(high, steps - 1)
+        return onset_samples(self.onset, steps, rate)
 
     def end_range(self, steps: int, rate: float) -> tuple[int, int]:
         """First and last sample at which it can end; `steps` for a fault that lasts."""
