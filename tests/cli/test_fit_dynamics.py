@@ -81,8 +81,8 @@ def test_state_equations_are_fitted_and_generate(folder: Path, tmp_path: Path, c
     assert white["p"] > 1e-3
     assert abs(white["autocorrelation"]) < 0.2
     assert DynamicsTwin.load(out).case == str(case.resolve())
-    code, _, said = call("generate", out, "--out", tmp_path / "g.npz", "--per-class", 4)
-    assert (code, len(rt.load(tmp_path / "g.npz"))) == (0, 4), said
+    code, _, err = call("generate", out, "--out", tmp_path / "g.npz", "--per-class", 4)
+    assert (code, len(rt.load(tmp_path / "g.npz"))) == (0, 4), err
     code, printed, _ = call("twin", "info", out)
     assert (code, "level" in printed) == (0, True)
 
@@ -92,8 +92,8 @@ def test_a_study_compares_them(folder: Path, tmp_path: Path, call) -> None:
     case, data, out = folder / "case.toml", folder / "d.csv", tmp_path / "study"
     compared = ("twin", "pi_ls", "dynamics", "arx", "narx")
     given = ("--sources", ",".join(compared), "--runs", 1, "--processes", 1)
-    code, _, said = call("study", case, "--data", data, *given, "--out", out)
-    assert code == 0, said
+    code, _, err = call("study", case, "--data", data, *given, "--out", out)
+    assert code == 0, err
     sources = json.loads((out / "results.json").read_text())["sources"]
     error = {name: sources[name]["rmse"][0] for name in compared}
     assert error["dynamics"] < 0.3 * min(error["twin"], error["pi_ls"])
@@ -129,8 +129,8 @@ def test_wrong_settings_are_refused_by_name(
     case, out = folder / "wrong.toml", tmp_path / "model"
     case.write_text(CASE.replace(old, new))
     given = ("fit", case, "--data", folder / "d.csv", "--dynamics", "--out", out)
-    code, _, said = call(*given)
-    assert (code, named in said) == (2, True), said
+    code, _, err = call(*given)
+    assert (code, named in err) == (2, True), err
     assert not out.exists()
 
 
