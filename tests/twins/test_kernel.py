@@ -35,7 +35,8 @@ def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.Monk
     rng, used = np.random.default_rng(0), []
     commands, kicks = rng.normal(size=(5, 40, 1)), 0.1 * rng.normal(size=(5, 40, 1))
     measured = rng.normal(size=(5, 40, 1)), rng.random((5, 40, 1)) < 0.8
-    theta, variances = rng.normal(size=(5, 1)), (np.ones(1), np.ones(1), np.ones(1))
+    theta, spread = rng.normal(size=(5, 1)), np.ones((5, 1, 1))
+    variances = np.ones(1), np.ones(1)
     pool = kernel.ThreadPoolExecutor
     monkeypatch.setattr(kernel, "ThreadPoolExecutor", lambda n: (used.append(n), pool(n))[1])
 
@@ -45,12 +46,12 @@ def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.Monk
         arrays = (
             *steps.run(commands, theta, kicks),
             *steps.sensitivities(commands, theta),
-            *steps.filter(commands, theta, measured, variances),
+            *steps.filter(commands, theta, measured, spread, variances),
         )
         return [each.tobytes() for each in arrays]
 
     assert made(1) == made(2) == made(8)
-    assert used == [1] * 3 + [2] * 3 + [5] * 3
+    assert used == [2] * 3 + [5] * 3
 
 
 def test_a_compiler_that_does_not_know_the_processor_is_used(

@@ -68,12 +68,12 @@ def test_shifted_parameters_are_the_same_without_a_compiler(monkeypatch) -> None
     changes = LAG.changes([fault], STEPS)
     values = LAG.values(None, 1)
     measured = (np.zeros((1, STEPS, 2)), np.ones((1, STEPS, 2)))
-    variances = (np.array([0.1]), np.array([0.01]), np.array([0.1, 0.2]))
+    spread, variances = np.array([[[0.1]]]), (np.array([0.01]), np.array([0.1, 0.2]))
 
     def both() -> list[np.ndarray]:
         steps = LAG.steps()
         simulated = steps.run(COMMANDS, values, changes=changes)
-        filtered = steps.filter(COMMANDS, values, measured, variances, changes)
+        filtered = steps.filter(COMMANDS, values, measured, spread, variances, changes)
         return [*simulated, *filtered]
 
     compiled = both()

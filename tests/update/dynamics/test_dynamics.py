@@ -224,7 +224,9 @@ def test_the_filter_is_the_exact_conditional_of_a_linear_system() -> None:
     seen = np.ones((1, samples, 2), dtype=bool)
     seen[0, 2], seen[0, 3, 0] = False, False
     measured = (y.reshape(1, samples, 2), seen)
-    mean, covariance, _ = twin.steps().filter(commands, theta, measured, (start, process, noise))
+    known = np.diag(start)[None]
+    found = twin.steps().filter(commands, theta, measured, known, (process, noise))
+    mean, covariance, *_ = found
     for k in range(samples):
         earlier = np.flatnonzero(seen.ravel()[: 2 * k])
         now = np.arange(2 * k, 2 * k + 2)
@@ -242,11 +244,12 @@ def test_the_compiled_filter_and_process_noise_are_those_of_torch(
     twin, rng = replace(OSCILLATOR, interpolation=interpolation), np.random.default_rng(0)
     commands, theta = forces(2, 3, samples=40), np.tile(twin.values({"cubic": 90.0}, 1), (2, 1))
     kicks = 0.01 * rng.normal(size=(2, 40, 2))
-    variances = np.array([0.1, 0.2]), np.array([1e-4, 1e-3]), np.array([1e-4])
+    spread = np.tile([[0.1, 0.05], [0.05, 0.2]], (2, 1, 1))
+    variances = np.array([1e-4, 1e-3]), np.array([1e-4])
 
     def both() -> list[np.ndarray]:
         made = twin.steps().run(commands, theta, kicks)
-        return [*made, *twin.steps().filter(commands, theta, measured, variances)]
+        return [*made, *twin.steps().filter(commands, theta, measured, spread, variances)]
 
     measured = (rng.normal(size=(2, 40, 1)), rng.random((2, 40, 1)) > 0.2)
     compiled = both()

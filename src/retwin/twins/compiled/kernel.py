@@ -125,5 +125,8 @@ def call(
             *(ctypes.c_void_p(None if a is None else a.ctypes.data) for a in (*common, *own)),
         )
 
+    if count == 1:
+        part(0, sizes[0])
+        return
     with ThreadPoolExecutor(count) as pool:
         list(pool.map(part, ends[:-1], ends[1:]))

@@ -125,14 +125,16 @@ EXPORT void sensitivities(long long n, long long samples, long long substeps, do
     }
 }
 
-/* Extended Kalman filter. Variances at the start v[NX], of the process noise of a sample q[NX] and of
- * the measurement r[NY]; measured y[n][samples][NY], of which seen[n][samples][NY] is not 0; to
+/* Extended Kalman filter. Variances of the process noise of a sample q[NX] and of the measurement
+ * r[NY]; covariance of the states spread[n][NX][NX], at the first sample before it is measured, which
+ * becomes that after the last one; measured y[n][samples][NY], of which seen[n][samples][NY] is not 0; to
  * mean[n][samples][NY] and covariance[n][samples][NY][NY] of y given all earlier samples, and to
  * x[n][samples][NX] given these and the present one; `changes` as for `simulate`. */
 EXPORT void filter(long long n, long long samples, long long substeps, double period,
-                   const double *v, const double *q, const double *r, const double *c,
-                   const double *p, const double *start, const double *y, const double *seen,
-                   const double *changes, double *mean, double *covariance, double *x)
+                   const double *q, const double *r, const double *c, const double *p,
+                   const double *start, const double *y, const double *seen,
+                   const double *changes, double *spread, double *mean, double *covariance,
+                   double *x)
 {
     double z[NX * (1 + NX)], u[NU + 1], hx[NY * NX], hp[NY * NP + 1], P[NX][NX], g[NX], FP[NX][NX];
     double changed[NP + 1];
@@ -141,7 +143,7 @@ EXPORT void filter(long long n, long long samples, long long substeps, double pe
         for (int i = 0; i < NX; i++) {
             z[i] = start[i];
             for (int j = 0; j < NX; j++)
-                P[i][j] = i == j ? v[i] : 0.0;
+                P[i][j] = spread[i * NX + j];
         }
         for (long long t = 0; t < samples; t++) {
             const double *now = at_present(p, &changes, changed);
@@ -174,26 +176,30 @@ EXPORT void filter(long long n, long long samples, long long substeps, double pe
                         P[i][j] -= g[i] * g[j] / variance;
                 }
             }
-            for (int i = 0; i < NX; i++) {
-                z[i] = x[i];
-                for (int j = 0; j < NX; j++)
-                    F[i * NX + j] = i == j ? 1.0 : 0.0;
-            }
-            if (t + 1 < samples)
+            if (t + 1 < samples) {
+                for (int i = 0; i < NX; i++) {
+                    z[i] = x[i];
+                    for (int j = 0; j < NX; j++)
+                        F[i * NX + j] = i == j ? 1.0 : 0.0;
+                }
                 advance(slope_by_state, NX * (1 + NX), c, now, period, substeps, z);
-            for (int i = 0; i < NX; i++)
-                for (int j = 0; j < NX; j++) {
-                    FP[i][j] = 0.0;
-                    for (int k = 0; k < NX; k++)
-                        FP[i][j] += F[i * NX + k] * P[k][j];
-                }
-            for (int i = 0; i < NX; i++)
-                for (int j = 0; j < NX; j++) {
-                    P[i][j] = i == j ? q[i] : 0.0;
-                    for (int k = 0; k < NX; k++)
-                        P[i][j] += FP[i][k] * F[j * NX + k];
-                }
+                for (int i = 0; i < NX; i++)
+                    for (int j = 0; j < NX; j++) {
+                        FP[i][j] = 0.0;
+                        for (int k = 0; k < NX; k++)
+                            FP[i][j] += F[i * NX + k] * P[k][j];
+                    }
+                for (int i = 0; i < NX; i++)
+                    for (int j = 0; j < NX; j++) {
+                        P[i][j] = i == j ? q[i] : 0.0;
+                        for (int k = 0; k < NX; k++)
+                            P[i][j] += FP[i][k] * F[j * NX + k];
+                    }
+            }
             c += 4 * NU, y += NY, seen += NY, mean += NY, covariance += NY * NY, x += NX;
         }
+        for (int i = 0; i < NX; i++)
+            for (int j = 0; j < NX; j++)
+                *spread++ = P[i][j];
     }
 }

@@ -70,9 +70,11 @@ class Steps:
         commands: NDArray,
         theta: NDArray,
         measured: tuple[NDArray, NDArray],
-        variances: tuple[NDArray, NDArray, NDArray],
+        spread: NDArray,
+        variances: tuple[NDArray, NDArray],
         changes: NDArray | None = None,
-    ) -> tuple[NDArray, NDArray, NDArray]:
+        first: int = 0,
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """The extended Kalman filter.
 
         Parameters
@@ -81,21 +83,28 @@ class Steps:
             See `run`.
         measured : tuple of NDArray
             Outputs (n, T, d_y), and whether each was measured.
+        spread : NDArray
+            Covariances (n, d_x, d_x) of the states at the first sample, before it is measured.
+        first : int
+            Number of commands before the first sample, through which the interpolation passes.
         variances : tuple of NDArray
-            Of the states at the first sample (d_x,), of the process noise that each sample adds
-            (d_x,), and of the measurement noise (d_y,), above 0.
+            Of the process noise that each sample adds (d_x,), and of the measurement noise (d_y,),
+            above 0.
 
         Returns
         -------
-        mean, covariance, states : NDArray
+        mean, covariance, states, spread : NDArray
             Mean (n, T, d_y) and covariance (n, T, d_y, d_y) of the outputs given all earlier
-            samples, and the states (n, T, d_x) given the present one too.
+            samples, and the states (n, T, d_x) given the present one too, with their covariances
+            (n, d_x, d_x) at the last sample.
 
         """
         library = compiled(self.model.source)
-        shape, (outputs, states) = commands.shape[:2], self._widths
+        shape = len(commands), commands.shape[1] - first
+        outputs, states = self._widths
         if library is None:
-            return self._filtered(commands, theta, measured, variances, changes)
+            return self._filtered(commands, theta, measured, spread, variances, changes, first)
+        after = np.array(spread, np.float64)
         made = tuple(
             np.empty((*shape, *each)) for each in ((outputs,), (outputs, outputs), (states,))
         )
@@ -103,53 +112,56 @@ class Steps:
             [np.ascontiguousarray(each, np.float64) for each in own]
             for own in (variances, measured)
         )
-        rows = (*self._arrays(commands, theta), *seen, changes, *made)
+        c, *values = self._arrays(commands, theta)
+        rows = (np.ascontiguousarray(c[:, first:]), *values, *seen, changes, after, *made)
         call(library, "filter", (*shape, self.substeps), self.period, common, rows)
-        return made[0], made[1], made[2]
+        return made[0], made[1], made[2], after
 
     def _filtered(
         self,
         commands: NDArray,
         theta: NDArray,
         measured: tuple[NDArray, NDArray],
-        variances: tuple[NDArray, NDArray, NDArray],
+        spread: NDArray,
+        variances: tuple[NDArray, NDArray],
         changes: NDArray | None,
-    ) -> tuple[NDArray, NDArray, NDArray]:
+        first: int,
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """See `filter`, for one trajectory after the other."""
+        c = cubic_coefficients(_double(commands), self.interpolation)[:, first:].numpy()
         if changes is None:
-            changes = np.zeros((*commands.shape[:2], len(self.model.variables["p"])))
+            changes = np.zeros((*c.shape[:2], len(self.model.variables["p"])))
         rows = [
             self._filtered_row(*(_double(each) for each in row), *map(_double, variances))
-            for row in zip(commands, theta, *measured, changes, strict=True)
+            for row in zip(c, theta, *measured, changes, spread, strict=True)
         ]
-        mean, covariance, states = (np.stack(each) for each in zip(*rows, strict=True))
-        return mean, covariance, states
+        mean, covariance, states, after = (np.stack(each) for each in zip(*rows, strict=True))
+        return mean, covariance, states, after
 
     def _filtered_row(
         self,
-        commands: Tensor,
+        c: Tensor,
         theta: Tensor,
         outputs: Tensor,
         seen: Tensor,
         changes: Tensor,
-        start: Tensor,
+        spread: Tensor,
         process: Tensor,
         noise: Tensor,
     ) -> list[NDArray]:
         """See `filter`, for one trajectory."""
-        c = cubic_coefficients(commands[None], self.interpolation)
-        constant, first = self._parted(theta[:, None].unbind(0))
-        x, spread = torch.cat(list(first)), torch.diag(start)
+        constant, start = self._parted(theta[:, None].unbind(0))
+        x = torch.cat(list(start))
         made = []
         for t, (y, known) in enumerate(zip(outputs, seen > 0, strict=True)):
             now = [own + change for own, change in zip(constant, changes[t], strict=True)]
 
             def output(z: Tensor, t: int = t, p: Sequence[Tensor] = now) -> Tensor:
-                u = c[:, t, 0].unbind(1)
+                u = c[None, t, 0].unbind(1)
                 return torch.cat(self.model.evaluate("outputs", z[:, None].unbind(0), u, p))
 
             def after(z: Tensor, t: int = t, p: Sequence[Tensor] = now) -> Tensor:
-                return torch.cat(self._advanced(c[:, t], list(z[:, None].unbind(0)), p))
+                return torch.cat(self._advanced(c[None, t], list(z[:, None].unbind(0)), p))
 
             slope = torch.autograd.functional.jacobian(output, x)
             mean, predicted = output(x), slope @ spread @ slope.T + torch.diag(noise)
@@ -161,7 +173,8 @@ class Steps:
                 forward = torch.autograd.functional.jacobian(after, x)
                 x = after(x)
                 spread = forward @ spread @ forward.T + torch.diag(process)
-        return [torch.stack(each).numpy() for each in zip(*made, strict=True)]
+        stacked = [torch.stack(each).numpy() for each in zip(*made, strict=True)]
+        return [*stacked, spread.numpy()]
 
     def sensitivities(self, commands: NDArray, theta: NDArray) -> tuple[NDArray, NDArray]:
         """Outputs (n, T, d_y) and their derivatives (n, T, d_y, k) by `theta`."""

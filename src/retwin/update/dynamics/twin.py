@@ -288,16 +288,27 @@ class DynamicsTwin:
             See `Prediction`.
 
         """
-        theta, count = np.tile(self.values, (len(commands), 1)), len(self.process)
+        theta, spread = self.start(len(commands), known_start=known_start)
+        variances = noise or (self.process, self.noise)
+        given = (commands, theta + moves, (measured, seen), spread, variances, changes)
+        return self.equations.steps().filter(*given)[:3]
+
+    def start(self, count: int, *, known_start: bool) -> tuple[NDArray, NDArray]:
+        """What the filter knows of `count` trajectories before their first sample.
+
+        Returns
+        -------
+        theta, spread : ndarray, shapes (n, q + d_x) and (n, d_x, d_x)
+            `values` with the expected states, and the covariance of these; see `filter`.
+
+        """
+        theta, states = np.tile(self.values, (count, 1)), len(self.process)
         bounds = [(each.low or 0.0, each.high or 0.0) for each in self.equations.states]
         low, high = np.array(bounds, dtype=float).T
         if not known_start:
-            low, high = self.domain.low[:count], self.domain.high[:count]
-            theta[:, -count:] = (low + high) / 2
-        theta = theta + moves
-        variances = ((high - low) ** 2 / 12, *(noise or (self.process, self.noise)))
-        steps = self.equations.steps()
-        return steps.filter(commands, theta, (measured, seen), variances, changes)
+            low, high = self.domain.low[:states], self.domain.high[:states]
+            theta[:, -states:] = (low + high) / 2
+        return theta, np.tile(np.diag((high - low) ** 2 / 12), (count, 1, 1))
 
     def outside(self, commands: NDArray) -> NDArray:
         """Whether commands (n, T, d_u) leave the range that they had in calibration: (n,) bool."""
@@ -310,9 +321,10 @@ class DynamicsTwin:
         """Variances (n, T, d_y) of the outputs by process and measurement noise alone."""
         theta = np.tile(self.values, (len(commands), 1))
         shape = (*commands.shape[:2], len(self.noise))
-        variances = (np.zeros(len(self.process)), self.process, self.noise)
-        unseen = (np.zeros(shape), np.zeros(shape))
-        found = self.equations.steps().filter(commands, theta, unseen, variances)[1]
+        states = len(self.process)
+        known = np.zeros((len(commands), states, states))
+        unseen, variances = (np.zeros(shape), np.zeros(shape)), (self.process, self.noise)
+        found = self.equations.steps().filter(commands, theta, unseen, known, variances)[1]
         made: NDArray = np.diagonal(found, axis1=2, axis2=3)
         return made
 
