@@ -74,6 +74,7 @@ class Steps:
         variances: tuple[NDArray, NDArray],
         changes: NDArray | None = None,
         first: int = 0,
+        gate: float = np.inf,
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """The extended Kalman filter.
 
@@ -87,6 +88,8 @@ class Steps:
             Covariances (n, d_x, d_x) of the states at the first sample, before it is measured.
         first : int
             Number of commands before the first sample, through which the interpolation passes.
+        gate : float
+            An output with an error of more standard deviations than this is not used.
         variances : tuple of NDArray
             Of the process noise that each sample adds (d_x,), and of the measurement noise (d_y,),
             above 0.
@@ -101,20 +104,20 @@ class Steps:
         """
         library = compiled(self.model.source)
         shape = len(commands), commands.shape[1] - first
+        common = (*variances, np.array([gate]))
         outputs, states = self._widths
         if library is None:
-            return self._filtered(commands, theta, measured, spread, variances, changes, first)
+            return self._filtered(commands, theta, measured, spread, common, changes, first)
         after = np.array(spread, np.float64)
         made = tuple(
             np.empty((*shape, *each)) for each in ((outputs,), (outputs, outputs), (states,))
         )
-        common, seen = (
-            [np.ascontiguousarray(each, np.float64) for each in own]
-            for own in (variances, measured)
+        shared, seen = (
+            [np.ascontiguousarray(each, np.float64) for each in own] for own in (common, measured)
         )
         c, *values = self._arrays(commands, theta)
         rows = (np.ascontiguousarray(c[:, first:]), *values, *seen, changes, after, *made)
-        call(library, "filter", (*shape, self.substeps), self.period, common, rows)
+        call(library, "filter", (*shape, self.substeps), self.period, shared, rows)
         return made[0], made[1], made[2], after
 
     def _filtered(
@@ -123,7 +126,7 @@ class Steps:
         theta: NDArray,
         measured: tuple[NDArray, NDArray],
         spread: NDArray,
-        variances: tuple[NDArray, NDArray],
+        common: tuple[NDArray, NDArray, NDArray],
         changes: NDArray | None,
         first: int,
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
@@ -132,7 +135,7 @@ class Steps:
         if changes is None:
             changes = np.zeros((*c.shape[:2], len(self.model.variables["p"])))
         rows = [
-            self._filtered_row(*(_double(each) for each in row), *map(_double, variances))
+            self._filtered_row(*(_double(each) for each in row), *map(_double, common))
             for row in zip(c, theta, *measured, changes, spread, strict=True)
         ]
         mean, covariance, states, after = (np.stack(each) for each in zip(*rows, strict=True))
@@ -148,6 +151,7 @@ class Steps:
         spread: Tensor,
         process: Tensor,
         noise: Tensor,
+        gate: Tensor,
     ) -> list[NDArray]:
         """See `filter`, for one trajectory."""
         constant, start = self._parted(theta[:, None].unbind(0))
@@ -165,9 +169,15 @@ class Steps:
 
             slope = torch.autograd.functional.jacobian(output, x)
             mean, predicted = output(x), slope @ spread @ slope.T + torch.diag(noise)
-            gain = torch.linalg.solve(predicted[known][:, known], slope[known] @ spread).T
-            x = x + gain @ (y - mean)[known]
-            spread = spread - gain @ slope[known] @ spread
+            centre = x
+            for h, r, error in zip(slope[known], noise[known], (y - mean)[known], strict=True):
+                column = spread @ h
+                variance = h @ column + r
+                error = error - h @ (x - centre)
+                if error.abs() > gate * variance.sqrt():
+                    continue
+                x = x + column * error / variance
+                spread = spread - torch.outer(column, column) / variance
             made.append((mean, predicted, x))
             if t + 1 < len(outputs):
                 forward = torch.autograd.functional.jacobian(after, x)

@@ -17,6 +17,10 @@ from retwin.update.dynamics.twin import DynamicsTwin
 
 __all__ = ["FilterState", "OnlineFilter"]
 
+GATE = 100.0
+"""Number of standard deviations from which on an error is no news of the states: a sample of 1e300
+would stay in them. Where such samples persist, the uncertainty grows until they are used."""
+
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
@@ -118,6 +122,7 @@ class OnlineFilter:
             state.spread,
             (self.twin.process, self.twin.noise),
             first=earlier.shape[1] - 1,
+            gate=GATE,
         )
         after = FilterState(states[:, -1], spread, path[:, -earlier.shape[1] :])
         return after, mean[:, 1:], covariance[:, 1:]
