@@ -509,6 +509,12 @@ def test_what_is_saved_comes_back(tmp_path, suffix, changes):
     assert_same(load(tmp_path / f"a{suffix}"), made)
 
 
+def test_what_is_no_set_of_trajectories_is_not_saved(tmp_path):
+    with pytest.raises(InputError, match="trajectories: expected Trajectories"):
+        save(None, tmp_path / "set.npz")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_set_without_trajectories_comes_back(tmp_path, suffix):
     save(example()[[]], tmp_path / f"a{suffix}")

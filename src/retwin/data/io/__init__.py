@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 
 from retwin.catalog import FORMATS, FormatEntry, resolve
-from retwin.checks import require
+from retwin.checks import instance, require
 from retwin.data.io.assembly import DataCase, settle
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
@@ -90,10 +90,11 @@ def save(trajectories: Trajectories, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     InputError
-        The suffix is another one, the place cannot be written, or the extra `scale`, which Zarr
-        needs, is missing.
+        No trajectories, another suffix, the place cannot be written, or the extra `scale`, which
+        Zarr needs, is missing.
 
     """
+    instance("trajectories", trajectories, Trajectories, remedy="models have a method save")
     write = resolve(FORMATS[check_target(path)].writer)
     with write_atomically(path) as part:
         write(trajectories, part)
