@@ -1,0 +1,198 @@
+"""E-detectors: alarms for changes, with a guaranteed average run length to a false alarm."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from retwin.checks import at_least, instance, one_of, require, whole
+from retwin.monitor.bets import ALTERNATIVES, Alternative, Bets
+from retwin.monitor.slack import Slack
+
+__all__ = ["Detector", "DetectorState"]
+
+LARGEST = 1e290
+"""Evidence counts up to this; one further factor does not overflow."""
+
+
+@dataclass(frozen=True)
+class DetectorState:
+    """What a detector remembers; all of it.
+
+    Attributes
+    ----------
+    evidence : array (streams, J)
+        The e-detector of each alternative, at least 0.
+    previous : array (streams,)
+        The last score if it was measured, else 0.
+
+    """
+
+    evidence: NDArray
+    previous: NDArray
+
+
+@dataclass(frozen=True)
+class Detector:
+    r"""A mixture of e-detectors over location, scale, tails and dependence of scores.
+
+    With the bets L of `Alternative` j, whose expectation given the past is at most 1 for all
+    distributions of the class `slack`,
+
+    .. math:: M_t^j = (M_{t-1}^j + 1) L_t^j,\quad M_t = \sum_j w_j M_t^j
+
+    (Shiryaev–Roberts), or with max(M, 1) in place of M + 1 (CUSUM). Then M_t - t is a
+    supermartingale, so that the average run length until M_t first is at least A is at least A, for
+    each member of the class and without any limit (Shin, Ramdas and Rinaldo, E-detectors: a
+    nonparametric framework for sequential change detection, 2022, Definition 2.2, Proposition 2.4).
+    The probability of a false alarm within the first t samples is at most t/A.
+
+    A missing sample (NaN) leaves M as it is: it multiplies by 1, and nothing is added. With N_t
+    measured samples among t, M_t - N_t then is a supermartingale, as long as the class holds given
+    the past and given that the sample is measured. The average number of *measured* samples until
+    a false alarm is therefore at least A, and the time is longer still.
+
+    A score may be an interval: of ties, or of a rank. Its bet is the mean of the bet over the
+    interval, which is the expectation under a score drawn at random inside it; nothing is drawn.
+
+    Evidence is stored as it is rather than as its logarithm. It is bounded by 1e290, and a bet
+    is never 0 and at most exp(300); tables replace exponentials, so that the bytes depend neither
+    on the number of streams in a call nor on the processor's vector instructions.
+
+    Parameters
+    ----------
+    slack : Slack or sequence of Slack
+        One for all streams, or one per stream.
+    kind : "shiryaev_roberts" or "cusum"
+        The former is faster for the same guarantee.
+    alternatives : tuple of tuple of Alternative
+        Families of alternatives.
+
+    """
+
+    slack: Slack | Sequence[Slack] = field(default_factory=Slack)
+    kind: Literal["shiryaev_roberts", "cusum"] = "shiryaev_roberts"
+    alternatives: tuple[tuple[Alternative, ...], ...] = ALTERNATIVES
+    bets: Bets = field(init=False, repr=False, compare=False)
+    which: NDArray = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        one_of("kind", self.kind, ("shiryaev_roberts", "cusum"))
+        given = [self.slack] if isinstance(self.slack, Slack) else list(self.slack)
+        at_least("slack", given, 1, "classes", remedy="give one for all streams, or one for each")
+        for each in given:
+            instance("slack", each, Slack, remedy="use Slack(kappa, shift)")
+        at_least("alternatives", self.alternatives, 1, "families", remedy="leave the default")
+        for family in self.alternatives:
+            at_least("alternatives", family, 1, "members of a family", remedy="leave it out")
+        different = tuple(dict.fromkeys(given))
+        which = np.array([different.index(each) for each in given], dtype=np.intp)
+        object.__setattr__(self, "bets", Bets.of(different, self.alternatives))
+        object.__setattr__(self, "which", which)
+
+    def start(self, streams: int) -> DetectorState:
+        """The state before the first sample, and after a reset."""
+        count = whole("streams", streams, least=1)
+        require(
+            len(self.which) in (1, count),
+            "streams",
+            expected=f"{len(self.which)}, as many as there are slacks",
+            got=count,
+            remedy="give one slack for all streams, or one for each",
+        )
+        return DetectorState(np.zeros((count, len(self.bets.weights))), np.zeros(count))
+
+    def reset(self, state: DetectorState, where: NDArray) -> DetectorState:
+        """Begin anew in the streams (streams,) where `where` is True: after an alarm."""
+        evidence = np.where(where[:, None], 0.0, state.evidence)
+        return DetectorState(evidence, np.where(where, 0.0, state.previous))
+
+    def step(
+        self, state: DetectorState, score: ArrayLike, high: ArrayLike | None = None
+    ) -> tuple[DetectorState, NDArray]:
+        """One sample of all streams.
+
+        Parameters
+        ----------
+        state : DetectorState
+            Of `start` or of the sample before. It is not changed.
+        score : array (streams,)
+            Standard Gaussian scores, or the lower ends of intervals. NaN is missing; infinite and
+            other large ones count as 4.
+        high : array (streams,), optional
+            Upper ends of the intervals.
+
+        Returns
+        -------
+        DetectorState, array (streams,)
+            The next state, and the logarithm of the evidence M; minus infinity before the first
+            measured sample. An alarm is due where it is at least the logarithm of the ARL.
+
+        """
+        low = np.asarray(score, dtype=float)[:, None]
+        top = None if high is None else np.asarray(high, dtype=float)[:, None]
+        state, evidence = self.run(state, low, top)
+        return state, evidence[:, 0]
+
+    def run(
+        self, state: DetectorState, score: ArrayLike, high: ArrayLike | None = None
+    ) -> tuple[DetectorState, NDArray]:
+        """Many samples of all streams: arrays (streams, T) in place of (streams,) of `step`.
+
+        The bytes are those of T calls of `step`.
+        """
+        low, top = self.intervals(state.previous, score, high)
+        evidence, made = state.evidence.T, np.empty(low.shape[::-1])
+        previous = state.previous
+        weights = self.bets.weights[:, None]
+        add = np.maximum if self.kind == "cusum" else np.add
+        for t, (factor, seen, last) in enumerate(self.factors(previous, low, top)):
+            evidence, previous = add(evidence, seen), last
+            evidence *= factor
+            np.minimum(evidence, LARGEST, out=evidence)
+            # A running sum: unlike that of np.sum, its order does not depend on the shape.
+            made[t] = np.add.accumulate(evidence * weights, axis=0)[-1]
+        with np.errstate(divide="ignore"):
+            return DetectorState(evidence.T, previous), np.log(made).T
+
+    def intervals(
+        self, previous: NDArray, score: ArrayLike, high: ArrayLike | None
+    ) -> tuple[NDArray, NDArray]:
+        """Lower and upper ends (streams, T) of scores, which are checked."""
+        low = np.asarray(score, dtype=float)
+        top = low if high is None else np.asarray(high, dtype=float)
+        require(
+            low.ndim == 2 and low.shape == top.shape and len(low) == len(previous),
+            "score",
+            expected=f"scores of {len(previous)} streams, upper ends of the same shape",
+            got=f"shapes {low.shape} and {top.shape}",
+            remedy="start a state for as many streams as there are",
+        )
+        return low, top
+
+    def factors(
+        self, previous: NDArray, low: NDArray, high: NDArray
+    ) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
+        """Per sample: factors (J, streams), 1 where one is measured and else 0, and scores.
+
+        The latter two are (streams,). `previous` are the scores before the first sample.
+        """
+        bets = self.bets
+        first, last = (each.T.copy() for each in bets.position(low, high))
+        centre = (low + high) / 2
+        seen = ~np.isnan(centre)
+        centre = np.where(seen, np.clip(centre, -9, 9), 0.0).T.copy()
+        for a, b, there, score in zip(first, last, seen.T.astype(float), centre, strict=True):
+            offset = bets.offset(self.which, previous)
+            a, b = a + offset, b + offset
+            factor = np.take(bets.integrals, b, axis=1)
+            factor -= np.take(bets.integrals, a, axis=1)
+            factor /= bets.mass[b] - bets.mass[a]
+            if not there.all():
+                factor[:, there == 0] = 1.0
+            previous = score
+            yield factor, there, previous

@@ -1,0 +1,309 @@
+"""One-step predictions of residuals that are autocorrelated: an autoregression with noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from retwin.checks import require, whole
+
+__all__ = ["Disturbance", "DisturbanceState", "fit_disturbance"]
+
+GLITCH = 100.0
+"""An error of so many standard deviations is scored, but the filter takes the sample as missing: a
+sample of 1e300 would else stay in its state. Where such samples persist, its uncertainty grows
+until it follows them."""
+LARGEST_PARTIAL = 0.9995
+"""Of the partial autocorrelations: an average of two thousand samples."""
+GRID = [(a, b) for a in (-0.5, 0.2, 0.8, 1.4, 2.0, 2.6, 3.2) for b in (-8.0, -3.0, -1.0, 1.0, 3.0)]
+"""First values of the inverse hyperbolic tangent of a partial autocorrelation, and of the logarithm
+of the ratio of variances of measurement and process noise."""
+ROUNDS = 14
+"""Rounds of the pattern search; a failed one halves the step of a stream."""
+RATIOS = (-12.0, 12.0)
+FEWEST = 50
+"""Measured residuals per stream, at least."""
+
+
+@dataclass(frozen=True)
+class DisturbanceState:
+    """The filter's prediction of p values: mean (streams, p), covariance (streams, p, p)."""
+
+    mean: NDArray
+    covariance: NDArray
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """An autoregression of order p, measured with white noise, and its Kalman filter.
+
+    Attributes
+    ----------
+    coefficients : array (streams, p)
+        From lag 1 on; 0 beyond the order of a stream.
+    mean, process, measurement : array (streams,)
+        Mean of the residual, variances of the noise of process and measurement.
+    held_out : array (streams, T)
+        Standardised one-step errors of the calibration, each block of samples predicted with
+        parameters estimated without it; NaN where missing.
+
+    References
+    ----------
+    Harvey, Forecasting, Structural Time Series Models and the Kalman Filter, 1989, chapter 3.
+
+    """
+
+    coefficients: NDArray
+    mean: NDArray
+    process: NDArray
+    measurement: NDArray
+    held_out: NDArray
+
+    @property
+    def parameters(self) -> int:
+        """Number of estimated parameters that shift predictions."""
+        return self.coefficients.shape[1] + 2
+
+    def start(self) -> DisturbanceState:
+        """The stationary state, before the first sample."""
+        covariance = _stationary(self.coefficients.T) * self.process
+        return DisturbanceState(np.zeros_like(self.coefficients), np.moveaxis(covariance, -1, 0))
+
+    def step(
+        self, state: DisturbanceState, residual: ArrayLike
+    ) -> tuple[DisturbanceState, NDArray]:
+        """Standardised one-step errors (streams,) of residuals (streams,); see `run`."""
+        state, errors = self.run(state, np.asarray(residual, dtype=float)[:, None])
+        return state, errors[:, 0]
+
+    def run(self, state: DisturbanceState, residual: ArrayLike) -> tuple[DisturbanceState, NDArray]:
+        """Standardised one-step errors of residuals.
+
+        Parameters
+        ----------
+        state : DisturbanceState
+            Of `start` or of the sample before.
+        residual : array (streams, T)
+            Measured minus predicted; NaN is missing: its error is NaN, and the next prediction is
+            of two steps.
+
+        Returns
+        -------
+        DisturbanceState, array (streams, T)
+            The next state, and the errors, standard deviation 1.
+
+        """
+        given = np.asarray(residual, dtype=float)
+        require(
+            given.ndim == 2 and len(given) == len(self.mean),
+            "residual",
+            expected=f"residuals of {len(self.mean)} streams",
+            got=f"shape {given.shape}",
+            remedy="give one row per stream of the calibration",
+        )
+        mean = state.mean.T.copy()
+        covariance = np.moveaxis(state.covariance, 0, -1).copy()
+        errors = np.empty(given.shape[::-1])
+        filtered = _errors(
+            given.T - self.mean,
+            self.coefficients.T,
+            self.process,
+            self.measurement,
+            mean,
+            covariance,
+        )
+        for t, (error, variance) in enumerate(filtered):
+            errors[t] = error / np.sqrt(variance)
+        return DisturbanceState(mean.T, np.moveaxis(covariance, -1, 0)), errors.T
+
+
+def fit_disturbance(residual: ArrayLike, *, max_order: int = 3, folds: int = 4) -> Disturbance:
+    """Estimate the autoregression of residuals of a healthy machine, by maximum likelihood.
+
+    Parameters
+    ----------
+    residual : array (streams, T)
+        Measured minus predicted outputs; NaN is missing. Each stream has at least 50 and varies.
+    max_order : int
+        Largest order of the autoregression, from 1 to 6; each stream has the order of the least
+        Bayesian information criterion.
+    folds : int
+        Blocks of samples of which each is predicted with the parameters of the others.
+
+    Returns
+    -------
+    Disturbance
+        With the held-out errors of the calibration.
+
+    """
+    whole("max_order", max_order, least=1, most=6)
+    whole("folds", folds, least=2)
+    given = np.asarray(residual, dtype=float)
+    given = np.where(np.abs(given) < 1e100, given, np.nan)
+    seen = ~np.isnan(given)
+    require(
+        given.ndim == 2 and given.size and seen.sum(axis=-1).min() >= FEWEST,
+        "residual",
+        expected=f"an array (streams, T) with at least {FEWEST} residuals per stream",
+        got=f"shape {given.shape}" + (f" with {seen.sum(axis=-1).min()}" if given.size else ""),
+        remedy="calibrate on a longer healthy record",
+    )
+    mean, scale = np.nanmean(given, axis=1), np.nanstd(given, axis=1)
+    require(
+        np.all(scale > 1e-12 * np.abs(mean)),
+        "residual",
+        expected="residuals that vary in each stream",
+        got=f"a constant in stream {np.argmin(scale)}",
+        remedy="leave out a channel that does not move",
+    )
+    values = ((given - mean[:, None]) / scale[:, None]).T
+    point = _orders(values, max_order)
+    errors = np.full(values.shape, np.nan)
+    for block in np.array_split(np.arange(len(values)), folds):
+        part = values.copy()
+        part[block] = np.nan
+        other, _ = _search(part, point, ROUNDS // 2)
+        errors[block] = _standardised(values, part, other)[block]
+    coefficients, ratio = _model(point)
+    variance = _likelihood(values, point)[1] * scale**2
+    return Disturbance(coefficients.T, mean, variance, variance * ratio, errors.T)
+
+
+def _errors(
+    values: NDArray,
+    coefficients: NDArray,
+    process: NDArray | float,
+    measurement: NDArray,
+    mean: NDArray,
+    covariance: NDArray,
+) -> Iterator[tuple[NDArray, NDArray]]:
+    """Errors and their variances (..., streams), sample by sample; mean and covariance change.
+
+    Shapes: values (T, streams), coefficients (p, ..., streams), covariance (p, p, ..., streams).
+    """
+    order = len(coefficients)
+    for value in values:
+        error = value - mean[0]
+        variance = covariance[0, 0] + measurement
+        used = np.abs(error) <= GLITCH * np.sqrt(variance)  # False for NaN
+        yield error, variance
+        gain = np.where(used, covariance[0] / variance, 0.0)
+        first = covariance[0].copy()
+        mean += gain * np.where(used, error, 0.0)
+        for i in range(order):
+            for j in range(i, order):
+                covariance[i, j] -= gain[i] * first[j]
+        # One step on: the newest value is a sum of the others, which move by one place.
+        newest = coefficients[0] * mean[0]
+        for i in range(1, order):
+            newest = newest + coefficients[i] * mean[i]
+        mean[1:] = mean[:-1].copy()
+        mean[0] = newest
+        row = []
+        for i in range(order):
+            total = coefficients[0] * covariance[0, i]
+            for j in range(1, order):
+                total = total + coefficients[j] * covariance[min(i, j), max(i, j)]
+            row.append(total)
+        corner = coefficients[0] * row[0] + process
+        for i in range(1, order):
+            corner = corner + coefficients[i] * row[i]
+        covariance[1:, 1:] = covariance[:-1, :-1].copy()
+        covariance[0, 0] = corner
+        for i in range(1, order):
+            covariance[0, i] = covariance[i, 0] = row[i - 1]
+
+
+def _coefficients(partial: NDArray) -> NDArray:
+    """Coefficients of an autoregression from its partial autocorrelations (p, …): Levinson."""
+    made = partial[:1]
+    for k in range(1, len(partial)):
+        made = np.concatenate([made - partial[k] * made[::-1], partial[k : k + 1]])
+    return made
+
+
+def _stationary(coefficients: NDArray) -> NDArray:
+    """Covariance (p, p, …) of p consecutive values for unit process noise."""
+    order, shape = len(coefficients), coefficients.shape[1:]
+    phi = np.moveaxis(coefficients.reshape(order, -1), -1, 0)
+    companion = np.zeros((len(phi), order, order))
+    companion[:, 0] = phi
+    companion[:, range(1, order), range(order - 1)] = 1.0
+    system = np.eye(order**2) - np.einsum("sij,skl->sikjl", companion, companion).reshape(
+        len(phi), order**2, order**2
+    )
+    unit = np.zeros((len(phi), order**2, 1))
+    unit[:, 0] = 1.0
+    made: NDArray = np.linalg.solve(system, unit).reshape(-1, order, order)
+    return np.moveaxis(made, 0, -1).reshape(order, order, *shape)
+
+
+def _model(point: NDArray) -> tuple[NDArray, NDArray]:
+    """Coefficients and the ratio of variances from a point of the search (p + 1, …)."""
+    partial = LARGEST_PARTIAL * np.tanh(point[:-1])
+    return _coefficients(partial), np.exp(np.clip(point[-1], *RATIOS))
+
+
+def _likelihood(values: NDArray, point: NDArray) -> tuple[NDArray, NDArray]:
+    """Minus twice the log likelihood, with the variance of the process that maximises it."""
+    coefficients, ratio = _model(point)
+    covariance = _stationary(coefficients)
+    logs, squares, count = np.zeros(ratio.shape), np.zeros(ratio.shape), 0.0
+    filtered = _errors(values, coefficients, 1.0, ratio, np.zeros_like(coefficients), covariance)
+    for value, (error, variance) in zip(values, filtered, strict=True):
+        seen = ~np.isnan(value)
+        logs += np.where(seen, np.log(variance), 0.0)
+        squares += np.where(seen, error**2 / variance, 0.0)
+        count = count + seen
+    scale = squares / count
+    return count * np.log(scale) + logs, scale
+
+
+def _search(values: NDArray, point: NDArray, rounds: int) -> tuple[NDArray, NDArray]:
+    """Pattern search from a point (d, streams), for all streams and both directions at once."""
+    best = _likelihood(values, point[:, None])[0][0]
+    size = np.full(point.shape[1], 0.4)
+    directions = np.concatenate([np.eye(len(point)), -np.eye(len(point))])
+    directions[:, -1] *= 3  # the ratio of variances is in logarithms
+    for _ in range(rounds):
+        tried = point[:, None] + directions.T[:, :, None] * size
+        found = _likelihood(values, tried)[0]
+        chosen = np.argmin(found, axis=0)
+        streams = np.arange(len(size))
+        better = found[chosen, streams] < best - 1e-9
+        point = np.where(better, tried[:, chosen, streams], point)
+        best = np.where(better, found[chosen, streams], best)
+        size = np.where(better, size, size / 2)
+    return point, best
+
+
+def _orders(values: NDArray, max_order: int) -> NDArray:
+    """The best point (p + 1, streams), with the order of each stream by the BIC."""
+    streams = values.shape[1]
+    grid = np.repeat(np.transpose(GRID)[:, :, None], streams, axis=2)
+    first = np.argmin(_likelihood(values, grid)[0], axis=0)
+    point, best = _search(values, grid[:, first, np.arange(streams)], ROUNDS)
+    penalty = np.log(np.sum(~np.isnan(values), axis=0))
+    kept, orders = point, np.ones(streams)
+    for _ in range(1, max_order):
+        wider = np.insert(point, len(point) - 1, 0.0, axis=0)
+        point, found = _search(values, wider, ROUNDS)
+        kept = np.insert(kept, len(kept) - 1, 0.0, axis=0)
+        better = found + penalty < best
+        orders = np.where(better, len(point) - 1, orders)
+        kept, best = np.where(better, point, kept), np.where(better, found + penalty, best)
+    top = int(orders.max())
+    return np.concatenate([kept[:top], kept[-1:]])
+
+
+def _standardised(values: NDArray, part: NDArray, point: NDArray) -> NDArray:
+    """Errors of values (T, streams) with parameters, their variance that of a part of them."""
+    coefficients, ratio = _model(point)
+    scale = _likelihood(part, point)[1]
+    filtered = _errors(
+        values, coefficients, 1.0, ratio, np.zeros_like(coefficients), _stationary(coefficients)
+    )
+    return np.array([error / np.sqrt(variance * scale) for error, variance in filtered])

@@ -1,0 +1,133 @@
+"""How often a monitor may raise a false alarm, and the sentence that states what is promised."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from numbers import Real
+
+from retwin.checks import finite
+from retwin.errors import InputError
+from retwin.monitor.slack import Slack
+from retwin.times import sample_rate
+
+__all__ = ["Promise", "false_alarms"]
+
+SECONDS = {
+    "second": 1.0,
+    "minute": 60.0,
+    "hour": 3600.0,
+    "day": 86400.0,
+    "week": 604800.0,
+    "month": 2629800.0,
+    "year": 31557600.0,
+}
+"""Seconds of each unit of time: a year has 365.25 days, and a month is its twelfth part."""
+LEAST, MOST = 10.0, 1e15
+"""Limits of an average run length in samples: below ten samples every second alarm would be false
+at common rates, and above 1e15 the sums of a detector no longer count single samples."""
+NUMBER = r"(\d+(?:\.\d*)?(?:e[+-]?\d+)?)"
+
+
+def false_alarms(wanted: str | float, rate: float) -> float:
+    """The average run length (ARL) to a false alarm, in samples.
+
+    Parameters
+    ----------
+    wanted : str or float
+        A number per unit of time ("1 per month", "2 per year", "0.5 per hour"), a rate ("1e-6 Hz"),
+        a run length ("1000 samples"), or the same as a number of samples.
+    rate : float
+        Sample rate in Hz.
+
+    Returns
+    -------
+    float
+        From 10 to 1e15. It is the threshold of a `Detector`.
+
+    Raises
+    ------
+    InputError
+        The text has none of these forms, or the run length is outside the limits.
+
+    Examples
+    --------
+    >>> false_alarms("1 per day", 10.0)
+    864000.0
+
+    """
+    per_second = sample_rate("rate", rate)
+    remedy = "write '1 per month', '2 per year', '1e-6 Hz' or '1000 samples'"
+    if isinstance(wanted, str):
+        text = " ".join(wanted.lower().split())
+        of_time = re.fullmatch(rf"{NUMBER} (?:per|a|an) (\w+?)s?", text)
+        of_rate = re.fullmatch(rf"{NUMBER} ?hz", text)
+        of_samples = re.fullmatch(rf"{NUMBER} samples?", text)
+        if of_time and of_time[2] in SECONDS and float(of_time[1]) > 0:
+            samples = SECONDS[of_time[2]] * per_second / float(of_time[1])
+        elif of_rate and float(of_rate[1]) > 0:
+            samples = per_second / float(of_rate[1])
+        elif of_samples:
+            samples = float(of_samples[1])
+        else:
+            units = ", ".join(SECONDS)
+            raise InputError(
+                "false_alarms",
+                expected=f"a number per {units}, a rate in Hz, or a number of samples",
+                got=repr(wanted),
+                remedy=remedy,
+            )
+    elif isinstance(wanted, Real) and not isinstance(wanted, bool):
+        samples = float(wanted)
+    else:
+        raise InputError(
+            "false_alarms", expected="a text or a number", got=repr(wanted), remedy=remedy
+        )
+    return finite(
+        "false_alarms",
+        samples,
+        least=LEAST,
+        most=MOST,
+        unit="samples from one false alarm to the next, on average",
+        remedy=f"{remedy}; a bare number counts samples",
+    )
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What a monitor guarantees, for which distributions, and how often it may be wrong.
+
+    Parameters
+    ----------
+    arl : float
+        Average run length to a false alarm in samples, of `false_alarms`.
+    rate : float
+        Sample rate in Hz.
+    slack : Slack
+        The class of distributions.
+    alpha : float
+        Probability that the monitor ever declares the promise void although it holds.
+
+    """
+
+    arl: float
+    rate: float
+    slack: Slack
+    alpha: float = 0.01
+
+    def __str__(self) -> str:
+        """One sentence for pages, logs and the terminal."""
+        return (
+            f"On average at least {self.arl:.6g} measured samples "
+            f"({_duration(self.arl / self.rate)}) pass until a false alarm, "
+            f"as long as {self.slack}. "
+            f"Where that is so, it is declared void with a probability of at most {self.alpha:g}."
+        )
+
+
+def _duration(seconds: float) -> str:
+    """A duration in the largest unit of which it has at least two, or in seconds."""
+    for unit, size in reversed(SECONDS.items()):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.3g} {unit}s"
+    return f"{seconds:.3g} seconds"

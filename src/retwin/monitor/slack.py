@@ -1,0 +1,162 @@
+"""The class of distributions of scores for which a monitor's promise holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import betaincinv, ndtri
+
+from retwin.checks import finite, require, whole
+
+__all__ = ["Slack", "effective_samples"]
+
+CENTRE = 2.0
+"""Scores beyond this size may be as small as this: bounded and light-tailed noise is in the class,
+and bets on a smaller scale, which need few large scores, lose nothing."""
+STEP = 0.01
+"""Slack from calibration is rounded up to multiples of this, so that streams share tables."""
+
+
+@dataclass(frozen=True)
+class Slack:
+    r"""How far the distribution of scores may be from a standard Gaussian one.
+
+    A score z, given the past and given that it was measured, has a quantile function q. Written
+    over the quantiles e of a standard Gaussian distribution, the class is the band
+
+    .. math:: \min(e/κ, κe) - δ \le q(e) \le \max(e/κ, κe) + δ,
+
+    on both sides symmetrically; beyond |z| = 2 scores may be as small as 2, and beyond the clip of
+    the detector's grid as large as they like. Neither independence nor equal distributions are
+    required: the distribution may change with every sample inside the band.
+
+    Parameters
+    ----------
+    kappa : float
+        κ, slack of the scale, from 1 (none) to 10; two-sided.
+    shift : float
+        δ, the largest mean shift that is not to be detected, from 0 to 3 standard deviations.
+
+    """
+
+    kappa: float = 1.0
+    shift: float = 0.0
+
+    def __post_init__(self) -> None:
+        finite("kappa", self.kappa, least=1, most=10)
+        finite("shift", self.shift, least=0, most=3, unit="standard deviations")
+
+    def __str__(self) -> str:
+        return (
+            f"quantiles of the scores are within a factor {self.kappa:g} and a shift of "
+            f"{self.shift:g} of the standard Gaussian ones"
+        )
+
+    def upper(self, gaussian: NDArray) -> NDArray:
+        """The largest quantiles of the class at Gaussian ones."""
+        made: NDArray = np.maximum(gaussian * self.kappa, gaussian / self.kappa) + self.shift
+        return np.maximum(made, -CENTRE)
+
+    def lower(self, gaussian: NDArray) -> NDArray:
+        """The smallest quantiles of the class at Gaussian ones."""
+        return -self.upper(-gaussian)
+
+    @classmethod
+    def of_calibration(
+        cls, samples: float, *, parameters: int = 0, confidence: float = 0.95
+    ) -> Slack:
+        """The slack that ranks among so many calibration samples need.
+
+        The k-th of n calibration samples is a quantile whose probability has a Beta(k, n + 1 - k)
+        distribution, whatever the samples' distribution is. `shift` covers the median, and what
+        the estimated parameters of the predictive model shift predictions; `kappa` covers all
+        other ranks, the most extreme one included, each with probability `confidence`.
+
+        Parameters
+        ----------
+        samples : float
+            Effective number of calibration samples, of `effective_samples`, at least 8.
+        parameters : int
+            Number of parameters of the predictive model that were estimated from them.
+        confidence : float
+            From 0.5 to 0.9999.
+
+        Returns
+        -------
+        Slack
+            Rounded up to multiples of 0.01.
+
+        """
+        count = finite("samples", samples, least=8, remedy="calibrate on a longer healthy record")
+        finite("confidence", confidence, least=0.5, most=0.9999)
+        variance = (np.pi / 2 + whole("parameters", parameters)) / count
+        shift = ndtri((1 + confidence) / 2) * np.sqrt(variance)
+        ranks = np.unique(np.geomspace(1, (count + 1) / 2, 200))
+        score = -ndtri(ranks / (count + 1))
+        far, near = (
+            -ndtri(betaincinv(ranks, count + 1 - ranks, (1 + sign * confidence) / 2))
+            for sign in (-1, 1)
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            wider = np.where((near > 0) & (score > shift), (score - shift) / near, 1.0)
+            narrower = np.where((score < CENTRE) & (far > 0), far / (score + shift), 1.0)
+        kappa = max(1.0, float(wider.max()), float(narrower.max()))
+        up = [float(np.ceil(each / STEP - 1e-9) * STEP) for each in (kappa, shift)]
+        return cls(min(round(up[0], 2), 10.0), min(round(up[1], 2), 3.0))
+
+
+def effective_samples(scores: NDArray) -> NDArray:
+    """Number of independent samples that estimate a distribution as well as correlated ones.
+
+    Parameters
+    ----------
+    scores : array (streams, T)
+        Calibration scores; NaN is missing.
+
+    Returns
+    -------
+    array (streams,)
+        n / (1 + 2 sum of autocorrelations) with the sum over lags until the first pair of
+        autocorrelations that is not above its standard error; the smaller number of those for the
+        scores and for their sizes, and at most n.
+
+    References
+    ----------
+    Geyer, Practical Markov chain Monte Carlo, Statistical Science 7 (1992), initial sequences.
+
+    """
+    require(
+        np.ndim(scores) == 2,
+        "scores",
+        expected="an array (streams, T)",
+        got=f"shape {np.shape(scores)}",
+        remedy="give one row per stream",
+    )
+    ranks = np.where(np.isfinite(scores), np.clip(scores, -3, 3), np.nan)
+    found = [_independent(each) for each in (ranks, np.abs(ranks))]
+    made: NDArray = np.minimum(*found)
+    return made
+
+
+def _independent(values: NDArray) -> NDArray:
+    seen = np.isfinite(values)
+    count = seen.sum(axis=1)
+    filled = np.where(seen, values, 0.0)
+    filled = np.where(seen, filled - (filled.sum(axis=1) / np.maximum(count, 1))[:, None], 0.0)
+    lags = max(1, values.shape[1] // 4)
+    size = 2 * values.shape[1]
+    sums, pairs = (
+        np.fft.irfft(np.abs(np.fft.rfft(each, size, axis=1)) ** 2, size, axis=1)[:, : lags + 1]
+        for each in (filled, seen.astype(float))
+    )
+    variance = np.maximum(sums[:, :1] / np.maximum(count, 1)[:, None], np.finfo(float).tiny)
+    correlation = (sums / np.maximum(pairs, 1) / variance)[:, 1:]
+    even = correlation[:, : correlation.shape[1] // 2 * 2]
+    paired = even.reshape(len(even), -1, 2).sum(axis=2)
+    limit = 2 * np.sqrt(2 / np.maximum(count, 1))[:, None]
+    kept = np.logical_and.accumulate(paired > limit, axis=1)
+    time = 1 + 2 * np.sum(np.where(kept, paired, 0.0), axis=1)
+    made: NDArray = count / time
+    return made
