@@ -162,10 +162,11 @@ def _bets(alternative: Alternative, slack: Slack, levels: NDArray) -> NDArray:
     """An alternative's bet (levels, cells), divided by its largest expectation over the class."""
     finite("slack.kappa", slack.kappa, least=1)
     logs = [alternative.log_bet(CENTRES, level, slack.kappa) for level in levels]
-    values = np.maximum(np.exp(np.minimum(logs, 300.0)), FLOOR)
+    values = np.maximum(np.exp(np.minimum(logs, 40.0)), FLOOR)
     # Scores that are reached from each cell of Gaussian quantiles, by any member of the class.
     first = np.searchsorted(EDGES, slack.lower(EDGES[:-1]), side="right") - 1
     last = np.searchsorted(EDGES, slack.upper(EDGES[1:]), side="left")
     pairs = zip(first, last, strict=True)
     largest = [values[:, max(a, 0) : max(b, a + 1)].max(axis=1) for a, b in pairs]
-    return values / (np.transpose(largest) @ MASS)[:, None]
+    expectation = np.sum(np.array(largest).T * MASS, axis=1)  # each level in the same order
+    return values / expectation[:, None]

@@ -59,9 +59,10 @@ class Detector:
     A score may be an interval: of ties, or of a rank. Its bet is the mean of the bet over the
     interval, which is the expectation under a score drawn at random inside it; nothing is drawn.
 
-    Evidence is stored as it is rather than as its logarithm. It is bounded by 1e290, and a bet
-    is never 0 and at most exp(300); tables replace exponentials, so that the bytes depend neither
-    on the number of streams in a call nor on the processor's vector instructions.
+    Evidence is stored as it is rather than as its logarithm, bounded by 1e290; a bet is never 0 and
+    far below 1e18. A step only looks up, adds, multiplies and divides, since the last digit of an
+    exponential or a logarithm may depend on its place in an array: bytes do not depend on how
+    samples and streams are grouped into calls.
 
     Parameters
     ----------
@@ -129,8 +130,8 @@ class Detector:
         Returns
         -------
         DetectorState, array (streams,)
-            The next state, and the logarithm of the evidence M; minus infinity before the first
-            measured sample. An alarm is due where it is at least the logarithm of the ARL.
+            The next state, and the evidence M, 0 before the first measured sample. An alarm is due
+            where it is at least the ARL.
 
         """
         low = np.asarray(score, dtype=float)[:, None]
@@ -156,8 +157,7 @@ class Detector:
             np.minimum(evidence, LARGEST, out=evidence)
             # A running sum: unlike that of np.sum, its order does not depend on the shape.
             made[t] = np.add.accumulate(evidence * weights, axis=0)[-1]
-        with np.errstate(divide="ignore"):
-            return DetectorState(evidence.T, previous), np.log(made).T
+        return DetectorState(evidence.T, previous), made.T
 
     def intervals(
         self, previous: NDArray, score: ArrayLike, high: ArrayLike | None

@@ -28,9 +28,9 @@ class Slack:
 
     .. math:: \min(e/κ, κe) - δ \le q(e) \le \max(e/κ, κe) + δ,
 
-    on both sides symmetrically; beyond |z| = 2 scores may be as small as 2, and beyond the clip of
-    the detector's grid as large as they like. Neither independence nor equal distributions are
-    required: the distribution may change with every sample inside the band.
+    on both sides symmetrically; with κ > 1 scores beyond 2 may be as small as 2, and those beyond
+    the clip of the detector's grid, 4, as large as they like. Neither independence nor equal
+    distributions are required: the distribution may change with every sample inside the band.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Slack:
     def upper(self, gaussian: NDArray) -> NDArray:
         """The largest quantiles of the class at Gaussian ones."""
         made: NDArray = np.maximum(gaussian * self.kappa, gaussian / self.kappa) + self.shift
-        return np.maximum(made, -CENTRE)
+        return np.maximum(made, -CENTRE) if self.kappa > 1 else made
 
     def lower(self, gaussian: NDArray) -> NDArray:
         """The smallest quantiles of the class at Gaussian ones."""

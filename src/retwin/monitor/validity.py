@@ -146,7 +146,7 @@ class Validity:
         Returns
         -------
         ValidityState, array (streams, T)
-            The next state, and the logarithm of the evidence against the class.
+            The next state, and the evidence against the class.
 
         """
         low, top = self.detector.intervals(state.previous, score, high)
@@ -170,7 +170,7 @@ class Validity:
             evidence = (state.quiet + state.runs) / 2
             state = replace(state, highest=np.maximum(state.highest, evidence))
             made[t] = evidence
-        return state, np.log(made).T
+        return state, made.T
 
     def _with_alarms(self, state: ValidityState, alarm: NDArray) -> ValidityState:
         """After alarms in some streams: their run lengths are evidence."""
