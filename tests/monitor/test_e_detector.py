@@ -28,7 +28,7 @@ def same(first: DetectorState, second: DetectorState) -> bool:
 @pytest.mark.parametrize(("shift", "published"), [(0.0, 336.0), (1.0, 8.38)])
 def test_cusum_has_the_published_run_lengths(shift: float, published: float) -> None:
     # k = 0.5, h = 4, one-sided: NIST/SEMATECH e-Handbook of Statistical Methods, 6.3.2.3.1.
-    scores = np.random.default_rng(0).normal(shift, 1, (1500, 100 if shift else 3000))
+    scores = np.random.default_rng(0).normal(shift, 1, (1000, 100 if shift else 2500))
     found = run_lengths(Detector(kind="cusum", alternatives=ONE_SIGMA), np.exp(4), scores)
     assert abs(found.mean() - published) < 3.5 * found.std() / np.sqrt(len(found))
 
@@ -36,7 +36,7 @@ def test_cusum_has_the_published_run_lengths(shift: float, published: float) -> 
 def test_shiryaev_roberts_has_the_published_run_length() -> None:
     # A / zeta with zeta = 0.5604 for one standard deviation: Pollak, Average run lengths of an
     # optimal method of detecting a change in distribution, Annals of Statistics 15 (1987).
-    scores = np.random.default_rng(1).normal(size=(1500, 3000))
+    scores = np.random.default_rng(1).normal(size=(1000, 2500))
     found = run_lengths(Detector(alternatives=ONE_SIGMA), 200, scores)
     assert abs(found.mean() - 200 / 0.5604) < 3.5 * found.std() / np.sqrt(len(found))
 
