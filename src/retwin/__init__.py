@@ -47,6 +47,7 @@ as in `rt.twins.HoldSampler` or `from retwin.deploy import Bundle`:
 | `rt.study` | comparison of sources over runs |
 | `rt.report` | the report of a study |
 | `rt.deploy` | bundles, ONNX, large simulations |
+| `rt.monitor` | alarms beside the running machine, with a promised rate of false ones |
 | `rt.testing` | contract suites for twins, corrections and diagnosers of your own |
 """
 
@@ -128,6 +129,7 @@ _ROOMS = (
     "deploy",
     "diagnosis",
     "evaluation",
+    "monitor",
     "nets",
     "report",
     "scores",
@@ -147,6 +149,7 @@ if TYPE_CHECKING:
         deploy,
         diagnosis,
         evaluation,
+        monitor,
         nets,
         report,
         scores,

@@ -38,21 +38,21 @@ class DetectorState:
 
 @dataclass(frozen=True)
 class Detector:
-    r"""A mixture of e-detectors over location, scale, tails and dependence of scores.
+    """A mixture of e-detectors over location, scale, tails and dependence of scores.
 
-    With the bets L of `Alternative` j, whose expectation given the past is at most 1 for all
+    With the bets L_j of alternative j, whose expectation given the past is at most 1 for all
     distributions of the class `slack`,
 
-    .. math:: M_t^j = (M_{t-1}^j + 1) L_t^j,\quad M_t = \sum_j w_j M_t^j
+        M_j(t) = (M_j(t-1) + 1) L_j(t),   M(t) = sum of w_j M_j(t)
 
-    (Shiryaev–Roberts), or with max(M, 1) in place of M + 1 (CUSUM). Then M_t - t is a
-    supermartingale, so that the average run length until M_t first is at least A is at least A, for
+    (Shiryaev–Roberts), or with max(M, 1) in place of M + 1 (CUSUM). Then M(t) - t is a
+    supermartingale, so that the average run length until M(t) first is at least A is at least A, for
     each member of the class and without any limit (Shin, Ramdas and Rinaldo, E-detectors: a
     nonparametric framework for sequential change detection, 2022, Definition 2.2, Proposition 2.4).
     The probability of a false alarm within the first t samples is at most t/A.
 
     A missing sample (NaN) leaves M as it is: it multiplies by 1, and nothing is added. With N_t
-    measured samples among t, M_t - N_t then is a supermartingale, as long as the class holds given
+    measured samples among t, M(t) - N_t then is a supermartingale, as long as the class holds given
     the past and given that the sample is measured. The average number of *measured* samples until
     a false alarm is therefore at least A, and the time is longer still.
 

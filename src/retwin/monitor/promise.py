@@ -126,8 +126,7 @@ class Promise:
 
 
 def _duration(seconds: float) -> str:
-    """A duration in the largest unit of which it has at least two, or in seconds."""
-    for unit, size in reversed(SECONDS.items()):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.3g} {unit}s"
-    return f"{seconds:.3g} seconds"
+    """A duration in the largest unit of which it has at least one, or in seconds."""
+    unit = next((each for each in reversed(SECONDS) if seconds >= SECONDS[each]), "second")
+    count = f"{seconds / SECONDS[unit]:.3g}"
+    return f"{count} {unit}" if count == "1" else f"{count} {unit}s"

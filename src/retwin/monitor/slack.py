@@ -21,12 +21,12 @@ STEP = 0.01
 
 @dataclass(frozen=True)
 class Slack:
-    r"""How far the distribution of scores may be from a standard Gaussian one.
+    """How far the distribution of scores may be from a standard Gaussian one.
 
     A score z, given the past and given that it was measured, has a quantile function q. Written
     over the quantiles e of a standard Gaussian distribution, the class is the band
 
-    .. math:: \min(e/κ, κe) - δ \le q(e) \le \max(e/κ, κe) + δ,
+        min(e/κ, κe) - δ ≤ q(e) ≤ max(e/κ, κe) + δ,
 
     on both sides symmetrically; with κ > 1 scores beyond 2 may be as small as 2, and those beyond
     the clip of the detector's grid, 4, as large as they like. Neither independence nor equal

@@ -52,13 +52,13 @@ class ValidityState:
 
 @dataclass(frozen=True)
 class Validity:
-    r"""An e-process against the hypothesis that the scores are in the class of a detector.
+    """An e-process against the hypothesis that the scores are in the class of a detector.
 
     Quiet times: the mean of the products of a detector's bets over a block of measured samples is
     an e-value X. With F = (1 + min(X, 3)) / 2, or (1 + min(X, 1)) / 2 for a block with an alarm,
     and the weights π_b = 1 / ((b + 1) (b + 2)) of the block b at which the class ceases to apply,
 
-    .. math:: R_b = (R_{b-1} + π_b) F_b .
+        R_b = (R_(b-1) + π_b) F_b .
 
     Alarms: a run length of T measured samples since the last alarm, at which the detector started
     anew, has P(T ≤ t) ≤ t / ARL within the class, so that min(½ √(ARL / T), 4) is an e-value; Q is
