@@ -105,5 +105,9 @@ def test_what_cannot_be_estimated_is_refused() -> None:
     for wrong in (np.zeros((2, 20)), np.full((1, 90), np.nan), np.zeros(90)):
         with pytest.raises(InputError, match="at least 50 residuals per stream"):
             fit_disturbance(wrong)
+    gap = np.full((1, 400), np.nan)
+    gap[0, :60] = np.arange(60) % 7
+    with pytest.raises(InputError, match="at least 25 residuals outside"):
+        fit_disturbance(gap)
     with pytest.raises(InputError, match="residuals that vary"):
         fit_disturbance(np.ones((2, 90)))

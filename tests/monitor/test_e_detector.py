@@ -105,7 +105,7 @@ def test_hostile_samples_are_large_or_missing_and_overflow_nothing() -> None:
         assert np.isfinite(evidence).all()
         assert np.isfinite(state.evidence).all()
         assert np.all(state.evidence > 0)
-    assert np.all(evidence[:, -1] > 1e280), "bounded by 1e290, not stopped before"
+    assert np.all(evidence[:, -1] > 1e270), "bounded, but not stopped before"
     back, found = detector.run(state, np.random.default_rng(0).normal(size=(2, 3)))
     assert np.isfinite(found).all()
     assert np.isfinite(back.evidence).all()

@@ -15,7 +15,7 @@ from retwin.monitor.slack import Slack
 
 __all__ = ["Detector", "DetectorState"]
 
-LARGEST = 1e290
+LARGEST = 1e280
 """Evidence counts up to this; one further factor does not overflow."""
 
 
@@ -46,9 +46,9 @@ class Detector:
         M_j(t) = (M_j(t-1) + 1) L_j(t),   M(t) = sum of w_j M_j(t)
 
     (Shiryaev–Roberts), or with max(M, 1) in place of M + 1 (CUSUM). Then M(t) - t is a
-    supermartingale, so that the average run length until M(t) first is at least A is at least A, for
-    each member of the class and without any limit (Shin, Ramdas and Rinaldo, E-detectors: a
-    nonparametric framework for sequential change detection, 2022, Definition 2.2, Proposition 2.4).
+    supermartingale, so that on average at least A samples pass until M(t) reaches A, for each
+    member of the class and without any limit (Shin, Ramdas and Rinaldo, E-detectors: a
+    nonparametric framework for sequential change detection, 2022).
     The probability of a false alarm within the first t samples is at most t/A.
 
     A missing sample (NaN) leaves M as it is: it multiplies by 1, and nothing is added. With N_t
@@ -59,8 +59,8 @@ class Detector:
     A score may be an interval: of ties, or of a rank. Its bet is the mean of the bet over the
     interval, which is the expectation under a score drawn at random inside it; nothing is drawn.
 
-    Evidence is stored as it is rather than as its logarithm, bounded by 1e290; a bet is never 0 and
-    far below 1e18. A step only looks up, adds, multiplies and divides, since the last digit of an
+    Evidence is stored as it is rather than as its logarithm, bounded by 1e280; a bet is never 0 and
+    below 1e24. A step only looks up, adds, multiplies and divides, since the last digit of an
     exponential or a logarithm may depend on its place in an array: bytes do not depend on how
     samples and streams are grouped into calls.
 

@@ -24,6 +24,8 @@ of the ratio of variances of measurement and process noise."""
 ROUNDS = 14
 """Rounds of the pattern search; a failed one halves the step of a stream."""
 RATIOS = (-12.0, 12.0)
+BLOCK = 1000
+"""A longer record is estimated as independent blocks of so many samples, all at once."""
 FEWEST = 50
 """Measured residuals per stream, at least."""
 
@@ -159,16 +161,27 @@ def fit_disturbance(residual: ArrayLike, *, max_order: int = 3, folds: int = 4) 
         got=f"a constant in stream {np.argmin(scale)}",
         remedy="leave out a channel that does not move",
     )
+    folded = np.array_split(np.arange(given.shape[1]), folds)
+    fewest = min((seen.sum(axis=1) - seen[:, each].sum(axis=1)).min() for each in folded)
+    require(
+        fewest >= FEWEST // 2,
+        "residual",
+        expected=f"at least {FEWEST // 2} residuals outside each of {folds} parts of the record",
+        got=str(fewest),
+        remedy="leave out the parts of the record in which nothing was measured",
+    )
     values = ((given - mean[:, None]) / scale[:, None]).T
-    point = _orders(values, max_order)
+    blocks = _blocks(values)
+    point = _orders(blocks, max_order)
     errors = np.full(values.shape, np.nan)
-    for block in np.array_split(np.arange(len(values)), folds):
+    for block in folded:
         part = values.copy()
         part[block] = np.nan
-        other, _ = _search(part, point, ROUNDS // 2)
-        errors[block] = _standardised(values, part, other)[block]
+        parts = _blocks(part)
+        other, _ = _search(parts, point, ROUNDS // 2)
+        errors[block] = _standardised(values, other, _likelihood(parts, other)[1])[block]
     coefficients, ratio = _model(point)
-    variance = _likelihood(values, point)[1] * scale**2
+    variance = _likelihood(blocks, point)[1] * scale**2
     return Disturbance(coefficients.T, mean, variance, variance * ratio, errors.T)
 
 
@@ -247,30 +260,47 @@ def _model(point: NDArray) -> tuple[NDArray, NDArray]:
     return _coefficients(partial), np.exp(np.clip(point[-1], *RATIOS))
 
 
-def _likelihood(values: NDArray, point: NDArray) -> tuple[NDArray, NDArray]:
-    """Minus twice the log likelihood, with the variance of the process that maximises it."""
-    coefficients, ratio = _model(point)
-    covariance = _stationary(coefficients)
-    logs, squares, count = np.zeros(ratio.shape), np.zeros(ratio.shape), 0.0
-    filtered = _errors(values, coefficients, 1.0, ratio, np.zeros_like(coefficients), covariance)
-    for value, (error, variance) in zip(values, filtered, strict=True):
+def _likelihood(blocks: NDArray, point: NDArray) -> tuple[NDArray, NDArray]:
+    """Minus twice the log likelihood, with the variance of the process that maximises it.
+
+    Shapes: blocks (BLOCK, B, streams), point (d, …, streams).
+    """
+    coefficients, ratio = (each[..., None, :] for each in _model(point))
+    shape = (*ratio.shape[:-2], *blocks.shape[1:])
+    covariance = np.broadcast_to(
+        _stationary(coefficients), (len(coefficients), len(coefficients), *shape)
+    ).copy()
+    logs, squares, count = np.zeros(shape), np.zeros(shape), np.zeros(blocks.shape[1:])
+    mean = np.zeros((len(coefficients), *shape))
+    filtered = _errors(blocks, coefficients, 1.0, ratio, mean, covariance)
+    for value, (error, variance) in zip(blocks, filtered, strict=True):
         seen = ~np.isnan(value)
         logs += np.where(seen, np.log(variance), 0.0)
         squares += np.where(seen, error**2 / variance, 0.0)
-        count = count + seen
+        count += seen
+    logs, squares, count = (each.sum(axis=-2) for each in (logs, squares, count))
     scale = squares / count
     return count * np.log(scale) + logs, scale
 
 
-def _search(values: NDArray, point: NDArray, rounds: int) -> tuple[NDArray, NDArray]:
+def _blocks(values: NDArray) -> NDArray:
+    """Values (T, streams) as blocks (BLOCK, B, streams), filled up with missing ones."""
+    count = -(-len(values) // BLOCK)
+    size = BLOCK if count > 1 else len(values)
+    filled = np.full((count * size, values.shape[1]), np.nan)
+    filled[: len(values)] = values
+    return np.swapaxes(filled.reshape(count, size, -1), 0, 1)
+
+
+def _search(blocks: NDArray, point: NDArray, rounds: int) -> tuple[NDArray, NDArray]:
     """Pattern search from a point (d, streams), for all streams and both directions at once."""
-    best = _likelihood(values, point[:, None])[0][0]
+    best = _likelihood(blocks, point[:, None])[0][0]
     size = np.full(point.shape[1], 0.4)
     directions = np.concatenate([np.eye(len(point)), -np.eye(len(point))])
     directions[:, -1] *= 3  # the ratio of variances is in logarithms
     for _ in range(rounds):
         tried = point[:, None] + directions.T[:, :, None] * size
-        found = _likelihood(values, tried)[0]
+        found = _likelihood(blocks, tried)[0]
         chosen = np.argmin(found, axis=0)
         streams = np.arange(len(size))
         better = found[chosen, streams] < best - 1e-9
@@ -280,17 +310,17 @@ def _search(values: NDArray, point: NDArray, rounds: int) -> tuple[NDArray, NDAr
     return point, best
 
 
-def _orders(values: NDArray, max_order: int) -> NDArray:
+def _orders(blocks: NDArray, max_order: int) -> NDArray:
     """The best point (p + 1, streams), with the order of each stream by the BIC."""
-    streams = values.shape[1]
+    streams = blocks.shape[-1]
     grid = np.repeat(np.transpose(GRID)[:, :, None], streams, axis=2)
-    first = np.argmin(_likelihood(values, grid)[0], axis=0)
-    point, best = _search(values, grid[:, first, np.arange(streams)], ROUNDS)
-    penalty = np.log(np.sum(~np.isnan(values), axis=0))
+    first = np.argmin(_likelihood(blocks, grid)[0], axis=0)
+    point, best = _search(blocks, grid[:, first, np.arange(streams)], ROUNDS)
+    penalty = np.log(np.sum(~np.isnan(blocks), axis=(0, 1)))
     kept, orders = point, np.ones(streams)
     for _ in range(1, max_order):
         wider = np.insert(point, len(point) - 1, 0.0, axis=0)
-        point, found = _search(values, wider, ROUNDS)
+        point, found = _search(blocks, wider, ROUNDS)
         kept = np.insert(kept, len(kept) - 1, 0.0, axis=0)
         better = found + penalty < best
         orders = np.where(better, len(point) - 1, orders)
@@ -299,10 +329,9 @@ def _orders(values: NDArray, max_order: int) -> NDArray:
     return np.concatenate([kept[:top], kept[-1:]])
 
 
-def _standardised(values: NDArray, part: NDArray, point: NDArray) -> NDArray:
-    """Errors of values (T, streams) with parameters, their variance that of a part of them."""
+def _standardised(values: NDArray, point: NDArray, scale: NDArray) -> NDArray:
+    """Errors of values (T, streams), in standard deviations by a variance of the process."""
     coefficients, ratio = _model(point)
-    scale = _likelihood(part, point)[1]
     filtered = _errors(
         values, coefficients, 1.0, ratio, np.zeros_like(coefficients), _stationary(coefficients)
     )

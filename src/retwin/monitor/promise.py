@@ -126,7 +126,8 @@ class Promise:
 
 
 def _duration(seconds: float) -> str:
-    """A duration in the largest unit of which it has at least one, or in seconds."""
-    unit = next((each for each in reversed(SECONDS) if seconds >= SECONDS[each]), "second")
+    """A duration in the largest unit of which it has at least one, weeks apart, or in seconds."""
+    units = [each for each in reversed(SECONDS) if each != "week" and seconds >= SECONDS[each]]
+    unit = units[0] if units else "second"
     count = f"{seconds / SECONDS[unit]:.3g}"
     return f"{count} {unit}" if count == "1" else f"{count} {unit}s"
