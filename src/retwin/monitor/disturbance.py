@@ -65,9 +65,10 @@ class Disturbance:
     held_out: NDArray
 
     @property
-    def parameters(self) -> int:
-        """Number of estimated parameters that shift predictions."""
-        return self.coefficients.shape[1] + 2
+    def parameters(self) -> NDArray:
+        """Number of estimated parameters (streams,) that shift predictions."""
+        made: NDArray = np.count_nonzero(self.coefficients, axis=1) + 2
+        return made
 
     def start(self) -> DisturbanceState:
         """The stationary state, before the first sample."""

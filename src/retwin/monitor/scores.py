@@ -70,13 +70,20 @@ class ConformalScores:
         low, high = (np.where(missing, np.nan, self.quantiles[each]) for each in (below, upto))
         return low, high
 
-    def slack(self, parameters: int = 0, confidence: float = 0.95) -> tuple[Slack, ...]:
-        """The slack that each stream's calibration needs; see `Slack.of_calibration`."""
+    def slack(self, parameters: ArrayLike = 0, confidence: float = 0.95) -> tuple[Slack, ...]:
+        """The slack that each stream's calibration needs; see `Slack.of_calibration`.
+
+        `parameters` is one number of estimated parameters for all streams, or one for each.
+        """
+        each = np.broadcast_to(parameters, self.independent.shape)
+        keys = list(zip(np.floor(self.independent).tolist(), each.tolist(), strict=True))
         made = {
-            count: Slack.of_calibration(count, parameters=parameters, confidence=confidence)
-            for count in set(np.floor(self.independent))
+            (count, estimated): Slack.of_calibration(
+                count, parameters=estimated, confidence=confidence
+            )
+            for count, estimated in set(keys)
         }
-        return tuple(made[count] for count in np.floor(self.independent))
+        return tuple(made[key] for key in keys)
 
 
 def fit_scores(errors: ArrayLike) -> ConformalScores:
