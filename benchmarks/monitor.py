@@ -5,7 +5,7 @@ its first 500 samples. The average run length (ARL) that is promised is 1000 sam
 watched for 20 000 samples and count as that if they raise no alarm by then, so that the mean is too
 small rather than too large. The scenarios are a disturbance with Gaussian innovations, with
 autocorrelation 0.98, with Student's t innovations of 3 degrees of freedom, rounded to multiples of
-1/16 and of 1, with a tenth of the samples missing at random, and all together. Innovations have
+1/16, 1 and 4, with a tenth of the samples missing at random, and all together. Innovations have
 unit variance; all sizes are in their standard deviations.
 
 Delays are from a change at sample 101 until the alarm, at most 400, of streams without an alarm
@@ -44,6 +44,7 @@ from retwin.monitor import (
     Validity,
     fit_disturbance,
     fit_scores,
+    resolution,
 )
 
 STREAMS = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
@@ -57,6 +58,7 @@ SCENARIOS: dict[str, dict[str, float]] = {
     "t3": {"freedom": 3},
     "rounded to 1/16": {"quantum": 1 / 16},
     "rounded to 1": {"quantum": 1},
+    "0.98, rounded to 4": {"pole": 0.98, "quantum": 4},
     "10 % missing": {"missing": 0.1},
     "all, rounded to 1/16": {"pole": 0.98, "freedom": 3, "quantum": 1 / 16, "missing": 0.1},
     "all, rounded to 1": {"pole": 0.98, "freedom": 3, "quantum": 1, "missing": 0.1},
@@ -101,17 +103,18 @@ def monitor(healthy: NDArray) -> tuple[Run, dict[str, float]]:
     """The monitor with the slack that its calibration needs."""
     began = time.process_time()
     model = fit_disturbance(healthy)
-    scores = fit_scores(model.held_out)
+    quantum = resolution(healthy)[:, None]
+    scores = fit_scores(model.held_out, quantum / model.deviation)
     slacks = scores.slack(model.parameters)
     detector = Detector(slacks)
     seconds = time.process_time() - began
-    at_start, _ = model.run(model.start(), healthy)
+    at_start, _, _ = model.run(model.start(), healthy)
 
     def run(output: NDArray) -> NDArray:
         predictor, state, alarms = at_start, detector.start(len(output)), []
         for first in range(0, output.shape[1], CHUNK):
-            predictor, errors = model.run(predictor, output[:, first : first + CHUNK])
-            state, evidence = detector.run(state, *scores.score(errors))
+            predictor, errors, deviation = model.run(predictor, output[:, first : first + CHUNK])
+            state, evidence = detector.run(state, *scores.score(errors, quantum / deviation))
             alarms.append(evidence >= ARL)
         return first_alarms(np.concatenate(alarms, axis=1), output.shape[1])
 

@@ -11,7 +11,7 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import t
 
 from retwin.errors import InputError
-from retwin.monitor import Detector, Slack, effective_samples, fit_scores
+from retwin.monitor import Detector, Slack, effective_samples, fit_scores, resolution
 
 
 def test_an_interval_is_that_of_the_conformal_p_value() -> None:
@@ -88,3 +88,41 @@ def test_too_few_errors_are_refused() -> None:
             fit_scores(wrong)
     with pytest.raises(InputError, match="errors of 1 streams"):
         fit_scores(np.arange(9.0)[None]).score(np.zeros((2, 3)))
+
+
+def test_the_resolution_of_a_sensor_is_found_in_its_values() -> None:
+    rng = np.random.default_rng(4)
+    values = rng.normal(20, 1, (5, 400))
+    for row, step in enumerate((1 / 16, 0.25, 0.1, 3.0)):
+        values[row] = np.round(values[row] / step) * step
+    values[0, 3] = np.nan
+    assert resolution(values) == pytest.approx([1 / 16, 0.25, 0.1, 3.0, 0.0])
+    assert resolution(np.ones((1, 9))) == 0
+
+
+@pytest.mark.parametrize("step", [0.5, 2.0, 4.0])
+def test_scores_of_rounded_samples_are_uniform_given_the_prediction(step: float) -> None:
+    rng = np.random.default_rng(5)
+
+    def rounded(prediction: float, count: int) -> np.ndarray:
+        drawn = prediction + rng.normal(size=count)
+        return np.round(drawn / step) * step - prediction
+
+    calibration = np.concatenate([rounded(m, 20) for m in rng.uniform(-9, 9, 300)])
+    scores = fit_scores(calibration[None], step)
+    for prediction in (0.0, 0.3 * step, 0.5 * step):
+        low, high = scores.score(rounded(prediction, 3000)[None], step)
+        grid = ndtri(np.arange(1, 20) / 20)
+        # The mean over samples of the uniform distribution between the ends of the intervals.
+        ends = ndtr(low.T), ndtr(high.T)
+        share = np.clip((ndtr(grid) - ends[0]) / (ends[1] - ends[0]), 0, 1).mean(axis=0)
+        assert share == pytest.approx(ndtr(grid), abs=0.04)
+
+
+def test_a_huge_rounded_error_is_the_last_rank() -> None:
+    scores = fit_scores(np.round(np.random.default_rng(6).normal(size=(1, 200))), 1.0)
+    low, high = scores.score(np.array([[1e300, -1e300, np.inf, np.nan]]), 1.0)
+    assert ndtr(low[0, 0]) == pytest.approx(200 / 201)
+    assert ndtr(high[0, 1]) == pytest.approx(1 / 201)
+    assert high[0, 0] == high[0, 2] == np.inf
+    assert np.isnan(low[0, 3])

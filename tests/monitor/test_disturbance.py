@@ -50,18 +50,21 @@ def test_the_filter_is_that_of_a_general_state_space_model() -> None:
 
     values = simulated([1.2, -0.5], 0.7, (1, 60))
     values[0, [5, 6, 30]] = np.nan
+    nothing = np.empty((1, 0))
     model = Disturbance(
-        np.array([[1.2, -0.5]]), np.array([20.0]), np.ones(1), np.array([0.49]), np.empty((1, 0))
+        np.array([[1.2, -0.5]]), np.full(1, 20.0), np.ones(1), np.full(1, 0.49), nothing, nothing
     )
-    _, errors = model.run(model.start(), values)
+    _, errors, deviation = model.run(model.start(), values)
     reference = SARIMAX(values[0] - 20, order=(2, 0, 0), measurement_error=True)
     found = reference.filter([1.2, -0.5, 0.49, 1.0])
     expected = found.forecasts_error[0] / np.sqrt(found.forecasts_error_cov[0, 0])
+    assert deviation[0] ** 2 == pytest.approx(found.forecasts_error_cov[0, 0], rel=1e-6)
     seen = ~np.isnan(values[0])
     assert errors[0, seen] == pytest.approx(expected[seen], rel=1e-6)
     assert np.isnan(errors[0, ~seen]).all()
 
 
+@pytest.mark.slow
 def test_an_oscillation_needs_the_second_order() -> None:
     values = simulated([1.6, -0.9], 0.3, (8, 300))
     for order, white in ((1, False), (2, True)):
@@ -71,11 +74,11 @@ def test_an_oscillation_needs_the_second_order() -> None:
 
 def test_bytes_do_not_depend_on_grouping(slow: tuple[NDArray, Disturbance]) -> None:
     values, model = slow
-    whole, errors = model.run(model.start(), values[:, :50])
+    whole, errors, _ = model.run(model.start(), values[:, :50])
     state: DisturbanceState = model.start()
     steps = []
     for t in range(50):
-        state, found = model.step(state, values[:, t])
+        state, found, _ = model.step(state, values[:, t])
         steps.append(found)
     assert np.array(steps).T.tobytes() == errors.tobytes()
     assert state.mean.tobytes() == whole.mean.tobytes()
@@ -89,13 +92,13 @@ def test_a_glitch_is_scored_and_forgotten_and_a_new_level_is_followed(
     for glitch in (1e300, -1e9, np.inf):
         hostile = values[:, :200].copy()
         hostile[:, 50] = glitch
-        state, errors = model.run(model.start(), hostile)
+        state, errors, _ = model.run(model.start(), hostile)
         assert np.all(np.abs(errors[:, 50]) > 100)
         assert np.nanmax(np.abs(errors[:, 51:])) < 6
         assert np.isfinite(state.mean).all()
     jumped = values[:, :200].copy()
     jumped[:, 50:] += 1000 * np.sqrt(model.process + model.measurement)[:, None]
-    _, errors = model.run(model.start(), jumped)
+    _, errors, _ = model.run(model.start(), jumped)
     assert np.all(
         np.abs(errors[:, 50:]).max(axis=1, where=~np.isnan(errors[:, 50:]), initial=0) > 100
     )

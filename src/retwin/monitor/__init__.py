@@ -26,6 +26,7 @@ _HOME = {
     "false_alarms": "promise",
     "fit_disturbance": "disturbance",
     "fit_scores": "scores",
+    "resolution": "scores",
 }
 
 __getattr__, __dir__, __all__ = names(__name__, _HOME)

@@ -51,6 +51,8 @@ class Disturbance:
     held_out : array (streams, T)
         Standardised one-step errors of the calibration, each block of samples predicted with
         parameters estimated without it; NaN where missing.
+    deviation : array (streams, T)
+        The standard deviations of these predictions, in the unit of the residual.
 
     References
     ----------
@@ -63,6 +65,7 @@ class Disturbance:
     process: NDArray
     measurement: NDArray
     held_out: NDArray
+    deviation: NDArray
 
     @property
     def parameters(self) -> NDArray:
@@ -77,12 +80,14 @@ class Disturbance:
 
     def step(
         self, state: DisturbanceState, residual: ArrayLike
-    ) -> tuple[DisturbanceState, NDArray]:
-        """Standardised one-step errors (streams,) of residuals (streams,); see `run`."""
-        state, errors = self.run(state, np.asarray(residual, dtype=float)[:, None])
-        return state, errors[:, 0]
+    ) -> tuple[DisturbanceState, NDArray, NDArray]:
+        """One sample of all streams: arrays (streams,); see `run`."""
+        made, errors, deviation = self.run(state, np.asarray(residual, dtype=float)[:, None])
+        return made, errors[:, 0], deviation[:, 0]
 
-    def run(self, state: DisturbanceState, residual: ArrayLike) -> tuple[DisturbanceState, NDArray]:
+    def run(
+        self, state: DisturbanceState, residual: ArrayLike
+    ) -> tuple[DisturbanceState, NDArray, NDArray]:
         """Standardised one-step errors of residuals.
 
         Parameters
@@ -95,8 +100,8 @@ class Disturbance:
 
         Returns
         -------
-        DisturbanceState, array (streams, T)
-            The next state, and the errors, standard deviation 1.
+        DisturbanceState, array (streams, T), array (streams, T)
+            The next state, the errors in standard deviations of the predictions, and those.
 
         """
         given = np.asarray(residual, dtype=float)
@@ -109,7 +114,7 @@ class Disturbance:
         )
         mean = state.mean.T.copy()
         covariance = np.moveaxis(state.covariance, 0, -1).copy()
-        errors = np.empty(given.shape[::-1])
+        errors, deviation = np.empty((2, *given.shape[::-1]))
         filtered = _errors(
             given.T - self.mean,
             self.coefficients.T,
@@ -119,8 +124,10 @@ class Disturbance:
             covariance,
         )
         for t, (error, variance) in enumerate(filtered):
-            errors[t] = error / np.sqrt(variance)
-        return DisturbanceState(mean.T, np.moveaxis(covariance, -1, 0)), errors.T
+            deviation[t] = np.sqrt(variance)
+            errors[t] = error / deviation[t]
+        made = DisturbanceState(mean.T, np.moveaxis(covariance, -1, 0))
+        return made, errors.T, deviation.T
 
 
 def fit_disturbance(residual: ArrayLike, *, max_order: int = 3, folds: int = 4) -> Disturbance:
@@ -174,16 +181,18 @@ def fit_disturbance(residual: ArrayLike, *, max_order: int = 3, folds: int = 4) 
     values = ((given - mean[:, None]) / scale[:, None]).T
     blocks = _blocks(values)
     point = _orders(blocks, max_order)
-    errors = np.full(values.shape, np.nan)
+    errors, deviation = np.full((2, *values.shape), np.nan)
     for block in folded:
         part = values.copy()
         part[block] = np.nan
         parts = _blocks(part)
         other, _ = _search(parts, point, ROUNDS // 2)
-        errors[block] = _standardised(values, other, _likelihood(parts, other)[1])[block]
+        found = _standardised(values, other, _likelihood(parts, other)[1])
+        errors[block], deviation[block] = found[:, block]
     coefficients, ratio = _model(point)
     variance = _likelihood(blocks, point)[1] * scale**2
-    return Disturbance(coefficients.T, mean, variance, variance * ratio, errors.T)
+    spread = deviation.T * scale[:, None]
+    return Disturbance(coefficients.T, mean, variance, variance * ratio, errors.T, spread)
 
 
 def _errors(
@@ -331,9 +340,10 @@ def _orders(blocks: NDArray, max_order: int) -> NDArray:
 
 
 def _standardised(values: NDArray, point: NDArray, scale: NDArray) -> NDArray:
-    """Errors of values (T, streams), in standard deviations by a variance of the process."""
+    """Errors of values (T, streams) in standard deviations, and those, for a process variance."""
     coefficients, ratio = _model(point)
     filtered = _errors(
         values, coefficients, 1.0, ratio, np.zeros_like(coefficients), _stationary(coefficients)
     )
-    return np.array([error / np.sqrt(variance * scale) for error, variance in filtered])
+    both = [(error, np.sqrt(variance * scale)) for error, variance in filtered]
+    return np.array([(error / each, each) for error, each in both]).swapaxes(0, 1)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 from retwin.checks import require
 from retwin.monitor.slack import Slack, effective_samples
 
-__all__ = ["ConformalScores", "fit_scores"]
+__all__ = ["ConformalScores", "fit_scores", "resolution"]
 
 FEWEST = 8
 """Calibration errors per stream, at least."""
+COPIES = 8
+"""Places inside a rounding interval that stand for a rounded error."""
+SCALES = np.geomspace(0.05, 2, 32)
+"""Standard deviations of errors before rounding, relative to those after it."""
 
 
 @dataclass(frozen=True)
@@ -24,50 +28,62 @@ class ConformalScores:
     Among n calibration errors, an error that k of them are below and m of them not above has a
     conformal p-value between k / (n + 1) and (m + 1) / (n + 1), uniform if it is exchangeable with
     them (Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005, section 2.2.3).
-    Ties and quantisation only widen the interval. Nothing is assumed of the errors' distribution.
+    Ties only widen the interval. Nothing is assumed of the errors' distribution.
+
+    A rounded sample is known to be in an interval only, and its error given the past has few
+    possible values, which depend on the prediction. A rounded calibration error therefore counts in
+    equal parts at several places of its interval, those of a Gaussian distribution of the scale
+    that maximises the likelihood of all intervals, and the score of a rounded error is the
+    interval of ranks that its own interval spans.
 
     Attributes
     ----------
     errors : complex array (N,)
-        Calibration errors, sorted; the stream is the real part.
-    quantiles : array (N + 2 streams,)
-        Standard Gaussian quantiles at 0, 1 / (n + 1), …, 1, of each stream.
-    counts : array (streams,)
-        Calibration errors of each stream.
+        Calibration errors, each `copies` times, sorted; the stream is the real part.
+    quantiles : array
+        For each stream the standard Gaussian quantiles at equal steps from 0 to 1, as many as
+        there are ranks.
+    copies : int
+        Places that stand for one error: 1 if nothing is rounded.
     independent : array (streams,)
-        The number of independent ones that are worth as much.
+        The number of independent errors that are worth as much.
 
     """
 
     errors: NDArray
     quantiles: NDArray
-    counts: NDArray
+    copies: int
     independent: NDArray
 
-    def score(self, errors: ArrayLike) -> tuple[NDArray, NDArray]:
+    def score(self, errors: ArrayLike, width: ArrayLike = 0.0) -> tuple[NDArray, NDArray]:
         """Lower and upper ends of the scores of errors, NaN where missing.
 
         Parameters
         ----------
         errors : array (streams,) or (streams, T)
             Errors like those of the calibration; infinite ones are large.
+        width : float or array like errors
+            Widths of their rounding intervals: see `fit_scores`.
 
         """
         given = np.asarray(errors, dtype=float)
         require(
-            given.ndim in (1, 2) and len(given) == len(self.counts),
+            given.ndim in (1, 2) and len(given) == len(self.independent),
             "errors",
-            expected=f"errors of {len(self.counts)} streams",
+            expected=f"errors of {len(self.independent)} streams",
             got=f"shape {given.shape}",
             remedy="give one row per stream of the calibration",
         )
         streams = np.arange(len(given)).reshape(-1, *(1,) * (given.ndim - 1))
-        missing = np.isnan(given)
-        key = np.empty(given.shape, dtype=complex)
-        key.real, key.imag = streams, np.where(missing, 0.0, given)
-        below = np.searchsorted(self.errors, key, side="left") + 2 * streams
-        upto = np.searchsorted(self.errors, key, side="right") + 2 * streams + 1
-        low, high = (np.where(missing, np.nan, self.quantiles[each]) for each in (below, upto))
+        half = np.asarray(width, dtype=float) / 2 if self.copies > 1 else 0.0
+        missing = np.isnan(given + half)
+        low_key, high_key = (
+            _key(streams, np.where(missing, 0.0, end)) for end in (given - half, given + half)
+        )
+        first = (self.copies + 1) * streams  # more ranks than errors in each stream before
+        below = np.searchsorted(self.errors, low_key, side="left") + first
+        upto = np.searchsorted(self.errors, high_key, side="right") + first + self.copies
+        low, high = (np.where(missing, np.nan, self.quantiles[rank]) for rank in (below, upto))
         return low, high
 
     def slack(self, parameters: ArrayLike = 0, confidence: float = 0.95) -> tuple[Slack, ...]:
@@ -86,7 +102,7 @@ class ConformalScores:
         return tuple(made[key] for key in keys)
 
 
-def fit_scores(errors: ArrayLike) -> ConformalScores:
+def fit_scores(errors: ArrayLike, width: ArrayLike = 0.0) -> ConformalScores:
     """Scores by the ranks among calibration errors of one-step predictions.
 
     Parameters
@@ -95,10 +111,14 @@ def fit_scores(errors: ArrayLike) -> ConformalScores:
         Standardised errors, probability integral transforms, or any other statistic that has one
         distribution while the machine is healthy: of samples that the predictive model was not
         fitted on. NaN is missing; each stream has at least 8 finite ones.
+    width : float or array that broadcasts to errors
+        Widths of the intervals to which samples are rounded, in the unit of the errors: the
+        `resolution` of the sensor over the standard deviation of the prediction. 0 is none.
 
     """
     given = np.asarray(errors, dtype=float)
-    seen = np.isfinite(given)
+    widths = np.broadcast_to(np.asarray(width, dtype=float), given.shape)
+    seen = np.isfinite(given) & np.isfinite(widths)
     require(
         given.ndim == 2 and given.size and seen.sum(axis=-1).min() >= FEWEST,
         "errors",
@@ -106,12 +126,69 @@ def fit_scores(errors: ArrayLike) -> ConformalScores:
         got=f"shape {given.shape}" + (f" with {seen.sum(axis=-1).min()}" if given.size else ""),
         remedy="calibrate on a longer healthy record",
     )
-    counts = seen.sum(axis=1)
-    made = np.concatenate(
-        [np.sort(row[there]) + 0j for row, there in zip(given, seen, strict=True)]
-    )
-    made.imag, made.real = made.real.copy(), np.repeat(np.arange(len(given)), counts)
-    quantiles = np.concatenate([ndtri(np.arange(count + 2) / (count + 1)) for count in counts])
-    fitted = ConformalScores(made, quantiles, counts, counts.astype(float))
-    low, high = (np.clip(each, -4, 4) for each in fitted.score(given))
-    return ConformalScores(made, quantiles, counts, effective_samples((low + high) / 2))
+    rounded = bool(np.any(widths[seen] > 0))
+    copies = COPIES if rounded else 1
+    rows = [
+        np.sort(_spread(row[there], wide[there]).ravel() if rounded else row[there])
+        for row, wide, there in zip(given, widths, seen, strict=True)
+    ]
+    keys = np.concatenate([_key(np.array(i), row) for i, row in enumerate(rows)])
+    ranks = [len(row) + copies for row in rows]
+    quantiles = np.concatenate([ndtri(np.arange(count + 1) / count) for count in ranks])
+    fitted = ConformalScores(keys, quantiles, copies, seen.sum(axis=1).astype(float))
+    low, high = (np.clip(each, -4, 4) for each in fitted.score(given, widths))
+    return replace(fitted, independent=effective_samples((low + high) / 2))
+
+
+def resolution(measured: ArrayLike) -> NDArray:
+    """The steps to which a sensor rounds, 0 where it does not.
+
+    Parameters
+    ----------
+    measured : array (streams, T)
+        Measured outputs, not residuals; NaN is missing.
+
+    Returns
+    -------
+    array (streams,)
+        The smallest difference of two values of a stream, if all values are multiples of it from
+        each other, to a millionth of their range, and less than half of them are different.
+
+    """
+    given = np.asarray(measured, dtype=float)
+    steps = np.zeros(len(given))
+    for i, row in enumerate(given):
+        values, counts = np.unique(row[np.isfinite(row)], return_counts=True)
+        if 1 < len(values) < counts.sum() / 2:
+            offsets = values - values[0]
+            apart = np.diff(values)
+            step = apart[apart > 1e-9 * offsets[-1]].min()
+            if np.all(np.abs(offsets - step * np.round(offsets / step)) <= 1e-6 * offsets[-1]):
+                steps[i] = step
+    return steps
+
+
+def _key(stream: NDArray, value: NDArray) -> NDArray:
+    """Complex numbers, which numpy sorts by the real part and then by the imaginary one."""
+    made = np.empty(np.broadcast_shapes(stream.shape, value.shape), dtype=complex)
+    made.real, made.imag = stream, value
+    return made
+
+
+def _spread(errors: NDArray, width: NDArray) -> NDArray:
+    """Places (n, COPIES) of equal probability inside the rounding intervals of errors (n,)."""
+    # In the lower tail, where differences of probabilities keep their digits.
+    sign, centre, half = np.sign(errors), -np.abs(errors), width / 2
+    likelihood = [np.sum(np.log(_mass(centre, half, scale)[1])) for scale in SCALES]
+    scale = SCALES[int(np.argmax(likelihood))]
+    first, mass = _mass(centre, half, scale)
+    inside = first[:, None] + mass[:, None] * (np.arange(COPIES) + 0.5) / COPIES
+    least, most = (centre - half)[:, None], (centre + half)[:, None]
+    made = np.clip(scale * ndtri(inside), least, most)
+    return np.where(sign[:, None] > 0, -made, made)
+
+
+def _mass(centre: NDArray, half: NDArray, scale: float) -> tuple[NDArray, NDArray]:
+    """Gaussian probability below intervals and in them, above 0."""
+    first = ndtr((centre - half) / scale)
+    return first, np.maximum(ndtr((centre + half) / scale) - first, 1e-300)
