@@ -163,7 +163,7 @@ def _bets(alternative: Alternative, slack: Slack, levels: NDArray) -> NDArray:
     finite("slack.kappa", slack.kappa, least=1)
     logs = [alternative.log_bet(CENTRES, level, slack.kappa) for level in levels]
     values = np.maximum(np.exp(np.minimum(logs, 40.0)), FLOOR)
-    # Scores that are reached from each cell of Gaussian quantiles, by any member of the class.
+    # Scores that a member of the class may have at the Gaussian quantiles of each cell.
     first = np.searchsorted(EDGES, slack.lower(EDGES[:-1]), side="right") - 1
     last = np.searchsorted(EDGES, slack.upper(EDGES[1:]), side="left")
     pairs = zip(first, last, strict=True)

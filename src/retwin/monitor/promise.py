@@ -126,7 +126,7 @@ class Promise:
 
 
 def _duration(seconds: float) -> str:
-    """A duration in the largest unit of which it has at least one, weeks apart, or in seconds."""
+    """A duration in the largest unit but weeks of which it has at least one, or in seconds."""
     units = [each for each in reversed(SECONDS) if each != "week" and seconds >= SECONDS[each]]
     unit = units[0] if units else "second"
     count = f"{seconds / SECONDS[unit]:.3g}"

@@ -161,8 +161,8 @@ def resolution(measured: ArrayLike) -> NDArray:
         values, counts = np.unique(row[np.isfinite(row)], return_counts=True)
         if 1 < len(values) < counts.sum() / 2:
             offsets = values - values[0]
-            apart = np.diff(values)
-            step = apart[apart > 1e-9 * offsets[-1]].min()
+            differences = np.diff(values)
+            step = differences[differences > 1e-9 * offsets[-1]].min()
             if np.all(np.abs(offsets - step * np.round(offsets / step)) <= 1e-6 * offsets[-1]):
                 steps[i] = step
     return steps
