@@ -122,6 +122,9 @@ def test_a_missing_sample_changes_no_evidence_and_is_no_time() -> None:
     assert found[:, ::2].tobytes() == evidence.tobytes()
     assert found[:, 1::2].tobytes() == evidence.tobytes()
     assert other.evidence.tobytes() == state.evidence.tobytes()
+    everything = np.full((3, 4), np.inf)
+    all_ranks, _ = detector.run(state, -everything, everything)
+    assert all_ranks.evidence == pytest.approx(state.evidence + 4), "a bet of 1 each"
     empty, nothing = detector.step(detector.start(3), np.full(3, np.nan))
     assert same(empty, detector.start(3))
     assert not nothing.any()
@@ -139,6 +142,8 @@ def test_wrong_shapes_and_settings_are_refused() -> None:
     detector = Detector()
     with pytest.raises(InputError, match="scores of 2 streams"):
         detector.run(detector.start(2), np.zeros((3, 4)))
+    with pytest.raises(InputError, match="lower ends of intervals"):
+        detector.step(detector.start(1), [1.0], [0.5])
     with pytest.raises(InputError, match="kind: expected one of"):
         Detector(kind="ewma")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="streams: expected 2"):

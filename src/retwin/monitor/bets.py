@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from retwin.checks import finite
 from retwin.monitor.slack import Slack
 
 __all__ = ["ALTERNATIVES", "Alternative", "Bets", "Dependence", "Location", "Scale", "Tails"]
@@ -160,7 +159,6 @@ class Bets:
 
 def _bets(alternative: Alternative, slack: Slack, levels: NDArray) -> NDArray:
     """An alternative's bet (levels, cells), divided by its largest expectation over the class."""
-    finite("slack.kappa", slack.kappa, least=1)
     logs = [alternative.log_bet(CENTRES, level, slack.kappa) for level in levels]
     values = np.maximum(np.exp(np.minimum(logs, 40.0)), FLOOR)
     # Scores that a member of the class may have at the Gaussian quantiles of each cell.

@@ -144,7 +144,7 @@ class Detector:
     ) -> tuple[DetectorState, NDArray]:
         """Many samples of all streams: arrays (streams, T) in place of (streams,) of `step`.
 
-        The bytes are those of T calls of `step`.
+        The bytes are those of T calls of `step`. Memory grows with T: give long records in parts.
         """
         low, top = self.intervals(state.previous, score, high)
         evidence, made = state.evidence.T, np.empty(low.shape[::-1])
@@ -172,6 +172,13 @@ class Detector:
             got=f"shapes {low.shape} and {top.shape}",
             remedy="start a state for as many streams as there are",
         )
+        require(
+            not np.any(low > top),
+            "score",
+            expected="lower ends of intervals that are not above the upper ones",
+            got="at least one that is",
+            remedy="give what `ConformalScores.score` returns, in its order",
+        )
         return low, top
 
     def factors(
@@ -183,9 +190,9 @@ class Detector:
         """
         bets = self.bets
         first, last = (each.T.copy() for each in bets.position(low, high))
-        centre = (low + high) / 2
+        centre = (np.clip(low, -9, 9) + np.clip(high, -9, 9)) / 2
         seen = ~np.isnan(centre)
-        centre = np.where(seen, np.clip(centre, -9, 9), 0.0).T.copy()
+        centre = np.where(seen, centre, 0.0).T.copy()
         for a, b, there, score in zip(first, last, seen.T.astype(float), centre, strict=True):
             offset = bets.offset(self.which, previous)
             a, b = a + offset, b + offset
