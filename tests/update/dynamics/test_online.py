@@ -29,7 +29,7 @@ def fitted(interpolation: str) -> DynamicsTwin:
     twin = replace(TWIN, interpolation=interpolation)
     made = twin.simulate(COMMANDS, seed=0, parameters={"k": 5.0})
     noise = 1e-2 * np.random.default_rng(1).normal(size=made.observed.shape)
-    settings = Dynamics(Library(0, (), False), memory=False)
+    settings = Dynamics(Library(0, (), False))
     return fit_dynamics(twin, made.replace(observed=made.observed + noise), settings).twin
 
 
