@@ -1,7 +1,8 @@
 """Monitoring of a running machine by its twin, with false alarms no more often than promised.
 
-Belongs here: what turns streams of prediction errors into scores, evidence and alarms, and the
-promise that goes with them. Not here: fitting of twins, and causes of alarms (see `diagnosis`).
+Belongs here: what turns streams of measured samples into scores, evidence and alarms, the promise
+that goes with them, and the causes of alarms. Not here: fitting of twins, and evidence for faults
+of whole records (see `diagnosis`).
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from __future__ import annotations
 from retwin._lazy import names
 
 _HOME = {
+    "Alarm": "monitor",
+    "Cause": "cause",
     "ConformalScores": "scores",
     "Dependence": "bets",
     "Detector": "detector",
@@ -16,15 +19,20 @@ _HOME = {
     "Disturbance": "disturbance",
     "DisturbanceState": "disturbance",
     "Location": "bets",
+    "Monitor": "monitor",
+    "MonitorState": "monitor",
     "Promise": "promise",
     "Scale": "bets",
     "Slack": "slack",
     "Tails": "bets",
     "Validity": "validity",
     "ValidityState": "validity",
+    "Watched": "monitor",
     "effective_samples": "slack",
     "false_alarms": "promise",
+    "find_causes": "cause",
     "fit_disturbance": "disturbance",
+    "fit_monitor": "monitor",
     "fit_scores": "scores",
     "resolution": "scores",
 }

@@ -1,0 +1,132 @@
+"""Causes of alarms: which fault of the system explains what was measured before one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from retwin.checks import require, whole
+from retwin.data.trajectories import Trajectories
+from retwin.diagnosis.estimate import Estimate
+from retwin.diagnosis.state_inversion import StateInversionDiagnoser
+from retwin.monitor.monitor import Alarm
+from retwin.twins.faults import Fault
+from retwin.twins.system_faults import TimedFault
+from retwin.update.dynamics.twin import DynamicsTwin
+
+__all__ = ["Cause", "find_causes"]
+
+BEFORE = 100
+"""Samples before an alarm from which its cause is inferred."""
+FEWEST = 10
+"""Samples of a window, at least; the one of an earlier alarm is left out where more remain."""
+
+PARTS = ("value", "low", "high")
+"""Of an estimate."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """What explains an alarm best.
+
+    Attributes
+    ----------
+    alarm : Alarm
+        The alarm.
+    name : str
+        The most probable class.
+    probability : float
+        Its probability, if one of the classes is the true one.
+    unknown : float
+        Probability that there is something besides: none of the classes, or one that does more than
+        its equation.
+    size, onset : tuple of float
+        Value, and ends of the 90 % interval; the onset is in s from the first sample of the record.
+        NaN where the class has none.
+    probabilities : dict of str to float
+        Of all classes.
+
+    """
+
+    alarm: Alarm
+    name: str
+    probability: float
+    unknown: float
+    size: tuple[float, float, float]
+    onset: tuple[float, float, float]
+    probabilities: dict[str, float]
+
+
+def find_causes(
+    twin: DynamicsTwin,
+    record: Trajectories,
+    alarms: Sequence[Alarm],
+    faults: Mapping[str, Fault | None],
+    before: int = BEFORE,
+) -> list[Cause]:
+    """The causes of alarms, from the samples before each up to it.
+
+    Parameters
+    ----------
+    twin : DynamicsTwin
+        The twin of the monitor.
+    record : Trajectories
+        What was watched.
+    alarms : sequence of Alarm
+        Alarms of `Monitor.watch`.
+    faults : mapping of str to Fault or None
+        Classes, None for the healthy one. Their sizes count; a fault may begin at any sample before
+        the alarm and lasts until it.
+    before : int
+        Number of samples before an alarm from which its cause is inferred. They begin after the
+        alarm before it, if that is later and leaves ten samples.
+
+    Raises
+    ------
+    InputError
+        Faults that cannot be inverted (`fit_inversion`), or an alarm of another record.
+
+    """
+    whole("before", before, least=FEWEST)
+    ids, found, last = record.ids.tolist(), [], dict[str, int]()
+    for alarm in alarms:
+        require(
+            alarm.trajectory in ids and alarm.sample < record.steps,
+            "alarms",
+            expected="alarms of this record",
+            got=f"one of {alarm.trajectory!r} at sample {alarm.sample}",
+            remedy="give the record that was watched",
+        )
+        first = max(0, alarm.sample - before)
+        if alarm.sample - last.get(alarm.trajectory, -1) > FEWEST:
+            first = max(first, last.get(alarm.trajectory, -1) + 1)
+        last[alarm.trajectory] = alarm.sample
+        begin, end = first / record.rate, (alarm.sample + 1) / record.rate
+        window = record[[ids.index(alarm.trajectory)]].between(begin, end)
+        latest = (alarm.sample - first) / record.rate
+        own = {
+            name: replace(each, onset=(0.0, latest), end=None)
+            if isinstance(each, TimedFault)
+            else each
+            for name, each in faults.items()
+        }
+        made = StateInversionDiagnoser(twin, own).diagnose(window, known_start=first == 0)
+        best = int(made.probabilities[0].argmax())
+
+        def interval(estimate: Estimate, best: int = best) -> tuple[float, float, float]:
+            value, low, high = (getattr(estimate, part)[0, best] for part in PARTS)
+            return float(value), float(low), float(high)
+
+        onset = interval(made.onset)
+        found.append(
+            Cause(
+                alarm,
+                made.classes[best],
+                float(made.probabilities[0, best]),
+                float(made.unknown[0]),
+                interval(made.size),
+                (begin + onset[0], begin + onset[1], begin + onset[2]),
+                dict(zip(made.classes, made.probabilities[0].tolist(), strict=True)),
+            )
+        )
+    return found

@@ -1,0 +1,568 @@
+"""`Monitor`: watches running machines by their corrected twin, and raises alarms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from retwin.checks import finite, instance, require, whole
+from retwin.data.trajectories import Trajectories
+from retwin.monitor.bets import Dependence, Location, Scale
+from retwin.monitor.detector import Detector, DetectorState
+from retwin.monitor.disturbance import Disturbance, DisturbanceState, fit_disturbance
+from retwin.monitor.promise import Promise, false_alarms
+from retwin.monitor.scores import ConformalScores, fit_scores, resolution
+from retwin.monitor.slack import Slack
+from retwin.monitor.validity import Validity, ValidityState
+from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.twins.twin import check_channels
+from retwin.update.dynamics.online import FilterState, OnlineFilter
+from retwin.update.dynamics.prediction import root_of, whitened
+from retwin.update.dynamics.twin import DynamicsTwin
+
+__all__ = ["Alarm", "Monitor", "MonitorState", "Watched", "fit_monitor"]
+
+KIND = "monitor"
+"""Kind of the saved model."""
+APART = 200
+"""Missing samples that are put between two calibration records, so that neither predicts the
+other."""
+SETTLED = 1.05
+"""Ratio of a predicted standard deviation to its usual one, from which on the filter knows the
+states of a machine that it did not see start."""
+PARTS = {
+    "filter": FilterState,
+    "disturbance": DisturbanceState,
+    "detector": DetectorState,
+    "validity": ValidityState,
+}
+"""What the state of a monitor consists of."""
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorState:
+    """What a monitor remembers of n machines with d_y outputs each; all of it.
+
+    Attributes
+    ----------
+    filter : FilterState
+        Of the n machines.
+    disturbance, detector, validity
+        Of n * d_y streams, the outputs of the first machine first.
+    samples, blank : NDArray
+        (n,), samples since the start, and samples for which no alarm is raised any more.
+    void : NDArray
+        (n,) bool, whether the promise does not apply to the machine.
+
+    """
+
+    filter: FilterState
+    disturbance: DisturbanceState
+    detector: DetectorState
+    validity: ValidityState
+    samples: NDArray
+    blank: NDArray
+    void: NDArray
+
+    def arrays(self) -> dict[str, NDArray]:
+        """All arrays by name, whose first axis is that of machines."""
+        found = {}
+        for part in fields(self):
+            value = getattr(self, part.name)
+            if isinstance(value, np.ndarray):
+                found[part.name] = value
+                continue
+            for each in fields(value):
+                array = getattr(value, each.name)
+                if not isinstance(value, FilterState):
+                    array = array.reshape(len(self.void), -1, *array.shape[1:])
+                found[f"{part.name}.{each.name}"] = array
+        return found
+
+    @classmethod
+    def of_arrays(cls, arrays: dict[str, NDArray]) -> MonitorState:
+        """The state of what `arrays` gave, of some machines or of several joined."""
+
+        def part(name: str, kind: Any) -> Any:
+            own = {each.name: arrays[f"{name}.{each.name}"] for each in fields(kind)}
+            if kind is not FilterState:
+                own = {key: each.reshape(-1, *each.shape[2:]) for key, each in own.items()}
+            return kind(**own)
+
+        return cls(
+            *(part(name, kind) for name, kind in PARTS.items()),
+            *(arrays[name] for name in ("samples", "blank", "void")),
+        )
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """A change that a monitor has found.
+
+    Attributes
+    ----------
+    trajectory : str
+        The id of the record or machine.
+    sample : int
+        Number of the sample at which the alarm was raised.
+    time : float
+        Its time in s from the first sample.
+    output : str
+        The output with most evidence.
+    change : str
+        The change of that output's errors for which there is most evidence.
+    evidence : float
+        At least the average run length of the promise.
+
+    """
+
+    trajectory: str
+    sample: int
+    time: float
+    output: str
+    change: str
+    evidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """What a monitor found in T samples of n machines.
+
+    Attributes
+    ----------
+    mean, deviation : NDArray
+        (n, T, d_y), one-step predictions of the twin.
+    score : NDArray
+        (n, T, d_y), of the errors: standard Gaussian for a healthy machine; NaN for samples that
+        do not count.
+    evidence : NDArray
+        (n, T), that of a change; an alarm is raised from the average run length on.
+    alarm, void : NDArray
+        (n, T) bool, whether an alarm was raised, and whether the promise does not apply.
+    alarms : list of Alarm
+        The alarms.
+
+    """
+
+    mean: NDArray
+    deviation: NDArray
+    score: NDArray
+    evidence: NDArray
+    alarm: NDArray
+    void: NDArray
+    alarms: list[Alarm]
+
+
+@dataclass(frozen=True, eq=False)
+class Monitor:
+    """A corrected twin that watches machines, with a promise of how rare false alarms are.
+
+    A Kalman filter predicts each sample from all earlier ones, an autoregression what its errors
+    have in common, and their ranks among those of the calibration are scores. An e-detector sums
+    the evidence for a change of these scores (`Detector`), and a test finds out whether the
+    promise applies (`Validity`).
+
+    Attributes
+    ----------
+    twin : DynamicsTwin
+        The twin.
+    disturbance : Disturbance
+        Of the d_y outputs.
+    scores : ConformalScores
+        The calibration errors of the d_y outputs.
+    slack : tuple of Slack
+        The classes of distributions of the scores of the d_y outputs.
+    resolution : NDArray
+        (d_y,), the steps to which the outputs are rounded; 0 for none.
+    arl : float
+        Average number of measured samples to a false alarm, at least.
+    blanking : float
+        Time in s after an alarm in which none is raised.
+    warm_up : float
+        Time in s after the first sample in which no evidence is counted: the states are unknown.
+    alpha : float
+        Probability of declaring a promise void that applies.
+
+    """
+
+    twin: DynamicsTwin
+    disturbance: Disturbance
+    scores: ConformalScores
+    slack: tuple[Slack, ...]
+    resolution: NDArray
+    arl: float
+    blanking: float = 0.0
+    warm_up: float = 0.0
+    alpha: float = 0.01
+
+    @property
+    def promises(self) -> dict[str, Promise]:
+        """What is promised of each output."""
+        return {
+            name: Promise(self.arl, self.twin.rate, slack, self.alpha)
+            for name, slack in zip(self.twin.outputs.names, self.slack, strict=True)
+        }
+
+    def start(self, count: int) -> MonitorState:
+        """What is known of so many machines before their first sample."""
+        streams = self._streams(count)
+        zeros = np.zeros(count, dtype=np.int64)
+        return MonitorState(
+            OnlineFilter(self.twin).start(count),
+            streams.disturbance.start(),
+            streams.detector.start(count * len(self.slack)),
+            streams.validity.start(count * len(self.slack)),
+            zeros,
+            zeros,
+            np.zeros(count, dtype=bool),
+        )
+
+    def step(
+        self, state: MonitorState, commands: ArrayLike, measured: ArrayLike, ids: ArrayLike = ()
+    ) -> tuple[MonitorState, Watched]:
+        """Watch T more samples of n machines. However samples are cut, results are the same bytes.
+
+        Parameters
+        ----------
+        state : MonitorState
+            After the samples before. It is not changed.
+        commands : array_like, shape (n, T, d_u)
+            A command that is not finite is the one before it; the first must be finite.
+        measured : array_like, shape (n, T, d_y)
+            Outputs; those that are not finite are missing.
+        ids : sequence of str, optional
+            Names of the machines.
+
+        """
+        commands, measured = (np.asarray(each, dtype=float) for each in (commands, measured))
+        count, samples = measured.shape[:2]
+        require(
+            commands.shape == (count, samples, len(self.twin.inputs))
+            and measured.shape == (count, samples, len(self.twin.outputs))
+            and count == len(state.void),
+            "measured",
+            expected=f"samples of {len(state.void)} machines with {len(self.twin.inputs)} "
+            f"commands and {len(self.twin.outputs)} outputs",
+            got=f"shapes {commands.shape} and {measured.shape}",
+            remedy="give arrays (machines, samples, channels)",
+        )
+        seen = np.isfinite(measured)
+        known = self._held(state, commands)
+        filtered, mean, covariance = OnlineFilter(self.twin).step(
+            state.filter, known, measured, seen
+        )
+        error, width = _standardised(measured - mean, covariance, seen, self.resolution)
+        streams = self._streams(count)
+        disturbance, error, scale = streams.disturbance.run(state.disturbance, _by_stream(error))
+        width = _by_stream(width) / scale
+        low, high = self.scores.score(_by_output(error, count), _by_output(width, count))
+        low, high = (_by_stream(_by_machine(each, count)) for each in (low, high))
+        late = state.samples[:, None] + np.arange(samples) < round(self.warm_up * self.twin.rate)
+        hidden = np.repeat(late, len(self.slack), axis=0)
+        low, high = (np.where(hidden, np.nan, each) for each in (low, high))
+        state = replace(state, filter=filtered, disturbance=disturbance)
+        state, found = self._detected(streams, state, low, high, list(np.asarray(ids, dtype=str)))
+        state = replace(state, samples=state.samples + samples)
+        evidence, alarm, void, alarms = found
+        deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
+        shape = (count, len(self.slack), samples)
+        score = np.moveaxis(((low + high) / 2).reshape(shape), 1, 2)
+        return state, Watched(mean, deviation, score, evidence, alarm, void, alarms)
+
+    def watch(self, record: Trajectories) -> Watched:
+        """Watch recorded trajectories, each as a machine of its own.
+
+        Raises
+        ------
+        InputError
+            Other channels or another rate than those of the twin.
+
+        """
+        check_channels(self.twin, record, "record")
+        measured = np.where(record.mask, record.observed, np.nan)
+        return self.step(self.start(len(record)), record.commands, measured, record.ids)[1]
+
+    def _detected(
+        self,
+        streams: _Streams,
+        state: MonitorState,
+        low: NDArray,
+        high: NDArray,
+        ids: list[str],
+    ) -> tuple[MonitorState, tuple[NDArray, NDArray, NDArray, list[Alarm]]]:
+        """Evidence and alarms of scores (n * d_y, T): the detector begins anew after each alarm."""
+        count, samples = len(state.void), low.shape[1]
+        each = len(self.slack)
+        evidence, alarm = np.zeros((count, samples)), np.zeros((count, samples), dtype=bool)
+        void, alarms, first = alarm.copy(), [], 0
+        pause = round(self.blanking * self.twin.rate)
+        while first < samples:
+            # The scores up to the next alarm, and of a machine that pauses none.
+            number = np.arange(samples - first)
+            paused = np.repeat(state.blank[:, None] > number, each, axis=0)
+            part = [np.where(paused, np.nan, own[:, first:]) for own in (low, high)]
+            detector, found = streams.detector.run(state.detector, *part)
+            total = found.reshape(count, each, -1).mean(axis=1)
+            raised = total >= self.arl
+            ends = np.flatnonzero(raised.any(axis=0))
+            last = int(ends[0]) + 1 if len(ends) else samples - first
+            if last < samples - first:
+                part = [own[:, :last] for own in part]
+                detector, found = streams.detector.run(state.detector, *part)
+            here = slice(first, first + last)
+            evidence[:, here], alarm[:, here] = total[:, :last], raised[:, :last]
+            now = raised[:, last - 1]
+            flags = np.repeat(raised[:, :last], each, axis=0)
+            validity, against = streams.validity.run(state.validity, flags, *part)
+            broken = against.reshape(count, each, -1).mean(axis=1) >= 1 / self.alpha
+            void[:, here] = np.logical_or.accumulate(broken, axis=1) | state.void[:, None]
+            for machine in np.flatnonzero(now):
+                sample = int(state.samples[machine]) + first + last - 1
+                rows = slice(machine * each, (machine + 1) * each)
+                output = int(np.argmax(found[rows, -1]))
+                chosen = int(
+                    np.argmax(detector.evidence[rows][output] * streams.detector.bets.weights)
+                )
+                alarms.append(
+                    Alarm(
+                        ids[machine] if ids else str(machine),
+                        sample,
+                        sample / self.twin.rate,
+                        self.twin.outputs.names[output],
+                        _described(streams.detector, chosen),
+                        float(total[machine, last - 1]),
+                    )
+                )
+            state = replace(
+                state,
+                detector=streams.detector.reset(detector, np.repeat(now, each)),
+                validity=validity,
+                blank=np.where(now, pause, np.maximum(state.blank - last, 0)),
+                void=void[:, first + last - 1],
+            )
+            first += last
+        return state, (evidence, alarm, void, alarms)
+
+    def _held(self, state: MonitorState, commands: NDArray) -> NDArray:
+        """Commands (n, T, d_u), where those that are not finite are as before."""
+        known = np.concatenate([state.filter.commands[:, -1:], commands], axis=1)
+        index = np.where(np.isfinite(known), np.arange(known.shape[1])[:, None], 0)
+        index = np.maximum.accumulate(index, axis=1)
+        held = np.take_along_axis(known, index, axis=1)[:, 1:]
+        require(
+            np.isfinite(held).all(),
+            "commands",
+            expected="finite commands at the first sample of each machine",
+            got="others",
+            remedy="begin at the first sample whose commands are known",
+        )
+        return held
+
+    @cached_property
+    def _by_count(self) -> dict[int, _Streams]:
+        """The parts for each number of machines that was used: their tables take long to make."""
+        return {}
+
+    def _streams(self, count: int) -> _Streams:
+        if count not in self._by_count:
+            self._by_count[count] = _Streams.of(self, count)
+        return self._by_count[count]
+
+    def save(self, folder: str | Path) -> None:
+        """Write the twin, the calibration and the promise."""
+        about = {
+            "slack": [[each.kappa, each.shift] for each in self.slack],
+            "copies": self.scores.copies,
+            **{name: getattr(self, name) for name in NUMBERS},
+        }
+        arrays = {name: getattr(self.disturbance, name) for name in DISTURBANCE}
+        arrays |= {"stream": self.scores.errors.real, "error": self.scores.errors.imag}
+        arrays |= {name: getattr(self.scores, name) for name in SCORES}
+        arrays["resolution"] = self.resolution
+        tensors = {name: torch.tensor(np.ascontiguousarray(each)) for name, each in arrays.items()}
+        with write_model(folder, KIND, about, tensors) as temporary:
+            self.twin.save(temporary / "twin")
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Monitor:
+        """Read what `save` wrote. Raises InputError if it is no monitor or is damaged."""
+        about, weights = read_model(folder, KIND)
+        with refusing(folder, expected="a monitor"):
+            arrays = {name: each.numpy() for name, each in weights.items()}
+            nothing = np.zeros((len(arrays["mean"]), 0))
+            own = {name: arrays[name] for name in DISTURBANCE}
+            disturbance = Disturbance(**own, held_out=nothing, deviation=nothing)
+            errors = np.empty(len(arrays["error"]), dtype=complex)
+            errors.real, errors.imag = arrays["stream"], arrays["error"]
+            copies = whole("copies", about["copies"], least=1)
+            quantiles, independent = (arrays[name] for name in SCORES)
+            scores = ConformalScores(errors, quantiles, copies, independent)
+            slack = tuple(Slack(*each) for each in about["slack"])
+            twin = DynamicsTwin.load(Path(folder) / "twin")
+            numbers = {name: finite(name, about[name], least=0.0) for name in NUMBERS}
+            shapes = [
+                len(each) for each in (disturbance.mean, independent, slack, arrays["resolution"])
+            ]
+            require(
+                shapes == [len(twin.outputs)] * 4
+                and len(quantiles) == len(errors) + len(slack) * (copies + 1)
+                and np.isfinite(disturbance.coefficients).all()
+                and (disturbance.process > 0).all()
+                and (disturbance.measurement >= 0).all(),
+                "weights",
+                expected=f"the calibration of {len(twin.outputs)} outputs",
+                got=shapes,
+                remedy="save the monitor again",
+            )
+            return cls(twin, disturbance, scores, slack, arrays["resolution"], **numbers)
+
+
+NUMBERS = ("arl", "blanking", "warm_up", "alpha")
+"""Attributes of a monitor that are saved as numbers."""
+DISTURBANCE = ("coefficients", "mean", "process", "measurement")
+SCORES = ("quantiles", "independent")
+"""Attributes of the disturbance and of the scores that are saved as arrays."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Streams:
+    """The parts of a monitor for the outputs of so many machines."""
+
+    disturbance: Disturbance
+    detector: Detector
+    validity: Validity
+
+    @classmethod
+    def of(cls, monitor: Monitor, count: int) -> _Streams:
+        repeated = {
+            name: np.concatenate([getattr(monitor.disturbance, name)] * count)
+            for name in DISTURBANCE
+        }
+        detector = Detector(monitor.slack * count)
+        return cls(
+            replace(monitor.disturbance, **repeated),
+            detector,
+            Validity(detector, monitor.arl, monitor.alpha),
+        )
+
+
+def fit_monitor(
+    twin: DynamicsTwin,
+    healthy: Trajectories,
+    false_alarms_at_most: str | float = "1 per month",
+    *,
+    blanking: float = 60.0,
+    alpha: float = 0.01,
+) -> Monitor:
+    """Calibrate a monitor on records of the healthy machine.
+
+    Parameters
+    ----------
+    twin : DynamicsTwin
+        The corrected twin, of `fit_dynamics`.
+    healthy : Trajectories
+        Healthy records, best of several days, that the twin was not fitted to: the errors of those
+        are smaller than of others, and the promise is that of these errors.
+    false_alarms_at_most : str or float
+        See `false_alarms`.
+    blanking : float
+        Time in s after an alarm in which no other is raised.
+    alpha : float
+        Probability of declaring the promise void although it applies.
+
+    Returns
+    -------
+    Monitor
+        With its promise.
+
+    Raises
+    ------
+    InputError
+        Other channels or another rate than those of the twin, or too few samples.
+
+    """
+    instance("twin", twin, DynamicsTwin, remedy="fit it by fit_dynamics")
+    check_channels(twin, healthy, "healthy")
+    arl = false_alarms(false_alarms_at_most, twin.rate)
+    finite("blanking", blanking, least=0.0, unit="s")
+    measured = np.where(healthy.mask, healthy.observed, np.nan).astype(float)
+    online, seen = OnlineFilter(twin), healthy.mask
+    commands = healthy.commands.astype(float)
+    _, mean, covariance = online.step(online.start(len(healthy)), commands, measured, seen)
+    require(
+        np.isfinite(mean).all() and np.isfinite(covariance).all(),
+        "healthy",
+        expected="records with which the filter of the twin stays finite",
+        got="others",
+        remedy="leave them out, or give the twin more substeps",
+    )
+    warm_up = _settled(covariance)
+    steps = resolution(np.moveaxis(measured, 2, 0).reshape(measured.shape[2], -1))
+    late = (np.arange(healthy.steps) >= warm_up)[None, :, None]
+    error, width = (
+        np.pad(each, [(0, 0), (0, APART), (0, 0)], constant_values=np.nan)
+        .reshape(-1, measured.shape[2])
+        .T
+        for each in _standardised(measured - mean, covariance, seen & late, steps)
+    )
+    disturbance = fit_disturbance(error)
+    scores = fit_scores(disturbance.held_out, width / disturbance.deviation)
+    slack = scores.slack(disturbance.parameters)
+    return Monitor(
+        twin, disturbance, scores, slack, steps, arl, blanking, warm_up / twin.rate, float(alpha)
+    )
+
+
+def _standardised(
+    error: NDArray, covariance: NDArray, seen: NDArray, steps: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Independent errors (n, T, d_y) of variance 1, and widths of their rounding intervals.
+
+    Errors are NaN where a sample is not seen.
+    """
+    factor = root_of(covariance, seen)
+    made = np.where(seen, whitened(error, factor, seen), np.nan)
+    return made, steps / np.diagonal(factor, axis1=2, axis2=3)
+
+
+def _settled(covariance: NDArray) -> int:
+    """Number of samples (n, T, d_y, d_y) until the filter knows the states."""
+    deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
+    usual = np.median(deviation, axis=1, keepdims=True)
+    late = (deviation > SETTLED * usual).any(axis=(0, 2))
+    half = covariance.shape[1] // 2
+    return int(np.flatnonzero(late[:half])[-1]) + 1 if late[:half].any() else 0
+
+
+def _described(detector: Detector, number: int) -> str:
+    """What an alternative is a change of."""
+    chosen = [each for family in detector.alternatives for each in family][number]
+    if isinstance(chosen, Location):
+        return "higher than predicted" if chosen.size > 0 else "lower than predicted"
+    if isinstance(chosen, Scale):
+        return "larger errors" if chosen.ratio > 1 else "smaller errors"
+    if isinstance(chosen, Dependence):
+        return "errors that depend on each other"
+    return "single large errors"
+
+
+def _by_stream(values: NDArray) -> NDArray:
+    """(n * d_y, T) of (n, T, d_y)."""
+    return np.moveaxis(values, 2, 1).reshape(-1, values.shape[1])
+
+
+def _by_output(values: NDArray, count: int) -> NDArray:
+    """(d_y, n * T) of (n * d_y, T)."""
+    parted = values.reshape(count, -1, values.shape[1])
+    return np.moveaxis(parted, 1, 0).reshape(parted.shape[1], -1)
+
+
+def _by_machine(values: NDArray, count: int) -> NDArray:
+    """(n, T, d_y) of (d_y, n * T)."""
+    return np.moveaxis(values.reshape(len(values), count, -1), 0, 2)

@@ -1,0 +1,214 @@
+"""Monitors of running machines: alarms, promises, and what they remember."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+import retwin as rt
+from retwin.errors import InputError
+from retwin.monitor.cause import find_causes
+from retwin.monitor.monitor import Monitor, MonitorState, Watched, fit_monitor
+from retwin.twins import (
+    ActuatorGain,
+    Parameter,
+    ParameterShift,
+    SensorBias,
+    State,
+    StateTwin,
+)
+from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
+
+RATE = 10.0
+NOISE = 0.02
+TANK = StateTwin(
+    (State("level", "m", 0.0, 0.0, 2.0),),
+    lambda x, u: (x.level, 2 * x.level),
+    rt.Channels(("pump",), ("V",)),
+    rt.Channels(("level", "pressure"), ("m", "kPa")),
+    RATE,
+    derivative=lambda x, u, p: (u.pump - p.drain * x.level,),
+    parameters=(Parameter("drain", "1/s", 0.05, 10.0, 1.0),),
+)
+
+
+def record(
+    count: int, seed: int, steps: int = 600, faults: list | None = None, **truth: float
+) -> rt.Trajectories:
+    rng = np.random.default_rng(seed)
+    commands = np.repeat(rng.uniform(0, 2, size=(count, steps // 20, 1)), 20, axis=1)
+    made = TANK.simulate(commands, faults=faults, seed=0, parameters={"drain": 1.3, **truth})
+    noise = NOISE * rng.normal(size=made.observed.shape)
+    return made.replace(observed=made.observed + noise)
+
+
+@pytest.fixture(scope="module")
+def twin() -> DynamicsTwin:
+    settings = Dynamics(Library(0, (), False))
+    return fit_dynamics(TANK, record(1, 0), settings).twin
+
+
+@pytest.fixture(scope="module")
+def monitor(twin: DynamicsTwin) -> Monitor:
+    return fit_monitor(twin, record(2, 1), "1 per hour", blanking=5.0)
+
+
+def leaking(seed: int = 5) -> rt.Trajectories:
+    """Three machines of which the second one leaks from 30 s on, without some samples."""
+    leak = ParameterShift("drain", size=1.3, onset=30.0)
+    whole = record(3, seed, faults=[None, leak, None])
+    return whole.replace(mask=np.random.default_rng(0).random(whole.observed.shape) > 0.05)
+
+
+def arrays_of(watched: Watched) -> list[np.ndarray]:
+    return [getattr(watched, each.name) for each in fields(watched) if each.name != "alarms"]
+
+
+def cut(monitor: Monitor, whole: rt.Trajectories, places: list[int]) -> tuple[list, list, list]:
+    state, arrays, alarms = monitor.start(len(whole)), [], []
+    measured = np.where(whole.mask, whole.observed, np.nan)
+    parts = (np.split(each, places, axis=1) for each in (whole.commands, measured))
+    for part in zip(*parts, strict=True):
+        state, found = monitor.step(state, *part, whole.ids)
+        arrays.append(arrays_of(found))
+        alarms += found.alarms
+    joined = [np.concatenate(each, axis=1).tobytes() for each in zip(*arrays, strict=True)]
+    return joined, alarms, [each.tobytes() for each in state.arrays().values()]
+
+
+def test_a_leak_is_found_in_the_machine_that_leaks_alone(monitor: Monitor) -> None:
+    found = monitor.watch(leaking())
+    assert {each.trajectory for each in found.alarms} == {leaking().ids[1]}
+    first = found.alarms[0]
+    assert 30.0 < first.time < 33.0
+    assert first.change == "lower than predicted"
+    assert first.evidence >= monitor.arl
+    assert found.alarm[1].sum() == len(found.alarms)
+    assert found.mean.shape == (3, 600, 2)
+    assert found.score.shape == (3, 600, 2)
+
+
+def test_however_samples_are_cut_the_results_are_the_same_bytes(monitor: Monitor) -> None:
+    whole = leaking()
+    wanted = cut(monitor, whole, [])
+    assert wanted[1]
+    assert cut(monitor, whole, [1, 2, 305, 311, 590]) == wanted
+    assert cut(monitor, whole, list(range(1, 600))) == wanted
+
+
+def test_a_machine_is_watched_the_same_beside_others(monitor: Monitor) -> None:
+    whole = leaking()
+    for both in zip(
+        arrays_of(monitor.watch(whole)), arrays_of(monitor.watch(whole[[1]])), strict=True
+    ):
+        np.testing.assert_array_equal(both[0][1], both[1][0])
+
+
+def test_no_alarm_is_raised_in_the_pause_after_one(monitor: Monitor) -> None:
+    times = [each.time for each in monitor.watch(leaking()).alarms]
+    assert len(times) > 1
+    assert np.diff(times).min() > 5.0
+
+
+def test_the_state_is_arrays_that_are_joined_and_divided(monitor: Monitor) -> None:
+    whole = leaking()
+    measured = np.where(whole.mask, whole.observed, np.nan)
+    now, later = slice(0, 310), slice(310, 600)
+    state, _ = monitor.step(monitor.start(3), whole.commands[:, now], measured[:, now])
+    arrays = {name: each[[2, 1]] for name, each in state.arrays().items()}
+    again = MonitorState.of_arrays(arrays)
+    own = monitor.step(again, whole.commands[[2, 1], later], measured[[2, 1], later])[1]
+    wanted = monitor.step(state, whole.commands[:, later], measured[:, later])[1]
+    np.testing.assert_array_equal(own.evidence, wanted.evidence[[2, 1]])
+
+
+def test_a_machine_that_was_rebuilt_voids_the_promise(monitor: Monitor) -> None:
+    found = monitor.watch(record(1, 7, steps=3000, drain=2.6))
+    assert found.void[0, -1]
+    assert not found.void[0, 0]
+    assert not monitor.watch(record(4, 8, steps=3000)).void.any()
+
+
+def test_what_is_not_measured_is_no_evidence(monitor: Monitor) -> None:
+    whole = record(1, 3)
+    found = monitor.watch(whole.replace(mask=whole.mask & False))
+    assert (found.evidence == 0).all()
+    assert np.isnan(found.score).all()
+
+
+def test_a_missing_command_is_the_one_before(monitor: Monitor) -> None:
+    whole = record(1, 3)
+    commands = whole.commands.astype(float).copy()
+    commands[0, 105:115] = np.nan  # within 20 equal samples
+    state = monitor.start(1)
+    found = monitor.step(state, commands, whole.observed)[1]
+    np.testing.assert_array_equal(found.score, monitor.watch(whole).score)
+    commands[0, 0] = np.nan
+    with pytest.raises(InputError, match="commands"):
+        monitor.step(state, commands, whole.observed)
+
+
+@pytest.mark.parametrize("value", [1e300, -1e300, np.inf, np.nan])
+def test_hostile_outputs_leave_the_monitor_usable(monitor: Monitor, value: float) -> None:
+    whole = record(1, 3)
+    observed = whole.observed.astype(float).copy()
+    observed[0, 300] = value
+    found = monitor.step(monitor.start(1), whole.commands, observed)[1]
+    assert np.isfinite(found.evidence).all()
+    assert np.isfinite(found.mean).all()
+    assert np.isfinite(found.score[0, 500:]).all()
+
+
+def test_a_saved_monitor_is_the_same(monitor: Monitor, tmp_path) -> None:
+    monitor.save(tmp_path / "monitor")
+    again = Monitor.load(tmp_path / "monitor")
+    assert again.promises == monitor.promises
+    for both in zip(
+        arrays_of(again.watch(leaking())), arrays_of(monitor.watch(leaking())), strict=True
+    ):
+        np.testing.assert_array_equal(*both)
+
+
+def test_the_promise_is_a_sentence_with_its_assumption(monitor: Monitor) -> None:
+    text = str(monitor.promises["level"])
+    assert "36000" in text
+    assert "slack" not in text
+    assert str(monitor.slack[0]) in text
+
+
+def test_other_channels_and_too_few_samples_are_refused(
+    monitor: Monitor, twin: DynamicsTwin
+) -> None:
+    with pytest.raises(InputError, match="measured"):
+        monitor.step(monitor.start(2), np.zeros((2, 5, 1)), np.zeros((2, 5, 1)))
+    with pytest.raises(InputError, match="measured"):
+        monitor.step(monitor.start(1), np.zeros((2, 5, 1)), np.zeros((2, 5, 2)))
+    other = replace(record(1, 0), rate=5.0)
+    with pytest.raises(InputError, match="rate"):
+        monitor.watch(other)
+    with pytest.raises(InputError, match="longer"):
+        fit_monitor(twin, record(1, 0, steps=40))
+    with pytest.raises(InputError, match="fit_dynamics"):
+        fit_monitor(TANK, record(1, 0))  # type: ignore[arg-type]
+
+
+def test_the_cause_of_an_alarm_is_named_with_its_onset_and_size(
+    twin: DynamicsTwin, monitor: Monitor
+) -> None:
+    watched = leaking()
+    first = monitor.watch(watched).alarms[:1]
+    faults = {
+        "Healthy": None,
+        "leak": ParameterShift("drain", size=(0.1, 5.0)),
+        "weak pump": ActuatorGain(0, size=(-0.9, -0.1)),
+        "level sensor": SensorBias(0, size=(-1.0, 1.0)),
+    }
+    (cause,) = find_causes(twin, watched, first, faults)
+    assert cause.name == "leak"
+    assert cause.probability > 0.99
+    assert abs(cause.onset[0] - 30.0) < 0.5
+    assert cause.size[1] < 1.3 < cause.size[2]
+    with pytest.raises(InputError, match="alarms"):
+        find_causes(twin, watched[[0]], first, faults)
