@@ -19,7 +19,7 @@ import typer
 from typer.core import TyperGroup
 
 from retwin._version import __version__
-from retwin.cli import bench, bundle, data, diagnose, doctor, models, studies, twins
+from retwin.cli import bench, bundle, data, diagnose, doctor, models, monitor, studies, twins
 from retwin.cli.terminal import (
     BAD_INPUT,
     FAILED,
@@ -44,12 +44,10 @@ class FirstScreen(TyperGroup):
     """All commands; its help fits into 24 lines of 80."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """The options; of the two that Typer adds for completion only one is shown."""
+        """The options; those that Typer adds for completion are in the documentation."""
         params: list[Any] = [*super().get_params(ctx)]
         for each in params:
-            if each.name == "install_completion":
-                each.help = "Let this shell complete words."
-            each.hidden = each.name == "show_completion"
+            each.hidden = each.name in ("install_completion", "show_completion")
         return params
 
 
@@ -74,6 +72,7 @@ app.add_typer(data.app, name="data")
 app.add_typer(twins.app, name="twin")
 app.add_typer(diagnose.app, name="diagnose")
 app.add_typer(bundle.app, name="bundle")
+app.add_typer(monitor.app, name="monitor")
 
 
 @app.callback(invoke_without_command=True)

@@ -1,0 +1,179 @@
+"""`retwin monitor`: calibrate a monitor of a corrected twin, and replay records through it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from retwin.checks import require
+from retwin.cli.options import Json, MaxBytes, OtherCase
+from retwin.cli.reading import case_named, read, saved
+from retwin.cli.terminal import answer, bar, example, note, table
+from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.serialisation.places import check_place
+
+if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
+    from retwin.cases.case import Case
+    from retwin.monitor import Alarm, Cause, Monitor, Watched
+
+__all__ = ["app"]
+
+UNEXPLAINED = 0.5
+"""Probability from which on it is printed that a cause does not explain all."""
+
+app = typer.Typer(
+    help="Watch a machine with its corrected twin.",
+    epilog=example("retwin monitor replay watch day1.npz"),
+    no_args_is_help=True,
+)
+
+
+@app.command(epilog=example("retwin monitor fit model healthy.npz --out watch"))
+def fit(
+    model: Annotated[
+        Path, typer.Argument(metavar="MODEL", help="Folder of corrected dynamics, of retwin fit.")
+    ],
+    healthy: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="HEALTHY...", help="Healthy records, best not those it was fitted to."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where to save the monitor.")],
+    false_alarms: Annotated[
+        str,
+        typer.Option(metavar="RATE", help='At most: "1 per month", "2 per year", "1e-6 Hz".'),
+    ] = "1 per month",
+    blanking: Annotated[
+        float, typer.Option(metavar="S", help="Time without alarms after an alarm.")
+    ] = 60.0,
+    case: OtherCase = None,
+    max_bytes: MaxBytes = None,
+    as_json: Json = False,
+) -> None:
+    """Calibrate a monitor on healthy records."""
+    from retwin.monitor import fit_monitor
+    from retwin.update import DynamicsTwin
+
+    check_place(out, folder=True, holds=("model.json", "weights.safetensors", "twin"))
+    twin = DynamicsTwin.load(saved(model))
+    system = case_named(case or twin.case or None)
+    records = [_healthy(read(file, system, max_bytes=max_bytes), file) for file in healthy]
+    with bar("calibrate") as show:
+        show("monitor", 0.0)
+        made = fit_monitor(twin, Trajectories.concatenate(records), false_alarms, blanking=blanking)
+    made.save(out)
+    promises = {name: str(each) for name, each in made.promises.items()}
+    answer(
+        {"saved": str(out), "arl": made.arl, "warm_up": made.warm_up, "promises": promises},
+        *(f"{name}: {text}" for name, text in promises.items()),
+        as_json=as_json,
+    )
+    note(f"Saved {out}")
+
+
+@app.command(epilog=example("retwin monitor replay watch day1.npz day2.npz"))
+def replay(
+    monitor: Annotated[
+        Path, typer.Argument(metavar="MONITOR", help="Folder of a monitor, of retwin monitor fit.")
+    ],
+    logs: Annotated[
+        list[Path], typer.Argument(metavar="LOG...", help="Records, in the order of time.")
+    ],
+    case: OtherCase = None,
+    max_bytes: MaxBytes = None,
+    as_json: Json = False,
+) -> None:
+    """Watch recorded data as if they came now: alarms, their causes, and the promise."""
+    from retwin.monitor import Monitor
+
+    made = Monitor.load(saved(monitor))
+    system = case_named(case or made.twin.case or None)
+    found, rows = [], []
+    for file in logs:
+        record = read(file, system, max_bytes=max_bytes)
+        watched = made.watch(record)
+        causes = _causes(made, record, watched.alarms, system)
+        found.append((file, record, watched, causes))
+        for i, alarm in enumerate(watched.alarms):
+            cause = _written(causes[i]) if causes else ""
+            change = f"{alarm.output} {alarm.change}"
+            rows.append((file.name, alarm.trajectory, f"{alarm.time:.6g}", change, cause))
+    answer(
+        {
+            "arl": made.arl,
+            "promises": {name: str(each) for name, each in made.promises.items()},
+            "records": [_json(*each) for each in found],
+        },
+        *([table(("file", "record", "time in s", "what", "cause"), rows)] if rows else []),
+        *(_summary(*each[:3]) for each in found),
+        as_json=as_json,
+    )
+
+
+def _healthy(record: Trajectories, file: Path) -> Trajectories:
+    """The healthy trajectories of a file."""
+    if record.labels is None:
+        return record
+    chosen = record[[i for i, label in enumerate(record.labels) if label in (HEALTHY, "")]]
+    require(
+        len(chosen) > 0,
+        str(file),
+        expected="healthy trajectories",
+        got="faulty ones alone",
+        remedy="a monitor is calibrated on the healthy machine",
+    )
+    return chosen
+
+
+def _causes(
+    monitor: Monitor, record: Trajectories, alarms: Sequence[Alarm], system: Case | None
+) -> list[Cause]:
+    """The causes of alarms, where the case has faults that can be inverted."""
+    from retwin.monitor import find_causes
+    from retwin.twins.system_faults import TimedFault
+
+    faults = {
+        name: each
+        for name, each in (system.faults if system else {}).items()
+        if each is None or isinstance(each, TimedFault)
+    }
+    if len(faults) < 2 or not alarms:
+        return []
+    with bar("explain") as show:
+        show("alarms", 0.0)
+        return find_causes(monitor.twin, record, alarms, faults)
+
+
+def _written(cause: Cause) -> str:
+    """A cause with its onset, and whether there is more to it."""
+    more = ", and more than that" if cause.unknown > UNEXPLAINED else ""
+    return f"{cause.name} from {cause.onset[0]:.6g} s{more}"
+
+
+def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
+    """What was watched, and whether the promise applied."""
+    seconds = record.mask.any(axis=2).sum() / record.rate
+    void = sum(bool(each[-1]) for each in watched.void)
+    text = f"{file.name}: {len(watched.alarms)} alarms in {seconds / 3600:.3g} measured hours"
+    if void:
+        text += (
+            f"; in {void} of {len(record)} records the promise is VOID: the machine is not the one "
+            "of the calibration, so calibrate again"
+        )
+    return text + "."
+
+
+def _json(file: Path, record: Trajectories, watched: Watched, causes: list[Cause]) -> dict:
+    alarms = [vars(each) | {} for each in watched.alarms]
+    for alarm, cause in zip(alarms, causes, strict=False):
+        alarm["cause"] = {name: value for name, value in vars(cause).items() if name != "alarm"}
+    return {
+        "file": str(file),
+        "alarms": alarms,
+        "void": [record.ids[i] for i, each in enumerate(watched.void) if each[-1]],
+        "measured_samples": int(record.mask.any(axis=2).sum()),
+    }
