@@ -66,8 +66,8 @@ class Validity:
     probability of at most α in the class, and there the promise is void.
 
     A block multiplies evidence by at most 2 and an alarm by at most 4. A fault that is alarmed and
-    acknowledged voids nothing; a class that is wrong for hundreds of samples without an alarm
-    does, and so does a machine that alarms again after every reset.
+    acknowledged voids nothing; a machine that alarms again after every reset does, and so does a
+    large deviation of hundreds of samples in which no alarm is counted.
 
     Parameters
     ----------
