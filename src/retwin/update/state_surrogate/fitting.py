@@ -1,0 +1,346 @@
+"""`fit_state_surrogate`: the state equations of any twin with memory, from simulations of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.arrays import floats
+from retwin.checks import finite, positive, require, whole
+from retwin.data.trajectories import Trajectories
+from retwin.progress import Progress
+from retwin.serialisation.models import read_model, refusing, write_model
+from retwin.twins.limits import Limits
+from retwin.twins.parametric import Parameter
+from retwin.twins.samplers import CommandSampler
+from retwin.twins.saved_equations import equations_from, equations_of
+from retwin.twins.state_twin import StateTwin
+from retwin.twins.twin import Twin, checked_seed
+from retwin.update.state_surrogate.search import Found, relative_error, searched
+from retwin.update.state_surrogate.simulations import (
+    MIN_SIMULATIONS,
+    Simulations,
+    check_outputs,
+    drawn_parameters,
+    samplers_of,
+)
+
+__all__ = ["FittedStateSurrogate", "StateSurrogate", "fit_state_surrogate"]
+
+KIND = "state_surrogate"
+MARGIN = 0.25
+"""How far beyond the commands of the simulations the surrogate takes commands, in widths of their
+range; other draws of the same sampler are within."""
+SMALL = 0.5
+"""Largest error of a surrogate over the discrepancy of its twin, both root mean squares."""
+
+
+@dataclass(frozen=True)
+class StateSurrogate:
+    """Settings of a state surrogate.
+
+    Parameters
+    ----------
+    states : int or sequence of int
+        Numbers of states that are tried, the smallest first; by default from as many as the outputs
+        have components on, until more do not lower the error of held-out simulations.
+    hidden : int, default 16
+        Width of the network inside the equations; twice that is tried where it does not suffice.
+    simulations : int, default 100
+        Simulations from which it learns, at least 10. Half as many more are held out.
+    spread : float, default 1
+        Share of each parameter's bounds over which simulations draw it, about its present value,
+        above 0 and up to 1; the bounds of the surrogate's parameters are these.
+    accuracy : float, default 0.01
+        Error of held-out simulations, over the standard deviation of an output, from which on no
+        more states are tried.
+    allowed : float, default 0.1
+        Largest such error that is no error message.
+    unknown_start : bool, default False
+        Whether the states at the first sample are free, since real records begin anywhere; by
+        default they are those with which the twin begins.
+
+    """
+
+    states: int | Sequence[int] = ()
+    hidden: int = 16
+    simulations: int = 100
+    spread: float = 1.0
+    accuracy: float = 0.01
+    allowed: float = 0.1
+    unknown_start: bool = False
+
+    def __post_init__(self) -> None:
+        given = (self.states,) if isinstance(self.states, int) else tuple(self.states)
+        orders = tuple(sorted({whole("states", each, least=1) for each in given}))
+        object.__setattr__(self, "states", orders)
+        whole("hidden", self.hidden, least=1)
+        whole("simulations", self.simulations, least=MIN_SIMULATIONS)
+        positive("spread", self.spread)
+        finite("spread", self.spread, most=1.0)
+        positive("accuracy", self.accuracy)
+        positive("allowed", self.allowed)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedStateSurrogate:
+    """State equations that stand in for a twin, and how well.
+
+    Attributes
+    ----------
+    twin : StateTwin
+        The surrogate. Its parameters are those of the twin, with the bounds over which they were
+        drawn; its states x1, x2, ... have no physical meaning.
+    figures : dict of str to float
+        `states` and `hidden`, the size; `simulations`, from which it learned; of other simulations,
+        per output, `rmse_NAME` in its unit, `nrmse_NAME` over its standard deviation, and
+        `nrmse_first_NAME` and `nrmse_last_NAME` of the first and the last tenth of the samples;
+        `own_NAME` and `discrepancy_NAME`, the root mean square of the error on the user's own
+        commands and of the twin's discrepancy there; and `speed`, the time of the twin over that
+        of the surrogate.
+    history : dict of int to float
+        Largest relative error of held-out simulations by the number of states.
+    seconds : float
+        Duration.
+    reason : str
+        What the result does not cover; "" for nothing.
+
+    """
+
+    twin: StateTwin
+    figures: dict[str, float]
+    history: dict[int, float]
+    seconds: float
+    reason: str
+
+    def save(self, folder: str | Path) -> None:
+        """Write the equations and the figures; no code of the twin is needed to read them."""
+        about = {
+            "equations": equations_of(self.twin),
+            "figures": self.figures,
+            "history": {str(order): error for order, error in self.history.items()},
+            "seconds": self.seconds,
+            "reason": self.reason,
+        }
+        with write_model(folder, KIND, about, {}):
+            pass
+
+    @classmethod
+    def load(cls, folder: str | Path) -> FittedStateSurrogate:
+        """Read what `save` wrote.
+
+        Raises InputError if the folder holds no such model or is damaged.
+        """
+        about, _ = read_model(folder, KIND)
+        with refusing(folder, expected="a state surrogate"):
+            return cls(
+                equations_from(StateTwin, about["equations"]),
+                {str(name): finite(name, each) for name, each in about["figures"].items()},
+                {int(order): float(error) for order, error in about["history"].items()},
+                finite("seconds", about["seconds"]),
+                str(about["reason"]),
+            )
+
+
+def fit_state_surrogate(
+    twin: Twin,
+    commands: CommandSampler | NDArray,
+    observed: Trajectories | None = None,
+    settings: StateSurrogate = StateSurrogate(),
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> FittedStateSurrogate:
+    """Learn the state equations of a twin that has memory, from simulations of it.
+
+    The result is a `StateTwin`: it is differentiable, its parameters can be identified, its
+    dynamics corrected (`fit_dynamics`), and its faults inverted. The order is that with the least
+    error of held-out simulations. All simulations of the twin must begin alike.
+
+    Parameters
+    ----------
+    twin : Twin
+        Any twin. The free parameters of a `ParametricTwin` are parameters of the surrogate;
+        simulations draw them. The noise of a stochastic twin is averaged.
+    commands : CommandSampler or ndarray, shape (n, T, d_u)
+        The distribution of the commands, such as that of a case, or your own commands. Of your own
+        commands, those that `sampler_from` draws and pieces of these are simulated, and the
+        surrogate is compared with the twin on them.
+    observed : Trajectories, optional
+        Measured trajectories, whose commands are treated as your own. Where the error of the
+        surrogate on them is not small compared with the discrepancy of the twin, that is an error.
+    settings : StateSurrogate
+        Size, simulations, and accuracy.
+    seed : int
+        Of commands, parameters and first weights, at least 0.
+    progress : callable, optional
+        Called with the share of the work that is done.
+
+    Returns
+    -------
+    FittedStateSurrogate
+        Its `twin` is a `StateTwin`.
+
+    Raises
+    ------
+    InputError
+        Commands at another rate or of other channels, too short or too many failing simulations, an
+        output that never changes; and a surrogate that does not follow the twin: on other
+        simulations, or on your own commands.
+
+    """
+    began = time.perf_counter()
+    seed, report = checked_seed(seed), progress or (lambda _: None)
+    free = drawn_parameters(twin, settings.spread)
+    samplers, own = samplers_of(twin, commands, observed)
+    simulations, rng = Simulations(twin, free, samplers), np.random.default_rng(seed)
+    training = simulations.made(settings.simulations, rng)
+    held_out, test = (simulations.made(settings.simulations // 4, rng) for _ in range(2))
+    check_outputs(training)
+    report(0.2)
+    found, history = searched(
+        training,
+        held_out,
+        orders=settings.states,  # type: ignore[arg-type]  # a tuple
+        hidden=settings.hidden,
+        accuracy=settings.accuracy,
+        seed=seed,
+        progress=lambda share: report(0.2 + 0.7 * share),
+    )
+    made = _twin_of(twin, found, free, training, own, unknown_start=settings.unknown_start)
+    figures = {
+        "states": float(found.order),
+        "hidden": float(len(found.equations.arrays["b"])),
+        "simulations": float(len(training)),
+    }
+    figures |= _tested(made, test, found, simulations.seconds, settings.allowed)
+    for commands in own if observed is None else own[-1:]:
+        figures |= _compared(twin, made, commands, observed, settings.allowed)
+    report(1.0)
+    duration = time.perf_counter() - began
+    return FittedStateSurrogate(made, figures, history, duration, simulations.reason)
+
+
+def _twin_of(
+    twin: Twin,
+    found: Found,
+    free: tuple[Parameter, ...],
+    training: Trajectories,
+    own: Sequence[NDArray],
+    *,
+    unknown_start: bool,
+) -> StateTwin:
+    """The surrogate, whose limits are those of the commands in simulations, with a margin."""
+    simulated, parameters = _parted(training, len(twin.inputs))
+    low, high = (
+        make([make(each, axis=(0, 1)) for each in (simulated, *own)], axis=0)
+        for make in (np.min, np.max)
+    )
+    low, high = low - MARGIN * (high - low), high + MARGIN * (high - low)
+    limits = getattr(twin, "limits", None)
+    if limits is not None:
+        low, high = np.maximum(low, limits.low), np.minimum(high, limits.high)
+    limits = Limits(floats(low), floats(high), "refuse" if limits is None else limits.outside)
+
+    def made(starts: NDArray | None) -> StateTwin:
+        return found.equations.twin(twin.inputs, twin.outputs, twin.rate, free, limits, starts)
+
+    known = made(None)
+    if not unknown_start:
+        return known
+    given = dict(zip((each.name for each in free), parameters.T, strict=True))
+    visited = known.hidden(simulated, given)
+    return made(np.stack([visited.min(axis=(0, 1)), visited.max(axis=(0, 1))]))
+
+
+def _parted(made: Trajectories, width: int) -> tuple[NDArray, NDArray]:
+    """Commands (n, T, d_u) and parameters (n, k) of simulations."""
+    return made.commands[..., :width], made.commands[:, 0, width:]
+
+
+def _tested(
+    made: StateTwin, test: Trajectories, found: Found, seconds: float, allowed: float
+) -> dict[str, float]:
+    """Errors on simulations of which nothing was learned, and the ratio of speeds.
+
+    Raises InputError where an error is larger than allowed.
+    """
+    commands, parameters = _parted(test, len(made.inputs))
+    given = dict(zip((each.name for each in made.parameters), parameters.T, strict=True))
+    values, simulate = made.values(given, len(test)), made.steps().run
+    simulate(commands, values)  # which compiles it
+    began = time.perf_counter()
+    error = simulate(commands, values)[0] - test.observed
+    duration = (time.perf_counter() - began) / commands[..., 0].size
+    tenth, deviation = max(1, test.steps // 10), found.equations.outputs.deviation
+    whole, first, last = (
+        relative_error(error[:, part], test.mask[:, part], deviation)
+        for part in (slice(None), slice(tenth), slice(-tenth, None))
+    )
+    worst, names = int(np.argmax(whole)), made.outputs.names
+    require(
+        whole[worst] <= allowed,
+        "twin",
+        expected=f"simulations that a state surrogate follows to {allowed:.3g} of the standard "
+        "deviation of each output",
+        got=f"an error of {whole[worst]:.3g} for {names[worst]} ({first[worst]:.3g} in the first "
+        f"tenth of the samples, {last[worst]:.3g} in the last)",
+        remedy="give more simulations, a wider network, a smaller spread of the parameters, or "
+        "shorter trajectories; chaos, impacts, switches, and a start that depends on the first "
+        "command can hardly be learned: use the twin itself with a correction of its outputs",
+    )
+    columns = {
+        "rmse": whole * deviation,
+        "nrmse": whole,
+        "nrmse_first": first,
+        "nrmse_last": last,
+    }
+    return {
+        f"{figure}_{name}": float(each)
+        for figure, row in columns.items()
+        for name, each in zip(names, row, strict=True)
+    } | {"speed": seconds / max(duration, 1e-12)}
+
+
+def _compared(
+    twin: Twin,
+    made: StateTwin,
+    own: NDArray,
+    observed: Trajectories | None,
+    allowed: float,
+) -> dict[str, float]:
+    """Errors on the user's own commands, at the present values of the parameters.
+
+    Raises InputError where an error is not small compared with the discrepancy of the twin; without
+    measurements, where it is larger than allowed.
+    """
+    expected = twin.simulate(own, seed=0)
+    error = made.simulate(own, seed=0).observed - expected.observed
+    seen, ones = expected.mask, np.ones(len(made.outputs))
+    if observed is None:
+        compared, largest = expected.observed - expected.observed.mean(axis=(0, 1)), allowed
+        what = "the standard deviation of the output"
+    else:
+        compared, largest, seen = observed.observed - expected.observed, SMALL, seen & observed.mask
+        what = "the twin's discrepancy there"
+    errors, sizes = (relative_error(each, seen, ones) for each in (error, compared))
+    worst, names = int(np.argmax(errors - largest * sizes)), made.outputs.names
+    require(
+        errors[worst] <= largest * sizes[worst],
+        "commands" if observed is None else "observed",
+        expected=f"an error of the surrogate on these commands of at most {largest:g} of {what}",
+        got=f"{errors[worst]:.3g} with {sizes[worst]:.3g} {made.outputs.units[worst]} for "
+        f"{names[worst]}",
+        remedy="give more simulations, a wider network or a smaller spread of the parameters, so "
+        "that the surrogate is more accurate",
+    )
+    figures = {f"own_{name}": float(each) for name, each in zip(names, errors, strict=True)}
+    if observed is None:
+        return figures
+    sized = zip(names, sizes, strict=True)
+    return figures | {f"discrepancy_{name}": float(each) for name, each in sized}

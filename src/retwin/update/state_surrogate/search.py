@@ -1,0 +1,173 @@
+"""The weights of a state surrogate on free simulation, and the number of its states.
+
+The search follows the optimum from a strong prior about the linear model to a weak one, as that of
+a black-box model does; but simulations have no noise, so that it goes on as long as simulations
+that are held out are predicted better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.trajectories import Trajectories
+from retwin.progress import Progress
+from retwin.update.dynamics.estimation import Estimation
+from retwin.update.dynamics.linearised import Point
+from retwin.update.dynamics.unknowns import unknowns_of
+from retwin.update.state_surrogate.equations import Equations
+
+__all__ = ["Found", "fitted", "relative_error", "searched"]
+
+STRONGEST, WEAKEST, STEP = 0.1, 1e-8, 10.0
+"""Variances of the error that are assumed first and last, in those of the outputs, and the ratio of
+one to the next: from a prior so strong that the network begins near 0 to nearly none."""
+STEPS = 15
+"""Steps of the search with each variance at most."""
+MAX_PASSES = 16
+"""Number of searches at most, those with the last variance included."""
+WORTH = 0.95
+"""Ratio of errors below which a further search, or another state, is worth its time."""
+PATIENCE = 2
+"""Searches, or numbers of states, that are tried beyond the best one."""
+MORE = 8
+"""Largest number of states beyond the first that is tried."""
+COMPONENT = 0.01
+"""Standard deviation of a component of the outputs, over that of the first, which counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Equations, and the error of simulations that were held out.
+
+    Attributes
+    ----------
+    equations : Equations
+        With the best weights.
+    error : float
+        See `relative_error`; infinite where a simulation diverges.
+
+    """
+
+    equations: Equations
+    error: float
+
+    @property
+    def order(self) -> int:
+        """The number of states."""
+        return len(self.equations.speed)
+
+
+def relative_error(error: NDArray, seen: NDArray, deviation: NDArray) -> NDArray:
+    """Root mean squares (d_y,) of errors (n, T, d_y) that count, over deviations (d_y,).
+
+    Infinite where an error is not finite.
+    """
+    counted = np.where(seen, error, 0.0)
+    count = np.maximum(seen.sum(axis=(0, 1)), 1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        rms = np.sqrt(np.sum(counted**2, axis=(0, 1)) / count)
+    made: NDArray = np.nan_to_num(rms, nan=np.inf) / deviation
+    return made
+
+
+def searched(
+    training: Trajectories,
+    held_out: Trajectories,
+    *,
+    orders: Iterable[int],
+    hidden: int,
+    accuracy: float,
+    seed: int,
+    progress: Progress,
+) -> tuple[Found, dict[int, float]]:
+    """The equations with the number of states that predicts held-out simulations best.
+
+    Parameters
+    ----------
+    training, held_out : Trajectories
+        Simulations whose inputs are the commands and the parameters.
+    orders : iterable of int
+        Numbers of states in the order in which they are tried; none for those from the number of
+        components of the outputs on.
+    hidden : int
+        Width of the network; twice that is tried too if the error stays above the accuracy.
+    accuracy : float
+        No more states are tried once the error is below.
+    seed : int
+        Of the first weights.
+    progress : callable
+        Called with the share of the work that is done.
+
+    Returns
+    -------
+    Found
+        The best.
+    dict of int to float
+        The error by the number of states.
+
+    """
+    first = _components(training.observed)
+    tried = tuple(orders) or range(first, first + MORE + 1)
+    best: Found | None = None
+    history: dict[int, float] = {}
+    worse = 0
+    for order in tried:
+        found = fitted(training, held_out, order, hidden, seed)
+        history[order] = found.error
+        worse += 1
+        if best is None or found.error < WORTH * best.error:
+            best, worse = found, 0
+        progress(0.7 * (1 - 0.7 ** len(history)))
+        if best.error < accuracy or (worse == PATIENCE and np.isfinite(best.error)):
+            break
+    assert best is not None
+    if best.error >= accuracy:
+        wider = fitted(training, held_out, best.order, 2 * hidden, seed)
+        best = min(best, wider, key=lambda each: each.error)
+        history[best.order] = best.error
+    return best, history
+
+
+def fitted(
+    training: Trajectories, held_out: Trajectories, order: int, hidden: int, seed: int
+) -> Found:
+    """The equations with so many states and a network of such a width, see `searched`."""
+    equations = Equations.begun(training, order, hidden, np.random.default_rng(seed))
+    twin = equations.trainable(training.inputs, training.outputs, training.rate)
+    starts = dict.fromkeys((f"start_{each.name}" for each in twin.states), 0.0)
+    weights = dict(zip(twin.names, equations.flat, strict=False))
+    unknowns = unknowns_of(twin, twin.parameters, starts | weights)
+    unknowns = replace(unknowns, deviation=np.ones(unknowns.count))
+    power = equations.outputs.deviation**2
+    estimation = Estimation(twin, training, unknowns, training.mask, power)
+    tested = Estimation(twin, held_out, unknowns, held_out.mask, power)
+    own, other = (np.zeros((len(each), 0)) for each in (training, held_out))
+    best, variance, worse = Found(equations, np.inf), STRONGEST, 0
+    now = estimation.linearised(Point(equations.flat, own))
+    for _ in range(MAX_PASSES):
+        if not now.finite:
+            break
+        now = replace(estimation, variance=variance * power).minimised(now, STEPS)
+        shared = now.point.shared
+        residual = tested.residual(Point(shared, other))
+        error = float(relative_error(residual, held_out.mask, equations.outputs.deviation).max())
+        worse = 0 if error < WORTH * best.error else worse + 1
+        if error < best.error:
+            best = Found(equations.with_weights(shared), error)
+        if worse == PATIENCE:
+            break
+        variance = max(variance / STEP, WEAKEST)
+    return best
+
+
+def _components(outputs: NDArray) -> int:
+    """How many components outputs (n, T, d_y) have: fewer states cannot tell them apart."""
+    values = outputs.reshape(-1, outputs.shape[2])
+    deviation = values.std(axis=0)
+    scaled = (values - values.mean(axis=0)) / np.where(deviation > 0, deviation, 1.0)
+    size = np.linalg.svd(scaled, compute_uv=False)
+    return int(np.sum(size > COMPONENT * size[0]))

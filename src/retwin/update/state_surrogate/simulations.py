@@ -1,0 +1,151 @@
+"""Simulations of a twin by drawn commands and parameters, from which its equations are learned."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import at_least, require
+from retwin.data.trajectories import Channels, Trajectories
+from retwin.errors import InputError
+from retwin.twins.parametric import Parameter, ParametricTwin
+from retwin.twins.record_sampler import sampler_from
+from retwin.twins.samplers import CommandSampler, RecordedSampler
+from retwin.twins.twin import SimulationError, Twin, check_channels, checked_commands
+
+__all__ = ["MIN_SIMULATIONS", "Simulations", "check_outputs", "drawn_parameters", "samplers_of"]
+
+MIN_SAMPLES = 20
+"""Least number of samples of a simulation: fewer show hardly any memory."""
+MAX_SAMPLES = 30_000
+"""Number of samples of all simulations together, about; more do not lower the error."""
+MIN_SIMULATIONS = 10
+"""Least number of simulations to learn from."""
+FAILED = 0.2
+"""Largest share of the simulations that may fail."""
+
+
+def drawn_parameters(twin: Twin, spread: float) -> tuple[Parameter, ...]:
+    """The free parameters of a twin, with the bounds between which they are drawn."""
+    if not isinstance(twin, ParametricTwin):
+        return ()
+    made = []
+    for each, value in zip(twin.parameters, twin.values, strict=True):
+        low, high = (value + spread * (end - value) for end in (each.low, each.high))
+        made.append(Parameter(each.name, each.unit, min(low, value), max(high, value), value))
+    return tuple(made)
+
+
+def samplers_of(
+    twin: Twin, commands: CommandSampler | NDArray, observed: Trajectories | None
+) -> tuple[list[CommandSampler], list[NDArray]]:
+    """What draws commands for simulations, and the user's own commands, each (n, T, d_u)."""
+    samplers: list[CommandSampler] = []
+    own: list[NDArray] = []
+    if hasattr(commands, "sample"):
+        sampler: Any = commands
+        require(
+            sampler.rate == twin.rate,
+            "commands",
+            expected=f"a sampler at the rate of the twin, {twin.rate:g} Hz",
+            got=f"{sampler.rate:g} Hz",
+            remedy="give both the same rate",
+        )
+        samplers.append(sampler)
+    else:
+        own.append(checked_commands(commands, twin.inputs).astype(np.float64))
+    if observed is not None:
+        check_channels(twin, observed, "observed")
+        at_least("observed", observed.ids, 1, "trajectory", remedy="leave it out if there is none")
+        own.append(observed.commands.astype(np.float64))
+    for each in own:
+        similar = sampler_from(each, twin.rate, limits=getattr(twin, "limits", None))
+        duration = min(similar.duration, each.shape[1] / twin.rate)
+        samplers += [similar, RecordedSampler(each, twin.rate, duration)]
+    return samplers, own
+
+
+@dataclass(eq=False)
+class Simulations:
+    """Simulations of a twin by drawn commands and parameters.
+
+    Attributes
+    ----------
+    twin : Twin
+        The twin.
+    parameters : sequence of Parameter
+        What is drawn.
+    samplers : sequence of CommandSampler
+        Of equal parts of the commands.
+    seconds : float
+        What a simulated sample takes.
+    reason : str
+        How many have failed.
+
+    """
+
+    twin: Twin
+    parameters: Sequence[Parameter]
+    samplers: Sequence[CommandSampler]
+    seconds: float = field(default=0.0, init=False)
+    reason: str = field(default="", init=False)
+
+    def made(self, count: int, rng: np.random.Generator) -> Trajectories:
+        """So many simulations, or fewer long ones; their inputs are commands and parameters."""
+        longest = max(each.steps for each in self.samplers)
+        affordable = max(MIN_SIMULATIONS, MAX_SAMPLES // longest)
+        each = -(-min(count, affordable) // len(self.samplers))
+        parts = [self._of(sampler, each, rng) for sampler in self.samplers]
+        steps = max(part.steps for part in parts)
+        return Trajectories.concatenate([part.padded(steps) for part in parts])
+
+    def _of(self, sampler: CommandSampler, count: int, rng: np.random.Generator) -> Trajectories:
+        u = sampler.sample(count, rng=rng).astype(np.float64)
+        u = u[:, : MAX_SAMPLES // MIN_SIMULATIONS]
+        require(
+            u.shape[1] >= MIN_SAMPLES,
+            "commands",
+            expected=f"trajectories of {MIN_SAMPLES} samples or more",
+            got=u.shape[1],
+            remedy="draw longer ones, in which the twin's memory shows",
+        )
+        drawn = {each.name: rng.uniform(each.low, each.high, count) for each in self.parameters}
+        options: dict[str, Any] = {"parameters": drawn} if drawn else {}
+        began = time.perf_counter()
+        try:
+            made = self.twin.simulate(u, seed=int(rng.integers(2**31)), **options)
+        except SimulationError as error:
+            made, self.reason = error.finished, f"of {count} simulations {len(error.failed)} failed"
+            if len(error.failed) > FAILED * count:
+                raise InputError(
+                    "twin",
+                    expected="simulations that succeed, of commands and parameters as drawn",
+                    got=str(error),
+                    remedy="narrow the bounds of the parameters, or give a smaller spread",
+                ) from error
+        self.seconds = (time.perf_counter() - began) / u[..., 0].size
+        rows = made.ids.astype(int)
+        held = [np.repeat(each[rows, None, None], u.shape[1], axis=1) for each in drawn.values()]
+        names = (f"parameter {name}" for name in drawn)
+        units = (each.unit for each in self.parameters)
+        inputs = Channels((*made.inputs.names, *names), (*made.inputs.units, *units))
+        return made.replace(commands=np.concatenate([made.commands, *held], 2), inputs=inputs)
+
+
+def check_outputs(training: Trajectories) -> None:
+    """Refuse simulations in which an output is constant."""
+    spread = np.where(training.mask, training.observed, np.nan)
+    fixed = np.nanmax(spread, axis=(0, 1)) == np.nanmin(spread, axis=(0, 1))
+    names = [name for name, each in zip(training.outputs.names, fixed, strict=True) if each]
+    require(
+        not names,
+        "twin",
+        expected="outputs that change in its simulations",
+        got=f"outputs that do not: {', '.join(names)}",
+        remedy="leave such outputs out, or give commands that excite them",
+    )
