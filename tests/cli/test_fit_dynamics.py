@@ -87,6 +87,50 @@ def test_state_equations_are_fitted_and_generate(folder: Path, tmp_path: Path, c
     assert (code, "level" in printed) == (0, True)
 
 
+FUNCTION = """
+import numpy as np
+
+
+def level(valve, rate, gain=0.1, leak=0.05):
+    x, levels = np.zeros(valve.shape[::2]), []
+    for u in valve.swapaxes(0, 1):
+        levels.append(x)
+        x = x + (gain * u - leak * x) / rate
+    return np.stack(levels, axis=1)
+"""
+
+BLACK_BOX = """
+rate = 1.0
+inputs = { valve = { unit = "1" } }
+outputs = { level = { unit = "m" } }
+[parameters]
+gain = { unit = "m", low = 0.05, high = 0.2, start = 0.1 }
+leak = { unit = "1/s", low = 0.02, high = 0.1, start = 0.05 }
+[state_surrogate]
+states = 1
+hidden = 4
+simulations = 30
+[records]
+"""
+
+
+@pytest.mark.slow
+def test_equations_of_a_function_are_learned_first(folder: Path, tmp_path: Path, call) -> None:
+    (folder / "tank_function.py").write_text(FUNCTION)
+    case, out = folder / "function.toml", tmp_path / "model"
+    written = CASE.replace("state_module:tank", "tank_function:level")
+    case.write_text(written.replace("[records]\n", BLACK_BOX.lstrip()))
+    given = ("--data", folder / "d.csv", "--dynamics", "--out", out, "--json")
+    code, printed, err = call("fit", case, *given)
+    assert (code, "stand in for it" in err) == (0, True), err
+    found = json.loads(printed)
+    assert set(found["parameters"]) == {"gain", "leak"}
+    assert found["surrogate"]["own_level"] < 0.1 * found["surrogate"]["discrepancy_level"]
+    assert found["figures"]["rms_after"] < 0.2 * found["figures"]["rms_before"]
+    code, _, err = call("generate", out, "--out", tmp_path / "g.npz", "--per-class", 4)
+    assert (code, len(rt.load(tmp_path / "g.npz"))) == (0, 4), err
+
+
 @pytest.mark.slow
 def test_a_study_compares_them(folder: Path, tmp_path: Path, call) -> None:
     case, data, out = folder / "case.toml", folder / "d.csv", tmp_path / "study"
@@ -121,6 +165,7 @@ def test_a_study_compares_them(folder: Path, tmp_path: Path, call) -> None:
         ("folds = 8", "fold = 8", "fold"),
         ("knots = []", "knots = [2.0]", "knots"),
         ("folds = 8", 'states = ["nope"]', "states"),
+        ("folds = 8", "folds = 8\n[state_surrogate]\nspread = 2", "spread"),
     ],
 )
 def test_wrong_settings_are_refused_by_name(

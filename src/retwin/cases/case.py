@@ -23,6 +23,7 @@ from retwin.twins.twin import Twin
 from retwin.update.corrections import Correction
 from retwin.update.dynamics import Dynamics, state_names
 from retwin.update.residual import Density, Mixture, SequenceMixture
+from retwin.update.state_surrogate import StateSurrogate
 
 __all__ = ["Body", "Case"]
 
@@ -108,7 +109,9 @@ class Case:
         Splits a file into the calibration set and the test set of a benchmark; None if a file holds
         one set.
     dynamics : Dynamics
-        The form of a discrepancy inside the state equations, for twins that are a `StateTwin`.
+        The form of a discrepancy inside the state equations.
+    state_surrogate : StateSurrogate
+        How state equations are learned for it from simulations, of a twin that is no `StateTwin`.
 
     Raises
     ------
@@ -138,6 +141,7 @@ class Case:
     density: Density | SequenceMixture = Mixture()  # noqa: RUF009 - frozen
     records: Callable[[Path], tuple[Trajectories, Trajectories]] | None = None
     dynamics: Dynamics = Dynamics()  # noqa: RUF009 - frozen
+    state_surrogate: StateSurrogate = StateSurrogate()  # noqa: RUF009 - frozen
 
     def __post_init__(self) -> None:
         require(

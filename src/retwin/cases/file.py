@@ -50,6 +50,7 @@ from retwin.twins.twin import Twin
 from retwin.update.corrections import Correction, DelayOffset
 from retwin.update.dynamics import Dynamics
 from retwin.update.residual import Density, Mixture, SequenceMixture
+from retwin.update.state_surrogate import StateSurrogate
 
 __all__ = ["check_density", "read_case"]
 
@@ -86,6 +87,7 @@ class CaseFile:
     output_correction: Correction | str | None = None
     density: Density | SequenceMixture | str | None = None
     dynamics: Dynamics = Dynamics()  # noqa: RUF009 - frozen
+    state_surrogate: StateSurrogate = StateSurrogate()  # noqa: RUF009 - frozen
     network: Network | str | None = None
     training: Training | None = None
     records: _Columns | str | None = None
@@ -160,6 +162,7 @@ def read_case(path: str | Path) -> Case:
             density=density,
             records=records,
             dynamics=keys.dynamics,
+            state_surrogate=keys.state_surrogate,
         )
 
 

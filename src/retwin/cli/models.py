@@ -23,6 +23,7 @@ from retwin.serialisation.places import check_place
 if TYPE_CHECKING:
     from retwin.cases.case import Case
     from retwin.twins.samplers import CommandSampler
+    from retwin.update import FittedStateSurrogate
     from retwin.update.dynamics import FittedDynamics, Prediction
     from retwin.update.residual import ResidualModel, SequenceResidual
     from retwin.update.surrogate import Surrogate
@@ -92,7 +93,7 @@ StateEquations = Annotated[
     model_option(
         "--dynamics",
         metavar="",
-        help="Correct the state equations; no surrogate. For a StateTwin.",
+        help="Correct the state equations, which are learned first if the twin is no StateTwin.",
     ),
 ]
 
@@ -126,7 +127,7 @@ def fit(
     # The path is absolute, since a model is also used from other folders.
     name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
     if dynamics:
-        _fit_dynamics(system, measured, out, name, as_json=as_json)
+        _fit_dynamics(system, measured, out, name, seed, as_json=as_json)
         return
     faults = system.faults if calibrate_on == "all" else calibrate_on
     calibrating(measured, faults)  # before the surrogate is trained, which takes minutes
@@ -158,14 +159,19 @@ def fit(
 
 
 def _fit_dynamics(
-    system: Case, measured: Trajectories, out: Path, name: str, *, as_json: bool
+    system: Case, measured: Trajectories, out: Path, name: str, seed: int, *, as_json: bool
 ) -> None:
     """Learn what the state equations lack, save the twin, and print what was learned."""
     from retwin.update import fit_dynamics
+    from retwin.update.dynamics import state_names
 
+    twin, surrogate = system.twin, None
+    if not state_names(twin):
+        surrogate = _state_surrogate(system, measured, seed)
+        twin = surrogate.twin
     with bar("fit") as show:
         found = fit_dynamics(
-            system.twin,
+            twin,
             measured,
             system.dynamics,
             progress=lambda s: show("state equations", s),
@@ -186,6 +192,7 @@ def _fit_dynamics(
             "correlations": [[*pair, each] for pair, each in found.correlations.items()],
             "terms": found.terms,
             "one_step_errors": white,
+            "surrogate": None if surrogate is None else surrogate.figures,
             "figures": figures,
             "reason": found.reason,
         },
@@ -206,6 +213,31 @@ def _fit_dynamics(
         as_json=as_json,
     )
     note(f"Saved {out}")
+
+
+def _state_surrogate(system: Case, measured: Trajectories, seed: int) -> FittedStateSurrogate:
+    """State equations that stand in for the case's twin, which is no `StateTwin`."""
+    from retwin.update import fit_state_surrogate
+
+    with bar("fit") as show:
+        found = fit_state_surrogate(
+            system.twin,
+            system.sampler,
+            measured,
+            system.state_surrogate,
+            seed=seed,
+            progress=lambda s: show("state surrogate", s),
+        )
+    errors = (
+        f"{found.figures[f'own_{name}']:.3g} {unit} of {name}"
+        for name, unit in zip(found.twin.outputs.names, found.twin.outputs.units, strict=True)
+    )
+    note(
+        f"The twin shows no state equations. Others with {found.figures['states']:.0f} states "
+        "stand in for it, learned from simulations; on the measured commands their RMS error is "
+        f"{', '.join(errors)}"
+    )
+    return found
 
 
 def _strongest(found: FittedDynamics, parameter: str) -> str:

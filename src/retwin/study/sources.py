@@ -160,7 +160,10 @@ def lacking(name: str, case: Case, plan: StudyPlan) -> str:
     if name == "inversion" and isinstance(case.density, SequenceMixture):
         return "a correction per segment"
     if ("update", "dynamics") in source.needs and not state_names(case.twin):
-        return f"a case whose twin is a StateTwin; that of {case.name!r} is none"
+        return (
+            f"a case whose twin is a StateTwin; that of {case.name!r} is none, but "
+            "fit_state_surrogate learns one from simulations"
+        )
     if source.parametric and case.parametric is None:
         return f"a case that declares the free parameters of its twin; {case.name!r} does not"
     if source.network and isinstance(plan.classifier_config, Rocket):

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
+from fmus import c_fmu
 from numpy.typing import NDArray
 
 import retwin as rt
@@ -166,16 +166,16 @@ def test_an_error_beside_which_the_discrepancy_is_small_is_refused() -> None:
     commands = SHORT.sample(2, rng=np.random.default_rng(3))
     near = GAINS.simulate(commands, seed=0)
     near = near.replace(observed=near.observed + 1e-6)
-    with pytest.raises(InputError, match="observed.*twin's discrepancy.*more simulations"):
+    with pytest.raises(InputError, match=r"observed.*twin's discrepancy.*more simulations"):
         fit_state_surrogate(GAINS, SHORT, near, SMALL)
 
 
 def test_a_constant_output_and_another_rate_are_refused() -> None:
     still = twin_of(lambda u: np.ones_like(u))
-    with pytest.raises(InputError, match="outputs that change.*position"):
+    with pytest.raises(InputError, match=r"outputs that change.*position"):
         fit_state_surrogate(still, SHORT, settings=SMALL)
     slow = HoldSampler((-2.0,), (2.0,), 2 * RATE, 6.0)
-    with pytest.raises(InputError, match="commands.*rate of the twin"):
+    with pytest.raises(InputError, match=r"commands.*rate of the twin"):
         fit_state_surrogate(GAINS, slow, settings=SMALL)
     with pytest.raises(InputError, match="spread"):
         StateSurrogate(spread=1.5)
@@ -235,6 +235,23 @@ def test_the_cascaded_tanks() -> None:
     assert relative(found.twin, TANKS, fresh) < 0.01
 
 
+@pytest.mark.slow
+def test_parameters_of_an_fmu(tmp_path: Path) -> None:
+    channels = (["u"], ["x"])
+    inner = rt.FMUTwin.from_file(c_fmu(tmp_path), 50.0, *channels, workers=1)
+    free = (rt.Parameter("gain", "1", 0.5, 2.0, 1.0), rt.Parameter("tau", "s", 0.05, 0.3, 0.1))
+    twin = rt.ParametricTwin(inner, free)
+    sampler = HoldSampler((-5.0,), (5.0,), 50.0, 4.0)
+    found = fit_state_surrogate(twin, sampler, settings=StateSurrogate(states=1))
+    assert found.figures["nrmse_x"] < 0.01
+    real = twin.with_values([1.4, 0.2]).simulate(
+        sampler.sample(3, rng=np.random.default_rng(9)), seed=0
+    )
+    updated = identify(found.twin.parametric(), real, seed=0)
+    assert updated.values["gain"] == pytest.approx(1.4, rel=0.01)
+    assert updated.values["tau"] == pytest.approx(0.2, rel=0.02)
+
+
 PENDULUM = """
 <mujoco>
   <option timestep="0.005"/>
@@ -252,7 +269,6 @@ PENDULUM = """
 
 @pytest.mark.slow
 def test_a_mujoco_model_with_memory(tmp_path: Path) -> None:
-    assert mujoco.__version__
     (tmp_path / "pendulum.xml").write_text(PENDULUM)
     twin = rt.MuJoCoTwin.from_file(tmp_path / "pendulum.xml", rate=20.0)
     sampler = HoldSampler((-1.0,), (1.0,), 20.0, 15.0)

@@ -87,7 +87,8 @@ def state_twin_of(
         "twin",
         expected="a StateTwin, or a ParametricTwin of one",
         got=type(base).__name__,
-        remedy="write the state equations as a StateTwin; other twins have output corrections",
+        remedy="write the state equations as a StateTwin, or learn them from simulations by "
+        "fit_state_surrogate; other twins have output corrections",
     )
     assert isinstance(base, StateTwin)
     values = dict(zip(base.names, base.values(None, 1)[0].tolist(), strict=True))
