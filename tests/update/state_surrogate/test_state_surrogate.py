@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -185,7 +186,9 @@ def test_a_constant_output_and_another_rate_are_refused() -> None:
 def test_a_chaotic_twin_is_refused() -> None:
     excited = HoldSampler((-0.5,), (0.5,), RATE, 30.0)
     with pytest.raises(InputError, match=r"twin.*follows to 0\.1.*last.*chaos"):
-        fit_state_surrogate(twin_of(two_wells), excited, settings=StateSurrogate(states=2))
+        fit_state_surrogate(
+            twin_of(two_wells), excited, settings=StateSurrogate(states=2, simulations=30)
+        )
 
 
 @pytest.mark.slow
@@ -200,13 +203,13 @@ def test_the_number_of_states_is_found(sprung: FittedStateSurrogate) -> None:
 def test_shifted_parameters_of_a_black_box_are_identified(sprung: FittedStateSurrogate) -> None:
     truth = {"stiffness": 5.5, "damping": 0.8}
     inside = 0
-    for seed in range(6):
+    for seed in range(4):
         found = fit_dynamics(sprung.twin, noisy(with_values(truth), seed))
         for name, value in truth.items():
             deviations = abs(found.parameters[name] - value) / found.errors[name]
             inside += deviations < 2
         assert found.figures["rms_after"] < 0.0115
-    assert inside >= 10, "of 12 intervals of two standard errors"
+    assert inside >= 6, "of 8 intervals of two standard errors"
     updated = identify(sprung.twin.parametric(), noisy(with_values(truth), 0), seed=0)
     for name, value in truth.items():
         assert updated.values[name] == pytest.approx(value, rel=0.01)
@@ -229,7 +232,7 @@ def test_faults_of_a_black_box_are_inverted(sprung: FittedStateSurrogate) -> Non
 
 @pytest.mark.slow
 def test_the_cascaded_tanks() -> None:
-    found = fit_state_surrogate(TANKS, VOLTAGES)
+    found = fit_state_surrogate(TANKS, VOLTAGES, settings=StateSurrogate(simulations=50))
     assert found.figures["states"] == 2
     fresh = VOLTAGES.sample(20, rng=np.random.default_rng(9))
     assert relative(found.twin, TANKS, fresh) < 0.01
@@ -242,7 +245,8 @@ def test_parameters_of_an_fmu(tmp_path: Path) -> None:
     free = (rt.Parameter("gain", "1", 0.5, 2.0, 1.0), rt.Parameter("tau", "s", 0.05, 0.3, 0.1))
     twin = rt.ParametricTwin(inner, free)
     sampler = HoldSampler((-5.0,), (5.0,), 50.0, 4.0)
-    found = fit_state_surrogate(twin, sampler, settings=StateSurrogate(states=1))
+    settings = StateSurrogate(states=1, hidden=8, simulations=50)
+    found = fit_state_surrogate(twin, sampler, settings=settings)
     assert found.figures["nrmse_x"] < 0.01
     real = twin.with_values([1.4, 0.2]).simulate(
         sampler.sample(3, rng=np.random.default_rng(9)), seed=0
@@ -272,6 +276,18 @@ def test_a_mujoco_model_with_memory(tmp_path: Path) -> None:
     (tmp_path / "pendulum.xml").write_text(PENDULUM)
     twin = rt.MuJoCoTwin.from_file(tmp_path / "pendulum.xml", rate=20.0)
     sampler = HoldSampler((-1.0,), (1.0,), 20.0, 15.0)
-    found = fit_state_surrogate(twin, sampler, settings=StateSurrogate(states=2))
+    settings = StateSurrogate(states=2, simulations=30)
+    found = fit_state_surrogate(twin, sampler, settings=settings)
     fresh = sampler.sample(10, rng=np.random.default_rng(9))
     assert relative(found.twin, twin, fresh) < 0.01
+
+
+@pytest.mark.slow
+def test_the_page_of_state_surrogates() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "state_surrogate.md").read_text("utf-8")
+    names: dict = {"__name__": "shown"}
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(code, "docs/state_surrogate.md", "exec"), names)
+    assert names["learned"].figures["nrmse_level"] < 0.005
+    found = names["fitted"]
+    assert abs(found.parameters["leak"] - 0.06) < 3 * found.errors["leak"] < 0.003

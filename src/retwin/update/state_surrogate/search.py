@@ -33,6 +33,9 @@ WORTH = 0.95
 """Ratio of errors below which a further search, or another state, is worth its time."""
 PATIENCE = 2
 """Searches, or numbers of states, that are tried beyond the best one."""
+MAX_SAMPLES, MIN_STEPS = 30_000, 100
+"""Samples on which the search begins, the first ones of all simulations, and of each at least; it
+ends on whole simulations."""
 MORE = 8
 """Largest number of states beyond the first that is tried."""
 COMPONENT = 0.01
@@ -107,36 +110,43 @@ def searched(
     Found
         The best.
     dict of int to float
-        The error by the number of states.
+        The error by the number of states, over the samples on which the search begins.
 
     """
-    first = _components(training.observed)
-    tried = tuple(orders) or range(first, first + MORE + 1)
+    first, rng = _components(training.observed), np.random.SeedSequence(seed)
+    steps = min(training.steps, max(MIN_STEPS, MAX_SAMPLES // len(training)))
+    part, other = (each.between(0, steps / each.rate) for each in (training, held_out))
+
+    def begun(order: int, width: int) -> Found:
+        equations = Equations.begun(part, order, width, np.random.default_rng(rng))
+        return fitted(part, other, equations, STRONGEST)
+
     best: Found | None = None
     history: dict[int, float] = {}
     worse = 0
-    for order in tried:
-        found = fitted(training, held_out, order, hidden, seed)
+    for order in tuple(orders) or range(first, first + MORE + 1):
+        found = begun(order, hidden)
         history[order] = found.error
         worse += 1
         if best is None or found.error < WORTH * best.error:
             best, worse = found, 0
-        progress(0.7 * (1 - 0.7 ** len(history)))
+        progress(0.6 * (1 - 0.7 ** len(history)))
         if best.error < accuracy or (worse == PATIENCE and np.isfinite(best.error)):
             break
     assert best is not None
     if best.error >= accuracy:
-        wider = fitted(training, held_out, best.order, 2 * hidden, seed)
-        best = min(best, wider, key=lambda each: each.error)
+        best = min(best, begun(best.order, 2 * hidden), key=lambda each: each.error)
         history[best.order] = best.error
+    progress(0.7)
+    if steps < training.steps and np.isfinite(best.error):
+        best = fitted(training, held_out, best.equations, WEAKEST)
     return best, history
 
 
 def fitted(
-    training: Trajectories, held_out: Trajectories, order: int, hidden: int, seed: int
+    training: Trajectories, held_out: Trajectories, equations: Equations, variance: float
 ) -> Found:
-    """The equations with so many states and a network of such a width, see `searched`."""
-    equations = Equations.begun(training, order, hidden, np.random.default_rng(seed))
+    """The equations whose search begins at some weights, with an assumed variance."""
     twin = equations.trainable(training.inputs, training.outputs, training.rate)
     starts = dict.fromkeys((f"start_{each.name}" for each in twin.states), 0.0)
     weights = dict(zip(twin.names, equations.flat, strict=False))
@@ -146,7 +156,7 @@ def fitted(
     estimation = Estimation(twin, training, unknowns, training.mask, power)
     tested = Estimation(twin, held_out, unknowns, held_out.mask, power)
     own, other = (np.zeros((len(each), 0)) for each in (training, held_out))
-    best, variance, worse = Found(equations, np.inf), STRONGEST, 0
+    best, worse = Found(equations, np.inf), 0
     now = estimation.linearised(Point(equations.flat, own))
     for _ in range(MAX_PASSES):
         if not now.finite:

@@ -22,7 +22,7 @@ __all__ = ["MIN_SIMULATIONS", "Simulations", "check_outputs", "drawn_parameters"
 
 MIN_SAMPLES = 20
 """Least number of samples of a simulation: fewer show hardly any memory."""
-MAX_SAMPLES = 30_000
+MAX_SAMPLES = 100_000
 """Number of samples of all simulations together, about; more do not lower the error."""
 MIN_SIMULATIONS = 10
 """Least number of simulations to learn from."""
