@@ -47,6 +47,7 @@ _HOME = {
     "SequenceResidual": "residual",
     "StateSurrogate": "state_surrogate",
     "Surrogate": "surrogate",
+    "TanhNetwork": "dynamics",
     "Updated": "identification",
     "calibration_ranks": "identification",
     "command_space": "corrections",

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.update.dynamics.corrected import Domain
-from retwin.update.dynamics.library import Library, Term
+from retwin.update.dynamics.library import Library
+from retwin.update.dynamics.terms import Term
 
 __all__ = ["ROWS_PER_TERM", "Lags", "Rows", "Scales", "least_squares"]
 

@@ -3,11 +3,13 @@
 Corrections of outputs and commands are in `retwin.update.corrections`.
 """
 
-from retwin.update.dynamics.corrected import Domain
 from retwin.update.dynamics.curves import Curve
-from retwin.update.dynamics.fitting import Dynamics, FittedDynamics, fit_dynamics
+from retwin.update.dynamics.domain import Domain
+from retwin.update.dynamics.fitting import FittedDynamics, fit_dynamics
 from retwin.update.dynamics.library import Library
+from retwin.update.dynamics.network import TanhNetwork
 from retwin.update.dynamics.prediction import Prediction
+from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_names, state_twin_of
 
@@ -19,6 +21,7 @@ __all__ = [
     "FittedDynamics",
     "Library",
     "Prediction",
+    "TanhNetwork",
     "fit_dynamics",
     "state_names",
     "state_twin_of",

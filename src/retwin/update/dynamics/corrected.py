@@ -22,121 +22,99 @@ from retwin.checks import one_of, require
 from retwin.twins.compiled.program import Node
 from retwin.twins.parametric import Parameter
 from retwin.twins.state_twin import StateTwin, with_parameters
-from retwin.update.dynamics.library import Library, Term
+from retwin.update.dynamics.domain import Domain
+from retwin.update.dynamics.library import Library
+from retwin.update.dynamics.network import TanhNetwork
+from retwin.update.dynamics.settings import Dynamics
+from retwin.update.dynamics.terms import Term
 
-__all__ = ["CorrectedEquations", "Domain"]
+__all__ = ["CorrectedEquations", "correctable", "variable_names", "variables_of"]
 
-EXTRAPOLATED = 0.25
-"""How far beyond its range in calibration, in widths of that, a variable of the discrepancy is
-extrapolated. From there on it is held, since polynomials diverge."""
 LINEAR = {"variable", "constant", "add", "sub", "neg"}
 """Operations of an equation that only defines a state."""
 COMPARED = 5000
 """Number of samples at which terms are compared."""
 DISTINCT = 1e-5
 """Norm of what a term of norm 1 has beyond others, below which it is a combination of them."""
-WIDEST = 1e9
-"""Bound of the coefficients of terms, which their prior keeps much smaller."""
+ABSORBED = 1e-3
+"""Standard deviation of what a network has in common with the effects of parameters, in the root
+mean square of the states' time derivatives: so small that it is theirs."""
 
 
-@dataclass(frozen=True)
-class Domain:
-    """The range of states and commands in calibration, by which variables are scaled.
+@dataclass(frozen=True, eq=False)
+class Equation:
+    """A corrected state equation.
 
     Attributes
     ----------
-    low, high : NDArray
-        (d_x + d_u,), of the states and then the commands.
-    mean : NDArray
-        (d_x + d_u,), their means.
-    speed : NDArray
-        (d_x,), root mean square of the time derivatives of the states, or of their steps.
+    index : int
+        The index of its state.
+    places : sequence of int
+        Indices of the variables of its discrepancy among the states and then the commands.
+    terms : sequence of Term
+        The terms of its discrepancy.
+    zero : float, optional
+        The scaled state where it is 0, for a passive equation: terms are 0 there.
 
     """
 
-    low: NDArray
-    high: NDArray
-    mean: NDArray
-    speed: NDArray
+    index: int
+    places: Sequence[int]
+    terms: Sequence[Term]
+    zero: float | None
 
-    @classmethod
-    def visited(cls, states: NDArray, commands: NDArray, speed: NDArray) -> Domain:
-        """The domain of states (n, T, d_x) and commands (n, T, d_u)."""
-        both = np.concatenate([states, commands], axis=2)
-        low, high, mean = (make(both, axis=(0, 1)) for make in (np.min, np.max, np.mean))
-        return cls(low, high, np.clip(mean, low, high), speed)
+    def values(self, variables: Sequence[Any], inner: Sequence[Sequence[Any]]) -> list[Any]:
+        """The values of the terms at all scaled variables, with the inner coefficients of each."""
+        import torch
 
-    @cached_property
-    def centre(self) -> NDArray:
-        """Centres (d_x + d_u,): 0 where a range lies about it, for terms that are then simpler."""
-        middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
-        return np.where(np.abs(middle) < half / 2, 0.0, middle)
-
-    @cached_property
-    def scale(self) -> NDArray:
-        """Half widths (d_x + d_u,) about the centre; 1 for a constant."""
-        half = np.maximum(self.high - self.centre, self.centre - self.low)
-        return np.where(half > 0, half, 1.0)
-
-    def scaled(self, variables: Sequence[Any]) -> list[Any]:
-        """States and commands, tensors, as variables of the discrepancy."""
-        beyond = EXTRAPOLATED * (self.high - self.low)
-        ends = (
-            (each - self.centre) / self.scale for each in (self.low - beyond, self.high + beyond)
-        )
-        columns = (self.centre.tolist(), self.scale.tolist(), *(each.tolist() for each in ends))
-        return [
-            ((each - centre) / scale).clamp(low, high)
-            for each, centre, scale, low, high in zip(variables, *columns, strict=True)
-        ]
-
-    def excess(self, states: NDArray, commands: NDArray) -> NDArray:
-        """How far states (n, T, d_x) and commands (n, T, d_u) leave the domain, in widths of it.
-
-        (d_x + d_u,), the most of all trajectories; those with states that are not finite do not
-        count.
-        """
-        finite = np.isfinite(states).all(axis=(1, 2))
-        if not finite.any():
-            return np.zeros(len(self.low))
-        both = np.concatenate([states[finite], commands[finite]], axis=2)
-        width = np.where(self.high > self.low, self.high - self.low, self.scale)
-        beyond = np.maximum(both.max(axis=(0, 1)) - self.high, self.low - both.min(axis=(0, 1)))
-        made: NDArray = np.maximum(beyond, 0.0) / width
-        return made
+        v = [variables[place] for place in self.places]
+        made = [term.value(v, *own) for term, own in zip(self.terms, inner, strict=True)]
+        if self.zero is None:
+            return made
+        v[self.places.index(self.index)] = torch.tensor(self.zero, dtype=torch.float64)
+        at_rest = [term.value(v, *own) for term, own in zip(self.terms, inner, strict=True)]
+        return [one - other for one, other in zip(made, at_rest, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
 class CorrectedEquations:
     """A twin with a discrepancy in some of its state equations.
 
+    The coefficients psi are, term by term, its weight and then its inner coefficients.
+
     Attributes
     ----------
     twin : StateTwin
         The twin whose equations are corrected.
-    library : Library
-        Forms of the discrepancy.
+    form : Library or TanhNetwork
+        The form of the discrepancy.
+    settings : Dynamics
+        What is known of it.
     domain : Domain
         Scales of the variables.
-    states : tuple of str
-        The states whose equations are corrected.
+    visited : tuple of NDArray
+        States (K, d_x) and commands (K, d_u) of the calibration record, some of the samples.
+    free : NDArray
+        (q, k), by which the parameters of the twin depend on the free ones.
     dropped : frozenset of str
-        Names of coefficients that are left out.
+        Names of terms that are left out.
 
     """
 
     twin: StateTwin
-    library: Library
+    form: Library | TanhNetwork
+    settings: Dynamics
     domain: Domain
-    states: tuple[str, ...]
+    visited: tuple[NDArray, NDArray]
+    free: NDArray
     dropped: frozenset[str] = frozenset()
 
     @classmethod
     def distinct(
         cls,
         twin: StateTwin,
-        library: Library,
-        states: tuple[str, ...],
+        form: Library | TanhNetwork,
+        settings: Dynamics,
         visited: tuple[NDArray, NDArray],
         free: NDArray,
     ) -> CorrectedEquations:
@@ -146,24 +124,23 @@ class CorrectedEquations:
 
         Parameters
         ----------
-        twin, library, states
+        twin, form, settings, free
             See the attributes.
         visited : tuple of NDArray
             States (n, T, d_x) and commands (n, T, d_u) of the calibration record.
-        free : NDArray
-            (q, k), by which the parameters of the twin depend on the free ones.
 
         """
         x, u = visited
         steps = np.diff(x, axis=1) * (1.0 if twin.step else twin.rate)
         speed = np.sqrt(np.mean(steps**2, axis=(0, 1)))
         domain = Domain.visited(x, u, np.where(speed > 0, speed, 1.0))
-        whole = cls(twin, library, domain, states)
         x, u = (each.reshape(-1, each.shape[2]) for each in visited)
         some = np.linspace(0, len(x) - 1, min(len(x), COMPARED)).astype(int)
+        whole = cls(twin, form, settings, domain, (x[some], u[some]), free)
         columns = whole.values(x[some], u[some])
         dropped, first = set(), 0
-        for i, _, terms in whole.equations:
+        for equation in whole.equations:
+            i, terms = equation.index, equation.terms
             own = columns[:, first : first + len(terms)]
             basis = np.linalg.qr(_scaled(_by_parameters(twin, i, x[some], u[some]) @ free))[0]
             for column, term in zip(_scaled(own).T, terms, strict=True):
@@ -178,41 +155,56 @@ class CorrectedEquations:
         return replace(whole, dropped=frozenset(dropped))
 
     @cached_property
-    def equations(self) -> list[tuple[int, list[int], list[Term]]]:
-        """Per corrected state: its index, indices of its variables, and its terms."""
-        names = [each.name for each in self.twin.states]
-        # A command may have the name of a state.
-        commands = [f"command {each}" if each in names else each for each in self.twin.inputs.names]
+    def equations(self) -> list[Equation]:
+        """The corrected state equations."""
+        import torch
+
+        twin, settings = self.twin, self.settings
+        names, everything = [each.name for each in twin.states], variable_names(twin)
+        for setting in ("depends", "monotone", "passive"):
+            for state in getattr(settings, setting):
+                one_of(setting, state, self.states)
+        rest = self.domain.scaled(torch.zeros(len(everything), dtype=torch.float64).unbind())
         made = []
         for state in self.states:
             i = names.index(state)
-            used = variables_of(self.twin, i)
-            places = sorted({i, *used})
-            own = [[*names, *commands][place] for place in places]
-            count = sum(place < len(names) for place in places)
+            given = settings.depends.get(state)
+            for name in given or ():
+                one_of("depends", name, everything)
+            used = [everything.index(each) for each in given] if given else variables_of(twin, i)
+            places = sorted({*used} if given else {i, *used})
+            own = [everything[place] for place in places]
+            signs = settings.signs(state, own)
             terms = [
                 term
-                for term in self.library.terms(own, count)
+                for term in self.form.terms(own, sum(place < len(names) for place in places), signs)
                 if f"{state}: {term.name}" not in self.dropped
             ]
-            made.append((i, places, terms))
+            zero = float(rest[i]) if state in settings.passive else None
+            made.append(Equation(i, places, terms, zero))
         return made
 
-    @property
-    def names(self) -> list[str]:
-        """Names of the coefficients psi: the state and the term."""
+    @cached_property
+    def states(self) -> tuple[str, ...]:
+        """The states whose equations are corrected."""
+        return correctable(self.twin, self.settings.states)
+
+    @cached_property
+    def coefficients(self) -> list[Parameter]:
+        """The coefficients psi, named by the state and the term; their starts are prior means."""
         return [
-            f"{self.twin.states[i].name}: {term.name}"
-            for i, _, terms in self.equations
-            for term in terms
+            replace(each, name=f"{self.twin.states[equation.index].name}: {each.name}")
+            for equation in self.equations
+            for term in equation.terms
+            for each in (term.weight, *term.inner)
         ]
 
     @cached_property
     def corrected(self) -> StateTwin:
-        """The twin with the coefficients psi as further parameters, 0 by default.
+        """The twin with the coefficients psi as further parameters, with which delta is 0.
 
-        A coefficient of 1 is a term that at the edge of the domain is as large as the root mean
-        square of the state's time derivative.
+        A weight of 1 is a term that, where it is 1, is as large as the root mean square of the
+        state's time derivative.
         """
         twin, own = self.twin, len(self.twin.parameters)
         named = namedtuple("p", [each.name for each in twin.parameters], rename=True)  # type: ignore[misc]
@@ -221,37 +213,93 @@ class CorrectedEquations:
         )
 
         def corrected(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
-            variables = self.domain.scaled([*x, *u])
             slope = list(function(x, u, named(*p[:own])))
-            coefficients = iter(p[own:])
-            for i, places, terms in self.equations:
-                v = [variables[j] for j in places]
-                total = sum(next(coefficients) * term.value(v) for term in terms)
-                slope[i] = slope[i] + float(self.domain.speed[i]) * total
+            found = self.discrepancies(self.domain.scaled([*x, *u]), p[own:])
+            for equation, each in zip(self.equations, found, strict=True):
+                i = equation.index
+                slope[i] = slope[i] + float(self.domain.speed[i]) * each
             return tuple(slope)
 
-        extra = (Parameter(name, "1", -WIDEST, WIDEST, 0.0) for name in self.names)
         own_equations = (
             replace(twin, step=corrected) if twin.step else replace(twin, derivative=corrected)
         )
         return replace(
             own_equations,
             output=lambda x, u, p: output(x, u, named(*p[:own])),
-            parameters=(*twin.parameters, *extra),
+            parameters=(*twin.parameters, *self.coefficients),
         )
 
-    def values(self, states: NDArray, commands: NDArray) -> NDArray:
-        """The values (K, k) of all terms at states (K, d_x) and commands (K, d_u)."""
+    def discrepancies(self, variables: Sequence[Any], coefficients: Sequence[Any]) -> list[Any]:
+        """Per equation, the discrepancy over the speed of its state, at scaled variables."""
+        made, left = [], iter(coefficients)
+        for equation in self.equations:
+            parts = [(next(left), [next(left) for _ in term.inner]) for term in equation.terms]
+            values = equation.values(variables, [inner for _, inner in parts])
+            made.append(sum(weight * each for (weight, _), each in zip(parts, values, strict=True)))
+        return made
+
+    def values(
+        self, states: NDArray, commands: NDArray, coefficients: NDArray | None = None
+    ) -> NDArray:
+        """The values (K, k) of all terms at states (K, d_x) and commands (K, d_u).
+
+        `coefficients` are those of psi, by default the starts; weights do not matter.
+        """
+        scaled = self._scaled(states, commands)
+        starts = [each.start for each in self.coefficients]
+        left = iter(starts if coefficients is None else coefficients.tolist())
+        columns = []
+        for equation in self.equations:
+            parts = [(next(left), [next(left) for _ in term.inner]) for term in equation.terms]
+            columns += equation.values(scaled, [inner for _, inner in parts])
+        zero = 0.0 * scaled[0]
+        made: NDArray = np.stack([(zero + each).numpy() for each in columns] or [[]] * len(zero), 1)
+        return made.reshape(len(zero), -1)
+
+    @property
+    def weights(self) -> NDArray:
+        """Which coefficients (k,) are weights of terms."""
+        made = [
+            place == 0
+            for equation in self.equations
+            for term in equation.terms
+            for place in range(1 + len(term.inner))
+        ]
+        return np.array(made, dtype=bool)
+
+    def absorbed(self, coefficients: NDArray) -> tuple[NDArray, NDArray]:
+        """What the parameters could explain of a network, (r,), and its derivatives (r, k).
+
+        It is the component of the discrepancies in the span of the effects of the parameters on all
+        state equations, over the visited states, in the standard deviation that it may have.
+        Nothing (0,) for a library: its terms have a meaning, so that their effects are not divided.
+        """
+        import torch
+
+        if self.weights.all() or not self._effects.size:
+            return np.zeros(0), np.zeros((0, len(coefficients)))
+        psi = torch.tensor(coefficients, requires_grad=True)
+        scaled, basis = self._scaled(*self.visited), torch.tensor(self._effects)
+        parts = zip(self.equations, self.discrepancies(scaled, psi.unbind()), strict=True)
+        common = sum(basis[:, own.index] @ (0.0 * scaled[0] + each) for own, each in parts)
+        common = common / (ABSORBED * len(scaled[0]) ** 0.5)
+        slope = [torch.autograd.grad(each, psi, retain_graph=True)[0] for each in common.unbind()]
+        return common.detach().numpy(), torch.stack(slope).numpy()
+
+    @cached_property
+    def _effects(self) -> NDArray:
+        """An orthonormal basis (r, d_x, K) of the effects of the free parameters."""
+        count = len(self.twin.states)
+        by_all = [_by_parameters(self.twin, i, *self.visited) @ self.free for i in range(count)]
+        columns = np.stack(by_all) / self.domain.speed[:, None, None]
+        basis, size, _ = np.linalg.svd(_scaled(columns.reshape(-1, columns.shape[2])), False)
+        return basis[:, size > DISTINCT].T.reshape(-1, count, len(self.visited[0]))
+
+    def _scaled(self, states: NDArray, commands: NDArray) -> list[Any]:
         import torch
 
         both = torch.as_tensor(np.concatenate([states, commands], axis=1))
-        scaled = self.domain.scaled(both.unbind(1))
-        columns = [
-            term.value([scaled[j] for j in places]) * torch.ones_like(scaled[0])
-            for _, places, terms in self.equations
-            for term in terms
-        ]
-        return torch.stack(columns, 1).numpy() if columns else np.zeros((len(states), 0))
+        return self.domain.scaled(both.unbind(1))
 
 
 def _by_parameters(twin: StateTwin, equation: int, states: NDArray, commands: NDArray) -> NDArray:
@@ -277,6 +325,12 @@ def _scaled(columns: NDArray) -> NDArray:
     size = np.linalg.norm(columns, axis=0)
     made: NDArray = np.divide(columns, size, out=np.zeros_like(columns), where=size > 0)
     return made
+
+
+def variable_names(twin: StateTwin) -> list[str]:
+    """Names of the states and then of the commands; a command may have the name of a state."""
+    names = [each.name for each in twin.states]
+    return [*names, *(f"command {u}" if u in names else u for u in twin.inputs.names)]
 
 
 def variables_of(twin: StateTwin, equation: int) -> list[int]:

@@ -12,7 +12,8 @@ from scipy.special import ndtri
 
 from retwin.checks import one_of
 from retwin.twins.state_twin import StateTwin
-from retwin.update.dynamics.corrected import EXTRAPOLATED, Domain, variables_of
+from retwin.update.dynamics.corrected import variable_names, variables_of
+from retwin.update.dynamics.domain import EXTRAPOLATED, Domain
 
 __all__ = ["Curve", "axes_of", "curve_of"]
 
@@ -62,7 +63,7 @@ class Curve:
 
 def axes_of(equations: StateTwin, corrected: tuple[str, ...]) -> list[tuple[str, str]]:
     """The corrected equations with each variable on which they depend."""
-    states, names = [each.name for each in equations.states], _variables(equations)
+    states, names = [each.name for each in equations.states], variable_names(equations)
     return [
         (state, names[i])
         for state in corrected
@@ -96,7 +97,7 @@ def curve_of(
     one_of("equation", equation, corrected)
     one_of("variable", variable, [name for _, name in axes_of(equations, (equation,))])
     states = [each.name for each in equations.states]
-    index, place = states.index(equation), _variables(equations).index(variable)
+    index, place = states.index(equation), variable_names(equations).index(variable)
     parameters = [each.name for each in equations.parameters]
     learned = np.array([n.startswith(tuple(f"{s}: " for s in corrected)) for n in parameters], bool)
     own = [name for name, each in zip(parameters, learned, strict=True) if not each]
@@ -135,9 +136,3 @@ def curve_of(
         low,
         high,
     )
-
-
-def _variables(equations: StateTwin) -> list[str]:
-    """Names of the states and then of the commands; a command may have the name of a state."""
-    names = [each.name for each in equations.states]
-    return [*names, *(f"command {u}" if u in names else u for u in equations.inputs.names)]

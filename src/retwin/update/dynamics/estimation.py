@@ -14,7 +14,7 @@ trajectories at a time, and only sums of their products are kept.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -62,6 +62,11 @@ class Estimation:
         (n, T, d_y) bool, the samples that count.
     variance : NDArray
         (d_y,), of the error of an effective sample.
+    absorbed : callable, optional
+        From the shared coordinates (k,) to further errors (r,) of variance 1 and their derivatives
+        (r, k), see `CorrectedEquations.absorbed`.
+    free_starts : bool, default True
+        Whether unknown starts are estimated; otherwise they stay where the search begins.
 
     """
 
@@ -70,6 +75,8 @@ class Estimation:
     unknowns: Unknowns
     seen: NDArray
     variance: NDArray
+    absorbed: Callable[[NDArray], tuple[NDArray, NDArray]] | None = None
+    free_starts: bool = True
 
     @cached_property
     def commands(self) -> NDArray:
@@ -166,72 +173,110 @@ class Estimation:
     def minimised(self, at: Linearised, steps: int = MAX_STEPS) -> Linearised:
         """The most probable point, from a start at which the simulation is finite.
 
-        The search ends after so many steps at most.
+        The search ends after so many steps at most. Steps are projected onto the bounds.
         """
         flat = at.point.flat
         if not flat.size:
             return at
-        value, gradient, curvature = self._expanded(at, flat)
+        value, gradient, curvature = self._expanded(at)
         unit = _unit(curvature)
         radius = WIDEST / 1e3
         for _ in range(steps):
             if np.linalg.norm(unit * gradient) < TOLERANCE:
                 break
             scaled = curvature.scaled(unit)
-            step = trust_region_step(scaled, unit * gradient, radius)
+            there = flat + unit * trust_region_step(scaled, unit * gradient, radius)
+            inside = np.clip(there, *self._bounds)
+            step = (inside - flat) / unit
             expected = -float(step @ (unit * gradient + scaled.times(step) / 2))
+            length = float(np.linalg.norm(step))
             if expected <= 0:
-                break
-            there = flat + unit * step
-            tried = self.linearised(self.point(np.clip(there, *self._bounds)))
-            found = self._expanded(tried, there)
-            ratio, length = (value - found[0]) / expected, float(np.linalg.norm(step))
+                if (inside == there).all():
+                    break
+                radius = float(np.linalg.norm((there - flat) / unit)) / 4
+                continue
+            tried = self.linearised(self.point(inside))
+            found = self._expanded(tried)
+            ratio = (value - found[0]) / expected
             if ratio < 0.25:
                 radius = length / 4
             elif ratio > 0.75:
                 radius = max(radius, min(2 * length, WIDEST))
             if ratio > ACCEPTED:
-                at, flat, (value, gradient, curvature) = tried, there, found
+                at, flat, (value, gradient, curvature) = tried, inside, found
         return at
 
-    def _expanded(self, at: Linearised, flat: NDArray) -> tuple[float, NDArray, Arrow]:
-        """The objective at a flat point, its gradient (k + n m,) and Gauss-Newton curvature.
+    def _expanded(self, at: Linearised) -> tuple[float, NDArray, Arrow]:
+        """The objective at a point, its gradient (k + n m,) and Gauss-Newton curvature.
 
-        `at` is the point inside the bounds that is next to it. Where the simulation is not finite,
-        the objective is infinite.
+        A coordinate at its bound is held where the objective would take it further. Where the
+        simulation is not finite, the objective is infinite.
         """
+        flat = at.point.flat
         mean, precision = self._prior
         prior = precision * (flat - mean)
         if not at.finite:
             return np.inf, prior, self._curvature(at)
-        weight = 1 / self.variance
         squares = np.sum(at.residual**2, axis=(0, 1))
-        value = 0.5 * float(weight @ squares + prior @ (flat - mean))
-        parameters = len(self.unknowns.offset)
-        shared = self.unknowns.matrix.T @ (weight @ at.products[:, :parameters, -1])
-        own = np.tensordot(weight, at.own[..., -1], 1)
-        gradient = prior - np.concatenate([shared, own.ravel()])
-        # A coordinate at its bound is held where the objective would take it further.
-        outside = flat - at.point.flat
-        held = (outside != 0) & (gradient * outside < 0)
+        value = 0.5 * float((1 / self.variance) @ squares + prior @ (flat - mean))
+        if self.absorbed is not None:
+            value += 0.5 * float(np.sum(self.absorbed(at.point.shared)[0] ** 2))
+        gradient = self._gradient(at)
+        held = self._pressed(flat, gradient)
+        if not self.free_starts:
+            held[self.unknowns.count :] = True
         gradient[held] = 0.0
         return value, gradient, self._curvature(at).scaled(1.0 - held).plus(1.0 * held)
+
+    def _gradient(self, at: Linearised) -> NDArray:
+        """The gradient (k + n m,) of the objective."""
+        flat, (mean, precision) = at.point.flat, self._prior
+        unknowns, weight = self.unknowns, 1 / self.variance
+        shared = unknowns.matrix.T @ (weight @ at.products[:, : len(unknowns.offset), -1])
+        own = np.tensordot(weight, at.own[..., -1], 1)
+        made: NDArray = precision * (flat - mean) - np.concatenate([shared, own.ravel()])
+        if self.absorbed is not None:
+            error, slope = self.absorbed(at.point.shared)
+            made[: unknowns.count] += slope.T @ error
+        return made
+
+    def _pressed(self, flat: NDArray, gradient: NDArray) -> NDArray:
+        """Which coordinates (k + n m,) are at a bound beyond which the objective falls."""
+        low, high = self._bounds
+        made: NDArray = ((flat <= low) & (gradient > 0)) | ((flat >= high) & (gradient < 0))
+        return made
 
     def _curvature(self, at: Linearised) -> Arrow:
         """The Gauss-Newton curvature of the objective."""
         unknowns, weight = self.unknowns, 1 / self.variance
         parameters = len(unknowns.offset)
         products, own = (np.tensordot(weight, each[..., :-1], 1) for each in (at.products, at.own))
+        shared = unknowns.matrix.T @ products[:parameters, :parameters] @ unknowns.matrix
+        if self.absorbed is not None:
+            slope = self.absorbed(at.point.shared)[1]
+            shared = shared + slope.T @ slope
         arrow = Arrow(
-            unknowns.matrix.T @ products[:parameters, :parameters] @ unknowns.matrix,
+            shared,
             own[..., :parameters] @ unknowns.matrix,
             own[..., parameters + unknowns.free],
         )
         return arrow.plus(self._prior[1])
 
+    def _bounded(self, at: Linearised) -> Arrow:
+        """The curvature of a Gaussian approximation to the posterior within its bounds.
+
+        At a bound that is pressed by the gradient g > 0, with a curvature h, the density of the
+        distance t is proportional to exp(-g t - h t^2 / 2). A precision h + g^2 / 2 gives its
+        second moment about the bound for g = 0 and for large g, and at most 1.4 times it between.
+        """
+        gradient = self._gradient(at)
+        return self._curvature(at).plus(
+            np.where(self._pressed(at.point.flat, gradient), gradient**2 / 2, 0.0)
+        )
+
     def covariance(self, at: Linearised) -> NDArray:
         """Posterior covariance (k + m, k + m) of coordinates and mean starts, by Laplace."""
-        curvature = self._curvature(at)
+        curvature = self._bounded(at)
         unit = _unit(curvature)
         complement, follow, inverse = curvature.scaled(unit).reduced()
         k = len(complement)
@@ -266,7 +311,7 @@ class Estimation:
 
         """
         k = self.unknowns.count
-        curvature = self._curvature(at)
+        curvature = self._bounded(at)
         unit = _unit(curvature)[:k]
         by_unit = self.unknowns.matrix * unit
         scale = 1 / np.sqrt(self.variance)
@@ -285,6 +330,8 @@ class Estimation:
             gradients[i] -= weighted.T @ (error * scale).ravel()
         covariances = np.linalg.pinv(left, hermitian=True)
         steps = np.einsum("fij,fj->fi", covariances, gradients)
+        ends = (each[:k] - at.point.shared for each in self._bounds)
+        steps = np.clip(unit * steps, *ends) / unit
         errors, variances = at.residual.copy(), np.zeros(at.residual.shape)
         for i, rows, error, jacobian in parts():
             fold = folds[i][rows]

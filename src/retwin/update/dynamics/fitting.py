@@ -12,21 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from retwin.checks import instance, require, whole
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
-from retwin.update.dynamics.corrected import CorrectedEquations, Domain, correctable
+from retwin.update.dynamics.corrected import CorrectedEquations
+from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.estimation import Estimation, correlation_time, root
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
+from retwin.update.dynamics.network import TanhNetwork
 from retwin.update.dynamics.noise import fit_noise, folds, widening
+from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of
 
-__all__ = ["Dynamics", "FittedDynamics", "assembled", "fit_dynamics"]
+__all__ = ["FittedDynamics", "assembled", "fit_dynamics"]
 
 NONLINEAR = 1.5
 """Ratio of the errors of a simulation to those of a linear step, from which on the step is none."""
@@ -38,47 +41,12 @@ STEP = (2.0, 3.0)
 search follows."""
 CONSISTENT = 0.9
 """Ratio of the observed to the assumed variance from which they agree."""
+FURTHER = 8
+"""Steps at most to the estimates without a part, from those of all samples."""
 MAX_STRENGTHS = 30
 """Number of variances at most."""
 ERROR_STEPS = 2
 """Times that the error of each output is estimated anew where the twin alone is fitted."""
-
-
-@dataclass(frozen=True)
-class Dynamics:
-    """Settings of the discrepancy inside state equations.
-
-    Parameters
-    ----------
-    library : Library
-        Terms of which the discrepancy of each corrected equation is a weighted sum, at most: the
-        constant alone and monomials of low degree alone are tried too, and the terms are those
-        that predict held-out blocks best.
-    states : sequence of str
-        The states whose equations are corrected; by default all whose equation is no definition,
-        such as position' = velocity.
-    folds : int, default 10
-        Parts of the calibration record, each made of blocks of all trajectories, that are held out
-        in turn to choose the terms and to calibrate bands.
-
-    """
-
-    library: Library = Library()  # noqa: RUF009 - frozen
-    states: Sequence[str] = ()
-    folds: int = 10
-
-    def __post_init__(self) -> None:
-        remedy = "give Library(degree=..., knots=..., friction=...)"
-        instance("library", self.library, Library, remedy=remedy)
-        require(
-            not isinstance(self.states, str) and len(set(self.states)) == len(self.states),
-            "states",
-            expected="different names of states",
-            got=repr(self.states),
-            remedy="give each once, in a tuple",
-        )
-        object.__setattr__(self, "states", tuple(self.states))
-        whole("folds", self.folds, least=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +70,10 @@ class FittedDynamics:
     figures : dict of str to float
         `rms_before` and `rms_after` of free simulation over the calibration record, in output units
         (relative to each output's standard deviation where units differ), `held_out`, that of
-        blocks left out, `widening`, of the bands, `library`, the number of the chosen one of
-        `Library.nested`, and `strength`, the assumed variance of errors over that of the twin.
+        blocks left out, `widening`, of the bands, and `strength`, the assumed variance of errors
+        over that of the twin.
+    form : Library or TanhNetwork
+        The chosen form of the discrepancy.
     seconds : float
         Duration.
     reason : str
@@ -118,6 +88,7 @@ class FittedDynamics:
     correlations: dict[tuple[str, str], float]
     terms: dict[str, float]
     figures: dict[str, float]
+    form: Library | TanhNetwork
     seconds: float
     reason: str
 
@@ -195,15 +166,14 @@ def fit_dynamics(
     tried, parts = [], folds(observed.mask, settings.folds)
     for equations in _candidates(alone, fitted.point, settings):
         estimation, found = _followed(equations, alone, fitted)
-        held_out = estimation.held_out(found, parts)
+        held_out = _held_out(estimation, found, parts)
         tried.append((equations, estimation, found, held_out))
         report(1 - 0.95 * 0.6 ** len(tried))
     errors = [own.rms(held_out.errors) for _, own, _, held_out in tried]
     chosen = int(np.argmin(np.nan_to_num(errors, nan=np.inf)))
     equations, estimation, found, held_out = tried[chosen]
     corrected = equations.states, equations.domain.speed
-    moves = _trusted(estimation, found.point, held_out, parts)
-    made = assembled(estimation, found, *corrected, parts, moves)
+    made = assembled(estimation, found, *corrected, parts, held_out.moves)
     made = replace(made, widening=widening(made, estimation, held_out))
     report(1.0)
     unknown = estimation.undetermined(found)[: unknowns.count]
@@ -226,9 +196,9 @@ def fit_dynamics(
             "rms_after": estimation.rms(found.residual),
             "held_out": errors[chosen],
             "widening": made.widening,
-            "library": float(chosen),
             "strength": float(np.mean(estimation.variance / alone.power(fitted.residual))),
         },
+        form=equations.form,
         seconds=time.perf_counter() - began,
         reason=notes,
     )
@@ -267,13 +237,12 @@ def _with_starts(base: StateTwin, unknowns: Unknowns, point: Point) -> StateTwin
 def _candidates(
     alone: Estimation, point: Point, settings: Dynamics
 ) -> Iterator[CorrectedEquations]:
-    """The corrected equations with each library that is tried, at the parameters of a point."""
+    """The corrected equations with each form that is tried, at the parameters of a point."""
     unknowns = alone.unknowns
     twin = _with_starts(alone.twin, unknowns, point)
-    states = correctable(twin, settings.states)
     visited = (alone.simulated(point)[1], alone.commands)
-    for library in settings.library.nested():
-        yield CorrectedEquations.distinct(twin, library, states, visited, unknowns.matrix)
+    for form in settings.forms:
+        yield CorrectedEquations.distinct(twin, form, settings, visited, unknowns.matrix)
 
 
 def _followed(
@@ -284,20 +253,26 @@ def _followed(
     The prior of the discrepancy begins strong, as if errors were large, and becomes weaker step by
     step, which leads the search along.
     """
-    unknowns = alone.unknowns.with_coefficients(equations.names)
-    estimation = replace(alone, twin=equations.corrected, unknowns=unknowns)
-    shared = np.pad(fitted.point.shared, (0, len(equations.names)))
+    unknowns, own = alone.unknowns.with_coefficients(equations.coefficients), alone.unknowns.count
+
+    def absorbed(shared: NDArray) -> tuple[NDArray, NDArray]:
+        error, slope = equations.absorbed(shared[own:])
+        return error, np.pad(slope, ((0, 0), (own, 0)))
+
+    estimation = replace(alone, twin=equations.corrected, unknowns=unknowns, absorbed=absorbed)
+    shared = np.append(fitted.point.shared, unknowns.mean[own:])
     now = estimation.linearised(Point(shared, fitted.point.starts))
     power = alone.power(fitted.residual)
     strength = STRONGEST
     for _ in range(MAX_STRENGTHS):
-        own = replace(estimation, variance=strength * power)
-        now = own.minimised(now)
-        observed = correlation_time(now.residual) * float(np.mean(own.power(now.residual) / power))
+        estimation = replace(estimation, variance=strength * power)
+        now = estimation.minimised(now)
+        ratio = np.mean(estimation.power(now.residual) / power)
+        observed = correlation_time(now.residual) * float(ratio)
         if observed >= CONSISTENT * strength:
             break
         strength = float(np.clip(observed, strength / STEP[1], strength / STEP[0]))
-    return own, now
+    return estimation, now
 
 
 def assembled(
@@ -350,20 +325,24 @@ def assembled(
     return fit_noise(made, estimation.observed, indices, parts, by_values)
 
 
-def _trusted(
-    estimation: Estimation, found: Point, held_out: HeldOut, parts: Sequence[NDArray]
-) -> NDArray:
-    """The moves (K, k) of the estimates without each part; 0 where they are no linear step.
+def _held_out(estimation: Estimation, found: Linearised, parts: Sequence[NDArray]) -> HeldOut:
+    """See `Estimation.held_out`, with further steps where the estimates without a part need them.
 
     The errors of the simulation itself then differ from those of the linear step.
     """
-    moves = np.zeros(held_out.moves.shape)
-    for k, (part, move) in enumerate(zip(parts, held_out.moves, strict=True)):
-        residual = estimation.residual(Point(found.shared + move, found.starts))[part]
-        linear = held_out.errors[part]
-        if np.sum(residual**2) <= NONLINEAR**2 * np.sum(linear**2):
-            moves[k] = move
-    return moves
+    made = estimation.held_out(found, parts)
+    for k, part in enumerate(parts):
+        point = Point(found.point.shared + made.moves[k], found.point.starts)
+        wanted = NONLINEAR**2 * np.sum(made.errors[part] ** 2)
+        if np.sum(estimation.residual(point)[part] ** 2) <= wanted:
+            continue
+        seen = estimation.seen & ~part[..., None]
+        without = replace(estimation, seen=seen, free_starts=False)
+        point = without.minimised(without.linearised(found.point), FURTHER).point
+        made.moves[k] = point.shared - found.point.shared
+        errors = estimation.residual(point)[part]
+        made.errors[part] = np.where(np.isfinite(errors), errors, np.inf)
+    return made
 
 
 def _notes(estimation: Estimation, found: Point, unknown: NDArray) -> str:
@@ -397,8 +376,9 @@ def _correlations(
 def _sizes(equations: CorrectedEquations, estimation: Estimation, found: Point) -> dict[str, float]:
     """The root mean square of each term over the calibration record, the largest first."""
     states = estimation.simulated(found)[1].reshape(-1, len(estimation.unknowns.start))
-    values = equations.values(states, estimation.commands.reshape(len(states), -1))
-    coefficients = found.shared[len(found.shared) - len(equations.names) :]
-    sizes = np.abs(coefficients) * np.sqrt(np.mean(values**2, axis=0))
-    order = np.argsort(-sizes)
-    return {equations.names[i]: float(sizes[i]) for i in order}
+    weights = equations.weights
+    psi = found.shared[len(found.shared) - len(weights) :]
+    values = equations.values(states, estimation.commands.reshape(len(states), -1), psi)
+    sizes = np.abs(psi[weights]) * np.sqrt(np.mean(values**2, axis=0))
+    names = [each.name for each, own in zip(equations.coefficients, weights, strict=True) if own]
+    return {names[i]: float(sizes[i]) for i in np.argsort(-sizes)}

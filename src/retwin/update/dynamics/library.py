@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations_with_replacement, product
@@ -13,8 +13,9 @@ import torch
 
 from retwin.arrays import floats
 from retwin.checks import one_of, require, whole
+from retwin.update.dynamics.terms import Term, allowed
 
-__all__ = ["Library", "Term"]
+__all__ = ["Library"]
 
 STEEPNESS = 0.05
 """Width of the smooth sign function of Coulomb friction, in half ranges of its variable."""
@@ -22,23 +23,6 @@ SIMPLE = 2
 """Degree up to which libraries of monomials alone are tried before the whole one."""
 MAX_MONOMIALS = 200
 """Number of monomials of an equation above which their degree is lowered."""
-
-
-@dataclass(frozen=True)
-class Term:
-    """A function of the variables of an equation.
-
-    Attributes
-    ----------
-    name : str
-        How it is written in tables.
-    value : callable
-        From the scaled variables, scalar tensors, to a scalar tensor.
-
-    """
-
-    name: str
-    value: Callable[[Sequence[Any]], Any]
 
 
 @dataclass(frozen=True)
@@ -82,30 +66,48 @@ class Library:
         smooth = [Library(degree, (), False) for degree in range(min(self.degree, SIMPLE) + 1)]
         return [*(each for each in smooth if each != self), self]
 
-    def terms(self, variables: Sequence[str], states: int) -> list[Term]:
-        """The terms of an equation with such variables, of which the first `states` are states."""
+    def terms(
+        self, variables: Sequence[str], states: int, signs: Sequence[int] = ()
+    ) -> list[Term]:
+        """The terms of an equation with such variables, of which the first `states` are states.
+
+        `signs` are those of `allowed`, by default all free.
+        """
         places = range(len(variables))
         degree = self.degree
         while degree > 1 and comb(len(variables) + degree, degree) > MAX_MONOMIALS:
             degree -= 1
         found = [
-            Term(_product(variables, chosen), partial(_monomial, chosen=chosen))
+            Term(
+                _product(variables, chosen),
+                partial(_monomial, chosen=chosen),
+                [_direction(chosen, i) for i in places],
+            )
             for order in range(degree + 1)
             for chosen in combinations_with_replacement(places, order)
         ]
         for i, name in enumerate(variables):
+            only = [int(i == place) for place in places]
             for sign, knot in product((1, -1), self.knots):
                 shifted = f"{'-' if sign < 0 else ''}{name}{f' - {knot:g}' if knot else ''}"
                 hinge = partial(_hinge, i=i, sign=sign, knot=knot)
-                found.append(Term(f"max(0, {shifted})", hinge))
+                found.append(Term(f"max(0, {shifted})", hinge, [sign * each for each in only]))
             if self.friction and i < states:
-                found.append(Term(f"sign({name})", partial(_sign, i=i)))
-                found.append(Term(f"{name} |{name}|", partial(_quadratic, i=i)))
-        return found
+                found.append(Term(f"sign({name})", partial(_sign, i=i), only))
+                found.append(Term(f"{name} |{name}|", partial(_quadratic, i=i), only))
+        return list(allowed(found, signs or [0] * len(variables)))
 
 
 def _monomial(v: Sequence[Any], chosen: Sequence[int]) -> Any:
     return prod(v[i] for i in chosen)
+
+
+def _direction(chosen: Sequence[int], i: int) -> int | None:
+    """See `Term.directions`: that of a monomial."""
+    if i not in chosen:
+        return 0
+    others = (chosen.count(each) % 2 == 0 for each in chosen if each != i)
+    return 1 if chosen.count(i) % 2 and all(others) else None
 
 
 def _hinge(v: Sequence[Any], i: int, sign: int, knot: float) -> Any:

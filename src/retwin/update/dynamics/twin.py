@@ -22,8 +22,9 @@ from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.twins.state_twin import SAMPLES_PER_CHUNK, StateTwin
 from retwin.twins.twin import Chunk, check_channels, checked_commands, simulate_in_chunks
 from retwin.twins.wrapper import chunk_generator
-from retwin.update.dynamics.corrected import Domain, correctable
+from retwin.update.dynamics.corrected import correctable
 from retwin.update.dynamics.curves import Curve, axes_of, curve_of
+from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.estimation import Estimation, root
 from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.prediction import Prediction

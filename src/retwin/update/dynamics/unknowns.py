@@ -55,18 +55,18 @@ class Unknowns:
         """The number k of shared coordinates."""
         return len(self.mean)
 
-    def with_coefficients(self, names: Sequence[str]) -> Unknowns:
-        """The same and coefficients, further parameters with a standard normal prior."""
-        k, extra = self.count, len(names)
+    def with_coefficients(self, coefficients: Sequence[Parameter]) -> Unknowns:
+        """The same and coefficients, further parameters with a normal prior of variance 1."""
+        k, extra = self.count, len(coefficients)
         return replace(
             self,
-            names=(*self.names, *names),
+            names=(*self.names, *(each.name for each in coefficients)),
             offset=np.pad(self.offset, (0, extra)),
             matrix=block_diag(self.matrix, np.eye(extra)),
-            mean=np.pad(self.mean, (0, extra)),
+            mean=np.append(self.mean, [float(each.start or 0.0) for each in coefficients]),
             deviation=np.pad(self.deviation, (0, extra), constant_values=1.0),
-            low=np.insert(self.low, k, np.full(extra, -np.inf)),
-            high=np.insert(self.high, k, np.full(extra, np.inf)),
+            low=np.insert(self.low, k, [each.low for each in coefficients]),
+            high=np.insert(self.high, k, [each.high for each in coefficients]),
         )
 
 
