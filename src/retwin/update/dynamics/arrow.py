@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Arrow", "trust_region_step"]
+__all__ = ["Arrow", "bounded_step"]
 
 SINGULAR = 1e-12
 """Share of the largest curvature that is added to all, since some directions may have none."""
@@ -129,3 +129,23 @@ def trust_region_step(curvature: Arrow, gradient: NDArray, radius: float) -> NDA
             break
         damping += length**2 / float(step @ damped.solve(step)) * (length / radius - 1)
     return step
+
+
+def bounded_step(
+    curvature: Arrow, gradient: NDArray, radius: float, low: NDArray, high: NDArray
+) -> NDArray:
+    """A step as by `trust_region_step` with bounds (k + n m,) of each component.
+
+    Components that would leave their bounds are fixed there, and the others follow, until none
+    leaves them (an active-set method: Nocedal and Wright, chapter 16).
+    """
+    step, fixed = np.zeros(len(gradient)), np.zeros(len(gradient), dtype=bool)
+    while True:
+        slope = np.where(fixed, 0.0, gradient + curvature.times(step))
+        own = curvature.scaled(1.0 - fixed).plus(1.0 * fixed)
+        step = step + trust_region_step(own, slope, radius)
+        outside = ((step < low) | (step > high)) & ~fixed
+        if not outside.any():
+            return step
+        fixed |= outside
+        step = np.where(fixed, np.clip(step, low, high), 0.0)

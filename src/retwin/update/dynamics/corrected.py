@@ -39,6 +39,8 @@ DISTINCT = 1e-5
 ABSORBED = 1e-3
 """Standard deviation of what a network has in common with the effects of parameters, in the root
 mean square of the states' time derivatives: so small that it is theirs."""
+SHARED = 0.03
+"""The same for equations with a known sign, whose discrepancy may be impossible without any."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +57,9 @@ class Equation:
         The terms of its discrepancy.
     zero : float, optional
         The scaled state where it is 0, for a passive equation: terms are 0 there.
+    common : float
+        Standard deviation of what the discrepancy has in common with the effects of parameters:
+        `ABSORBED`, or `SHARED` with a known sign, since passive friction always has some damping.
 
     """
 
@@ -62,6 +67,7 @@ class Equation:
     places: Sequence[int]
     terms: Sequence[Term]
     zero: float | None
+    common: float
 
     def values(self, variables: Sequence[Any], inner: Sequence[Sequence[Any]]) -> list[Any]:
         """The values of the terms at all scaled variables, with the inner coefficients of each."""
@@ -134,15 +140,14 @@ class CorrectedEquations:
         steps = np.diff(x, axis=1) * (1.0 if twin.step else twin.rate)
         speed = np.sqrt(np.mean(steps**2, axis=(0, 1)))
         domain = Domain.visited(x, u, np.where(speed > 0, speed, 1.0))
-        x, u = (each.reshape(-1, each.shape[2]) for each in visited)
-        some = np.linspace(0, len(x) - 1, min(len(x), COMPARED)).astype(int)
-        whole = cls(twin, form, settings, domain, (x[some], u[some]), free)
-        columns = whole.values(x[some], u[some])
+        x, u = _some(*visited)
+        whole = cls(twin, form, settings, domain, (x, u), free)
+        columns = whole.values(x, u)
         dropped, first = set(), 0
         for equation in whole.equations:
             i, terms = equation.index, equation.terms
             own = columns[:, first : first + len(terms)]
-            basis = np.linalg.qr(_scaled(_by_parameters(twin, i, x[some], u[some]) @ free))[0]
+            basis = np.linalg.qr(_scaled(_by_parameters(twin, i, x, u) @ free))[0]
             for column, term in zip(_scaled(own).T, terms, strict=True):
                 rest = column - basis @ (basis.T @ column)
                 rest -= basis @ (basis.T @ rest)
@@ -153,6 +158,10 @@ class CorrectedEquations:
                     basis = np.column_stack([basis, rest / size])
             first += len(terms)
         return replace(whole, dropped=frozenset(dropped))
+
+    def visiting(self, states: NDArray, commands: NDArray) -> CorrectedEquations:
+        """The same with other states (n, T, d_x) and commands (n, T, d_u) that are visited."""
+        return replace(self, visited=_some(states, commands))
 
     @cached_property
     def equations(self) -> list[Equation]:
@@ -181,7 +190,8 @@ class CorrectedEquations:
                 if f"{state}: {term.name}" not in self.dropped
             ]
             zero = float(rest[i]) if state in settings.passive else None
-            made.append(Equation(i, places, terms, zero))
+            common = SHARED if any(signs) else ABSORBED
+            made.append(Equation(i, places, terms, zero, common))
         return made
 
     @cached_property
@@ -270,21 +280,24 @@ class CorrectedEquations:
     def absorbed(self, coefficients: NDArray) -> tuple[NDArray, NDArray]:
         """What the parameters could explain of a network, (r,), and its derivatives (r, k).
 
-        It is the component of the discrepancies in the span of the effects of the parameters on all
+        It is the component of each discrepancy in the span of the effects of the parameters on all
         state equations, over the visited states, in the standard deviation that it may have.
-        Nothing (0,) for a library: its terms have a meaning, so that their effects are not divided.
+        Nothing (0,) for a library, whose terms have a meaning of their own.
         """
         import torch
 
-        if self.weights.all() or not self._effects.size:
+        if isinstance(self.form, Library) or not self._effects.size:
             return np.zeros(0), np.zeros((0, len(coefficients)))
         psi = torch.tensor(coefficients, requires_grad=True)
         scaled, basis = self._scaled(*self.visited), torch.tensor(self._effects)
-        parts = zip(self.equations, self.discrepancies(scaled, psi.unbind()), strict=True)
-        common = sum(basis[:, own.index] @ (0.0 * scaled[0] + each) for own, each in parts)
-        common = common / (ABSORBED * len(scaled[0]) ** 0.5)
-        slope = [torch.autograd.grad(each, psi, retain_graph=True)[0] for each in common.unbind()]
-        return common.detach().numpy(), torch.stack(slope).numpy()
+        found = self.discrepancies(scaled, psi.unbind())
+        groups: dict[float, Any] = {}
+        for own, each in zip(self.equations, found, strict=True):
+            part = basis[:, own.index] @ (0.0 * scaled[0] + each) / len(scaled[0]) ** 0.5
+            groups[own.common] = groups.get(own.common, 0.0) + part / own.common
+        errors = torch.cat(list(groups.values()))
+        slope = [torch.autograd.grad(each, psi, retain_graph=True)[0] for each in errors.unbind()]
+        return errors.detach().numpy(), torch.stack(slope).numpy()
 
     @cached_property
     def _effects(self) -> NDArray:
@@ -300,6 +313,13 @@ class CorrectedEquations:
 
         both = torch.as_tensor(np.concatenate([states, commands], axis=1))
         return self.domain.scaled(both.unbind(1))
+
+
+def _some(states: NDArray, commands: NDArray) -> tuple[NDArray, NDArray]:
+    """At most so many samples (K, d_x) and (K, d_u) of states and commands."""
+    x, u = (each.reshape(-1, each.shape[2]) for each in (states, commands))
+    some = np.linspace(0, len(x) - 1, min(len(x), COMPARED)).astype(int)
+    return x[some], u[some]
 
 
 def _by_parameters(twin: StateTwin, equation: int, states: NDArray, commands: NDArray) -> NDArray:

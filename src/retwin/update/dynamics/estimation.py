@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.twins.state_twin import StateTwin
-from retwin.update.dynamics.arrow import Arrow, trust_region_step
+from retwin.update.dynamics.arrow import Arrow, bounded_step
 from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
 from retwin.update.dynamics.unknowns import Unknowns
 
@@ -173,7 +173,7 @@ class Estimation:
     def minimised(self, at: Linearised, steps: int = MAX_STEPS) -> Linearised:
         """The most probable point, from a start at which the simulation is finite.
 
-        The search ends after so many steps at most. Steps are projected onto the bounds.
+        The search ends after so many steps at most, none of which leaves the bounds.
         """
         flat = at.point.flat
         if not flat.size:
@@ -185,16 +185,13 @@ class Estimation:
             if np.linalg.norm(unit * gradient) < TOLERANCE:
                 break
             scaled = curvature.scaled(unit)
-            there = flat + unit * trust_region_step(scaled, unit * gradient, radius)
-            inside = np.clip(there, *self._bounds)
-            step = (inside - flat) / unit
+            ends = ((each - flat) / unit for each in self._bounds)
+            step = bounded_step(scaled, unit * gradient, radius, *ends)
             expected = -float(step @ (unit * gradient + scaled.times(step) / 2))
             length = float(np.linalg.norm(step))
             if expected <= 0:
-                if (inside == there).all():
-                    break
-                radius = float(np.linalg.norm((there - flat) / unit)) / 4
-                continue
+                break
+            inside = np.clip(flat + unit * step, *self._bounds)
             tried = self.linearised(self.point(inside))
             found = self._expanded(tried)
             ratio = (value - found[0]) / expected

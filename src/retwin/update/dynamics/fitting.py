@@ -24,7 +24,7 @@ from retwin.update.dynamics.estimation import Estimation, correlation_time, root
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
 from retwin.update.dynamics.network import TanhNetwork
-from retwin.update.dynamics.noise import fit_noise, folds, widening
+from retwin.update.dynamics.noise import fit_noise, folds, loudest, widening
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of
@@ -70,7 +70,8 @@ class FittedDynamics:
     figures : dict of str to float
         `rms_before` and `rms_after` of free simulation over the calibration record, in output units
         (relative to each output's standard deviation where units differ), `held_out`, that of
-        blocks left out, `widening`, of the bands, and `strength`, the assumed variance of errors
+        blocks left out in time, `held_out_amplitudes`, that of the blocks of the largest amplitudes
+        if they are left out, `widening`, of the bands, and `strength`, the assumed variance of errors
         over that of the twin.
     form : Library or TanhNetwork
         The chosen form of the discrepancy.
@@ -163,14 +164,17 @@ def fit_dynamics(
     )
     alone, fitted = _without_discrepancy(base, observed, unknowns)
     report(0.05)
-    tried, parts = [], folds(observed.mask, settings.folds)
+    tried, errors, parts = [], [], folds(observed.mask, settings.folds)
+    loud = loudest(alone, settings.folds)
     for equations in _candidates(alone, fitted.point, settings):
         estimation, found = _followed(equations, alone, fitted)
         held_out = _held_out(estimation, found, parts)
         tried.append((equations, estimation, found, held_out))
+        louder = np.where(loud[..., None], _held_out(estimation, found, [loud]).errors, 0.0)
+        at_loud = replace(estimation, seen=estimation.seen & loud[..., None])
+        errors.append((estimation.rms(held_out.errors), at_loud.rms(louder)))
         report(1 - 0.95 * 0.6 ** len(tried))
-    errors = [own.rms(held_out.errors) for _, own, _, held_out in tried]
-    chosen = int(np.argmin(np.nan_to_num(errors, nan=np.inf)))
+    chosen = int(np.argmin(np.nan_to_num(np.hypot(*np.transpose(errors)), nan=np.inf)))
     equations, estimation, found, held_out = tried[chosen]
     corrected = equations.states, equations.domain.speed
     made = assembled(estimation, found, *corrected, parts, held_out.moves)
@@ -194,7 +198,8 @@ def fit_dynamics(
         figures={
             "rms_before": alone.rms(fitted.residual),
             "rms_after": estimation.rms(found.residual),
-            "held_out": errors[chosen],
+            "held_out": errors[chosen][0],
+            "held_out_amplitudes": errors[chosen][1],
             "widening": made.widening,
             "strength": float(np.mean(estimation.variance / alone.power(fitted.residual))),
         },
@@ -267,12 +272,14 @@ def _followed(
     for _ in range(MAX_STRENGTHS):
         estimation = replace(estimation, variance=strength * power)
         now = estimation.minimised(now)
+        # What a network has in common with parameters is that over the states that it leads to.
+        equations = equations.visiting(estimation.simulated(now.point)[1], estimation.commands)
         ratio = np.mean(estimation.power(now.residual) / power)
         observed = correlation_time(now.residual) * float(ratio)
         if observed >= CONSISTENT * strength:
             break
         strength = float(np.clip(observed, strength / STEP[1], strength / STEP[0]))
-    return estimation, now
+    return estimation, estimation.minimised(now)
 
 
 def assembled(
@@ -347,11 +354,15 @@ def _held_out(estimation: Estimation, found: Linearised, parts: Sequence[NDArray
 
 def _notes(estimation: Estimation, found: Point, unknown: NDArray) -> str:
     """Which parameters (k,) are unknown, and what is at a bound."""
-    unknowns = estimation.unknowns
+    unknowns, k = estimation.unknowns, len(unknown)
     own = [f"start_{estimation.twin.states[i].name}" for i in unknowns.free]
-    values = np.vstack([np.tile(found.shared, (len(found.starts), 1)).T, found.starts.T])
-    at = (values <= unknowns.low[:, None]) | (values >= unknowns.high[:, None])
-    names = [name for name, each in zip([*unknowns.names, *own], at, strict=True) if each.any()]
+    values = np.vstack([np.tile(found.shared[:k], (len(found.starts), 1)).T, found.starts.T])
+    low, high = (
+        np.append(each[:k], each[unknowns.count :])[:, None]
+        for each in (unknowns.low, unknowns.high)
+    )
+    at = (values <= low) | (values >= high)
+    names = [name for name, each in zip([*unknowns.names[:k], *own], at, strict=True) if each.any()]
     free = [name for name, each in zip(unknowns.names, unknown, strict=False) if each]
     groups = {"at a bound, and perhaps beyond it": names, "not determined by the record": free}
     return "; ".join(f"{what}: {', '.join(each)}" for what, each in groups.items() if each)

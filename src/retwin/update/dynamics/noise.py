@@ -11,12 +11,12 @@ from scipy.optimize import minimize
 from scipy.special import ndtri
 
 from retwin.data.trajectories import Trajectories
-from retwin.update.dynamics.estimation import Estimation
+from retwin.update.dynamics.estimation import Estimation, correlation_time
 from retwin.update.dynamics.linearised import HeldOut
 from retwin.update.dynamics.prediction import Prediction
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["fit_noise", "folds", "widening"]
+__all__ = ["fit_noise", "folds", "loudest", "widening"]
 
 PROCESS = (1e-3, 1e-2, 1e-1, 1.0)
 """Deviations of the process noise with which the search may begin, over the usual step of a
@@ -141,6 +141,27 @@ def folds(seen: NDArray, count: int) -> list[NDArray]:
     block = np.arange(samples) * count // samples
     own = (block + np.arange(trajectories)[:, None]) % count
     return [own == fold for fold in range(count)]
+
+
+def loudest(estimation: Estimation, count: int) -> NDArray:
+    """A part (n, T) of the record: the share 1 / count of its blocks with the largest amplitudes.
+
+    Without it, what is learned has to be extrapolated to these amplitudes. A block is as long as
+    the amplitude is correlated.
+    """
+    seen = estimation.seen
+    mean = np.sum(estimation.measured, axis=(0, 1), where=seen) / seen.sum(axis=(0, 1))
+    power = np.where(seen, (estimation.measured - mean) ** 2 / estimation.spread, 0.0)
+    level = np.sum(power, axis=(0, 1)) / seen.sum(axis=(0, 1))
+    length = correlation_time(np.where(seen, power - level, 0.0))
+    trajectories, samples = seen.shape[:2]
+    blocks = int(np.clip(samples / length, 2, samples))
+    block = np.arange(samples) * blocks // samples
+    own = np.zeros((trajectories, blocks))
+    np.add.at(own, (slice(None), block), power.sum(axis=2) / np.bincount(block)[block])
+    largest = np.argsort(-own, axis=None)[: max(1, own.size // count)]
+    made: NDArray = np.isin(np.arange(own.size).reshape(own.shape), largest)[:, block]
+    return made
 
 
 def widening(twin: DynamicsTwin, estimation: Estimation, held_out: HeldOut) -> float:
