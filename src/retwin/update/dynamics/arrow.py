@@ -136,16 +136,21 @@ def bounded_step(
 ) -> NDArray:
     """A step as by `trust_region_step` with bounds (k + n m,) of each component.
 
-    Components that would leave their bounds are fixed there, and the others follow, until none
-    leaves them (an active-set method: Nocedal and Wright, chapter 16).
+    Where a component meets its bound, it stays there, and the others go on (the primal active-set
+    method: Nocedal and Wright, algorithm 16.3).
     """
     step, fixed = np.zeros(len(gradient)), np.zeros(len(gradient), dtype=bool)
-    while True:
+    while not fixed.all():
         slope = np.where(fixed, 0.0, gradient + curvature.times(step))
         own = curvature.scaled(1.0 - fixed).plus(1.0 * fixed)
-        step = step + trust_region_step(own, slope, radius)
-        outside = ((step < low) | (step > high)) & ~fixed
-        if not outside.any():
-            return step
-        fixed |= outside
-        step = np.where(fixed, np.clip(step, low, high), 0.0)
+        further = trust_region_step(own, slope, radius - float(np.linalg.norm(step)))
+        ends = np.where(further > 0, high, low) - step
+        share = np.divide(ends, further, out=np.full(len(step), np.inf), where=further != 0)
+        share[fixed] = np.inf
+        if share.min() >= 1:
+            return step + further
+        step = step + share.min() * further
+        fixed |= share <= share.min()
+        if np.linalg.norm(step) >= radius / RIM:
+            break
+    return step
