@@ -310,7 +310,8 @@ def test_states_beyond_their_range_are_a_warning(fitted: FittedDynamics) -> None
 
 
 def test_the_equations_to_correct_can_be_named() -> None:
-    found = fit_dynamics(LINEAR, record(**TRUTH), Dynamics(states=("position",)))
+    with pytest.warns(UserWarning, match="at a bound, and perhaps beyond it: damping"):
+        found = fit_dynamics(LINEAR, record(**TRUTH), Dynamics(states=("position",)))
     assert found.twin.corrected == ("position",)
     with pytest.raises(InputError, match="states"):
         fit_dynamics(LINEAR, record(**TRUTH), Dynamics(states=("force",)))

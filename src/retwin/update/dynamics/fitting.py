@@ -24,7 +24,7 @@ from retwin.update.dynamics.estimation import Estimation, correlation_time, root
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
 from retwin.update.dynamics.network import TanhNetwork
-from retwin.update.dynamics.noise import fit_noise, folds, loudest, widening
+from retwin.update.dynamics.noise import edges, fit_noise, folds, widening
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of
@@ -41,8 +41,6 @@ STEP = (2.0, 3.0)
 search follows."""
 CONSISTENT = 0.9
 """Ratio of the observed to the assumed variance from which they agree."""
-FURTHER = 8
-"""Steps at most to the estimates without a part, from those of all samples."""
 MAX_STRENGTHS = 30
 """Number of variances at most."""
 ERROR_STEPS = 2
@@ -70,8 +68,8 @@ class FittedDynamics:
     figures : dict of str to float
         `rms_before` and `rms_after` of free simulation over the calibration record, in output units
         (relative to each output's standard deviation where units differ), `held_out`, that of
-        blocks left out in time, `held_out_amplitudes`, that of the blocks of the largest amplitudes
-        if they are left out, `widening`, of the bands, and `strength`, the assumed variance of errors
+        blocks left out in time, `held_out_edges`, that of the ends of the range of each
+        state and command if they are left out, `widening`, of the bands, and `strength`, the assumed variance of errors
         over that of the twin.
     form : Library or TanhNetwork
         The chosen form of the discrepancy.
@@ -165,19 +163,18 @@ def fit_dynamics(
     alone, fitted = _without_discrepancy(base, observed, unknowns)
     report(0.05)
     tried, errors, parts = [], [], folds(observed.mask, settings.folds)
-    loud = loudest(alone, settings.folds)
+    far = edges(alone.simulated(fitted.point)[1], alone.commands, settings.folds)
     for equations in _candidates(alone, fitted.point, settings):
         estimation, found = _followed(equations, alone, fitted)
-        held_out = _held_out(estimation, found, parts)
+        held_out = estimation.held_out(found, parts)
         tried.append((equations, estimation, found, held_out))
-        louder = np.where(loud[..., None], _held_out(estimation, found, [loud]).errors, 0.0)
-        at_loud = replace(estimation, seen=estimation.seen & loud[..., None])
-        errors.append((estimation.rms(held_out.errors), at_loud.rms(louder)))
+        errors.append((estimation.rms(held_out.errors), _beyond(estimation, found, far)))
         report(1 - 0.95 * 0.6 ** len(tried))
     chosen = int(np.argmin(np.nan_to_num(np.hypot(*np.transpose(errors)), nan=np.inf)))
     equations, estimation, found, held_out = tried[chosen]
     corrected = equations.states, equations.domain.speed
-    made = assembled(estimation, found, *corrected, parts, held_out.moves)
+    moves = _trusted(estimation, found.point, held_out, parts)
+    made = assembled(estimation, found, *corrected, parts, moves)
     made = replace(made, widening=widening(made, estimation, held_out))
     report(1.0)
     unknown = estimation.undetermined(found)[: unknowns.count]
@@ -199,7 +196,7 @@ def fit_dynamics(
             "rms_before": alone.rms(fitted.residual),
             "rms_after": estimation.rms(found.residual),
             "held_out": errors[chosen][0],
-            "held_out_amplitudes": errors[chosen][1],
+            "held_out_edges": errors[chosen][1],
             "widening": made.widening,
             "strength": float(np.mean(estimation.variance / alone.power(fitted.residual))),
         },
@@ -332,24 +329,31 @@ def assembled(
     return fit_noise(made, estimation.observed, indices, parts, by_values)
 
 
-def _held_out(estimation: Estimation, found: Linearised, parts: Sequence[NDArray]) -> HeldOut:
-    """See `Estimation.held_out`, with further steps where the estimates without a part need them.
+def _trusted(
+    estimation: Estimation, found: Point, held_out: HeldOut, parts: Sequence[NDArray]
+) -> NDArray:
+    """The moves (K, k) of the estimates without each part; 0 where they are no linear step.
 
     The errors of the simulation itself then differ from those of the linear step.
     """
-    made = estimation.held_out(found, parts)
-    for k, part in enumerate(parts):
-        point = Point(found.point.shared + made.moves[k], found.point.starts)
-        wanted = NONLINEAR**2 * np.sum(made.errors[part] ** 2)
-        if np.sum(estimation.residual(point)[part] ** 2) <= wanted:
-            continue
-        seen = estimation.seen & ~part[..., None]
-        without = replace(estimation, seen=seen, free_starts=False)
-        point = without.minimised(without.linearised(found.point), FURTHER).point
-        made.moves[k] = point.shared - found.point.shared
-        errors = estimation.residual(point)[part]
-        made.errors[part] = np.where(np.isfinite(errors), errors, np.inf)
-    return made
+    moves = np.zeros(held_out.moves.shape)
+    for k, (part, move) in enumerate(zip(parts, held_out.moves, strict=True)):
+        residual = estimation.residual(Point(found.shared + move, found.starts))[part]
+        linear = held_out.errors[part]
+        if np.sum(residual**2) <= NONLINEAR**2 * np.sum(linear**2):
+            moves[k] = move
+    return moves
+
+
+def _beyond(estimation: Estimation, found: Linearised, parts: Sequence[NDArray]) -> float:
+    """The error of parts, each without it, that may overlap: the root of their mean square."""
+    seen = [estimation.seen & part[..., None] for part in parts]
+    made = [
+        replace(estimation, seen=own).rms(np.where(own, estimation.held_out(found, [part]).errors, 0))
+        for part, own in zip(parts, seen, strict=True)
+        if own.any(axis=(0, 1)).all()
+    ]
+    return float(np.sqrt(np.mean(np.square(made)))) if made else 0.0
 
 
 def _notes(estimation: Estimation, found: Point, unknown: NDArray) -> str:

@@ -30,14 +30,14 @@ class TanhNetwork:
 
     Parameters
     ----------
-    hidden : int, default 16
+    hidden : int, default 8
         Number of units per corrected equation.
     seed : int, default 0
         Seed of the weights inside the units.
 
     """
 
-    hidden: int = 16
+    hidden: int = 8
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -16,7 +16,7 @@ from retwin.update.dynamics.linearised import HeldOut
 from retwin.update.dynamics.prediction import Prediction
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["fit_noise", "folds", "loudest", "widening"]
+__all__ = ["edges", "fit_noise", "folds", "widening"]
 
 PROCESS = (1e-3, 1e-2, 1e-1, 1.0)
 """Deviations of the process noise with which the search may begin, over the usual step of a
@@ -143,25 +143,37 @@ def folds(seen: NDArray, count: int) -> list[NDArray]:
     return [own == fold for fold in range(count)]
 
 
-def loudest(estimation: Estimation, count: int) -> NDArray:
-    """A part (n, T) of the record: the share 1 / count of its blocks with the largest amplitudes.
+def edges(states: NDArray, commands: NDArray, count: int) -> list[NDArray]:
+    """Parts (n, T) of the record that hold what is at one end of the range of a variable.
 
-    Without it, what is learned has to be extrapolated to these amplitudes. A block is as long as
-    the amplitude is correlated.
+    Without such a part, what is learned has to be extrapolated to it. For each end of each state
+    and command it is the share 1 / count of the blocks that reach furthest. A block is as long as
+    the variable's distance from its mean is correlated.
+
+    Parameters
+    ----------
+    states, commands : NDArray
+        (n, T, d_x) and (n, T, d_u).
+    count : int
+        The number of parts of that size.
+
     """
-    seen = estimation.seen
-    mean = np.sum(estimation.measured, axis=(0, 1), where=seen) / seen.sum(axis=(0, 1))
-    power = np.where(seen, (estimation.measured - mean) ** 2 / estimation.spread, 0.0)
-    level = np.sum(power, axis=(0, 1)) / seen.sum(axis=(0, 1))
-    length = correlation_time(np.where(seen, power - level, 0.0))
-    trajectories, samples = seen.shape[:2]
-    blocks = int(np.clip(samples / length, 2, samples))
-    block = np.arange(samples) * blocks // samples
-    own = np.zeros((trajectories, blocks))
-    np.add.at(own, (slice(None), block), power.sum(axis=2) / np.bincount(block)[block])
-    largest = np.argsort(-own, axis=None)[: max(1, own.size // count)]
-    made: NDArray = np.isin(np.arange(own.size).reshape(own.shape), largest)[:, block]
-    return made
+    parts = []
+    trajectories, samples = states.shape[:2]
+    for variable in np.moveaxis(np.concatenate([states, commands], axis=2), 2, 0):
+        distance = (variable - variable.mean()) ** 2
+        length = correlation_time((distance - distance.mean())[..., None])
+        blocks = int(np.clip(samples / length, 2, samples))
+        first = np.arange(blocks) * samples // blocks
+        block = np.searchsorted(first, np.arange(samples), side="right") - 1
+        for reached in (
+            np.maximum.reduceat(variable, first, axis=1),
+            -np.minimum.reduceat(variable, first, axis=1),
+        ):
+            furthest = np.argsort(-reached, axis=None, kind="stable")
+            own = np.isin(np.arange(reached.size), furthest[: max(1, reached.size // count)])
+            parts.append(own.reshape(trajectories, blocks)[:, block])
+    return parts
 
 
 def widening(twin: DynamicsTwin, estimation: Estimation, held_out: HeldOut) -> float:
