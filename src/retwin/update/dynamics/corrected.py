@@ -10,7 +10,7 @@ nonlinear operations, such as position' = velocity, is a definition, in which th
 from __future__ import annotations
 
 from collections import namedtuple
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -241,11 +241,10 @@ class CorrectedEquations:
 
     def discrepancies(self, variables: Sequence[Any], coefficients: Sequence[Any]) -> list[Any]:
         """Per equation, the discrepancy over the speed of its state, at scaled variables."""
-        made, left = [], iter(coefficients)
-        for equation in self.equations:
-            parts = [(next(left), [next(left) for _ in term.inner]) for term in equation.terms]
-            values = equation.values(variables, [inner for _, inner in parts])
-            made.append(sum(weight * each for (weight, _), each in zip(parts, values, strict=True)))
+        made = []
+        for equation, weights, inner in self._parted(coefficients):
+            values = equation.values(variables, inner)
+            made.append(sum(own * each for own, each in zip(weights, values, strict=True)))
         return made
 
     def values(
@@ -257,25 +256,25 @@ class CorrectedEquations:
         """
         scaled = self._scaled(states, commands)
         starts = [each.start for each in self.coefficients]
-        left = iter(starts if coefficients is None else coefficients.tolist())
         columns = []
-        for equation in self.equations:
-            parts = [(next(left), [next(left) for _ in term.inner]) for term in equation.terms]
-            columns += equation.values(scaled, [inner for _, inner in parts])
+        for equation, _, inner in self._parted(starts if coefficients is None else coefficients):
+            columns += equation.values(scaled, inner)
         zero = 0.0 * scaled[0]
         made: NDArray = np.stack([(zero + each).numpy() for each in columns] or [[]] * len(zero), 1)
         return made.reshape(len(zero), -1)
 
+    def _parted(self, coefficients: Sequence[Any]) -> Iterator[tuple[Equation, list, list[list]]]:
+        """Per equation, the weights of its terms, and the inner coefficients of each."""
+        left = iter(coefficients)
+        for equation in self.equations:
+            parts = [(next(left), [next(left) for _ in term.inner]) for term in equation.terms]
+            yield equation, [weight for weight, _ in parts], [inner for _, inner in parts]
+
     @property
     def weights(self) -> NDArray:
-        """Which coefficients (k,) are weights of terms."""
-        made = [
-            place == 0
-            for equation in self.equations
-            for term in equation.terms
-            for place in range(1 + len(term.inner))
-        ]
-        return np.array(made, dtype=bool)
+        """The places (t,) of the weights among the coefficients."""
+        found = self._parted(range(len(self.coefficients)))
+        return np.array([each for _, own, _ in found for each in own], dtype=int)
 
     def absorbed(self, coefficients: NDArray) -> tuple[NDArray, NDArray]:
         """What the parameters could explain of a network, (r,), and its derivatives (r, k).

@@ -68,9 +68,9 @@ class FittedDynamics:
     figures : dict of str to float
         `rms_before` and `rms_after` of free simulation over the calibration record, in output units
         (relative to each output's standard deviation where units differ), `held_out`, that of
-        blocks left out in time, `held_out_edges`, that of the ends of the range of each
-        state and command if they are left out, `widening`, of the bands, and `strength`, the assumed variance of errors
-        over that of the twin.
+        blocks left out in time, `held_out_edges`, that of the ends of the range of each state and
+        command if they are left out, `widening`, of the bands, and `strength`, the assumed variance
+        of errors over that of the twin.
     form : Library or TanhNetwork
         The chosen form of the discrepancy.
     seconds : float
@@ -95,7 +95,7 @@ class FittedDynamics:
 def fit_dynamics(
     twin: StateTwin | ParametricTwin,
     observed: Trajectories,
-    settings: Dynamics = Dynamics(),
+    settings: Dynamics = Dynamics(),  # noqa: B008 - frozen
     *,
     progress: Progress | None = None,
 ) -> FittedDynamics:
@@ -349,7 +349,9 @@ def _beyond(estimation: Estimation, found: Linearised, parts: Sequence[NDArray])
     """The error of parts, each without it, that may overlap: the root of their mean square."""
     seen = [estimation.seen & part[..., None] for part in parts]
     made = [
-        replace(estimation, seen=own).rms(np.where(own, estimation.held_out(found, [part]).errors, 0))
+        replace(estimation, seen=own).rms(
+            np.where(own, estimation.held_out(found, [part]).errors, 0)
+        )
         for part, own in zip(parts, seen, strict=True)
         if own.any(axis=(0, 1)).all()
     ]
@@ -391,9 +393,9 @@ def _correlations(
 def _sizes(equations: CorrectedEquations, estimation: Estimation, found: Point) -> dict[str, float]:
     """The root mean square of each term over the calibration record, the largest first."""
     states = estimation.simulated(found)[1].reshape(-1, len(estimation.unknowns.start))
-    weights = equations.weights
-    psi = found.shared[len(found.shared) - len(weights) :]
+    count = len(equations.coefficients)
+    psi = found.shared[len(found.shared) - count :]
     values = equations.values(states, estimation.commands.reshape(len(states), -1), psi)
-    sizes = np.abs(psi[weights]) * np.sqrt(np.mean(values**2, axis=0))
-    names = [each.name for each, own in zip(equations.coefficients, weights, strict=True) if own]
+    sizes = np.abs(psi[equations.weights]) * np.sqrt(np.mean(values**2, axis=0))
+    names = [equations.coefficients[place].name for place in equations.weights]
     return {names[i]: float(sizes[i]) for i in np.argsort(-sizes)}

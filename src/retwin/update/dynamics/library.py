@@ -66,9 +66,7 @@ class Library:
         smooth = [Library(degree, (), False) for degree in range(min(self.degree, SIMPLE) + 1)]
         return [*(each for each in smooth if each != self), self]
 
-    def terms(
-        self, variables: Sequence[str], states: int, signs: Sequence[int] = ()
-    ) -> list[Term]:
+    def terms(self, variables: Sequence[str], states: int, signs: Sequence[int] = ()) -> list[Term]:
         """The terms of an equation with such variables, of which the first `states` are states.
 
         `signs` are those of `allowed`, by default all free.
