@@ -10,7 +10,7 @@ nonlinear operations, such as position' = velocity, is a definition, in which th
 from __future__ import annotations
 
 from collections import namedtuple
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -263,7 +263,7 @@ class CorrectedEquations:
         made: NDArray = np.stack([(zero + each).numpy() for each in columns] or [[]] * len(zero), 1)
         return made.reshape(len(zero), -1)
 
-    def _parted(self, coefficients: Sequence[Any]) -> Iterator[tuple[Equation, list, list[list]]]:
+    def _parted(self, coefficients: Iterable[Any]) -> Iterator[tuple[Equation, list, list[list]]]:
         """Per equation, the weights of its terms, and the inner coefficients of each."""
         left = iter(coefficients)
         for equation in self.equations:
