@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.update import DynamicsTwin
+from retwin.cases.file import read_case
+from retwin.update import DynamicsTwin, TanhNetwork
 
 MODULE = """
 import retwin as rt
@@ -166,6 +167,9 @@ def test_a_study_compares_them(folder: Path, tmp_path: Path, call) -> None:
         ("knots = []", "knots = [2.0]", "knots"),
         ("folds = 8", 'states = ["nope"]', "states"),
         ("folds = 8", "folds = 8\n[state_surrogate]\nspread = 2", "spread"),
+        ("folds = 8", "network = { hidden = 0 }", "hidden"),
+        ("folds = 8", "monotone = { level = { level = 2 } }", "monotone"),
+        ("folds = 8", 'depends = { level = ["nope"] }', "depends"),
     ],
 )
 def test_wrong_settings_are_refused_by_name(
@@ -177,6 +181,15 @@ def test_wrong_settings_are_refused_by_name(
     code, _, err = call(*given)
     assert (code, named in err) == (2, True), err
     assert not out.exists()
+
+
+def test_forms_and_known_structure_are_read_from_a_case(folder: Path) -> None:
+    file, known = folder / "known.toml", 'network = { hidden = 4 }\npassive = ["level"]'
+    file.write_text(CASE.replace("folds = 8", f'{known}\ndepends = {{ level = ["level"] }}'))
+    dynamics = read_case(file).dynamics
+    assert (dynamics.network, dynamics.passive) == (TanhNetwork(4), ("level",))
+    assert dynamics.depends == {"level": ("level",)}
+    assert list(dynamics.forms)[-1] == TanhNetwork(4)
 
 
 def test_states_that_the_twin_has_not_are_refused_when_the_case_is_read(folder: Path) -> None:
