@@ -145,7 +145,8 @@ def bounded_step(
         own = curvature.scaled(1.0 - fixed).plus(1.0 * fixed)
         further = trust_region_step(own, slope, radius - float(np.linalg.norm(step)))
         ends = np.where(further > 0, high, low) - step
-        share = np.divide(ends, further, out=np.full(len(step), np.inf), where=further != 0)
+        with np.errstate(over="ignore"):  # one that does not move meets no bound
+            share = np.divide(ends, further, out=np.full(len(step), np.inf), where=further != 0)
         share[fixed] = np.inf
         if share.min() >= 1:
             return step + further
