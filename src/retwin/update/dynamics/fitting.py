@@ -168,9 +168,15 @@ def fit_dynamics(
         estimation, found = _followed(equations, alone, fitted)
         held_out = estimation.held_out(found, parts)
         tried.append((equations, estimation, found, held_out))
-        errors.append((estimation.rms(held_out.errors), _beyond(estimation, found, far)))
+        each_alone = [estimation.held_out(found, [part]).errors for part in far]
+        errors.append(
+            (
+                _squares(estimation, [held_out.errors] * len(parts), parts),
+                _squares(estimation, each_alone, far),
+            )
+        )
         report(1 - 0.95 * 0.6 ** len(tried))
-    chosen = int(np.argmin(np.nan_to_num(np.hypot(*np.transpose(errors)), nan=np.inf)))
+    chosen = _chosen(errors)
     equations, estimation, found, held_out = tried[chosen]
     corrected = equations.states, equations.domain.speed
     moves = _trusted(estimation, found.point, held_out, parts)
@@ -195,8 +201,8 @@ def fit_dynamics(
         figures={
             "rms_before": alone.rms(fitted.residual),
             "rms_after": estimation.rms(found.residual),
-            "held_out": errors[chosen][0],
-            "held_out_edges": errors[chosen][1],
+            "held_out": estimation.rms(held_out.errors),
+            "held_out_edges": float(np.sqrt(np.mean(errors[chosen][1]))),
             "widening": made.widening,
             "strength": float(np.mean(estimation.variance / alone.power(fitted.residual))),
         },
@@ -345,17 +351,33 @@ def _trusted(
     return moves
 
 
-def _beyond(estimation: Estimation, found: Linearised, parts: Sequence[NDArray]) -> float:
-    """The error of parts, each without it, that may overlap: the root of their mean square."""
-    seen = [estimation.seen & part[..., None] for part in parts]
-    made = [
-        replace(estimation, seen=own).rms(
-            np.where(own, estimation.held_out(found, [part]).errors, 0)
-        )
-        for part, own in zip(parts, seen, strict=True)
-        if own.any(axis=(0, 1)).all()
-    ]
-    return float(np.sqrt(np.mean(np.square(made)))) if made else 0.0
+def _squares(
+    estimation: Estimation, errors: Sequence[NDArray], parts: Sequence[NDArray]
+) -> NDArray:
+    """Mean squares of errors (n, T, d_y), one each for parts (n, T) where all is measured."""
+    made = []
+    for each, part in zip(errors, parts, strict=True):
+        seen = estimation.seen & part[..., None]
+        if seen.any(axis=(0, 1)).all():
+            made.append(replace(estimation, seen=seen).rms(np.where(seen, each, 0.0)) ** 2)
+    return np.array(made or [0.0])
+
+
+def _chosen(errors: Sequence[tuple[NDArray, NDArray]]) -> int:
+    """The simplest form whose held-out errors are those of the best one, up to chance.
+
+    The errors are mean squares of parts in time and at the edges of the domain, which count alike;
+    chance is one standard error of the difference over the parts (Breiman, Friedman, Olshen and
+    Stone, Classification and Regression Trees, 1984, section 3.4).
+    """
+    total = [float(np.nan_to_num(sum(np.mean(each) for each in own), nan=np.inf)) for own in errors]
+    best = int(np.argmin(total))
+    for i in range(best):
+        change = [one - other for one, other in zip(errors[i], errors[best], strict=True)]
+        variance = sum(np.var(each, ddof=1) / len(each) for each in change if len(each) > 1)
+        if np.isfinite(total[i]) and total[i] - total[best] <= np.sqrt(variance):
+            return i
+    return best
 
 
 def _notes(estimation: Estimation, found: Point, unknown: NDArray) -> str:
