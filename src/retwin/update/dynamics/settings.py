@@ -28,8 +28,8 @@ class Dynamics:
         Parts of the calibration record, each made of blocks of all trajectories, that are held out
         in turn to choose the form and to calibrate bands.
     network : TanhNetwork, optional
-        A network in place of the terms, by default none. With a library too, the form is the one
-        that predicts held-out samples best.
+        A network in place of the terms, by default none. With a library too, both are tried, and
+        the network is taken where it predicts held-out samples better beyond chance.
     depends : mapping of str to sequence of str
         Per corrected state, the states and commands on which its discrepancy may depend ("command
         NAME" for a command with the name of a state); by default those of the equation itself.
