@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.twins.state_twin import StateTwin
-from retwin.update.dynamics.arrow import Arrow, bounded_step
+from retwin.update.dynamics.arrow import Arrow, bounded_step, trust_region_step
 from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
 from retwin.update.dynamics.unknowns import Unknowns
 
@@ -202,6 +202,16 @@ class Estimation:
             if ratio > ACCEPTED:
                 at, flat, (value, gradient, curvature) = tried, inside, found
         return at
+
+    def gain(self, at: Linearised) -> float:
+        """The decrease of the objective, in nats, by a Gauss-Newton step from a point."""
+        if not at.finite:
+            return -np.inf
+        _, gradient, curvature = self._expanded(at)
+        unit = _unit(curvature)
+        scaled = curvature.scaled(unit)
+        step = trust_region_step(scaled, unit * gradient, WIDEST)
+        return -float(step @ (unit * gradient + scaled.times(step) / 2))
 
     def _expanded(self, at: Linearised) -> tuple[float, NDArray, Arrow]:
         """The objective at a point, its gradient (k + n m,) and Gauss-Newton curvature.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -18,13 +18,15 @@ from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
+from retwin.update.dynamics.candidates import chosen
 from retwin.update.dynamics.corrected import CorrectedEquations
 from retwin.update.dynamics.domain import Domain
-from retwin.update.dynamics.estimation import Estimation, correlation_time, root
+from retwin.update.dynamics.estimation import Estimation, root
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
+from retwin.update.dynamics.memory import Memory
 from retwin.update.dynamics.network import TanhNetwork
-from retwin.update.dynamics.noise import edges, fit_noise, folds, widening
+from retwin.update.dynamics.noise import fit_noise, folds, widening
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of
@@ -33,16 +35,6 @@ __all__ = ["FittedDynamics", "assembled", "fit_dynamics"]
 
 NONLINEAR = 1.5
 """Ratio of the errors of a simulation to those of a linear step, from which on the step is none."""
-STRONGEST = 100.0
-"""Variance of the error of an effective sample that is assumed first, over that of the samples of
-the twin without discrepancy: a prior so strong that the discrepancy begins near 0."""
-STEP = (2.0, 3.0)
-"""Least and largest ratio of that variance to the next one: larger steps leave the optimum that the
-search follows."""
-CONSISTENT = 0.9
-"""Ratio of the observed to the assumed variance from which they agree."""
-MAX_STRENGTHS = 30
-"""Number of variances at most."""
 ERROR_STEPS = 2
 """Times that the error of each output is estimated anew where the twin alone is fitted."""
 
@@ -162,23 +154,13 @@ def fit_dynamics(
     )
     alone, fitted = _without_discrepancy(base, observed, unknowns)
     report(0.05)
-    tried, errors, parts = [], [], folds(observed.mask, settings.folds)
-    far = edges(alone.simulated(fitted.point)[1], alone.commands, settings.folds)
-    for equations in _candidates(alone, fitted.point, settings):
-        estimation, found = _followed(equations, alone, fitted)
-        held_out = estimation.held_out(found, parts)
-        tried.append((equations, estimation, found, held_out))
-        each_alone = [estimation.held_out(found, [part]).errors for part in far]
-        errors.append(
-            (
-                _squares(estimation, [held_out.errors] * len(parts), parts),
-                _squares(estimation, each_alone, far),
-            )
-        )
-        report(1 - 0.95 * 0.6 ** len(tried))
-    chosen = _chosen(errors)
-    equations, estimation, found, held_out = tried[chosen]
-    corrected = equations.states, equations.domain.speed
+    power = alone.power(fitted.residual)
+    parts = folds(observed.mask, settings.folds)
+    alone = replace(alone, variance=power)
+    best = chosen(alone, fitted.point, settings, parts, report)
+    equations, memory = best.equations, best.memory
+    estimation, found, held_out = best.estimation, best.found, best.held_out
+    corrected = equations.states, (memory.speed(equations) if memory else equations.domain.speed)
     moves = _trusted(estimation, found.point, held_out, parts)
     made = assembled(estimation, found, *corrected, parts, moves)
     made = replace(made, widening=widening(made, estimation, held_out))
@@ -197,14 +179,14 @@ def fit_dynamics(
         parameters=dict(zip(unknowns.names, found.point.shared[:k].tolist(), strict=True)),
         errors=dict(zip(unknowns.names, deviation[:k].tolist(), strict=True)),
         correlations=_correlations(estimation.unknowns.names, covariance, unknown),
-        terms=_sizes(equations, estimation, found.point),
+        terms=_sizes(equations, memory, estimation, found.point),
         figures={
             "rms_before": alone.rms(fitted.residual),
             "rms_after": estimation.rms(found.residual),
             "held_out": estimation.rms(held_out.errors),
-            "held_out_edges": float(np.sqrt(np.mean(errors[chosen][1]))),
+            "held_out_edges": float(np.sqrt(np.mean(best.squares[1]))),
             "widening": made.widening,
-            "strength": float(np.mean(estimation.variance / alone.power(fitted.residual))),
+            "strength": float(np.mean(estimation.variance / power)),
         },
         form=equations.form,
         seconds=time.perf_counter() - began,
@@ -230,59 +212,6 @@ def _without_discrepancy(
         estimation = replace(estimation, variance=estimation.power(found.residual))
         found = estimation.minimised(found)
     return estimation, found
-
-
-def _with_starts(base: StateTwin, unknowns: Unknowns, point: Point) -> StateTwin:
-    """The twin whose parameters start at a point."""
-    values = unknowns.offset + unknowns.matrix @ point.shared
-    parameters = (
-        replace(each, start=value, low=min(each.low, value), high=max(each.high, value))
-        for each, value in zip(base.parameters, values.tolist(), strict=True)
-    )
-    return replace(base, parameters=tuple(parameters))
-
-
-def _candidates(
-    alone: Estimation, point: Point, settings: Dynamics
-) -> Iterator[CorrectedEquations]:
-    """The corrected equations with each form that is tried, at the parameters of a point."""
-    unknowns = alone.unknowns
-    twin = _with_starts(alone.twin, unknowns, point)
-    visited = (alone.simulated(point)[1], alone.commands)
-    for form in settings.forms:
-        yield CorrectedEquations.distinct(twin, form, settings, visited, unknowns.matrix)
-
-
-def _followed(
-    equations: CorrectedEquations, alone: Estimation, fitted: Linearised
-) -> tuple[Estimation, Linearised]:
-    """The fit whose assumed errors are those that are observed.
-
-    The prior of the discrepancy begins strong, as if errors were large, and becomes weaker step by
-    step, which leads the search along.
-    """
-    unknowns, own = alone.unknowns.with_coefficients(equations.coefficients), alone.unknowns.count
-
-    def absorbed(shared: NDArray) -> tuple[NDArray, NDArray]:
-        error, slope = equations.absorbed(shared[own:])
-        return error, np.pad(slope, ((0, 0), (own, 0)))
-
-    estimation = replace(alone, twin=equations.corrected, unknowns=unknowns, absorbed=absorbed)
-    shared = np.append(fitted.point.shared, unknowns.mean[own:])
-    now = estimation.linearised(Point(shared, fitted.point.starts))
-    power = alone.power(fitted.residual)
-    strength = STRONGEST
-    for _ in range(MAX_STRENGTHS):
-        estimation = replace(estimation, variance=strength * power)
-        now = estimation.minimised(now)
-        # What a network has in common with parameters is that over the states that it leads to.
-        equations = equations.visiting(estimation.simulated(now.point)[1], estimation.commands)
-        ratio = np.mean(estimation.power(now.residual) / power)
-        observed = correlation_time(now.residual) * float(ratio)
-        if observed >= CONSISTENT * strength:
-            break
-        strength = float(np.clip(observed, strength / STEP[1], strength / STEP[0]))
-    return estimation, estimation.minimised(now)
 
 
 def assembled(
@@ -351,35 +280,6 @@ def _trusted(
     return moves
 
 
-def _squares(
-    estimation: Estimation, errors: Sequence[NDArray], parts: Sequence[NDArray]
-) -> NDArray:
-    """Mean squares of errors (n, T, d_y), one each for parts (n, T) where all is measured."""
-    made = []
-    for each, part in zip(errors, parts, strict=True):
-        seen = estimation.seen & part[..., None]
-        if seen.any(axis=(0, 1)).all():
-            made.append(replace(estimation, seen=seen).rms(np.where(seen, each, 0.0)) ** 2)
-    return np.array(made or [0.0])
-
-
-def _chosen(errors: Sequence[tuple[NDArray, NDArray]]) -> int:
-    """The simplest form whose held-out errors are those of the best one, up to chance.
-
-    The errors are mean squares of parts in time and at the edges of the domain, which count alike;
-    chance is one standard error of the difference over the parts (Breiman, Friedman, Olshen and
-    Stone, Classification and Regression Trees, 1984, section 3.4).
-    """
-    total = [float(np.nan_to_num(sum(np.mean(each) for each in own), nan=np.inf)) for own in errors]
-    best = int(np.argmin(total))
-    for i in range(best):
-        change = [one - other for one, other in zip(errors[i], errors[best], strict=True)]
-        variance = sum(np.var(each, ddof=1) / len(each) for each in change if len(each) > 1)
-        if np.isfinite(total[i]) and total[i] - total[best] <= np.sqrt(variance):
-            return i
-    return best
-
-
 def _notes(estimation: Estimation, found: Point, unknown: NDArray) -> str:
     """Which parameters (k,) are unknown, and what is at a bound."""
     unknowns, k = estimation.unknowns, len(unknown)
@@ -412,12 +312,20 @@ def _correlations(
     return dict(sorted(made.items(), key=lambda each: -abs(each[1])))
 
 
-def _sizes(equations: CorrectedEquations, estimation: Estimation, found: Point) -> dict[str, float]:
+def _sizes(
+    equations: CorrectedEquations, memory: Memory | None, estimation: Estimation, found: Point
+) -> dict[str, float]:
     """The root mean square of each term over the calibration record, the largest first."""
     states = estimation.simulated(found)[1].reshape(-1, len(estimation.unknowns.start))
-    count = len(equations.coefficients)
-    psi = found.shared[len(found.shared) - count :]
-    values = equations.values(states, estimation.commands.reshape(len(states), -1), psi)
+    own, more = len(equations.twin.states), 2 if memory else 0
+    first = len(found.shared) - len(equations.coefficients) - more
+    psi = found.shared[first : len(found.shared) - more]
+    commands = estimation.commands.reshape(len(states), -1)
+    values = equations.values(states[:, :own], commands, psi)
     sizes = np.abs(psi[equations.weights]) * np.sqrt(np.mean(values**2, axis=0))
     names = [equations.coefficients[place].name for place in equations.weights]
+    if memory:
+        names.append(f"{memory.state}: memory over {memory.fitted(found.shared):.3g} s")
+        value = memory.values(equations, states[:, -1])
+        sizes = np.append(sizes, np.abs(found.shared[-2]) * np.sqrt(np.mean(value**2)))
     return {names[i]: float(sizes[i]) for i in np.argsort(-sizes)}

@@ -61,6 +61,11 @@ class Library:
             remedy="a hinge outside that range is not determined by the data",
         )
 
+    @property
+    def linear(self) -> bool:
+        """Whether the terms are linear in the variables."""
+        return self.degree <= 1 and not self.knots and not self.friction
+
     def nested(self) -> list[Library]:
         """Libraries of which each contains the one before; the last is this one."""
         smooth = [Library(degree, (), False) for degree in range(min(self.degree, SIMPLE) + 1)]

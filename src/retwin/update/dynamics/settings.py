@@ -30,6 +30,10 @@ class Dynamics:
     network : TanhNetwork, optional
         A network in place of the terms, by default none. With a library too, both are tried, and
         the network is taken where it predicts held-out samples better beyond chance.
+    memory : bool, default True
+        Whether a hidden state that follows a corrected one slowly, such as a wall that takes up
+        heat, is tried beside the linear terms of the library (`Memory`), unless more is known of
+        the structure.
     depends : mapping of str to sequence of str
         Per corrected state, the states and commands on which its discrepancy may depend ("command
         NAME" for a command with the name of a state); by default those of the equation itself.
@@ -46,6 +50,7 @@ class Dynamics:
     states: Sequence[str] = ()
     folds: int = 10
     network: TanhNetwork | None = None
+    memory: bool = True
     depends: Mapping[str, Sequence[str]] = field(default_factory=dict)
     monotone: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     passive: Sequence[str] = ()
@@ -72,6 +77,7 @@ class Dynamics:
             )
             object.__setattr__(self, name, tuple(given))
         whole("folds", self.folds, least=2)
+        one_of("memory", self.memory, (True, False))
         for state, variables in self.depends.items():
             require(
                 not isinstance(variables, str) and len(variables) > 0,
@@ -99,6 +105,11 @@ class Dynamics:
         yield from libraries
         if self.network is not None:
             yield self.network
+
+    def remembers(self, form: Library | TanhNetwork) -> bool:
+        """Whether a memory is tried beside a form."""
+        known = self.depends or self.monotone or self.passive
+        return self.memory and not known and isinstance(form, Library) and form.linear
 
     def signs(self, state: str, variables: Sequence[str]) -> list[int]:
         """Per variable of a state equation, the sign of the slope of its discrepancy, or 0."""

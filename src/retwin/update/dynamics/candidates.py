@@ -1,0 +1,238 @@
+"""`Candidate`: a form of the discrepancy that was fitted, and how it predicts what was left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.progress import Progress
+from retwin.twins.state_twin import StateTwin
+from retwin.update.dynamics.corrected import CorrectedEquations
+from retwin.update.dynamics.estimation import Estimation, correlation_time
+from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
+from retwin.update.dynamics.memory import Memory
+from retwin.update.dynamics.noise import edges
+from retwin.update.dynamics.settings import Dynamics
+from retwin.update.dynamics.unknowns import Unknowns
+
+__all__ = ["Candidate", "chosen"]
+
+STRONGEST = 100.0
+"""Variance of the error of an effective sample that is assumed first, over that of the samples of
+the twin without discrepancy: a prior so strong that the discrepancy begins near 0."""
+STEP = (2.0, 3.0)
+"""Least and largest ratio of that variance to the next one: larger steps leave the optimum that the
+search follows."""
+CONSISTENT = 0.9
+"""Ratio of the observed to the assumed variance from which they agree."""
+MAX_STRENGTHS = 30
+"""Number of variances at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A fitted form of the discrepancy, its held-out errors, and their mean squares per part.
+
+    The parts are those in time and those at the edges of the domain.
+    """
+
+    equations: CorrectedEquations
+    memory: Memory | None
+    estimation: Estimation
+    found: Linearised
+    held_out: HeldOut
+    squares: tuple[NDArray, NDArray]
+
+    @classmethod
+    def tested(
+        cls,
+        equations: CorrectedEquations,
+        memory: Memory | None,
+        estimation: Estimation,
+        found: Linearised,
+        parts: Sequence[NDArray],
+        far: Sequence[NDArray],
+    ) -> Candidate:
+        """The candidate, tried on parts (n, T) in time and on those at the edges of the domain."""
+        held_out = estimation.held_out(found, parts)
+        alone = [estimation.held_out(found, [part]).errors for part in far]
+        squares = (
+            _squares(estimation, [held_out.errors] * len(parts), parts),
+            _squares(estimation, alone, far),
+        )
+        return cls(equations, memory, estimation, found, held_out, squares)
+
+
+def chosen(
+    alone: Estimation,
+    point: Point,
+    settings: Dynamics,
+    parts: Sequence[NDArray],
+    progress: Progress,
+) -> Candidate:
+    """The simplest candidate whose held-out errors are those of the best one, up to chance.
+
+    Parameters
+    ----------
+    alone : Estimation
+        That of the twin without discrepancy; its variances are those of its errors.
+    point : Point
+        Its optimum.
+    settings : Dynamics
+        The forms that are tried.
+    parts : sequence of NDArray
+        Parts (n, T) of the samples that are held out in turn.
+    progress : callable
+        Called with the share of the work that is done.
+
+    """
+    tried: list[Candidate] = []
+    far = edges(alone.simulated(point)[1], alone.commands, settings.folds)
+    for number, equations in enumerate(_forms(alone, point, settings)):
+        own, found = _followed(equations, None, alone, point, STRONGEST)
+        tried.append(Candidate.tested(equations, None, own, found, parts, far))
+        if settings.remembers(equations.form):
+            slow = _memory(equations, alone, own, found)
+            strength = float(np.mean(own.variance / alone.variance))
+            own, found = _followed(equations, slow, alone, found.point, strength)
+            tried.append(Candidate.tested(equations, slow, own, found, parts, far))
+        progress(1 - 0.95 * 0.6 ** (number + 1))
+    return tried[_simplest([each.squares for each in tried])]
+
+
+def _with_starts(base: StateTwin, unknowns: Unknowns, point: Point) -> StateTwin:
+    """The twin whose parameters start at a point."""
+    values = unknowns.offset + unknowns.matrix @ point.shared
+    parameters = (
+        replace(each, start=value, low=min(each.low, value), high=max(each.high, value))
+        for each, value in zip(base.parameters, values.tolist(), strict=True)
+    )
+    return replace(base, parameters=tuple(parameters))
+
+
+def _forms(alone: Estimation, point: Point, settings: Dynamics) -> Iterator[CorrectedEquations]:
+    """The corrected equations with each form that is tried, at the parameters of a point."""
+    unknowns = alone.unknowns
+    twin = _with_starts(alone.twin, unknowns, point)
+    visited = (alone.simulated(point)[1], alone.commands)
+    for form in settings.forms:
+        yield CorrectedEquations.distinct(twin, form, settings, visited, unknowns.matrix)
+
+
+def _with_discrepancy(
+    equations: CorrectedEquations, memory: Memory | None, alone: Estimation
+) -> Estimation:
+    """The estimation of corrected equations, with a memory if it is given."""
+    more = memory.coefficients if memory else ()
+    unknowns = alone.unknowns.with_coefficients([*equations.coefficients, *more])
+    return replace(
+        alone,
+        twin=memory.added(equations) if memory else equations.corrected,
+        unknowns=replace(unknowns, start=np.append(unknowns.start, [0.0] if memory else [])),
+        absorbed=_absorbed(equations, alone.unknowns.count),
+    )
+
+
+def _absorbed(
+    equations: CorrectedEquations, first: int
+) -> Callable[[NDArray], tuple[NDArray, NDArray]]:
+    """What the discrepancy absorbs of the parameters, by all shared coordinates.
+
+    Its own coefficients begin at the number `first` of these.
+    """
+    last = first + len(equations.coefficients)
+
+    def absorbed(shared: NDArray) -> tuple[NDArray, NDArray]:
+        error, slope = equations.absorbed(shared[first:last])
+        return error, np.pad(slope, ((0, 0), (first, len(shared) - last)))
+
+    return absorbed
+
+
+def _memory(
+    equations: CorrectedEquations, alone: Estimation, estimation: Estimation, found: Linearised
+) -> Memory:
+    """The memory from which the fit without one would gain most, by a linear step."""
+    point = Point(np.pad(found.point.shared, (0, 2)), found.point.starts)
+
+    def gain(memory: Memory) -> float:
+        own = replace(_with_discrepancy(equations, memory, alone), variance=estimation.variance)
+        return own.gain(own.linearised(point))
+
+    return max(Memory.tried(equations, alone.observed.steps), key=gain)
+
+
+def _followed(
+    equations: CorrectedEquations,
+    memory: Memory | None,
+    alone: Estimation,
+    point: Point,
+    strength: float,
+) -> tuple[Estimation, Linearised]:
+    """The fit whose assumed errors are those that are observed.
+
+    The prior of the discrepancy begins strong, as if errors were large, and becomes weaker step by
+    step, which leads the search along.
+
+    Parameters
+    ----------
+    equations, memory
+        The corrected equations.
+    alone : Estimation
+        That of the twin without discrepancy; its variances are those of its errors.
+    point : Point
+        Where the search begins; coefficients that it does not have are at their starts.
+    strength : float
+        The first assumed variance, over that of `alone`.
+
+    """
+    estimation, power = _with_discrepancy(equations, memory, alone), alone.variance
+    begun = np.append(point.shared, estimation.unknowns.mean[len(point.shared) :])
+    now = estimation.linearised(Point(begun, point.starts))
+    states = len(equations.twin.states)
+    for _ in range(MAX_STRENGTHS):
+        estimation = replace(estimation, variance=strength * power)
+        now = estimation.minimised(now)
+        # What a network has in common with parameters is that over the states that it leads to.
+        visited = estimation.simulated(now.point)[1][..., :states]
+        equations = equations.visiting(visited, estimation.commands)
+        absorbed = _absorbed(equations, alone.unknowns.count)
+        estimation = replace(estimation, absorbed=absorbed)
+        ratio = np.mean(estimation.power(now.residual) / power)
+        observed = correlation_time(now.residual) * float(ratio)
+        if observed >= CONSISTENT * strength:
+            break
+        strength = float(np.clip(observed, strength / STEP[1], strength / STEP[0]))
+    return estimation, estimation.minimised(now)
+
+
+def _squares(
+    estimation: Estimation, errors: Sequence[NDArray], parts: Sequence[NDArray]
+) -> NDArray:
+    """Mean squares of errors (n, T, d_y), one each for parts (n, T) where all is measured."""
+    made = []
+    for each, part in zip(errors, parts, strict=True):
+        seen = estimation.seen & part[..., None]
+        if seen.any(axis=(0, 1)).all():
+            made.append(replace(estimation, seen=seen).rms(np.where(seen, each, 0.0)) ** 2)
+    return np.array(made or [0.0])
+
+
+def _simplest(errors: Sequence[tuple[NDArray, NDArray]]) -> int:
+    """The simplest form whose held-out errors are those of the best one, up to chance.
+
+    The errors are mean squares of parts in time and at the edges of the domain, which count alike;
+    chance is one standard error of the difference over the parts (Breiman, Friedman, Olshen and
+    Stone, Classification and Regression Trees, 1984, section 3.4).
+    """
+    total = [float(np.nan_to_num(sum(np.mean(each) for each in own), nan=np.inf)) for own in errors]
+    best = int(np.argmin(total))
+    for i in range(best):
+        change = [one - other for one, other in zip(errors[i], errors[best], strict=True)]
+        variance = sum(np.var(each, ddof=1) / len(each) for each in change if len(each) > 1)
+        if np.isfinite(total[i]) and total[i] - total[best] <= np.sqrt(variance):
+            return i
+    return best
