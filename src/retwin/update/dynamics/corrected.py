@@ -39,8 +39,9 @@ DISTINCT = 1e-5
 ABSORBED = 1e-3
 """Standard deviation of what a network has in common with the effects of parameters, in the root
 mean square of the states' time derivatives: so small that it is theirs."""
-SHARED = 0.03
-"""The same for equations with a known sign, whose discrepancy may be impossible without any."""
+SHARED = 1.0
+"""The same for equations with a known sign, whose discrepancy may be impossible without any: as
+much as a coefficient's."""
 
 
 @dataclass(frozen=True, eq=False)
