@@ -133,6 +133,7 @@ def test_a_saved_network_is_the_same(fitted: FittedDynamics, tmp_path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:at a bound, and perhaps beyond it. damping")
 @pytest.mark.parametrize("form", [Library(), TanhNetwork(8)])
 def test_known_structure_holds_after_a_fit(form: Library | TanhNetwork) -> None:
     """Over and beyond the domain, and at other places of the other variables."""
