@@ -28,6 +28,8 @@ STEP = (2.0, 3.0)
 search follows."""
 CONSISTENT = 0.9
 """Ratio of the observed to the assumed variance from which they agree."""
+DECIDED = 2.0
+"""Number of standard errors by which a memory must lower the logarithms of held-out errors."""
 MAX_STRENGTHS = 30
 """Number of variances at most."""
 
@@ -100,7 +102,22 @@ def chosen(
             own, found = _followed(equations, slow, alone, found.point, strength)
             tried.append(Candidate.tested(equations, slow, own, found, parts, far))
         progress(1 - 0.95 * 0.6 ** (number + 1))
-    return tried[_simplest([each.squares for each in tried])]
+    best = tried[_simplest([each.squares for each in tried])]
+    without = [each for each in tried if each.memory is None]
+    other = without[_simplest([each.squares for each in without])]
+    return other if best.memory and not _decided(best, other) else best
+
+
+def _decided(candidate: Candidate, other: Candidate) -> bool:
+    """Whether a candidate has lower held-out errors in nearly all parts.
+
+    A memory is a state more, and with a short time constant much like a parameter.
+    """
+    before, after = (np.log(np.concatenate(each.squares)) for each in (other, candidate))
+    change = (after - before)[np.isfinite(after - before)]
+    if len(change) < 2:
+        return False
+    return bool(np.mean(change) < -DECIDED * np.std(change, ddof=1) / np.sqrt(len(change)))
 
 
 def _with_starts(base: StateTwin, unknowns: Unknowns, point: Point) -> StateTwin:
