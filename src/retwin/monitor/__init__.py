@@ -11,6 +11,7 @@ from retwin._lazy import names
 
 _HOME = {
     "Alarm": "monitor",
+    "Audit": "audit",
     "Cause": "cause",
     "ConformalScores": "scores",
     "Dependence": "bets",
@@ -18,6 +19,7 @@ _HOME = {
     "DetectorState": "detector",
     "Disturbance": "disturbance",
     "DisturbanceState": "disturbance",
+    "Entry": "audit",
     "Location": "bets",
     "Monitor": "monitor",
     "MonitorState": "monitor",
@@ -29,12 +31,15 @@ _HOME = {
     "ValidityState": "validity",
     "Watched": "monitor",
     "effective_samples": "slack",
+    "export_log": "audit",
     "false_alarms": "promise",
     "find_causes": "cause",
     "fit_disturbance": "disturbance",
     "fit_monitor": "monitor",
     "fit_scores": "scores",
+    "read_log": "audit",
     "resolution": "scores",
+    "verify": "audit",
 }
 
 __getattr__, __dir__, __all__ = names(__name__, _HOME)
