@@ -11,8 +11,10 @@ from retwin._lazy import names
 
 _HOME = {
     "Alarm": "monitor",
+    "Asset": "store",
     "Audit": "audit",
     "Cause": "cause",
+    "Committed": "store",
     "ConformalScores": "scores",
     "Dependence": "bets",
     "Detector": "detector",
@@ -26,7 +28,9 @@ _HOME = {
     "Promise": "promise",
     "Scale": "bets",
     "Slack": "slack",
+    "Store": "store",
     "Tails": "bets",
+    "Update": "store",
     "Validity": "validity",
     "ValidityState": "validity",
     "Watched": "monitor",
