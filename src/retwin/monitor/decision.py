@@ -1,0 +1,170 @@
+"""Whether a new version of a twin is better than the active one, and keeps the promise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from retwin.checks import positive, require, whole
+from retwin.scores.bootstrap import BLOCKS, MIN_RECORDS, bootstrap_means
+
+__all__ = ["Decision", "FalseAlarmTest", "decide"]
+
+SIGNIFICANCE = 0.05
+"""Probability of the observed false alarms or more, below which the promise counts as broken."""
+MIN_SAMPLES = 10 * BLOCKS
+"""Samples of a record at least, so that a block of the bootstrap has ten."""
+DRAWS = 4000
+
+
+@dataclass(frozen=True)
+class FalseAlarmTest:
+    """Alarms of a version on healthy samples, compared with the rate that was promised.
+
+    Parameters
+    ----------
+    alarms : int
+        Alarms that were raised.
+    samples : int
+        Healthy samples on which they were.
+    run_length : float
+        The promised mean number of samples between false alarms.
+
+    """
+
+    alarms: int
+    samples: int
+    run_length: float
+
+    def __post_init__(self) -> None:
+        whole("alarms", self.alarms)
+        whole("samples", self.samples, least=1)
+        positive("run_length", self.run_length, unit="samples")
+
+    @property
+    def p(self) -> float:
+        """The probability of so many alarms or more at the promised rate, by Poisson."""
+        from scipy.stats import poisson
+
+        return float(poisson.sf(self.alarms - 1, self.samples / self.run_length))
+
+    @property
+    def passed(self) -> bool:
+        """Whether the alarms agree with the promise, which few samples cannot prove."""
+        return self.p >= SIGNIFICANCE
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A comparison of a new version with the active one.
+
+    Attributes
+    ----------
+    old_crps, new_crps : float
+        Mean CRPS on the same samples.
+    difference : float
+        Old minus new: positive where the new one is better.
+    low, high : float
+        The 95 % interval of the difference.
+    false_alarms : FalseAlarmTest
+        The test of the new version.
+
+    """
+
+    old_crps: float
+    new_crps: float
+    difference: float
+    low: float
+    high: float
+    false_alarms: FalseAlarmTest
+
+    @property
+    def better(self) -> bool:
+        """Whether the interval is above 0 and the new version's alarms are as promised."""
+        return self.low > 0 and self.false_alarms.passed
+
+    @property
+    def summary(self) -> str:
+        """Both numbers: the difference with its interval, and the false alarms."""
+        test = self.false_alarms
+        return (
+            f"CRPS {self.old_crps:.4g} - {self.new_crps:.4g} = {self.difference:.3g} "
+            f"(95 % interval {self.low:.3g} to {self.high:.3g}), and {test.alarms} alarms in "
+            f"{test.samples} samples where {test.samples / test.run_length:.3g} are promised "
+            f"(p = {test.p:.2g}, at least {SIGNIFICANCE} needed)"
+        )
+
+
+def decide(
+    old_crps: ArrayLike, new_crps: ArrayLike, false_alarm_test: FalseAlarmTest, *, seed: int = 0
+) -> Decision:
+    """Compare two versions on the same samples.
+
+    Parameters
+    ----------
+    old_crps, new_crps : array (T,) or (n, T)
+        CRPS of each sample of a record, or of n records, in the order of time; NaN where a sample
+        is missing.
+    false_alarm_test : FalseAlarmTest
+        The alarms of the new version on healthy samples.
+    seed : int
+        Seed of the bootstrap.
+
+    Raises
+    ------
+    InputError
+        The shapes differ, the versions were not compared on the same samples, a value is infinite,
+        or a record has fewer than 160 samples.
+
+    Notes
+    -----
+    The standard deviation of the mean difference is that of block bootstrap draws
+    (`retwin.scores.bootstrap.bootstrap_means`), and the interval is that of Student's t with as
+    many degrees of freedom as independent blocks or records allow.
+
+    """
+    from scipy.special import stdtrit
+
+    old, new = (np.atleast_2d(np.asarray(each, dtype=float)) for each in (old_crps, new_crps))
+    require(
+        old.shape == new.shape and old.ndim == 2 and np.array_equal(np.isnan(old), np.isnan(new)),
+        "new_crps",
+        expected=f"CRPS of the same samples as old_crps, {old.shape}",
+        got=f"{new.shape}, or other samples",
+        remedy="score both versions on the same samples",
+    )
+    present = np.isfinite(old) & np.isfinite(new)
+    require(
+        (present | np.isnan(old)).all(),
+        "crps",
+        expected="finite scores, NaN where a sample is missing",
+        got="infinite ones",
+        remedy="find out which samples have such predictions",
+    )
+    fewest = int(present.sum(axis=1).min(initial=old.shape[1])) if len(old) else 0
+    require(
+        fewest >= MIN_SAMPLES,
+        "crps",
+        expected=f"at least {MIN_SAMPLES} samples of each record",
+        got=fewest,
+        remedy="collect more samples",
+    )
+    difference = (old - new)[:, :, None]
+    draws = bootstrap_means(difference, draws=DRAWS, seed=seed)
+    mean = float(np.nanmean(difference, axis=1).mean())
+    if len(old) >= MIN_RECORDS:  # the draws are already as wide as Student's interval
+        width = 1.96 * float(np.nanstd(draws))
+    else:
+        blocks = BLOCKS * len(old)
+        scale = np.sqrt(BLOCKS / (BLOCKS - 1)) * stdtrit(blocks - len(old), 0.975)
+        width = float(scale * np.nanstd(draws))
+    return Decision(
+        float(np.nanmean(old, axis=1).mean()),
+        float(np.nanmean(new, axis=1).mean()),
+        mean,
+        mean - width,
+        mean + width,
+        false_alarm_test,
+    )
