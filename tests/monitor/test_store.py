@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -297,6 +298,34 @@ def test_damaged_files(tmp_path: Path) -> None:
                 reading()
         found = verify(store.log(), store.head)
         assert (found.intact, found.reason) == (1, "entry 1: its contents do not give its hash")
+
+
+def test_a_full_disk_is_one_error_and_loses_nothing(tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with Store(tmp_path) as store:
+        store.add_asset(Asset("pump", 20))
+        acknowledged, error = 0, None
+        try:
+            for attempt in range(2):
+                resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, before[1]))
+                with pytest.raises(InputError) as error:
+                    while True:
+                        part = update("pump", acknowledged, acknowledged + 100, channels=20)
+                        store.commit([part], [("note", {"last": acknowledged + 99})])
+                        acknowledged += 100
+                assert "nothing of this step was acknowledged" in str(error.value)
+                assert "\n" not in str(error.value)
+                assert read(store, "pump")[0].tolist() == [*range(acknowledged)], attempt
+                assert (store.state("pump") or (0,))[0] == acknowledged - 1
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert acknowledged > 0
+        done = store.commit([update("pump", acknowledged, acknowledged + 100, channels=20)])
+        assert done.repeated == {}
+    with Store(tmp_path) as store:
+        assert read(store, "pump")[0].tolist() == [*range(acknowledged + 100)]
+        found = verify(store.log(), store.head)
+        assert (found.ok, found.intact) == (True, acknowledged // 100)
 
 
 @pytest.mark.parametrize("name", ["", "a" * 201, "a\nb", "a\0b", "\ud800"])

@@ -23,7 +23,9 @@ SCHEMA = 1
 WRITER = 0x72657477696E
 """The number of the lock that the one process that writes holds in PostgreSQL: "retwin"."""
 PATIENCE = 5.0
-"""Seconds for which a lock of a broken connection, or of a reader, is waited for."""
+"""Seconds for which a lock inside SQLite is waited for."""
+RELEASE = 2.0
+"""Seconds in which PostgreSQL notices that a process ended, and frees its lock."""
 PRAGMAS = {
     "journal_mode": "wal",
     "synchronous": 2,  # FULL: each commit is flushed to the disk
@@ -100,7 +102,6 @@ class Database:
         """Whether the database may hold something else than the last transaction left."""
         self._read_only = read_only
         self._writer: Any = None
-        self._opened = False
         if url:
             needs_extra("psycopg", "postgres", "speaks to PostgreSQL")
             address = _address(url)
@@ -136,7 +137,6 @@ class Database:
             TABLES.create_all(connection)
             if connection.execute(meta.select()).first() is None:
                 connection.execute(meta.insert().values(key="schema", value=str(SCHEMA)))
-        self._opened = True
 
     def close(self) -> None:
         """Close all connections."""
@@ -210,8 +210,7 @@ class Database:
         if self._sqlite:
             return
         ask = sa.text(f"SELECT pg_try_advisory_lock({WRITER})")
-        # A lock of a connection that broke is freed when the server notices.
-        until = time.monotonic() + (PATIENCE if self._opened else 0.0)
+        until = time.monotonic() + RELEASE
         while not (held := self._writer.execute(ask).scalar_one()) and time.monotonic() < until:
             time.sleep(0.1)
         self._writer.commit()
