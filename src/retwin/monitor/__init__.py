@@ -1,8 +1,8 @@
 """Monitoring of a running machine by its twin, with false alarms no more often than promised.
 
 Belongs here: what turns streams of measured samples into scores, evidence and alarms, the promise
-that goes with them, and the causes of alarms. Not here: fitting of twins, and evidence for faults
-of whole records (see `diagnosis`).
+that goes with them, the causes of alarms, and what is stored of all that. Not here: fitting of
+twins, and evidence for faults of whole records (see `diagnosis`).
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -251,19 +251,17 @@ class Store:
                 if not new.all():
                     repeated[each.asset] = each.times[~new]
                 rows += [each.rows[i] for i in np.flatnonzero(new)]
-            if rows:
-                connection.execute(samples.insert(), rows)
+            self._database.insert(connection, samples, rows)
             latest = [each.state for each in packed if each.state]
             if latest:
-                keys = [row["asset"] for row in latest]
+                keys = [row[0] for row in latest]
                 connection.execute(states.delete().where(states.c.asset.in_(keys)))
-                connection.execute(states.insert(), latest)
+            self._database.insert(connection, states, latest)
             chained = []
             for kind, data in entries:
                 self._last = append(self._last, kind, data)
                 chained.append(self._last)
-            if chained:
-                connection.execute(log.insert(), [vars(entry) for entry in chained])
+            self._database.insert(connection, log, [astuple(entry) for entry in chained])
             for each in packed:
                 self._remove_surplus(connection, each.key)
         return Committed(repeated, chained)
@@ -437,8 +435,8 @@ class _Packed:
     asset: str
     key: int
     times: NDArray
-    rows: list[dict[str, Any]]
-    state: dict[str, Any] | None
+    rows: list[tuple]
+    state: tuple | None
 
 
 def _packed(update: Update, known: Mapping[str, tuple[int, int]]) -> _Packed:
@@ -460,10 +458,7 @@ def _packed(update: Update, known: Mapping[str, tuple[int, int]]) -> _Packed:
     stamps = times.astype(np.int64)
     data = np.ascontiguousarray(values).tobytes()
     size = channels * WORD.itemsize
-    rows = [
-        {"asset": key, "time": time, "packed": data[i * size : (i + 1) * size]}
-        for i, time in enumerate(stamps.tolist())
-    ]
+    rows = [(key, time, data[i * size : (i + 1) * size]) for i, time in enumerate(stamps.tolist())]
     if update.state is None:
         return _Packed(update.asset, key, stamps, rows, None)
     time = update.time if update.time is not None else max(stamps.tolist(), default=None)
@@ -476,9 +471,7 @@ def _packed(update: Update, known: Mapping[str, tuple[int, int]]) -> _Packed:
     )
     # C order, since the writer takes the memory of an array as it lies.
     arrays = {name: np.asarray(each, order="C") for name, each in update.state.items()}
-    return _Packed(
-        update.asset, key, stamps, rows, {"asset": key, "time": time, "arrays": save(arrays)}
-    )
+    return _Packed(update.asset, key, stamps, rows, (key, time, save(arrays)))
 
 
 def _present(connection: Any, key: int, times: NDArray) -> NDArray:
