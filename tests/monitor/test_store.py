@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import resource
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -118,6 +120,12 @@ def test_a_commit_is_stored_whole_or_not_at_all(opened: Open) -> None:
         ([update("pump", 5, 9)], [("note", {"n": float("nan")})]),
         ([update("pump", 5, 9)], [("note", {"n": 1}), ("Kind of note", {})]),
         ([Update("pump", [5.5], [[0.0, 0.0]])], []),
+        ([Update("pump", [2**63], [[0.0, 0.0]])], []),
+        ([Update("pump", [5], [["a", "b"]])], []),
+        ([Update("pump", [5, 6], [[0.0, 0.0], [0.0]])], []),
+        ([Update("pump", state={"x": np.array(["text"])}, time=9)], []),
+        ([Update("pump", state={"x": np.zeros(1)}, time=2**63)], []),
+        ([Update("pump", state={"x": np.zeros(1)})], []),
         ([Update("pump", [5], [[0.0, 0.0]]), Update("pump", state={"x": np.zeros(2)})], []),
     )
     for updates, entries in wrong:
@@ -276,6 +284,20 @@ def test_wrong_arguments(tmp_path: Path, given: dict, message: str) -> None:
         Store(tmp_path, **given)
     assert "secret" not in str(error.value)
     Store(tmp_path).close()
+
+
+def test_without_the_extra_all_else_works() -> None:
+    code = (
+        "import sys, retwin\n"
+        "assert 'sqlalchemy' not in sys.modules\n"
+        "sys.modules['sqlalchemy'] = None\n"
+        "assert retwin.monitor.verify([]).ok\n"
+        "assert 'torch' not in sys.modules\n"
+        "try: retwin.monitor.Store\n"
+        "except retwin.InputError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert 'pip install "retwin[monitor]"' in done.stdout
 
 
 def test_damaged_files(tmp_path: Path) -> None:

@@ -11,10 +11,10 @@ from retwin._lazy import names
 
 _HOME = {
     "Alarm": "monitor",
-    "Asset": "store",
+    "Asset": "updates",
     "Audit": "audit",
     "Cause": "cause",
-    "Committed": "store",
+    "Committed": "updates",
     "ConformalScores": "scores",
     "Decision": "decision",
     "Dependence": "bets",
@@ -33,7 +33,7 @@ _HOME = {
     "Slack": "slack",
     "Store": "store",
     "Tails": "bets",
-    "Update": "store",
+    "Update": "updates",
     "Validity": "validity",
     "ValidityState": "validity",
     "Version": "registry",

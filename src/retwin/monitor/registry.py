@@ -112,18 +112,21 @@ class Registry:
         """
         instance("reason", reason, str, remedy="say why in a text")
         source = Path(folder)
-        digest = self._copy(source)
-        number = len(self._read()[0]) + 1
-        self._log("propose", number, digest=digest, reason=reason)
+        with self._store.lock:
+            digest = self._copy(source)
+            number = len(self._read()[0]) + 1
+            self._log("propose", number, digest=digest, reason=reason)
         return Version(number, digest, "proposed", reason)
 
     def shadow(self, number: int) -> Version:
         """Let a proposed version predict beside the active one, without alarms that count."""
-        return self._step("shadow", number)
+        with self._store.lock:
+            return self._step("shadow", number)
 
     def reject(self, number: int, reason: str) -> Version:
         """Give up a version that is proposed or a shadow."""
-        return self._step("reject", number, reason=reason)
+        with self._store.lock:
+            return self._step("reject", number, reason=reason)
 
     def promote(self, number: int, evidence: Decision | None = None) -> Version:
         """Make a version the active one; the former one is retired.
@@ -144,31 +147,23 @@ class Registry:
             The evidence is missing or against the version, or it is in another state.
 
         """
-        if self.active is None:
-            return self._step("promote", number, first=True)
-        decision = instance("evidence", evidence, Decision, remedy="compare both with decide()")
-        require(
-            decision.better,
-            "evidence",
-            expected="a difference in CRPS whose 95 % interval is above 0, and alarms as promised",
-            got=decision.summary,
-            remedy="keep the active version, or collect more samples",
-        )
-        return self._step("promote", number, evidence=asdict(decision))
+        with self._store.lock:
+            return self._promoted(number, evidence)
 
     def rollback(self, reason: str = "") -> Version:
         """Make the version active that was so before the active one, which is retired."""
-        history = self._read()[1]
-        require(
-            len(history) > 1,
-            "rollback",
-            expected="a version that was active before",
-            got=f"{len(history)} that was active" if history else "none that was ever active",
-            remedy="propose and promote another version",
-        )
-        self.folder(history[-2])
-        self._log("rollback", history[-2], reason=reason)
-        return self._read()[0][history[-2]]
+        with self._store.lock:
+            history = self._read()[1]
+            require(
+                len(history) > 1,
+                "rollback",
+                expected="a version that was active before",
+                got=f"{len(history)} that was active" if history else "none that was ever active",
+                remedy="propose and promote another version",
+            )
+            self.folder(history[-2])
+            self._log("rollback", history[-2], reason=reason)
+            return self._read()[0][history[-2]]
 
     def folder(self, number: int) -> Path:
         """The folder of a version, after its bytes were compared with its hash; only read it.
@@ -189,6 +184,19 @@ class Registry:
             found == version.digest, str(place), expected=expected, got="other bytes", remedy=remedy
         )
         return place
+
+    def _promoted(self, number: int, evidence: Decision | None) -> Version:
+        if self.active is None:
+            return self._step("promote", number, first=True)
+        decision = instance("evidence", evidence, Decision, remedy="compare both with decide()")
+        require(
+            decision.better,
+            "evidence",
+            expected="a difference in CRPS whose 95 % interval is above 0, and alarms as promised",
+            got=decision.summary,
+            remedy="keep the active version, or collect more samples",
+        )
+        return self._step("promote", number, evidence=asdict(decision))
 
     def _version(self, number: int) -> Version:
         versions = self._read()[0]

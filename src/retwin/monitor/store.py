@@ -9,18 +9,28 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from retwin.checks import instance, require, whole
-from retwin.errors import InputError
 from retwin.monitor import database
 from retwin.monitor.audit import START, Entry, append, canonical
 from retwin.monitor.database import Database, assets, log, samples, states
+from retwin.monitor.updates import (
+    LEAST,
+    MOST,
+    WORD,
+    Asset,
+    Committed,
+    Packed,
+    Update,
+    one_asset,
+    pack,
+)
 from retwin.serialisation.files import refusing
 from retwin.serialisation.places import in_use
 
@@ -29,7 +39,7 @@ if TYPE_CHECKING:
 else:
     sa = database.sa
 
-__all__ = ["Asset", "Committed", "Store", "Update"]
+__all__ = ["Store"]
 
 FILE = "monitor.sqlite"
 """The database in the folder of the store, where no other is given."""
@@ -37,77 +47,6 @@ ROWS = 4096
 """Rows that are read at once."""
 SURPLUS = 0.1
 """Share of `max_samples` by which an asset may exceed it, so that samples are removed in groups."""
-LEAST = -(2**63)
-"""The earliest stream time, in nanoseconds."""
-WORD = np.dtype("<f8")
-"""How a value is stored."""
-
-
-@dataclass(frozen=True)
-class Asset:
-    """A machine that is watched.
-
-    Attributes
-    ----------
-    name : str
-        Its unique name.
-    channels : int
-        Values per sample.
-    settings : dict
-        Settings of its monitor, as JSON values.
-    version : int, optional
-        The version of the twin that watches it.
-
-    """
-
-    name: str
-    channels: int
-    settings: dict[str, Any] = field(default_factory=dict)
-    version: int | None = None
-
-
-@dataclass(frozen=True)
-class Update:
-    """What one asset adds in a commit.
-
-    Parameters
-    ----------
-    asset : str
-        Its name.
-    times : array (n,)
-        Stream times of new samples in nanoseconds, in any order.
-    values : array (n, channels)
-        Their values; NaN where missing.
-    state : mapping of str to array, optional
-        The state of its monitor after these samples, which replaces the former one.
-    time : int, optional
-        The stream time of the state in nanoseconds; by default the latest of `times`.
-
-    """
-
-    asset: str
-    times: ArrayLike = ()
-    values: ArrayLike = ()
-    state: Mapping[str, NDArray] | None = None
-    time: int | None = None
-
-
-@dataclass(frozen=True)
-class Committed:
-    """What a commit acknowledged.
-
-    Attributes
-    ----------
-    repeated : dict of str to array (m,)
-        Per asset, times of samples that were stored already or repeated within the commit. Their
-        new values are not stored.
-    entries : list of Entry
-        The new entries of the log.
-
-    """
-
-    repeated: dict[str, NDArray]
-    entries: list[Entry]
 
 
 class Store:
@@ -150,7 +89,8 @@ class Store:
         self.folder = Path(folder)
         self.read_only = read_only
         self._max_samples = max_samples
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
+        """Held while a thread reads something and writes what depends on it."""
         self._last: Entry | None = None
         self._assets: dict[str, tuple[int, int]] | None = None
         """Key and channels of each asset by its name; None if they must be read."""
@@ -174,7 +114,7 @@ class Store:
 
     def close(self) -> None:
         """Close the store, so that another process may write; once more is no error."""
-        with self._lock:
+        with self.lock:
             self._opened.close()
 
     def add_asset(self, asset: Asset) -> None:
@@ -198,7 +138,9 @@ class Store:
         row = {
             "channels": whole("channels", asset.channels, least=1, most=10_000),
             "settings": canonical(asset.settings),
-            "version": asset.version,
+            "version": None
+            if asset.version is None
+            else whole("version", asset.version, most=2**31 - 1),
         }
         with self._writing() as connection:
             known = self._known(connection).get(name)
@@ -243,7 +185,15 @@ class Store:
         """
         with self._writing() as connection:
             known = self._known(connection)
-            packed = [_packed(each, known) for each in updates]
+            packed = [pack(each, known) for each in updates]
+            names = [each.asset for each in packed]
+            require(
+                len(set(names)) == len(names),
+                "updates",
+                expected="one per asset",
+                got="several of one",
+                remedy="join the samples of an asset",
+            )
             repeated = {}
             rows = []
             for each in packed:
@@ -283,7 +233,7 @@ class Store:
 
         """
         key, channels = self._asset(asset)
-        low = LEAST if after is None else int(after)
+        low = LEAST if after is None else whole("after", after, least=LEAST, most=MOST)
         chosen = samples.select().where(samples.c.asset == key).order_by(samples.c.time)
         inclusive = after is None
         while True:
@@ -334,8 +284,8 @@ class Store:
         return START if last is None else last.hash
 
     def _asset(self, name: str) -> tuple[int, int]:
-        with self._lock, self._reading() as connection:
-            return _one(self._known(connection), name)
+        with self.lock, self._reading() as connection:
+            return one_asset(self._known(connection), name)
 
     def _known(self, connection: Any) -> dict[str, tuple[int, int]]:
         if self._assets is None or self.read_only:
@@ -358,7 +308,7 @@ class Store:
             got="one that was opened to read only",
             remedy="open it without read_only",
         )
-        with self._lock, self._database.reporting():
+        with self.lock, self._database.reporting():
             try:
                 with self._database.writer() as connection:
                     if self._database.stale:
@@ -371,7 +321,7 @@ class Store:
                 self._database.stale = True
                 raise
 
-    def _new(self, connection: Any, packed: _Packed) -> NDArray:
+    def _new(self, connection: Any, packed: Packed) -> NDArray:
         """Whether each sample (n,) is neither stored nor repeated; it is counted as stored."""
         times = packed.times
         if not len(times):
@@ -428,70 +378,11 @@ class _Held:
     latest: int
 
 
-@dataclass(frozen=True)
-class _Packed:
-    """An update as rows of the tables."""
-
-    asset: str
-    key: int
-    times: NDArray
-    rows: list[tuple]
-    state: tuple | None
-
-
-def _packed(update: Update, known: Mapping[str, tuple[int, int]]) -> _Packed:
-    from safetensors.numpy import save
-
-    key, channels = _one(known, update.asset)
-    times = np.asarray(update.times)
-    values = np.asarray(update.values, dtype=WORD)
-    if times.size == 0:
-        times, values = np.empty(0, np.int64), np.empty((0, channels), WORD)
-    shapes = ((len(times),), (len(times), channels))
-    require(
-        times.dtype.kind in "iu" and (times.shape, values.shape) == shapes,
-        f"update of {update.asset}",
-        expected=f"whole times (n,) and values (n, {channels})",
-        got=f"{times.dtype} {times.shape} and {values.shape}",
-        remedy="give times in nanoseconds, and one row of values for each",
-    )
-    stamps = times.astype(np.int64)
-    data = np.ascontiguousarray(values).tobytes()
-    size = channels * WORD.itemsize
-    rows = [(key, time, data[i * size : (i + 1) * size]) for i, time in enumerate(stamps.tolist())]
-    if update.state is None:
-        return _Packed(update.asset, key, stamps, rows, None)
-    time = update.time if update.time is not None else max(stamps.tolist(), default=None)
-    require(
-        time is not None,
-        f"state of {update.asset}",
-        expected="its stream time",
-        got="none, and no samples",
-        remedy="give time",
-    )
-    # C order, since the writer takes the memory of an array as it lies.
-    arrays = {name: np.asarray(each, order="C") for name, each in update.state.items()}
-    return _Packed(update.asset, key, stamps, rows, (key, time, save(arrays)))
-
-
 def _present(connection: Any, key: int, times: NDArray) -> NDArray:
     """Stored times of an asset from the least to the largest of `times`."""
     inside = samples.c.time.between(int(times.min()), int(times.max()))
     chosen = sa.select(samples.c.time).where(samples.c.asset == key, inside)
     return np.array(connection.execute(chosen).scalars().all(), dtype=np.int64)
-
-
-def _one(known: Mapping[str, tuple[int, int]], name: str) -> tuple[int, int]:
-    found = known.get(name)
-    if found is None:
-        listed = ", ".join(list(known)[:5]) or "none"
-        raise InputError(
-            "asset",
-            expected=f"one of the store's assets ({listed})",
-            got=repr(name)[:80],
-            remedy="add it first, with add_asset",
-        )
-    return found
 
 
 def _last_entry(connection: Any) -> Entry | None:
