@@ -135,12 +135,12 @@ class Store:
             got=repr(name[:80]),
             remedy="rename the asset",
         )
+        if asset.version is not None:
+            whole("version", asset.version, most=2**31 - 1)
         row = {
             "channels": whole("channels", asset.channels, least=1, most=10_000),
             "settings": canonical(asset.settings),
-            "version": None
-            if asset.version is None
-            else whole("version", asset.version, most=2**31 - 1),
+            "version": asset.version,
         }
         with self._writing() as connection:
             known = self._known(connection).get(name)
