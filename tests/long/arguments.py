@@ -72,6 +72,8 @@ BASE = {
     "diagnose predict": "cnn real.npz",
     "fit": "reach.toml --real real.npz --simulations 20",
     "generate": "model --case reach.toml --per-class 1",
+    "monitor fit": "model real.npz",
+    "monitor replay": "model real.npz",
     "study": "reach.toml --real real.npz --folds 2 --sources dt,ibg --runs 1 --per-class 5",
     "twin animate": "real.npz --case reach.toml",
     "twin info": "own_of_mutations:reach --inputs first,second --outputs far,high",

@@ -309,6 +309,7 @@ def test_states_beyond_their_range_are_a_warning(fitted: FittedDynamics) -> None
         fitted.twin.simulate(forces(1, 7, size=16.0), seed=0)
 
 
+@pytest.mark.slow
 def test_the_equations_to_correct_can_be_named() -> None:
     with pytest.warns(UserWarning, match="at a bound, and perhaps beyond it: damping"):
         found = fit_dynamics(LINEAR, record(**TRUTH), Dynamics(states=("position",)))
@@ -330,6 +331,7 @@ def test_a_parameter_at_its_bound_is_a_warning() -> None:
     assert "stiffness" in found.reason
 
 
+@pytest.mark.slow
 def test_noise_free_outputs_are_fitted_without_a_failure() -> None:
     exact = record(**TRUTH)
     found = fit_dynamics(LINEAR, exact.replace(observed=exact.nominal))
@@ -364,6 +366,7 @@ def test_the_correlation_time_is_that_of_an_autoregression() -> None:
     assert correlation_time(rng.normal(size=(4, 20_000, 1))) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_progress_ends_at_one() -> None:
     shares: list[float] = []
     with warnings.catch_warnings():
@@ -373,6 +376,7 @@ def test_progress_ends_at_one() -> None:
     assert shares[-1] == 1.0
 
 
+@pytest.mark.slow
 def test_the_page_of_corrected_dynamics() -> None:
     page = (Path(__file__).parents[3] / "docs" / "dynamics.md").read_text("utf-8")
     names: dict = {"__name__": "shown"}

@@ -78,6 +78,7 @@ def test_a_network_finds_it_too(observed: rt.Trajectories, chains: Posterior) ->
     assert not list(Path.cwd().glob("sbi-logs"))
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_draws_over_processes(observed: rt.Trajectories) -> None:
     progress: list[float] = []
     method = MCMC(8, 40, 20, 1, WHITE)

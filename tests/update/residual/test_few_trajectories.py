@@ -97,7 +97,7 @@ def outputs_inside(twin: rt.Surrogate, model: rt.ResidualModel, test: rt.Traject
     return float(held[:, STEPS:].mean())
 
 
-@pytest.mark.parametrize("persistence", [0.0, 0.7])
+@pytest.mark.parametrize("persistence", [0.0, pytest.param(0.7, marks=pytest.mark.slow)])
 def test_intervals_from_two_trajectories_hold(twin: rt.Surrogate, persistence: float) -> None:
     """90 % intervals hold 0.92 of z on average over calibration sets, 0.95 of those that persist.
 
@@ -112,7 +112,7 @@ def test_intervals_from_two_trajectories_hold(twin: rt.Surrogate, persistence: f
     ("count", "loss"),
     [
         pytest.param(1, 0.8, marks=pytest.mark.slow),
-        (2, 0.55),
+        pytest.param(2, 0.55, marks=pytest.mark.slow),
         pytest.param(4, 0.26, marks=pytest.mark.slow),
     ],
 )
