@@ -63,7 +63,8 @@ def leaking(seed: int = 5) -> rt.Trajectories:
 
 
 def arrays_of(watched: Watched) -> list[np.ndarray]:
-    return [getattr(watched, each.name) for each in fields(watched) if each.name != "alarms"]
+    names = (each.name for each in fields(watched))
+    return [getattr(watched, each) for each in names if each not in ("alarms", "outside")]
 
 
 def cut(monitor: Monitor, whole: rt.Trajectories, places: list[int]) -> tuple[list, list, list]:
@@ -212,3 +213,16 @@ def test_the_cause_of_an_alarm_is_named_with_its_onset_and_size(
     assert cause.size[1] < 1.3 < cause.size[2]
     with pytest.raises(InputError, match="alarms"):
         find_causes(twin, watched[[0]], first, faults)
+
+
+def test_a_filter_that_diverges_voids_the_promise_and_begins_anew(monitor: Monitor) -> None:
+    whole = record(2, 3)
+    commands = whole.commands.astype(float).copy()
+    commands[0, 300] = 1e308
+    state, found = monitor.step(monitor.start(2), commands, whole.observed)
+    assert found.outside.tolist() == [True, False]
+    assert found.void[:, -1].tolist() == [True, False]
+    assert all(np.isfinite(each).all() for each in vars(state.filter).values())
+    again = monitor.step(state, whole.commands, whole.observed)[1]
+    assert np.isfinite(again.mean).all()
+    assert not np.isnan(again.score[:, 100:]).any()

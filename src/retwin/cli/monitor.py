@@ -164,6 +164,11 @@ def _summary(file: Path, record: Trajectories, watched: Watched) -> str:
             f"; in {void} of {len(record)} records the promise is VOID: the machine is not the one "
             "of the calibration, so calibrate again"
         )
+    if watched.outside.any():
+        text += (
+            f"; in {int(watched.outside.sum())} of {len(record)} records commands leave the range "
+            "of the calibration, where the twin extrapolates"
+        )
     return text + "."
 
 
@@ -175,5 +180,6 @@ def _json(file: Path, record: Trajectories, watched: Watched, causes: list[Cause
         "file": str(file),
         "alarms": alarms,
         "void": [record.ids[i] for i, each in enumerate(watched.void) if each[-1]],
+        "outside": [record.ids[i] for i, each in enumerate(watched.outside) if each],
         "measured_samples": int(record.mask.any(axis=2).sum()),
     }

@@ -145,6 +145,8 @@ class Watched:
         (n, T), that of a change; an alarm is raised from the average run length on.
     alarm, void : NDArray
         (n, T) bool, whether an alarm was raised, and whether the promise does not apply.
+    outside : NDArray
+        (n,) bool, whether commands leave the range that they had when the twin was calibrated.
     alarms : list of Alarm
         The alarms.
 
@@ -156,6 +158,7 @@ class Watched:
     evidence: NDArray
     alarm: NDArray
     void: NDArray
+    outside: NDArray
     alarms: list[Alarm]
 
 
@@ -228,6 +231,9 @@ class Monitor:
     ) -> tuple[MonitorState, Watched]:
         """Watch T more samples of n machines. However samples are cut, results are the same bytes.
 
+        Where the filter does not stay finite, it begins anew after these samples, and the promise
+        does not apply to that machine any more.
+
         Parameters
         ----------
         state : MonitorState
@@ -266,14 +272,23 @@ class Monitor:
         late = state.samples[:, None] + np.arange(samples) < round(self.warm_up * self.twin.rate)
         hidden = np.repeat(late, len(self.slack), axis=0)
         low, high = (np.where(hidden, np.nan, each) for each in (low, high))
-        state = replace(state, filter=filtered, disturbance=disturbance)
+        kept = np.isfinite(filtered.states).all(axis=1)
+        kept &= np.isfinite(filtered.spread).all(axis=(1, 2))
+        lost = np.flatnonzero(~kept)
+        if len(lost):
+            fresh = OnlineFilter(self.twin).start(len(lost))
+            fresh = replace(fresh, commands=filtered.commands[lost])
+            filtered = filtered.merged(lost, fresh)
+        void = state.void | ~np.isfinite(mean).all(axis=(1, 2))
+        state = replace(state, filter=filtered, disturbance=disturbance, void=void)
         state, found = self._detected(streams, state, low, high, list(np.asarray(ids, dtype=str)))
         state = replace(state, samples=state.samples + samples)
         evidence, alarm, void, alarms = found
         deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
         shape = (count, len(self.slack), samples)
         score = np.moveaxis(((low + high) / 2).reshape(shape), 1, 2)
-        return state, Watched(mean, deviation, score, evidence, alarm, void, alarms)
+        outside = self.twin.outside(known)
+        return state, Watched(mean, deviation, score, evidence, alarm, void, outside, alarms)
 
     def watch(self, record: Trajectories) -> Watched:
         """Watch recorded trajectories, each as a machine of its own.
