@@ -195,7 +195,13 @@ def unequal(trajectories: rt.Trajectories) -> rt.Trajectories:
     return rt.Trajectories.concatenate([even, short]) if len(odd) else trajectories
 
 
-@pytest.fixture(scope="module", params=TOYS)
+SLOW_TOYS = ("command space, polled", "no segments, one output")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(each, marks=[pytest.mark.slow] * (each in SLOW_TOYS)) for each in TOYS],
+)
 def toy(request: pytest.FixtureRequest) -> Toy:
     return TOYS[request.param]
 
