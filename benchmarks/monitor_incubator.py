@@ -29,15 +29,14 @@ from scipy.stats import chi2
 
 import retwin as rt
 from retwin.cases.columns import ColumnRecords
-from retwin.cases.styrofoam_incubator.case import measurements
+from retwin.cases.styrofoam_incubator.case import incubator, measurements
 from retwin.cases.styrofoam_incubator.twin import INCUBATOR
-from retwin.monitor import Monitor, find_causes, fit_monitor
+from retwin.monitor import Monitor, find_causes, fit_monitor, possible_causes
 from retwin.twins import (
     ActuatorGain,
     ParameterShift,
     SensorBias,
     SensorDrift,
-    SensorFreeze,
     Stuck,
 )
 from retwin.twins.faults import Fault
@@ -51,14 +50,6 @@ QUANTUM = 1 / 16
 SAMPLES = 1000
 """Samples of an emulated record: 50 minutes."""
 ONSET = 1500.0
-CAUSES: dict[str, Fault | None] = {
-    "Healthy": None,
-    "lid": ParameterShift("g_box", size=(0.3, 20.0)),
-    "heater": ActuatorGain(0, size=(-1.0, -0.1)),
-    "sensor bias": SensorBias(0, size=(-10.0, 10.0)),
-    "sensor drift": SensorDrift(0, size=(-0.1, 0.1)),
-    "frozen sensor": SensorFreeze(0),
-}
 EMULATED: dict[str, Fault | None] = {
     "healthy": None,
     "dead heater": ActuatorGain(0, size=-1.0, onset=ONSET),
@@ -121,6 +112,7 @@ def watched(
         faulty |= (time >= start) & (time <= end + AFTER)
     hours = float((whole.mask[0, :, 0] & ~faulty).sum() / whole.rate / 3600)
     false = sum(not faulty[each.sample] for each in found.alarms)
+    causes = possible_causes(monitor.twin, incubator().alarm_causes)
     delays, onsets, named = [], [], 0
     for start, end in zip(opened, closed, strict=True):
         first = [each for each in found.alarms if start <= each.time <= end]
@@ -128,7 +120,7 @@ def watched(
             delays.append(np.inf)
             continue
         delays.append(first[0].time - start)
-        (cause,) = find_causes(monitor.twin, whole, first[:1], CAUSES)
+        (cause,) = find_causes(monitor.twin, whole, first[:1], causes)
         named += cause.name == "lid"
         onsets.append(abs(cause.onset[0] - start) * whole.rate)
     return {

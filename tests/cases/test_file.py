@@ -20,6 +20,7 @@ import retwin as rt
 from retwin.cases import ColumnRecords
 from retwin.testing import check_twin
 from retwin.twins.samplers import HoldSampler, MultisineSampler, RampSampler, RecordedSampler
+from retwin.twins.system_faults import SensorFreeze
 from retwin.update.identification import LeastSquares, identify
 from retwin.update.residual import SequenceMixture
 
@@ -124,6 +125,8 @@ start = 0.5
 b_stuck = { kind = "Stuck", actuator = "b", onset = [0.3, 0.9] }
 a_off = { kind = "ActuatorBias", actuator = 0, size = [0.5, 1] }
 leak = "toy_module:leak"
+[causes]
+sensor = { kind = "SensorFreeze", output = "y" }
 [records]
 calibration = { a = "a1", b = "b1", y = "y1" }
 test = { a = "a2", b = "b2", y = "y2" }
@@ -197,6 +200,8 @@ def test_every_key_has_its_effect(read: Callable[..., rt.Case]) -> None:
         "a_off": rt.ActuatorBias(0, (0.5, 1.0)),
         "leak": rt.ActuatorBias(1, (1.0, 2.0)),
     }
+    assert case.causes == {"sensor": SensorFreeze(0)}
+    assert [*case.alarm_causes] == [*case.faults, "sensor"]
     assert case.parametric is case.twin
     assert case.parametric.parameters == (
         rt.Parameter("gain", "m/V", 1, 3),
@@ -610,6 +615,11 @@ WRONG = [
         BASE,
         BASE + "[faults]\nf = { kind = 'Stuck', actuator = 'c' }\n",
         r"case\.toml: faults\.f\.actuator: expected one of a, b, got 'c'",
+    ),
+    (
+        BASE,
+        BASE + "[causes]\nHealthy = { kind = 'SensorFreeze', output = 0 }\n",
+        r"case\.toml: causes: expected names that no fault has, got Healthy",
     ),
     (
         BASE,

@@ -9,7 +9,7 @@ import pytest
 
 import retwin as rt
 from retwin.errors import InputError
-from retwin.monitor.cause import find_causes
+from retwin.monitor.cause import find_causes, possible_causes
 from retwin.monitor.monitor import Monitor, MonitorState, Watched, fit_monitor
 from retwin.twins import (
     ActuatorGain,
@@ -18,7 +18,9 @@ from retwin.twins import (
     SensorBias,
     State,
     StateTwin,
+    Stuck,
 )
+from retwin.twins.faults import Fault
 from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
 
 RATE = 10.0
@@ -213,6 +215,26 @@ def test_the_cause_of_an_alarm_is_named_with_its_onset_and_size(
     assert cause.size[1] < 1.3 < cause.size[2]
     with pytest.raises(InputError, match="alarms"):
         find_causes(twin, watched[[0]], first, faults)
+
+
+@pytest.mark.parametrize(
+    ("fault", "name"),
+    [
+        (ParameterShift("drain", size=1.3, onset=30.0), "drain changed"),
+        (ActuatorGain(0, size=-0.4, onset=30.0), "pump: another effect"),
+        (SensorBias(1, size=0.3, onset=30.0), "pressure: sensor offset"),
+    ],
+)
+def test_causes_are_any_change_where_no_faults_are_known(
+    monitor: Monitor, fault: Fault, name: str
+) -> None:
+    watched = record(1, 5, faults=[fault])
+    first = monitor.watch(watched).alarms[:1]
+    (cause,) = find_causes(monitor.twin, watched, first, possible_causes(monitor.twin))
+    assert cause.name == name
+    assert abs(cause.onset[0] - 30.0) < 0.5
+    known = {"Healthy": None, "leak": ParameterShift("drain", size=1.0), "stuck": Stuck(0)}
+    assert [*possible_causes(monitor.twin, known)] == ["Healthy", "leak"]
 
 
 def test_a_filter_that_diverges_voids_the_promise_and_begins_anew(monitor: Monitor) -> None:

@@ -112,6 +112,8 @@ class Case:
         The form of a discrepancy inside the state equations.
     state_surrogate : StateSurrogate
         How state equations are learned for it from simulations, of a twin that is no `StateTwin`.
+    causes : mapping of str to Fault
+        Further causes of alarms of a monitor, beside the faults. They are no classes.
 
     Raises
     ------
@@ -142,6 +144,7 @@ class Case:
     records: Callable[[Path], tuple[Trajectories, Trajectories]] | None = None
     dynamics: Dynamics = Dynamics()  # noqa: RUF009 - frozen
     state_surrogate: StateSurrogate = StateSurrogate()  # noqa: RUF009 - frozen
+    causes: Mapping[str, Fault] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require(
@@ -153,6 +156,14 @@ class Case:
         )
         for name in self.dynamics.states:
             one_of("dynamics.states", name, state_names(self.twin) or (name,))
+        twice = [name for name in self.causes if name in self.faults]
+        require(
+            not twice,
+            "causes",
+            expected="names that no fault has",
+            got=", ".join(twice),
+            remedy="the faults are causes of alarms already: leave them out",
+        )
         for fault in self.faults.values():
             if isinstance(fault, Stuck | TimedFault):
                 fault.onset_range(self.sampler.steps, self.rate)
@@ -166,6 +177,11 @@ class Case:
     def diagnosed(self) -> bool:
         """Whether there is more than one class, so that a diagnosis makes sense."""
         return len(self.faults) > 1
+
+    @property
+    def alarm_causes(self) -> dict[str, Fault | None]:
+        """The faults and the further causes of alarms, by their names."""
+        return {**self.faults, **self.causes}
 
     @property
     def inputs(self) -> Channels:

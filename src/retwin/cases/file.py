@@ -83,6 +83,7 @@ class CaseFile:
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     commands: dict[str, Any] | str = field(default_factory=dict)
     faults: dict[str, dict[str, Any] | str] = field(default_factory=dict)
+    causes: dict[str, dict[str, Any] | str] = field(default_factory=dict)
     correction: Correction | str | None = None
     output_correction: Correction | str | None = None
     density: Density | SequenceMixture | str | None = None
@@ -142,7 +143,8 @@ def read_case(path: str | Path) -> Case:
         remedy="leave it out, or choose another correction",
     )
     sensor_rate = twin.rate if keys.sensor_rate is None else keys.sensor_rate
-    faults = _faults(keys.faults, twin, folder, key(place, "faults"))
+    faults = {HEALTHY: None, **_faults(keys.faults, twin, folder, key(place, "faults"))}
+    causes = _faults(keys.causes, twin, folder, key(place, "causes"))
     network = _chosen(network, catalog.NETWORKS, key(place, "network"))
     sensor_rate = sample_rate(key(place, "sensor_rate"), sensor_rate)
     with at(place):
@@ -163,6 +165,7 @@ def read_case(path: str | Path) -> Case:
             records=records,
             dynamics=keys.dynamics,
             state_surrogate=keys.state_surrogate,
+            causes=causes,
         )
 
 
@@ -245,14 +248,12 @@ def _own(name: str, folder: Path, place: str, protocol: type) -> Any:
     return found
 
 
-def _faults(
-    tables: Mapping[str, Any], twin: Twin, folder: Path, place: str
-) -> dict[str, Fault | None]:
-    """Class name to fault, healthy first; actuators and outputs may be named as channels are.
+def _faults(tables: Mapping[str, Any], twin: Twin, folder: Path, place: str) -> dict[str, Fault]:
+    """Name to fault; actuators and outputs may be named as channels are.
 
     Raises InputError for a fault that the twin cannot have.
     """
-    made: dict[str, Fault | None] = {HEALTHY: None}
+    made: dict[str, Fault] = {}
     for name, value in tables.items():
         inside = key(place, name)
         if isinstance(value, str):

@@ -132,17 +132,12 @@ def _healthy(record: Trajectories, file: Path) -> Trajectories:
 def _causes(
     monitor: Monitor, record: Trajectories, alarms: Sequence[Alarm], system: Case | None
 ) -> list[Cause]:
-    """The causes of alarms, where the case has faults that can be inverted."""
-    from retwin.monitor import find_causes
-    from retwin.twins.system_faults import TimedFault
+    """The causes of alarms, among those of the case if it has any."""
+    from retwin.monitor import find_causes, possible_causes
 
-    faults = {
-        name: each
-        for name, each in (system.faults if system else {}).items()
-        if each is None or isinstance(each, TimedFault)
-    }
-    if len(faults) < 2 or not alarms:
+    if not alarms:
         return []
+    faults = possible_causes(monitor.twin, system.alarm_causes if system else None)
     with bar("explain") as show:
         show("alarms", 0.0)
         return find_causes(monitor.twin, record, alarms, faults)

@@ -46,6 +46,7 @@ _HOME = {
     "fit_disturbance": "disturbance",
     "fit_monitor": "monitor",
     "fit_scores": "scores",
+    "possible_causes": "cause",
     "read_log": "audit",
     "resolution": "scores",
     "verify": "audit",

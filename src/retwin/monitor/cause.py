@@ -5,16 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from retwin.checks import require, whole
-from retwin.data.trajectories import Trajectories
+from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis.estimate import Estimate
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.monitor.monitor import Alarm
 from retwin.twins.faults import Fault
-from retwin.twins.system_faults import TimedFault
+from retwin.twins.system_faults import (
+    ActuatorGain,
+    ParameterShift,
+    SensorBias,
+    SensorDrift,
+    SensorFreeze,
+    TimedFault,
+)
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["Cause", "find_causes"]
+__all__ = ["Cause", "find_causes", "possible_causes"]
 
 BEFORE = 100
 """Samples before an alarm from which its cause is inferred."""
@@ -55,6 +64,56 @@ class Cause:
     size: tuple[float, float, float]
     onset: tuple[float, float, float]
     probabilities: dict[str, float]
+
+
+def possible_causes(
+    twin: DynamicsTwin, faults: Mapping[str, Fault | None] | None = None
+) -> dict[str, TimedFault | None]:
+    """What may cause an alarm: the faults that are known, or else any change of the system.
+
+    Without known faults these are a shift of each parameter of the twin within its bounds, another
+    gain of each command, and an offset, a drift and a freeze of each sensor, by up to the range
+    that the output has in calibration.
+
+    Parameters
+    ----------
+    twin : DynamicsTwin
+        The twin of the monitor.
+    faults : mapping of str to Fault or None, optional
+        Known faults, such as `Case.alarm_causes`; those that cannot be inverted are left out.
+
+    Returns
+    -------
+    dict of str to TimedFault or None
+        Classes, with the healthy one; see `find_causes`.
+
+    """
+    known = {name: each for name, each in (faults or {}).items() if isinstance(each, TimedFault)}
+    return {HEALTHY: None, **(known or _any_change(twin))}
+
+
+def _any_change(twin: DynamicsTwin) -> dict[str, TimedFault]:
+    """Any change of parameters, commands and sensors that the twin can simulate."""
+    made: dict[str, TimedFault] = {}
+    present = dict(zip(twin.equations.names, twin.values.tolist(), strict=True))
+    for each in twin.equations.parameters:
+        if each.name.isidentifier():  # those of the discrepancy have names of several words
+            value = min(max(present[each.name], each.low), each.high)
+            size = (each.low - value, each.high - value)
+            made[f"{each.name} changed"] = ParameterShift(parameter=each.name, size=size)
+    states = len(twin.process)
+    moved = twin.domain.high[states:] > twin.domain.low[states:]
+    for i in np.flatnonzero(moved).tolist():
+        name = f"{twin.inputs.names[i]}: another effect"
+        made[name] = ActuatorGain(actuator=i, size=(-1.0, 1.0))
+    commands, unseen = twin.domain.mean[None, None, states:], np.zeros((1, 1, len(twin.noise)))
+    spread = twin.filter(commands, unseen, unseen.astype(bool), known_start=False)[1][0, 0]
+    for i, range_ in enumerate(np.sqrt(12 * np.diagonal(spread)).tolist()):
+        name, rate = twin.outputs.names[i], range_ * twin.rate / BEFORE
+        made[f"{name}: sensor offset"] = SensorBias(output=i, size=(-range_, range_))
+        made[f"{name}: sensor drift"] = SensorDrift(output=i, size=(-rate, rate))
+        made[f"{name}: sensor frozen"] = SensorFreeze(output=i)
+    return made
 
 
 def find_causes(

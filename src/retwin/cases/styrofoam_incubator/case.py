@@ -15,7 +15,15 @@ from retwin.cases.styrofoam_incubator.twin import INCUBATOR
 from retwin.cases.time_column import TimeColumn
 from retwin.data.trajectories import HEALTHY
 from retwin.nets.networks import LSTM
+from retwin.twins.faults import Fault
 from retwin.twins.samplers import HoldSampler
+from retwin.twins.system_faults import (
+    ActuatorGain,
+    ParameterShift,
+    SensorBias,
+    SensorDrift,
+    SensorFreeze,
+)
 from retwin.update.corrections import Additive
 from retwin.update.residual import SequenceMixture
 
@@ -32,6 +40,15 @@ LID = 220
 WARM_UP = 120.0
 """Duration in s at the begin of a test record that is not scored: the heater's temperature at the
 first sample is unknown, and is inferred from it."""
+
+CAUSES: Mapping[str, Fault] = {
+    "lid": ParameterShift("g_box", size=(0.3, 20.0)),
+    "heater": ActuatorGain(0, size=(-1.0, -0.1)),
+    "sensor bias": SensorBias(0, size=(-10.0, 10.0)),
+    "sensor drift": SensorDrift(0, size=(-0.1, 0.1)),
+    "frozen sensor": SensorFreeze(0),
+}
+"""What may cause an alarm."""
 
 
 def measurements(warm_up: float = WARM_UP) -> ColumnRecords:
@@ -62,6 +79,8 @@ def measurements(warm_up: float = WARM_UP) -> ColumnRecords:
 def incubator() -> Case:
     """The case with the twin of four parameters; it has no faults, so nothing is diagnosed.
 
+    A monitor distinguishes an open lid, a weak heater and faults of the sensor.
+
     Returns
     -------
     Case
@@ -82,4 +101,5 @@ def incubator() -> Case:
         network=LSTM(64),
         density=SequenceMixture(block=64, margin=32),
         records=measurements(),
+        causes=CAUSES,
     )
