@@ -11,7 +11,8 @@ import pytest
 
 import retwin as rt
 from retwin.monitor import fit_monitor
-from retwin.update import fit_dynamics
+from retwin.twins import ParameterShift
+from retwin.update import DynamicsTwin, fit_dynamics
 
 MODULE = """
 import retwin as rt
@@ -107,3 +108,30 @@ def test_what_cannot_calibrate_leaves_nothing(folder: Path, call, tmp_path) -> N
 def test_what_is_no_monitor_is_refused(folder: Path, call) -> None:
     code, _, err = call("monitor", "replay", folder / "model", folder / "leak.npz")
     assert (code, "monitor" in err) == (2, True), err
+
+
+def test_trajectories_are_watched_by_a_diagnoser(folder: Path, call, tmp_path: Path) -> None:
+    case = ("--case", folder / "case.toml")
+    code, _, err = call("diagnose", "invert", folder / "model", "--out", tmp_path / "physics")
+    assert code == 0, err
+    twin = DynamicsTwin.load(folder / "model")
+    rng = np.random.default_rng(1)
+    leak = ParameterShift("leak", size=0.1)
+    for name, count, fault in (("healthy", 13, None), ("leak", 3, leak)):
+        valve = np.repeat(rng.random((count, 5, 1)), 10, axis=1)
+        rt.save(twin.simulate(valve, faults=[fault] * count, seed=2), tmp_path / f"{name}.npz")
+    given = ("monitor", "fit", tmp_path / "physics", tmp_path / "healthy.npz", *case)
+    out = ("--out", tmp_path / "watch")
+    code, _, err = call(*given, *out, "--blanking", "5")
+    assert (code, "whole trajectories" in err) == (2, True), err
+    code, printed, err = call(*given, *out, "--false-alarms", "500 trajectories")
+    assert code == 0, err
+    assert "at least 500 trajectories" in " ".join(printed.split())
+    replayed = ("monitor", "replay", tmp_path / "watch", tmp_path / "healthy.npz")
+    code, printed, err = call(*replayed, tmp_path / "leak.npz", "--json")
+    assert code == 0, err
+    healthy, leaking = json.loads(printed)["records"]
+    assert (healthy["alarms"], healthy["trajectories"]) == ([], 13)
+    assert (leaking["alarms"][0]["number"], leaking["alarms"][0]["name"]) == (13, "leaking")
+    code, printed, _ = call(*replayed, tmp_path / "leak.npz")
+    assert "healthy.npz: 0 alarms in 13 trajectories." in printed

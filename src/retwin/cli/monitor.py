@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from retwin import catalog
 from retwin.checks import require
 from retwin.cli.options import Json, MaxBytes, OtherCase
 from retwin.cli.reading import case_named, read, saved
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.serialisation.models import kind_of
 from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
@@ -34,7 +36,8 @@ app = typer.Typer(
 @app.command(epilog=example("retwin monitor fit model healthy.npz --out watch"))
 def fit(
     model: Annotated[
-        Path, typer.Argument(metavar="MODEL", help="Folder of corrected dynamics, of retwin fit.")
+        Path,
+        typer.Argument(metavar="MODEL", help="Corrected dynamics, or a diagnoser by inversion."),
     ],
     healthy: Annotated[
         list[Path],
@@ -48,8 +51,8 @@ def fit(
         typer.Option(metavar="RATE", help='At most: "1 per month", "2 per year", "1e-6 Hz".'),
     ] = "1 per month",
     blanking: Annotated[
-        float, typer.Option(metavar="S", help="Time without alarms after an alarm.")
-    ] = 60.0,
+        float | None, typer.Option(metavar="S", help="Time without alarms after an alarm: 60.")
+    ] = None,
     case: OtherCase = None,
     max_bytes: MaxBytes = None,
     as_json: Json = False,
@@ -58,13 +61,26 @@ def fit(
     from retwin.monitor import fit_monitor
     from retwin.update import DynamicsTwin
 
-    check_place(out, folder=True, holds=("model.json", "weights.safetensors", "twin"))
-    twin = DynamicsTwin.load(saved(model))
+    check_place(out, folder=True, holds=("model.json", "weights.safetensors", "twin", "diagnoser"))
+    if kind_of(saved(model)) in catalog.DIAGNOSERS:
+        require(
+            blanking is None,
+            "blanking",
+            expected="none for a diagnoser, whose monitor watches whole trajectories",
+            got=blanking,
+            remedy="leave it out",
+        )
+        _fit_trajectories(model, healthy, out, false_alarms, case, max_bytes, as_json)
+        return
+    twin = DynamicsTwin.load(model)
     system = case_named(case or twin.case or None)
     records = [_healthy(read(file, system, max_bytes=max_bytes), file) for file in healthy]
     with bar("calibrate") as show:
         show("monitor", 0.0)
-        made = fit_monitor(twin, Trajectories.concatenate(records), false_alarms, blanking=blanking)
+        given = Trajectories.concatenate(records)
+        made = fit_monitor(
+            twin, given, false_alarms, blanking=60.0 if blanking is None else blanking
+        )
     made.save(out)
     promises = {name: str(each) for name, each in made.promises.items()}
     answer(
@@ -90,7 +106,10 @@ def replay(
     """Watch recorded data as if they came now: alarms, their causes, and the promise."""
     from retwin.monitor import Monitor
 
-    made = Monitor.load(saved(monitor))
+    if kind_of(saved(monitor)) == "trajectory_monitor":
+        _replay_trajectories(monitor, logs, case, max_bytes, as_json)
+        return
+    made = Monitor.load(monitor)
     system = case_named(case or made.twin.case or None)
     found, rows = [], []
     for file in logs:
@@ -110,6 +129,76 @@ def replay(
         },
         *([table(("file", "record", "time in s", "what", "cause"), rows)] if rows else []),
         *(_summary(*each[:3]) for each in found),
+        as_json=as_json,
+    )
+
+
+def _fit_trajectories(
+    model: Path,
+    healthy: Sequence[Path],
+    out: Path,
+    false_alarms: str,
+    case: str | None,
+    max_bytes: int | None,
+    as_json: bool,
+) -> None:
+    """Calibrate a monitor of trajectories, by a diagnoser."""
+    from retwin.diagnosis import load_diagnoser
+    from retwin.monitor import fit_trajectory_monitor
+
+    system = case_named(case)
+    records = [_healthy(read(file, system, max_bytes=max_bytes), file) for file in healthy]
+    with bar("calibrate") as show:
+        made = fit_trajectory_monitor(
+            load_diagnoser(model),  # refused there if it is no inversion
+            Trajectories.concatenate(records),
+            false_alarms,
+            causes=system.causes if system else None,
+            progress=lambda share: show("diagnose", share),
+        )
+    made.save(out)
+    about = {"saved": str(out), "arl": made.arl, "kappa": made.kappa, "promise": made.promise}
+    answer(about, made.promise, as_json=as_json)
+    note(f"Saved {out}")
+
+
+def _replay_trajectories(
+    monitor: Path, logs: Sequence[Path], case: str | None, max_bytes: int | None, as_json: bool
+) -> None:
+    """Watch recorded trajectories of one machine, file after file."""
+    from retwin.monitor import TrajectoryMonitor
+
+    made, system, state = TrajectoryMonitor.load(monitor), case_named(case), None
+    rows, found, texts = [], [], []
+    for file in logs:
+        record = read(file, system, max_bytes=max_bytes)
+        with bar("diagnose") as show:
+            state, watched = made.watch(
+                record, state, progress=lambda share, name=file.name: show(name, share)
+            )
+        rows += [
+            (file.name, each.trajectory, str(each.number), each.name) for each in watched.alarms
+        ]
+        void, outside = int(watched.void.sum()), int(watched.outside.sum())
+        found.append(
+            {
+                "file": str(file),
+                "alarms": [vars(each) for each in watched.alarms],
+                "trajectories": len(record),
+                "void": void,
+                "outside": outside,
+            }
+        )
+        texts.append(
+            f"{file.name}: {len(watched.alarms)} alarms in {len(record)} trajectories"
+            + (f"; the promise is VOID in {void}: calibrate again" if void else "")
+            + (f"; the twin extrapolates in {outside}" if outside else "")
+            + "."
+        )
+    answer(
+        {"arl": made.arl, "promise": made.promise, "records": found},
+        *([table(("file", "trajectory", "number", "cause"), rows)] if rows else []),
+        *texts,
         as_json=as_json,
     )
 

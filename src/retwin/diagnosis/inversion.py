@@ -191,6 +191,17 @@ class InversionDiagnoser:
         """Class names, in the order of the probabilities."""
         return tuple(self.faults)
 
+    def with_faults(self, more: Mapping[str, Fault | None]) -> InversionDiagnoser:
+        """The same with further classes."""
+        return InversionDiagnoser(
+            self.surrogate,
+            self.residual,
+            {**self.faults, **more},
+            noise=self.noise,
+            surrogate_variance=self.surrogate_variance,
+            bound=self.bound,
+        )
+
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
         """Probabilities (n, classes), see `Diagnoser`."""
         return self.diagnose(trajectories).probabilities

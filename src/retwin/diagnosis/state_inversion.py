@@ -121,6 +121,10 @@ class StateInversionDiagnoser:
         """Class names, in the order of the probabilities."""
         return tuple(self.faults)
 
+    def with_faults(self, more: Mapping[str, Fault | None]) -> StateInversionDiagnoser:
+        """The same with further classes."""
+        return StateInversionDiagnoser(self.twin, {**self.faults, **more})
+
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
         """Probabilities (n, classes), see `Diagnoser`."""
         return self.diagnose(trajectories).probabilities

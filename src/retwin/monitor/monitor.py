@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import finite, instance, require, whole
+from retwin.checks import finite, instance, require
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.bets import Dependence, Location, Scale
 from retwin.monitor.detector import Detector, DetectorState
@@ -397,8 +397,7 @@ class Monitor:
             **{name: getattr(self, name) for name in NUMBERS},
         }
         arrays = {name: getattr(self.disturbance, name) for name in DISTURBANCE}
-        arrays |= {"stream": self.scores.errors.real, "error": self.scores.errors.imag}
-        arrays |= {name: getattr(self.scores, name) for name in SCORES}
+        arrays |= self.scores.arrays()
         arrays["resolution"] = self.resolution
         tensors = {name: torch.tensor(np.ascontiguousarray(each)) for name, each in arrays.items()}
         with write_model(folder, KIND, about, tensors) as temporary:
@@ -413,20 +412,14 @@ class Monitor:
             nothing = np.zeros((len(arrays["mean"]), 0))
             own = {name: arrays[name] for name in DISTURBANCE}
             disturbance = Disturbance(**own, held_out=nothing, deviation=nothing)
-            errors = np.empty(len(arrays["error"]), dtype=complex)
-            errors.real, errors.imag = arrays["stream"], arrays["error"]
-            copies = whole("copies", about["copies"], least=1)
-            quantiles, independent = (arrays[name] for name in SCORES)
-            scores = ConformalScores(errors, quantiles, copies, independent)
+            scores = ConformalScores.of_arrays(arrays, about["copies"])
             slack = tuple(Slack(*each) for each in about["slack"])
             twin = DynamicsTwin.load(Path(folder) / "twin")
             numbers = {name: finite(name, about[name], least=0.0) for name in NUMBERS}
-            shapes = [
-                len(each) for each in (disturbance.mean, independent, slack, arrays["resolution"])
-            ]
+            parts = (disturbance.mean, scores.independent, slack, arrays["resolution"])
+            shapes = [len(each) for each in parts]
             require(
                 shapes == [len(twin.outputs)] * 4
-                and len(quantiles) == len(errors) + len(slack) * (copies + 1)
                 and np.isfinite(disturbance.coefficients).all()
                 and (disturbance.process > 0).all()
                 and (disturbance.measurement >= 0).all(),
@@ -441,8 +434,7 @@ class Monitor:
 NUMBERS = ("arl", "blanking", "warm_up", "alpha")
 """Attributes of a monitor that are saved as numbers."""
 DISTURBANCE = ("coefficients", "mean", "process", "measurement")
-SCORES = ("quantiles", "independent")
-"""Attributes of the disturbance and of the scores that are saved as arrays."""
+"""Attributes of the disturbance that are saved as arrays."""
 
 
 @dataclass(frozen=True, eq=False)

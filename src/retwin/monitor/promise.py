@@ -11,7 +11,7 @@ from retwin.errors import InputError
 from retwin.monitor.slack import Slack
 from retwin.times import sample_rate
 
-__all__ = ["Promise", "false_alarms"]
+__all__ = ["Promise", "duration", "false_alarms"]
 
 SECONDS = {
     "second": 1.0,
@@ -36,9 +36,9 @@ def false_alarms(wanted: str | float, rate: float) -> float:
     ----------
     wanted : str or float
         A number per unit of time ("1 per month", "2 per year", "0.5 per hour"), a rate ("1e-6 Hz"),
-        a run length ("1000 samples"), or the same as a number of samples.
+        a run length ("1000 samples", "1000 trajectories"), or the same as a number.
     rate : float
-        Sample rate in Hz.
+        Sample rate in Hz, or trajectories per second.
 
     Returns
     -------
@@ -62,7 +62,7 @@ def false_alarms(wanted: str | float, rate: float) -> float:
         text = " ".join(wanted.lower().split())
         of_time = re.fullmatch(rf"{NUMBER} (?:per|a|an) (\w+?)s?", text)
         of_rate = re.fullmatch(rf"{NUMBER} ?hz", text)
-        of_samples = re.fullmatch(rf"{NUMBER} samples?", text)
+        of_samples = re.fullmatch(rf"{NUMBER} (?:samples?|trajector(?:y|ies))", text)
         if of_time and of_time[2] in SECONDS and float(of_time[1]) > 0:
             samples = SECONDS[of_time[2]] * per_second / float(of_time[1])
         elif of_rate and float(of_rate[1]) > 0:
@@ -119,13 +119,13 @@ class Promise:
         """One sentence for pages, logs and the terminal."""
         return (
             f"On average at least {self.arl:.6g} measured samples "
-            f"({_duration(self.arl / self.rate)}) pass until a false alarm, "
+            f"({duration(self.arl / self.rate)}) pass until a false alarm, "
             f"as long as {self.slack}. "
             f"Where that is so, it is declared void with a probability of at most {self.alpha:g}."
         )
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """A duration in the largest unit but weeks of which it has at least one, or in seconds."""
     units = [each for each in reversed(SECONDS) if each != "week" and seconds >= SECONDS[each]]
     unit = units[0] if units else "second"

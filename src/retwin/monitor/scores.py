@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr, ndtri
 
-from retwin.checks import require
+from retwin.checks import require, whole
 from retwin.monitor.slack import Slack, effective_samples
 
 __all__ = ["ConformalScores", "fit_scores", "resolution"]
@@ -85,6 +86,31 @@ class ConformalScores:
         upto = np.searchsorted(self.errors, high_key, side="right") + first + self.copies
         low, high = (np.where(missing, np.nan, self.quantiles[rank]) for rank in (below, upto))
         return low, high
+
+    def arrays(self) -> dict[str, NDArray]:
+        """All but `copies`, as real arrays by name."""
+        return {
+            "stream": self.errors.real,
+            "error": self.errors.imag,
+            "quantiles": self.quantiles,
+            "independent": self.independent,
+        }
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, NDArray], copies: int) -> ConformalScores:
+        """The scores of what `arrays` gave; InputError if they do not belong together."""
+        errors = np.empty(len(arrays["error"]), dtype=complex)
+        errors.real, errors.imag = arrays["stream"], arrays["error"]
+        quantiles, independent = arrays["quantiles"], arrays["independent"]
+        ranks = len(errors) + len(independent) * (whole("copies", copies, least=1) + 1)
+        require(
+            len(quantiles) == ranks,
+            "quantiles",
+            expected=f"{ranks}, one per rank",
+            got=len(quantiles),
+            remedy="save the calibration again",
+        )
+        return cls(errors, quantiles, copies, independent)
 
     def slack(self, parameters: ArrayLike = 0, confidence: float = 0.95) -> tuple[Slack, ...]:
         """The slack that each stream's calibration needs; see `Slack.of_calibration`.

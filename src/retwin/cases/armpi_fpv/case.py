@@ -109,6 +109,12 @@ FAULTS: dict[str, Fault | None] = {
     **{label: ActuatorBias(i, SIZE) for i, label in enumerate(BIASED)},
 }
 """Faults of the nine classes in their fixed order."""
+CAUSES: dict[str, Fault] = {
+    **{f"{label}_later": Stuck(i, (ONSET, 8.0)) for i, label in enumerate(STUCK)},
+    **{f"{label}_small": ActuatorBias(i, (2.0, SIZE[0])) for i, label in enumerate(BIASED)},
+}
+"""What else may cause the alarms of a monitor: motors that stick during a trajectory, and biases
+below the published ones."""
 
 
 def encoder_noise(trajectories: Trajectories, units: float, seed: int) -> Trajectories:
@@ -159,6 +165,7 @@ def armpi() -> Case:
         name="armpi",
         title="ArmPi FPV robot arm",
         faults=FAULTS,
+        causes=CAUSES,
         twin=ArmPiTwin(),
         emulator=EmulatedArmPi(),
         sampler=ArmSampler(),
