@@ -29,6 +29,7 @@ _HOME = {
     "MonitorState": "monitor",
     "Promise": "promise",
     "Registry": "registry",
+    "Samples": "samples",
     "Scale": "bets",
     "Slack": "slack",
     "Store": "store",

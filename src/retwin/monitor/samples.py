@@ -1,0 +1,218 @@
+"""`Samples` of a machine as they arrive, and the JSON in which they are sent."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import require
+from retwin.errors import InputError, brief
+from retwin.monitor.updates import LEAST, MOST
+
+__all__ = ["SECOND", "Samples", "nanoseconds", "parse"]
+
+SECOND = 10**9
+"""Nanoseconds of a second."""
+LONGEST = 100_000
+"""Samples of a document at most."""
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+KEYS = {"asset", "time", "time_ns", "values"}
+REMEDY = 'send {"asset": "line1", "time": 1700000000.0, "values": {"T1": 21.3}}'
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Samples of one machine.
+
+    Parameters
+    ----------
+    asset : str
+        Its name.
+    times : array (n,) of int64
+        Nanoseconds since the epoch, in the order of arrival.
+    values : array (n, d_u + d_y)
+        Commands, then outputs; what is not finite is missing.
+
+    Raises
+    ------
+    InputError
+        Arrays of other shapes or types.
+
+    """
+
+    asset: str
+    times: NDArray
+    values: NDArray
+
+    def __post_init__(self) -> None:
+        times, values = np.asarray(self.times), np.asarray(self.values, dtype=float)
+        require(
+            times.dtype.kind == "i"
+            and times.ndim == 1
+            and values.shape[:1] == times.shape
+            and values.ndim == 2,
+            f"samples of {self.asset}",
+            expected="whole times (n,) in nanoseconds and values (n, channels)",
+            got=f"{times.dtype} {times.shape} and {values.shape}",
+            remedy="give one row of values for each time",
+        )
+        object.__setattr__(self, "times", times.astype(np.int64))
+        object.__setattr__(self, "values", np.where(np.isfinite(values), values, np.nan))
+
+
+def parse(document: bytes | str, channels: Callable[[str], Sequence[str]]) -> list[Samples]:
+    """The samples of a JSON document, of one machine after the other.
+
+    Parameters
+    ----------
+    document : bytes or str
+        An object `{"asset": "line1", "time": 1700000000.25, "values": {"heater": 1, "T1": 21.3}}`,
+        an array of such objects, or one on each line. `time` is in s since the epoch or ISO 8601
+        with an offset; `time_ns` in its place is a whole number of nanoseconds. A channel that is
+        absent, null or not finite is missing.
+    channels : callable
+        Gives the names of the channels of a machine, commands first; it raises an InputError for an
+        unknown one (`Live.channels`).
+
+    Raises
+    ------
+    InputError
+        No such document, more than 100 000 samples, or an unknown machine or channel.
+
+    """
+    times: dict[str, list[int]] = {}
+    rows: dict[str, list[list[float]]] = {}
+    known: dict[str, dict[str, int]] = {}
+    for number, each in enumerate(_objects(document)):
+        place = f"sample {number}"
+        require(
+            number < LONGEST,
+            "samples",
+            expected=f"at most {LONGEST} in a document",
+            got="more",
+            remedy="send them in parts",
+        )
+        require(
+            isinstance(each, dict) and {"asset", "values"} <= each.keys() <= KEYS,
+            place,
+            expected="an object with asset, time and values",
+            got=f"{type(each).__name__} {repr(each)[:60]}",
+            remedy=REMEDY,
+        )
+        asset = each["asset"]
+        require(
+            isinstance(asset, str),
+            f"{place}: asset",
+            expected="its name",
+            got=repr(asset)[:60],
+            remedy=REMEDY,
+        )
+        if asset not in known:
+            known[asset] = {name: i for i, name in enumerate(channels(asset))}
+        times.setdefault(asset, []).append(_time(each, place))
+        rows.setdefault(asset, []).append(_row(each["values"], known[asset], place))
+    return [
+        Samples(asset, np.array(times[asset], dtype=np.int64), np.array(rows[asset]))
+        for asset in times
+    ]
+
+
+def nanoseconds(time: datetime) -> int:
+    """A time with a time zone in nanoseconds since the epoch."""
+    since = time - EPOCH
+    return (since.days * 86400 + since.seconds) * SECOND + since.microseconds * 1000
+
+
+def _objects(document: bytes | str) -> Iterator[Any]:
+    """The objects of a document: one, those of an array, or one of each line."""
+    try:
+        text = document if isinstance(document, str) else document.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise _no_document(error) from None
+    lines = [each for each in text.splitlines() if each.strip()]
+    try:
+        try:
+            whole = json.loads(text)
+        except json.JSONDecodeError:
+            if len(lines) < 2:
+                raise
+            for each in lines:
+                yield json.loads(each)
+        else:
+            yield from whole if isinstance(whole, list) else [whole]
+    except (ValueError, RecursionError) as error:
+        raise _no_document(error) from None
+
+
+def _no_document(error: Exception) -> InputError:
+    return InputError(
+        "samples",
+        expected="a JSON object, an array of them, or one on each line",
+        got=f"{type(error).__name__}: {brief(error)}",
+        remedy=REMEDY,
+    )
+
+
+def _time(each: dict[str, Any], place: str) -> int:
+    """The time of a sample in nanoseconds."""
+    given = each.get("time_ns", each.get("time"))
+    made: int | None = None
+    if len({"time", "time_ns"} & each.keys()) == 1:
+        if isinstance(given, str) and "time" in each:
+            try:
+                moment = datetime.fromisoformat(given)
+                made = nanoseconds(moment) if moment.tzinfo else None
+            except ValueError:
+                made = None
+        elif isinstance(given, int) and not isinstance(given, bool):
+            made = given if "time_ns" in each else given * SECOND
+        elif isinstance(given, float) and "time" in each and np.isfinite(given):
+            made = round(given * SECOND)
+    if made is not None and LEAST < made < MOST:
+        return made
+    raise InputError(
+        f"{place}: time",
+        expected="seconds since the epoch, ISO 8601 with an offset, or whole time_ns",
+        got=repr(given)[:60],
+        remedy=REMEDY,
+    )
+
+
+def _row(values: Any, places: dict[str, int], place: str) -> list[float]:
+    """The values of all channels; NaN where one is missing."""
+    made = [np.nan] * len(places)
+    if not isinstance(values, dict):
+        raise InputError(
+            f"{place}: values",
+            expected="an object of channels",
+            got=repr(values)[:60],
+            remedy=REMEDY,
+        )
+    for name, value in values.items():
+        if name not in places:
+            raise InputError(
+                f"{place}: values",
+                expected=f"channels among {', '.join(places)}",
+                got=repr(name)[:60],
+                remedy="leave it out, or correct its name",
+            )
+        if value is None:
+            continue
+        try:
+            if not isinstance(value, int | float):
+                raise TypeError
+            made[places[name]] = float(value)
+        except (TypeError, OverflowError):
+            raise InputError(
+                f"{place}: {name}",
+                expected="a number or null",
+                got=repr(value)[:60],
+                remedy="send numbers as JSON numbers",
+            ) from None
+    return made
