@@ -261,12 +261,24 @@ class Store:
         with refusing(f"state of {asset}", expected="stored arrays", remedy="restore a copy"):
             return row.time, load(row.arrays)
 
-    def log(self, kind: str | None = None) -> Iterator[Entry]:
-        """The entries of the log in their order, or those of one kind, read part by part."""
+    def present(self, asset: str, times: NDArray) -> NDArray:
+        """Those of the times (n,), in nanoseconds, at which samples of an asset are stored."""
+        if not len(times):
+            return np.zeros(0, dtype=np.int64)
+        key, _ = self._asset(asset)
+        with self._reading() as connection:
+            found = _present(connection, key, times)
+        return found[np.isin(found, times)]
+
+    def log(self, kind: str | None = None, after: int = LEAST) -> Iterator[Entry]:
+        """The entries of the log in their order, or those of one kind, read part by part.
+
+        With `after`, only those whose sequence is larger.
+        """
         chosen = log.select().order_by(log.c.sequence).limit(ROWS)
         if kind is not None:
             chosen = chosen.where(log.c.kind == kind)
-        low = LEAST
+        low = after
         while True:
             with self._reading() as connection:
                 rows = connection.execute(chosen.where(log.c.sequence > low)).all()

@@ -1,0 +1,121 @@
+"""`Gate`: many producers of samples, whose samples are stored in common commits."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Sequence
+from concurrent.futures import Future
+from typing import TypeAlias
+
+from retwin.errors import InputError
+from retwin.monitor.live import Live, Received
+from retwin.monitor.samples import Samples
+
+__all__ = ["Gate"]
+
+QUEUE = 10_000
+"""Producers that may wait at the same time; further ones wait before they are taken."""
+GROUP = 50_000
+"""Samples of one commit at most, beside those of one producer."""
+
+_Waiting: TypeAlias = tuple[Samples, "Future[Received]"]
+
+
+class Gate:
+    """The way of samples into a `Live`; a context manager that closes it.
+
+    A thread takes all samples that wait and submits them in one commit, so that commits become
+    larger when there is more to do. Samples of one machine are used in the order of `send`.
+
+    Parameters
+    ----------
+    live : Live
+        Where samples go.
+
+    """
+
+    def __init__(self, live: Live) -> None:
+        self.live = live
+        self._queue: queue.Queue[_Waiting | None] = queue.Queue(QUEUE)
+        self._lock = threading.Lock()
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="gate", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Gate:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def send(self, samples: Samples) -> Future[Received]:
+        """Hand samples over; the future has a result when they are durable.
+
+        Its exception is an `InputError` if they were refused or could not be stored.
+
+        Raises
+        ------
+        InputError
+            The gate is closed.
+
+        """
+        future: Future[Received] = Future()
+        with self._lock:
+            if self._closed:
+                raise InputError(
+                    "gate", expected="one that is open", got="a closed one", remedy="open another"
+                )
+            self._queue.put((samples, future))
+        return future
+
+    def close(self) -> None:
+        """Store what waits, and end; once more is no error."""
+        with self._lock:
+            if not self._closed:
+                self._closed = True
+                self._queue.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        open_ = True
+        while open_:
+            group: list[_Waiting] = []
+            waiting = self._queue.get()
+            count = 0
+            while waiting is not None:
+                group.append(waiting)
+                count += len(waiting[0].times)
+                if count >= GROUP:
+                    break
+                try:
+                    waiting = self._queue.get_nowait()
+                except queue.Empty:
+                    break
+            open_ = waiting is not None
+            self._submit(group)
+
+    def _submit(self, group: Sequence[_Waiting]) -> None:
+        """Submit a group, or, if it is refused, each of it alone."""
+        active = [each for each in group if each[1].set_running_or_notify_cancel()]
+        if not active:
+            return
+        try:
+            found = self.live.submit([samples for samples, _ in active])
+        except InputError as error:
+            if len(active) == 1:
+                active[0][1].set_exception(error)
+                return
+            for samples, future in active:
+                try:
+                    (own,) = self.live.submit([samples])
+                except Exception as alone:
+                    future.set_exception(alone)
+                else:
+                    future.set_result(own)
+        except Exception as error:
+            for _, future in active:
+                future.set_exception(error)
+        else:
+            for (_, future), own in zip(active, found, strict=True):
+                future.set_result(own)

@@ -1,0 +1,378 @@
+"""`Live`: watches all machines of a store as their samples arrive, and stores what it finds."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import finite, instance, require, whole
+from retwin.errors import InputError
+from retwin.monitor.machine import Counts, Machine, Recent, Work
+from retwin.monitor.monitor import Alarm, Monitor, MonitorState, Watched
+from retwin.monitor.registry import Registry
+from retwin.monitor.samples import SECOND, Samples
+from retwin.monitor.store import Store
+from retwin.monitor.updates import Asset, Update, one_asset
+
+__all__ = ["AssetStatus", "Live", "Received"]
+
+MOST_WAIT = 60.0
+"""Seconds for which a place without a sample is waited for at most."""
+
+
+@dataclass(frozen=True)
+class Received:
+    """What became of samples of one machine; see docs/monitor.md.
+
+    Attributes
+    ----------
+    asset : str
+        Its name.
+    counts : Counts
+        Samples by what was done with them.
+    alarms : int
+        Alarms that were raised when they were used.
+
+    """
+
+    asset: str
+    counts: Counts
+    alarms: int
+
+
+@dataclass(frozen=True)
+class AssetStatus:
+    """How a machine is.
+
+    Attributes
+    ----------
+    asset, twin : str
+        Its name, and that of its twin.
+    version : int
+        The version of the twin that watches it.
+    time : int, optional
+        Time of its newest sample in nanoseconds; None before the first.
+    ratio : float
+        Evidence for a change, over the threshold of an alarm.
+    alarms : int
+        Alarms since the program was started.
+    last_alarm : int, optional
+        Time of the last one of these.
+    void, outside : bool
+        Whether the promise does not apply any more, and whether commands have left their range in
+        calibration.
+    rate : str
+        How the sample rate differs from the twin's; "" if it does not.
+    counts : dict of str to int
+        Samples since the program was started, by what was done with them.
+
+    """
+
+    asset: str
+    twin: str
+    version: int
+    time: int | None
+    ratio: float
+    alarms: int
+    last_alarm: int | None
+    void: bool
+    outside: bool
+    rate: str
+    counts: dict[str, int]
+
+
+class Live:
+    """Watches all assets of a store that have a twin; thread-safe.
+
+    The settings of such an asset hold `twin`, the name of a `Registry` whose versions are monitors.
+    Assets are added by `Live.add`, or by `Store.add_asset` before.
+
+    Parameters
+    ----------
+    store : Store
+        Opened to write.
+    wait : float, optional
+        Time in s, at most 60, for which a place in a stream without a sample is waited for; by
+        default two sample periods. A stream in order is never delayed.
+    ahead : float
+        How far in s a sample may be ahead of the clock of this computer; a later one is refused.
+    clock : callable
+        Gives the time in nanoseconds since the epoch.
+
+    Raises
+    ------
+    InputError
+        A setting out of range, or an asset whose twin has no active version.
+
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        *,
+        wait: float | None = None,
+        ahead: float = 60.0,
+        clock: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self.store = instance("store", store, Store, remedy="open one with Store(folder)")
+        if wait is not None:
+            finite("wait", wait, least=0.0, most=MOST_WAIT, unit="s")
+        self._wait = wait
+        self._ahead = finite("ahead", ahead, least=0.0, unit="s")
+        self._clock = clock
+        self._lock = threading.RLock()
+        self._monitors: dict[tuple[str, int], Monitor] = {}
+        self._machines: dict[str, Machine] = {}
+        self.revision = 0
+        """Grows whenever something has changed."""
+        self.refresh()
+
+    def add(self, name: str, twin: str, settings: Mapping[str, Any] | None = None) -> None:
+        """Watch a machine by the active version of a twin; one that is watched so stays as it is.
+
+        Raises
+        ------
+        InputError
+            The twin has no active version, or the machine has other channels.
+
+        """
+        with self._lock:
+            version = self._active(twin)
+            monitor = self._monitor(twin, version)
+            channels = len(monitor.twin.inputs) + len(monitor.twin.outputs)
+            asset = Asset(name, channels, {**(settings or {}), "twin": twin}, version)
+            if asset not in self.store.assets():
+                self.store.add_asset(asset)
+            self.refresh()
+
+    def refresh(self) -> None:
+        """Read assets and active versions again: after a version was promoted or rolled back.
+
+        A machine whose version has changed begins anew with its next sample.
+        """
+        with self._lock:
+            active: dict[str, int] = {}
+            machines, entries = {}, []
+            for asset in self.store.assets():
+                twin = asset.settings.get("twin")
+                if twin is None:
+                    continue
+                if twin not in active:
+                    active[twin] = self._active(twin)
+                if asset.version != active[twin]:
+                    entries.append(("event", _version_event(asset, active[twin])))
+                    asset = replace(asset, version=active[twin])
+                    self.store.add_asset(asset)
+                known = self._machines.get(asset.name)
+                same = known is not None and known.asset == asset
+                machines[asset.name] = known if known and same else self._machine(asset)
+            if entries:
+                self.store.commit(entries=entries)
+            self._machines = machines
+            self.revision += 1
+
+    def channels(self, asset: str) -> tuple[str, ...]:
+        """Names of the commands and then the outputs of a machine; InputError if it is unknown."""
+        twin = self._one(asset).monitor.twin
+        return (*twin.inputs.names, *twin.outputs.names)
+
+    def monitor(self, asset: str) -> Monitor:
+        """The monitor that watches a machine."""
+        return self._one(asset).monitor
+
+    def submit(self, batch: Sequence[Samples]) -> list[Received]:
+        """Use samples of any machines, in their order; all is durable on return.
+
+        Samples, states and alarms are stored in one commit. What is found does not depend on how
+        samples and machines are grouped into calls.
+
+        Raises
+        ------
+        InputError
+            An unknown machine, another number of channels, or the store fails: nothing of the
+            batch was acknowledged, and it may be sent again.
+
+        """
+        with self._lock:
+            for each in batch:
+                width = self._one(each.asset).asset.channels
+                require(
+                    each.values.shape[1] == width,
+                    f"samples of {each.asset}",
+                    expected=f"{width} channels",
+                    got=each.values.shape[1],
+                    remedy="give commands and then outputs, see Live.channels",
+                )
+            try:
+                return self._submitted(batch)
+            except BaseException:
+                # What the store holds is true; machines are read from it again.
+                for each in batch:
+                    machine = self._machines[each.asset]
+                    self._machines[each.asset] = self._machine(machine.asset)
+                raise
+
+    def status(self) -> list[AssetStatus]:
+        """All machines, those with most evidence for a change first."""
+        with self._lock:
+            made = [
+                AssetStatus(
+                    each.asset.name,
+                    each.asset.settings["twin"],
+                    each.asset.version or 0,
+                    each.newest,
+                    each.evidence / each.monitor.arl,
+                    each.alarms,
+                    each.last_alarm,
+                    each.void,
+                    each.outside,
+                    each.rate,
+                    vars(each.counts).copy(),
+                )
+                for each in self._machines.values()
+            ]
+        return sorted(made, key=lambda each: (-each.void, -each.ratio))
+
+    def recent(self, asset: str) -> Recent:
+        """The newest samples of a machine and what was predicted, since the program was started."""
+        with self._lock:
+            return self._one(asset).recent()
+
+    def acknowledge(self, sequence: int, who: str, note: str = "") -> None:
+        """Log that somebody has seen the alarm with this sequence in the log.
+
+        Raises
+        ------
+        InputError
+            There is no such alarm.
+
+        """
+        after = whole("sequence", sequence, least=0) - 1
+        entry = next(iter(self.store.log("alarm", after=after)), None)
+        require(
+            entry is not None and entry.sequence == sequence,
+            "sequence",
+            expected="that of an alarm in the log",
+            got=sequence,
+            remedy="see the alarms",
+        )
+        data = {"alarm": sequence, "who": who, "note": note, "at": self._clock()}
+        self.store.commit(entries=[("acknowledge", data)])
+        self.revision += 1
+
+    def _submitted(self, batch: Sequence[Samples]) -> list[Received]:
+        limit = self._clock() + round(self._ahead * SECOND)
+        found = []
+        for each in batch:
+            machine = self._machines[each.asset]
+            stored = self.store.present(each.asset, machine.unsure(each.times))
+            found.append(machine.accept(each, limit, stored))
+        used = list(dict.fromkeys(each.asset for each in batch))
+        machines = [self._machines[name] for name in used]
+        alarms = self._stepped(machines)
+        updates, entries = [], []
+        for machine in machines:
+            new = machine.new_samples()
+            state = machine.arrays() if machine.changed else None
+            if state is not None or len(new.times):
+                updates.append(Update(new.asset, new.times, new.values, state, machine.newest or 0))
+            entries += machine.entries
+        entries.sort(key=lambda each: (each[1]["time"], each[1]["asset"]))
+        if updates or entries:
+            self.store.commit(updates, entries)
+        for machine in machines:
+            machine.committed()
+        self.revision += 1
+        last = {each.asset: i for i, each in enumerate(batch)}
+        return [
+            Received(each.asset, counts, alarms.get(each.asset, 0) * (last[each.asset] == i))
+            for i, (each, counts) in enumerate(zip(batch, found, strict=True))
+        ]
+
+    def _stepped(self, machines: Sequence[Machine]) -> dict[str, int]:
+        """Step the monitors of machines through what is complete; alarms by machine."""
+        alarms: dict[str, int] = {}
+        while ready := [(each, work) for each in machines if (work := each.next_work())]:
+            key: Callable[[tuple[Machine, Work]], tuple] = lambda each: (  # noqa: E731
+                id(each[0].monitor),
+                len(each[1].values),
+            )
+            for _, group in groupby(sorted(ready, key=key), key):
+                together = list(group)
+                for name, count in _step(together).items():
+                    alarms[name] = alarms.get(name, 0) + count
+        return alarms
+
+    def _one(self, name: str) -> Machine:
+        found = self._machines.get(name)
+        if found is None:
+            one_asset(dict.fromkeys(self._machines, (0, 0)), name)
+        assert found is not None
+        return found
+
+    def _machine(self, asset: Asset) -> Machine:
+        """A machine as the store has it, with the samples that wait for others."""
+        assert asset.version is not None
+        monitor = self._monitor(asset.settings["twin"], asset.version)
+        machine = Machine(asset, monitor, self._wait)
+        stored = self.store.state(asset.name)
+        if stored is not None and machine.restore(stored[1]):
+            for times, values in self.store.samples(asset.name, machine.stepped_time):
+                machine.hold(times, values)
+        return machine
+
+    def _active(self, twin: str) -> int:
+        active = Registry(self.store, twin).active
+        if active is None:
+            raise InputError(
+                "twin",
+                expected=f"an active version of {twin}",
+                got="none",
+                remedy="propose and promote one",
+            )
+        return active.number
+
+    def _monitor(self, twin: str, version: int) -> Monitor:
+        key = twin, version
+        if key not in self._monitors:
+            self._monitors[key] = Monitor.load(Registry(self.store, twin).folder(version))
+        return self._monitors[key]
+
+
+def _version_event(asset: Asset, version: int) -> dict[str, Any]:
+    text = f"watched by version {version} from the next sample on, before by {asset.version}"
+    return {"asset": asset.name, "time": time.time_ns(), "what": "version", "text": text}
+
+
+def _step(together: Sequence[tuple[Machine, Work]]) -> dict[str, int]:
+    """Step machines of one monitor, each by as many samples; their numbers of alarms."""
+    machines = [each for each, _ in together]
+    monitor = machines[0].monitor
+    parts = [machine.state_for(work) for machine, work in together]
+    joined = {name: np.concatenate([each[name] for each in parts]) for name in parts[0]}
+    values = np.stack([work.values for _, work in together])
+    commands, measured = np.split(values, [len(monitor.twin.inputs)], axis=2)
+    names = [each.asset.name for each in machines]
+    state, watched = monitor.step(MonitorState.of_arrays(joined), commands, measured, names)
+    arrays = state.arrays()
+    alarms: dict[str, list[Alarm]] = {name: [] for name in names}
+    for alarm in watched.alarms:
+        alarms[alarm.trajectory].append(alarm)
+    for i, (machine, work) in enumerate(together):
+        own = {name: each[i : i + 1] for name, each in arrays.items()}
+        machine.stepped(work, own, _row(watched, i), alarms[machine.asset.name])
+    return {name: len(each) for name, each in alarms.items()}
+
+
+def _row(watched: Watched, i: int) -> dict[str, NDArray]:
+    return {
+        name: getattr(watched, name)[i]
+        for name in ("mean", "deviation", "evidence", "void", "outside")
+    }

@@ -1,0 +1,371 @@
+"""`Machine`: one watched stream, from samples as they arrive to complete parts in order.
+
+Samples have a place on a grid of the twin's sample rate. A place without a sample is waited for,
+and then missing.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.monitor.monitor import Alarm, Monitor
+from retwin.monitor.samples import SECOND, Samples
+from retwin.monitor.updates import Asset
+
+__all__ = ["Counts", "Machine", "Recent", "Work"]
+
+DEFAULT_WAIT = 2
+"""Sample periods for which a place is waited for, unless it is given."""
+LONGEST_GAP = 10_000
+LONGEST_GAP_SECONDS = 3600.0
+"""A pause of more places, or of a longer time, begins a new stream: what was known is too old."""
+KEPT = 600
+"""Newest samples that are kept for pages."""
+PART = 4096
+"""Samples that are stepped at once at most."""
+WINDOW, TOLERATED = 100, 20
+"""Places of a check of the sample rate, and how many may be missing or have further samples."""
+BEHIND = 10
+"""Late samples in a row from which on the clock of the machine counts as set back."""
+
+
+@dataclass
+class Counts:
+    """Samples by what was done with them.
+
+    Attributes
+    ----------
+    used : int
+        Stored, and used or waiting for an earlier one.
+    repeated : int
+        Stored before, with the same time.
+    late : int
+        Not stored: their place was passed.
+    ahead : int
+        Not stored: their time is in the future.
+    extra : int
+        Not stored: their place has another sample.
+    unknown : int
+        Not stored: before the first sample of which all commands are known.
+
+    """
+
+    used: int = 0
+    repeated: int = 0
+    late: int = 0
+    ahead: int = 0
+    extra: int = 0
+    unknown: int = 0
+
+    def add(self, other: Counts) -> None:
+        """Add the counts of further samples."""
+        for name, count in vars(other).items():
+            setattr(self, name, getattr(self, name) + count)
+
+
+@dataclass(frozen=True, eq=False)
+class Recent:
+    """The newest samples of a machine.
+
+    Attributes
+    ----------
+    times : NDArray
+        (n,), of the places, in nanoseconds since the epoch.
+    commands, measured : NDArray
+        (n, d_u) and (n, d_y); NaN where missing.
+    mean, deviation : NDArray
+        (n, d_y), predictions of each sample from those before.
+    evidence : NDArray
+        (n,), that of a change.
+
+    """
+
+    times: NDArray
+    commands: NDArray
+    measured: NDArray
+    mean: NDArray
+    deviation: NDArray
+    evidence: NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """Complete samples (T, d_u + d_y) from a place on; the first ones of a stream `begin` it."""
+
+    origin: int
+    first: int
+    values: NDArray
+    begins: bool
+
+
+class Machine:
+    """The stream of one asset. It changes in place; see `Live`.
+
+    Parameters
+    ----------
+    asset : Asset
+        The asset, with the version of its twin.
+    monitor : Monitor
+        That version.
+    wait : float or None
+        Time in s for which a place is waited for; None for two sample periods.
+
+    """
+
+    def __init__(self, asset: Asset, monitor: Monitor, wait: float | None) -> None:
+        rate = monitor.twin.rate
+        self.asset = asset
+        self.monitor = monitor
+        self.counts = Counts()
+        self.newest: int | None = None
+        self.evidence = 0.0
+        self.alarms = 0
+        self.last_alarm: int | None = None
+        self.void = self.outside = False
+        self.rate = ""
+        self.entries: list[tuple[str, dict[str, Any]]] = []
+        self.changed = False
+        self._period = SECOND / rate
+        self._wait = DEFAULT_WAIT if wait is None else int(np.ceil(wait * rate))
+        self._gap = min(LONGEST_GAP, max(2, round(LONGEST_GAP_SECONDS * rate)))
+        self._commands = len(monitor.twin.inputs)
+        self._missing = np.full(asset.channels, np.nan)
+        self._origin: int | None = None
+        self._done = -1
+        self._pending: dict[int, tuple[int, NDArray]] = {}
+        self._farthest = -1
+        self._rows: list[NDArray] = []
+        self._work: deque[Work] = deque()
+        self._begins = True
+        self._state: Mapping[str, NDArray] | None = None
+        self._new: dict[int, NDArray] = {}
+        self._window = [0, 0, 0]
+        self._late = 0
+        self._recent: deque[tuple[NDArray, ...]] = deque()
+        self._kept = 0
+
+    @property
+    def stepped_time(self) -> int:
+        """A time in nanoseconds after which are all samples that were not stepped."""
+        assert self._origin is not None
+        return self._origin + round((self._done - 0.5) * self._period)
+
+    def unsure(self, times: NDArray) -> NDArray:
+        """Those times that may be of samples which are stored already."""
+        return times if self.newest is None else times[times <= self.newest]
+
+    def accept(self, samples: Samples, limit: int, stored: Iterable[int]) -> Counts:
+        """Take samples in the order of their arrival.
+
+        Parameters
+        ----------
+        samples : Samples
+            Of this machine.
+        limit : int
+            The latest time that counts.
+        stored : iterable of int
+            Times of samples that the store has.
+
+        """
+        known, counts = set(stored), Counts()
+        for moment, row in zip(samples.times.tolist(), samples.values, strict=True):
+            what = self._placed(moment, row, limit, known)
+            setattr(counts, what, getattr(counts, what) + 1)
+        self._complete()
+        self.counts.add(counts)
+        return counts
+
+    def hold(self, times: NDArray, values: NDArray) -> None:
+        """Take samples of the store that were not stepped."""
+        for moment, row in zip(times.tolist(), values, strict=True):
+            place = self._place(moment)
+            if place > self._done:
+                self._pending[place] = moment, row
+                self._farthest = max(self._farthest, place)
+                self.newest = max(self.newest or moment, moment)
+
+    def next_work(self) -> Work | None:
+        """The next complete samples, which must be stepped before any others; None if none are."""
+        return self._work.popleft() if self._work else None
+
+    def state_for(self, work: Work) -> Mapping[str, NDArray]:
+        """The arrays of the monitor's state before these samples."""
+        if work.begins or self._state is None:
+            return self.monitor.start(1).arrays()
+        return self._state
+
+    def stepped(
+        self,
+        work: Work,
+        state: Mapping[str, NDArray],
+        found: Mapping[str, NDArray],
+        alarms: Sequence[Alarm],
+    ) -> None:
+        """Take the state after these samples, and what was found in them."""
+        self._state, self.changed = state, True
+        self.evidence = float(found["evidence"][-1])
+        self.outside = bool(found["outside"])
+        places = work.first + np.arange(len(work.values))
+        times = work.origin + np.round(places * self._period).astype(np.int64)
+        for alarm in alarms:
+            self.alarms += 1
+            self.last_alarm = int(times[alarm.sample - work.first])
+            data = {name: getattr(alarm, name) for name in ("sample", "output", "change")}
+            self._log("alarm", self.last_alarm, **data, evidence=alarm.evidence)
+        void = found["void"]
+        if void.any() and not self.void:
+            self._log("void", int(times[int(np.argmax(void))]))
+        self.void = bool(void[-1])
+        commands, measured = np.split(work.values, [self._commands], axis=1)
+        predicted = (found["mean"], found["deviation"], found["evidence"])
+        self._recent.append((times, commands, measured, *predicted))
+        self._kept += len(times)
+        while self._kept - len(self._recent[0][0]) >= KEPT:
+            self._kept -= len(self._recent.popleft()[0])
+
+    def recent(self) -> Recent:
+        """The newest samples."""
+        if not self._recent:
+            inputs, outputs = self._commands, self.asset.channels - self._commands
+            none, times = np.zeros((0, outputs)), np.zeros(0, dtype=np.int64)
+            return Recent(times, np.zeros((0, inputs)), none, none, none, np.zeros(0))
+        times, *more = (np.concatenate(each)[-KEPT:] for each in zip(*self._recent, strict=True))
+        commands, measured, mean, deviation, evidence = more
+        return Recent(times, commands, measured, mean, deviation, evidence)
+
+    def new_samples(self) -> Samples:
+        """Samples that are not stored yet."""
+        times = np.array(list(self._new), dtype=np.int64)
+        rows = np.array(list(self._new.values())).reshape(-1, self.asset.channels)
+        return Samples(self.asset.name, times, rows)
+
+    def committed(self) -> None:
+        """Everything is stored."""
+        self._new, self.entries, self.changed = {}, [], False
+
+    def arrays(self) -> dict[str, NDArray]:
+        """All that must be stored, beside the samples."""
+        own = (self._origin, self._done, self.newest, self.asset.version, *self._window)
+        made = {"stream": np.array(own, dtype=np.int64)}
+        return made | {f"monitor.{name}": each for name, each in (self._state or {}).items()}
+
+    def restore(self, arrays: Mapping[str, NDArray]) -> bool:
+        """Continue where `arrays` was stored; False if another version watched."""
+        self._origin, self._done, self.newest, version, *self._window = arrays["stream"].tolist()
+        self._state = {
+            name.removeprefix("monitor."): each for name, each in arrays.items() if name != "stream"
+        }
+        if version != self.asset.version:
+            self._origin, self._done, self._state = None, -1, None
+            return False
+        self._begins, self._farthest = False, self._done
+        self.void = bool(self._state["void"][0])
+        return True
+
+    def _place(self, moment: int) -> int:
+        assert self._origin is not None
+        return round((moment - self._origin) / self._period)
+
+    def _placed(self, moment: int, row: NDArray, limit: int, known: set[int]) -> str:
+        """What is done with a sample: the name of a count."""
+        if moment > limit:
+            return "ahead"
+        if moment in known or moment in self._new:
+            return "repeated"
+        begins = self._origin is None
+        if self.newest is not None and moment <= self.newest and begins:
+            return self._too_late(moment)
+        if not begins:
+            place = self._place(moment)
+            if place in self._pending:
+                return self._further()
+            if place <= self._done:
+                later = self.newest is not None and moment > self.newest
+                return self._further() if later else self._too_late(moment)
+            begins = place - self._farthest > self._gap
+        if begins:
+            if not np.isfinite(row[: self._commands]).all():
+                return "unknown"
+            self._begin(moment)
+        place = self._place(moment)
+        self._pending[place] = moment, row
+        self._new[moment] = row
+        self._farthest = max(self._farthest, place)
+        self.newest = moment if self.newest is None else max(self.newest, moment)
+        self._late = 0
+        self._advance(self._wait)
+        return "used"
+
+    def _begin(self, moment: int) -> None:
+        """Begin a stream with its first sample; the one before it is complete."""
+        if self._origin is not None:
+            self._advance(0)
+            self._complete()
+            assert self.newest is not None
+            pause = (moment - self.newest) / SECOND
+            text = f"no sample for {pause:.6g} s: the monitor begins anew"
+            self._log("event", moment, what="gap", text=text)
+        self._origin, self._done, self._farthest, self._begins = moment, -1, -1, True
+
+    def _further(self) -> str:
+        self._window[2] += 1
+        return "extra"
+
+    def _too_late(self, moment: int) -> str:
+        self._late += 1
+        if self._late == BEHIND and self.newest is not None:
+            behind = (self.newest - moment) / SECOND
+            text = (
+                f"samples are {behind:.6g} s behind the newest one and not used: a clock set back?"
+            )
+            self._log("event", self.newest, what="clock", text=text)
+        return "late"
+
+    def _advance(self, wait: int) -> None:
+        """Pass all places that have a sample, or were waited for."""
+        while self._done < self._farthest:
+            place = self._done + 1
+            found = self._pending.pop(place, None)
+            if found is None and self._farthest - place < wait:
+                return
+            self._rows.append(self._missing if found is None else found[1])
+            self._done = place
+            self._checked_rate(place, missing=found is None)
+
+    def _complete(self) -> None:
+        """Make work of the places that were passed."""
+        first = self._done + 1 - len(self._rows)
+        for i in range(0, len(self._rows), PART):
+            assert self._origin is not None
+            part = np.array(self._rows[i : i + PART])
+            self._work.append(Work(self._origin, first + i, part, self._begins))
+            self._begins = False
+        self._rows = []
+
+    def _checked_rate(self, place: int, *, missing: bool) -> None:
+        """Count a place; after every hundred, compare the rate with the twin's."""
+        self._window[0] += 1
+        self._window[1] += missing
+        places, absent, further = self._window
+        if places < WINDOW:
+            return
+        rate = self.monitor.twin.rate
+        wrong = absent + further > TOLERATED
+        text = f"{rate * (places - absent + further) / places:.4g} Hz instead of {rate:.4g} Hz"
+        if wrong != bool(self.rate):
+            assert self._origin is not None
+            moment = self._origin + round(place * self._period)
+            after = f"samples come at {text}" if wrong else "samples come at the right rate again"
+            self._log("event", moment, what="rate", text=after)
+        self.rate = text if wrong else ""
+        self._window = [0, 0, 0]
+
+    def _log(self, kind: str, moment: int, **data: Any) -> None:
+        own = {"asset": self.asset.name, "version": self.asset.version, "time": moment}
+        self.entries.append((kind, {**own, **data}))

@@ -1,0 +1,287 @@
+"""The live monitor: what happens to samples, alarms, and what survives a restart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import retwin as rt
+from retwin.errors import InputError
+from retwin.monitor import (
+    FalseAlarmTest,
+    Gate,
+    Live,
+    Monitor,
+    Registry,
+    Samples,
+    Store,
+    decide,
+    fit_monitor,
+    verify,
+)
+from retwin.twins import Parameter, ParameterShift, State, StateTwin
+from retwin.update import Dynamics, Library, fit_dynamics
+
+SECOND = 10**9
+BEGIN = 1_700_000_000 * SECOND
+STEPS = 400
+TANK = StateTwin(
+    (State("level", "m", 0.5, 0.0, 3.0),),
+    lambda x, u: x.level,
+    rt.Channels(("pump",), ("V",)),
+    rt.Channels(("level",), ("m",)),
+    1.0,
+    derivative=lambda x, u, p: (0.1 * u.pump - p.drain * x.level,),
+    parameters=(Parameter("drain", "1/s", 0.01, 1.0, 0.1),),
+)
+
+
+def recorded(seed: int, fault: rt.Fault | None = None, count: int = 1) -> rt.Trajectories:
+    rng = np.random.default_rng(seed)
+    pump = np.repeat(rng.uniform(0.0, 2.0, size=(count, STEPS // 20, 1)), 20, axis=1)
+    made = TANK.simulate(pump, faults=[fault] * count, seed=0, parameters={"drain": 0.13})
+    return made.replace(observed=made.observed + 0.01 * rng.normal(size=made.observed.shape))
+
+
+def rows(record: rt.Trajectories, i: int = 0) -> np.ndarray:
+    return np.concatenate([record.commands[i], record.observed[i]], axis=1).astype(float)
+
+
+@pytest.fixture(scope="module")
+def monitor() -> Monitor:
+    twin = fit_dynamics(TANK, recorded(0), Dynamics(Library(0, (), False))).twin
+    return fit_monitor(twin, recorded(1, count=2), "1 per day", blanking=30.0)
+
+
+@pytest.fixture(scope="module")
+def folder(monitor: Monitor, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("live") / "watch"
+    monitor.save(made)
+    return made
+
+
+@pytest.fixture
+def store(folder: Path, tmp_path: Path) -> Iterator[Store]:
+    with Store(tmp_path / "store") as opened:
+        registry = Registry(opened, "tank")
+        registry.promote(registry.propose(folder, "first").number)
+        yield opened
+
+
+def opened(store: Store, *assets: str, **settings: object) -> Live:
+    live = Live(store, **settings)  # type: ignore[arg-type]
+    for name in assets or ("a",):
+        live.add(name, "tank")
+    return live
+
+
+def samples(values: np.ndarray, first: int = 0, asset: str = "a", begin: int = BEGIN) -> Samples:
+    times = begin + SECOND * np.arange(first, first + len(values))
+    return Samples(asset, times, values)
+
+
+def alarms(store: Store) -> list[dict]:
+    return [entry.data for entry in store.log("alarm")]
+
+
+def events(store: Store) -> list[str]:
+    return [entry.data["what"] for entry in store.log("event")]
+
+
+LEAK = ParameterShift("drain", size=0.2, onset=200.0)
+
+
+def test_alarms_are_those_of_the_monitor(store: Store, monitor: Monitor) -> None:
+    live, made = opened(store), recorded(5, LEAK)
+    expected = monitor.watch(made).alarms
+    assert expected
+    (found,) = live.submit([samples(rows(made))])
+    assert (found.counts.used, found.alarms) == (STEPS, len(expected))
+    first = alarms(store)[0]
+    assert first["time"] == BEGIN + SECOND * expected[0].sample
+    assert (first["asset"], first["output"], first["version"]) == ("a", "level", 1)
+    assert first["evidence"] == expected[0].evidence
+    recent = live.recent("a")
+    assert recent.mean.shape == (len(recent.times), 1) == recent.commands.shape
+    (status,) = live.status()
+    assert (status.time, status.alarms) == (BEGIN + SECOND * (STEPS - 1), len(expected))
+    live.acknowledge(next(store.log("alarm")).sequence, "me", "a leak")
+    with pytest.raises(InputError, match="sequence"):
+        live.acknowledge(0, "me")
+    assert not verify(store.log()).reason
+
+
+def test_machines_and_samples_grouped_in_any_way_give_the_same_bytes(
+    folder: Path, tmp_path: Path
+) -> None:
+    streams = {f"m{i}": rows(recorded(5 + i, LEAK if i % 2 else None)) for i in range(4)}
+    found = []
+    for kind, sizes in (("one", [STEPS]), ("cut", [7, 1, 92, 300]), ("apart", [50] * 8)):
+        with Store(tmp_path / kind) as store:
+            registry = Registry(store, "tank")
+            registry.promote(registry.propose(folder, "first").number)
+            live, first = opened(store, *streams), 0
+            for size in sizes:
+                batch = [samples(v[first : first + size], first, k) for k, v in streams.items()]
+                for part in [[each] for each in batch] if kind == "apart" else [batch]:
+                    live.submit(part)
+                first += size
+            states = [store.state(name) for name in streams]
+            assert all(each is not None for each in states)
+            arrays = [{k: v.tobytes() for k, v in each[1].items()} for each in states]
+            logged = sorted((each["time"], str(each)) for each in alarms(store))
+            found.append((arrays, logged))
+    assert found[0] == found[1] == found[2]
+    assert found[0][1]
+
+
+def test_a_restart_continues_with_held_samples(store: Store, monitor: Monitor) -> None:
+    made = rows(recorded(5, LEAK))
+    live = opened(store, wait=30.0)
+    live.submit([samples(made[:100])])
+    live.submit([samples(made[110:120], 110)])  # ten places are waited for
+    live = Live(store, wait=30.0)
+    (again,) = live.submit([samples(made[90:120], 90)])
+    assert vars(again.counts) == {
+        "used": 10, "repeated": 20, "late": 0, "ahead": 0, "extra": 0, "unknown": 0,
+    }  # fmt: skip
+    live.submit([samples(made[120:], 120)])
+    whole = monitor.watch(recorded(5, LEAK)).alarms
+    assert [each["sample"] for each in alarms(store)] == [each.sample for each in whole]
+
+
+def test_a_place_without_a_sample_is_missing_after_the_wait(store: Store) -> None:
+    live, made = opened(store), rows(recorded(2))
+    live.submit([samples(made[:10])])
+    live.submit([samples(made[11:12], 11)])
+    assert len(live.recent("a").times) == 10
+    (late,) = live.submit([samples(made[12:20], 12), samples(made[10:11], 10)])[1:]
+    assert (late.counts.late, late.counts.used) == (1, 0)
+    recent = live.recent("a")
+    assert len(recent.times) == 20
+    assert np.isnan(recent.measured[10]).all()
+    assert np.isfinite(recent.mean).all()
+    (in_time,) = live.submit([samples(made[[21, 20, 22]])])  # repeated times of the begin
+    assert in_time.counts.repeated == 3
+
+
+def test_samples_out_of_order_within_the_wait_are_used(store: Store) -> None:
+    live, made = opened(store, wait=5.0), rows(recorded(2))
+    order = np.concatenate([np.arange(10), [12, 11, 14, 10, 13]])
+    times = BEGIN + SECOND * order
+    (found,) = live.submit([Samples("a", times, made[order])])
+    assert found.counts.used == 15
+    np.testing.assert_array_equal(live.recent("a").measured[:, 0], made[:15, 1])
+
+
+def test_every_sample_has_one_behaviour(store: Store) -> None:
+    now = [BEGIN + 1000 * SECOND]
+    live, made = opened(store, clock=lambda: now[0]), rows(recorded(2))
+    unknown = made[:2].copy()
+    unknown[:, 0] = np.nan
+    (found,) = live.submit([samples(unknown)])
+    assert found.counts.unknown == 2
+    live.submit([samples(made[:50])])
+    (found,) = live.submit([samples(made[50:51], 2000)])
+    assert found.counts.ahead == 1
+    half = Samples("a", BEGIN + SECOND * np.arange(50, 60) + SECOND // 3, made[50:60])
+    live.submit([samples(made[50:60], 50)])
+    (found,) = live.submit([half])
+    assert found.counts.extra + found.counts.late == 10
+    with pytest.raises(InputError, match="channels"):
+        live.submit([Samples("a", np.array([BEGIN]), np.zeros((1, 3)))])
+    with pytest.raises(InputError, match="'b'"):
+        live.submit([samples(made[:1], 60), samples(made[:1], asset="b")])
+    (found,) = live.submit([samples(made[60:61], 60)])  # nothing of the refused batch was used
+    assert found.counts.used == 1
+
+
+def test_a_long_pause_begins_anew(store: Store) -> None:
+    live, made = opened(store), rows(recorded(2))
+    live.submit([samples(made[:100])])
+    live.submit([samples(made[100:200], 100 + 3700)])
+    assert events(store) == ["gap"]
+    state = store.state("a")
+    assert state is not None
+    assert int(state[1]["monitor.samples"][0]) == 100
+
+
+def test_a_clock_that_is_set_back_is_logged_once(store: Store) -> None:
+    live, made = opened(store), rows(recorded(2))
+    live.submit([samples(made[:200])])
+    (found,) = live.submit([samples(made[:50], begin=BEGIN + SECOND // 4)])
+    assert found.counts.late == 50
+    assert events(store) == ["clock"]
+    assert live.submit([samples(made[200:210], 200)])[0].counts.used == 10
+
+
+def test_another_sample_rate_is_a_status_and_an_event(store: Store) -> None:
+    live, made = opened(store), rows(recorded(2))
+    half = np.arange(0, 150, 2)
+    live.submit([Samples("a", BEGIN + SECOND * half, made[half])])
+    assert "instead of 1 Hz" in live.status()[0].rate
+    live.submit([samples(made[150:380], 150)])
+    assert not live.status()[0].rate
+    assert events(store) == ["rate", "rate"]
+    tenth = BEGIN + 380 * SECOND + np.arange(1200) * SECOND // 10
+    live.submit([Samples("a", tenth, np.repeat(made[:120], 10, axis=0))])
+    assert live.status()[0].rate.startswith("10 Hz")
+
+
+def test_a_new_version_begins_anew(store: Store, monitor: Monitor, tmp_path: Path) -> None:
+    live, made = opened(store), rows(recorded(2))
+    live.submit([samples(made[:100])])
+    replace(monitor, alpha=0.02).save(tmp_path / "other")
+    registry = Registry(store, "tank")
+    registry.shadow(registry.propose(tmp_path / "other", "wider").number)
+    live.refresh()
+    assert live.status()[0].version == 1
+    crps = np.random.default_rng(0).random((1, 5000))
+    registry.promote(2, decide(crps + 0.1, crps, FalseAlarmTest(0, 5000, monitor.arl)))
+    live.refresh()
+    live.submit([samples(made[100:150], 100)])
+    assert (live.status()[0].version, events(store)) == (2, ["version"])
+    state = store.state("a")
+    assert state is not None
+    assert int(state[1]["monitor.samples"][0]) == 50
+
+
+def test_a_store_that_fails_acknowledges_nothing(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live, made = opened(store), rows(recorded(2))
+    live.submit([samples(made[:50])])
+
+    def broken(*_: object) -> None:
+        raise InputError("store", expected="a disk with room", got="a full one", remedy="clean up")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "commit", broken)
+        with pytest.raises(InputError, match="full"):
+            live.submit([samples(made[50:60], 50)])
+    (found,) = live.submit([samples(made[50:60], 50)])
+    assert found.counts.used == 10
+
+
+def test_producers_share_commits_and_one_that_is_refused_fails_alone(store: Store) -> None:
+    live, made = opened(store, "a", "b"), rows(recorded(2))
+    before = live.revision
+    with Gate(live) as gate:
+        with store.lock:
+            sent = [
+                gate.send(samples(made[i : i + 1], i, name))
+                for i in range(50)
+                for name in ("a", "b")
+            ]
+        assert all(each.result(10).counts.used == 1 for each in sent)
+        assert live.revision - before < 20
+        refused = gate.send(samples(made[:1], asset="c"))
+        with pytest.raises(InputError, match="'c'"):
+            refused.result(10)
+    assert sum(len(times) for times, _ in store.samples("b")) == 50
+    with pytest.raises(InputError, match="closed"):
+        gate.send(samples(made[:1], 50))
