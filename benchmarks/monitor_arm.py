@@ -2,8 +2,8 @@
 
 The twin is calibrated on 12 healthy trajectories and the monitor on 54 others, at one false alarm
 in 1000 trajectories. It then watches healthy machines, and machines with a fault from their first
-trajectory on: a motor that sticks at any sample of the first four fifths, and a motor whose bias
-is twice the standard deviation of the offsets of a healthy one. The emulator's own offsets are
+trajectory on: a motor that sticks at 0.49 s, as in the published data, or at any sample of the
+first four fifths, after which it may have nothing left to do; and a motor whose bias is twice the standard deviation of the offsets of a healthy one. The emulator's own offsets are
 larger than what the twin knows of them after 12 trajectories. Motor 4 turns the gripper, of which
 the measured position shows least.
 """
@@ -45,8 +45,10 @@ def main() -> None:
         }
     }
     for motor in range(4):
-        sticks = Stuck(motor, (0.49, 8.0))
-        rows[f"motor {motor + 1} sticks"] = found(monitor, case, sticks, STICKS[motor], 1)
+        for when, onset in (("at 0.49 s", 0.49), ("at any time", (0.49, 8.0))):
+            sticks = Stuck(motor, onset)
+            name = f"motor {motor + 1} sticks {when}"
+            rows[name] = found(monitor, case, sticks, STICKS[motor], 1)
     for motor in range(4):
         biased = ActuatorBias(motor, (TWICE - 0.1, TWICE + 0.1))
         name = f"motor {motor + 1}, bias of 2 standard deviations"

@@ -12,6 +12,7 @@ import pytest
 import retwin as rt
 from retwin.errors import InputError
 from retwin.monitor import (
+    Explanations,
     FalseAlarmTest,
     Gate,
     Live,
@@ -285,3 +286,23 @@ def test_producers_share_commits_and_one_that_is_refused_fails_alone(store: Stor
     assert sum(len(times) for times, _ in store.samples("b")) == 50
     with pytest.raises(InputError, match="closed"):
         gate.send(samples(made[:1], 50))
+
+
+def test_alarms_are_explained_beside_the_stream_and_after_a_restart(store: Store) -> None:
+    live, made = opened(store), rows(recorded(5, LEAK))
+    reported = []
+    with Explanations(live, report=lambda alarm, cause: reported.append(cause)) as explanations:
+        live.submit([samples(made[:210])])
+        explanations.wait()
+    live.submit([samples(made[210:], 210)])
+    (cause,) = [entry.data for entry in store.log("cause")]
+    assert cause == reported[0]
+    assert (cause["name"], cause["alarm"]) == (
+        "drain changed",
+        next(iter(store.log("alarm"))).sequence,
+    )
+    assert abs(cause["onset"][0] - (BEGIN + 200 * SECOND)) < 2 * SECOND
+    with Explanations(Live(store)) as explanations:
+        explanations.wait()
+    explained = [entry.data["alarm"] for entry in store.log("cause")]
+    assert explained == [entry.sequence for entry in store.log("alarm")]

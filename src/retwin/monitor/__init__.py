@@ -25,6 +25,7 @@ _HOME = {
     "Disturbance": "disturbance",
     "DisturbanceState": "disturbance",
     "Entry": "audit",
+    "Explanations": "explanations",
     "FalseAlarmTest": "decision",
     "Gate": "gate",
     "Live": "live",

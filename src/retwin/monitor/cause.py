@@ -122,6 +122,8 @@ def find_causes(
     alarms: Sequence[Alarm],
     faults: Mapping[str, Fault | None],
     before: int = BEFORE,
+    *,
+    known_start: bool = True,
 ) -> list[Cause]:
     """The causes of alarms, from the samples before each up to it.
 
@@ -139,6 +141,8 @@ def find_causes(
     before : int
         Number of samples before an alarm from which its cause is inferred. They begin after the
         alarm before it, if that is later and leaves ten samples.
+    known_start : bool
+        Whether the record starts as those in calibration do; a stream may start anywhere.
 
     Raises
     ------
@@ -169,7 +173,9 @@ def find_causes(
             else each
             for name, each in faults.items()
         }
-        made = StateInversionDiagnoser(twin, own).diagnose(window, known_start=first == 0)
+        made = StateInversionDiagnoser(twin, own).diagnose(
+            window, known_start=known_start and first == 0
+        )
         best = int(made.probabilities[0].argmax())
 
         def interval(estimate: Estimate, best: int = best) -> tuple[float, float, float]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import finite, instance, require, whole
 from retwin.errors import InputError
+from retwin.monitor.audit import Entry
 from retwin.monitor.machine import Counts, Machine, Recent, Work
 from retwin.monitor.monitor import Alarm, Monitor, MonitorState, Watched
 from retwin.monitor.registry import Registry
@@ -130,6 +131,7 @@ class Live:
         self._lock = threading.RLock()
         self._monitors: dict[tuple[str, int], Monitor] = {}
         self._machines: dict[str, Machine] = {}
+        self._listeners: list[Callable[[list[Entry]], None]] = []
         self.revision = 0
         """Grows whenever something has changed."""
         self.refresh()
@@ -173,10 +175,8 @@ class Live:
                 known = self._machines.get(asset.name)
                 same = known is not None and known.asset == asset
                 machines[asset.name] = known if known and same else self._machine(asset)
-            if entries:
-                self.store.commit(entries=entries)
             self._machines = machines
-            self.revision += 1
+            self.log(entries)
 
     def channels(self, asset: str) -> tuple[str, ...]:
         """Names of the commands and then the outputs of a machine; InputError if it is unknown."""
@@ -245,6 +245,14 @@ class Live:
         with self._lock:
             return self._one(asset).recent()
 
+    def listen(self, listener: Callable[[list[Entry]], None]) -> None:
+        """Call a function with the new entries of the log after each commit; it must be quick."""
+        self._listeners.append(listener)
+
+    def log(self, entries: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
+        """Store entries of the log."""
+        self._announce(self.store.commit(entries=entries).entries)
+
     def acknowledge(self, sequence: int, who: str, note: str = "") -> None:
         """Log that somebody has seen the alarm with this sequence in the log.
 
@@ -264,8 +272,7 @@ class Live:
             remedy="see the alarms",
         )
         data = {"alarm": sequence, "who": who, "note": note, "at": self._clock()}
-        self.store.commit(entries=[("acknowledge", data)])
-        self.revision += 1
+        self.log([("acknowledge", data)])
 
     def _submitted(self, batch: Sequence[Samples]) -> list[Received]:
         limit = self._clock() + round(self._ahead * SECOND)
@@ -285,11 +292,10 @@ class Live:
                 updates.append(Update(new.asset, new.times, new.values, state, machine.newest or 0))
             entries += machine.entries
         entries.sort(key=lambda each: (each[1]["time"], each[1]["asset"]))
-        if updates or entries:
-            self.store.commit(updates, entries)
+        committed = self.store.commit(updates, entries).entries if updates or entries else []
         for machine in machines:
             machine.committed()
-        self.revision += 1
+        self._announce(committed)
         last = {each.asset: i for i, each in enumerate(batch)}
         return [
             Received(each.asset, counts, alarms.get(each.asset, 0) * (last[each.asset] == i))
@@ -309,6 +315,11 @@ class Live:
                 for name, count in _step(together).items():
                     alarms[name] = alarms.get(name, 0) + count
         return alarms
+
+    def _announce(self, entries: list[Entry]) -> None:
+        self.revision += 1
+        for listener in self._listeners:
+            listener(entries)
 
     def _one(self, name: str) -> Machine:
         found = self._machines.get(name)

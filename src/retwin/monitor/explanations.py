@@ -1,0 +1,187 @@
+"""`Explanations`: finds the causes of alarms beside the stream, and logs them."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from retwin.data.trajectories import Trajectories
+from retwin.diagnosis.estimate import UNKNOWN
+from retwin.errors import InputError, brief
+from retwin.monitor.audit import Entry
+from retwin.monitor.cause import BEFORE, FEWEST, Cause, find_causes, possible_causes
+from retwin.monitor.live import Live
+from retwin.monitor.monitor import Alarm, Monitor
+from retwin.monitor.registry import Registry
+from retwin.monitor.samples import SECOND
+from retwin.twins.faults import Fault
+
+__all__ = ["Explanations"]
+
+Faults = Callable[[str], "dict[str, Fault | None] | None"]
+"""The known faults of a twin by its name; None for any change."""
+
+
+class Explanations:
+    """A thread that explains each alarm from the stored samples before it.
+
+    A context manager that ends the thread. What is found is an entry `cause` of the log. Alarms
+    that have none, since the program was stopped, are explained when it is started again.
+
+    Parameters
+    ----------
+    live : Live
+        What raises the alarms.
+    faults : callable, optional
+        Gives the known faults of a twin by its name (`Case.alarm_causes`), or None; by default any
+        change of the machine (`possible_causes`).
+    report : callable, optional
+        Takes the data of each alarm and of its cause.
+
+    """
+
+    def __init__(
+        self,
+        live: Live,
+        faults: Faults = lambda twin: None,
+        report: Callable[[dict[str, Any], dict[str, Any]], None] = lambda alarm, cause: None,
+    ) -> None:
+        self._live = live
+        self._faults = faults
+        self._report = report
+        self._queue: queue.Queue[Entry | None] = queue.Queue()
+        self._closed = threading.Event()
+        explained = {entry.data["alarm"] for entry in live.store.log("cause")}
+        self._last = -1
+        for entry in live.store.log("alarm"):
+            if entry.sequence not in explained:
+                self._queue.put(entry)
+            self._last = entry.sequence
+        live.listen(self._on_entries)
+        self._thread = threading.Thread(target=self._run, name="explanations", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Explanations:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the thread after the alarm that it explains; once more is no error."""
+        self._closed.set()
+        self._queue.put(None)
+        self._thread.join()
+
+    def wait(self) -> None:
+        """Return when all alarms so far are explained."""
+        self._queue.join()
+
+    def causes(self, twin: str, monitor: Monitor) -> dict[str, Any]:
+        """What may cause alarms of a twin."""
+        return possible_causes(monitor.twin, self._faults(twin))
+
+    def _on_entries(self, entries: list[Entry]) -> None:
+        for entry in entries:
+            if entry.kind == "alarm" and entry.sequence > self._last:
+                self._queue.put(entry)
+
+    def _run(self) -> None:
+        while (entry := self._queue.get()) is not None and not self._closed.is_set():
+            try:
+                self._explain(entry)
+            finally:
+                self._queue.task_done()
+
+    def _explain(self, entry: Entry) -> None:
+        alarm = entry.data
+        try:
+            found = _data(entry, self._found(alarm))
+        except (InputError, ValueError, FloatingPointError, np.linalg.LinAlgError) as error:
+            found = {
+                "alarm": entry.sequence,
+                "asset": alarm["asset"],
+                "name": UNKNOWN,
+                "probability": 0.0,
+                "unknown": 1.0,
+                "size": [None] * 3,
+                "onset": [None] * 3,
+                "probabilities": {},
+                "note": brief(error),
+            }
+        self._live.log([("cause", found)])
+        self._report(alarm, found)
+
+    def _found(self, alarm: dict[str, Any]) -> tuple[Cause, int]:
+        """The cause of an alarm, and the time of the first sample that it was found from."""
+        store, name = self._live.store, alarm["asset"]
+        twin = next(each for each in store.assets() if each.name == name).settings["twin"]
+        monitor = Monitor.load(Registry(store, twin).folder(alarm["version"]))
+        period = SECOND / monitor.twin.rate
+        last = max(
+            (
+                each.data["time"]
+                for each in store.log("alarm")
+                if each.data["asset"] == name and each.data["time"] < alarm["time"]
+            ),
+            default=0,
+        )
+        window = round(min(BEFORE, alarm["sample"]) * period)
+        if alarm["time"] - last > FEWEST * period:
+            window = min(window, alarm["time"] - last - round(period / 2))
+        record = _record(store, name, monitor, alarm["time"] - window, alarm["time"])
+        own = Alarm("", record.steps - 1, 0.0, alarm["output"], alarm["change"], alarm["evidence"])
+        known = self.causes(twin, monitor)
+        (cause,) = find_causes(monitor.twin, record, [own], known, known_start=False)
+        return cause, alarm["time"] - round((record.steps - 1) * period)
+
+
+def _record(store: Any, name: str, monitor: Monitor, first: int, last: int) -> Trajectories:
+    """The stored samples of a machine from a time to another, on the grid of the last one."""
+    twin = monitor.twin
+    period = SECOND / twin.rate
+    steps = round((last - first) / period) + 1
+    values = np.full((steps, len(twin.inputs) + len(twin.outputs)), np.nan)
+    for times, rows in store.samples(name, first - round(period)):
+        place = steps - 1 + np.round((times - last) / period).astype(np.int64)
+        inside = (place >= 0) & (place < steps)
+        values[place[inside]] = rows[inside]
+        if len(times) and times[-1] > last:
+            break
+    commands, measured = np.split(values, [len(twin.inputs)], axis=1)
+    known = np.isfinite(commands)
+    index = np.maximum.accumulate(np.where(known, np.arange(steps)[:, None], 0), axis=0)
+    commands = np.take_along_axis(commands, index, axis=0)
+    begin = int(np.argmax(np.isfinite(commands).all(axis=1)))
+    commands, measured = commands[begin:], measured[begin:]
+    return Trajectories(
+        commands=commands[None],
+        nominal=np.zeros_like(measured)[None],
+        observed=np.where(np.isfinite(measured), measured, 0.0)[None],
+        mask=np.isfinite(measured)[None],
+        rate=twin.rate,
+        ids=np.array([""]),
+        inputs=twin.inputs,
+        outputs=twin.outputs,
+    )
+
+
+def _data(entry: Entry, found: tuple[Cause, int]) -> dict[str, Any]:
+    """A cause as data of the log: times in nanoseconds, None where there is no number."""
+    cause, first = found
+    return {
+        "alarm": entry.sequence,
+        "asset": entry.data["asset"],
+        "name": cause.name,
+        "probability": cause.probability,
+        "unknown": cause.unknown,
+        "size": [each if np.isfinite(each) else None for each in cause.size],
+        "onset": [
+            first + round(each * SECOND) if np.isfinite(each) else None for each in cause.onset
+        ],
+        "probabilities": cause.probabilities,
+    }
