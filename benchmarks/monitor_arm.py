@@ -3,9 +3,9 @@
 The twin is calibrated on 12 healthy trajectories and the monitor on 54 others, at one false alarm
 in 1000 trajectories. It then watches healthy machines, and machines with a fault from their first
 trajectory on: a motor that sticks at 0.49 s, as in the published data, or at any sample of the
-first four fifths, after which it may have nothing left to do; and a motor whose bias is twice the standard deviation of the offsets of a healthy one. The emulator's own offsets are
-larger than what the twin knows of them after 12 trajectories. Motor 4 turns the gripper, of which
-the measured position shows least.
+first four fifths, after which it may have nothing left to do; and a motor whose bias is twice the
+standard deviation of the offsets of a healthy one. Motor 4 turns the gripper, of which the measured
+position shows least.
 """
 
 from __future__ import annotations
