@@ -208,7 +208,7 @@ def test_a_long_pause_begins_anew(store: Store) -> None:
     assert events(store) == ["gap"]
     state = store.state("a")
     assert state is not None
-    assert int(state[1]["monitor.samples"][0]) == 100
+    assert int(state[1]["stream"][1]) == 99
 
 
 def test_a_clock_that_is_set_back_is_logged_once(store: Store) -> None:
@@ -248,7 +248,7 @@ def test_a_new_version_begins_anew(store: Store, monitor: Monitor, tmp_path: Pat
     assert (live.status()[0].version, events(store)) == (2, ["version"])
     state = store.state("a")
     assert state is not None
-    assert int(state[1]["monitor.samples"][0]) == 50
+    assert int(state[1]["stream"][1]) == 49
 
 
 def test_a_store_that_fails_acknowledges_nothing(

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from retwin.checks import finite, instance, require, whole
 from retwin.errors import InputError
 from retwin.monitor.audit import Entry
-from retwin.monitor.machine import Counts, Machine, Recent, Work
-from retwin.monitor.monitor import Alarm, Monitor, MonitorState, Watched
+from retwin.monitor.machine import Counts, Layout, Machine, Recent, Work
+from retwin.monitor.monitor import Alarm, Monitor, Watched
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import SECOND, Samples
 from retwin.monitor.store import Store
@@ -129,7 +129,7 @@ class Live:
         self._ahead = finite("ahead", ahead, least=0.0, unit="s")
         self._clock = clock
         self._lock = threading.RLock()
-        self._monitors: dict[tuple[str, int], Monitor] = {}
+        self._monitors: dict[tuple[str, int], tuple[Monitor, Layout]] = {}
         self._machines: dict[str, Machine] = {}
         self._listeners: list[Callable[[list[Entry]], None]] = []
         self.revision = 0
@@ -147,7 +147,7 @@ class Live:
         """
         with self._lock:
             version = self._active(twin)
-            monitor = self._monitor(twin, version)
+            monitor, _ = self._monitor(twin, version)
             channels = len(monitor.twin.inputs) + len(monitor.twin.outputs)
             asset = Asset(name, channels, {**(settings or {}), "twin": twin}, version)
             if asset not in self.store.assets():
@@ -332,7 +332,7 @@ class Live:
         """A machine as the store has it, with the samples that wait for others."""
         assert asset.version is not None
         monitor = self._monitor(asset.settings["twin"], asset.version)
-        machine = Machine(asset, monitor, self._wait)
+        machine = Machine(asset, *monitor, self._wait)
         stored = self.store.state(asset.name)
         if stored is not None and machine.restore(stored[1]):
             for times, values in self.store.samples(asset.name, machine.stepped_time):
@@ -350,10 +350,11 @@ class Live:
             )
         return active.number
 
-    def _monitor(self, twin: str, version: int) -> Monitor:
+    def _monitor(self, twin: str, version: int) -> tuple[Monitor, Layout]:
         key = twin, version
         if key not in self._monitors:
-            self._monitors[key] = Monitor.load(Registry(self.store, twin).folder(version))
+            monitor = Monitor.load(Registry(self.store, twin).folder(version))
+            self._monitors[key] = monitor, Layout(monitor)
         return self._monitors[key]
 
 
@@ -366,19 +367,18 @@ def _step(together: Sequence[tuple[Machine, Work]]) -> dict[str, int]:
     """Step machines of one monitor, each by as many samples; their numbers of alarms."""
     machines = [each for each, _ in together]
     monitor = machines[0].monitor
-    parts = [machine.state_for(work) for machine, work in together]
-    joined = {name: np.concatenate([each[name] for each in parts]) for name in parts[0]}
+    layout = machines[0].layout
+    before = layout.state(np.stack([machine.state_for(work) for machine, work in together]))
     values = np.stack([work.values for _, work in together])
     commands, measured = np.split(values, [len(monitor.twin.inputs)], axis=2)
     names = [each.asset.name for each in machines]
-    state, watched = monitor.step(MonitorState.of_arrays(joined), commands, measured, names)
-    arrays = state.arrays()
+    after, watched = monitor.step(before, commands, measured, names)
+    states = layout.rows(after)
     alarms: dict[str, list[Alarm]] = {name: [] for name in names}
     for alarm in watched.alarms:
         alarms[alarm.trajectory].append(alarm)
     for i, (machine, work) in enumerate(together):
-        own = {name: each[i : i + 1] for name, each in arrays.items()}
-        machine.stepped(work, own, _row(watched, i), alarms[machine.asset.name])
+        machine.stepped(work, states[i], _row(watched, i), alarms[machine.asset.name])
     return {name: len(each) for name, each in alarms.items()}
 
 

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.monitor.monitor import Alarm, Monitor
+from retwin.monitor.monitor import Alarm, Monitor, MonitorState
 from retwin.monitor.samples import SECOND, Samples
 from retwin.monitor.updates import Asset
 
-__all__ = ["Counts", "Machine", "Recent", "Work"]
+__all__ = ["Counts", "Layout", "Machine", "Recent", "Work"]
 
 DEFAULT_WAIT = 2
 """Sample periods for which a place is waited for, unless it is given."""
@@ -104,6 +104,42 @@ class Work:
     begins: bool
 
 
+class Layout:
+    """The states of machines of one monitor as rows (n, K) of numbers, which are stored and joined.
+
+    Parameters
+    ----------
+    monitor : Monitor
+        The monitor.
+
+    """
+
+    def __init__(self, monitor: Monitor) -> None:
+        start = monitor.start(1).arrays()
+        self._parts = {name: (each.dtype, each.shape[1:]) for name, each in start.items()}
+        self._ends = np.cumsum([each[0].size for each in start.values()])
+        self.start = self.rows(monitor.start(1))[0]
+        """(K,), the state before the first sample."""
+
+    def rows(self, state: MonitorState) -> NDArray:
+        """The rows (n, K) of a state."""
+        arrays = state.arrays()
+        count = len(state.void)
+        # Whole numbers and truth values are exact as floats.
+        flat = [arrays[name].reshape(count, -1).astype(float) for name in self._parts]
+        return np.concatenate(flat, axis=1)
+
+    def state(self, rows: NDArray) -> MonitorState:
+        """The state of rows (n, K)."""
+        parts = np.split(rows, self._ends[:-1], axis=1)
+        return MonitorState.of_arrays(
+            {
+                name: part.reshape(-1, *shape).astype(dtype)
+                for (name, (dtype, shape)), part in zip(self._parts.items(), parts, strict=True)
+            }
+        )
+
+
 class Machine:
     """The stream of one asset. It changes in place; see `Live`.
 
@@ -113,15 +149,18 @@ class Machine:
         The asset, with the version of its twin.
     monitor : Monitor
         That version.
+    layout : Layout
+        Of that monitor.
     wait : float or None
         Time in s for which a place is waited for; None for two sample periods.
 
     """
 
-    def __init__(self, asset: Asset, monitor: Monitor, wait: float | None) -> None:
+    def __init__(self, asset: Asset, monitor: Monitor, layout: Layout, wait: float | None) -> None:
         rate = monitor.twin.rate
         self.asset = asset
         self.monitor = monitor
+        self.layout = layout
         self.counts = Counts()
         self.newest: int | None = None
         self.evidence = 0.0
@@ -143,7 +182,7 @@ class Machine:
         self._rows: list[NDArray] = []
         self._work: deque[Work] = deque()
         self._begins = True
-        self._state: Mapping[str, NDArray] | None = None
+        self._state = layout.start
         self._new: dict[int, NDArray] = {}
         self._window = [0, 0, 0]
         self._late = 0
@@ -194,16 +233,14 @@ class Machine:
         """The next complete samples, which must be stepped before any others; None if none are."""
         return self._work.popleft() if self._work else None
 
-    def state_for(self, work: Work) -> Mapping[str, NDArray]:
-        """The arrays of the monitor's state before these samples."""
-        if work.begins or self._state is None:
-            return self.monitor.start(1).arrays()
-        return self._state
+    def state_for(self, work: Work) -> NDArray:
+        """The monitor's state before these samples, as a row of the layout."""
+        return self.layout.start if work.begins else self._state
 
     def stepped(
         self,
         work: Work,
-        state: Mapping[str, NDArray],
+        state: NDArray,
         found: Mapping[str, NDArray],
         alarms: Sequence[Alarm],
     ) -> None:
@@ -252,20 +289,16 @@ class Machine:
     def arrays(self) -> dict[str, NDArray]:
         """All that must be stored, beside the samples."""
         own = (self._origin, self._done, self.newest, self.asset.version, *self._window)
-        made = {"stream": np.array(own, dtype=np.int64)}
-        return made | {f"monitor.{name}": each for name, each in (self._state or {}).items()}
+        return {"stream": np.array(own, dtype=np.int64), "monitor": self._state}
 
     def restore(self, arrays: Mapping[str, NDArray]) -> bool:
         """Continue where `arrays` was stored; False if another version watched."""
-        self._origin, self._done, self.newest, version, *self._window = arrays["stream"].tolist()
-        self._state = {
-            name.removeprefix("monitor."): each for name, each in arrays.items() if name != "stream"
-        }
-        if version != self.asset.version:
-            self._origin, self._done, self._state = None, -1, None
+        origin, done, self.newest, version, *window = arrays["stream"].tolist()
+        if version != self.asset.version or arrays["monitor"].shape != self._state.shape:
             return False
-        self._begins, self._farthest = False, self._done
-        self.void = bool(self._state["void"][0])
+        self._origin, self._done, self._farthest, self._window = origin, done, done, window
+        self._state, self._begins = arrays["monitor"], False
+        self.void = bool(self.layout.state(self._state[None]).void[0])
         return True
 
     def _place(self, moment: int) -> int:
