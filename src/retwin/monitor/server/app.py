@@ -1,0 +1,337 @@
+"""The HTTP interface of the monitor: samples in; assets, alarms, versions, metrics and the page."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Collection, Mapping
+from dataclasses import asdict
+from importlib import resources
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from retwin._version import __version__
+from retwin.checks import needs_extra, require
+from retwin.errors import InputError
+from retwin.monitor.decision import Decision
+from retwin.monitor.explanations import Explanations
+from retwin.monitor.gate import Gate
+from retwin.monitor.live import Live, Received
+from retwin.monitor.registry import Registry
+from retwin.monitor.samples import parse
+from retwin.monitor.server.comparison import Comparisons
+from retwin.monitor.server.guard import Guard
+from retwin.monitor.server.metrics import Metrics
+from retwin.monitor.server.views import Views
+from retwin.report.style import CHROME, PALETTE
+
+if TYPE_CHECKING:
+    import fastapi
+else:
+    fastapi = needs_extra("fastapi", "monitor", "answers requests")
+
+__all__ = ["create_app"]
+
+LEAST_TOKEN = 16
+"""Characters of a token at least."""
+LISTENERS = 100
+"""Pages that may listen to events at the same time."""
+PAUSE, HEARTBEAT = 0.25, 15.0
+"""Seconds between two events at least, and at most."""
+TEXT = "charset=utf-8"
+FILES = {
+    "/": ("index.html", f"text/html; {TEXT}"),
+    "/page.js": ("page.js", f"text/javascript; {TEXT}"),
+    "/uplot.js": ("uplot.js", f"text/javascript; {TEXT}"),
+    "/uplot.css": ("uplot.css", f"text/css; {TEXT}"),
+}
+"""The files of the page and their types; the style sheet is made from the report's colours."""
+
+JSON = fastapi.responses.JSONResponse
+Sequence = Annotated[int, fastapi.Path(ge=0, lt=2**63)]
+Number = Annotated[int, fastapi.Path(ge=1, lt=2**31)]
+
+
+class Acknowledgement(BaseModel):
+    """Who has seen an alarm, and what was found."""
+
+    model_config = ConfigDict(extra="forbid")
+    who: str = Field("", max_length=200)
+    note: str = Field("", max_length=2000)
+
+
+class Step(BaseModel):
+    """Why a version changes its state."""
+
+    model_config = ConfigDict(extra="forbid")
+    reason: str = Field("", max_length=2000)
+
+
+def create_app(
+    live: Live,
+    gate: Gate,
+    *,
+    token: str,
+    explanations: Explanations | None = None,
+    hosts: Collection[str] = (),
+    sources: Mapping[str, Callable[[], bool]] | None = None,
+    emulated: bool = False,
+) -> Guard:
+    """The ASGI application of a live monitor.
+
+    Parameters
+    ----------
+    live : Live
+        The monitor.
+    gate : Gate
+        Where samples go.
+    token : str
+        What requests that write must present, at least 16 characters.
+    explanations : Explanations, optional
+        What explains alarms, for the kinds of faults; by default any change of the machine.
+    hosts : collection of str
+        Names of this server beside those of the loopback interface.
+    sources : mapping of str to callable, optional
+        Whether each source of samples is connected, by its name.
+    emulated : bool
+        Whether the page states that the machines are emulated.
+
+    Raises
+    ------
+    InputError
+        The token is shorter, or a package of the extra is missing.
+
+    """
+    require(
+        isinstance(token, str) and len(token) >= LEAST_TOKEN and token.isascii(),
+        "token",
+        expected=f"at least {LEAST_TOKEN} ASCII characters",
+        got="another one",
+        remedy="make one: python -c 'import secrets; print(secrets.token_urlsafe())'",
+    )
+    # The pages of the documentation that FastAPI has would load scripts from elsewhere.
+    app = fastapi.FastAPI(
+        title="retwin monitor", version=__version__, docs_url=None, redoc_url=None
+    )
+    _report_errors(app)
+    _add_page(app)
+    views, metrics = Views(live, explanations), Metrics(live, sources or {})
+    _add_reading(app, live, views, metrics, emulated=emulated)
+    _add_writing(app, live, gate, metrics)
+    _add_versions(app, live, views)
+    guard = Guard(app, token, hosts)
+    app.state.closing = guard.closing
+    return guard
+
+
+def _report_errors(app: fastapi.FastAPI) -> None:
+    """Turn errors into one line of JSON."""
+
+    def refused(request: fastapi.Request, error: Exception) -> Any:
+        return JSON({"error": str(error)}, 400)
+
+    def invalid(request: fastapi.Request, error: Any) -> Any:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        return JSON({"error": f"{where}: {first['msg']}"}, 422)
+
+    def unknown(request: fastapi.Request, error: Any) -> Any:
+        headers = getattr(error, "headers", None)
+        return JSON({"error": error.detail}, error.status_code, headers)
+
+    app.add_exception_handler(InputError, refused)
+    app.add_exception_handler(fastapi.exceptions.RequestValidationError, invalid)
+    app.add_exception_handler(404, unknown)
+    app.add_exception_handler(405, unknown)
+    app.add_exception_handler(fastapi.HTTPException, unknown)
+
+
+def _add_page(app: fastapi.FastAPI) -> None:
+    folder = resources.files(__package__).joinpath("page")
+
+    def add(path: str, content: bytes, kind: str) -> None:
+        async def answer() -> Any:
+            return fastapi.Response(content, media_type=kind, headers={"cache-control": "no-cache"})
+
+        app.add_api_route(path, answer, methods=["GET", "HEAD"], include_in_schema=False)
+
+    for path, (name, kind) in FILES.items():
+        add(path, folder.joinpath(name).read_bytes(), kind)
+    colours = {**{f"c{place}": pair for place, pair in enumerate(PALETTE)}, **CHROME}
+    light, dark = (
+        "".join(f"--{name}: {pair[place]}; " for name, pair in colours.items()) for place in (0, 1)
+    )
+    style = (
+        f":root {{ {light}}}\n@media (prefers-color-scheme: dark) {{ :root {{ {dark}}} }}\n"
+        + folder.joinpath("page.css").read_text("utf-8")
+    )
+    add("/page.css", style.encode(), f"text/css; {TEXT}")
+
+
+def _add_reading(
+    app: fastapi.FastAPI, live: Live, views: Views, metrics: Metrics, *, emulated: bool
+) -> None:
+    """What anyone may read who reaches the server."""
+    listeners: set[object] = set()
+
+    @app.get("/assets")
+    def assets() -> Any:
+        """All assets, the worst first."""
+        found = {"assets": views.assets(), "emulated": emulated, "revision": live.revision}
+        return JSON(found)
+
+    @app.get("/assets/{name:path}")
+    def asset(name: str, after: float | None = None) -> Any:
+        """An asset with its newest samples, or with those after a time in s since the epoch."""
+        return JSON(views.asset(name, after))
+
+    @app.get("/alarms")
+    def alarms(
+        asset: str | None = None,
+        before: Annotated[int | None, fastapi.Query(ge=0, lt=2**63)] = None,
+        limit: Annotated[int, fastapi.Query(ge=1, le=500)] = 50,
+    ) -> Any:
+        """Alarms with causes and acknowledgements, the newest first; `next` continues them."""
+        return JSON(views.alarms(asset, before, limit))
+
+    @app.get("/alarms/{sequence}")
+    def alarm(sequence: Sequence) -> Any:
+        """One alarm."""
+        return JSON(views.alarm(sequence))
+
+    @app.get("/alarms/{sequence}/samples")
+    def around(sequence: Sequence) -> Any:
+        """The samples around an alarm, and what its version of the twin predicts of them."""
+        return JSON(views.around(sequence))
+
+    @app.get("/metrics", response_class=fastapi.responses.PlainTextResponse)
+    def prometheus() -> Any:
+        """Metrics for Prometheus."""
+        return fastapi.Response(metrics.text(), media_type="text/plain; version=0.0.4")
+
+    @app.get("/events")
+    async def events(request: fastapi.Request) -> Any:
+        """Server-sent events: one with the revision whenever something has changed."""
+        require(
+            len(listeners) < LISTENERS,
+            "events",
+            expected=f"at most {LISTENERS} listeners",
+            got="more",
+            remedy="close pages that are not needed",
+        )
+        return fastapi.responses.StreamingResponse(
+            _revisions(live, listeners, request.app.state.closing), media_type="text/event-stream"
+        )
+
+
+async def _revisions(
+    live: Live, listeners: set[object], closing: threading.Event
+) -> AsyncIterator[str]:
+    own, last, sent = object(), None, time.monotonic()
+    listeners.add(own)
+    try:
+        while not closing.is_set():
+            now = time.monotonic()
+            if live.revision != last:
+                last, sent = live.revision, now
+                yield f"data: {last}\n\n"
+            elif now - sent > HEARTBEAT:
+                sent = now
+                yield ":\n\n"
+            await asyncio.sleep(PAUSE)
+    finally:
+        listeners.discard(own)
+
+
+def _add_writing(app: fastapi.FastAPI, live: Live, gate: Gate, metrics: Metrics) -> None:
+    """Samples and acknowledgements; the guard has checked the token."""
+
+    @app.post("/samples", openapi_extra=BODY)
+    async def samples(request: fastapi.Request) -> Any:
+        """Store samples; the counts that are answered are durable.
+
+        With status 503 some were not stored: send all again, since those that were count as
+        repeated.
+        """
+        began, document = time.perf_counter(), await request.body()
+        sent = await asyncio.to_thread(
+            lambda: [gate.send(each) for each in parse(document, live.channels)]
+        )
+        made = await asyncio.gather(*map(asyncio.wrap_future, sent), return_exceptions=True)
+        done = [each for each in made if isinstance(each, Received)]
+        if len(done) < len(made):
+            error = next(str(each) for each in made if not isinstance(each, Received))
+            return JSON({"error": error}, 503)
+        metrics.latency.observe(time.perf_counter() - began)
+        return JSON({each.asset: {**vars(each.counts), "alarms": each.alarms} for each in done})
+
+    @app.post("/alarms/{sequence}/acknowledge")
+    def acknowledge(sequence: Sequence, body: Acknowledgement) -> Any:
+        """Record who has seen an alarm."""
+        live.acknowledge(sequence, body.who, body.note)
+        return JSON({"acknowledged": sequence})
+
+
+BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {"schema": {"type": ["object", "array"]}},
+            "application/x-ndjson": {"schema": {"type": "string"}},
+        },
+    }
+}
+
+
+def _add_versions(app: fastapi.FastAPI, live: Live, views: Views) -> None:
+    comparisons = Comparisons(live.store)
+
+    # Before the next one, whose twin may contain slashes.
+    @app.get("/versions/{twin:path}/{number}/comparison")
+    async def comparison(twin: str, number: Number) -> Any:
+        """The version compared with the active one on stored samples, at most a minute old."""
+        found = await asyncio.wrap_future(comparisons.of(twin, number))
+        test = found.false_alarms
+        return JSON(
+            {
+                **{name: each for name, each in vars(found).items() if name != "false_alarms"},
+                **asdict(test),
+                "promised": test.samples / test.run_length,
+                "p": test.p,
+                "passed": test.passed,
+                "better": found.better,
+                "summary": found.summary,
+            }
+        )
+
+    @app.get("/versions/{twin:path}")
+    def versions(twin: str) -> Any:
+        """The versions of a twin."""
+        return JSON({"twin": twin, "versions": views.versions(twin)})
+
+    @app.post("/versions/{twin:path}/rollback")
+    def rollback(twin: str, body: Step) -> Any:
+        """Make the version active that was so before."""
+        made = Registry(live.store, twin).rollback(body.reason)
+        live.refresh()
+        return JSON(vars(made))
+
+    @app.post("/versions/{twin:path}/{number}/{step}")
+    async def change(
+        twin: str, number: Number, step: Literal["promote", "shadow", "reject"], body: Step
+    ) -> Any:
+        """Change the state of a version; one is promoted that is better than the active one."""
+        registry = Registry(live.store, twin)
+        if step == "promote":
+            evidence: Decision | None = None
+            if registry.active is not None:
+                evidence = await asyncio.wrap_future(comparisons.of(twin, number))
+            made = await asyncio.to_thread(registry.promote, number, evidence)
+            await asyncio.to_thread(live.refresh)
+        elif step == "shadow":
+            made = await asyncio.to_thread(registry.shadow, number)
+        else:
+            made = await asyncio.to_thread(registry.reject, number, body.reason)
+        return JSON(vars(made))

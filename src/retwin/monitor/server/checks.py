@@ -1,0 +1,82 @@
+"""What to check on the machine, by the kind of fault that explains an alarm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from retwin.data.trajectories import HEALTHY
+from retwin.monitor.monitor import Monitor
+from retwin.twins.system_faults import (
+    ActuatorGain,
+    ParameterShift,
+    SensorBias,
+    SensorDrift,
+    SensorFreeze,
+)
+
+__all__ = ["size_unit", "what_to_check"]
+
+SENTENCES: Mapping[type, Callable[[Any, Monitor], str]] = {
+    ParameterShift: lambda fault, monitor: (
+        f"The parameter {fault.parameter} of the machine has changed. Look for what sets it: "
+        "something that is open, leaks, is clogged, worn, loose or was replaced."
+    ),
+    ActuatorGain: lambda fault, monitor: (
+        f"The machine does not do what the command {_input(fault, monitor)} demands. Check the "
+        "actuator: its supply, its connection, its wear, and whether something limits or overrides "
+        "the command."
+    ),
+    SensorBias: lambda fault, monitor: (
+        f"The sensor of {_output(fault, monitor)} is offset. Compare it with a second instrument, "
+        "and check its mounting, its reference and its calibration."
+    ),
+    SensorDrift: lambda fault, monitor: (
+        f"The error of the sensor of {_output(fault, monitor)} grows with time. Compare it with a "
+        "second instrument now and again later, and check it for dirt, moisture and ageing."
+    ),
+    SensorFreeze: lambda fault, monitor: (
+        f"The sensor of {_output(fault, monitor)} repeats the same value. Check its cable, its bus "
+        "and the program that reads it, and whether its value changes when it must."
+    ),
+}
+NOTHING = (
+    "None of the known faults explains the alarm better than the healthy machine does. Look at the "
+    "samples around it; a single disturbance from outside is possible, and so is a false alarm, "
+    "which is as rare as promised."
+)
+UNNAMED = (
+    "Compare what the machine does on site with what it is commanded and with what its sensors "
+    "show, and find out what was changed on it."
+)
+"""Where the cause is of another kind."""
+
+
+def what_to_check(name: str, fault: object, monitor: Monitor) -> str:
+    """A sentence or two on what to check first, for the fault that a cause names."""
+    if name == HEALTHY:
+        return NOTHING
+    found = SENTENCES.get(type(fault))
+    return found(fault, monitor) if found else UNNAMED
+
+
+def size_unit(fault: object, monitor: Monitor) -> str:
+    """The unit of a fault's size; "" where it has none."""
+    units = monitor.twin.outputs.units
+    if isinstance(fault, ParameterShift):
+        parameters = monitor.twin.equations.parameters
+        own = [each.unit for each in parameters if each.name == fault.parameter]
+        return own[0] if own else ""
+    if isinstance(fault, ActuatorGain):
+        return "of the command"
+    if isinstance(fault, SensorDrift):
+        return f"{units[fault.output]}/s"
+    return units[fault.output] if isinstance(fault, SensorBias) else ""
+
+
+def _input(fault: ActuatorGain, monitor: Monitor) -> str:
+    return monitor.twin.inputs.names[fault.actuator]
+
+
+def _output(fault: SensorBias | SensorDrift | SensorFreeze, monitor: Monitor) -> str:
+    return monitor.twin.outputs.names[fault.output]

@@ -1,0 +1,107 @@
+"""What the log holds of alarms and of events of assets, kept in memory and read on as it grows."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from retwin.checks import require
+from retwin.errors import InputError
+from retwin.monitor.audit import Entry
+from retwin.monitor.samples import SECOND
+from retwin.monitor.store import Store
+
+__all__ = ["Journal"]
+
+KEPT = 10_000
+"""Newest alarms that are kept; all of them are in the log."""
+EVENTS = 50
+"""Newest events of each asset that are kept."""
+
+
+class Journal:
+    """Alarms with their causes and acknowledgements, and the events of each asset.
+
+    Parameters
+    ----------
+    store : Store
+        Whose log is read.
+
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._lock = threading.Lock()
+        self._last = -1
+        self._alarms: dict[int, dict[str, Any]] = {}
+        self._events: dict[str, deque[dict[str, Any]]] = {}
+
+    def alarms(
+        self, asset: str | None = None, before: int | None = None, limit: int = 50
+    ) -> tuple[list[dict[str, Any]], int | None]:
+        """The newest alarms first, and the `before` of those that follow; None at the end."""
+        with self._read():
+            found = [
+                alarm
+                for sequence, alarm in reversed(self._alarms.items())
+                if (before is None or sequence < before) and asset in (None, alarm["asset"])
+            ]
+        return found[:limit], found[limit - 1]["sequence"] if len(found) > limit else None
+
+    def alarm(self, sequence: int) -> dict[str, Any]:
+        """One alarm by its place in the log; InputError where none is there."""
+        with self._read():
+            found = self._alarms.get(sequence)
+        if found is None:
+            raise InputError(
+                "sequence",
+                expected=f"that of one of the newest {KEPT} alarms",
+                got=str(sequence)[:40],
+                remedy="see /alarms",
+            )
+        return found
+
+    def open(self) -> dict[str, dict[str, Any]]:
+        """The newest alarm of each asset that nobody has acknowledged."""
+        with self._read():
+            alarms = self._alarms.values()
+            return {each["asset"]: each for each in alarms if each["acknowledged"] is None}
+
+    def events(self, asset: str) -> list[dict[str, Any]]:
+        """The newest events of an asset, its alarms among them, the newest first."""
+        with self._read():
+            return list(reversed(self._events.get(asset, ())))
+
+    @contextmanager
+    def _read(self) -> Iterator[None]:
+        """Hold the lock, after the log was read on."""
+        with self._lock:
+            for entry in self._store.log(after=self._last):
+                self._add(entry, entry.data)
+                self._last = entry.sequence
+            while len(self._alarms) > KEPT:
+                del self._alarms[next(iter(self._alarms))]
+            yield
+
+    def _add(self, entry: Entry, data: Mapping[str, Any]) -> None:
+        if entry.kind in ("cause", "acknowledge"):
+            alarm = self._alarms.get(data["alarm"])
+            if alarm is not None:
+                alarm["cause" if entry.kind == "cause" else "acknowledged"] = dict(data)
+        elif entry.kind in ("alarm", "void", "event"):
+            require(
+                {"asset", "time"} <= data.keys(),
+                f"entry {entry.sequence} of the log",
+                expected="an asset and a time",
+                got=", ".join(data),
+                remedy="verify the log",
+            )
+            made = {**data, "kind": entry.kind, "sequence": entry.sequence}
+            made["time"] = data["time"] / SECOND
+            if entry.kind == "alarm":
+                made |= {"cause": None, "acknowledged": None}
+                self._alarms[entry.sequence] = made
+            self._events.setdefault(data["asset"], deque(maxlen=EVENTS)).append(made)

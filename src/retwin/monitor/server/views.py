@@ -1,0 +1,223 @@
+"""What the page shows, as plain values for JSON: times in s since the epoch, None for no number."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import require
+from retwin.data.trajectories import Channels
+from retwin.errors import InputError
+from retwin.monitor.cause import possible_causes
+from retwin.monitor.explanations import Explanations
+from retwin.monitor.live import AssetStatus, Live
+from retwin.monitor.machine import Recent
+from retwin.monitor.monitor import Monitor
+from retwin.monitor.registry import Registry
+from retwin.monitor.samples import SECOND
+from retwin.monitor.server.checks import size_unit, what_to_check
+from retwin.monitor.server.comparison import stored
+from retwin.monitor.server.journal import Journal
+
+__all__ = ["Views"]
+
+BAND = 1.645
+"""Half the width of the 90 % band of a Gaussian, in its standard deviations."""
+SILENT = 20
+"""Sample periods without a new sample after which an asset counts as stopped, 30 s at least."""
+SILENT_SECONDS = 30.0
+LEARNED, SHOWN, AFTER = 400, 80, 60
+"""Samples before an alarm from which the filter starts anew, those that are shown, and samples
+after it."""
+KEPT = 16
+"""Monitors that are kept in memory, besides those that watch."""
+
+
+class Views:
+    """The state of the live monitor for the page.
+
+    Parameters
+    ----------
+    live : Live
+        The monitor.
+
+    """
+
+    def __init__(self, live: Live, explanations: Explanations | None = None) -> None:
+        self._live = live
+        self.journal = Journal(live.store)
+        self._newest: dict[str, tuple[float | None, float]] = {}
+
+        @lru_cache(KEPT)
+        def loaded(twin: str, version: int) -> Monitor:
+            return Monitor.load(Registry(live.store, twin).folder(version))
+
+        @lru_cache(KEPT)
+        def causes(twin: str, version: int) -> Mapping[str, Any]:
+            monitor = loaded(twin, version)
+            if explanations is None:
+                return possible_causes(monitor.twin)
+            return explanations.causes(twin, monitor)
+
+        self._monitor, self._causes = loaded, causes
+
+    def assets(self) -> list[dict[str, Any]]:
+        """All assets, the worst first."""
+        alarms, twins = self.journal.open(), self._twins()
+        made = [self._status(each, alarms, twins) for each in self._live.status()]
+        # Evidence by decades, so that healthy machines keep their order.
+        return sorted(
+            made,
+            key=lambda each: (
+                ORDER.index(each["state"]),
+                -math.floor(math.log10(max(each["evidence"], 1e-3))),
+                each["asset"],
+            ),
+        )
+
+    def asset(self, name: str, after: float | None) -> dict[str, Any]:
+        """An asset with its newest samples, or those after a time."""
+        found = {each.asset: each for each in self._live.status()}.get(name)
+        if found is None:
+            raise InputError(
+                "asset", expected="one that is watched", got=repr(name)[:80], remedy="see /assets"
+            )
+        monitor, twins = self._live.monitor(name), self._twins()
+        recent = self._live.recent(name)
+        times = recent.times / SECOND
+        new = slice(0 if after is None else int(np.searchsorted(times, after, "right")), None)
+        return {
+            "status": self._status(found, self.journal.open(), twins),
+            "arl": monitor.arl,
+            "rate": monitor.twin.rate,
+            "promise": {name: str(each) for name, each in monitor.promises.items()},
+            "events": [
+                self._explained(each, twins) if each["kind"] == "alarm" else each
+                for each in self.journal.events(name)
+            ],
+            "evidence": plain(recent.evidence[new]),
+            **_drawn(monitor, recent, new),
+        }
+
+    def around(self, sequence: int) -> dict[str, Any]:
+        """The stored samples around an alarm, predicted anew; none if they were removed."""
+        alarm = self.journal.alarm(sequence)
+        asset = next(each for each in self._live.store.assets() if each.name == alarm["asset"])
+        monitor = self._monitor(asset.settings["twin"], alarm["version"])
+        period = SECOND / monitor.twin.rate
+        moment = round(alarm["time"] * SECOND)
+        first, last = moment - round(LEARNED * period), moment + round(AFTER * period)
+        times, rows = stored(self._live.store, asset, monitor, first, last)
+        commands, measured = np.split(rows, [len(monitor.twin.inputs)], axis=1)
+        if len(times):
+            watched = monitor.step(monitor.start(1), commands[None], measured[None])[1]
+            mean, deviation = watched.mean[0], watched.deviation[0]
+        else:
+            mean, deviation = measured, measured
+        recent = Recent(times, commands, measured, mean, deviation, np.zeros(len(times)))
+        shown = np.searchsorted(times, moment - round(SHOWN * period))
+        return _drawn(monitor, recent, slice(int(shown), None))
+
+    def alarms(self, asset: str | None, before: int | None, limit: int) -> dict[str, Any]:
+        """A page of alarms, the newest first."""
+        found, following = self.journal.alarms(asset, before, limit)
+        twins = self._twins()
+        return {"alarms": [self._explained(each, twins) for each in found], "next": following}
+
+    def alarm(self, sequence: int) -> dict[str, Any]:
+        """One alarm, with what to check."""
+        return self._explained(self.journal.alarm(sequence), self._twins())
+
+    def versions(self, twin: str) -> list[dict[str, Any]]:
+        """The versions of a twin; InputError where there is none."""
+        found = Registry(self._live.store, twin).versions()
+        require(
+            found, "twin", expected="one with versions", got=repr(twin)[:80], remedy="see /assets"
+        )
+        return [vars(each) for each in found]
+
+    def _twins(self) -> dict[str, str]:
+        """The name of the twin of each asset."""
+        return {each.name: each.settings.get("twin", "") for each in self._live.store.assets()}
+
+    def _status(
+        self, status: AssetStatus, alarms: Mapping[str, Any], twins: Mapping[str, str]
+    ) -> dict[str, Any]:
+        now = time.monotonic()
+        newest, since = self._newest.get(status.asset, (None, now))
+        if newest != status.time:
+            since = now
+        self._newest[status.asset] = status.time, since
+        idle = now - since
+        alarm = alarms.get(status.asset)
+        silent = max(SILENT_SECONDS, SILENT / self._live.monitor(status.asset).twin.rate)
+        states = {
+            "alarm": alarm is not None,
+            "void": status.void,
+            "stopped": status.time is not None and idle > silent,
+            "rate": bool(status.rate),
+            "outside": status.outside,
+            "ok": True,
+        }
+        return {
+            "asset": status.asset,
+            "twin": status.twin,
+            "version": status.version,
+            "time": None if status.time is None else status.time / SECOND,
+            "evidence": status.ratio,
+            "alarm": None if alarm is None else self._explained(alarm, twins),
+            "state": next(name for name, holds in states.items() if holds),
+            "rate": status.rate,
+            "idle": idle,
+            "counts": status.counts,
+        }
+
+    def _explained(self, alarm: Mapping[str, Any], twins: Mapping[str, str]) -> dict[str, Any]:
+        """An alarm of the log, its cause with the unit of its size and what to check."""
+        twin = twins[alarm["asset"]]
+        monitor = self._monitor(twin, alarm["version"])
+        made = {**alarm, "arl": monitor.arl}
+        if alarm["cause"] is not None:
+            cause = dict(alarm["cause"])
+            fault = self._causes(twin, alarm["version"]).get(cause["name"])
+            cause["onset"] = [None if each is None else each / SECOND for each in cause["onset"]]
+            cause["unit"] = size_unit(fault, monitor)
+            cause["check"] = what_to_check(cause["name"], fault, monitor)
+            made["cause"] = cause
+        return made
+
+
+def _drawn(monitor: Monitor, recent: Recent, part: slice) -> dict[str, Any]:
+    """What plots of samples need."""
+    mean, half = recent.mean[part], BAND * recent.deviation[part]
+    return {
+        "inputs": _named(monitor.twin.inputs),
+        "outputs": _named(monitor.twin.outputs),
+        "times": (recent.times[part] / SECOND).tolist(),
+        "commands": plain(recent.commands[part]),
+        "measured": plain(recent.measured[part]),
+        "mean": plain(mean),
+        "low": plain(mean - half),
+        "high": plain(mean + half),
+    }
+
+
+ORDER = ("alarm", "void", "stopped", "rate", "outside", "ok")
+"""The states of assets, the worst first."""
+
+
+def plain(values: NDArray) -> list[Any]:
+    """An array as lists, with None for what is not finite."""
+    made = values.astype(object)
+    made[~np.isfinite(values)] = None
+    return list(made.tolist())
+
+
+def _named(channels: Channels) -> list[tuple[str, str]]:
+    return list(zip(channels.names, channels.units, strict=True))
