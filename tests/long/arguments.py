@@ -38,15 +38,15 @@ LONG = "x" * 300
 HUGE = "99999999999999999999"
 NUMBERS = ("nan", "inf", "-inf", "-1", "0", HUGE, "1e308", "1e-300", "")
 POSSIBLE = {
-    "0": {"seed", "encoder_noise", "index"},
+    "0": {"seed", "encoder_noise", "index", "port"},
     HUGE: {"chunk", "max_bytes", "processes", "workers", "rate"},
     "1e308": {"rate"},
-    "1e-300": {"rate"},
+    "1e-300": {"rate", "seconds"},
 }
 """Options for which an odd number may be accepted."""
-LONG_WORK = ("bench", "data fetch", "demo", "diagnose fit", "fit", "study")
+LONG_WORK = ("bench", "data fetch", "demo", "diagnose fit", "fit", "monitor demo", "study")
 """Commands that work for a long time, or download, on what they accept; it is not tried."""
-NOT_RUN = ("bench", "bundle export", "data fetch", "demo", "doctor", "study")
+NOT_RUN = ("bench", "bundle export", "data fetch", "demo", "doctor", "monitor demo", "study")
 """Commands of which only the reading of words is tried with mutated ones: they work for a long
 time, or need a network."""
 ODD_WORDS = ("", "-", "--", "-1", "nan", HUGE, "x" * 300, "none", "..", "set", "study", "--seed")
@@ -72,6 +72,7 @@ BASE = {
     "diagnose predict": "cnn real.npz",
     "fit": "reach.toml --real real.npz --simulations 20",
     "generate": "model --case reach.toml --per-class 1",
+    "monitor demo": "--seconds 1 --port 0",
     "monitor fit": "model real.npz",
     "monitor replay": "model real.npz",
     "study": "reach.toml --real real.npz --folds 2 --sources dt,ibg --runs 1 --per-class 5",

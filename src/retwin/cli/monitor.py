@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import secrets
+import tempfile
+import threading
+import webbrowser
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from retwin import catalog
-from retwin.checks import require
+from retwin.checks import finite, positive, require
 from retwin.cli.options import Json, MaxBytes, OtherCase
 from retwin.cli.reading import case_named, read, saved
 from retwin.cli.terminal import answer, bar, example, note, table
@@ -201,6 +206,49 @@ def _replay_trajectories(
         *texts,
         as_json=as_json,
     )
+
+
+@app.command(epilog=example("retwin monitor demo --open"))
+def demo(
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, metavar="N", help="Of the page; 0 is any free one.")
+    ] = 8710,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", help="End by itself after this time.")
+    ] = None,
+    open_page: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Show the live monitor with emulated incubators, of which some become faulty.
+
+    They run 60 times as fast as real ones. Everything is removed at the end.
+    """
+    from retwin.monitor.demo import demonstration
+    from retwin.monitor.server import create_app, listening, serving
+
+    if seconds is not None:
+        finite("seconds", positive("seconds", seconds, unit="s"), most=threading.TIMEOUT_MAX)
+    token = secrets.token_urlsafe()
+    with (
+        listening("127.0.0.1", port) as bound,
+        tempfile.TemporaryDirectory(prefix="retwin-") as folder,
+        ExitStack() as running,
+    ):
+        with bar("demo") as show:
+            show("fit the twin", 0.0)
+            live, gate, explanations = running.enter_context(demonstration(Path(folder)))
+        app = create_app(live, gate, token=token, explanations=explanations, emulated=True)
+        running.enter_context(serving(app, bound))
+        address = f"http://127.0.0.1:{bound.getsockname()[1]}/"
+        answer(
+            {"address": address, "token": token},
+            f"Page: {address}",
+            f"Token, for changes on the page: {token}",
+            as_json=as_json,
+        )
+        if open_page:
+            webbrowser.open(address)
+        threading.Event().wait(seconds)
 
 
 def _healthy(record: Trajectories, file: Path) -> Trajectories:
