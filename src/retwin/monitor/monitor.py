@@ -17,7 +17,7 @@ from retwin.monitor.bets import Dependence, Location, Scale
 from retwin.monitor.detector import Detector, DetectorState
 from retwin.monitor.disturbance import Disturbance, DisturbanceState, fit_disturbance
 from retwin.monitor.promise import Promise, false_alarms
-from retwin.monitor.scores import ConformalScores, fit_scores, resolution
+from retwin.monitor.scores import ConformalScores, fit_scores, middle, resolution
 from retwin.monitor.slack import Slack
 from retwin.monitor.validity import Validity, ValidityState
 from retwin.serialisation.models import read_model, refusing, write_model
@@ -286,7 +286,7 @@ class Monitor:
         evidence, alarm, void, alarms = found
         deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
         shape = (count, len(self.slack), samples)
-        score = np.moveaxis(((low + high) / 2).reshape(shape), 1, 2)
+        score = np.moveaxis(middle(low, high).reshape(shape), 1, 2)
         outside = self.twin.outside(known)
         return state, Watched(mean, deviation, score, evidence, alarm, void, outside, alarms)
 

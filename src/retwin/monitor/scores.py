@@ -12,12 +12,14 @@ from scipy.special import ndtr, ndtri
 from retwin.checks import require, whole
 from retwin.monitor.slack import Slack, effective_samples
 
-__all__ = ["ConformalScores", "fit_scores", "resolution"]
+__all__ = ["ConformalScores", "fit_scores", "middle", "resolution"]
 
 FEWEST = 8
 """Calibration errors per stream, at least."""
 COPIES = 8
 """Places inside a rounding interval that stand for a rounded error."""
+FARTHEST = 4.0
+"""Scores beyond it count as it in a detector."""
 SCALES = np.geomspace(0.05, 2, 32)
 """Standard deviations of errors before rounding, relative to those after it."""
 
@@ -164,6 +166,12 @@ def fit_scores(errors: ArrayLike, width: ArrayLike = 0.0) -> ConformalScores:
     fitted = ConformalScores(keys, quantiles, copies, seen.sum(axis=1).astype(float))
     low, high = (np.clip(each, -4, 4) for each in fitted.score(given, widths))
     return replace(fitted, independent=effective_samples((low + high) / 2))
+
+
+def middle(low: NDArray, high: NDArray) -> NDArray:
+    """Middles of intervals of scores, each end from -4 to 4: larger ones are not distinguished."""
+    made: NDArray = (np.clip(low, -FARTHEST, FARTHEST) + np.clip(high, -FARTHEST, FARTHEST)) / 2
+    return made
 
 
 def resolution(measured: ArrayLike) -> NDArray:

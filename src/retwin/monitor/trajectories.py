@@ -25,7 +25,7 @@ from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.monitor.detector import LARGEST, Detector, DetectorState
 from retwin.monitor.promise import duration, false_alarms
-from retwin.monitor.scores import ConformalScores, fit_scores
+from retwin.monitor.scores import ConformalScores, fit_scores, middle
 from retwin.monitor.slack import Slack
 from retwin.monitor.validity import Validity, ValidityState
 from retwin.progress import Progress
@@ -47,8 +47,6 @@ FEWEST = 8
 LARGEST_RATIO = 300.0
 """Logarithms of likelihood ratios count up to this, far more than any threshold; the largest of a
 trajectory is reduced to it, and the others by as much."""
-FARTHEST = 4.0
-"""Scores are from minus this to this: a detector does not distinguish larger ones."""
 FACTORS = np.arange(1.0, 10.005, 0.01)
 """Factors of the errors of which the smallest is taken with which the calibration agrees."""
 CERTAIN = 1.645
@@ -239,8 +237,9 @@ class TrajectoryMonitor:
                 own = np.zeros_like(own)
             detected = detector.reset(detected, np.array([alarm]))
             state = TrajectoryState(own, detected, tested, state.count + 1)
-        score = ((np.clip(low, -FARTHEST, FARTHEST) + np.clip(high, -FARTHEST, FARTHEST)) / 2)[0]
-        return state, WatchedTrajectories(score, made.mean(axis=1), void, outside, alarms)
+        return state, WatchedTrajectories(
+            middle(low, high)[0], made.mean(axis=1), void, outside, alarms
+        )
 
     def save(self, folder: str | Path) -> None:
         """Write the diagnoser, the calibration and the promise."""
