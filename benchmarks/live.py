@@ -1,12 +1,13 @@
-"""What the live monitor costs: latency, load of a core, memory, and speed of a replay.
+"""What the live monitor costs: latency, load of a core, speed of a replay, and memory.
 
-    python benchmarks/live.py [SAMPLES]
+    python benchmarks/live.py
+    python benchmarks/live.py memory
 
 An emulated tank with one input and one output. Latency is the time from `Gate.send` to the result,
-when samples, state and alarms of one machine are durable. The load is that of 100 machines
-at 10 Hz whose samples arrive in batches of 0.1 s, as CPU time of all threads over the wall clock
-time. Memory is resident memory after a tenth and after all of SAMPLES (2 million) samples of 100
-machines. The replay is of one stored day at 1 Hz in one call.
+when samples, state and alarms of one machine are durable. The load is that of 100 machines at 10 Hz
+whose samples arrive in batches of 0.1 s, as CPU time of all threads over the wall clock time. The
+replay is of one day at 1 Hz in one call. Memory is resident memory after 0.2 and after 2 million
+samples of 100 machines.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from retwin.monitor import Gate, Live, Monitor, Registry, Samples, Store, fit_mo
 from retwin.twins import Parameter, State, StateTwin
 from retwin.update import Dynamics, Library, fit_dynamics
 
-MACHINES = 100
+MACHINES, TOTAL = 100, 2_000_000
 SECOND = 10**9
 SENT = 300
 """Samples of one machine from which the latency is measured."""
@@ -82,10 +83,11 @@ def rows(made: rt.Trajectories) -> np.ndarray:
 
 
 def main() -> None:
-    total = int(sys.argv[1]) if len(sys.argv) > 1 else 2_000_000
-    fast, slow = calibrated(10.0), calibrated(1.0)
-    begin = time.time_ns() - 10**6 * SECOND
-    figures = latency(fast, begin) | load(fast, begin) | replay(slow) | memory(fast, begin, total)
+    monitor, begin = calibrated(10.0), time.time_ns() - 10**6 * SECOND
+    if sys.argv[1:] == ["memory"]:
+        record("live memory", f"live monitor, {MACHINES} machines", memory(monitor, begin))
+        return
+    figures = latency(monitor, begin) | load(monitor, begin) | replay(calibrated(1.0))
     record("live", f"live monitor, {MACHINES} machines", figures)
 
 
@@ -142,18 +144,18 @@ def replay(monitor: Monitor) -> dict[str, float]:
     return {"replay, times real time at 1 Hz": day / taken}
 
 
-def memory(monitor: Monitor, begin: int, total: int) -> dict[str, float]:
+def memory(monitor: Monitor, begin: int) -> dict[str, float]:
     """Resident memory after a tenth and all of the samples."""
     part = 100
     values = rows(recorded(10.0, MACHINES, 1000, 5))
-    count = total // (MACHINES * part)
+    count = TOTAL // (MACHINES * part)
     sizes = {}
     with opened(monitor, MACHINES) as live:
         for k in range(count):
             times = begin + (k * part + np.arange(part)) * SECOND // 10
             here = slice(k * part % 1000, k * part % 1000 + part)
             live.submit([Samples(f"m{i}", times, values[i, here]) for i in range(MACHINES)])
-            if k + 1 in (max(1, count // 10), count):
+            if k + 1 in (count // 10, count):
                 sizes[k + 1] = resident()
     least, most = sizes.values()
     return {
