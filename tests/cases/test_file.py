@@ -507,7 +507,9 @@ def test_no_value_in_the_wrong_place_is_anything_but_an_input_error(
         *parents, last = paths[rng.integers(len(paths))]
         inside = reduce(lambda table, key: table[key], parents, tables)
         inside[last] = odd[rng.integers(len(odd))]
-        monkeypatch.setattr("retwin.cases.file.tomllib.loads", lambda _, tables=tables: tables)
+        monkeypatch.setattr(
+            "retwin.serialisation.configs.tomllib.loads", lambda _, tables=tables: tables
+        )
         try:
             rt.cases.get(str(tmp_path / "case.toml"))
         except rt.InputError as error:

@@ -6,8 +6,6 @@ Code is named as `module:object`; a module beside the file is found. No other co
 
 from __future__ import annotations
 
-import re
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -25,11 +23,17 @@ from retwin.checks import one_of, require
 from retwin.data.io import load
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
-from retwin.errors import InputError
 from retwin.nets.networks import Network
 from retwin.nets.training import Training
-from retwin.serialisation.configs import at, checked, fits, from_config, from_settings, key
-from retwin.serialisation.files import check_regular
+from retwin.serialisation.configs import (
+    at,
+    checked,
+    fits,
+    from_config,
+    from_settings,
+    key,
+    read_toml,
+)
 from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.fmu import FMUTwin
@@ -54,8 +58,7 @@ from retwin.update.state_surrogate import StateSurrogate
 
 __all__ = ["check_density", "read_case"]
 
-MAX_DEPTH = 100
-"""The largest number of dots in a key; reading takes memory by the square of it."""
+CONTENTS = "see docs/own_twin.md for what it holds"
 SAMPLERS: tuple[type, ...] = (RampSampler, HoldSampler, MultisineSampler, RecordedSampler)
 Records = Callable[[Path], tuple[Trajectories, Trajectories]]
 """A function that splits a file into calibration records and test records."""
@@ -108,7 +111,7 @@ def read_case(path: str | Path) -> Case:
     folder = path.parent
     named = (catalog.CORRECTIONS, catalog.DENSITIES, catalog.NETWORKS)
     kinds = [kind for entries in named for kind in catalog.classes(entries)]
-    settings = _read(path)
+    settings = read_toml(path, expected="a case as a TOML file", remedy=CONTENTS)
     rate = settings.get("rate")
     rate = rate if isinstance(rate, int | float) else None
     keys = from_settings(CaseFile, settings, kinds, place=place, rate=rate)
@@ -212,21 +215,6 @@ def _is_static(twin: Twin, sampler: CommandSampler) -> bool:
         return False
     scale = float(np.abs(ideal).max(initial=0.0))
     return bool(np.allclose(ideal[:, order], other, rtol=0, atol=1e-6 * scale))
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        text = check_regular(path).read_text("utf-8")
-        if max(part.count(".") for part in re.split(r"[=,{}\n]", text)) > MAX_DEPTH:
-            raise ValueError("a key is nested too deeply")
-        return tomllib.loads(text)
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
-            str(path),
-            expected="a case as a TOML file",
-            got=f"{type(error).__name__}: {error}",
-            remedy="see docs/own_twin.md for what it holds",
-        ) from None
 
 
 def _chosen(value: Any, entries: Mapping[str, catalog.Entry], place: str) -> Any:

@@ -7,13 +7,14 @@ is active is what its entries yield.
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import stat
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from retwin.checks import instance, require, whole
 from retwin.errors import InputError
@@ -22,14 +23,13 @@ from retwin.monitor.store import Store
 from retwin.serialisation.files import refusing, sha256, write_atomically
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["Registry", "Version"]
+__all__ = ["Registry", "Step", "Version", "damaged"]
 
 State = Literal["proposed", "shadow", "active", "retired", "rejected"]
 KIND = "version"
 """The kind of the registry's entries in the log."""
 FOLDER = "versions"
 """The folder in that of the store, with one folder per content, named by its hash."""
-DIGEST = re.compile(r"[0-9a-f]{64}")
 BEFORE: Mapping[str, tuple[State, ...]] = {
     "shadow": ("proposed",),
     "promote": ("shadow",),
@@ -65,6 +65,42 @@ class Version:
     state: State
     reason: str
     reference: bool = False
+
+
+class Step(BaseModel):
+    """The data of an entry of kind "version" in the log; docs/registry.schema.json is its schema.
+
+    Attributes
+    ----------
+    twin : str
+        The name of the twin.
+    step : str
+        What was done.
+    version : int
+        With which version; a rollback names the one that is active again.
+    digest : str
+        Of a proposed version, the SHA-256 of its folder, `versions/DIGEST` in that of the store.
+    reason : str
+        Why it was done.
+    evidence : dict
+        Of a promotion, but for the first one, the comparison with the active version.
+
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    twin: str
+    step: Literal["propose", "shadow", "promote", "reject", "rollback"]
+    version: Annotated[int, Field(ge=1)]
+    digest: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    reason: str = ""
+    evidence: dict[str, Any] | None = None
+
+    @model_validator(mode="after")
+    def _proposed_by_its_digest(self) -> Step:
+        if (self.step == "propose") != (self.digest is not None):
+            raise ValueError("a digest is that of a proposed version")
+        return self
 
 
 class Registry:
@@ -238,7 +274,7 @@ class Registry:
             where = f"entry {entry.sequence} of the log"
             with refusing(where, expected="a step of the registry", remedy="verify the log"):
                 if data["twin"] == self.twin:
-                    _apply(data, versions, history)
+                    _apply(Step.model_validate(data), versions, history)
         return versions, history
 
     def _copy(self, source: Path) -> str:
@@ -284,13 +320,24 @@ class Registry:
         return digest
 
 
-def _apply(data: Mapping[str, Any], versions: dict[int, Version], history: list[int]) -> None:
+def damaged(store: Store) -> str:
+    """The first version of any twin whose files were changed since it was proposed; "" for none."""
+    twins = {str(entry.data.get("twin")) for entry in store.log(KIND)}
+    for twin in sorted(twins):
+        registry = Registry(store, twin)
+        try:
+            for version in registry.versions():
+                registry.folder(version.number)
+        except InputError as error:
+            return f"twin {twin}: {error}"
+    return ""
+
+
+def _apply(taken: Step, versions: dict[int, Version], history: list[int]) -> None:
     """Apply a step of the log."""
-    step, number = data["step"], data["version"]
+    step, number = taken.step, taken.version
     if step == "propose":
-        if not DIGEST.fullmatch(data["digest"]):
-            raise ValueError("its digest is none")
-        versions[number] = Version(number, data["digest"], "proposed", data["reason"])
+        versions[number] = Version(number, str(taken.digest), "proposed", taken.reason)
         return
     if step in ("promote", "rollback"):
         if history:

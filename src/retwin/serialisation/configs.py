@@ -8,11 +8,13 @@ a file names.
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache, partial
 from operator import truediv
+from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -28,6 +30,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 
 from retwin.checks import one_of, require
 from retwin.errors import InputError
+from retwin.serialisation.files import check_regular
 
 __all__ = [
     "Converted",
@@ -37,10 +40,14 @@ __all__ = [
     "from_config",
     "from_settings",
     "key",
+    "plain_reason",
+    "read_toml",
     "to_config",
 ]
 
 T = TypeVar("T")
+MAX_DEPTH = 100
+"""The largest number of dots in a key; reading takes memory by the square of it."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +94,18 @@ RENAMED_SETTINGS: dict[str, dict[str, str | Converted]] = {
     "SequenceMixture": {"gap": "margin"},
 }
 """Per kind, settings in files of versions before 0.1.0, and their present names."""
+
+
+def read_toml(path: Path, *, expected: str, remedy: str) -> dict[str, Any]:
+    """The tables of a TOML file; InputError if it cannot be read or is none."""
+    try:
+        text = check_regular(path).read_text("utf-8")
+        if max(part.count(".") for part in re.split(r"[=,{}\n]", text)) > MAX_DEPTH:
+            raise ValueError("a key is nested too deeply")
+        return tomllib.loads(text)
+    except (OSError, ValueError, RecursionError) as error:
+        got = f"{type(error).__name__}: {error}"
+        raise InputError(str(path), expected=expected, got=got, remedy=remedy) from None
 
 
 def to_config(value: Any, kinds: Sequence[type]) -> dict[str, Any]:
@@ -253,7 +272,7 @@ def _validated(
                 raise each["ctx"]["error"]
     raise InputError(
         where,
-        expected=" or ".join(dict.fromkeys(map(_expected, errors))),
+        expected=" or ".join(dict.fromkeys(map(plain_reason, errors))),
         got=repr(given[name]),
         remedy="see what this key may hold",
     )
@@ -288,8 +307,8 @@ def _whole(value: Any) -> bool:
     return all(map(_whole, value)) if isinstance(value, list | tuple) else type(value) is int
 
 
-def _expected(error: ErrorDetails) -> str:
-    """What pydantic expected, in the words of TOML."""
+def plain_reason(error: ErrorDetails) -> str:
+    """What pydantic expected of a value, in the words of TOML."""
     text = {"missing": "more items", "too_long": "fewer items"}.get(error["type"], error["msg"])
     return re.sub("dictionary|mapping", "table", text.removeprefix("Input should be "))
 
