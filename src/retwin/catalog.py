@@ -194,6 +194,7 @@ EXTRAS: Mapping[str, Extra] = {
     "fmu": Extra("twins that are FMUs", "fmpy"),
     "monitor": Extra("the live monitor: its store, its streams and its page", "sqlalchemy"),
     "onnx": Extra("bundles that need no torch", "onnxruntime"),
+    "parquet": Extra("Parquet files as a source of the monitor", "pyarrow"),
     "postgres": Extra("PostgreSQL as the store of the monitor", "psycopg"),
     "render": Extra("films drawn by MuJoCo, and MP4", "imageio_ffmpeg"),
     "rocket": Extra("the classifier rocket", "sktime"),

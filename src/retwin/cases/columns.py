@@ -20,7 +20,7 @@ from retwin.errors import InputError
 from retwin.serialisation.files import sha256
 from retwin.twins.twin import Twin
 
-__all__ = ["ColumnRecords", "Record"]
+__all__ = ["ColumnRecords", "Record", "number"]
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,12 @@ class ColumnRecords:
     @property
     def in_folder(self) -> bool:
         """Whether the records name the files of a folder."""
-        return any(each.files for name in ("calibration", "test") for each in self._records(name))
+        return any(each.files for each in self.every_record)
+
+    @property
+    def every_record(self) -> tuple[Record, ...]:
+        """The records of both sets."""
+        return self._records("calibration") + self._records("test")
 
     def _records(self, name: str) -> tuple[Record, ...]:
         records: tuple[Record, ...] = getattr(self, name)
@@ -216,7 +221,7 @@ class ColumnRecords:
         wanted: dict[Path, dict[str, Callable[[str], float]]] = {}
         for file, record in (*calibration, *test):
             cells = wanted.setdefault(file, {})
-            cells |= dict.fromkeys(record.every_column, _number)
+            cells |= dict.fromkeys(record.every_column, number)
             if record.clock:
                 cells[record.clock.column] = record.clock.number
         tables = {file: _read(file, cells) for file, cells in wanted.items()}
@@ -292,8 +297,8 @@ class ColumnRecords:
         )
 
 
-def _number(cell: str) -> float:
-    """The number in a cell; NaN in an empty one."""
+def number(cell: str) -> float:
+    """The number in a cell, NaN in an empty one; ValueError if it is none."""
     truth = {"true": 1.0, "false": 0.0}.get(cell.strip().lower())
     return float(cell or "nan") if truth is None else truth
 

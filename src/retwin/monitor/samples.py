@@ -66,7 +66,9 @@ class Samples:
         object.__setattr__(self, "values", np.where(np.isfinite(values), values, np.nan))
 
 
-def parse(document: bytes | str, channels: Callable[[str], Sequence[str]]) -> list[Samples]:
+def parse(
+    document: bytes | str, channels: Callable[[str], Sequence[str]], asset: str | None = None
+) -> list[Samples]:
     """The samples of a JSON document, of one machine after the other.
 
     Parameters
@@ -79,6 +81,8 @@ def parse(document: bytes | str, channels: Callable[[str], Sequence[str]]) -> li
     channels : callable
         Gives the names of the channels of a machine, commands first; it raises an InputError for an
         unknown one (`Live.channels`).
+    asset : str, optional
+        The one machine that the document is about; its objects need not name it.
 
     Raises
     ------
@@ -89,6 +93,7 @@ def parse(document: bytes | str, channels: Callable[[str], Sequence[str]]) -> li
     times: dict[str, list[int]] = {}
     rows: dict[str, list[list[float]]] = {}
     known: dict[str, dict[str, int]] = {}
+    needed = {"values"} if asset is not None else {"asset", "values"}
     for number, each in enumerate(_objects(document)):
         place = f"sample {number}"
         require(
@@ -99,27 +104,26 @@ def parse(document: bytes | str, channels: Callable[[str], Sequence[str]]) -> li
             remedy="send them in parts",
         )
         require(
-            isinstance(each, dict) and {"asset", "values"} <= each.keys() <= KEYS,
+            isinstance(each, dict) and needed <= each.keys() <= KEYS,
             place,
-            expected="an object with asset, time and values",
+            expected=f"an object with {', '.join(sorted(needed))} and time",
             got=f"{type(each).__name__} {repr(each)[:60]}",
             remedy=REMEDY,
         )
-        asset = each["asset"]
+        name = each.get("asset", asset)
         require(
-            isinstance(asset, str),
+            isinstance(name, str) and asset in (None, name),
             f"{place}: asset",
-            expected="its name",
-            got=repr(asset)[:60],
+            expected="its name" if asset is None else repr(asset),
+            got=repr(name)[:60],
             remedy=REMEDY,
         )
-        if asset not in known:
-            known[asset] = {name: i for i, name in enumerate(channels(asset))}
-        times.setdefault(asset, []).append(_time(each, place))
-        rows.setdefault(asset, []).append(_row(each["values"], known[asset], place))
+        if name not in known:
+            known[name] = {channel: i for i, channel in enumerate(channels(name))}
+        times.setdefault(name, []).append(_time(each, place))
+        rows.setdefault(name, []).append(_row(each["values"], known[name], place))
     return [
-        Samples(asset, np.array(times[asset], dtype=np.int64), np.array(rows[asset]))
-        for asset in times
+        Samples(name, np.array(times[name], dtype=np.int64), np.array(rows[name])) for name in times
     ]
 
 

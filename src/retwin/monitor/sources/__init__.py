@@ -1,0 +1,1 @@
+"""Where samples come from, besides those that programs post: folders, MQTT brokers, OPC UA."""

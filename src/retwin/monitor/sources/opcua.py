@@ -1,0 +1,214 @@
+"""Samples from a subscription to nodes of an OPC UA server."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC
+from typing import Any
+
+from retwin.checks import needs_extra, require
+from retwin.errors import InputError, brief
+from retwin.monitor.gate import Gate
+from retwin.monitor.samples import Samples, nanoseconds
+from retwin.monitor.settings import OpcUaSource, secret
+from retwin.monitor.sources.assembly import Assembly
+from retwin.monitor.sources.source import AGAIN, Source
+
+__all__ = ["OpcUa"]
+
+TIMEOUT = 4.0
+"""Seconds in which the server must answer."""
+LONGEST = 1.0
+"""Seconds between two publications, at most."""
+QUEUE = 1000
+"""Values of a node that the server keeps while the connection is lost."""
+MARGIN = 1.5
+"""Intervals of publication for which a sample waits for channels that may not have changed."""
+
+
+class OpcUa(Source):
+    """The nodes of machines at a server.
+
+    Each value has the time at which its source took it, and values of one moment make a sample. A
+    node that did not change keeps its value; one with a bad status is missing. What was sent while
+    the connection was lost is asked for again, where the server still has it.
+
+    Parameters
+    ----------
+    settings : OpcUaSource
+        The server and its nodes.
+    channels : mapping of str to sequence of str
+        The channels of each machine.
+    rates : mapping of str to float
+        The sample rate of each machine, in Hz.
+    report : callable
+        Takes a line about an event.
+
+    Raises
+    ------
+    InputError
+        A machine has not one node for each channel, or an address of a node is none.
+
+    """
+
+    def __init__(
+        self,
+        settings: OpcUaSource,
+        channels: Mapping[str, Sequence[str]],
+        rates: Mapping[str, float],
+        report: Callable[[str], None],
+    ) -> None:
+        self._asyncua: Any = needs_extra("asyncua", "monitor", "speaks to OPC UA servers")
+        super().__init__(f"opcua {settings.url}", report)
+        # Its warnings would be lines besides those that are reported.
+        logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+        self._settings = settings
+        self._password = secret("password of the server", settings.password_env)
+        shortest = min(1 / rates[asset] for asset in settings.nodes)
+        self._interval = settings.interval or min(shortest / 2, LONGEST)
+        self._used: dict[Any, list[tuple[str, int]]] = {}
+        """By node, the machines that it belongs to, with the number of the channel."""
+        self._assemblies: dict[str, Assembly] = {}
+        self._subscription: Any = None
+        self._ready = False
+        self._begun: dict[Any, Any] = {}
+        """By node, the number of the subscription that has sent its present value."""
+        for asset, nodes in settings.nodes.items():
+            require(
+                set(nodes) == set(channels[asset]),
+                f"sources.nodes.{asset}",
+                expected=f"a node for each of {', '.join(channels[asset])}",
+                got=", ".join(nodes) or "none",
+                remedy='write for each channel NAME = "ns=2;s=NODE"',
+            )
+            for name, text in nodes.items():
+                place = (asset, list(channels[asset]).index(name))
+                self._used.setdefault(self._node(text), []).append(place)
+            period, settle = 1 / rates[asset], MARGIN * self._interval
+            self._assemblies[asset] = Assembly(len(nodes), period, settle)
+
+    def run(self, gate: Gate, stop: threading.Event) -> None:
+        """Take values from the server until `stop` is set."""
+        asyncio.run(self._run(gate, stop))
+
+    async def _run(self, gate: Gate, stop: threading.Event) -> None:
+        failures = (OSError, asyncio.TimeoutError, self._asyncua.ua.UaError, InputError)
+        while not stop.is_set():
+            try:
+                await self._subscribed(gate, stop)
+            except failures as error:
+                self.lost(brief(error))
+            await asyncio.to_thread(stop.wait, AGAIN)
+
+    async def _subscribed(self, gate: Gate, stop: threading.Event) -> None:
+        """Subscribe, and send samples until `stop` is set."""
+        self._ready = False
+        client = await self._client()
+        async with client:
+            # The handler is this object: `datachange_notification` is called.
+            subscription = await client.create_subscription(1000 * self._interval, self)
+            self._subscription = subscription
+            results = await subscription.create_monitored_items(self._items(subscription))
+            for node, result in zip(self._used, results, strict=True):
+                require(
+                    not isinstance(result, self._asyncua.ua.StatusCode),
+                    str(node),
+                    expected="a node of the server",
+                    got=str(result),
+                    remedy="correct its address in the source",
+                )
+            self._ready = True
+            self.back()
+            while not stop.is_set():
+                await asyncio.sleep(min(self._interval / 4, 0.1))
+                now = time.monotonic()
+                found = [
+                    Samples(asset, *each.take(now)) for asset, each in self._assemblies.items()
+                ]
+                new = [each for each in found if len(each.times)]
+                if new:
+                    futures = [gate.send(each) for each in new]
+                    for samples, future in zip(new, futures, strict=True):
+                        await asyncio.to_thread(self.stored, gate, samples, stop, future)
+
+    async def _client(self) -> Any:
+        own = self._settings
+        client = self._asyncua.Client(
+            own.url, TIMEOUT, auto_reconnect=True, reconnect_max_delay=2 * AGAIN
+        )
+        client.connection_lost_callback = self._on_lost
+        if own.user is not None:
+            client.set_user(own.user)
+        if self._password is not None:
+            client.set_password(self._password)
+        if own.security is not None:
+            files = f"{own.cert_file},{own.key_file}"
+            await client.set_security_string(f"{own.security},SignAndEncrypt,{files}")
+        return client
+
+    async def _on_lost(self, error: Exception) -> None:
+        self.lost(brief(error))
+
+    def _node(self, text: str) -> Any:
+        ua = self._asyncua.ua
+        try:
+            return ua.NodeId.from_string(text)
+        except ua.UaError as error:
+            raise InputError(
+                "sources.nodes",
+                expected='addresses of nodes, "ns=2;s=NAME" or "ns=2;i=NUMBER"',
+                got=f"{text!r} ({brief(error)})",
+                remedy="take them from a browser of the server",
+            ) from None
+
+    def _items(self, subscription: Any) -> list[Any]:
+        """What the server is asked for: each new value or time of each node."""
+        ua = self._asyncua.ua
+        items = []
+        for handle, node in enumerate(self._used, 1):
+            asked = ua.MonitoredItemCreateRequest()
+            asked.ItemToMonitor = ua.ReadValueId(NodeId=node, AttributeId=ua.AttributeIds.Value)
+            asked.MonitoringMode = ua.MonitoringMode.Reporting
+            asked.RequestedParameters = ua.MonitoringParameters(
+                ClientHandle=handle,
+                SamplingInterval=1000 * self._interval,
+                Filter=ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp),
+                QueueSize=QUEUE,
+                DiscardOldest=True,
+            )
+            items.append(asked)
+        return items
+
+    def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
+        """Take a value of a node."""
+        if self._ready:
+            self.back()
+        given = data.monitored_item.Value
+        stamp = given.SourceTimestamp or given.ServerTimestamp
+        at = (
+            0
+            if stamp is None
+            else nanoseconds(stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC))
+        )
+        if at <= 0:
+            return self.refuse(f"a value of {node} without a time")
+        found = float("nan")
+        if not given.StatusCode.is_bad():
+            if isinstance(value, bool | int | float):
+                found = float(value)
+            elif value is not None:
+                self.refuse(f"a value of {node} that is no number")
+        # A subscription begins with the present values, however old they are.
+        number = self._subscription.subscription_id
+        present = self._begun.get(node.nodeid) != number
+        self._begun[node.nodeid] = number
+        for asset, channel in self._used[node.nodeid]:
+            if present:
+                self._assemblies[asset].hold(channel, found)
+            else:
+                self._assemblies[asset].add(channel, at, found, time.monotonic())
+        return None

@@ -1,0 +1,281 @@
+"""Tables of samples that grow: which rows of a CSV or Parquet file were not read yet."""
+
+from __future__ import annotations
+
+import csv
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.cases.case import Case
+from retwin.cases.columns import ColumnRecords, number
+from retwin.checks import needs_extra, require
+from retwin.errors import InputError, brief
+from retwin.monitor.samples import nanoseconds
+from retwin.monitor.settings import FolderSource
+
+__all__ = ["Layout", "Rows", "Table", "layout_of", "table_at"]
+
+CHUNK = 2**16
+"""Bytes of a CSV file, and of one of its rows, that are read at once."""
+ROWS = 8192
+"""Rows of a Parquet file that are read at once."""
+TAIL = 256
+"""Bytes before the place up to which a file was read that are compared before it is read on."""
+NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where a table has the times, and each channel: the mean of its columns."""
+
+    time: str
+    unit: str
+    columns: tuple[tuple[str, ...], ...]
+
+    @property
+    def wanted(self) -> list[str]:
+        """All columns, that of the times first."""
+        return [self.time, *dict.fromkeys(each for own in self.columns for each in own)]
+
+    def nanoseconds(self, cell: str) -> int:
+        """The time in a cell, from 1970 on; ValueError if it is none."""
+        if self.unit == "iso":
+            time = datetime.fromisoformat(cell.strip())
+            return nanoseconds(time if time.tzinfo else time.replace(tzinfo=UTC))
+        found = Decimal(cell.strip()) * NANOSECONDS[self.unit]
+        if not abs(found) < 2**63:
+            raise ValueError("a time that is out of range")
+        return round(found)
+
+    def values(self, cells: Mapping[str, NDArray]) -> NDArray:
+        """The channels (n, d) of columns (n,)."""
+        found = [np.mean([cells[each] for each in own], axis=0) for own in self.columns]
+        made = np.array(found, dtype=float).reshape(len(self.columns), -1).T
+        return np.where(np.isfinite(made), made, np.nan)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of a table: times (n,) in ns, values (n, d), and why rows between them are no samples.
+
+    `end` is what the table continues from.
+    """
+
+    times: NDArray
+    values: NDArray
+    bad: list[str]
+    end: Any
+
+
+def layout_of(settings: FolderSource, channels: Sequence[str], case: Case | None) -> Layout:
+    """The columns of the settings, else those of the case's records, else names of the channels.
+
+    Raises
+    ------
+    InputError
+        A channel has no column, or there is another; or the records of the case differ.
+
+    """
+    records = case.records if case is not None else None
+    known = records.every_record if isinstance(records, ColumnRecords) else ()
+    columns = settings.columns or _same(
+        [dict(each.columns) for each in known], "columns", {name: name for name in channels}
+    )
+    require(
+        set(columns) == set(channels),
+        "sources.columns",
+        expected=f"a column for each of {', '.join(channels)}",
+        got=", ".join(columns),
+        remedy='write for each channel NAME = "COLUMN"',
+    )
+    clocks = [each.clock for each in known if each.clock is not None]
+    time = settings.time or _same([each.column for each in clocks], "time", "time")
+    unit = settings.unit or _same([each.unit for each in clocks], "unit", "s")
+    several = [columns[name] for name in channels]
+    return Layout(time, unit, tuple((e,) if isinstance(e, str) else tuple(e) for e in several))
+
+
+def table_at(path: Path, layout: Layout) -> Table:
+    """What reads that file, by its suffix."""
+    return (Parquet if path.suffix == ".parquet" else Csv)(path, layout)
+
+
+class Table(ABC):
+    """A file of rows that may grow, or be replaced by another one of that name.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    layout : Layout
+        Its columns.
+
+    """
+
+    def __init__(self, path: Path, layout: Layout) -> None:
+        self.path = path
+        self.layout = layout
+        self.place: Any = None
+        """How far it was read; None from its begin."""
+        self._seen: tuple[int, ...] = ()
+
+    def changed(self) -> bool:
+        """Whether the file was written to, or replaced, since this was last called."""
+        about = os.stat(self.path)
+        now = (about.st_ino, about.st_size, about.st_mtime_ns)
+        before, self._seen = self._seen, now
+        return before != now
+
+    @abstractmethod
+    def rows(self) -> Iterator[Rows]:
+        """New rows part by part; after each, set `place` to its end to have read it.
+
+        Where the file was replaced or truncated, or its begin was changed, all rows are new again.
+        Raises InputError where it is no table, or lacks a column.
+        """
+
+    def refusing(self, error: Exception) -> InputError:
+        """The error about a file that cannot be read."""
+        return InputError(
+            str(self.path),
+            expected=f"a table with columns {', '.join(self.layout.wanted)}",
+            got=f"{type(error).__name__}: {brief(error)}",
+            remedy="correct it, or name the columns as the file does",
+        )
+
+
+@dataclass(frozen=True)
+class _Place:
+    """How far a CSV file was read: bytes, those before, and the number of cells' columns."""
+
+    offset: int
+    tail: bytes
+    header: tuple[str, ...]
+
+
+class Csv(Table):
+    """A CSV file with a header. An incomplete last row waits for its end."""
+
+    def rows(self) -> Iterator[Rows]:
+        try:
+            with self.path.open("rb") as file:
+                place = self._kept(file)
+                while True:
+                    file.seek(place.offset if place else 0)
+                    chunk = file.read(CHUNK)
+                    text = chunk[: chunk.rfind(b"\n") + 1]
+                    if not text:
+                        if len(chunk) == CHUNK:
+                            raise ValueError(f"a row of more than {CHUNK} bytes")
+                        return
+                    made = self._parsed(text, place)
+                    yield made
+                    place = made.end
+        except (OSError, ValueError, csv.Error) as error:
+            if isinstance(error, InputError):
+                raise
+            raise self.refusing(error) from None
+
+    def _kept(self, file: Any) -> _Place | None:
+        """How far the file was read, if it still is the same up to there."""
+        place: _Place | None = self.place
+        if place is None:
+            return None
+        file.seek(place.offset - len(place.tail))
+        return place if file.read(len(place.tail)) == place.tail else None
+
+    def _parsed(self, text: bytes, place: _Place | None) -> Rows:
+        tail = ((place.tail if place else b"") + text)[-TAIL:]
+        offset = (place.offset if place else 0) + len(text)
+        lines = text.decode("utf-8", "replace").split("\n")
+        if place is None:
+            header = tuple(next(csv.reader([lines[0].removeprefix("\ufeff")])))
+            missing = [each for each in self.layout.wanted if each not in header]
+            if missing:
+                raise ValueError(f"no column {', '.join(missing)} in its header")
+            lines = lines[1:]
+        else:
+            header = place.header
+        at = {name: header.index(name) for name in self.layout.wanted}
+        times: list[int] = []
+        cells: list[list[float]] = []
+        bad: list[str] = []
+        clock = at.pop(self.layout.time)
+        for line in lines:
+            if not line.strip():
+                continue
+            try:
+                (row,) = csv.reader([line], strict=True)
+                if len(row) != len(header):
+                    raise ValueError(f"{len(row)} of {len(header)} cells")
+                found = [number(row[column]) for column in at.values()]
+                times.append(self.layout.nanoseconds(row[clock]))
+                cells.append(found)
+            except (ValueError, ArithmeticError, csv.Error) as error:
+                bad.append(f"{line[:80]!r} in {self.path.name} ({brief(error)})")
+        table = np.array(cells, dtype=float).reshape(len(cells), len(at))
+        values = self.layout.values(dict(zip(at, table.T, strict=True)))
+        stamps = np.array(times, dtype=np.int64)
+        return Rows(stamps, values, bad, _Place(offset, tail, header))
+
+
+class Parquet(Table):
+    """A Parquet file, which is written anew when it grows."""
+
+    def rows(self) -> Iterator[Rows]:
+        parquet = needs_extra("pyarrow.parquet", "parquet", "reads Parquet files")
+        try:
+            with parquet.ParquetFile(self.path) as file:
+                clock = file.read(columns=[self.layout.time]).column(0)
+                done, last = self.place or (0, None)
+                if done > len(clock) or (done and clock[done - 1].as_py() != last):
+                    done = 0  # another file
+                first = 0
+                for batch in file.iter_batches(ROWS, columns=self.layout.wanted):
+                    first, begin = first + batch.num_rows, first
+                    if first > done:
+                        part = batch.slice(max(0, done - begin))
+                        yield self._converted(part, (first, clock[first - 1].as_py()))
+        except Exception as error:  # of pyarrow, whose classes are many
+            if isinstance(error, InputError):
+                raise
+            raise self.refusing(error) from None
+
+    def _converted(self, batch: Any, end: Any) -> Rows:
+        cells = {
+            name: batch.column(name).cast("double").to_numpy(zero_copy_only=False).astype(float)
+            for name in self.layout.wanted[1:]
+        }
+        clock = batch.column(self.layout.time)
+        stamped = str(clock.type).startswith("timestamp")
+        if stamped:
+            clock = clock.cast("timestamp[ns]", safe=False).cast("int64")
+        times, kept, bad = [], [], []
+        for i, cell in enumerate(clock.to_pylist()):
+            try:
+                times.append(int(cell) if stamped else self.layout.nanoseconds(str(cell)))
+                kept.append(i)
+            except (ValueError, TypeError, ArithmeticError) as error:
+                bad.append(f"time {str(cell)[:80]!r} in {self.path.name} ({brief(error)})")
+        return Rows(np.array(times, dtype=np.int64), self.layout.values(cells)[kept], bad, end)
+
+
+def _same(found: list[Any], what: str, default: Any) -> Any:
+    """What all records of a case have in common, or the default where there are none."""
+    require(
+        all(each == found[0] for each in found),
+        f"sources.{what}",
+        expected=f"the {what} of the files",
+        got="none, and records of the case that differ in it",
+        remedy=f"give `{what}` in the source",
+    )
+    return found[0] if found else default

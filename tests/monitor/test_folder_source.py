@@ -1,0 +1,195 @@
+"""Samples from files that appear, grow, and are replaced."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pyarrow
+import pytest
+from collecting import CollectingGate, running, wait
+from pyarrow import parquet
+
+import retwin as rt
+from retwin.errors import InputError
+from retwin.monitor.settings import FolderSource
+from retwin.monitor.sources.folder import Folder
+from retwin.monitor.sources.tables import CHUNK, Layout, layout_of
+
+SECOND = 10**9
+CHANNELS = ("heater", "T1")
+HEADER = "time,heater,T1\n"
+
+
+def settings(pattern: object, **more: object) -> FolderSource:
+    given = {"type": "folder", "files": str(pattern), "every": 0.02, **more}
+    return FolderSource.model_validate(given)
+
+
+def source(folder: Path, lines: list[str], newest: int | None = None, **more: object) -> Folder:
+    own = settings(folder / "{asset}" / "*.csv", **more)
+    known = {} if newest is None else {"line1": newest}
+    return Folder(own, {"line1": layout_of(own, CHANNELS, None)}, known, lines.append)
+
+
+def seconds(gate: CollectingGate) -> list[float]:
+    return [each / SECOND for each in gate.order.get("line1", [])]
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    (tmp_path / "line1").mkdir()
+    return tmp_path / "line1"
+
+
+def test_files_appear_and_grow_and_only_complete_rows_count(logs: Path) -> None:
+    lines: list[str] = []
+    gate = CollectingGate()
+    (logs / "b.csv").write_text(HEADER + "10,1,20\n11,1,21\n12,")
+    (logs / "c.csv").write_text("\ufeffT1,other,time,heater\r\n5,x,7,True\r\n,x,8,0\r\n")
+    with running(source(logs.parent, lines), gate):
+        wait(lambda: len(seconds(gate)) == 4, lines)
+        assert seconds(gate) == [7, 8, 10, 11], "files in the order of their rows"
+        with (logs / "b.csv").open("a") as file:
+            file.write("0,nan\n13,1,inf\n\n14,1")
+        wait(lambda: len(seconds(gate)) == 6, lines)
+        (logs / "a.csv").write_text(HEADER + "20,1,1\n")
+        wait(lambda: seconds(gate)[-1] == 20, lines)
+    nan = float("nan")
+    expected = [[1, 5], [0, nan], [1, 20], [1, 21], [0, nan], [1, nan], [1, 1]]
+    np.testing.assert_array_equal(gate.values("line1"), expected)
+    assert len(lines) == 1
+
+
+def test_rows_that_cannot_be_read_are_counted_and_stop_nothing(logs: Path) -> None:
+    lines: list[str] = []
+    gate = CollectingGate()
+    hostile = ["x,1,2", "1,2", "1,1,\x1b[2J", "1,1,2,3", "nan,1,2", "1e30,1,2", "\x00,1,2"]
+    hostile.append('1,"1,2')
+    (logs / "a.csv").write_text(HEADER + "\n".join(hostile) + "\n9,1,2\n")
+    (logs / "none.csv").write_text("time,heater\n1,1\n")
+    (logs / "empty.csv").write_text("")
+    (logs / "long.csv").write_text("x" * (2 * CHUNK))
+    own = source(logs.parent, lines)
+    with running(own, gate):
+        wait(lambda: seconds(gate) == [9] and len(lines) == 4, lines)
+    assert own.refused == len(hostile) + 2
+    assert any("no column T1" in line for line in lines)
+
+
+@pytest.mark.parametrize("how", ["replaced", "truncated", "rewritten"])
+def test_a_file_that_is_another_one_is_read_from_its_begin(how: str, logs: Path) -> None:
+    lines: list[str] = []
+    gate = CollectingGate()
+    file = logs / "a.csv"
+    file.write_text(HEADER + "1,1,1\n2,1,2\n")
+    with running(source(logs.parent, lines), gate):
+        wait(lambda: seconds(gate) == [1, 2], lines)
+        if how == "replaced":
+            (logs / "new").write_text(HEADER + "1,1,1\n2,1,2\n3,1,3\n4,1,4\n")
+            os.replace(logs / "new", file)
+        elif how == "truncated":
+            file.write_text(HEADER + "3,1,3\n")
+        else:  # in place, to the same size and more
+            file.write_text("time,T1,heater\n4,4,1\n5,5,1\n6,6,1\n")
+        newest = {"replaced": 4, "truncated": 3, "rewritten": 6}[how]
+        wait(lambda: seconds(gate)[-1] == newest, lines)
+    assert gate.values("line1")[-1].tolist() == [1, newest]
+    if how == "replaced":
+        assert seconds(gate) == [1, 2, 3, 4], "what is the same is not read again"
+
+
+def test_after_a_restart_old_rows_are_left_out(logs: Path) -> None:
+    lines: list[str] = []
+    gate = CollectingGate()
+    rows = "".join(f"{number},1,{number}\n" for number in range(1, 201))
+    (logs / "a.csv").write_text(HEADER + rows)
+    with running(source(logs.parent, lines, newest=150 * SECOND), gate):
+        wait(lambda: bool(seconds(gate)) and seconds(gate)[-1] == 200, lines)
+    assert seconds(gate) == list(range(91, 201))
+
+
+def test_what_the_store_refuses_is_sent_again(logs: Path, monkeypatch) -> None:
+    monkeypatch.setattr("retwin.monitor.sources.source.AGAIN", 0.05)
+    lines: list[str] = []
+    gate = CollectingGate(failing=3)
+    (logs / "a.csv").write_text(HEADER + "1,1,1\n2,1,2\n")
+    with running(source(logs.parent, lines), gate):
+        wait(lambda: seconds(gate) == [1, 2], lines)
+        wait(lambda: len(lines) == 3, lines)
+    assert "not stored" in lines[1]
+    assert "stored again" in lines[2]
+
+
+def test_a_folder_that_is_away_is_lost_and_back(logs: Path) -> None:
+    lines: list[str] = []
+    gate = CollectingGate()
+    logs.rename(logs.parent / "away")
+    with running(source(logs.parent, lines), gate):
+        wait(lambda: "lost" in "".join(lines))
+        (logs.parent / "away").rename(logs)
+        (logs / "a.csv").write_text(HEADER + "1,1,1\n")
+        wait(lambda: seconds(gate) == [1], lines)
+    assert "back" in lines[1]
+
+
+def test_large_files_come_in_parts_with_their_times_exact(logs: Path) -> None:
+    lines: list[str] = []
+    gate = CollectingGate()
+    begin, count = 1_700_000_000_123_456_789, 20_000
+    rows = "".join(f"{begin + i},1,{i}\n" for i in range(count))
+    (logs / "a.csv").write_text(HEADER + rows)
+    with running(source(logs.parent, lines, unit="ns"), gate):
+        wait(lambda: len(seconds(gate)) == count, lines)
+    assert gate.order["line1"] == [begin + i for i in range(count)]
+
+
+def test_parquet_files_are_read_and_continued(tmp_path: Path) -> None:
+    lines: list[str] = []
+    gate = CollectingGate()
+    stamp = pyarrow.timestamp("us", tz="UTC")
+
+    def write(count: int) -> None:
+        times = pyarrow.array(range(0, count * 10**6, 10**6), stamp)
+        table = {"when": times, "a": [1.0] * count, "b": [None, *range(1, count)]}
+        parquet.write_table(pyarrow.table(table), tmp_path / "part")
+        os.replace(tmp_path / "part", tmp_path / "x.parquet")
+
+    columns = {"heater": "a", "T1": ["a", "b"]}
+    own = settings(tmp_path / "*.parquet", asset="line1", time="when", columns=columns)
+    write(3)
+    (tmp_path / "broken.parquet").write_bytes(b"PAR1")
+    layout = layout_of(own, CHANNELS, None)
+    with running(Folder(own, {"line1": layout}, {}, lines.append), gate):
+        wait(lambda: seconds(gate) == [0, 1, 2], lines)
+        write(5)
+        wait(lambda: len(seconds(gate)) == 5, lines)
+    assert seconds(gate) == [0, 1, 2, 3, 4]
+    np.testing.assert_array_equal(gate.values("line1")[:3], [[1, float("nan")], [1, 1], [1, 1.5]])
+    assert any("broken.parquet" in line for line in lines)
+
+
+def test_columns_are_those_of_the_case_unless_they_are_given() -> None:
+    case = rt.cases.get("incubator")
+    names = (*case.inputs.names, *case.outputs.names)
+    with pytest.raises(InputError, match="give `unit`"):
+        layout_of(settings("a.csv", asset="line1"), names, case)
+    found = layout_of(settings("a.csv", asset="line1", unit="ns"), names, case)
+    assert found == Layout("time", "ns", (("heater_on",), ("t1",), ("t2", "t3")))
+    with pytest.raises(InputError, match="a column for each of heater, room, air"):
+        layout_of(settings("a.csv", asset="line1", columns={"heater": "x"}), names, case)
+
+
+@pytest.mark.parametrize(
+    ("unit", "cell", "expected"),
+    [
+        ("s", "1700000000.123456789", 1_700_000_000_123_456_789),
+        ("ms", " 5 ", 5_000_000),
+        ("ns", "-7", -7),
+        ("iso", "1970-01-01T00:00:01", SECOND),
+        ("iso", "1970-01-01T01:00:01.000001+01:00", SECOND + 1000),
+    ],
+)
+def test_times_are_read_exactly(unit: str, cell: str, expected: int) -> None:
+    assert Layout("time", unit, ()).nanoseconds(cell) == expected
