@@ -73,6 +73,7 @@ BASE = {
     "fit": "reach.toml --real real.npz --simulations 20",
     "generate": "model --case reach.toml --per-class 1",
     "monitor demo": "--seconds 1 --port 0",
+    "monitor audit": "alarms.jsonl",
     "monitor fit": "model real.npz",
     "monitor replay": "model real.npz",
     "study": "reach.toml --real real.npz --folds 2 --sources dt,ibg --runs 1 --per-class 5",

@@ -23,6 +23,7 @@ def together(samples: Path, tmp_path: Path) -> Path:
     shutil.copy(samples / "npz" / "a.npz", folder / "real.npz")
     shutil.copy(samples / "case" / "case.toml", folder / "reach.toml")
     shutil.copy(samples / "case" / "own_of_mutations.py", folder)
+    (folder / "alarms.jsonl").touch()  # a log without entries
     return folder
 
 

@@ -1,7 +1,8 @@
-"""`retwin monitor`: calibrate a monitor of a corrected twin, and replay records through it."""
+"""`retwin monitor`: calibrate a monitor of a twin, replay records, and verify logs."""
 
 from __future__ import annotations
 
+import re
 import secrets
 import tempfile
 import threading
@@ -17,7 +18,7 @@ from retwin import catalog
 from retwin.checks import finite, positive, require
 from retwin.cli.options import Json, MaxBytes, OtherCase
 from retwin.cli.reading import case_named, read, saved
-from retwin.cli.terminal import answer, bar, example, note, table
+from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.serialisation.models import kind_of
 from retwin.serialisation.places import check_place
@@ -249,6 +250,46 @@ def demo(
         if open_page:
             webbrowser.open(address)
         threading.Event().wait(seconds)
+
+
+@app.command(epilog=example("retwin monitor audit store"))
+def audit(
+    store: Annotated[
+        Path, typer.Argument(metavar="STORE", help="Folder of the store, or an exported log.")
+    ],
+    head: Annotated[
+        str | None, typer.Option(metavar="HASH", help="A former head that was kept elsewhere.")
+    ] = None,
+    url: Annotated[str, typer.Option(metavar="URL", help="The PostgreSQL database, if one.")] = "",
+    as_json: Json = False,
+) -> None:
+    """Verify the log of a store, and the files of its versions."""
+    from retwin.monitor import Store, read_log, verify
+    from retwin.monitor.registry import damaged
+
+    require(
+        head is None or re.fullmatch("[0-9a-f]{64}", head),
+        "--head",
+        expected="64 hexadecimal digits",
+        got=repr(head)[:80],
+        remedy="give the head that this command printed",
+    )
+    if store.is_file():
+        found, reason = verify(read_log(store), head), ""
+    else:
+        with Store(saved(store), url, read_only=True) as opened:
+            found = verify(opened.log(), head)
+            reason = "" if found.reason else damaged(opened)
+    reason = found.reason or reason
+    answer(
+        {"ok": not reason, "entries": found.intact, "head": found.head, "reason": reason},
+        f"{found.intact} entries are intact.",
+        f"Head: {found.head}",
+        as_json=as_json,
+    )
+    if reason:
+        complain(reason)
+        raise typer.Exit(BAD_INPUT)
 
 
 def _healthy(record: Trajectories, file: Path) -> Trajectories:
