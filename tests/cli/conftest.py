@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import pytest
@@ -93,12 +94,14 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
 class Running:
     """`retwin …` in a process of its own, which Ctrl-C reaches."""
 
-    def __init__(self, words: tuple[object, ...], stderr: Path) -> None:
+    def __init__(
+        self, words: tuple[object, ...], stderr: Path, stdout: int | IO = subprocess.PIPE
+    ) -> None:
         self._stderr = stderr
         with stderr.open("w") as file:
             self.process = subprocess.Popen(
                 [PROGRAM, *map(str, words)],
-                stdout=subprocess.PIPE,
+                stdout=stdout,
                 stderr=file,
                 text=True,
                 start_new_session=True,
@@ -140,8 +143,8 @@ def start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Ru
     """Start `retwin …` as a process of its own."""
     begun: list[Running] = []
 
-    def run(*words: object) -> Running:
-        begun.append(Running(words, tmp_path_factory.mktemp("output") / "stderr"))
+    def run(*words: object, **more: object) -> Running:
+        begun.append(Running(words, tmp_path_factory.mktemp("output") / "stderr", **more))
         return begun[-1]
 
     yield run

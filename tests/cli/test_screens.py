@@ -22,6 +22,7 @@ from retwin.cli.terminal import answer, bar, be_quiet, note, show_warnings, tabl
 WITHOUT_TABLES = {
     *("data convert", "data split", "data fetch", "twin simulate", "twin animate"),
     *("diagnose fit", "diagnose invert", "bundle save", "bundle generate", "generate", "report"),
+    "monitor run",
 }
 """Commands that print a line at most; all others have --json."""
 

@@ -1,9 +1,10 @@
-"""`retwin monitor`: calibrate a monitor of a twin, replay records, and verify logs."""
+"""`retwin monitor`: calibrate a monitor of a twin, replay records, and watch running machines."""
 
 from __future__ import annotations
 
 import re
 import secrets
+import signal
 import tempfile
 import threading
 import webbrowser
@@ -250,6 +251,27 @@ def demo(
         if open_page:
             webbrowser.open(address)
         threading.Event().wait(seconds)
+
+
+@app.command(epilog=example("retwin monitor run --config monitor.toml"))
+def run(
+    config: Annotated[
+        Path, typer.Option(metavar="FILE", help="Machines, twins and sources, as TOML.")
+    ] = Path("monitor.toml"),
+) -> None:
+    """Watch running machines, until Ctrl-C or SIGTERM."""
+    from retwin.monitor.program import run as watch
+    from retwin.monitor.settings import read_settings
+
+    settings, stop = read_settings(config), threading.Event()
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
+    try:
+        watch(settings, lambda line: answer(None, line), stop)
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+    note("Stopped; everything that was acknowledged is stored.")
 
 
 @app.command(epilog=example("retwin monitor audit store"))

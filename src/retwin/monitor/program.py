@@ -1,0 +1,224 @@
+"""The monitor beside running machines, as a monitor.toml describes it, until it is stopped."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from functools import partial
+from typing import Any
+
+from retwin import cases
+from retwin.cases.case import Case
+from retwin.errors import InputError
+from retwin.monitor.audit import Entry
+from retwin.monitor.explanations import Explanations
+from retwin.monitor.gate import Gate
+from retwin.monitor.live import Live
+from retwin.monitor.monitor import Monitor
+from retwin.monitor.registry import Registry
+from retwin.monitor.samples import SECOND
+from retwin.monitor.server import create_app, listening, serving
+from retwin.monitor.settings import (
+    FolderSource,
+    MonitorSettings,
+    MqttSource,
+    ServerSettings,
+    TwinSettings,
+    secret,
+)
+from retwin.monitor.sources.folder import Folder
+from retwin.monitor.sources.mqtt import Mqtt
+from retwin.monitor.sources.opcua import OpcUa
+from retwin.monitor.sources.source import Source
+from retwin.monitor.sources.tables import layout_of
+from retwin.monitor.store import Store
+from retwin.serialisation.files import sha256
+from retwin.twins.faults import Fault
+
+__all__ = ["described", "run"]
+
+INTERVAL = 0.5
+"""Seconds after which new entries of the log are reported."""
+
+UNEXPLAINED = 0.5
+"""Probability from which on it is reported that a cause does not explain all."""
+
+
+def run(settings: MonitorSettings, report: Callable[[str], None], stop: threading.Event) -> None:
+    """Watch the machines until `stop` is set; what was acknowledged is durable then.
+
+    The monitor of a twin without versions is proposed and promoted. If it differs from all versions
+    there are, it is proposed, and that is reported.
+
+    Parameters
+    ----------
+    settings : MonitorSettings
+        Machines, twins and sources.
+    report : callable
+        Takes a line about each alarm, cause, change of the promise, event, and lost source.
+    stop : Event
+        Ends it.
+
+    Raises
+    ------
+    InputError
+        A monitor cannot be read, a source does not suit it, the store cannot be opened, the port is
+        in use, a secret is missing, or a package of an extra.
+
+    """
+    with ExitStack() as opened:
+        bound = settings.server and opened.enter_context(_bound(settings.server))
+        for twin in settings.twins.values():
+            Monitor.load(twin.monitor)
+        store = Store(settings.store, settings.url, max_samples=settings.max_samples)
+        opened.enter_context(store)
+        for name, twin in settings.twins.items():
+            _offer(Registry(store, name), twin, report)
+        live = Live(store, wait=settings.wait, ahead=settings.ahead)
+        for name, asset in settings.assets.items():
+            live.add(name, asset.twin)
+        news = _News(store, report)
+        opened.callback(news.read)
+        twins = {each.twin: live.monitor(name) for name, each in settings.assets.items()}
+        systems = {name: _case(settings.twins[name], each) for name, each in twins.items()}
+        explanations = Explanations(live, lambda twin: _faults(systems.get(twin)))
+        opened.enter_context(explanations)
+        gate = opened.enter_context(Gate(live))
+        sources = [_source(each, settings, live, systems, report) for each in settings.sources]
+        if settings.server and bound:
+            app = create_app(
+                live,
+                gate,
+                token=_token(settings.server),
+                hosts=settings.server.hosts,
+                explanations=explanations,
+                sources={each.name: partial(getattr, each, "connected") for each in sources},
+            )
+            opened.enter_context(serving(app, bound))
+            host, port = bound.getsockname()[:2]
+            report(f"page: http://{f'[{host}]' if ':' in host else host}:{port}/")
+        for each in sources:
+            thread = threading.Thread(target=each.keep_running, args=(gate, stop), name=each.name)
+            thread.start()
+            opened.callback(thread.join)
+        opened.callback(stop.set)
+        report(f"watching {', '.join(settings.assets)}")
+        while not stop.wait(INTERVAL):
+            news.read()
+
+
+def described(entry: Entry) -> str:
+    """An entry of the log in a line; "" for one that is not reported."""
+    data = entry.data
+    if entry.kind == "version":
+        reason = f": {data['reason']}" if data.get("reason") else ""
+        return f"twin {data['twin']}: {data['step']} version {data['version']}{reason}"
+    if entry.kind == "cause":
+        onset = data["onset"][0]
+        since = "" if onset is None else f" from {_moment(onset)}"
+        more = ", and more than that" if data["unknown"] > UNEXPLAINED else ""
+        text = f"cause of alarm {data['alarm']}: {data['name']}{since}{more}"
+        return f"{data['asset']}: {text} (probability {data['probability']:.2f})"
+    texts = {
+        "alarm": "ALARM {sequence}: {output}, {change}",
+        "void": "promise VOID: the machine is not the one of the calibration, so calibrate again",
+        "event": "{text}",
+    }
+    if entry.kind not in texts:
+        return ""
+    text = texts[entry.kind].format(sequence=entry.sequence, **data)
+    return f"{data['asset']}: {text} ({_moment(data['time'])})"
+
+
+def _moment(time: int) -> str:
+    """A time in ns, to the second."""
+    moment = datetime.fromtimestamp(time // SECOND, UTC)
+    return moment.isoformat().replace("+00:00", "Z")
+
+
+class _News:
+    """Reports the entries that are new in the log."""
+
+    def __init__(self, store: Store, report: Callable[[str], None]) -> None:
+        self._store = store
+        self._report = report
+        newest = deque(store.log(), maxlen=1)
+        self._last = newest[0].sequence if newest else -1
+        self._failed = False
+
+    def read(self) -> None:
+        """Report them; a store that cannot be read is reported once, and read again later."""
+        try:
+            for entry in self._store.log(after=self._last):
+                line = described(entry)
+                if line:
+                    self._report(line)
+                self._last = entry.sequence
+        except InputError as error:
+            if not self._failed:
+                self._report(str(error))
+            self._failed = True
+        else:
+            self._failed = False
+
+
+def _offer(registry: Registry, twin: TwinSettings, report: Callable[[str], None]) -> None:
+    """Make the monitor of a twin its first version, or propose it if it is a new one."""
+    folder, versions = twin.monitor.resolve(), registry.versions()
+    if sha256(folder) not in [each.digest for each in versions]:
+        made = registry.propose(folder, f"the folder {twin.monitor.name} at the start")
+        if versions:
+            active = registry.active
+            report(
+                f"twin {registry.twin}: {twin.monitor} has changed and is version {made.number} "
+                f"now, which is only proposed; version {active.number if active else 0} watches"
+            )
+    if registry.active is None and not versions:
+        registry.promote(1)
+        report(f"twin {registry.twin}: {twin.monitor} is version 1")
+
+
+def _bound(server: ServerSettings) -> socket.socket:
+    """The socket of the page; InputError if its token is missing or its port is in use."""
+    _token(server)
+    return listening(server.host, server.port)
+
+
+def _token(server: ServerSettings) -> str | None:
+    return secret("token", server.token_env, server.token_file)
+
+
+def _source(
+    settings: Any,
+    whole: MonitorSettings,
+    live: Live,
+    systems: Mapping[str, Case | None],
+    report: Callable[[str], None],
+) -> Source:
+    """What reads a source."""
+    channels = {name: live.channels(name) for name in whole.assets}
+    if isinstance(settings, MqttSource):
+        return Mqtt(settings, channels, report)
+    if isinstance(settings, FolderSource):
+        names = [settings.asset] if settings.asset else list(whole.assets)
+        layouts = {
+            name: layout_of(settings, channels[name], systems[whole.assets[name].twin])
+            for name in names
+        }
+        newest = {each.asset: each.time for each in live.status() if each.time is not None}
+        return Folder(settings, layouts, newest, report)
+    rates = {name: live.monitor(name).twin.rate for name in whole.assets}
+    return OpcUa(settings, channels, rates, report)
+
+
+def _faults(case: Case | None) -> dict[str, Fault | None] | None:
+    return None if case is None else dict(case.alarm_causes)
+
+
+def _case(twin: TwinSettings, monitor: Monitor) -> Case | None:
+    name = twin.case or monitor.twin.case
+    return cases.get(name) if name else None
