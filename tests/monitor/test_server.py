@@ -78,11 +78,12 @@ def test_an_alarm_has_a_cause_and_is_acknowledged(client: httpx.Client, server: 
     assert "The parameter drain" in first["cause"]["check"]
     around = client.get(f"/alarms/{first['sequence']}/samples").json()
     assert around["times"][0] < first["time"] < around["times"][-1]
-    path = f"/alarms/{first['sequence']}/acknowledge"
+    path = f"/alarms/{whole[0]['sequence']}/acknowledge"  # the newest, and so all before it
     note = {"who": "<b>me</b>", "note": "closed the valve"}
     assert client.post(path, json=note).status_code == 200
     found = client.get(f"/alarms/{first['sequence']}").json()["acknowledged"]
     assert {key: found[key] for key in note} == note
+    assert client.get("/assets").json()["assets"][0]["state"] != "alarm"
     assert client.post("/alarms/9999/acknowledge", json=note).status_code == 400
     assert verify(server.store.log()).ok
 

@@ -87,10 +87,13 @@ class Journal:
             yield
 
     def _add(self, entry: Entry, data: Mapping[str, Any]) -> None:
-        if entry.kind in ("cause", "acknowledge"):
-            alarm = self._alarms.get(data["alarm"])
-            if alarm is not None:
-                alarm["cause" if entry.kind == "cause" else "acknowledged"] = dict(data)
+        alarm = self._alarms.get(data["alarm"]) if entry.kind in ("cause", "acknowledge") else None
+        if alarm is not None and entry.kind == "cause":
+            alarm["cause"] = dict(data)
+        elif alarm is not None:  # it is for the earlier ones of the asset too
+            for sequence, each in self._alarms.items():
+                if sequence <= data["alarm"] and each["asset"] == alarm["asset"]:
+                    each["acknowledged"] = each["acknowledged"] or dict(data)
         elif entry.kind in ("alarm", "void", "event"):
             require(
                 {"asset", "time"} <= data.keys(),

@@ -408,7 +408,7 @@
   const acknowledge = (found) => {
     const who = h("input", { autocomplete: "name", maxlength: 200 });
     const note = h("textarea", { maxlength: 2000 });
-    return h("section", { class: "card" }, h("h2", {}, "Acknowledge"), h("label", {}, "Your name", who), h("label", {}, "What was found", note),
+    return h("section", { class: "card" }, h("h2", {}, "Acknowledge"), h("p", { class: "quiet" }, "It is for this alarm and for earlier ones of this machine."), h("label", {}, "Your name", who), h("label", {}, "What was found", note),
       h("p", { class: "buttons" }, action("Acknowledge", `/alarms/${found.sequence}/acknowledge`, () => ({ who: who.value, note: note.value }), { first: true })));
   };
   const around = async (place, found) => {
