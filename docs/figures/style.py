@@ -25,6 +25,7 @@ __all__ = [
     "note",
     "save",
     "title",
+    "write",
 ]
 
 INK, MUTED, RULE = map(hexadecimal, ("ink", "muted", "rule"))
@@ -59,6 +60,11 @@ def save(name: str, figure: Figure, whose: str) -> None:
     figure.suptitle(whose, fontsize=9, color=MUTED, x=0.01, ha="left")
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=120, metadata={"Software": None})
+    write(name, file)
+
+
+def write(name: str, file: io.BytesIO) -> None:
+    """docs/images/NAME.png of a picture in memory, with few colours."""
     IMAGES.mkdir(exist_ok=True)
     image = Image.open(file).convert("RGB").quantize(COLOURS)
     image.save(IMAGES / f"{name}.png", optimize=True)
