@@ -285,6 +285,27 @@ def test_no_request_is_an_error_of_the_server(
         assert "\n" not in answer.json()["error"]
 
 
+@pytest.mark.parametrize(
+    "path", ["/assets/%ff", "/assets/%ed%a0%80", "/versions/%00", "/alarms/1e3"]
+)
+def test_names_that_are_no_text_are_refused(client: httpx.Client, path: str) -> None:
+    answer = client.get(path)
+    assert 400 <= answer.status_code < 500
+    assert answer.json()["error"]
+
+
+@pytest.mark.parametrize(
+    "text", ['"\\ud800"', '"\\u0000"', '"\\u202e<b>"', "1e999", "[[]]", '"' + "x" * 3000 + '"']
+)
+def test_odd_notes_are_stored_or_refused(client: httpx.Client, text: str) -> None:
+    (alarm, *_) = client.get("/alarms").json()["alarms"]
+    body = f'{{"who": "me", "note": {text}}}'.encode()
+    kind = {"content-type": "application/json"}
+    answer = client.post(f"/alarms/{alarm['sequence']}/acknowledge", content=body, headers=kind)
+    assert answer.status_code in (200, 400, 422)
+    assert client.get("/alarms").status_code == 200
+
+
 def test_a_port_in_use_is_an_error_in_one_line(server: Served) -> None:
     port = int(server.url.rpartition(":")[2])
     with pytest.raises(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Collection, Mapping
@@ -11,6 +12,7 @@ from importlib import resources
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+from pydantic_core import to_jsonable_python
 
 from retwin._version import __version__
 from retwin.checks import needs_extra, require
@@ -49,9 +51,16 @@ FILES = {
 }
 """The files of the page and their types; the style sheet is made from the report's colours."""
 
-JSON = fastapi.responses.JSONResponse
 Sequence = Annotated[int, fastapi.Path(ge=0, lt=2**63)]
 Number = Annotated[int, fastapi.Path(ge=1, lt=2**31)]
+
+
+class JSON(fastapi.responses.JSONResponse):
+    """An answer in ASCII, with null for numbers that JSON does not have."""
+
+    def render(self, content: Any) -> bytes:
+        """The bytes of the answer; texts may contain halves of surrogate pairs."""
+        return json.dumps(to_jsonable_python(content, inf_nan_mode="null")).encode()
 
 
 class Acknowledgement(BaseModel):

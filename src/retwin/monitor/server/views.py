@@ -1,4 +1,4 @@
-"""What the page shows, as plain values for JSON: times in s since the epoch, None for no number."""
+"""What the page shows, as plain values: times in s since the epoch, NaN for what is missing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from retwin.checks import require
 from retwin.data.trajectories import Channels
@@ -101,7 +100,7 @@ class Views:
                 self._explained(each, twins) if each["kind"] == "alarm" else each
                 for each in self.journal.events(name)
             ],
-            "evidence": plain(recent.evidence[new]),
+            "evidence": recent.evidence[new].tolist(),
             **_drawn(monitor, recent, new),
         }
 
@@ -200,23 +199,16 @@ def _drawn(monitor: Monitor, recent: Recent, part: slice) -> dict[str, Any]:
         "inputs": _named(monitor.twin.inputs),
         "outputs": _named(monitor.twin.outputs),
         "times": (recent.times[part] / SECOND).tolist(),
-        "commands": plain(recent.commands[part]),
-        "measured": plain(recent.measured[part]),
-        "mean": plain(mean),
-        "low": plain(mean - half),
-        "high": plain(mean + half),
+        "commands": recent.commands[part].tolist(),
+        "measured": recent.measured[part].tolist(),
+        "mean": mean.tolist(),
+        "low": (mean - half).tolist(),
+        "high": (mean + half).tolist(),
     }
 
 
 ORDER = ("alarm", "void", "stopped", "rate", "outside", "ok")
 """The states of assets, the worst first."""
-
-
-def plain(values: NDArray) -> list[Any]:
-    """An array as lists, with None for what is not finite."""
-    made = values.astype(object)
-    made[~np.isfinite(values)] = None
-    return list(made.tolist())
 
 
 def _named(channels: Channels) -> list[tuple[str, str]]:
