@@ -245,7 +245,7 @@ def test_the_compiled_filter_and_process_noise_are_those_of_torch(
     commands, theta = forces(2, 3, samples=40), np.tile(twin.values({"cubic": 90.0}, 1), (2, 1))
     kicks = 0.01 * rng.normal(size=(2, 40, 2))
     spread = np.tile([[0.1, 0.05], [0.05, 0.2]], (2, 1, 1))
-    variances = np.array([1e-4, 1e-3]), np.array([1e-4])
+    variances = 1e-3 * rng.random((2, 40, 2)), np.array([1e-4])
 
     def both() -> list[np.ndarray]:
         made = twin.steps().run(commands, theta, kicks)

@@ -125,15 +125,15 @@ EXPORT void sensitivities(long long n, long long samples, long long substeps, do
     }
 }
 
-/* Extended Kalman filter. Variances of the process noise of a sample q[NX] and of the measurement
- * r[NY]; covariance of the states spread[n][NX][NX], at the first sample before it is measured, which
- * becomes that after the last one; outputs with an error of more than *gate standard deviations are
- * not used; measured y[n][samples][NY], of which seen[n][samples][NY] is not 0; to
+/* Extended Kalman filter. Variances of the measurement noise r[NY], and of the process noise
+ * q[n][samples][NX] after each sample; covariance of the states spread[n][NX][NX], at the first sample
+ * before it is measured, which becomes that after the last one; outputs with an error of more than
+ * *gate standard deviations are not used; measured y[n][samples][NY], of which seen[n][samples][NY] is not 0; to
  * mean[n][samples][NY] and covariance[n][samples][NY][NY] of y given all earlier samples, and to
  * x[n][samples][NX] given these and the present one; `changes` as for `simulate`. */
 EXPORT void filter(long long n, long long samples, long long substeps, double period,
-                   const double *q, const double *r, const double *gate, const double *c,
-                   const double *p, const double *start, const double *y, const double *seen,
+                   const double *r, const double *gate, const double *c, const double *p,
+                   const double *start, const double *q, const double *y, const double *seen,
                    const double *changes, double *spread, double *mean, double *covariance,
                    double *x)
 {
@@ -199,7 +199,7 @@ EXPORT void filter(long long n, long long samples, long long substeps, double pe
                             P[i][j] += FP[i][k] * F[j * NX + k];
                     }
             }
-            c += 4 * NU, y += NY, seen += NY, mean += NY, covariance += NY * NY, x += NX;
+            c += 4 * NU, q += NX, y += NY, seen += NY, mean += NY, covariance += NY * NY, x += NX;
         }
         for (int i = 0; i < NX; i++)
             for (int j = 0; j < NX; j++)

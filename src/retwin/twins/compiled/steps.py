@@ -48,21 +48,24 @@ class Steps:
         theta: NDArray,
         kicks: NDArray | None = None,
         changes: NDArray | None = None,
+        first: int = 0,
     ) -> tuple[NDArray, NDArray]:
         """Outputs (n, T, d_y) and states (n, T, d_x) for commands (n, T, d_u).
 
         `kicks` (n, T, d_x), contiguous, are added to the states after each sample: process noise.
-        `changes` (n, T, q), contiguous, are added to the q parameters until the next sample.
+        `changes` (n, T, q), contiguous, are added to the q parameters until the next sample. So
+        many commands as `first` are before the first sample; the interpolation passes through them.
         """
         library = compiled(self.model.source)
         if library is None:
             with torch.no_grad():
-                outputs, states = self.in_torch(_double(commands), _double(theta), kicks, changes)
+                inputs, values = _double(commands), _double(theta)
+                outputs, states = self.in_torch(inputs, values, kicks, changes, first)
             return outputs.numpy(), states.numpy()
-        made = tuple(np.empty((*commands.shape[:2], width)) for width in self._widths)
-        sizes = (*commands.shape[:2], self.substeps)
-        given = self._arrays(commands, theta)
-        call(library, "simulate", sizes, self.period, (), (*given, kicks, changes, *made))
+        shape = len(commands), commands.shape[1] - first
+        made = tuple(np.empty((*shape, width)) for width in self._widths)
+        given = (*self._arrays(commands, theta, first), kicks, changes, *made)
+        call(library, "simulate", (*shape, self.substeps), self.period, (), given)
         return made[0], made[1]
 
     def filter(
@@ -80,19 +83,17 @@ class Steps:
 
         Parameters
         ----------
-        commands, theta, changes : NDArray
+        commands, theta, changes, first
             See `run`.
         measured : tuple of NDArray
             Outputs (n, T, d_y), and whether each was measured.
         spread : NDArray
             Covariances (n, d_x, d_x) of the states at the first sample, before it is measured.
-        first : int
-            Number of commands before the first sample, through which the interpolation passes.
         gate : float
             An output with an error of more standard deviations than this is not used.
         variances : tuple of NDArray
-            Of the process noise that each sample adds (d_x,), and of the measurement noise (d_y,),
-            above 0.
+            Of the process noise after each sample, (d_x,) or (n, T, d_x), and of the measurement
+            noise (d_y,), above 0.
 
         Returns
         -------
@@ -104,19 +105,21 @@ class Steps:
         """
         library = compiled(self.model.source)
         shape = len(commands), commands.shape[1] - first
-        common = (*variances, np.array([gate]))
         outputs, states = self._widths
+        process, common = variances[0], (variances[1], np.array([gate]))
+        process = np.broadcast_to(process, (*shape, states))
         if library is None:
-            return self._filtered(commands, theta, measured, spread, common, changes, first)
+            given = (process, measured, changes, spread)
+            return self._filtered(commands, theta, given, common, first)
         after = np.array(spread, np.float64)
         made = tuple(
             np.empty((*shape, *each)) for each in ((outputs,), (outputs, outputs), (states,))
         )
         shared, seen = (
-            [np.ascontiguousarray(each, np.float64) for each in own] for own in (common, measured)
+            [np.ascontiguousarray(each, np.float64) for each in own]
+            for own in (common, (process, *measured))
         )
-        c, *values = self._arrays(commands, theta)
-        rows = (np.ascontiguousarray(c[:, first:]), *values, *seen, changes, after, *made)
+        rows = (*self._arrays(commands, theta, first), *seen, changes, after, *made)
         call(library, "filter", (*shape, self.substeps), self.period, shared, rows)
         return made[0], made[1], made[2], after
 
@@ -124,19 +127,18 @@ class Steps:
         self,
         commands: NDArray,
         theta: NDArray,
-        measured: tuple[NDArray, NDArray],
-        spread: NDArray,
-        common: tuple[NDArray, NDArray, NDArray],
-        changes: NDArray | None,
+        given: tuple[NDArray, tuple[NDArray, NDArray], NDArray | None, NDArray],
+        common: tuple[NDArray, NDArray],
         first: int,
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """See `filter`, for one trajectory after the other."""
         c = cubic_coefficients(_double(commands), self.interpolation)[:, first:].numpy()
+        process, measured, changes, spread = given
         if changes is None:
             changes = np.zeros((*c.shape[:2], len(self.model.variables["p"])))
         rows = [
             self._filtered_row(*(_double(each) for each in row), *map(_double, common))
-            for row in zip(c, theta, *measured, changes, spread, strict=True)
+            for row in zip(c, theta, process, *measured, changes, spread, strict=True)
         ]
         mean, covariance, states, after = (np.stack(each) for each in zip(*rows, strict=True))
         return mean, covariance, states, after
@@ -145,11 +147,11 @@ class Steps:
         self,
         c: Tensor,
         theta: Tensor,
+        process: Tensor,
         outputs: Tensor,
         seen: Tensor,
         changes: Tensor,
         spread: Tensor,
-        process: Tensor,
         noise: Tensor,
         gate: Tensor,
     ) -> list[NDArray]:
@@ -182,7 +184,7 @@ class Steps:
             if t + 1 < len(outputs):
                 forward = torch.autograd.functional.jacobian(after, x)
                 x = after(x)
-                spread = forward @ spread @ forward.T + torch.diag(process)
+                spread = forward @ spread @ forward.T + torch.diag(process[t])
         stacked = [torch.stack(each).numpy() for each in zip(*made, strict=True)]
         return [*stacked, spread.numpy()]
 
@@ -212,9 +214,10 @@ class Steps:
         theta: Tensor,
         kicks: NDArray | None = None,
         changes: NDArray | None = None,
+        first: int = 0,
     ) -> tuple[Tensor, Tensor]:
         """The same as `run` for double tensors, with gradient by both."""
-        c = cubic_coefficients(commands, self.interpolation)
+        c = cubic_coefficients(commands, self.interpolation)[:, first:]
         p, start = self._parted(theta.unbind(1))
         constant = p
         x, outputs, states = list(start), [], []
@@ -251,9 +254,9 @@ class Steps:
             ]
         return x
 
-    def _arrays(self, commands: NDArray, theta: NDArray) -> list[NDArray]:
+    def _arrays(self, commands: NDArray, theta: NDArray, first: int = 0) -> list[NDArray]:
         """Coefficients of the commands, parameters and starts, as the compiled model takes them."""
-        c = cubic_coefficients(_double(commands), self.interpolation).numpy()
+        c = cubic_coefficients(_double(commands), self.interpolation)[:, first:].numpy()
         columns = self._parted(list(theta.T))
         starts = [np.stack(own, 1) if own else np.zeros((len(theta), 0)) for own in columns]
         return [np.ascontiguousarray(each, np.float64) for each in (c, *starts)]
