@@ -52,7 +52,7 @@ ROWS = 256
 NOTHING = np.full(3, np.nan)
 """The size, onset and end of no fault."""
 
-_Noise = tuple[NDArray, NDArray]
+_Noise = tuple[NDArray | float, NDArray | float]
 _Given = tuple[NDArray, NDArray, NDArray, NDArray | None]
 
 
@@ -124,10 +124,7 @@ class FaultEvidence:
         if fault is None or not np.isfinite(found.evidence):
             return found
         states, outputs = self._effect(fault, found.best)
-        noise = (
-            self.twin.process + (TOLERANCE * states) ** 2,
-            self.twin.noise + (TOLERANCE * outputs) ** 2,
-        )
+        noise = ((TOLERANCE * states) ** 2, (TOLERANCE * outputs) ** 2)
         gain = self._gain(fault, found.best, noise, self._slopes(noise))
         return replace(found, evidence=found.evidence + float(np.logaddexp(0, gain) - np.log(2)))
 
@@ -147,9 +144,9 @@ class FaultEvidence:
     def _gain(
         self, fault: TimedFault | None, point: NDArray, noise: _Noise, slopes: NDArray
     ) -> float:
-        """By how much another noise, with the slopes of its filter, raises a log density."""
+        """By how much more noise, with the slopes of its filter, raises a log density."""
         given, _ = self._inputs(fault, point[None])
-        more = self._log_density(*given, noise=noise, slopes=slopes)
+        more = self._log_density(*given, more=noise, slopes=slopes)
         less = self._log_density(*given, slopes=self._by_parameters)
         return float(more[0] - less[0]) if np.isfinite(more[0]) else -np.inf
 
@@ -166,13 +163,13 @@ class FaultEvidence:
         return tuple(np.sqrt(np.mean(each**2, axis=0)) for each in both)
 
     def _noises(self) -> list[_Noise]:
-        """Variances of process and measurement noise, of which one is larger than the twin's."""
+        """Variances that are added to those of process or measurement noise."""
         twin = self.twin
         step = twin.domain.speed if twin.equations.step else twin.domain.speed / twin.rate
         columns = zip(self.measured.T, self.seen.T, strict=True)
         usual = np.array([own[seen].std() if seen.any() else 0.0 for own, seen in columns])
-        more = [(twin.process + (level * step) ** 2, twin.noise) for level in LEVELS]
-        return more + [(twin.process, twin.noise + (level * usual) ** 2) for level in LEVELS]
+        more: list[_Noise] = [((level * step) ** 2, 0.0) for level in LEVELS]
+        return more + [(0.0, (level * usual) ** 2) for level in LEVELS]
 
     def _under(self, fault: TimedFault | None, points: NDArray) -> NDArray:
         """Log likelihoods (J,) under a fault of these sizes, onsets and ends (J, 3), in samples."""
@@ -226,7 +223,7 @@ class FaultEvidence:
         changes: NDArray | None,
         *,
         slopes: NDArray,
-        noise: _Noise | None = None,
+        more: _Noise = (0.0, 0.0),
     ) -> NDArray:
         """Log densities (J,) of what was measured; minus infinity where they are not finite.
 
@@ -234,7 +231,7 @@ class FaultEvidence:
         linearly, with `slopes` (T, d_y, r), those of the healthy system.
         """
         mean, covariance, _ = self.twin.filter(
-            commands, measured, seen, changes=changes, noise=noise, known_start=self.known_start
+            commands, measured, seen, changes=changes, more=more, known_start=self.known_start
         )
         made, factor = np.full(len(commands), -np.inf), root_of(covariance, seen)
         finite = np.isfinite(mean).all(axis=(1, 2)) & np.isfinite(factor).all(axis=(1, 2, 3))
@@ -258,9 +255,9 @@ class FaultEvidence:
     @cached_property
     def _by_parameters(self) -> NDArray:
         """Those of the twin with its own noise."""
-        return self._slopes(None)
+        return self._slopes((0.0, 0.0))
 
-    def _slopes(self, noise: _Noise | None) -> NDArray:
+    def _slopes(self, more: _Noise) -> NDArray:
         """Derivatives (T, d_y, r) of predictions by the twin's parameters, in posterior deviations.
 
         By central differences along the columns of the factor of their covariance, and then along
@@ -272,7 +269,7 @@ class FaultEvidence:
         count = len(moves)
         mean, covariance, _ = self.twin.filter(
             *(np.tile(e, (2 * count, 1, 1)) for e in (self.commands, self.measured, self.seen)),
-            noise=noise,
+            more=more,
             known_start=self.known_start,
             moves=np.concatenate([moves, -moves]) * STEP,
         )

@@ -254,6 +254,7 @@ def assembled(
         factor,
         deviation,
         np.zeros(len(start)),
+        np.zeros(len(start)),
         estimation.power(found.residual),
         1.0,
         Domain.visited(states, estimation.commands, speed),

@@ -30,6 +30,8 @@ class FilterState:
     ----------
     states, spread : NDArray
         (n, d_x) and (n, d_x, d_x), means and covariances of the states.
+    simulated : NDArray
+        (n, d_x), states that are simulated from commands alone.
     commands : NDArray
         (n, H, d_u), the last commands; NaN before the first sample.
 
@@ -37,6 +39,7 @@ class FilterState:
 
     states: NDArray
     spread: NDArray
+    simulated: NDArray
     commands: NDArray
 
     def of(self, rows: NDArray) -> FilterState:
@@ -72,7 +75,8 @@ class OnlineFilter:
         theta, spread = self.twin.start(count, known_start=False)
         earlier = TAPS if self.twin.equations.interpolation == "spline" else 1
         commands = np.full((count, earlier, len(self.twin.inputs)), np.nan)
-        return FilterState(theta[:, -spread.shape[1] :], spread, commands)
+        states = theta[:, -spread.shape[1] :]
+        return FilterState(states, spread, states, commands)
 
     def step(
         self, state: FilterState, commands: NDArray, measured: NDArray, seen: NDArray
@@ -115,14 +119,15 @@ class OnlineFilter:
         # The sample before is that of `state`, and was used.
         pad = [(0, 0), (1, 0), (0, 0)]
         given = np.pad(np.where(seen, measured, 0.0), pad), np.pad(seen, pad)
-        mean, covariance, states, spread = self.twin.equations.steps().filter(
-            path,
-            theta,
-            given,
-            state.spread,
-            (self.twin.process, self.twin.noise),
-            first=earlier.shape[1] - 1,
-            gate=GATE,
+        steps, first = self.twin.equations.steps(), earlier.shape[1] - 1
+        process, simulated = self.twin.process, state.simulated
+        if self.twin.proportional.any():
+            own = np.concatenate([theta[:, : -simulated.shape[1]], simulated], axis=1)
+            course = steps.run(path, own, first=first)[1]
+            process, simulated = self.twin.process_variance(course), course[:, -1]
+        variances = process, self.twin.noise
+        mean, covariance, states, spread = steps.filter(
+            path, theta, given, state.spread, variances, first=first, gate=GATE
         )
-        after = FilterState(states[:, -1], spread, path[:, -earlier.shape[1] :])
+        after = FilterState(states[:, -1], spread, simulated, path[:, -earlier.shape[1] :])
         return after, mean[:, 1:], covariance[:, 1:]

@@ -35,7 +35,7 @@ __all__ = ["DynamicsTwin"]
 
 KIND = "dynamics"
 """Kind of the saved model."""
-ARRAYS = ("values", "factor", "start_deviation", "process", "noise")
+ARRAYS = ("values", "factor", "start_deviation", "process", "proportional", "noise")
 """Attributes that are saved as arrays."""
 DOMAIN = ("low", "high", "mean", "speed")
 """Attributes of the domain."""
@@ -63,8 +63,10 @@ class DynamicsTwin:
         (q + d_x, r), of the posterior covariance of `values`, factor @ factor.T.
     start_deviation : NDArray
         (d_x,), by which starts differ between trajectories.
-    process, noise : NDArray
-        (d_x,) and (d_y,), variances of w and v.
+    process, proportional, noise : NDArray
+        (d_x,), (d_x,) and (d_y,). The variance of w is `process`, plus `proportional` times the
+        square of the change that the commands alone make in that sample (`process_variance`); that
+        of v is `noise`.
     widening : float
         Factor of the deviations from the most probable outputs, from held-out blocks.
     domain : Domain
@@ -83,6 +85,7 @@ class DynamicsTwin:
     factor: NDArray
     start_deviation: NDArray
     process: NDArray
+    proportional: NDArray
     noise: NDArray
     widening: float
     domain: Domain
@@ -263,7 +266,7 @@ class DynamicsTwin:
         seen: NDArray,
         *,
         changes: NDArray | None = None,
-        noise: tuple[NDArray, NDArray] | None = None,
+        more: tuple[NDArray | float, NDArray | float] = (0.0, 0.0),
         known_start: bool = True,
         moves: NDArray | float = 0.0,
     ) -> tuple[NDArray, NDArray, NDArray]:
@@ -275,8 +278,8 @@ class DynamicsTwin:
             Commands, outputs, and whether these were measured.
         changes : ndarray, shape (n, T, q), optional
             What is added to the parameters at each sample.
-        noise : tuple of ndarray, optional
-            Variances of process and measurement noise, in place of the twin's.
+        more : tuple of ndarray, default 0
+            Variances that are added to those of process and measurement noise.
         known_start : bool, default True
             Whether the first sample is the start of a record as in calibration; otherwise the
             states may be anywhere in their range in calibration.
@@ -290,9 +293,12 @@ class DynamicsTwin:
 
         """
         theta, spread = self.start(len(commands), known_start=known_start)
-        variances = noise or (self.process, self.noise)
-        given = (commands, theta + moves, (measured, seen), spread, variances, changes)
-        return self.equations.steps().filter(*given)[:3]
+        steps, theta, process = self.equations.steps(), theta + moves, self.process
+        if self.proportional.any():
+            process = self.process_variance(steps.run(commands, theta, changes=changes)[1])
+        variances = (process + more[0], self.noise + more[1])
+        given = (commands, theta, (measured, seen), spread, variances, changes)
+        return steps.filter(*given)[:3]
 
     def start(self, count: int, *, known_start: bool) -> tuple[NDArray, NDArray]:
         """What the filter knows of `count` trajectories before their first sample.
@@ -318,14 +324,30 @@ class DynamicsTwin:
         made: NDArray = ((commands < low - margin) | (commands > high + margin)).any(axis=(1, 2))
         return made
 
+    def process_variance(self, states: NDArray) -> NDArray:
+        """Variances (n, T, d_x) of the process noise after each sample.
+
+        `states` (n, T, d_x) are simulated from commands alone, so that no measured deviation, as by
+        a fault, makes larger ones probable. Their change is at most their range in calibration.
+        """
+        count = len(self.process)
+        largest = self.domain.high[:count] - self.domain.low[:count]
+        with np.errstate(invalid="ignore"):
+            change = np.abs(np.diff(states, axis=1, append=states[:, -1:]))
+        made: NDArray = self.process + self.proportional * np.fmin(change, largest) ** 2
+        return made
+
     def noise_variance(self, commands: NDArray) -> NDArray:
         """Variances (n, T, d_y) of the outputs by process and measurement noise alone."""
         theta = np.tile(self.values, (len(commands), 1))
         shape = (*commands.shape[:2], len(self.noise))
-        states = len(self.process)
-        known = np.zeros((len(commands), states, states))
-        unseen, variances = (np.zeros(shape), np.zeros(shape)), (self.process, self.noise)
-        found = self.equations.steps().filter(commands, theta, unseen, known, variances)[1]
+        states, steps = len(self.process), self.equations.steps()
+        known, unseen = (
+            np.zeros((len(commands), states, states)),
+            (np.zeros(shape), np.zeros(shape)),
+        )
+        variances = self.process_variance(self._most_probable(commands)[1]), self.noise
+        found = steps.filter(commands, theta, unseen, known, variances)[1]
         made: NDArray = np.diagonal(found, axis1=2, axis2=3)
         return made
 
@@ -400,29 +422,26 @@ class DynamicsTwin:
         Korzepa and Bauer, "Improving predictions of Bayesian neural nets via local linearization",
         2021). `changes` (n, T, q) of the parameters over time do not change these derivatives.
         """
-        count, samples = commands.shape[:2]
-        states = len(self.process)
+        count = len(commands)
         steps, theta = self.equations.steps(), np.tile(self.values, (count, 1))
-        kicks = np.sqrt(self.process) * rng.normal(size=(count, samples, states))
+        centre, states = self._most_probable(commands)
         changed = np.array([each.any() for each in changes])
+        if changed.any():
+            centre[changed], states[changed] = steps.run(
+                commands[changed], theta[changed], changes=changes[changed]
+            )
+        kicks = np.sqrt(self.process_variance(states)) * rng.normal(size=states.shape)
         made = steps.run(commands, theta, kicks, changes if changed.any() else None)[0]
         made += np.sqrt(self.noise) * rng.normal(size=made.shape)
         moves = rng.normal(size=(count, self.factor.shape[1])) @ self.factor.T
-        moves[:, -states:] += self.start_deviation * rng.normal(size=(count, states))
+        starts = self.start_deviation * rng.normal(size=(count, len(self.process)))
+        moves[:, -len(self.process) :] += starts
         distinct, own = np.unique(commands, axis=0, return_inverse=True)
         for i, each in enumerate(distinct):
-            nominal, by_all = (
-                found[0] for found in steps.sensitivities(each[None], self.values[None])
-            )
+            by_all = steps.sensitivities(each[None], self.values[None])[1][0]
             rows = np.flatnonzero(own.ravel() == i)
-            centre = np.tile(nominal, (len(rows), 1, 1))
-            if changed[rows].any():
-                faulty = rows[changed[rows]]
-                centre[changed[rows]] = steps.run(
-                    commands[faulty], theta[faulty], changes=changes[faulty]
-                )[0]
             moved = np.moveaxis(by_all @ moves[rows].T, -1, 0)
-            made[rows] = centre + self.widening * (made[rows] - centre + moved)
+            made[rows] = centre[rows] + self.widening * (made[rows] - centre[rows] + moved)
         return made
 
     def _warn(self, beyond: NDArray) -> None:
@@ -462,13 +481,14 @@ class DynamicsTwin:
         with refusing(folder, expected="corrected dynamics"):
             equations = equations_from(StateTwin, about["equations"])
             corrected = correctable(equations, about["corrected"])
+            weights = {"proportional": torch.zeros_like(weights["process"])} | weights
             arrays = {name: weights[name].double().numpy() for name in ARRAYS}
             domain = Domain(*(weights[f"domain_{name}"].double().numpy() for name in DOMAIN))
             traced = equations.model
             count = (len(equations.parameters), len(traced.slope), len(traced.outputs))
             shapes = [arrays[name].shape for name in ARRAYS]
             both = count[0] + count[1]
-            wanted = [(both,), (both, shapes[1][-1]), *[(count[1],)] * 2, (count[2],)]
+            wanted = [(both,), (both, shapes[1][-1]), *[(count[1],)] * 3, (count[2],)]
             require(
                 shapes == wanted and all(np.isfinite(each).all() for each in arrays.values()),
                 "weights",
@@ -476,7 +496,7 @@ class DynamicsTwin:
                 got=shapes,
                 remedy="save the model again",
             )
-            variances = (arrays["start_deviation"], arrays["process"], arrays["noise"])
+            variances = [arrays[name] for name in ARRAYS[2:]]
             widening = finite("widening", about["widening"], least=0.0)
             ends = np.stack([domain.low, domain.mean, domain.high])
             require(
