@@ -34,8 +34,8 @@ APART = 200
 """Missing samples that are put between two calibration records, so that neither predicts the
 other."""
 SETTLED = 1.05
-"""Ratio of a predicted standard deviation to its usual one, from which on the filter knows the
-states of a machine that it did not see start."""
+"""Ratio of predicted standard deviations, for starts of which one is twice as uncertain, up to
+which the filter knows the states of a machine that it did not see start."""
 PARTS = {
     "filter": FilterState,
     "disturbance": DisturbanceState,
@@ -501,7 +501,8 @@ def fit_monitor(
     measured = np.where(healthy.mask, healthy.observed, np.nan).astype(float)
     online, seen = OnlineFilter(twin), healthy.mask
     commands = healthy.commands.astype(float)
-    _, mean, covariance = online.step(online.start(len(healthy)), commands, measured, seen)
+    start = online.start(len(healthy))
+    _, mean, covariance = online.step(start, commands, measured, seen)
     require(
         np.isfinite(mean).all() and np.isfinite(covariance).all(),
         "healthy",
@@ -509,7 +510,8 @@ def fit_monitor(
         got="others",
         remedy="leave them out, or give the twin more substeps",
     )
-    warm_up = _settled(covariance)
+    surer = replace(start, spread=start.spread / 4)
+    warm_up = _settled(covariance, online.step(surer, commands, measured, seen)[2])
     steps = resolution(np.moveaxis(measured, 2, 0).reshape(measured.shape[2], -1))
     late = (np.arange(healthy.steps) >= warm_up)[None, :, None]
     error, width = (
@@ -538,11 +540,10 @@ def _standardised(
     return made, steps / np.diagonal(factor, axis1=2, axis2=3)
 
 
-def _settled(covariance: NDArray) -> int:
-    """Number of samples (n, T, d_y, d_y) until the filter knows the states."""
-    deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
-    usual = np.median(deviation, axis=1, keepdims=True)
-    late = (deviation > SETTLED * usual).any(axis=(0, 2))
+def _settled(covariance: NDArray, other: NDArray) -> int:
+    """Number of samples (n, T, d_y, d_y) until the start of the filter does not matter."""
+    ratio = np.diagonal(covariance / other, axis1=2, axis2=3)
+    late = (np.abs(np.log(ratio)) > 2 * np.log(SETTLED)).any(axis=(0, 2))
     half = covariance.shape[1] // 2
     return int(np.flatnonzero(late[:half])[-1]) + 1 if late[:half].any() else 0
 
