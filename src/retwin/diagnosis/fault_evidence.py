@@ -41,8 +41,6 @@ TOLERANCE = 0.1
 """Share of a fault's effect by which it may differ from that of its equation."""
 FROZEN = np.array([1.0, 1e-2, 1e-4])
 """Standard deviations of a sensor that is frozen, in those of its noise in calibration."""
-STEP = 0.1
-"""Differences of parameters, in posterior deviations, by which predictions are differentiated."""
 SMALLEST = 0.1
 """Smallest effect of parameters that counts: a change of the log density by 0.005 nats."""
 ROWS = 256
@@ -258,25 +256,13 @@ class FaultEvidence:
         return self._slopes((0.0, 0.0))
 
     def _slopes(self, more: _Noise) -> NDArray:
-        """Derivatives (T, d_y, r) of predictions by the twin's parameters, in posterior deviations.
-
-        By central differences along the columns of the factor of their covariance, and then along
-        the r directions that matter.
-        """
-        moves = self.twin.factor.T.copy()
-        if not self.known_start:
-            moves[:, -len(self.twin.process) :] = 0.0
-        count = len(moves)
-        mean, covariance, _ = self.twin.filter(
-            *(np.tile(e, (2 * count, 1, 1)) for e in (self.commands, self.measured, self.seen)),
-            more=more,
-            known_start=self.known_start,
-            moves=np.concatenate([moves, -moves]) * STEP,
-        )
-        made = np.moveaxis((mean[:count] - mean[count:]) / (2 * STEP), 0, -1)
-        made = np.where(np.isfinite(made) & self.seen[..., None], made, 0.0)
+        """Derivatives (T, d_y, r) of predictions by the parameters, along r directions."""
+        given = tuple(each[None] for each in (self.commands, self.measured, self.seen))
+        made = self.twin.slopes(*given, more=more, known_start=self.known_start)[0]
+        made = np.where(self.seen[..., None], made, 0.0)
+        covariance = self.twin.filter(*given, more=more, known_start=self.known_start)[1]
         factor = root_of(covariance[:1], self.seen[None])[0]
-        scaled = np.linalg.solve(factor, made).reshape(-1, count)
+        scaled = np.linalg.solve(factor, made).reshape(-1, made.shape[2])
         if not np.isfinite(scaled).all():
             return made[..., :0]
         _, values, directions = np.linalg.svd(scaled, full_matrices=False)

@@ -21,7 +21,7 @@ from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.update import Dynamics, DynamicsTwin, Library, OutsideTrainingWarning, fit_dynamics
 from retwin.update.dynamics import FittedDynamics
 from retwin.update.dynamics.estimation import correlation_time
-from retwin.update.dynamics.prediction import log_density
+from retwin.update.dynamics.prediction import Prediction, log_density
 
 FORCE = rt.Channels(("force",), ("N",))
 POSITION = rt.Channels(("position",), ("m",))
@@ -235,6 +235,37 @@ def test_the_filter_is_the_exact_conditional_of_a_linear_system() -> None:
         left = joint[np.ix_(now, now)] - gain @ joint[np.ix_(earlier, now)]
         np.testing.assert_allclose(mean[0, k], wanted, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(covariance[0, k], left, rtol=1e-9, atol=1e-12)
+
+
+def test_predictions_with_uncertain_parameters_are_the_exact_conditional_ones() -> None:
+    """Against the joint Gaussian distribution of all outputs."""
+    rng, samples = np.random.default_rng(0), 7
+    noise, slopes = rng.uniform(0.1, 1.0, samples * 2), rng.normal(size=(samples * 2, 3))
+    joint = np.diag(noise) + slopes @ slopes.T
+    y, centre = rng.normal(size=(2, samples * 2))
+    seen = rng.random(samples * 2) < 0.7
+    outputs = rt.Channels(("y", "z"), ("m", "m"))
+    record = rt.Trajectories(
+        commands=rng.normal(size=(1, samples, 1)),
+        nominal=np.zeros((1, samples, 2)),
+        observed=y.reshape(1, samples, 2),
+        rate=RATE,
+        mask=seen.reshape(1, samples, 2),
+        inputs=FORCE,
+        outputs=outputs,
+    )
+    y = np.where(seen, record.observed.ravel(), 0.0)
+    covariance = np.stack([np.diag(each) for each in noise.reshape(samples, 2)])[None]
+    known = Prediction(record, centre.reshape(1, samples, 2), covariance, np.zeros((1, samples, 1)))
+    found = known.marginal(slopes.reshape(1, samples, 2, 3))
+    for k in range(samples):
+        earlier = np.flatnonzero(seen[: 2 * k])
+        now = np.arange(2 * k, 2 * k + 2)
+        gain = joint[np.ix_(now, earlier)] @ np.linalg.inv(joint[np.ix_(earlier, earlier)])
+        wanted = centre[now] + gain @ (y - centre)[earlier]
+        np.testing.assert_allclose(found.mean[0, k], wanted, rtol=1e-9)
+        left = joint[np.ix_(now, now)] - gain @ joint[np.ix_(earlier, now)]
+        np.testing.assert_allclose(found.covariance[0, k], left, rtol=1e-9)
 
 
 @pytest.mark.parametrize("interpolation", ["hold", "linear", "spline"])

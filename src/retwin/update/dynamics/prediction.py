@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -87,6 +87,37 @@ class Prediction:
         """
         found = [autocorrelation(each) for each in np.moveaxis(self.standardised(), -1, 0)]
         return [(each, ljung_box(each)[1]) for each in found]
+
+    def marginal(self, slopes: NDArray) -> Prediction:
+        """The same for parameters that are standard Gaussian, on which the means depend linearly.
+
+        Recursive least squares: each sample narrows the distribution of the parameters with which
+        later ones are predicted. `states` stay those at the most probable parameters.
+
+        Parameters
+        ----------
+        slopes : NDArray
+            (n, T, d_y, r), derivatives of the means.
+
+        """
+        mean, covariance, seen = self.mean.copy(), self.covariance.copy(), self.record.mask
+        count, samples, outputs, width = slopes.shape
+        centre, spread = np.zeros((count, width)), np.tile(np.eye(width), (count, 1, 1))
+        for t in range(samples):
+            h = slopes[:, t]
+            column = spread @ h.swapaxes(1, 2)
+            mean[:, t] += (h @ centre[..., None])[..., 0]
+            covariance[:, t] += h @ column
+            used = seen[:, t]
+            if used.any():
+                own, unit = covariance[:, t], np.eye(outputs)
+                both = used[:, :, None] & used[:, None, :]
+                column = np.where(used[:, None, :], column, 0.0)
+                gain = column @ np.linalg.inv(np.where(both, own, unit))
+                error = np.where(used, self.record.observed[:, t] - mean[:, t], 0.0)
+                centre = centre + (gain @ error[..., None])[..., 0]
+                spread = spread - gain @ column.swapaxes(1, 2)
+        return replace(self, mean=mean, covariance=covariance)
 
     def log_density(self) -> NDArray:
         """Log density (n, T) of the measured outputs of each sample, jointly; 0 for none."""

@@ -39,6 +39,8 @@ ARRAYS = ("values", "factor", "start_deviation", "process", "proportional", "noi
 """Attributes that are saved as arrays."""
 DOMAIN = ("low", "high", "mean", "speed")
 """Attributes of the domain."""
+STEP = 0.1
+"""Differences of parameters, in posterior deviations, by which predictions are differentiated."""
 BEYOND = 0.05
 """How far, in widths of the domain, states and commands may leave it without a warning."""
 
@@ -213,9 +215,10 @@ class DynamicsTwin:
     def predictive(self, record: Trajectories) -> Prediction:
         """The distribution of each sample of a record given all earlier ones.
 
-        An extended Kalman filter at the most probable parameters. Samples that are masked are not
-        used, so a record whose mask ends after a warm-up is simulated from there on. An unknown
-        start has the variance of a uniform distribution between its bounds.
+        An extended Kalman filter, with the uncertainty of the parameters, of which the record
+        removes a part (`Prediction.marginal`). Samples that are masked are not used, so a record
+        whose mask ends after a warm-up is simulated from there on. An unknown start has the
+        variance of a uniform distribution between its bounds.
 
         Parameters
         ----------
@@ -240,7 +243,8 @@ class DynamicsTwin:
 
         """
         check_channels(self, record, "record")
-        made = self.filtered(record)
+        given = self._given(record)
+        made = Prediction(record, *self.filter(*given)).marginal(self.slopes(*given))
         parts = (made.mean, made.covariance, made.states)
         good = np.all([np.isfinite(each).reshape(len(record), -1).all(1) for each in parts], 0)
         require(
@@ -253,11 +257,10 @@ class DynamicsTwin:
         self._warn(self.domain.excess(made.states, record.commands))
         return made
 
-    def filtered(self, record: Trajectories) -> Prediction:
-        """See `predictive`; without checks."""
+    def _given(self, record: Trajectories) -> tuple[NDArray, NDArray, NDArray]:
+        """Commands, outputs and whether these were measured, as `filter` takes them."""
         commands = checked_commands(record.commands, self.inputs).astype(np.float64)
-        measured = np.where(record.mask, record.observed, 0.0)
-        return Prediction(record, *self.filter(commands, measured, record.mask))
+        return commands, np.where(record.mask, record.observed, 0.0), record.mask
 
     def filter(
         self,
@@ -299,6 +302,35 @@ class DynamicsTwin:
         variances = (process + more[0], self.noise + more[1])
         given = (commands, theta, (measured, seen), spread, variances, changes)
         return steps.filter(*given)[:3]
+
+    def slopes(
+        self,
+        commands: NDArray,
+        measured: NDArray,
+        seen: NDArray,
+        *,
+        more: tuple[NDArray | float, NDArray | float] = (0.0, 0.0),
+        known_start: bool = True,
+    ) -> NDArray:
+        """Derivatives (n, T, d_y, r) of the filter's mean by the parameters, for `filter`'s arrays.
+
+        They are central differences along the columns of `factor`, in posterior deviations; 0 where
+        these are not finite.
+        """
+        moves = STEP * self.factor.T
+        if not known_start:
+            moves[:, -len(self.process) :] = 0.0
+        moves = moves[moves.any(axis=1)]
+        made = np.zeros((*measured.shape, len(moves)))
+        size = max(1, SAMPLES_PER_CHUNK // (2 * measured[..., 0].size))
+        for first in range(0, len(moves), size):
+            own = moves[first : first + size]
+            both = np.repeat(np.concatenate([own, -own]), len(commands), axis=0)
+            given = (np.tile(e, (2 * len(own), 1, 1)) for e in (commands, measured, seen))
+            mean = self.filter(*given, more=more, known_start=known_start, moves=both)[0]
+            up, down = mean.reshape(2, len(own), *measured.shape)
+            made[..., first : first + size] = np.moveaxis((up - down) / (2 * STEP), 0, -1)
+        return np.where(np.isfinite(made), made, 0.0)
 
     def start(self, count: int, *, known_start: bool) -> tuple[NDArray, NDArray]:
         """What the filter knows of `count` trajectories before their first sample.
