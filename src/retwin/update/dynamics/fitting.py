@@ -255,6 +255,7 @@ def assembled(
         deviation,
         np.zeros(len(start)),
         np.zeros(len(start)),
+        np.zeros(len(start)),
         estimation.power(found.residual),
         1.0,
         Domain.visited(states, estimation.commands, speed),

@@ -86,20 +86,27 @@ def fit_noise(
     ]
     kept = np.where(np.array(finite)[:, None], moves, 0.0)
     search = _Search(twin, observed[some], indices, [part[some] for part in parts], kept)
+
+    def scaled(logs: NDArray) -> DynamicsTwin:
+        # A common scale changes no prediction, but all intervals.
+        made = _noisy(twin, indices, logs)
+        error = np.abs(_predicted(made, observed, parts, kept).standardised())
+        scale = (np.nanquantile(error, LEVEL) / ndtri((1 + LEVEL) / 2)) ** 2
+        return replace(
+            made,
+            process=scale * made.process,
+            proportional=scale * made.proportional,
+            free_process=scale * made.process,
+            noise=np.maximum(scale * made.noise, SMALLEST**2 * twin.noise),
+        )
+
     found = search.visited()
+    made = scaled(found.best)
     if 0.5 ** len(parts) < CHANCE:  # fewer parts cannot show it
         more = search.visited(found.best)
-        found = more if more.decided(found) else found
-    made = _noisy(twin, indices, found.best)
-    # A common scale changes no prediction, but all intervals.
-    error = np.abs(_predicted(made, observed, parts, kept).standardised())
-    scale = (np.nanquantile(error, LEVEL) / ndtri((1 + LEVEL) / 2)) ** 2
-    return replace(
-        made,
-        process=scale * made.process,
-        proportional=scale * made.proportional,
-        noise=np.maximum(scale * made.noise, SMALLEST**2 * twin.noise),
-    )
+        if more.decided(found):
+            return replace(scaled(more.best), free_process=made.free_process)
+    return made
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +184,7 @@ class _Search:
         Without `constant` the process noise is constant; with it, the best such noise, a part is in
         proportion to the change of the state.
         """
-        widths = (len(self.indices), len(self.twin.noise), len(self.indices))
+        widths = (len(self.indices), len(self.twin.noise), 1)
         low = np.log(np.repeat(LOWEST, widths))[: None if constant is not None else sum(widths[:2])]
         points, scores = [], []
 
@@ -215,7 +222,7 @@ def _noisy(twin: DynamicsTwin, indices: NDArray, logs: NDArray) -> DynamicsTwin:
     """The twin with noise of which the logarithms of the ratios to the usual ones are given.
 
     They are those of process noise, of measurement noise, and of process noise over the change of
-    the state; the last ones may be left out.
+    the state, one for all states, which may be left out.
     """
     count, step = len(indices), twin.domain.speed
     if not twin.equations.step:

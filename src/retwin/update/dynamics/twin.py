@@ -35,7 +35,15 @@ __all__ = ["DynamicsTwin"]
 
 KIND = "dynamics"
 """Kind of the saved model."""
-ARRAYS = ("values", "factor", "start_deviation", "process", "proportional", "noise")
+ARRAYS = (
+    "values",
+    "factor",
+    "start_deviation",
+    "process",
+    "proportional",
+    "free_process",
+    "noise",
+)
 """Attributes that are saved as arrays."""
 DOMAIN = ("low", "high", "mean", "speed")
 """Attributes of the domain."""
@@ -69,6 +77,9 @@ class DynamicsTwin:
         (d_x,), (d_x,) and (d_y,). The variance of w is `process`, plus `proportional` times the
         square of the change that the commands alone make in that sample (`process_variance`); that
         of v is `noise`.
+    free_process : NDArray
+        (d_x,), the variance of w in free simulation, which is constant: errors that are new in each
+        sample, as those after a switch seem to be, cancel each other over many.
     widening : float
         Factor of the deviations from the most probable outputs, from held-out blocks.
     domain : Domain
@@ -88,6 +99,7 @@ class DynamicsTwin:
     start_deviation: NDArray
     process: NDArray
     proportional: NDArray
+    free_process: NDArray
     noise: NDArray
     widening: float
     domain: Domain
@@ -370,7 +382,7 @@ class DynamicsTwin:
         return made
 
     def noise_variance(self, commands: NDArray) -> NDArray:
-        """Variances (n, T, d_y) of the outputs by process and measurement noise alone."""
+        """Variances (n, T, d_y) of the outputs in free simulation by noise alone."""
         theta = np.tile(self.values, (len(commands), 1))
         shape = (*commands.shape[:2], len(self.noise))
         states, steps = len(self.process), self.equations.steps()
@@ -378,7 +390,7 @@ class DynamicsTwin:
             np.zeros((len(commands), states, states)),
             (np.zeros(shape), np.zeros(shape)),
         )
-        variances = self.process_variance(self._most_probable(commands)[1]), self.noise
+        variances = self.free_process, self.noise
         found = steps.filter(commands, theta, unseen, known, variances)[1]
         made: NDArray = np.diagonal(found, axis1=2, axis2=3)
         return made
@@ -454,26 +466,29 @@ class DynamicsTwin:
         Korzepa and Bauer, "Improving predictions of Bayesian neural nets via local linearization",
         2021). `changes` (n, T, q) of the parameters over time do not change these derivatives.
         """
-        count = len(commands)
+        count, samples = commands.shape[:2]
+        states = len(self.process)
         steps, theta = self.equations.steps(), np.tile(self.values, (count, 1))
-        centre, states = self._most_probable(commands)
+        kicks = np.sqrt(self.free_process) * rng.normal(size=(count, samples, states))
         changed = np.array([each.any() for each in changes])
-        if changed.any():
-            centre[changed], states[changed] = steps.run(
-                commands[changed], theta[changed], changes=changes[changed]
-            )
-        kicks = np.sqrt(self.process_variance(states)) * rng.normal(size=states.shape)
         made = steps.run(commands, theta, kicks, changes if changed.any() else None)[0]
         made += np.sqrt(self.noise) * rng.normal(size=made.shape)
         moves = rng.normal(size=(count, self.factor.shape[1])) @ self.factor.T
-        starts = self.start_deviation * rng.normal(size=(count, len(self.process)))
-        moves[:, -len(self.process) :] += starts
+        moves[:, -states:] += self.start_deviation * rng.normal(size=(count, states))
         distinct, own = np.unique(commands, axis=0, return_inverse=True)
         for i, each in enumerate(distinct):
-            by_all = steps.sensitivities(each[None], self.values[None])[1][0]
+            nominal, by_all = (
+                found[0] for found in steps.sensitivities(each[None], self.values[None])
+            )
             rows = np.flatnonzero(own.ravel() == i)
+            centre = np.tile(nominal, (len(rows), 1, 1))
+            if changed[rows].any():
+                faulty = rows[changed[rows]]
+                centre[changed[rows]] = steps.run(
+                    commands[faulty], theta[faulty], changes=changes[faulty]
+                )[0]
             moved = np.moveaxis(by_all @ moves[rows].T, -1, 0)
-            made[rows] = centre[rows] + self.widening * (made[rows] - centre[rows] + moved)
+            made[rows] = centre + self.widening * (made[rows] - centre + moved)
         return made
 
     def _warn(self, beyond: NDArray) -> None:
@@ -513,14 +528,15 @@ class DynamicsTwin:
         with refusing(folder, expected="corrected dynamics"):
             equations = equations_from(StateTwin, about["equations"])
             corrected = correctable(equations, about["corrected"])
-            weights = {"proportional": torch.zeros_like(weights["process"])} | weights
+            process = weights["process"]
+            weights = {"proportional": 0 * process, "free_process": process} | weights
             arrays = {name: weights[name].double().numpy() for name in ARRAYS}
             domain = Domain(*(weights[f"domain_{name}"].double().numpy() for name in DOMAIN))
             traced = equations.model
             count = (len(equations.parameters), len(traced.slope), len(traced.outputs))
             shapes = [arrays[name].shape for name in ARRAYS]
             both = count[0] + count[1]
-            wanted = [(both,), (both, shapes[1][-1]), *[(count[1],)] * 3, (count[2],)]
+            wanted = [(both,), (both, shapes[1][-1]), *[(count[1],)] * 4, (count[2],)]
             require(
                 shapes == wanted and all(np.isfinite(each).all() for each in arrays.values()),
                 "weights",
