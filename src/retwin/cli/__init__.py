@@ -19,7 +19,18 @@ import typer
 from typer.core import TyperGroup
 
 from retwin._version import __version__
-from retwin.cli import bench, bundle, data, diagnose, doctor, models, monitor, studies, twins
+from retwin.cli import (
+    bench,
+    bundle,
+    data,
+    diagnose,
+    doctor,
+    export,
+    models,
+    monitor,
+    studies,
+    twins,
+)
 from retwin.cli.terminal import (
     BAD_INPUT,
     FAILED,
@@ -72,6 +83,7 @@ app.add_typer(data.app, name="data")
 app.add_typer(twins.app, name="twin")
 app.add_typer(diagnose.app, name="diagnose")
 app.add_typer(bundle.app, name="bundle")
+app.add_typer(export.app, name="export")
 app.add_typer(monitor.app, name="monitor")
 
 

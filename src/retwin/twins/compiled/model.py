@@ -76,6 +76,14 @@ class Model:
     @cached_property
     def source(self) -> str:
         """The model and its simulation in C99, without memory allocation."""
+        exported = (
+            "#ifdef _WIN32\n#define EXPORT __declspec(dllexport)\n#else\n#define EXPORT\n#endif\n"
+        )
+        return "\n".join([exported, self.steps_source, _written_beside("simulate.c")])
+
+    @cached_property
+    def steps_source(self) -> str:
+        """The model and its steps from sample to sample in C99, all static."""
         x, u, p = (self.variables[name] for name in "xup")
         sizes = {"NX": len(x), "NU": len(u), "NP": len(p), "NY": len(self.outputs)}
         sizes |= {"NQ": len(p) + len(x), "DISCRETE": int(self.discrete)}
@@ -89,11 +97,10 @@ class Model:
             functions.append(self._function(name, [("f", nodes)]))
             functions.append(self._function(f"{name}_jacobian", [("f", nodes), *jacobians]))
         parts = [
-            "#include <math.h>\n#ifdef _WIN32\n#define EXPORT __declspec(dllexport)\n#else\n"
-            "#define EXPORT\n#endif\n",
+            "#include <math.h>\n",
             "".join(f"#define {name} {size}\n" for name, size in sizes.items()),
             *functions,
-            files(__package__).joinpath("simulate.c").read_text("utf-8"),
+            _written_beside("steps.c"),
         ]
         return "\n".join(parts)
 
@@ -112,6 +119,11 @@ class Model:
         for array, nodes in results:
             lines += [f"    {array}[{i}] = {_written(node)};" for i, node in enumerate(nodes)]
         return "\n".join([*lines, "}\n"])
+
+
+def _written_beside(name: str) -> str:
+    """The text of a C file of this package."""
+    return files(__package__).joinpath(name).read_text("utf-8")
 
 
 def _written(node: Node) -> str:

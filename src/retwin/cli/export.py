@@ -1,0 +1,70 @@
+"""`retwin export`: updated twins for other tools."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from retwin.cli.options import Json
+from retwin.cli.reading import saved
+from retwin.cli.terminal import answer, bar, example, note
+from retwin.errors import InputError
+from retwin.serialisation.models import kind_of
+from retwin.serialisation.places import check_place
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    help="Take an updated twin to other tools.",
+    epilog=example("retwin export fmu model --out twin.fmu"),
+    no_args_is_help=True,
+)
+
+
+@app.callback()
+def _export() -> None:
+    """Without it, the only command would be the group itself."""
+
+
+@app.command(epilog=example("retwin export fmu model --out twin.fmu --version 3.0"))
+def fmu(
+    model: Annotated[
+        Path, typer.Argument(metavar="MODEL", help="Folder of corrected dynamics, of retwin fit.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The FMU to write, *.fmu.")],
+    version: Annotated[
+        Literal["2.0", "3.0"], typer.Option(metavar="FMI", help="Version of FMI: 2.0 or 3.0.")
+    ] = "2.0",
+    source_only: Annotated[
+        bool,
+        typer.Option("--source-only", metavar="", help="Write no binary for this machine."),
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Write corrected dynamics as an FMU with C source code inside."""
+    from retwin.deploy.fmu.export import export_fmu
+    from retwin.update import DynamicsTwin
+
+    check_place(out)
+    if kind_of(saved(model)) != "dynamics":
+        raise InputError(
+            "model",
+            expected="corrected dynamics",
+            got=f"a model of the kind {kind_of(model) or 'none'}",
+            remedy="fit the case with retwin fit --dynamics",
+        )
+    with bar("export") as show:
+        show("compile", 0.0)
+        made = export_fmu(DynamicsTwin.load(model), out, version=version, compiled=not source_only)
+    delayed = (
+        f"Its outputs are {made.delay:g} s behind, since the command at the end of a step is not "
+        "known when the step begins."
+    )
+    answer(
+        {"saved": str(out), "variables": list(made.variables), "delay": made.delay},
+        *([delayed] if made.delay else []),
+        as_json=as_json,
+    )
+    note(f"Saved {out}")

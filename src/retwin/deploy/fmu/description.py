@@ -1,0 +1,245 @@
+"""The variables of an exported twin, and the XML files that describe them."""
+
+from __future__ import annotations
+
+import re
+import uuid
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+from retwin._version import __version__
+from retwin.data.trajectories import Channels
+from retwin.twins.parametric import Parameter
+
+__all__ = ["Variable", "build_description", "description", "variables_of"]
+
+EPOCH = datetime(1980, 1, 1, tzinfo=UTC)
+"""The date in a file, which does not depend on when it was made."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable of an FMU; its value reference is its place among all.
+
+    Attributes
+    ----------
+    name, unit, about : str
+        Its name, unit ("" for none) and description.
+    role : str
+        "time", "input", "output", "parameter" (tunable), "fixed" (before the begin), "seed" or
+        "noise".
+    start : float
+        Its value at the begin, but for outputs.
+
+    """
+
+    name: str
+    unit: str
+    about: str
+    role: str
+    start: float = 0.0
+
+
+def variables_of(
+    inputs: Channels,
+    outputs: Channels,
+    first: Sequence[float],
+    parameters: Sequence[tuple[Parameter, float]],
+    starts: Sequence[tuple[str, str, float]],
+) -> list[Variable]:
+    """All variables in the order of twin.c.
+
+    Parameters
+    ----------
+    inputs, outputs : Channels
+        Commands and outputs.
+    first : sequence of float
+        Commands before any are given.
+    parameters : sequence of (Parameter, float)
+        Parameters that may be set, with their values.
+    starts : sequence of (str, str, float)
+        Name, unit and start value of each state.
+
+    """
+    us, ys = (list(zip(each.names, each.units, strict=True)) for each in (inputs, outputs))
+    made = [Variable("time", "s", "", "time")]
+    made += [
+        Variable(name, unit, "command", "input", value)
+        for (name, unit), value in zip(us, first, strict=True)
+    ]
+    made += [Variable(name, unit, "output, drawn if noise is true", "output") for name, unit in ys]
+    quantities = (("mean", "its mean"), ("q05", "its 5 % quantile"), ("q95", "its 95 % quantile"))
+    for suffix, about in quantities:
+        made += [Variable(f"{name}.{suffix}", unit, about, "output") for name, unit in ys]
+    gain, bias = (
+        "fault: relative change of the command's effect",
+        "fault: added to what is measured",
+    )
+    made += [Variable(f"fault.gain.{name}", "", gain, "parameter") for name, _ in us]
+    made += [Variable(f"fault.bias.{name}", unit, bias, "parameter") for name, unit in ys]
+    made += [
+        Variable(each.name, each.unit, f"from {each.low:g} to {each.high:g}", "parameter", value)
+        for each, value in parameters
+    ]
+    made += [
+        Variable(f"start.{name}", unit, f"start of the state {name}", "fixed", value)
+        for name, unit, value in starts
+    ]
+    made.append(Variable("seed", "", "seed of the noise", "seed"))
+    made.append(Variable("noise", "", "whether outputs are drawn from their distribution", "noise"))
+    return list(_distinct(made))
+
+
+def _distinct(variables: Sequence[Variable]) -> Iterator[Variable]:
+    """Variables with names that XML can hold, each once."""
+    taken: set[str] = set()
+    for each in variables:
+        name = base = re.sub(r"\s+", " ", _printable(each.name)).strip() or "unnamed"
+        number = 2
+        while name in taken:
+            name, number = f"{base}.{number}", number + 1
+        taken.add(name)
+        unit, about = _printable(each.unit), _printable(each.about)
+        yield Variable(name, "" if unit == "1" else unit, about, each.role, each.start)
+
+
+def _printable(text: str) -> str:
+    """A text without characters that XML forbids."""
+    allowed = re.sub(r"[^\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", " ", text)
+    return allowed.strip()
+
+
+CAUSALITY = {
+    "input": ("input", "continuous"),
+    "output": ("output", "continuous"),
+    "parameter": ("parameter", "tunable"),
+    "fixed": ("parameter", "fixed"),
+    "seed": ("parameter", "fixed"),
+    "noise": ("parameter", "tunable"),
+}
+"""Causality and variability by role."""
+
+
+def token_of(source: str) -> str:
+    """The identity of an FMU, from its source code."""
+    return "{" + str(uuid.uuid5(uuid.NAMESPACE_URL, f"retwin:{source}")) + "}"
+
+
+def description(
+    version: str,
+    identifier: str,
+    token: str,
+    about: str,
+    variables: Sequence[Variable],
+    period: float,
+) -> bytes:
+    """The file modelDescription.xml.
+
+    Parameters
+    ----------
+    version : str
+        "2.0" or "3.0".
+    identifier : str
+        Name of the binary.
+    token : str
+        See `token_of`.
+    about : str
+        What the twin is.
+    variables : sequence of Variable
+        Of `variables_of`.
+    period : float
+        Sample period in s.
+
+    """
+    two = version == "2.0"
+    root = Element(
+        "fmiModelDescription",
+        {
+            "fmiVersion": version,
+            "modelName": _printable(about) or identifier,
+            "guid" if two else "instantiationToken": token,
+            "description": "Corrected twin, sampled; made by retwin, without the user's simulator",
+            "generationTool": f"retwin {__version__}",
+            "generationDateAndTime": EPOCH.strftime("%Y-%m-%dT%H:%M:%SZ"),
+            "variableNamingConvention": "flat",
+        },
+    )
+    able = ("canGetAndSetFMUstate", "canSerializeFMUstate")
+    able = able if two else ("canGetAndSetFMUState", "canSerializeFMUState")
+    facts = dict.fromkeys((*able, "canHandleVariableCommunicationStepSize"), "true")
+    inside = SubElement(root, "CoSimulation", {"modelIdentifier": identifier, **facts})
+    if two:
+        SubElement(SubElement(inside, "SourceFiles"), "File", {"name": f"{identifier}.c"})
+    units = sorted({each.unit for each in variables if each.unit})
+    if units:
+        definitions = SubElement(root, "UnitDefinitions")
+        for unit in units:
+            SubElement(definitions, "Unit", {"name": unit})
+    SubElement(root, "DefaultExperiment", {"startTime": "0", "stepSize": repr(period)})
+    listed = SubElement(root, "ModelVariables")
+    shown = [(i, each) for i, each in enumerate(variables) if not (two and each.role == "time")]
+    for reference, each in shown:
+        _add_variable(listed, reference, each, two=two)
+    structure = SubElement(root, "ModelStructure")
+    outputs = [
+        (place if two else reference)
+        for place, (reference, each) in enumerate(shown, 1)
+        if each.role == "output"
+    ]
+    if two:
+        for part, tag in (("Outputs", "Unknown"), ("InitialUnknowns", "Unknown")):
+            held = SubElement(structure, part)
+            for index in outputs:
+                SubElement(held, tag, {"index": str(index)})
+    else:
+        for tag in ("Output", "InitialUnknown"):
+            for reference in outputs:
+                SubElement(structure, tag, {"valueReference": str(reference)})
+    return _written(root)
+
+
+def _add_variable(listed: Element, reference: int, each: Variable, *, two: bool) -> None:
+    """Add a variable to the list of ModelVariables."""
+    kinds = {"seed": "Integer" if two else "Int32", "noise": "Boolean"}
+    kind = kinds.get(each.role, "Real" if two else "Float64")
+    common = {"name": each.name, "valueReference": str(reference)}
+    if each.about:
+        common["description"] = each.about
+    values = {"unit": each.unit} if each.unit else {}
+    if each.role == "time":
+        SubElement(
+            listed, kind, {**common, "causality": "independent", "variability": "continuous"}
+        )
+        return
+    causality, variability = CAUSALITY[each.role]
+    if kind in ("Integer", "Int32", "Boolean") and each.role == "noise":
+        variability = "tunable"
+    common |= {"causality": causality, "variability": variability}
+    if each.role == "output":
+        common["initial"] = "calculated"
+    else:
+        start = {"Integer": "0", "Int32": "0", "Boolean": "false"}.get(
+            kind, repr(float(each.start))
+        )
+        values["start"] = start
+    if two:
+        SubElement(SubElement(listed, "ScalarVariable", common), kind, values)
+    else:
+        SubElement(listed, kind, {**common, **values})
+
+
+def build_description(identifier: str) -> bytes:
+    """The file sources/buildDescription.xml of FMI 3.0."""
+    root = Element("fmiBuildDescription", {"fmiVersion": "3.0"})
+    build = SubElement(root, "BuildConfiguration", {"modelIdentifier": identifier})
+    files = SubElement(build, "SourceFileSet", {"language": "C99"})
+    SubElement(files, "SourceFile", {"name": f"{identifier}.c"})
+    return _written(root)
+
+
+def _written(root: Element) -> bytes:
+    indent(root)
+    made: bytes = tostring(root, encoding="UTF-8", xml_declaration=True)
+    return made

@@ -1,0 +1,274 @@
+/* A twin as an FMU, from sample to sample. Above this text stand the model with its steps, and
+ *
+ *   NR                    columns of FACTOR
+ *   NV                    real variables, by value reference
+ *   SUBSTEPS, PERIOD      steps of the integration per sample, sample period in s
+ *   LINEAR                1 if commands are straight lines between samples, 0 if they are held
+ *   WIDENING              factor of the deviations from the mean
+ *   VALUES[NQ], PLACE[NQ] parameters and start values, and their value references, -1 for none
+ *   FACTOR[NQ][NR]        of the covariance of these, FACTOR FACTOR^T
+ *   START[NX]             deviations by which starts differ between instances
+ *   PROCESS[NX], PROPORTIONAL[NX], RANGE[NX], NOISE[NY]   variances of the noise
+ *
+ * Value references: 0 the time, commands, outputs, their means, 5 % and 95 % quantiles, gains of the
+ * commands and biases of the outputs by faults, then parameters and starts. */
+
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#define COMMAND 1
+#define OUTPUT (COMMAND + NU)
+#define MEAN (OUTPUT + NY)
+#define LOW (MEAN + NY)
+#define HIGH (LOW + NY)
+#define GAIN (HIGH + NY)
+#define BIAS (GAIN + NU)
+#define SEED NV
+#define NOISY (NV + 1)
+#define QUANTILE 1.6448536269514722
+
+/* All that an instance is, so that its state is copied as bytes. */
+typedef struct {
+    double v[NV];                /* variables by value reference */
+    double begin;                /* time of the first sample */
+    double before[NU + 1];       /* commands of the sample before, for straight lines */
+    double z[NX * (1 + NQ)];     /* most probable states, and their derivatives by all values */
+    double kicked[NX];           /* states with process noise */
+    double P[NX * NX];           /* covariance of the states by process noise */
+    double moves[NQ];            /* by how much the values differ in this instance */
+    double error[NY];            /* measurement noise of the present sample */
+    int64_t samples;             /* samples since the begin */
+    uint64_t drawn;              /* random numbers so far */
+    int32_t seed, noisy, begun, ready;
+} Twin;
+
+/* SplitMix64 (Steele, Lea and Flood, 2014) of a seed and a counter: a number in (0, 1). */
+static double uniform(uint64_t seed, uint64_t counter)
+{
+    uint64_t x = (seed * UINT64_C(0xD1342543DE82EF95)) + (counter + 1) * UINT64_C(0x9E3779B97F4A7C15);
+    x = (x ^ (x >> 30)) * UINT64_C(0xBF58476D1CE4E5B9);
+    x = (x ^ (x >> 27)) * UINT64_C(0x94D049BB133111EB);
+    x ^= x >> 31;
+    return ((double)(x >> 11) + 0.5) / 9007199254740992.0;
+}
+
+static double polynomial(const double *c, double x)
+{
+    double sum = c[7];
+    for (int i = 6; i >= 0; i--)
+        sum = sum * x + c[i];
+    return sum;
+}
+
+/* The standard Gaussian quantile, to 1e-16 (Wichura, algorithm AS 241, 1988). */
+static double gaussian(double p)
+{
+    static const double a[8] = {3.3871328727963666080e0, 1.3314166789178437745e2,
+        1.9715909503065514427e3, 1.3731693765509461125e4, 4.5921953931549871457e4,
+        6.7265770927008700853e4, 3.3430575583588128105e4, 2.5090809287301226727e3};
+    static const double b[8] = {1.0, 4.2313330701600911252e1, 6.8718700749205790830e2,
+        5.3941960214247511077e3, 2.1213794301586595867e4, 3.9307895800092710610e4,
+        2.8729085735721942674e4, 5.2264952788528545610e3};
+    static const double c[8] = {1.42343711074968357734e0, 4.63033784615654529590e0,
+        5.76949722146069140550e0, 3.64784832476320460504e0, 1.27045825245236838258e0,
+        2.41780725177450611770e-1, 2.27238449892691845833e-2, 7.74545014278341407640e-4};
+    static const double d[8] = {1.0, 2.05319162663775882187e0, 1.67638483018380384940e0,
+        6.89767334985100004550e-1, 1.48103976427480074590e-1, 1.51986665636164571966e-2,
+        5.47593808499534494600e-4, 1.05075007164441684324e-9};
+    static const double e[8] = {6.65790464350110377720e0, 5.46378491116411436990e0,
+        1.78482653991729133580e0, 2.96560571828504891230e-1, 2.65321895265761230930e-2,
+        1.24266094738807843860e-3, 2.71155556874348757815e-5, 2.01033439929228813265e-7};
+    static const double f[8] = {1.0, 5.99832206555887937690e-1, 1.36929880922735805310e-1,
+        1.48753612908506148525e-2, 7.86869131145613259100e-4, 1.84631831751005468180e-5,
+        1.42151175831644588870e-7, 2.04426310338993978564e-15};
+    double q = p - 0.5, r;
+    if (fabs(q) <= 0.425) {
+        r = 0.180625 - q * q;
+        return q * polynomial(a, r) / polynomial(b, r);
+    }
+    r = sqrt(-log(q < 0.0 ? p : 1.0 - p));
+    double made = r <= 5.0 ? polynomial(c, r - 1.6) / polynomial(d, r - 1.6)
+                           : polynomial(e, r - 5.0) / polynomial(f, r - 5.0);
+    return q < 0.0 ? -made : made;
+}
+
+static double normal(Twin *twin)
+{
+    return gaussian(uniform((uint64_t)(uint32_t)twin->seed, twin->drawn++));
+}
+
+/* The values of parameters and starts, q[NQ]. */
+static void present(const Twin *twin, double *q)
+{
+    for (int i = 0; i < NQ; i++)
+        q[i] = PLACE[i] < 0 ? VALUES[i] : twin->v[PLACE[i]];
+}
+
+/* The commands as the actuators execute them, u[NU]. */
+static void executed(const Twin *twin, double *u)
+{
+    for (int i = 0; i < NU; i++)
+        u[i] = twin->v[COMMAND + i] * (1.0 + twin->v[GAIN + i]);
+}
+
+static void draw_error(Twin *twin)
+{
+    for (int i = 0; i < NY; i++)
+        twin->error[i] = sqrt(NOISE[i]) * normal(twin);
+}
+
+/* An instance before its initialization. */
+static void reset(Twin *twin)
+{
+    memset(twin, 0, sizeof *twin);
+    for (int i = 0; i < NQ; i++)
+        if (PLACE[i] >= 0)
+            twin->v[PLACE[i]] = VALUES[i];
+    for (int i = 0; i < NU; i++)
+        twin->v[COMMAND + i] = FIRST[i];
+}
+
+/* The first sample: starts, and what differs in this instance. */
+static void begin(Twin *twin)
+{
+    double q[NQ];
+    present(twin, q);
+    for (int i = 0; i < NX; i++) {
+        twin->z[i] = twin->kicked[i] = q[NP + i];
+        for (int k = 0; k < NQ; k++)
+            twin->z[NX + i * NQ + k] = k == NP + i ? 1.0 : 0.0;
+    }
+    memset(twin->P, 0, sizeof twin->P);
+    memset(twin->moves, 0, sizeof twin->moves);
+    twin->drawn = 0;
+    for (int r = 0; r < NR; r++) {
+        double drawn = normal(twin);
+        for (int k = 0; k < NQ; k++)
+            twin->moves[k] += FACTOR[k * NR + r] * drawn;
+    }
+    for (int i = 0; i < NX; i++)
+        twin->moves[NP + i] += START[i] * normal(twin);
+    draw_error(twin);
+    executed(twin, twin->before);
+    twin->samples = 0;
+    twin->begun = 1;
+    twin->ready = 0;
+}
+
+/* One sample on. */
+static void next(Twin *twin)
+{
+    double q[NQ], c[4 * NU + 1] = {0}, u[NU + 1], past[NX], F[NX * (1 + NX)], FP[NX * NX];
+    present(twin, q);
+    executed(twin, u);
+    for (int i = 0; i < NU; i++) {
+        c[i] = LINEAR ? twin->before[i] : u[i];
+        c[NU + i] = LINEAR ? u[i] - twin->before[i] : 0.0;
+        twin->before[i] = u[i];
+    }
+    for (int i = 0; i < NX; i++) {
+        past[i] = F[i] = twin->z[i];
+        for (int j = 0; j < NX; j++)
+            F[NX + i * NX + j] = i == j ? 1.0 : 0.0;
+    }
+    advance(slope_by_state, NX * (1 + NX), c, q, PERIOD, SUBSTEPS, F);
+    advance(slope_by_all, NX * (1 + NQ), c, q, PERIOD, SUBSTEPS, twin->z);
+    advance(slope, NX, c, q, PERIOD, SUBSTEPS, twin->kicked);
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NX; j++) {
+            FP[i * NX + j] = 0.0;
+            for (int k = 0; k < NX; k++)
+                FP[i * NX + j] += F[NX + i * NX + k] * twin->P[k * NX + j];
+        }
+    for (int i = 0; i < NX; i++) {
+        double change = fmin(fabs(twin->z[i] - past[i]), RANGE[i]);
+        double variance = PROCESS[i] + PROPORTIONAL[i] * change * change;
+        for (int j = 0; j < NX; j++) {
+            twin->P[i * NX + j] = i == j ? variance : 0.0;
+            for (int k = 0; k < NX; k++)
+                twin->P[i * NX + j] += FP[i * NX + k] * F[NX + j * NX + k];
+        }
+        twin->kicked[i] += sqrt(variance) * normal(twin);
+    }
+    draw_error(twin);
+    twin->ready = 0;
+}
+
+/* Outputs at the present states and commands. */
+static void evaluate(Twin *twin)
+{
+    double q[NQ], u[NU + 1], mean[NY], kicked[NY], hx[NY * NX], hp[NY * NP + 1];
+    if (twin->ready)
+        return;
+    present(twin, q);
+    executed(twin, u);
+    if (LINEAR && twin->samples > 0)
+        memcpy(u, twin->before, NU * sizeof *u);
+    output(twin->kicked, u, q, kicked);
+    output_jacobian(twin->z, u, q, mean, hx, hp);
+    for (int i = 0; i < NY; i++) {
+        double moved = 0.0, variance = NOISE[i], by[NQ];
+        for (int k = 0; k < NQ; k++) {
+            by[k] = k < NP ? hp[i * NP + k] : 0.0;
+            for (int j = 0; j < NX; j++)
+                by[k] += hx[i * NX + j] * twin->z[NX + j * NQ + k];
+            moved += by[k] * twin->moves[k];
+        }
+        for (int r = 0; r < NR; r++) {
+            double sum = 0.0;
+            for (int k = 0; k < NQ; k++)
+                sum += by[k] * FACTOR[k * NR + r];
+            variance += sum * sum;
+        }
+        for (int j = 0; j < NX; j++) {
+            variance += by[NP + j] * by[NP + j] * START[j] * START[j];
+            for (int k = 0; k < NX; k++)
+                variance += hx[i * NX + j] * twin->P[j * NX + k] * hx[i * NX + k];
+        }
+        double half = QUANTILE * WIDENING * sqrt(variance), drawn = 0.0;
+        if (twin->noisy)
+            drawn = WIDENING * (kicked[i] + twin->error[i] - mean[i] + moved);
+        twin->v[MEAN + i] = mean[i];
+        twin->v[LOW + i] = mean[i] - half;
+        twin->v[HIGH + i] = mean[i] + half;
+        twin->v[OUTPUT + i] = mean[i] + drawn + twin->v[BIAS + i];
+    }
+    twin->ready = 1;
+}
+
+/* On to a time; 0 if a state or an output is not finite. */
+static int advance_to(Twin *twin, double time)
+{
+    if (!twin->begun)
+        begin(twin);
+    /* With straight lines, the first step only learns the command at its begin. */
+    while (twin->begin + (double)(twin->samples + 1) * PERIOD <= time + 1e-6 * PERIOD) {
+        if (!LINEAR || twin->samples > 0)
+            next(twin);
+        else
+            executed(twin, twin->before);
+        twin->samples++;
+        twin->ready = 0;
+    }
+    twin->v[0] = time;
+    evaluate(twin);
+    for (int i = 0; i < NX; i++)
+        if (!isfinite(twin->z[i]))
+            return 0;
+    for (int i = 0; i < NY; i++)
+        if (!isfinite(twin->v[OUTPUT + i]))
+            return 0;
+    return 1;
+}
+
+/* Whether a value reference may be set: a command, a fault, a parameter, or a start before begin. */
+static int settable(const Twin *twin, uint32_t reference)
+{
+    if (reference >= NV || reference == 0 || (reference >= OUTPUT && reference < GAIN))
+        return 0;
+    for (int i = NP; i < NQ; i++)
+        if ((int64_t)PLACE[i] == (int64_t)reference)
+            return !twin->begun;
+    return 1;
+}
