@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import zipfile
 from pathlib import Path
@@ -19,6 +20,7 @@ from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
 
 fmpy = pytest.importorskip("fmpy")
 
+PAGE = Path(__file__).parents[2] / "docs" / "fmu_export.md"
 STEPS = 60
 HOSTILE = 'T "1" <°C> & \\n\n ü'
 
@@ -227,6 +229,16 @@ def test_the_command_line_exports_a_saved_twin(
     code, _, err = call("export", "fmu", tmp_path, "--out", tmp_path / "no.fmu")
     assert (code, "corrected dynamics" in err) == (2, True), err
     assert not (tmp_path / "no.fmu").exists()
+
+
+@pytest.mark.slow
+def test_the_code_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
+    names: dict = {}
+    exec(compile(code, str(PAGE), "exec"), names)
+    found = names["found"]
+    assert (found["outflow.q05"] < found["outflow.mean"]).all()
 
 
 @pytest.mark.slow

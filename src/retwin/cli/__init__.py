@@ -55,10 +55,10 @@ class FirstScreen(TyperGroup):
     """All commands; its help fits into 24 lines of 80."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """The options; those that Typer adds for completion are in the documentation."""
+        """The options; those that Typer adds are in the documentation."""
         params: list[Any] = [*super().get_params(ctx)]
         for each in params:
-            each.hidden = each.name in ("install_completion", "show_completion")
+            each.hidden = each.name in ("help", "install_completion", "show_completion")
         return params
 
 
