@@ -8,10 +8,8 @@ from typing import Annotated, Literal
 import typer
 
 from retwin.cli.options import Json
-from retwin.cli.reading import saved
+from retwin.cli.reading import updated_twin
 from retwin.cli.terminal import answer, bar, example, note
-from retwin.errors import InputError
-from retwin.serialisation.models import kind_of
 from retwin.serialisation.places import check_place
 
 __all__ = ["app"]
@@ -31,7 +29,7 @@ def _export() -> None:
 @app.command(epilog=example("retwin export fmu model --out twin.fmu --version 3.0"))
 def fmu(
     model: Annotated[
-        Path, typer.Argument(metavar="MODEL", help="Folder of corrected dynamics, of retwin fit.")
+        Path, typer.Argument(metavar="MODEL", help="Folder of an updated twin, of retwin fit.")
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The FMU to write, *.fmu.")],
     version: Annotated[
@@ -43,21 +41,14 @@ def fmu(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Write corrected dynamics as an FMU with C source code inside."""
+    """Write an updated twin as an FMU with C source code inside."""
     from retwin.deploy.fmu.export import export_fmu
-    from retwin.update import DynamicsTwin
 
     check_place(out)
-    if kind_of(saved(model)) != "dynamics":
-        raise InputError(
-            "model",
-            expected="corrected dynamics",
-            got=f"a model of the kind {kind_of(model) or 'none'}",
-            remedy="fit the case with retwin fit --dynamics",
-        )
+    twin = updated_twin(model)
     with bar("export") as show:
         show("compile", 0.0)
-        made = export_fmu(DynamicsTwin.load(model), out, version=version, compiled=not source_only)
+        made = export_fmu(twin, out, version=version, compiled=not source_only)
     delayed = (
         f"Its outputs are {made.delay:g} s behind, since the command at the end of a step is not "
         "known when the step begins."

@@ -1,4 +1,4 @@
-"""`export_fmu`: a twin with states as an FMU, with C99 source code inside."""
+"""`export_fmu`: an updated twin as an FMU, with C99 source code inside."""
 
 from __future__ import annotations
 
@@ -6,27 +6,22 @@ import re
 import subprocess
 import tempfile
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from retwin.checks import needs_extra, one_of, require
-from retwin.deploy.fmu.description import (
-    Variable,
-    build_description,
-    description,
-    token_of,
-    variables_of,
-)
+from retwin.deploy.fmu.description import build_description, description, token_of
+from retwin.deploy.fmu.states import states_text
+from retwin.deploy.fmu.surrogates import surrogate_text
+from retwin.deploy.fmu.text import Text, written_beside
 from retwin.errors import InputError, brief
 from retwin.serialisation.files import write_atomically
 from retwin.twins.compiled.kernel import compilers
 from retwin.twins.state_twin import StateTwin
+from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.twin import DynamicsTwin
+from retwin.update.surrogate import Surrogate
 
 __all__ = ["ExportedFMU", "export_fmu"]
 
@@ -69,7 +64,11 @@ class ExportedFMU:
 
 
 def export_fmu(
-    twin: StateTwin | DynamicsTwin, path: str | Path, *, version: str = "2.0", compiled: bool = True
+    twin: StateTwin | DynamicsTwin | Surrogate | CorrectedTwin,
+    path: str | Path,
+    *,
+    version: str = "2.0",
+    compiled: bool = True,
 ) -> ExportedFMU:
     """Write a twin as an FMU for co-simulation.
 
@@ -81,8 +80,9 @@ def export_fmu(
 
     Parameters
     ----------
-    twin : StateTwin or DynamicsTwin
-        A twin with state equations, or corrected dynamics.
+    twin : StateTwin, DynamicsTwin, Surrogate or CorrectedTwin
+        A twin with state equations, corrected dynamics, or a surrogate, alone or with a residual
+        at each sample (`Additive`).
     path : path
         The file, *.fmu.
     version : str
@@ -94,8 +94,9 @@ def export_fmu(
     Raises
     ------
     InputError
-        Another twin, one whose commands are splines between samples, which are not known before
-        later samples are; a file of another kind, or no C compiler that succeeds.
+        Another twin; one whose outputs depend on later samples, as with commands that are splines
+        between samples, a residual per segment, or a sensor that is sampled; a file of another
+        kind, or no C compiler that succeeds.
 
     """
     fmpy = needs_extra("fmpy", "fmu", "holds the headers of FMI")
@@ -108,31 +109,21 @@ def export_fmu(
         got=str(path),
         remedy="give a name that ends with .fmu",
     )
-    corrected = _as_corrected(twin)
-    equations = corrected.equations
-    require(
-        equations.interpolation != "spline",
-        "twin",
-        expected="commands that are held or straight lines between samples",
-        got="splines, which depend on commands that an FMU does not know yet",
-        remedy='make the twin with interpolation="linear"',
-    )
+    text = _text(twin)
     identifier = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"twin_{identifier}"
-    variables, places = _variables(corrected)
-    model = _model(corrected, variables, places)
-    token = token_of(model + version)
-    interface = "fmi2.c" if version == "2.0" else "fmi3.c"
-    source = "\n".join([model, _beside("twin.c"), f'#define TOKEN "{token}"', _beside(interface)])
+    token = token_of(text.source + version)
+    interface = written_beside("fmi2.c" if version == "2.0" else "fmi3.c")
+    source = "\n".join([text.source, f'#define TOKEN "{token}"', interface])
     headers = Path(str(fmpy.__file__)).parent / "c-code"
     content: dict[str, bytes] = {
         "modelDescription.xml": description(
             version,
             identifier,
             token,
-            corrected.case or path.stem,
-            variables,
-            1 / corrected.rate,
+            text.about or path.stem,
+            text.variables,
+            1 / text.rate,
         ),
         f"sources/{identifier}.c": source.encode(),
         **{f"sources/{name}": (headers / name).read_bytes() for name in HEADERS[version]},
@@ -146,119 +137,22 @@ def export_fmu(
             entry = zipfile.ZipInfo(name, DATE)
             entry.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(entry, data)
-    delay = 1 / corrected.rate if equations.interpolation == "linear" else 0.0
-    return ExportedFMU(path, tuple(each.name for each in variables), delay, compiled)
+    names = tuple(each.name for each in text.variables)
+    return ExportedFMU(path, names, text.delay, compiled)
 
 
-def _as_corrected(twin: StateTwin | DynamicsTwin) -> DynamicsTwin:
-    """Corrected dynamics; those of a twin with states alone have no noise."""
-    if isinstance(twin, DynamicsTwin):
-        return twin
-    if not isinstance(twin, StateTwin):
-        raise InputError(
-            "twin",
-            expected="a twin with state equations, or corrected dynamics",
-            got=type(twin).__name__,
-            remedy="learn state equations for it: fit_state_surrogate",
-        )
-    from retwin.update.dynamics.domain import Domain
-
-    names = twin.names
-    values = twin.values(None, 1)[0]
-    states, inputs = len(twin.states), len(twin.inputs)
-    limits = twin.limits
-    low, high = (
-        (np.zeros(inputs), np.zeros(inputs))
-        if limits is None
-        else (np.array(limits.low, float), np.array(limits.high, float))
+def _text(twin: object) -> Text:
+    """The C text of a twin of any kind that has one."""
+    if isinstance(twin, StateTwin | DynamicsTwin):
+        return states_text(twin)
+    if isinstance(twin, Surrogate | CorrectedTwin):
+        return surrogate_text(twin)
+    raise InputError(
+        "twin",
+        expected="a twin with state equations, corrected dynamics, or a surrogate",
+        got=type(twin).__name__,
+        remedy="learn state equations for it: fit_state_surrogate",
     )
-    starts = values[len(names) - states :]
-    middle = np.clip(0.0, low, high)
-    domain = Domain(
-        np.concatenate([starts, low]),
-        np.concatenate([starts, high]),
-        np.concatenate([starts, middle]),
-        np.ones(states),
-    )
-    nothing = np.zeros(states)
-    return DynamicsTwin(
-        twin,
-        values,
-        np.zeros((len(values), 0)),
-        nothing,
-        nothing,
-        nothing,
-        np.zeros(len(twin.outputs)),
-        1.0,
-        domain,
-        (),
-    )
-
-
-def _variables(twin: DynamicsTwin) -> tuple[list[Variable], list[int]]:
-    """The variables, and the value references of parameters and starts; -1 for none."""
-    equations = twin.equations
-    inputs, outputs = len(equations.inputs), len(equations.outputs)
-    states = len(equations.states)
-    # Coefficients of the discrepancy have names of several words.
-    shown = [each.name.isidentifier() for each in equations.parameters]
-    values = twin.values.tolist()
-    parameters = [
-        (each, value)
-        for each, value, own in zip(equations.parameters, values, shown, strict=False)
-        if own
-    ]
-    starts = [
-        (each.name, each.unit, value)
-        for each, value in zip(equations.states, values[-states:], strict=True)
-    ]
-    made = variables_of(
-        equations.inputs, equations.outputs, twin.domain.mean[states:].tolist(), parameters, starts
-    )
-    first = 1 + 2 * inputs + 5 * outputs
-    places = []
-    for own in [*shown, *[True] * states]:
-        places.append(first if own else -1)
-        first += own
-    return made, places
-
-
-def _model(twin: DynamicsTwin, variables: Sequence[Variable], places: Sequence[int]) -> str:
-    """The equations of a twin and its numbers as C."""
-    states = len(twin.process)
-    low, high = (each[:states] for each in (twin.domain.low, twin.domain.high))
-    sizes = {
-        "NR": twin.factor.shape[1],
-        "NV": len(variables) - 2,
-        "SUBSTEPS": twin.equations.substeps,
-        "LINEAR": int(twin.equations.interpolation == "linear"),
-    }
-    numbers = {"PERIOD": 1 / twin.rate, "WIDENING": twin.widening}
-    arrays: Mapping[str, NDArray] = {
-        "VALUES": twin.values,
-        "FACTOR": twin.factor.ravel(),
-        "START": twin.start_deviation,
-        "PROCESS": twin.process,
-        "PROPORTIONAL": twin.proportional,
-        "RANGE": high - low,
-        "NOISE": twin.noise,
-        "FIRST": twin.domain.mean[states:],
-    }
-    lines = [f"#define {name} {size}" for name, size in sizes.items()]
-    lines += [f"#define {name} {value!r}" for name, value in numbers.items()]
-    lines += [_array("double", name, [repr(x) for x in a.tolist()]) for name, a in arrays.items()]
-    lines.append(_array("int", "PLACE", [str(each) for each in places]))
-    return "\n".join([twin.equations.model.steps_source, *lines, ""])
-
-
-def _array(kind: str, name: str, items: Sequence[str]) -> str:
-    """A constant array; C has none without elements."""
-    text = ", ".join(items or ["0"])
-    return f"static const {kind} {name}[{max(1, len(items))}] = {{{text}}};"
-
-
-def _beside(name: str) -> str:
-    return files(__package__).joinpath(name).read_text("utf-8")
 
 
 def _binary(version: str, identifier: str) -> str:

@@ -1,0 +1,136 @@
+"""Twins with state equations as C99."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import require
+from retwin.deploy.fmu.description import Variable, variables_of
+from retwin.deploy.fmu.text import Text, constants, written_beside
+from retwin.twins.state_twin import StateTwin
+from retwin.update.dynamics.domain import Domain
+from retwin.update.dynamics.twin import DynamicsTwin
+
+__all__ = ["states_text"]
+
+
+def states_text(twin: StateTwin | DynamicsTwin) -> Text:
+    """A twin with state equations, or corrected dynamics, as C text.
+
+    Raises
+    ------
+    InputError
+        Its commands are splines between samples, which are not known before later samples are.
+
+    """
+    corrected = _as_corrected(twin) if isinstance(twin, StateTwin) else twin
+    interpolation = corrected.equations.interpolation
+    require(
+        interpolation != "spline",
+        "twin",
+        expected="commands that are held or straight lines between samples",
+        got="splines, which depend on commands that an FMU does not know yet",
+        remedy='make the twin with interpolation="linear"',
+    )
+    variables, places = _variables(corrected)
+    parts = map(written_beside, ("variables.c", "random.c", "states.c"))
+    return Text(
+        "\n".join([_model(corrected, variables, places), *parts]),
+        variables,
+        corrected.rate,
+        corrected.case,
+        1 / corrected.rate if interpolation == "linear" else 0.0,
+    )
+
+
+def _as_corrected(twin: StateTwin) -> DynamicsTwin:
+    """The equations as corrected dynamics without discrepancy and noise."""
+    names = twin.names
+    values = twin.values(None, 1)[0]
+    states, inputs = len(twin.states), len(twin.inputs)
+    limits = twin.limits
+    low, high = (
+        (np.zeros(inputs), np.zeros(inputs))
+        if limits is None
+        else (np.array(limits.low, float), np.array(limits.high, float))
+    )
+    starts = values[len(names) - states :]
+    middle = np.clip(0.0, low, high)
+    domain = Domain(
+        np.concatenate([starts, low]),
+        np.concatenate([starts, high]),
+        np.concatenate([starts, middle]),
+        np.ones(states),
+    )
+    nothing = np.zeros(states)
+    return DynamicsTwin(
+        twin,
+        values,
+        np.zeros((len(values), 0)),
+        nothing,
+        nothing,
+        nothing,
+        np.zeros(len(twin.outputs)),
+        1.0,
+        domain,
+        (),
+    )
+
+
+def _variables(twin: DynamicsTwin) -> tuple[list[Variable], list[int]]:
+    """The variables, and the value references of parameters and starts; -1 for none."""
+    equations = twin.equations
+    inputs, outputs = len(equations.inputs), len(equations.outputs)
+    states = len(equations.states)
+    # Coefficients of the discrepancy have names of several words.
+    shown = [each.name.isidentifier() for each in equations.parameters]
+    values = twin.values.tolist()
+    parameters = [
+        (each, value)
+        for each, value, own in zip(equations.parameters, values, shown, strict=False)
+        if own
+    ]
+    starts = [
+        (each.name, each.unit, value)
+        for each, value in zip(equations.states, values[-states:], strict=True)
+    ]
+    made = variables_of(
+        equations.inputs, equations.outputs, twin.domain.mean[states:].tolist(), parameters, starts
+    )
+    first = 1 + 2 * inputs + 5 * outputs
+    places = []
+    for own in [*shown, *[True] * states]:
+        places.append(first if own else -1)
+        first += own
+    return made, places
+
+
+def _model(twin: DynamicsTwin, variables: Sequence[Variable], places: Sequence[int]) -> str:
+    """The equations of a twin and its numbers as C."""
+    states = len(twin.process)
+    low, high = (each[:states] for each in (twin.domain.low, twin.domain.high))
+    sizes = {
+        "NR": twin.factor.shape[1],
+        "NV": len(variables) - 2,
+        "SUBSTEPS": twin.equations.substeps,
+        "LINEAR": int(twin.equations.interpolation == "linear"),
+    }
+    numbers = {"PERIOD": 1 / twin.rate, "WIDENING": twin.widening}
+    arrays: Mapping[str, NDArray] = {
+        "VALUES": twin.values,
+        "FACTOR": twin.factor.ravel(),
+        "START": twin.start_deviation,
+        "PROCESS": twin.process,
+        "PROPORTIONAL": twin.proportional,
+        "RANGE": high - low,
+        "NOISE": twin.noise,
+        "FIRST": twin.domain.mean[states:],
+    }
+    lines = [f"#define {name} {size}" for name, size in sizes.items()]
+    lines += [f"#define {name} {value!r}" for name, value in numbers.items()]
+    lines += [constants(name, values) for name, values in arrays.items()]
+    lines.append(constants("PLACE", places, "int"))
+    return "\n".join([twin.equations.model.steps_source, *lines])

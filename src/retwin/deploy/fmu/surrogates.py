@@ -1,0 +1,153 @@
+"""Surrogates, alone or with a residual at each sample, as C99."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import require
+from retwin.deploy.fmu.description import variables_of
+from retwin.deploy.fmu.networks import CNetwork, c_network, dense_weights, flat, weights_of
+from retwin.deploy.fmu.text import Text, constants, written_beside
+from retwin.nets.mixtures import FLOOR
+from retwin.nets.networks import Network
+from retwin.update.corrected import CorrectedTwin
+from retwin.update.corrections import Additive, Chain, SampledSensor
+from retwin.update.residual import Residual, SequenceResidual
+from retwin.update.surrogate import Surrogate
+
+__all__ = ["surrogate_text"]
+
+
+def surrogate_text(twin: Surrogate | CorrectedTwin) -> Text:
+    """A surrogate, with its residual model where it has one, as C text.
+
+    Raises
+    ------
+    InputError
+        A part that depends on later samples, or that does not exist in C.
+
+    """
+    residual = None if isinstance(twin, Surrogate) else _per_sample(twin.residual, twin.rate)
+    surrogate = twin if isinstance(twin, Surrogate) else twin.surrogate
+    _refuse(
+        not isinstance(surrogate, Surrogate),
+        "a twin in place of a surrogate, which is no network",
+        "fit a surrogate of it, or learn its state equations: fit_state_surrogate",
+    )
+    inputs, outputs = len(surrogate.inputs), len(surrogate.outputs)
+    network = c_network(surrogate.config, inputs, outputs)
+    networks = [network]
+    parts = [
+        network.defined("SURROGATE"),
+        f"#define REMEMBERED {network.memory}\n#define PERIOD {1 / surrogate.rate!r}\n",
+        constants("SURROGATE_WEIGHTS", weights_of(surrogate.config, surrogate.network), "float"),
+        constants("FIRST", flat(surrogate.before.mean)),
+        *_units(BEFORE=surrogate.before, AFTER=surrogate.after),
+    ]
+    if residual is not None:
+        encoder, texts = _residual_parts(residual)
+        networks.append(encoder)
+        parts += texts
+    kinds = sorted({each.kind.upper() for each in networks})
+    sizes = {"NU": inputs, "NY": outputs, "NV": 1 + 2 * inputs + 5 * outputs}
+    sizes |= {"WIDEST": max(each.widest for each in networks)}
+    defined = "".join(f"#define {name} {size}\n" for name, size in sizes.items())
+    defined += "".join(f"#define USES_{kind}\n" for kind in kinds)
+    shared = ["variables.c", "networks.c", *(["random.c"] if residual is not None else [])]
+    source = [defined, *map(written_beside, shared), *parts, written_beside("surrogate.c")]
+    first = surrogate.before.mean.tolist()
+    return Text(
+        "\n".join(source),
+        variables_of(surrogate.inputs, surrogate.outputs, first, (), ()),
+        surrogate.rate,
+        "" if isinstance(twin, Surrogate) else twin.case,
+    )
+
+
+def _refuse(wrong: bool, got: str, remedy: str) -> None:
+    require(
+        not wrong,
+        "twin",
+        expected="a twin whose outputs depend on past commands alone, in parts that exist in C",
+        got=got,
+        remedy=remedy,
+    )
+
+
+def _per_sample(residual: Residual, rate: float) -> SequenceResidual:
+    """The residual model, which must have one z per sample that is added."""
+    other = "fit Additive with a SequenceMixture, or the state equations (retwin fit --dynamics)"
+    correction = residual.correction
+    _refuse(
+        not isinstance(residual, SequenceResidual),
+        f"{_named(correction)} with one z per segment: it depends on where the segment ends and "
+        "how long it rests then, which is known only after it",
+        other,
+    )
+    assert isinstance(residual, SequenceResidual)
+    if isinstance(correction, Chain) and isinstance(correction.second, SampledSensor):
+        every = 0 if correction.second.period is None else correction.second.timing(rate)[0]
+        reason = "the errors of its samples have no C text"
+        if every > 1:
+            reason = "a record joins sampled values by straight lines: it depends on the next one"
+        _refuse(
+            every > 0,
+            f"{_named(correction)}: {reason}",
+            "fit the correction without SampledSensor, at the rate of the sensor",
+        )
+        correction = correction.first
+    _refuse(
+        type(correction) is not Additive,
+        f"{_named(correction)}, an operator that has no C text",
+        other,
+    )
+    return residual
+
+
+def _named(correction: object) -> str:
+    """The operators of a correction by their names."""
+    if isinstance(correction, Chain):
+        return f"Chain({_named(correction.first)}, {_named(correction.second)})"
+    return type(correction).__name__
+
+
+def _units(**modules: object) -> list[str]:
+    """Means and scales of standardisations, by the name of each."""
+    return [
+        constants(f"{name}_{what.upper()}", flat(getattr(module, what)))
+        for name, module in modules.items()
+        for what in ("mean", "scale")
+    ]
+
+
+def _residual_parts(residual: SequenceResidual) -> tuple[CNetwork, list[str]]:
+    """The ensemble of a residual model: its network, and its C text."""
+    density = residual.density
+    channels = len(residual.inputs) + len(residual.outputs)
+    encoder = c_network(density.network, channels, density.features)
+    weights = [_member_weights(density.network, each) for each in residual.members]
+    sizes = {"MEMBERS": len(weights), "PER_MEMBER": len(weights[0]), "ENCODED": encoder.memory}
+    sizes |= {"FEATURES": density.features, "COMPONENTS": density.components}
+    numbers = {"FLOOR": FLOOR, "SPREAD": float(residual.spread), "SQRT2": float(np.sqrt(2.0))}
+    persistence = flat(residual.persistence)
+    defined = "".join(f"#define {name} {value!r}\n" for name, value in (sizes | numbers).items())
+    return encoder, [
+        encoder.defined("ENCODER"),
+        defined,
+        constants("ENCODER_WEIGHTS", np.concatenate(weights), "float"),
+        *_units(PAST=residual.before),
+        constants("SHIFT", flat(residual.shift)),
+        constants("SCALE", flat(residual.scale)),
+        constants("TRUST", flat(residual.trust)),
+        constants("LIMIT", flat(residual.bounds)),
+        constants("PERSISTENCE", np.concatenate([persistence[:1], persistence])),
+    ]
+
+
+def _member_weights(config: Network, member: Any) -> NDArray:
+    """The weights of a network of the ensemble, those of its mixture last."""
+    parts = weights_of(config, member.encoder[0]), dense_weights(member.heads[0].linear)
+    return np.concatenate(parts)

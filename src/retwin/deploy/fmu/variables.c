@@ -1,0 +1,18 @@
+/* Value references: 0 the time, commands, outputs, their means, 5 % and 95 % quantiles, gains of the
+ * commands and biases of the outputs by faults, then what else NV variables are, seed and noise. Above
+ * this text stand NU, NY and NV. */
+
+#include <math.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#define COMMAND 1
+#define OUTPUT (COMMAND + NU)
+#define MEAN (OUTPUT + NY)
+#define LOW (MEAN + NY)
+#define HIGH (LOW + NY)
+#define GAIN (HIGH + NY)
+#define BIAS (GAIN + NU)
+#define SEED NV
+#define NOISY (NV + 1)

@@ -1,0 +1,306 @@
+"""Surrogates as FMUs: each network and each residual model against torch, for the same noise."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import ndtr, ndtri
+
+import retwin as rt
+from retwin.deploy.fmu.export import export_fmu
+from retwin.errors import InputError
+from retwin.nets.mixtures import Blocks
+from retwin.twins.compiled.kernel import compilers
+from retwin.update.corrections import Chain, SampledSensor
+from retwin.update.residual import SequenceMixture, SequenceResidual
+from retwin.update.residual.model import ResidualModel
+from retwin.update.residual.sequence import _picked, _pooled
+
+fmpy = pytest.importorskip("fmpy")
+build_platform_binary = pytest.importorskip("fmpy.build").build_platform_binary
+
+STEPS, RATE, SEED = 40, 10.0, 5
+COMMANDS = np.random.default_rng(1).normal(size=(STEPS, 2))
+NETWORKS = {
+    "mlp": rt.MLP((8, 5)),
+    "linear": rt.MLP(()),
+    "lstm": rt.LSTM(7, 2),
+    "tcn": rt.TCN(5, 3, 4),
+    "state_space": rt.StateSpace(4, 6),
+}
+
+
+class Doubled(rt.Additive):
+    """An operator of a user."""
+
+    def apply(self, context: Any, z: torch.Tensor) -> torch.Tensor:
+        return super().apply(context, 2 * z)
+
+
+CAUSAL = SequenceMixture(network=rt.LSTM(6), features=5, components=2, members=3)
+
+
+def surrogate(network: Any, inputs: int = 2, outputs: int = 3) -> rt.Surrogate:
+    """One with random weights and units."""
+    torch.manual_seed(0)
+    made = rt.Surrogate(
+        network,
+        inputs=rt.Channels.numbered("u", inputs),
+        outputs=rt.Channels.numbered("y", outputs),
+        rate=RATE,
+    )
+    _in_random_units(made)
+    return made.eval()
+
+
+def _in_random_units(module: torch.nn.Module) -> None:
+    for name, values in module.named_buffers():
+        if name.endswith(("mean", "scale")):
+            values.copy_(torch.rand_like(values) + 0.5)
+
+
+def corrected(
+    network: Any,
+    density: SequenceMixture,
+    correction: Any = rt.Additive(),  # noqa: B008 - frozen
+    channels: tuple[int, int] = (2, 3),
+) -> rt.CorrectedTwin:
+    """One with a residual model of random weights, bounds within its range, and persistence."""
+    of = surrogate(network, *channels)
+    made = SequenceResidual(correction, density, inputs=of.inputs, outputs=of.outputs)
+    _in_random_units(made)
+    with torch.no_grad():
+        for name in ("shift", "trust", "persistence"):
+            getattr(made, name).uniform_()
+        made.bounds.uniform_(2.0, 3.0)
+        made.spread.fill_(1.3)
+        for each in made.members.parameters():
+            each.mul_(2.0)
+    return rt.CorrectedTwin(of, made.eval())
+
+
+def uniform(count: int) -> np.ndarray:
+    """The first numbers of the FMU's generator."""
+    with np.errstate(over="ignore"):
+        x = np.uint64(SEED) * np.uint64(0xD1342543DE82EF95)
+        x = x + np.arange(1, count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        x ^= x >> np.uint64(31)
+    return ((x >> np.uint64(11)).astype(float) + 0.5) / 2.0**53
+
+
+@contextmanager
+def instance(path: Path, **faults: float) -> Iterator[tuple[Any, dict[str, int]]]:
+    """A running instance of a file or its folder, with noise, and the references of variables."""
+    found = fmpy.read_model_description(str(path), validate=True)
+    reference = {each.name: each.valueReference for each in found.modelVariables}
+    folder = str(path) if path.is_dir() else fmpy.extract(str(path))
+    slave = fmpy.instantiate_fmu(folder, found, "CoSimulation")
+    slave.setupExperiment(startTime=0.0)
+    slave.enterInitializationMode()
+    slave.setInteger([reference["seed"]], [SEED])
+    slave.setBoolean([reference["noise"]], [True])
+    for name, value in faults.items():
+        slave.setReal([reference[f"fault.{name}"]], [value])
+    slave.exitInitializationMode()
+    yield slave, reference
+    slave.terminate()
+    slave.freeInstance()
+
+
+def simulated(path: Path, commands: np.ndarray, outputs: int = 3, **faults: float) -> np.ndarray:
+    """Drawn outputs, means and quantiles (4, T, d_y), each for the command of its own sample."""
+    with instance(path, **faults) as (slave, reference):
+        given = [reference[name] for name in rt.Channels.numbered("u", commands.shape[1]).names]
+        names = rt.Channels.numbered("y", outputs).names
+        made = []
+        for k, command in enumerate(commands):
+            slave.setReal(given, command)
+            values = [
+                slave.getReal([reference[f"{name}{suffix}"] for name in names])
+                for suffix in ("", ".mean", ".q05", ".q95")
+            ]
+            made.append(values)
+            slave.doStep(k / RATE, 1 / RATE)
+    return np.array(made).swapaxes(0, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_surrogate_has_the_outputs_of_its_network(name: str, tmp_path: Path) -> None:
+    twin = surrogate(NETWORKS[name])
+    path = export_fmu(twin, tmp_path / "twin.fmu").path
+    with torch.no_grad():
+        expected = twin.double()(torch.tensor(COMMANDS)[None])[0].numpy()
+    for made in simulated(path, COMMANDS):
+        np.testing.assert_allclose(made / expected.std(0), expected / expected.std(0), atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("network", "encoder"),
+    [
+        pytest.param("mlp", rt.LSTM(6), id="mlp"),
+        pytest.param("lstm", rt.TCN(4, 3, 3), id="lstm", marks=pytest.mark.slow),
+    ],
+)
+def test_a_corrected_surrogate_has_the_draws_and_the_quantiles_of_the_twin(
+    network: str, encoder: Any, tmp_path: Path
+) -> None:
+    density = SequenceMixture(network=encoder, features=5, components=2, members=3)
+    twin = corrected(NETWORKS[network], density)
+    path = export_fmu(twin, tmp_path / "twin.fmu").path
+    drawn, mean, *quantiles = simulated(path, COMMANDS)
+    nominal, z, z_mean, members, bounds = _reference(twin)
+    spread = (nominal + z).std(axis=0)
+    np.testing.assert_allclose(drawn / spread, (nominal + z) / spread, atol=1e-5)
+    np.testing.assert_allclose(mean / spread, (nominal + z_mean) / spread, atol=1e-6)
+    for made, level in zip(quantiles, (0.05, 0.95), strict=True):
+        at = made - nominal
+        free = np.abs(at) < bounds - 1e-6
+        reached = members.marginal_cdf(torch.tensor(at)[None])[0].numpy()
+        assert free.any()
+        np.testing.assert_allclose(reached[free], level, atol=1e-6)
+        assert (np.abs(at) <= bounds + 1e-9).all()
+
+
+def _reference(twin: rt.CorrectedTwin) -> tuple[Any, ...]:
+    """Nominal outputs, z and its mean (T, d_y), its distribution and bounds, by torch."""
+    residual, commands = twin.residual.double(), torch.tensor(COMMANDS)[None]
+    assert isinstance(residual, SequenceResidual)
+    with torch.no_grad():
+        nominal = twin.surrogate.double()(commands)
+        members = [each[0] for each in residual.distributions(torch.cat([commands, nominal], -1))]
+        level, *rest = uniform(1 + STEPS * 4)
+        chosen = torch.tensor([int(len(members) * level)])
+        noise = ndtri(np.reshape(rest, (STEPS, 4)))
+        share = np.concatenate([residual.persistence[:1], residual.persistence])
+        for t in range(1, STEPS):
+            noise[t] = share * noise[t - 1] + np.sqrt(1 - share**2) * noise[t]
+        one = Blocks([_picked(members, chosen)])
+        normal = torch.tensor(noise[None, :, 1:])
+        z = one.from_noise(torch.tensor(ndtr(noise[None, :, :1])), normal)
+        pooled = _pooled(members)
+        bounds = residual.bounds
+        values = (nominal, *(each.clamp(-bounds, bounds) for each in (z, pooled.mean)))
+    return *(each[0].numpy() for each in values), pooled, bounds.numpy()
+
+
+@pytest.mark.slow
+def test_the_residual_does_not_see_faults(tmp_path: Path) -> None:
+    """As in `CorrectedTwin.simulate`: z is that of the commands without faults."""
+    twin = corrected(NETWORKS["mlp"], CAUSAL)
+    path = export_fmu(twin, tmp_path / "twin.fmu").path
+    healthy, faulty = simulated(path, COMMANDS), simulated(path, COMMANDS, **{"gain.u1": -0.5})
+    biased = simulated(path, COMMANDS, **{"bias.y1": 0.25})
+    nominal = twin.surrogate.double()
+    with torch.no_grad():
+        executed = COMMANDS * [0.5, 1.0]
+        change = nominal(torch.tensor(executed)[None]) - nominal(torch.tensor(COMMANDS)[None])
+    np.testing.assert_allclose((faulty - healthy)[0], change[0].numpy(), atol=1e-6)
+    np.testing.assert_allclose((biased - healthy)[0], np.tile([0.25, 0, 0], (STEPS, 1)), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_states_are_kept_and_steps_may_be_of_any_length(tmp_path: Path) -> None:
+    path = export_fmu(corrected(NETWORKS["lstm"], CAUSAL), tmp_path / "twin.fmu").path
+    ends = []
+    for count in (1, 4):
+        with instance(path) as (slave, reference):
+            for k in range(10 * count):
+                slave.doStep(k / RATE / count, 1 / RATE / count)
+            state = slave.getFMUState()
+            stored = slave.serializeFMUState(state)
+            slave.freeFMUState(state)
+            slave.doStep(10 / RATE, 1 / RATE)
+            ends.append(slave.getReal([reference["y1"]]))
+            kept = slave.deserializeFMUState(stored)
+            slave.setFMUState(kept)
+            slave.freeFMUState(kept)
+            slave.doStep(10 / RATE, 1 / RATE)
+            assert slave.getReal([reference["y1"]]) == ends[-1]
+    assert ends[0] == ends[1]
+
+
+def test_what_depends_on_the_future_is_refused(tmp_path: Path) -> None:
+    of, out = surrogate(NETWORKS["mlp"]), tmp_path / "twin.fmu"
+    channels = {"inputs": of.inputs, "outputs": of.outputs}
+    for correction in (
+        rt.DelayOffset(),
+        rt.CommandSpace(),
+        Chain(rt.DelayOffset(), SampledSensor()),
+    ):
+        per_segment = ResidualModel(correction, rt.Mixture(), **channels)
+        name = "Chain" if isinstance(correction, Chain) else type(correction).__name__
+        with pytest.raises(InputError, match=f"(?s){name}.*known only after it"):
+            export_fmu(rt.CorrectedTwin(of, per_segment), out)
+    for period, reason in ((5, "depends on the next one"), (1, "errors .* have no C text")):
+        sensor = Chain(rt.Additive(), SampledSensor(period=period / RATE))
+        with pytest.raises(InputError, match=reason):
+            export_fmu(corrected(NETWORKS["mlp"], CAUSAL, sensor), out)
+    with pytest.raises(InputError, match="Doubled, an operator that has no C text"):
+        export_fmu(corrected(NETWORKS["mlp"], CAUSAL, Doubled()), out)
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_the_command_line_exports_a_saved_corrected_twin(call: Any, tmp_path: Path) -> None:
+    corrected(NETWORKS["mlp"], CAUSAL).save(tmp_path / "model")
+    code, _, err = call("export", "fmu", tmp_path / "model", "--out", tmp_path / "twin.fmu")
+    assert code == 0, err
+    assert np.isfinite(simulated(tmp_path / "twin.fmu", COMMANDS)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+@pytest.mark.parametrize("name", [*NETWORKS, "corrected"])
+def test_the_source_code_is_clean(name: str, version: str, tmp_path: Path) -> None:
+    twin: Any = surrogate(NETWORKS.get(name), 1, 1) if name in NETWORKS else None
+    twin = twin or corrected(NETWORKS["tcn"], CAUSAL, channels=(1, 1))
+    path = export_fmu(twin, tmp_path / "twin.fmu", version=version, compiled=False).path
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(tmp_path)
+    strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-fsanitize=address,undefined")
+    driver = Path(__file__).with_name(f"drive_fmi{version[0]}.c")
+    token = fmpy.read_model_description(str(path)).guid
+    subprocess.run(
+        [*next(iter(compilers())), *strict, f'-DTOKEN_GIVEN="{token}"',
+         f"-I{tmp_path / 'sources'}", str(driver), str(tmp_path / "sources" / "twin.c"),
+         "-o", str(tmp_path / "driver"), "-lm"],
+        check=True,
+    )  # fmt: skip
+    done = subprocess.run([str(tmp_path / "driver")], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_fmpy_compiles_the_source_code(
+    version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    twin = corrected(NETWORKS["mlp"], CAUSAL)
+    path = export_fmu(twin, tmp_path / "twin.fmu", version=version).path
+    source = export_fmu(twin, tmp_path / "source.fmu", version=version, compiled=False).path
+    folder = tmp_path / "folder"
+    with zipfile.ZipFile(source) as archive:
+        archive.extractall(folder)
+    # The program cmake comes with the package of that name, which fmpy requires.
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    (tmp_path / "build").mkdir()
+    build_platform_binary(folder, tmp_path / "build")
+    if version == "2.0":
+        made = simulated(folder, COMMANDS) - simulated(path, COMMANDS)
+        np.testing.assert_allclose(made, 0.0, atol=1e-9)
+        return
+    found = [fmpy.simulate_fmu(str(each), stop_time=1.0) for each in (folder, path)]
+    np.testing.assert_allclose(found[0]["y1.q95"], found[1]["y1.q95"], atol=1e-9)
