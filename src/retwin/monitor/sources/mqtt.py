@@ -25,7 +25,7 @@ RETRY = 1, 4
 """Seconds between attempts to connect, which double from the first to the second."""
 LARGEST = 2**20
 """Bytes of a message at most; the broker keeps larger ones to itself."""
-IN_FLIGHT = 500
+IN_FLIGHT = 100
 """Messages that the broker sends before the first of them is acknowledged, at most."""
 
 
