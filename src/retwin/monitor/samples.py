@@ -139,7 +139,7 @@ def _objects(document: bytes | str) -> Iterator[Any]:
         text = document if isinstance(document, str) else document.decode("utf-8")
     except UnicodeDecodeError as error:
         raise _no_document(error) from None
-    lines = [each for each in text.splitlines() if each.strip()]
+    lines = [each for each in text.split("\n") if each.strip()]
     try:
         try:
             whole = json.loads(text)
@@ -176,7 +176,7 @@ def _time(each: dict[str, Any], place: str) -> int:
                 made = None
         elif isinstance(given, int) and not isinstance(given, bool):
             made = given if "time_ns" in each else given * SECOND
-        elif isinstance(given, float) and "time" in each and np.isfinite(given):
+        elif isinstance(given, float) and "time" in each and abs(given) < MOST:
             made = round(given * SECOND)
     if made is not None and LEAST < made < MOST:
         return made
