@@ -11,6 +11,7 @@ a smaller one, and the shifted one for bets on a shift.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -125,8 +126,9 @@ class Bets:
     weights: NDArray
 
     @classmethod
+    @lru_cache(maxsize=64)
     def of(cls, slacks: tuple[Slack, ...], families: tuple[tuple[Alternative, ...], ...]) -> Bets:
-        """Bets on each alternative against each class."""
+        """Bets on each alternative against each class; the newest ones are kept."""
         alternatives = [each for family in families for each in family]
         weights = [1 / len(families) / len(family) for family in families for _ in family]
         levels = np.arange(-LEVELS, LEVELS + 1.0)

@@ -92,7 +92,8 @@ class Detector:
             at_least("alternatives", family, 1, "members of a family", remedy="leave it out")
         different = tuple(dict.fromkeys(given))
         which = np.array([different.index(each) for each in given], dtype=np.intp)
-        object.__setattr__(self, "bets", Bets.of(different, self.alternatives))
+        families = tuple(tuple(family) for family in self.alternatives)
+        object.__setattr__(self, "bets", Bets.of(different, families))
         object.__setattr__(self, "which", which)
 
     def start(self, streams: int) -> DetectorState:
