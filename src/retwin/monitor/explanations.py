@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Container, Iterable
 from typing import Any
 
 import numpy as np
@@ -53,14 +53,12 @@ class Explanations:
         self._live = live
         self._faults = faults
         self._report = report
-        self._queue: queue.Queue[Entry | None] = queue.Queue()
+        self._queue: queue.Queue[tuple[Entry, int] | None] = queue.Queue()
+        self._before: dict[str, int] = {}
         self._closed = threading.Event()
         explained = {entry.data["alarm"] for entry in live.store.log("cause")}
         self._last = -1
-        for entry in live.store.log("alarm"):
-            if entry.sequence not in explained:
-                self._queue.put(entry)
-            self._last = entry.sequence
+        self._take(live.store.log("alarm"), explained)
         live.listen(self._on_entries)
         self._thread = threading.Thread(target=self._run, name="explanations", daemon=True)
         self._thread.start()
@@ -86,22 +84,31 @@ class Explanations:
         return possible_causes(monitor.twin, self._faults(twin))
 
     def _on_entries(self, entries: list[Entry]) -> None:
-        for entry in entries:
-            if entry.kind == "alarm" and entry.sequence > self._last:
-                self._queue.put(entry)
+        self._take(each for each in entries if each.kind == "alarm" and each.sequence > self._last)
+
+    def _take(self, alarms: Iterable[Entry], explained: Container[int] = ()) -> None:
+        """Queue alarms, each with the time of the alarm before it of the same machine."""
+        for entry in alarms:
+            asset = entry.data["asset"]
+            if entry.sequence not in explained:
+                self._queue.put((entry, self._before.get(asset, 0)))
+            self._before[asset] = entry.data["time"]
+            self._last = entry.sequence
 
     def _run(self) -> None:
-        while (entry := self._queue.get()) is not None and not self._closed.is_set():
+        while (waiting := self._queue.get()) is not None and not self._closed.is_set():
             try:
-                self._explain(entry)
+                self._explain(*waiting)
+            except InputError:
+                pass  # It could not be stored, so the alarm is explained after the next start.
             finally:
                 self._queue.task_done()
 
-    def _explain(self, entry: Entry) -> None:
+    def _explain(self, entry: Entry, before: int) -> None:
         alarm = entry.data
         try:
-            found = _data(entry, self._found(alarm))
-        except (InputError, ValueError, FloatingPointError, np.linalg.LinAlgError) as error:
+            found = _data(entry, self._found(alarm, before))
+        except Exception as error:  # Whatever fails is an entry, and the next alarm is explained.
             found = {
                 "alarm": entry.sequence,
                 "asset": alarm["asset"],
@@ -116,23 +123,15 @@ class Explanations:
         self._live.log([("cause", found)])
         self._report(alarm, found)
 
-    def _found(self, alarm: dict[str, Any]) -> tuple[Cause, int]:
+    def _found(self, alarm: dict[str, Any], before: int) -> tuple[Cause, int]:
         """The cause of an alarm, and the time of the first sample that it was found from."""
         store, name = self._live.store, alarm["asset"]
         twin = next(each for each in store.assets() if each.name == name).settings["twin"]
         monitor = Monitor.load(Registry(store, twin).folder(alarm["version"]))
         period = SECOND / monitor.twin.rate
-        last = max(
-            (
-                each.data["time"]
-                for each in store.log("alarm")
-                if each.data["asset"] == name and each.data["time"] < alarm["time"]
-            ),
-            default=0,
-        )
         window = round(min(BEFORE, alarm["sample"]) * period)
-        if alarm["time"] - last > FEWEST * period:
-            window = min(window, alarm["time"] - last - round(period / 2))
+        if alarm["time"] - before > FEWEST * period:
+            window = min(window, alarm["time"] - before - round(period / 2))
         record = _record(store, name, monitor, alarm["time"] - window, alarm["time"])
         own = Alarm("", record.steps - 1, 0.0, alarm["output"], alarm["change"], alarm["evidence"])
         known = self.causes(twin, monitor)
