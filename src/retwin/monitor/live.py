@@ -131,6 +131,8 @@ class Live:
         self._lock = threading.RLock()
         self._monitors: dict[tuple[str, int], tuple[Monitor, Layout]] = {}
         self._machines: dict[str, Machine] = {}
+        self._unsure: set[str] = set()
+        """Machines that must be read from the store again: a commit of theirs failed."""
         self._listeners: list[Callable[[list[Entry]], None]] = []
         self.revision = 0
         """Grows whenever something has changed."""
@@ -201,6 +203,7 @@ class Live:
 
         """
         with self._lock:
+            self._read_again()
             for each in batch:
                 width = self._one(each.asset).asset.channels
                 require(
@@ -213,10 +216,8 @@ class Live:
             try:
                 return self._submitted(batch)
             except BaseException:
-                # What the store holds is true; machines are read from it again.
-                for each in batch:
-                    machine = self._machines[each.asset]
-                    self._machines[each.asset] = self._machine(machine.asset)
+                # What the store holds is true, but it may not be in reach now.
+                self._unsure |= {each.asset for each in batch}
                 raise
 
     def status(self) -> list[AssetStatus]:
@@ -251,7 +252,8 @@ class Live:
 
     def log(self, entries: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
         """Store entries of the log."""
-        self._announce(self.store.commit(entries=entries).entries)
+        with self._lock:
+            self._announce(self.store.commit(entries=entries).entries)
 
     def acknowledge(self, sequence: int, who: str, note: str = "") -> None:
         """Log that somebody has seen the alarm with this sequence in the log.
@@ -273,6 +275,11 @@ class Live:
         )
         data = {"alarm": sequence, "who": who, "note": note, "at": self._clock()}
         self.log([("acknowledge", data)])
+
+    def _read_again(self) -> None:
+        for name in sorted(self._unsure & self._machines.keys()):
+            self._machines[name] = self._machine(self._machines[name].asset)
+            self._unsure.discard(name)
 
     def _submitted(self, batch: Sequence[Samples]) -> list[Received]:
         limit = self._clock() + round(self._ahead * SECOND)
