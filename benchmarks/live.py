@@ -7,11 +7,12 @@ An emulated tank with one input and one output. Latency is the time from `Gate.s
 when samples, state and alarms of one machine are durable. The load is that of 100 machines at 10 Hz
 whose samples arrive in batches of 0.1 s, as CPU time of all threads over the wall clock time. The
 replay is of one day at 1 Hz in one call. Memory is resident memory after 0.2 and after 2 million
-samples of 100 machines.
+samples of 100 machines. The latency of the disk is that of a commit of SQLite alone.
 """
 
 from __future__ import annotations
 
+import sqlite3
 import sys
 import tempfile
 import time
@@ -87,8 +88,31 @@ def main() -> None:
     if sys.argv[1:] == ["memory"]:
         record("live memory", f"live monitor, {MACHINES} machines", memory(monitor, begin))
         return
-    figures = latency(monitor, begin) | load(monitor, begin) | replay(calibrated(1.0))
+    figures = (
+        latency_of_disk() | latency(monitor, begin) | load(monitor, begin) | replay(calibrated(1.0))
+    )
     record("live", f"live monitor, {MACHINES} machines", figures)
+
+
+def latency_of_disk() -> dict[str, float]:
+    """Seconds of a durable commit of one row, without anything of this package."""
+    taken = []
+    with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:
+        connection = sqlite3.connect(Path(folder) / "disk.sqlite")
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = FULL")
+        connection.execute("CREATE TABLE rows (packed BLOB)")
+        for _ in range(SENT):
+            started = time.perf_counter()
+            connection.execute("INSERT INTO rows VALUES (?)", (bytes(1000),))
+            connection.commit()
+            taken.append(time.perf_counter() - started)
+            time.sleep(0.005)
+        connection.close()
+    return {
+        "commit of SQLite alone, median (ms)": 1e3 * float(np.median(taken)),
+        "commit of SQLite alone, 99 % (ms)": 1e3 * float(np.quantile(taken, 0.99)),
+    }
 
 
 def latency(monitor: Monitor, begin: int) -> dict[str, float]:
