@@ -115,7 +115,7 @@ def test_it_has_the_distribution_and_the_draws_of_the_twin(
     assert made.delay == (period if corrected.equations.interpolation == "linear" else 0)
     found = simulated(made.path, u[0], period, noise=True, seed=7)
     steps, theta = corrected.equations.steps(), corrected.values[None]
-    nominal, states = steps.run(u, theta)
+    nominal, _ = steps.run(u, theta)
     spread = nominal[0].std(axis=0)
     outputs = corrected.outputs.names
     mean = np.stack([found[f"{name}.mean"] for name in outputs], axis=1)
@@ -138,7 +138,7 @@ def test_it_has_the_distribution_and_the_draws_of_the_twin(
     errors = np.concatenate([rest[None, :2], rest[2:].reshape(-1, 4)[:, 2:]])
     kicks = np.zeros((1, STEPS, 2))
     kicks[0, :-1] = rest[2:].reshape(-1, 4)[:, :2]
-    kicks *= np.sqrt(corrected.process_variance(states))
+    kicks *= np.sqrt(corrected.free_process)
     kicked = steps.run(u, theta, kicks)[0][0] + np.sqrt(corrected.noise) * errors
     expected = nominal[0] + corrected.widening * (kicked - nominal[0] + by_all @ moves)
     sampled = np.stack([found[name] for name in outputs], axis=1)

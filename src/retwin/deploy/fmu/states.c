@@ -9,7 +9,7 @@
  *   VALUES[NQ], PLACE[NQ] parameters and start values, and their value references, -1 for none
  *   FACTOR[NQ][NR]        of the covariance of these, FACTOR FACTOR^T
  *   START[NX]             deviations by which starts differ between instances
- *   PROCESS[NX], PROPORTIONAL[NX], RANGE[NX], NOISE[NY]   variances of the noise */
+ *   PROCESS[NX], NOISE[NY] variances of process and measurement noise */
 
 #define QUANTILE 1.6448536269514722
 
@@ -94,7 +94,7 @@ static void begin(Twin *twin)
 /* One sample on. */
 static void next(Twin *twin)
 {
-    double q[NQ], c[4 * NU + 1] = {0}, u[NU + 1], past[NX], F[NX * (1 + NX)], FP[NX * NX];
+    double q[NQ], c[4 * NU + 1] = {0}, u[NU + 1], F[NX * (1 + NX)], FP[NX * NX];
     present(twin, q);
     executed(twin, u);
     for (int i = 0; i < NU; i++) {
@@ -103,7 +103,7 @@ static void next(Twin *twin)
         twin->before[i] = u[i];
     }
     for (int i = 0; i < NX; i++) {
-        past[i] = F[i] = twin->z[i];
+        F[i] = twin->z[i];
         for (int j = 0; j < NX; j++)
             F[NX + i * NX + j] = i == j ? 1.0 : 0.0;
     }
@@ -117,14 +117,12 @@ static void next(Twin *twin)
                 FP[i * NX + j] += F[NX + i * NX + k] * twin->P[k * NX + j];
         }
     for (int i = 0; i < NX; i++) {
-        double change = fmin(fabs(twin->z[i] - past[i]), RANGE[i]);
-        double variance = PROCESS[i] + PROPORTIONAL[i] * change * change;
         for (int j = 0; j < NX; j++) {
-            twin->P[i * NX + j] = i == j ? variance : 0.0;
+            twin->P[i * NX + j] = i == j ? PROCESS[i] : 0.0;
             for (int k = 0; k < NX; k++)
                 twin->P[i * NX + j] += FP[i * NX + k] * F[NX + j * NX + k];
         }
-        twin->kicked[i] += sqrt(variance) * normal(twin);
+        twin->kicked[i] += sqrt(PROCESS[i]) * normal(twin);
     }
     draw_error(twin);
     twin->ready = 0;

@@ -73,6 +73,7 @@ def _as_corrected(twin: StateTwin) -> DynamicsTwin:
         nothing,
         nothing,
         nothing,
+        nothing,
         np.zeros(len(twin.outputs)),
         1.0,
         domain,
@@ -111,7 +112,6 @@ def _variables(twin: DynamicsTwin) -> tuple[list[Variable], list[int]]:
 def _model(twin: DynamicsTwin, variables: Sequence[Variable], places: Sequence[int]) -> str:
     """The equations of a twin and its numbers as C."""
     states = len(twin.process)
-    low, high = (each[:states] for each in (twin.domain.low, twin.domain.high))
     sizes = {
         "NR": twin.factor.shape[1],
         "NV": len(variables) - 2,
@@ -123,9 +123,7 @@ def _model(twin: DynamicsTwin, variables: Sequence[Variable], places: Sequence[i
         "VALUES": twin.values,
         "FACTOR": twin.factor.ravel(),
         "START": twin.start_deviation,
-        "PROCESS": twin.process,
-        "PROPORTIONAL": twin.proportional,
-        "RANGE": high - low,
+        "PROCESS": twin.free_process,
         "NOISE": twin.noise,
         "FIRST": twin.domain.mean[states:],
     }
