@@ -49,4 +49,4 @@ def store(name: str, result: dict[str, Any]) -> None:
 def _rounded(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _rounded(each) for name, each in value.items()}
-    return float(f"{value:.4g}")
+    return None if value != value else float(f"{value:.4g}")  # JSON has no NaN
