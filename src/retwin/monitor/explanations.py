@@ -8,17 +8,20 @@ from collections.abc import Callable, Container, Iterable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.estimate import UNKNOWN
 from retwin.errors import InputError, brief
 from retwin.monitor.audit import Entry
 from retwin.monitor.cause import BEFORE, FEWEST, Cause, find_causes, possible_causes
+from retwin.monitor.gridded import gridded
 from retwin.monitor.live import Live
 from retwin.monitor.monitor import Alarm, Monitor
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import SECOND
 from retwin.twins.faults import Fault
+from retwin.update.dynamics.twin import DynamicsTwin
 
 __all__ = ["Explanations"]
 
@@ -132,31 +135,19 @@ class Explanations:
         window = round(min(BEFORE, alarm["sample"]) * period)
         if alarm["time"] - before > FEWEST * period:
             window = min(window, alarm["time"] - before - round(period / 2))
-        record = _record(store, name, monitor, alarm["time"] - window, alarm["time"])
+        half = round(period / 2)
+        begin, end = alarm["time"] - window - half, alarm["time"] + half
+        times, values = gridded(store, name, monitor.twin, begin, end)
+        record = _record(monitor.twin, values)
         own = Alarm("", record.steps - 1, 0.0, alarm["output"], alarm["change"], alarm["evidence"])
         known = self.causes(twin, monitor)
         (cause,) = find_causes(monitor.twin, record, [own], known, known_start=False)
-        return cause, alarm["time"] - round((record.steps - 1) * period)
+        return cause, int(times[0])
 
 
-def _record(store: Any, name: str, monitor: Monitor, first: int, last: int) -> Trajectories:
-    """The stored samples of a machine from a time to another, on the grid of the last one."""
-    twin = monitor.twin
-    period = SECOND / twin.rate
-    steps = round((last - first) / period) + 1
-    values = np.full((steps, len(twin.inputs) + len(twin.outputs)), np.nan)
-    for times, rows in store.samples(name, first - round(period)):
-        place = steps - 1 + np.round((times - last) / period).astype(np.int64)
-        inside = (place >= 0) & (place < steps)
-        values[place[inside]] = rows[inside]
-        if len(times) and times[-1] > last:
-            break
+def _record(twin: DynamicsTwin, values: NDArray) -> Trajectories:
+    """Samples (T, d_u + d_y) as a record."""
     commands, measured = np.split(values, [len(twin.inputs)], axis=1)
-    known = np.isfinite(commands)
-    index = np.maximum.accumulate(np.where(known, np.arange(steps)[:, None], 0), axis=0)
-    commands = np.take_along_axis(commands, index, axis=0)
-    begin = int(np.argmax(np.isfinite(commands).all(axis=1)))
-    commands, measured = commands[begin:], measured[begin:]
     return Trajectories(
         commands=commands[None],
         nominal=np.zeros_like(measured)[None],

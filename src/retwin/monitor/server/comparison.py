@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.monitor.cause import BEFORE
 from retwin.monitor.decision import MIN_SAMPLES, Decision, FalseAlarmTest, decide
+from retwin.monitor.gridded import gridded
 from retwin.monitor.monitor import Monitor
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import SECOND
 from retwin.monitor.store import Store
-from retwin.monitor.updates import Asset
 
-__all__ = ["Comparisons", "compare", "stored"]
+__all__ = ["Comparisons", "compare"]
 
 FRESH, QUEUE = 60.0, 16
 """Seconds for which a comparison is kept, and comparisons that may be made or kept."""
@@ -120,57 +120,14 @@ def _healthy(store: Store, twin: str, monitor: Monitor) -> Iterator[NDArray]:
         newest = store.state(asset.name)
         if asset.settings.get("twin") == twin and newest is not None:
             period = SECOND / monitor.twin.rate
-            times, rows = stored(store, asset, monitor, newest[0] - round(MOST * period), newest[0])
+            first = newest[0] - round(MOST * period)
+            times, rows = gridded(store, asset.name, monitor.twin, first, newest[0])
             ends = np.searchsorted(times, sorted(alarms.get(asset.name, [])))
             ends = np.unique(np.concatenate([[0], ends[ends > 0], [len(times) + BEFORE]]))
             first = int(np.argmax(np.diff(ends))) if len(ends) > 1 else 0
             part = rows[ends[first] : ends[first + 1] - BEFORE]
             known = np.isfinite(part[:, : len(monitor.twin.inputs)]).all(axis=1)
             yield part[int(np.argmax(known)) :] if known.any() else part[:0]
-
-
-def stored(
-    store: Store, asset: Asset, monitor: Monitor, first: int, last: int
-) -> tuple[NDArray, NDArray]:
-    """Times (T,) and values (T, d_u + d_y) of stored samples, at the sample rate of the twin.
-
-    Parameters
-    ----------
-    store : Store
-        The store.
-    asset : Asset
-        The asset.
-    monitor : Monitor
-        A monitor of it.
-    first, last : int
-        Times in nanoseconds between which samples are read.
-
-    Returns
-    -------
-    NDArray, NDArray
-        From the first sample with all commands on; NaN where there is no sample.
-
-    """
-    times, values = [], []
-    for part, rows in store.samples(asset.name, first - 1):
-        times.append(part[part <= last])
-        values.append(rows[part <= last])
-        if part[-1] > last:
-            break
-    found = np.concatenate([*times, np.zeros(0, dtype=np.int64)])
-    given = np.concatenate([*values, np.zeros((0, asset.channels))])
-    known = np.isfinite(given[:, : len(monitor.twin.inputs)]).all(axis=1)
-    found, given = found[np.logical_or.accumulate(known)], given[np.logical_or.accumulate(known)]
-    if not len(found):
-        return found, given
-    period = SECOND / monitor.twin.rate
-    place, chosen = np.unique(
-        np.round((found - found[0]) / period).astype(np.int64), return_index=True
-    )
-    inside = place <= (last - first) / period
-    rows = np.full((int(place[inside][-1]) + 1, asset.channels), np.nan)
-    rows[place[inside]] = given[chosen[inside]]
-    return found[0] + np.round(np.arange(len(rows)) * period).astype(np.int64), rows
 
 
 class Comparisons:

@@ -15,13 +15,13 @@ from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 from retwin.monitor.cause import possible_causes
 from retwin.monitor.explanations import Explanations
+from retwin.monitor.gridded import gridded
 from retwin.monitor.live import AssetStatus, Live
 from retwin.monitor.machine import Recent
 from retwin.monitor.monitor import Monitor
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import SECOND
 from retwin.monitor.server.checks import size_unit, what_to_check
-from retwin.monitor.server.comparison import stored
 from retwin.monitor.server.journal import Journal
 
 __all__ = ["Views"]
@@ -112,7 +112,7 @@ class Views:
         period = SECOND / monitor.twin.rate
         moment = round(alarm["time"] * SECOND)
         first, last = moment - round(LEARNED * period), moment + round(AFTER * period)
-        times, rows = stored(self._live.store, asset, monitor, first, last)
+        times, rows = gridded(self._live.store, asset.name, monitor.twin, first, last)
         commands, measured = np.split(rows, [len(monitor.twin.inputs)], axis=1)
         if len(times):
             watched = monitor.step(monitor.start(1), commands[None], measured[None])[1]

@@ -1,0 +1,60 @@
+"""Stored samples of a machine at the sample rate of its twin."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.monitor.samples import SECOND
+from retwin.monitor.store import Store
+from retwin.update.dynamics.twin import DynamicsTwin
+
+__all__ = ["gridded"]
+
+
+def gridded(
+    store: Store, asset: str, twin: DynamicsTwin, first: int, last: int
+) -> tuple[NDArray, NDArray]:
+    """Times (T,) and values (T, d_u + d_y) of stored samples, at the sample rate of the twin.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+    asset : str
+        Name of the machine.
+    twin : DynamicsTwin
+        Its twin.
+    first, last : int
+        Times in nanoseconds between which samples are read.
+
+    Returns
+    -------
+    NDArray, NDArray
+        From the first sample with all commands on; NaN where there is no sample. A command that is
+        missing later is the one before.
+
+    """
+    commands = len(twin.inputs)
+    times, values = [np.zeros(0, dtype=np.int64)], [np.zeros((0, commands + len(twin.outputs)))]
+    for part, rows in store.samples(asset, first - 1):
+        times.append(part[part <= last])
+        values.append(rows[part <= last])
+        if part[-1] > last:
+            break
+    found, given = np.concatenate(times), np.concatenate(values)
+    begun = np.logical_or.accumulate(np.isfinite(given[:, :commands]).all(axis=1))
+    found, given = found[begun], given[begun]
+    if not len(found):
+        return found, given
+    period = SECOND / twin.rate
+    place, chosen = np.unique(
+        np.round((found - found[0]) / period).astype(np.int64), return_index=True
+    )
+    inside = place <= (last - first) / period
+    rows = np.full((int(place[inside][-1]) + 1, given.shape[1]), np.nan)
+    rows[place[inside]] = given[chosen[inside]]
+    known = np.isfinite(rows[:, :commands])
+    index = np.maximum.accumulate(np.where(known, np.arange(len(rows))[:, None], 0), axis=0)
+    rows[:, :commands] = np.take_along_axis(rows[:, :commands], index, axis=0)
+    return found[0] + np.round(np.arange(len(rows)) * period).astype(np.int64), rows
