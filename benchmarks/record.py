@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -49,4 +50,4 @@ def store(name: str, result: dict[str, Any]) -> None:
 def _rounded(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _rounded(each) for name, each in value.items()}
-    return None if value != value else float(f"{value:.4g}")  # JSON has no NaN
+    return float(f"{value:.4g}") if isfinite(value) else None  # as JSON has only finite numbers
