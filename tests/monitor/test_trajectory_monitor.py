@@ -70,8 +70,8 @@ def test_a_fault_is_named_in_the_trajectory_in_which_it_begins(monitor: Trajecto
 
 
 def test_evidence_accumulates_over_trajectories(monitor: TrajectoryMonitor) -> None:
-    weak = ActuatorGain(0, size=-0.02)  # less than any that the diagnoser knows
-    _, watched = monitor.watch(runs(5, 5, weak))
+    weak = ActuatorGain(0, size=-0.013)  # less than any that the diagnoser knows
+    _, watched = monitor.watch(runs(15, 5, weak))
     assert watched.alarms
     assert watched.alarms[0].number > 0
 
