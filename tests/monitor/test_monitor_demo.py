@@ -11,7 +11,7 @@ import time
 import httpx
 import pytest
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 SECONDS = 75
 
 
