@@ -22,13 +22,16 @@ _HOME = {
     "Body": "case",
     "Case": "case",
     "ColumnRecords": "columns",
+    "Columns": "logs",
     "EmulatedArmPi": "armpi_fpv.emulator",
     "KinematicTwin": "armpi_fpv.closed_form",
     "Record": "columns",
     "TimeColumn": "time_column",
     "animate": "animation",
     "armpi_parametric": "armpi_fpv.parameters",
+    "open_parametric": "opened_twin",
     "read_case": "file",
+    "read_logs": "logs",
     "recover_commands": "armpi_fpv.recovery",
 }
 _CASES = {

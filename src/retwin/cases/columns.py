@@ -20,7 +20,7 @@ from retwin.errors import InputError
 from retwin.serialisation.files import sha256
 from retwin.twins.twin import Twin
 
-__all__ = ["ColumnRecords", "Record", "number"]
+__all__ = ["ColumnRecords", "Record", "number", "read_columns", "record_in"]
 
 
 @dataclass(frozen=True)
@@ -224,13 +224,13 @@ class ColumnRecords:
             cells |= dict.fromkeys(record.every_column, number)
             if record.clock:
                 cells[record.clock.column] = record.clock.number
-        tables = {file: _read(file, cells) for file, cells in wanted.items()}
+        tables = {file: read_columns(file, cells) for file, cells in wanted.items()}
         sources = {file: Provenance(file.name, sha256(file)) for file in tables}
 
         def made(name: str, found: Sequence[tuple[Path, Record]]) -> Trajectories:
             ids = [name] if len(found) == 1 else [f"{name}-{i + 1}" for i in range(len(found))]
             records = [
-                self._record(tables[file], record, own, sources[file])
+                record_in(tables[file], record, self.twin, own, sources[file])
                 for own, (file, record) in zip(ids, found, strict=True)
             ]
             steps = max(each.steps for each in records)
@@ -238,63 +238,84 @@ class ColumnRecords:
 
         return made("calibration", calibration), made("test", test)
 
-    def _record(
-        self, table: Mapping[str, NDArray], record: Record, name: str, source: Provenance
-    ) -> Trajectories:
-        """One record in a table, as a trajectory of that name."""
-        rows = slice(*(record.rows or (None,)))
-        clock, rate, seconds = record.clock, self.twin.rate, np.empty(0)
+
+def record_in(
+    table: Mapping[str, NDArray], record: Record, twin: Twin, name: str, source: Provenance
+) -> Trajectories:
+    """One record in a table, as a trajectory.
+
+    Parameters
+    ----------
+    table : mapping of str to ndarray, shape (T,)
+        Columns by name.
+    record : Record
+        The column of each channel, and the rows.
+    twin : Twin
+        Its channels and sample rate are those of the record.
+    name : str
+        The name of the trajectory.
+    source : Provenance
+        The file.
+
+    Raises
+    ------
+    InputError
+        A command is missing, nothing was measured, or the times are not as `TimeColumn` says.
+
+    """
+    rows = slice(*(record.rows or (None,)))
+    clock, rate, seconds = record.clock, twin.rate, np.empty(0)
+    if clock is not None:
+        place = f"{source.name}, {name} record"
+        seconds = clock.seconds(table[clock.column][rows], rate, place)
+
+    def values(channels: Channels, held: bool) -> NDArray:
+        columns = [
+            np.mean([table[each][rows] for each in several], axis=0)
+            for several in record.columns_of(channels)
+        ]
+        count = len(next(iter(table.values()))[rows])
+        found = np.array(columns).T.reshape(count, len(channels))
         if clock is not None:
-            place = f"{source.name}, {name} record"
-            seconds = clock.seconds(table[clock.column][rows], rate, place)
+            found = clock.sampled(seconds, found, rate, held=held)
+        return found[None]
 
-        def values(channels: Channels, held: bool) -> NDArray:
-            columns = [
-                np.mean([table[each][rows] for each in several], axis=0)
-                for several in record.columns_of(channels)
-            ]
-            count = len(next(iter(table.values()))[rows])
-            found = np.array(columns).T.reshape(count, len(channels))
-            if clock is not None:
-                found = clock.sampled(seconds, found, rate, held=held)
-            return found[None]
-
-        held = clock is not None and clock.commands == "hold"
-        commands, observed = values(self.twin.inputs, held), values(self.twin.outputs, False)
-        # Without commands, a record ends where its measurements end.
-        known = np.isfinite(commands[0]).all(axis=1)
-        ends = known if len(self.twin.inputs) else np.isfinite(observed[0]).any(axis=1)
-        steps = int(np.flatnonzero(ends).max(initial=-1)) + 1
-        first = int(np.append(known, False).argmin())
-        missing = f", none at {first / rate:g} s" if clock and first < steps else ""
-        require(
-            steps >= 2 and known[:steps].all(),
-            source.name,
-            expected="a number for every command until the record ends, two rows at least",
-            got=f"{int(known.sum())} of {steps} rows of the {name} record{missing}",
-            remedy="fill in the missing commands, which are known inputs, or give the rows before "
-            "and after them as two records",
-        )
-        observed[:, : round(record.transient * rate)] = np.nan
-        require(
-            np.isfinite(observed[:, :steps]).any(),
-            source.name,
-            expected=f"measurements in the {name} record, after its transient",
-            got=f"none in {steps} rows",
-            remedy="check columns, rows and transient",
-        )
-        commands = commands[:, :steps]
-        return Trajectories(
-            commands=commands,
-            nominal=self.twin.simulate(commands, seed=0).nominal,
-            observed=observed[:, :steps],
-            rate=rate,
-            labels=np.array([HEALTHY]),
-            ids=np.array([name]),
-            inputs=self.twin.inputs,
-            outputs=self.twin.outputs,
-            provenance=(source,),
-        )
+    held = clock is not None and clock.commands == "hold"
+    commands, observed = values(twin.inputs, held), values(twin.outputs, False)
+    # Without commands, a record ends where its measurements end.
+    known = np.isfinite(commands[0]).all(axis=1)
+    ends = known if len(twin.inputs) else np.isfinite(observed[0]).any(axis=1)
+    steps = int(np.flatnonzero(ends).max(initial=-1)) + 1
+    first = int(np.append(known, False).argmin())
+    missing = f", none at {first / rate:g} s" if clock and first < steps else ""
+    require(
+        steps >= 2 and known[:steps].all(),
+        source.name,
+        expected="a number for every command until the record ends, two rows at least",
+        got=f"{int(known.sum())} of {steps} rows of the {name} record{missing}",
+        remedy="fill in the missing commands, which are known inputs, or give the rows before "
+        "and after them as two records",
+    )
+    observed[:, : round(record.transient * rate)] = np.nan
+    require(
+        np.isfinite(observed[:, :steps]).any(),
+        source.name,
+        expected=f"measurements in the {name} record, after its transient",
+        got=f"none in {steps} rows",
+        remedy="check columns, rows and transient",
+    )
+    commands = commands[:, :steps]
+    return Trajectories(
+        commands=commands,
+        nominal=twin.simulate(commands, seed=0).nominal,
+        observed=observed[:, :steps],
+        rate=rate,
+        labels=np.array([HEALTHY]),
+        ids=np.array([name]),
+        inputs=twin.inputs,
+        outputs=twin.outputs,
+        provenance=(source,),
+    )
 
 
 def number(cell: str) -> float:
@@ -303,7 +324,7 @@ def number(cell: str) -> float:
     return float(cell or "nan") if truth is None else truth
 
 
-def _read(path: Path, cells: Mapping[str, Callable[[str], float]]) -> dict[str, NDArray]:
+def read_columns(path: Path, cells: Mapping[str, Callable[[str], float]]) -> dict[str, NDArray]:
     """Columns of a CSV file, each by a function of its cells."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as lines:

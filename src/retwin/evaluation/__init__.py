@@ -11,15 +11,18 @@ from retwin._lazy import names
 _HOME = {
     "Fidelity": "fidelity",
     "Figure": "fidelity",
+    "Identification": "identification",
     "Overlay": "fidelity",
     "Simulation": "fidelity",
     "evaluate": "diagnosers",
+    "hold_out": "identification",
     "measure_fidelity": "fidelity",
     "measure_widening": "fidelity",
     "predictive_overlay": "fidelity",
     "record_means": "fidelity",
     "simulate_records": "fidelity",
     "simulation_scores": "fidelity",
+    "validate_identification": "identification",
 }
 
 __getattr__, __dir__, __all__ = names(__name__, _HOME)

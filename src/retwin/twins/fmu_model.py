@@ -20,6 +20,7 @@ from retwin.twins.limits import Limits
 
 __all__ = [
     "Scalar",
+    "adjustable",
     "channels_of",
     "extract",
     "find_scalars",
@@ -296,6 +297,51 @@ def limits_of(inputs: Sequence[Scalar], outside: Literal["refuse", "clip"]) -> L
     return None if np.isinf(bounds).all() else Limits(low, high, outside)
 
 
+def _settable(description: Any) -> dict[str, Any]:
+    """The scalar variables that can be set before a run, by name."""
+    from fmpy.simulation import settable_in_initialization_mode, settable_in_instantiated
+
+    return {
+        variable.name: variable
+        for variable in description.modelVariables
+        if (settable_in_instantiated(variable) or settable_in_initialization_mode(variable))
+        and variable.causality != "structuralParameter"
+        and variable.type in (*SCALARS, "String")
+        and not variable.shape
+    }
+
+
+def adjustable(
+    description: Any,
+) -> list[tuple[str, str, float | None, float | None, float | None]]:
+    """Numbers that can be set before a run.
+
+    Parameters
+    ----------
+    description : fmpy.model_description.ModelDescription
+        The FMU's description.
+
+    Returns
+    -------
+    list of (str, str, float or None, float or None, float or None)
+        Name, unit, start, least and greatest value of each, None where the FMU states none.
+        Parameters come first; other numbers, such as starts of states, have no range.
+
+    """
+    able = [
+        each
+        for each in _settable(description).values()
+        if each.type in NUMBERS and each.causality not in ("input", "independent")
+    ]
+    found = []
+    for each in sorted(able, key=lambda each: each.causality != "parameter"):
+        ends = Scalar(each.name, each).bounds if each.causality == "parameter" else (np.inf,) * 2
+        low, high = (None if np.isinf(end) else end for end in ends)
+        start = None if each.start in (None, "") else float(each.start)
+        found.append((each.name, _declared(each, "unit") or "1", start, low, high))
+    return found
+
+
 def start_column(
     description: Any, name: str, value: Any, count: int, inputs: Sequence[str]
 ) -> list[Any]:
@@ -325,17 +371,7 @@ def start_column(
         A variable that cannot be set before a run, or a value that does not fit its type.
 
     """
-    from fmpy.simulation import settable_in_initialization_mode, settable_in_instantiated
-
-    able = {
-        variable.name: variable
-        for variable in description.modelVariables
-        if (settable_in_instantiated(variable) or settable_in_initialization_mode(variable))
-        and variable.causality != "structuralParameter"
-        and variable.type in (*SCALARS, "String")
-        and not variable.shape
-        and variable.name not in inputs
-    }
+    able = {each: v for each, v in _settable(description).items() if each not in inputs}
     require(
         name in able,
         "start",

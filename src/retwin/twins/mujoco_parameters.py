@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+import mujoco
 import numpy as np
 from mujoco import batch as mujoco_batch
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.errors import InputError
 
-__all__ = ["set_parameter"]
+__all__ = ["parameter_value", "set_parameter", "suggested_parameters"]
 
 PLACE = re.compile(
     r"opt\.(?P<option>\w+)(\[(?P<at>\d+)\])?"
@@ -20,6 +21,83 @@ PLACE = re.compile(
 )
 SHARED_OPTIONS = ("timestep", "integrator")
 """Options that are equal in all simulations, because their samples lie on one time grid."""
+
+
+SUGGESTED = {
+    "joint": ("damping", "frictionloss", "stiffness", "armature"),
+    "actuator": ("gainprm", "biasprm"),
+    "body": ("mass",),
+}
+"""The fields that are uncertain most often. There are many more."""
+ALWAYS = ("damping", "frictionloss")
+"""Of these, those that are suggested where they are 0 too: a model often leaves them out."""
+
+
+def suggested_parameters(model: mujoco.MjModel) -> list[tuple[str, float]]:
+    """Names and values of the numbers of a model that are uncertain most often.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+        The model.
+
+    Returns
+    -------
+    list of (str, float)
+        Each as `set_parameter` takes it, with the model's value; numbers that are 0 are left out
+        but for damping and friction.
+
+    """
+    found = []
+    for kind, fields in SUGGESTED.items():
+        count = {"joint": model.njnt, "actuator": model.nu, "body": model.nbody}[kind]
+        for i in range(count):
+            place = getattr(model, kind)(i)
+            for field in fields if place.name else ():
+                values = np.ravel(getattr(place, field)) if hasattr(place, field) else np.empty(0)
+                for index, value in enumerate(values[:3].tolist()):
+                    if value or (field in ALWAYS and index == 0):
+                        at = f"[{index}]" if len(values) > 1 else ""
+                        found.append((f"{kind}.{place.name}.{field}{at}", float(value)))
+    return found
+
+
+def parameter_value(model: mujoco.MjModel, name: str) -> float:
+    """The value of a field of a model.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+        The model.
+    name : str
+        Place of the field, see `set_parameter`.
+
+    Raises
+    ------
+    InputError
+        There is no such field.
+
+    """
+    parts = PLACE.fullmatch(name)
+    try:
+        if parts is None:
+            raise KeyError("no such form")
+        index = int(parts["index"] or parts["at"] or 0)
+        if parts["option"]:
+            return float(np.ravel(getattr(model.opt, parts["option"]))[index])
+        place = getattr(model, parts["kind"])(parts["name"])
+        return float(np.ravel(getattr(place, parts["field"]))[index])
+    except (KeyError, AttributeError, ValueError, IndexError, TypeError) as error:
+        raise _no_such_field(name, error) from None
+
+
+def _no_such_field(name: str, error: Exception) -> InputError:
+    return InputError(
+        "parameters",
+        expected='"KIND.NAME.FIELD[INDEX]" as in "joint.hip.damping", or "opt.FIELD[INDEX]"',
+        got=f"{name!r} ({' '.join(str(error.args[0]).split())})",
+        remedy="name a body, joint, actuator, … of the model and one of its number fields",
+    )
 
 
 def set_parameter(batch: mujoco_batch.Batch, name: str, values: NDArray) -> None:
@@ -62,9 +140,4 @@ def set_parameter(batch: mujoco_batch.Batch, name: str, values: NDArray) -> None
         field.reshape(len(values), -1)[:, index] = values
         setattr(place, parts["field"], field)
     except (KeyError, AttributeError, ValueError, IndexError) as error:
-        raise InputError(
-            "parameters",
-            expected='"KIND.NAME.FIELD[INDEX]" as in "joint.hip.damping", or "opt.FIELD[INDEX]"',
-            got=f"{name!r} ({' '.join(str(error.args[0]).split())})",
-            remedy="name a body, joint, actuator, … of the model and one of its number fields",
-        ) from None
+        raise _no_such_field(name, error) from None

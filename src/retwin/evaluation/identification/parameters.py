@@ -1,0 +1,201 @@
+"""Estimates of parameters with their uncertainty, and what the measurements leave open."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from retwin.twins.parametric import ParametricTwin
+from retwin.update.identification.identifiability import UNIFORM
+from retwin.update.identification.identify import Updated
+from retwin.update.identification.posterior import Posterior
+
+__all__ = ["Basis", "Direction", "Estimate", "Uncertainty", "uncertainty_of"]
+
+NEAR = 0.01
+"""Distance from a bound, in widths of the range, within which draws count as on it."""
+CROWDED = 0.1
+"""Share of the draws near a bound from which a parameter counts as at the bound; of a uniform
+distribution it is 0.01."""
+OPEN = 0.8
+"""Posterior standard deviation, over that of the prior, from which a direction counts as open."""
+SMALL = 0.1
+"""Least component of a direction that is listed."""
+Basis = Literal["trajectories", "samples", "posterior", "none"]
+"""What standard errors rest on: differences between trajectories, samples whose residuals correlate
+as those of a first-order autoregression, or draws from the posterior."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter before and after identification.
+
+    Attributes
+    ----------
+    name, unit : str
+        Its name and unit.
+    low, high : float
+        The range within which it was searched.
+    start, value : float
+        Value before and after; for a posterior its mean.
+    error : float
+        Standard error, or posterior standard deviation; NaN where it is not defined, as at a
+        bound, and infinite where no output depends on the parameter.
+    interval : (float, float) or None
+        The 95 % interval, None where there is no error.
+    identified : bool
+        Whether the measurements narrow it down within its range.
+    at_bound : "low", "high" or ""
+        The bound on which it lies; the true value may be beyond it.
+
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    start: float
+    value: float
+    error: float
+    interval: tuple[float, float] | None
+    identified: bool
+    at_bound: Literal["low", "high", ""]
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A combination of parameters, in widths of their ranges.
+
+    Attributes
+    ----------
+    components : dict of str to float
+        The larger components of its unit vector, by the name of the parameter.
+    error : float
+        Standard error along it, in widths of the ranges; infinite where no output depends on it.
+    open : bool
+        Whether the measurements leave it open: its error is not smaller than that of a uniform
+        distribution over the range.
+
+    """
+
+    components: dict[str, float]
+    error: float
+    open: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """Estimates, their correlation (k, k), directions from best to least determined, and basis."""
+
+    parameters: tuple[Estimate, ...]
+    correlation: NDArray
+    directions: tuple[Direction, ...]
+    basis: Basis
+
+
+def uncertainty_of(before: ParametricTwin, found: Updated | Posterior) -> Uncertainty:
+    """The estimates of a result of `rt.identify`, for a twin at its values before."""
+    return _of_posterior(before, found) if isinstance(found, Posterior) else _of_fit(before, found)
+
+
+def _of_fit(before: ParametricTwin, found: Updated) -> Uncertainty:
+    """By the curvature at the optimum."""
+    local = found.identifiability
+    errors = np.array(list(found.errors.values()))
+    values = np.array(list(found.values.values()))
+    intervals = np.array(list(found.intervals.values()))
+    basis: Basis = "trajectories"
+    if np.isnan(errors).any():
+        basis, errors = "samples", np.asarray(local.errors, dtype=float)
+        freedom = max(local.independent - len(errors), 1.0)
+        half = stats.t.ppf(0.975, freedom) * errors
+        intervals = np.stack([values - half, values + half], axis=1)
+    singular = np.asarray(local.singular_values, dtype=float)
+    with np.errstate(divide="ignore"):
+        along = np.where(singular > 0, 1 / singular, np.inf)
+    directions = _directions(before.names, local.directions, along, UNIFORM)
+    ends = [_end(each, low, high) for each, low, high in zip(values, *before.bounds, strict=True)]
+    sides = [end if bound else "" for end, bound in zip(ends, local.at_bound, strict=True)]
+    made = _estimates(before, values, errors, intervals, local.identified, sides)
+    return Uncertainty(made, local.correlation, directions, basis)
+
+
+def _of_posterior(before: ParametricTwin, found: Posterior) -> Uncertainty:
+    """By the draws."""
+    low, high = before.bounds
+    width = high - low
+    scaled = (found.samples - low) / width
+    deviation = scaled.std(axis=0)
+    near = np.stack([(scaled < NEAR).mean(axis=0), (scaled > 1 - NEAR).mean(axis=0)])
+    sides = [
+        ("low", "high")[int(share.argmax())] if share.max() > CROWDED else "" for share in near.T
+    ]
+    variances, vectors = np.linalg.eigh(np.atleast_2d(np.cov(scaled.T)))
+    along = np.sqrt(np.maximum(variances, 0.0))
+    directions = _directions(before.names, vectors.T, along, OPEN * UNIFORM)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correlation = np.atleast_2d(np.corrcoef(scaled.T))
+    made = _estimates(
+        before,
+        found.samples.mean(axis=0),
+        deviation * width,
+        np.quantile(found.samples, [0.025, 0.975], axis=0).T,
+        deviation < OPEN * UNIFORM,
+        sides,
+        bounded=True,
+    )
+    return Uncertainty(made, correlation, directions, "posterior")
+
+
+def _end(value: float, low: float, high: float) -> Literal["low", "high"]:
+    return "low" if value - low < high - value else "high"
+
+
+def _estimates(
+    before: ParametricTwin,
+    values: NDArray,
+    errors: NDArray,
+    intervals: NDArray,
+    identified: NDArray,
+    sides: Sequence[str],
+    *,
+    bounded: bool = False,
+) -> tuple[Estimate, ...]:
+    """One estimate per parameter; at a bound a fit has no error, whose theory ends there."""
+    made = []
+    for i, each in enumerate(before.parameters):
+        lost = (bool(sides[i]) and not bounded) or np.isnan(errors[i])
+        known = not lost and np.isfinite(intervals[i]).all()
+        made.append(
+            Estimate(
+                each.name,
+                each.unit,
+                each.low,
+                each.high,
+                before.values[i],
+                float(values[i]),
+                float("nan") if lost else float(errors[i]),
+                (float(intervals[i][0]), float(intervals[i][1])) if known else None,
+                bool(identified[i]),
+                sides[i],  # type: ignore[arg-type]
+            )
+        )
+    return tuple(made)
+
+
+def _directions(
+    names: Sequence[str], vectors: NDArray, along: NDArray, limit: float
+) -> tuple[Direction, ...]:
+    """Directions in rows, the best determined first."""
+    made = []
+    for i in np.argsort(along, kind="stable"):
+        vector = vectors[i] * (1.0 if vectors[i][np.argmax(np.abs(vectors[i]))] >= 0 else -1.0)
+        shown = [j for j in np.argsort(-np.abs(vector)) if abs(vector[j]) > SMALL]
+        components = {names[j]: float(vector[j]) for j in shown}
+        made.append(Direction(components, float(along[i]), bool(along[i] >= limit)))
+    return tuple(made)

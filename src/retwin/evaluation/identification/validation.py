@@ -1,0 +1,294 @@
+"""`validate_identification`: the error of a twin before and after identification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import instance, require
+from retwin.data.trajectories import Trajectories
+from retwin.evaluation.identification.parameters import Basis, Direction, Estimate, uncertainty_of
+from retwin.evaluation.identification.residual_tests import ResidualTest, residual_tests
+from retwin.scores.intervals import MIN_GROUPS, jackknife_interval
+from retwin.scores.residuals import decorrelated_after
+from retwin.twins.parametric import ParametricTwin
+from retwin.twins.twin import checked_stride
+from retwin.update.identification.identify import Updated
+from retwin.update.identification.posterior import Posterior
+
+__all__ = ["Identification", "OutputError", "RMSError", "validate_identification"]
+
+MAX_BLOCKS = 20
+"""Blocks into which held-out records are divided for an interval, at most."""
+Part = Literal["identification", "validation"]
+Split = Literal["trajectories", "time", "own", "none"]
+
+
+@dataclass(frozen=True)
+class RMSError:
+    """Root mean square error of free simulation before and after, in the output's unit.
+
+    Attributes
+    ----------
+    before, after : float
+        NaN where nothing was measured.
+    ratio : float
+        After over before.
+    interval : (float, float) or None
+        95 % interval of the ratio, by the jackknife over trajectories or blocks of time; None
+        where there are fewer than five.
+    groups : int
+        Trajectories or blocks.
+    samples : int
+        Measurements.
+
+    """
+
+    before: float
+    after: float
+    ratio: float
+    interval: tuple[float, float] | None
+    groups: int
+    samples: int
+
+
+@dataclass(frozen=True)
+class OutputError:
+    """The errors of one output.
+
+    Attributes
+    ----------
+    name, unit : str
+        The output.
+    spread : float
+        Standard deviation of all its measurements.
+    identification : RMSError
+        On the measurements that the parameters were identified on.
+    validation : RMSError or None
+        On those that were held out; None if none were.
+
+    """
+
+    name: str
+    unit: str
+    spread: float
+    identification: RMSError
+    validation: RMSError | None
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """Identified parameters, and how far they can be trusted.
+
+    Attributes
+    ----------
+    twin : ParametricTwin
+        The twin with the identified values; of a posterior with its mean.
+    parameters : tuple of Estimate
+        The parameters before and after, with their uncertainty.
+    correlation : NDArray
+        (k, k), of the estimates; NaN where it is not defined.
+    directions : tuple of Direction
+        Combinations of parameters, from the best to the least determined.
+    basis : str
+        What the errors rest on: "trajectories", "samples" or "posterior".
+    outputs : tuple of OutputError
+        The errors of free simulation before and after.
+    residuals : tuple of ResidualTest
+        Tests of the residuals after identification, on the held-out measurements if there are any.
+    split : str
+        What was held out: "trajectories", the last part in "time", the case's "own" test set, or
+        "none".
+    simulated : dict of str to tuple
+        By part, "identification" and "validation": measured trajectories, and outputs (n, T, d_y)
+        of the twin before and after.
+    found : Updated or Posterior
+        The result of `rt.identify`.
+
+    """
+
+    twin: ParametricTwin
+    parameters: tuple[Estimate, ...]
+    correlation: NDArray
+    directions: tuple[Direction, ...]
+    basis: Basis
+    outputs: tuple[OutputError, ...]
+    residuals: tuple[ResidualTest, ...]
+    split: Split
+    simulated: dict[Part, tuple[Trajectories, NDArray, NDArray]]
+    found: Updated | Posterior
+
+    @property
+    def compared(self) -> Part:
+        """The part on which before and after are compared: held-out measurements if there are."""
+        return "validation" if "validation" in self.simulated else "identification"
+
+    def errors(self, part: Part) -> dict[str, RMSError]:
+        """The errors of the outputs that were measured in a part, by name."""
+        found = {each.name: getattr(each, part) for each in self.outputs}
+        return {name: each for name, each in found.items() if each is not None and each.samples}
+
+    @property
+    def open_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that the measurements do not determine."""
+        return tuple(each.name for each in self.parameters if not each.identified)
+
+    @property
+    def at_bound(self) -> tuple[str, ...]:
+        """Names of the parameters that lie on a bound."""
+        return tuple(each.name for each in self.parameters if each.at_bound)
+
+
+def validate_identification(
+    found: Updated | Posterior,
+    before: ParametricTwin,
+    used: Trajectories,
+    held_out: Trajectories | None = None,
+    *,
+    seed: int = 0,
+) -> Identification:
+    """Compare free simulations of a twin before and after identification with measurements.
+
+    Parameters
+    ----------
+    found : Updated or Posterior
+        The result of `rt.identify`.
+    before : ParametricTwin
+        The twin that was given to it.
+    used : Trajectories
+        The measurements that were given to it.
+    held_out : Trajectories, optional
+        Measurements that it did not use, see `hold_out`.
+    seed : int
+        Seed of the simulations.
+
+    Returns
+    -------
+    Identification
+        The parameters with their uncertainty, errors before and after, and tests of the residuals.
+
+    Raises
+    ------
+    InputError
+        Measurements that do not fit the twin.
+    SimulationError
+        The twin cannot simulate some of the held-out commands.
+
+    """
+    instance("found", found, Updated | Posterior, remedy="give what rt.identify returned")  # type: ignore[arg-type]
+    mean = found.twin.twin if isinstance(found, Posterior) else found.twin
+    require(
+        mean.names == before.names,
+        "before",
+        expected=f"the twin with the parameters {', '.join(mean.names)}",
+        got=", ".join(before.names),
+        remedy="give the twin that was identified, at its values before",
+    )
+    parts: dict[Part, Trajectories] = {"identification": used}
+    if held_out is not None:
+        parts["validation"] = held_out
+    simulated: dict[Part, tuple[Trajectories, NDArray, NDArray]] = {}
+    for part, measured in parts.items():
+        checked_stride(before, measured, None, part)
+        first, second = (
+            twin.simulate(measured.commands.astype(np.float64), seed=seed).observed
+            for twin in (before, mean)
+        )
+        simulated[part] = (measured, first, second)
+    uncertainty = uncertainty_of(before, found)
+    last = simulated["validation" if held_out is not None else "identification"]
+    return Identification(
+        twin=mean,
+        parameters=uncertainty.parameters,
+        correlation=uncertainty.correlation,
+        directions=uncertainty.directions,
+        basis=uncertainty.basis,
+        outputs=_outputs(simulated),
+        residuals=residual_tests(_residual(last[0], last[2]), last[0]),
+        split=_split(used, held_out),
+        simulated=simulated,
+        found=found,
+    )
+
+
+def _split(used: Trajectories, held_out: Trajectories | None) -> Split:
+    """How the measurements were divided."""
+    if held_out is None:
+        return "none"
+    same = used.commands.shape == held_out.commands.shape and np.array_equal(used.ids, held_out.ids)
+    if same and np.array_equal(used.commands, held_out.commands):
+        return "time"
+    return "trajectories"
+
+
+def _residual(measured: Trajectories, outputs: NDArray) -> NDArray:
+    """Measured minus simulated outputs (n, T, d_y), NaN where nothing was measured."""
+    return np.where(measured.mask, measured.observed.astype(np.float64) - outputs, np.nan)
+
+
+def _outputs(
+    simulated: dict[Part, tuple[Trajectories, NDArray, NDArray]],
+) -> tuple[OutputError, ...]:
+    """The errors of each output in each part."""
+    first = simulated["identification"][0]
+    made = []
+    for channel, (name, unit) in enumerate(zip(first.outputs.names, first.outputs.units)):  # noqa: B905
+        values = [
+            each.observed[..., channel][each.mask[..., channel]] for each, _, _ in simulated.values()
+        ]
+        together = np.concatenate(values)
+        errors: dict[Part, RMSError] = {
+            part: _rms(*(_residual(measured, each)[..., channel] for each in (before, after)))
+            for part, (measured, before, after) in simulated.items()
+        }
+        spread = float(together.std()) if len(together) else float("nan")
+        made.append(
+            OutputError(name, unit, spread, errors["identification"], errors.get("validation"))
+        )
+    return tuple(made)
+
+
+def _rms(before: NDArray, after: NDArray) -> RMSError:
+    """Errors of one output, from residuals (n, T), and the interval of their ratio."""
+    seen = np.isfinite(after)
+    if not seen.any():
+        nothing = float("nan")
+        return RMSError(nothing, nothing, nothing, None, 0, 0)
+    first, second = (float(np.sqrt(np.mean(each[seen] ** 2))) for each in (before, after))
+    groups = _groups(after)
+    count = int(groups.max()) + 1
+    sums = [np.bincount(groups[seen], each[seen] ** 2, count) for each in (before, after)]
+    filled = np.bincount(groups[seen], minlength=count) > 0
+
+    def ratio(weights: NDArray) -> NDArray:
+        made: NDArray = np.sqrt((weights @ sums[1][filled]) / (weights @ sums[0][filled]))
+        return made
+
+    number = int(filled.sum())
+    interval = None
+    if number >= MIN_GROUPS and (sums[0] > 0).all():
+        interval = jackknife_interval(ratio, number, positive=True)
+    change = second / first if first > 0 else float("nan")
+    return RMSError(first, second, change, interval, number, int(seen.sum()))
+
+
+def _groups(residual: NDArray) -> NDArray:
+    """A group for each sample (n, T): its trajectory, or a block of time of it.
+
+    Where there are fewer than five trajectories, their measured parts are divided into blocks that
+    are longer than the residuals correlate, so that blocks are nearly independent.
+    """
+    seen = np.isfinite(residual)
+    rows = np.broadcast_to(np.arange(len(residual))[:, None], residual.shape)
+    if len(residual) >= MIN_GROUPS:
+        return rows
+    place = np.cumsum(seen, axis=1) - 1
+    length = max(decorrelated_after(residual), int(seen.sum()) // MAX_BLOCKS, 1)
+    blocks = np.maximum(seen.sum(axis=1) // length, 1)
+    starts = np.concatenate([[0], np.cumsum(blocks)[:-1]])
+    within = np.minimum(np.maximum(place, 0) // length, blocks[:, None] - 1)
+    made: NDArray = starts[:, None] + within
+    return made
