@@ -35,6 +35,7 @@ __all__ = [
     "DOWNLOADS",
     "EXTRAS",
     "FORMATS",
+    "IDENTIFICATIONS",
     "METRICS",
     "NEEDS",
     "NETWORKS",
@@ -110,6 +111,22 @@ TWINS: Mapping[str, Entry] = {
     ),
 }
 """Targets are twins, or make one when they are called without arguments."""
+
+IDENTIFICATIONS: Mapping[str, Entry] = {
+    "least_squares": Entry(
+        "retwin.update.identification:LeastSquares", "least squares from several starts (Eq. 2)"
+    ),
+    "evolution": Entry(
+        "retwin.update.identification:Evolution", "differential evolution, then least squares"
+    ),
+    "bayes": Entry(
+        "retwin.update.identification:MCMC", "posterior by Markov chains, for fast twins (Eq. 3)"
+    ),
+    "npe": Entry(
+        "retwin.update.identification:NPE", "posterior by a network, from few simulations (Eq. 3)"
+    ),
+}
+"""Methods by which a twin's own parameters are identified."""
 
 CORRECTIONS: Mapping[str, Entry] = {
     "additive": Entry("retwin.update.corrections:Additive", "a residual of each output sample"),

@@ -29,6 +29,7 @@ _HOME = {
     "TimeColumn": "time_column",
     "animate": "animation",
     "armpi_parametric": "armpi_fpv.parameters",
+    "log_rate": "logs",
     "open_parametric": "opened_twin",
     "read_case": "file",
     "read_logs": "logs",

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin import catalog
+from retwin.cases.based_on import merged, parameters_of, updated_built_in
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, Record
 from retwin.cases.named_twin import imported, parametric_twin, read_twin
@@ -32,14 +33,12 @@ from retwin.serialisation.configs import (
     from_config,
     from_settings,
     key,
-    read_toml,
 )
 from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.fmu import FMUTwin
 from retwin.twins.limits import Limits
 from retwin.twins.mujoco import MuJoCoTwin
-from retwin.twins.parametric import Parameter
 from retwin.twins.record_sampler import sampler_from
 from retwin.twins.samplers import (
     CommandSampler,
@@ -58,7 +57,6 @@ from retwin.update.state_surrogate import StateSurrogate
 
 __all__ = ["check_density", "read_case"]
 
-CONTENTS = "see docs/own_twin.md for what it holds"
 SAMPLERS: tuple[type, ...] = (RampSampler, HoldSampler, MultisineSampler, RecordedSampler)
 Records = Callable[[Path], tuple[Trajectories, Trajectories]]
 """A function that splits a file into calibration records and test records."""
@@ -79,6 +77,7 @@ class CaseFile:
     name: str
     twin: Any
     title: str = ""
+    folder: str = ""
     rate: float | None = None
     sensor_rate: float | None = None
     inputs: dict[str, Any] | tuple[str, ...] = ()
@@ -108,21 +107,20 @@ def read_case(path: str | Path) -> Case:
 
     """
     path, place = Path(path), f"{path}:"
-    folder = path.parent
+    settings, home = merged(path)
+    if isinstance(home, str):
+        return updated_built_in(home, settings, place)
     named = (catalog.CORRECTIONS, catalog.DENSITIES, catalog.NETWORKS)
     kinds = [kind for entries in named for kind in catalog.classes(entries)]
-    settings = read_toml(path, expected="a case as a TOML file", remedy=CONTENTS)
     rate = settings.get("rate")
     rate = rate if isinstance(rate, int | float) else None
     keys = from_settings(CaseFile, settings, kinds, place=place, rate=rate)
+    folder = home / keys.folder
     twin = read_twin(keys.twin, keys.inputs, keys.outputs, keys.rate, folder, place)
     parametric = None
     if keys.parameters:
         inside = key(place, "parameters")
-        free = [
-            from_settings(Parameter, {"name": name, **value}, place=key(inside, name))
-            for name, value in keys.parameters.items()
-        ]
+        free = parameters_of(keys.parameters, inside)
         twin = parametric = parametric_twin(twin, free, inside)
     elif isinstance(twin, StateTwin) and twin.free:
         twin = parametric = twin.parametric()

@@ -80,6 +80,8 @@ class OpenedTwin:
         All parameters that the twin itself names.
     case : Case or None
         The case to which the name belongs; None for a twin without a case.
+    own_channels : bool
+        Whether the twin has channels and a rate of its own, so that none were given.
 
     """
 
@@ -87,6 +89,7 @@ class OpenedTwin:
     twin: ParametricTwin
     known: tuple[Known, ...]
     case: Case | None
+    own_channels: bool
 
 
 def open_parametric(
@@ -140,7 +143,7 @@ def open_parametric(
         twin = twin.parametric()
     known = tuple(_known(twin))
     made = _freed(twin, _chosen(known, free, name))
-    return OpenedTwin(name, made, known, case)
+    return OpenedTwin(name, made, known, case, not (inputs or outputs or rate))
 
 
 def _case(name: str) -> Case | None:
@@ -248,19 +251,10 @@ def _freed(twin: Twin, chosen: Sequence[Parameter]) -> ParametricTwin:
         if isinstance(twin, MuJoCoTwin):
             chosen = [_started(each, twin) for each in chosen]
         return parametric_twin(twin, chosen, "--free")
-    declared = {each.name: each for each in twin.parameters}
-    now = dict(zip(twin.names, twin.values, strict=True))
-    made = [
-        replace(declared[each.name], low=each.low, high=each.high, start=each.start)
-        if each.name in declared
-        else each
-        for each in chosen
-    ]
-    inner = twin.inner(now)
+    made = twin.freed(chosen)
+    defaults = set(twin.twin.defaults) if isinstance(twin.twin, RebuiltTwin) else None
     unknown = [
-        each.name
-        for each in made
-        if isinstance(twin.twin, RebuiltTwin) and not set(each.places) <= set(twin.twin.defaults)
+        each.name for each in made.parameters if defaults is not None and set(each.places) - defaults
     ]
     require(
         not unknown,
@@ -269,9 +263,7 @@ def _freed(twin: Twin, chosen: Sequence[Parameter]) -> ParametricTwin:
         got=", ".join(unknown),
         remedy="declare it among the parameters of the case or of the twin",
     )
-    places = {place for each in made for place in each.places}
-    held = {place: float(value) for place, value in inner.items() if place not in places}  # type: ignore[arg-type]
-    return ParametricTwin(twin.twin, tuple(made), (), held)
+    return made
 
 
 def _started(parameter: Parameter, twin: MuJoCoTwin) -> Parameter:

@@ -280,6 +280,30 @@ class ParametricTwin(TwinWrapper):
         parameters, values = zip(*free, strict=True) if free else ((), ())
         return ParametricTwin(self.twin, parameters, values, dict(self.held) | held)
 
+    def freed(self, parameters: Sequence[Parameter]) -> ParametricTwin:
+        """The same twin with these parameters free, and all others held at their present values.
+
+        Parameters
+        ----------
+        parameters : sequence of Parameter
+            Some of its free parameters, with other ranges and starts, or further parameters of the
+            wrapped twin. Of one that is free already, the places are kept.
+
+        Returns
+        -------
+        ParametricTwin
+            The twin at the starts of these parameters.
+
+        """
+        declared = {each.name: each.places for each in self.parameters}
+        made = [
+            replace(each, places=declared.get(each.name, dict(each.places))) for each in parameters
+        ]
+        now = self.inner(dict(zip(self.names, self.values, strict=True)))
+        places = {place for each in made for place in each.places}
+        held = {place: float(value) for place, value in now.items() if place not in places}  # type: ignore[arg-type]
+        return ParametricTwin(self.twin, tuple(made), (), held)
+
     def simulate(
         self,
         commands: NDArray,

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import instance, require
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.evaluation.identification.parameters import Basis, Direction, Estimate, uncertainty_of
 from retwin.evaluation.identification.residual_tests import ResidualTest, residual_tests
@@ -24,7 +24,7 @@ __all__ = ["Identification", "OutputError", "RMSError", "validate_identification
 MAX_BLOCKS = 20
 """Blocks into which held-out records are divided for an interval, at most."""
 Part = Literal["identification", "validation"]
-Split = Literal["trajectories", "time", "own", "none"]
+Split = Literal["trajectories", "time", "none"]
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,7 @@ class Identification:
     residuals : tuple of ResidualTest
         Tests of the residuals after identification, on the held-out measurements if there are any.
     split : str
-        What was held out: "trajectories", the last part in "time", the case's "own" test set, or
-        "none".
+        What was held out: "trajectories", the last part of each in "time", or "none".
     simulated : dict of str to tuple
         By part, "identification" and "validation": measured trajectories, and outputs (n, T, d_y)
         of the twin before and after.
@@ -178,7 +177,13 @@ def validate_identification(
         The twin cannot simulate some of the held-out commands.
 
     """
-    instance("found", found, Updated | Posterior, remedy="give what rt.identify returned")  # type: ignore[arg-type]
+    require(
+        isinstance(found, Updated | Posterior),
+        "found",
+        expected="an Updated or a Posterior",
+        got=type(found).__name__,
+        remedy="give what rt.identify returned",
+    )
     mean = found.twin.twin if isinstance(found, Posterior) else found.twin
     require(
         mean.names == before.names,

@@ -1,0 +1,258 @@
+"""`retwin identify`: a user's own twin, its parameters identified from his logs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args
+
+import typer
+
+from retwin import catalog
+from retwin.checks import one_of, require
+from retwin.cli.completion import complete_twins
+from retwin.cli.completion import one_of as completing
+from retwin.cli.options import Json, MaxBytes, Seed
+from retwin.cli.terminal import answer, bar, command_given, note, table
+from retwin.serialisation.places import check_place
+
+if TYPE_CHECKING:
+    from retwin.cases.logs import Columns
+    from retwin.cases.opened_twin import OpenedTwin
+    from retwin.evaluation.identification import Identification
+
+__all__ = ["identify"]
+
+UNRATED = (".fmu", ".xml", ".urdf")
+"""Suffixes of twins that take any sample rate."""
+
+
+def _panel(name: str, *flags: str, **more: Any) -> Any:
+    return typer.Option(*flags, rich_help_panel=name, **more)
+
+
+TwinName = Annotated[
+    str,
+    typer.Argument(
+        metavar="TWIN",
+        help="plant.fmu, robot.xml, module:function, case.toml or a built-in case.",
+        autocompletion=complete_twins,
+    ),
+]
+LogFiles = Annotated[
+    list[Path], typer.Argument(metavar="LOG…", help="Tables *.csv, or what rt.load reads.")
+]
+Out = Annotated[Path, typer.Option(metavar="FOLDER", help="Where the results go.")]
+Free = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME=LOW:HIGH", help="A free parameter, or NAME=LOW:HIGH:START."),
+]
+MethodName = Annotated[
+    str,
+    typer.Option(
+        "--method",
+        metavar="NAME",
+        help="least_squares, evolution, bayes or npe.",
+        autocompletion=completing(catalog.IDENTIFICATIONS),
+    ),
+]
+HoldOut = Annotated[
+    float | None, typer.Option(metavar="X", help="Share held out for validation; else 0.25.")
+]
+Loss = Annotated[
+    str | None, _panel("Method", metavar="NAME", help="soft_l1 (default), linear or cauchy.")
+]
+Starts = Annotated[
+    int | None, _panel("Method", metavar="N", help="Starts of the search; else 4.")
+]
+SensorRate = Annotated[
+    float | None, _panel("Method", metavar="HZ", help="True rate of the sensor, if lower.")
+]
+Processes = Annotated[int, _panel("Method", metavar="N", help="Worker processes.")]
+Column = Annotated[
+    list[str] | None,
+    _panel("Logs", metavar="CHANNEL=NAME", help="The column of a channel, if named otherwise."),
+]
+Time = Annotated[
+    str | None, _panel("Logs", metavar="NAME", help="Column of the times; or NAME=ms, us, ns, iso.")
+]
+Transient = Annotated[
+    float, _panel("Logs", metavar="SECONDS", help="Begin of each log that is not used.")
+]
+Inputs = Annotated[
+    str, _panel("Twin", metavar="NAMES", help="Of the inputs, joined by commas.")
+]
+Outputs = Annotated[
+    str, _panel("Twin", metavar="NAMES", help="Of the outputs, joined by commas.")
+]
+Rate = Annotated[
+    float | None, _panel("Twin", metavar="HZ", help="Samples per second; else the log's.")
+]
+
+
+def identify(
+    twin: TwinName,
+    logs: LogFiles,
+    out: Out,
+    free: Free = None,
+    method: MethodName = "least_squares",
+    hold_out: HoldOut = None,
+    loss: Loss = None,
+    starts: Starts = None,
+    sensor_rate: SensorRate = None,
+    processes: Processes = 1,
+    column: Column = None,
+    time: Time = None,
+    transient: Transient = 0.0,
+    inputs: Inputs = "",
+    outputs: Outputs = "",
+    rate: Rate = None,
+    seed: Seed = 0,
+    max_bytes: MaxBytes = None,
+    as_json: Json = False,
+) -> None:
+    """Identify the parameters of your twin from logs.
+
+    Writes a page, identification.json, and updated.toml, a case with the values found. A module
+    that is named by the twin or its case is run with your rights.
+    """
+    from retwin import cases
+    from retwin.deploy.identified import HOLDS, save_identification
+    from retwin.evaluation import identification as room
+    from retwin.evaluation.identification.hold_out import SHARE
+    from retwin.update.identification import identify as run
+
+    check_place(out, folder=True, holds=HOLDS)
+    settings = _method(method, loss, starts)
+    columns = _columns(column, time, transient)
+    names = [tuple(each.strip() for each in o.split(",") if each.strip()) for o in (inputs, outputs)]
+    given = rate is not None
+    for log in logs:
+        require(
+            log.exists(),
+            "LOG",
+            expected="an existing file or folder",
+            got=f"{log}, where there is none",
+            remedy="check the name",
+        )
+    if rate is None and Path(twin).suffix.lower() in UNRATED:
+        rate = cases.log_rate(logs[0], columns)
+    opened = cases.open_parametric(
+        twin, free or (), inputs=names[0], outputs=names[1], rate=rate
+    )
+    with bar("identify") as show:
+        read = cases.read_logs(
+            logs,
+            opened.twin,
+            columns,
+            case=opened.case,
+            rows_at_rate=given or opened.own_channels or opened.case is not None,
+            progress=lambda share: show("read, 1 of 3", share),
+            max_bytes=max_bytes,
+        )
+        used, held_out = read.trajectories, read.test
+        if held_out is None or hold_out is not None:
+            share = SHARE if hold_out is None else hold_out
+            used, held_out = room.hold_out(read.trajectories, share, seed=seed)
+        note(_plan(opened, used, method))
+        found = run(
+            opened.twin,
+            used,
+            settings,
+            seed=seed,
+            rate=sensor_rate,
+            processes=processes,
+            progress=lambda share: show("search, 2 of 3", share),
+        )
+        show("validate, 3 of 3", 0.0)
+        checked = room.validate_identification(found, opened.twin, used, held_out, seed=seed)
+        values = save_identification(checked, opened, read, out, command=command_given())
+    _print(checked, values, as_json=as_json)
+
+
+def _method(name: str, loss: str | None, starts: int | None) -> Any:
+    """The settings of the method of that name."""
+    from retwin.update.identification.search import Loss as Losses
+
+    one_of("--method", name, catalog.IDENTIFICATIONS)
+    options: dict[str, Any] = {}
+    if loss is not None:
+        options["loss"] = one_of("--loss", loss, get_args(Losses))
+    if starts is not None:
+        options["starts"] = starts
+    taken = {"least_squares": ("loss", "starts"), "evolution": ("loss",), "bayes": ("starts",)}
+    for option in options:
+        methods = [each for each, names in taken.items() if option in names]
+        require(
+            name in methods,
+            f"--{option}",
+            expected=f"none with --method {name}",
+            got=options[option],
+            remedy=f"leave it out; {' and '.join(methods)} take it",
+        )
+    return catalog.resolve(catalog.IDENTIFICATIONS[name].target)(**options)
+
+
+def _columns(column: list[str] | None, time: str | None, transient: float) -> Columns:
+    """Which columns of a log are the channels of the twin."""
+    from retwin.cases import Columns, TimeColumn
+
+    names = {}
+    for text in column or ():
+        channel, _, name = text.partition("=")
+        require(
+            channel and name and channel not in names,
+            "--column",
+            expected="CHANNEL=COLUMN, each channel once",
+            got=repr(text),
+            remedy="write for instance --column speed=omega_measured",
+        )
+        names[channel] = name
+    clock = None
+    if time is not None:
+        name, _, unit = time.partition("=")
+        clock = TimeColumn(name, unit or "s")  # type: ignore[arg-type]
+    return Columns(names, clock, transient)
+
+
+def _plan(opened: OpenedTwin, used: Any, method: str) -> str:
+    """What will be done, in a line."""
+    count = len(used)
+    what = "trajectory" if count == 1 else "trajectories"
+    return (
+        f"{count} {what} of {used.steps / used.rate:g} s at {used.rate:g} Hz; {method} for "
+        f"{', '.join(opened.twin.names)}"
+    )
+
+
+def _print(found: Identification, values: dict[str, Any], *, as_json: bool) -> None:
+    """Parameters, errors before and after, and where the files are."""
+    from retwin.report.identification.texts import findings, interval, state, value
+
+    parameters = [
+        (p.name, p.unit, f"{p.start:.4g}", value(p), interval(p), state(p))
+        for p in found.parameters
+    ]
+    part = "held out" if found.compared == "validation" else "used"
+    errors = [
+        (name, o.unit, f"{o.identification.before:.3g}", f"{o.identification.after:.3g}")
+        + ((f"{o.validation.before:.3g}", f"{o.validation.after:.3g}") if o.validation else ())
+        for name, o in ((each.name, each) for each in found.outputs)
+    ]
+    heads = ("RMS error", "unit", "used: before", "after")
+    heads += ("held out: before", "after ") if part == "held out" else ()
+    answer(
+        values,
+        table(("parameter", "unit", "before", "after", "95 % interval", ""), parameters),
+        "",
+        table(heads, errors, numbers=heads[2:]),
+        "",
+        *findings(found),
+        *values["notes"],
+        as_json=as_json,
+    )
+    if values["updated_case"]:
+        note(f"No updated.toml: {values['updated_case']}")
+    for name in ("report.html", "identification.json", "updated.toml", "start_values.json"):
+        if name in values["files"]:
+            note(f"Saved {values['files'][name]}")
+

@@ -1,0 +1,251 @@
+"""Figures of the page: estimates in their ranges, records before and after, residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.trajectories import Trajectories
+from retwin.evaluation.identification import Identification
+from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Row
+from retwin.scores.residuals import (
+    autocorrelation,
+    cross_correlation,
+    decorrelated_after,
+    spectra,
+)
+
+__all__ = ["figures"]
+
+OUTPUTS, INPUTS = 6, 3
+"""Outputs and inputs of which figures are drawn, at most."""
+SAMPLES = 1500
+"""Samples of a record that are drawn, at most."""
+POINTS = 241
+"""Lags that are drawn, at most."""
+BEFORE, AFTER, MEASURED = "c1", "c0", "ink"
+KEYS = (Key("before", BEFORE, "dash"), Key("after", AFTER))
+ROW_HEIGHT, MARGIN = 34, 80
+"""Pixels of a parameter in the figure of estimates, and of its axis."""
+
+
+def figures(found: Identification) -> dict[str, Figure]:
+    """The figures that have something to show, by name."""
+    measured, before, after = found.simulated[found.compared]
+    errors = [
+        np.where(measured.mask, measured.observed.astype(float) - each, np.nan)
+        for each in (before, after)
+    ]
+    shown = [i for i in range(len(measured.outputs)) if measured.mask[..., i].any()][:OUTPUTS]
+    made = [
+        _estimates(found),
+        _records(found, shown),
+        _autocorrelations(measured, errors, shown),
+        _cross_correlations(measured, errors, shown),
+        _spectra(measured, errors, shown),
+    ]
+    return {each.name: each for each in made if each.panels}
+
+
+def _estimates(found: Identification) -> Figure:
+    """Each estimate and its interval within its range, the first parameter on top."""
+    names = [each.name for each in found.parameters]
+    place = np.arange(len(names))[::-1].astype(float)
+    low = np.array([each.low for each in found.parameters])
+    width = np.array([each.high for each in found.parameters]) - low
+
+    def shares(values: list[float]) -> NDArray:
+        made: NDArray = (np.array(values) - low) / width
+        return made
+
+    value = shares([each.value for each in found.parameters])
+    ends = [
+        each.interval if each.interval is not None else (each.value, each.value)
+        for each in found.parameters
+    ]
+    texts = [f"{p.name}: {p.value:.4g} {p.unit if p.unit != '1' else ''}" for p in found.parameters]
+    marks: list[Mark] = [
+        Points(
+            shares([each.start for each in found.parameters]),
+            place,
+            "before",
+            BEFORE,
+            "diamond-open",
+            texts=[f"{p.name} before: {p.start:.4g}" for p in found.parameters],
+        ),
+        Points(
+            value,
+            place,
+            "after",
+            AFTER,
+            low=np.clip(shares([e[0] for e in ends]), 0, 1),
+            high=np.clip(shares([e[1] for e in ends]), 0, 1),
+            texts=texts,
+            bar_width=3,
+        ),
+    ]
+    ticks = dict(zip(place.tolist(), names, strict=True))
+    panel = Panel(
+        Axis("place in its range", "", (-0.03, 1.03), "percent", step=0.25),
+        [Row(Axis("", kind="names", limits=(-0.6, len(names) - 0.4), ticks=ticks), marks)],
+        "Estimates of the parameters and their 95 % intervals within their ranges",
+        height=MARGIN + ROW_HEIGHT * len(names),
+    )
+    keys = [Key("before", BEFORE, "diamond"), Key("after, with its 95 % interval", AFTER, "circle")]
+    return Figure("estimates", [panel], keys, columns=1)
+
+
+def _records(found: Identification, shown: list[int]) -> Figure:
+    """Measured and simulated outputs of the trajectory with the median error after."""
+    measured, before, after = found.simulated[found.compared]
+    row = _typical(measured, after)
+    seen = measured.mask[row].any(axis=1)
+    samples = np.flatnonzero(seen)
+    first, last = int(samples[0]), int(samples[-1]) + 1
+    chosen = np.arange(first, last, max(1, -(-(last - first) // SAMPLES)))
+    times = chosen / measured.rate
+    panels = []
+    for i in shown:
+        values = np.where(measured.mask[row, :, i], measured.observed[row, :, i], np.nan)
+        marks: list[Mark] = [
+            Line(times, values[chosen], "measured", MEASURED, width=2.6, alpha=0.45),
+            Line(times, before[row, chosen, i], "before", BEFORE, "dash", 1.6),
+            Line(times, after[row, chosen, i], "after", AFTER, width=1.6),
+        ]
+        name, unit = measured.outputs.names[i], measured.outputs.units[i]
+        y = Axis(name, "" if unit == "1" else unit)
+        x = Axis("time", "s", (float(times[0]), float(times[-1])), count=8)
+        panels.append(Panel(x, [Row(y, marks)], f"{name} over time", name, height=300))
+    keys = [Key("measured", MEASURED), *KEYS]
+    return Figure("records", panels, keys, str(measured.ids[row]), columns=1)
+
+
+def _typical(measured: Trajectories, after: NDArray) -> int:
+    """The trajectory whose error, over all outputs in units of their spread, is the median."""
+    error = np.where(measured.mask, measured.observed - after, np.nan)
+    spread = np.nanstd(np.where(measured.mask, measured.observed, np.nan), axis=(0, 1))
+    scaled = error / np.where(np.nan_to_num(spread) > 0, spread, 1.0)
+    seen = np.isfinite(scaled)
+    count = np.maximum(seen.sum(axis=(1, 2)), 1)
+    mean = np.where(seen, scaled**2, 0.0).sum(axis=(1, 2)) / count
+    known = np.flatnonzero(seen.any(axis=(1, 2)))
+    return int(known[np.argsort(mean[known])[(len(known) - 1) // 2]])
+
+
+def _useful(residual: NDArray) -> bool:
+    """Whether correlations of a residual are defined."""
+    values = residual[np.isfinite(residual)]
+    return len(values) > 16 and bool(np.ptp(values) > 0)
+
+
+def _autocorrelations(measured: Trajectories, errors: list[NDArray], shown: list[int]) -> Figure:
+    panels = []
+    for i in shown:
+        pair = [each[..., i] for each in errors]
+        if not all(map(_useful, pair)):
+            continue
+        lags = decorrelated_after(pair[1])
+        found = [autocorrelation(each, lags) for each in pair]
+        x = found[1].lags / measured.rate
+        at = _thinned(len(x))
+        marks: list[Mark] = [_limits(x[at], found[1].limits[at])]
+        marks += _lines(x[at], [each.values[at] for each in found])
+        panels.append(_correlation_panel(measured.outputs.names[i], "lag", marks))
+    return Figure("autocorrelation", panels, [*KEYS, _LIMITS])
+
+
+def _cross_correlations(measured: Trajectories, errors: list[NDArray], shown: list[int]) -> Figure:
+    panels = []
+    for i in shown:
+        pair = [each[..., i] for each in errors]
+        if not all(map(_useful, pair)):
+            continue
+        for j, name in enumerate(measured.inputs.names[:INPUTS]):
+            command = measured.commands[..., j].astype(float)
+            if np.ptp(command) == 0:
+                continue
+            found = [cross_correlation(each, command) for each in pair]
+            x = found[1].lags / measured.rate
+            at = _thinned(len(x))
+            marks: list[Mark] = [_limits(x[at], found[1].limits[at])]
+            marks += _lines(x[at], [each.values[at] for each in found])
+            title = f"{measured.outputs.names[i]} with {name}"
+            panels.append(_correlation_panel(title, f"time after {name}", marks))
+    return Figure("crosscorrelation", panels, [*KEYS, _LIMITS])
+
+
+_LIMITS = Key("95 % limits without correlation", "grid", "bar")
+
+
+def _limits(x: NDArray, limits: NDArray) -> Band:
+    return Band(x, -limits, limits, "limits", "muted", 0.25)
+
+
+def _lines(x: NDArray, values: list[NDArray]) -> list[Mark]:
+    first, second = values
+    return [
+        Line(x, first, "before", BEFORE, "dash", 1.4),
+        Line(x, second, "after", AFTER, width=1.8),
+    ]
+
+
+def _correlation_panel(title: str, lag: str, marks: list[Mark]) -> Panel:
+    y = Axis("correlation", "", (-1.05, 1.05), step=0.5)
+    return Panel(Axis(lag, "s"), [Row(y, marks)], f"Correlation of {title}", title, height=280)
+
+
+def _thinned(count: int) -> NDArray:
+    return np.unique(np.linspace(0, count - 1, min(count, POINTS)).round().astype(int))
+
+
+def _spectra(measured: Trajectories, errors: list[NDArray], shown: list[int]) -> Figure:
+    """Spectra of the measured output and of the residuals, on logarithmic axes."""
+    panels = []
+    for i in shown:
+        values = np.where(measured.mask[..., i], measured.observed[..., i], np.nan).astype(float)
+        if not _useful(values) or not _useful(errors[1][..., i]):
+            continue
+        frequency, found = spectra([values, *(each[..., i] for each in errors)], measured.rate)
+        if not len(frequency):
+            continue
+        density = np.maximum(found, 1e-12 * found.max())
+        unit = measured.outputs.units[i]
+        unit = "1/Hz" if unit == "1" else f"({unit})²/Hz"
+        marks: list[Mark] = [
+            Line(frequency, density[0], "measured output", MEASURED, width=1.8, alpha=0.45),
+            Line(frequency, density[1], "residual before", BEFORE, "dash", 1.4),
+            Line(frequency, density[2], "residual after", AFTER, width=1.8),
+        ]
+        name = measured.outputs.names[i]
+        panels.append(
+            Panel(
+                _powers("frequency", "Hz", frequency),
+                [Row(_powers("density", unit, density), marks)],
+                f"Spectra of {name} and of its residuals",
+                name,
+                height=300,
+            )
+        )
+    keys = [
+        Key("measured output", MEASURED),
+        Key("residual before", BEFORE, "dash"),
+        Key("residual after", AFTER),
+    ]
+    return Figure("spectra", panels, keys)
+
+
+def _powers(label: str, unit: str, values: NDArray) -> Axis:
+    """A logarithmic axis with ticks at powers of ten, at most seven of them."""
+    low, high = np.log10(values.min()), np.log10(values.max())
+    powers = np.arange(np.ceil(low), np.floor(high) + 1)
+    powers = powers[:: max(1, -(-len(powers) // 7))]
+    if len(powers) < 2:
+        powers = np.array([low, high])
+    return Axis(label, unit, kind="log", ticks=dict(_ticks(powers)))
+
+
+def _ticks(powers: NDArray) -> Iterator[tuple[float, str]]:
+    for power in powers.tolist():
+        yield float(10.0**power), f"{10.0**power:.2g}"

@@ -1,0 +1,228 @@
+"""`identification_page`: one self-contained HTML page about an identification."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import resources
+from types import SimpleNamespace
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2.utils import htmlsafe_json_dumps
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+from pydantic_core import from_json, to_json
+
+from retwin.evaluation.identification import Identification
+from retwin.report.blocks import Cell, Column, Table, columns
+from retwin.report.identification.figures import INPUTS, OUTPUTS, figures
+from retwin.report.identification.texts import (
+    change,
+    combination,
+    findings,
+    interval,
+    significant,
+    state,
+    value,
+)
+from retwin.report.labels import counted, duration, p_value
+from retwin.report.plotly_specs import panel_spec
+from retwin.report.style import CHROME, PALETTE, colour_of, symbol
+
+__all__ = ["identification_page"]
+
+STRONG = 0.9
+"""Correlation from which a cell is emphasised."""
+MATRIX = 12
+"""Parameters of which a table of all correlations is shown, at most."""
+
+
+def identification_page(
+    found: Identification,
+    values: Mapping[str, Any],
+    start_values: Mapping[str, float],
+    *,
+    command: str,
+    folder: str,
+) -> str:
+    """The page as text, which needs no other file and no network.
+
+    Parameters
+    ----------
+    found : Identification
+        What `validate_identification` returned.
+    values : mapping
+        The contents of identification.json.
+    start_values : mapping of str to float
+        Start values of an FMU; empty for another twin.
+    command : str
+        The command that makes it again; "" if there is none.
+    folder : str
+        The folder in which the page lies, as it was given.
+
+    """
+    environment = Environment(
+        loader=PackageLoader("retwin.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "one_line": lambda text: Markup(" ").join(text.split()),
+        "counted": counted,
+        "duration": duration,
+        "significant": significant,
+    }
+    environment.globals |= {
+        "results": SimpleNamespace(emulated=bool(values["emulated"])),
+        "anchors": set(),
+        "images": {},
+        "colour_of": colour_of,
+        "symbol": symbol,
+    }
+    drawn = figures(found)
+    specs = {
+        f"plot-{name}-{place}": panel_spec(panel)
+        for name, figure in drawn.items()
+        for place, panel in enumerate(figure.panels)
+    }
+    return environment.get_template("identification.html.j2").render(
+        found=found,
+        values=values,
+        start_values=start_values,
+        command=command,
+        folder=folder,
+        findings=findings(found),
+        figures=drawn,
+        parameters=_parameters(found),
+        directions=_directions(found),
+        correlations=_correlations(found),
+        errors=_errors(found),
+        tests=_tests(found),
+        limited=len(found.outputs) > OUTPUTS or len(found.twin.inputs) > INPUTS,
+        colours={**{f"c{place}": pair for place, pair in enumerate(PALETTE)}, **CHROME},
+        style=_asset("page.css"),
+        script=_asset("page.js"),
+        # Plotly draws no point for null, which JSON has in place of NaN.
+        specs=htmlsafe_json_dumps(from_json(to_json(specs, inf_nan_mode="null"))),
+        plotly=Markup(get_plotlyjs()),
+    )
+
+
+def _asset(name: str) -> Markup:
+    file = resources.files("retwin.report").joinpath("templates", name)
+    return Markup(file.read_text(encoding="utf-8"))
+
+
+def _unit(text: str) -> str:
+    return "" if text == "1" else text
+
+
+def _parameters(found: Identification) -> Table:
+    rows = [
+        [
+            Cell(each.name, _unit(each.unit)),
+            Cell(significant(each.start)),
+            Cell(value(each), best=True),
+            Cell(interval(each)),
+            Cell(f"{significant(each.low)} to {significant(each.high)}"),
+            Cell(state(each) or "identified", tone="open" if state(each) else ""),
+        ]
+        for each in found.parameters
+    ]
+    bayes = found.basis == "posterior"
+    error = "posterior mean ± standard deviation" if bayes else "after ± standard error"
+    heads = [
+        *columns("parameter", "before", error, "95 % interval", "searched in"),
+        Column("", numeric=False),
+    ]
+    return Table("Parameters", heads, rows)
+
+
+def _directions(found: Identification) -> Table:
+    rows = [
+        [
+            Cell(combination(each)),
+            Cell(significant(each.error) if each.error < 1e6 else "infinite"),
+            Cell("open" if each.open else "determined", tone="open" if each.open else ""),
+        ]
+        for each in found.directions
+    ]
+    heads = [*columns("combination", "standard error"), Column("", numeric=False)]
+    return Table("Combinations of parameters, from the best to the least determined", heads, rows)
+
+
+def _correlations(found: Identification) -> Table | None:
+    names = [each.name for each in found.parameters]
+    if not 1 < len(names) <= MATRIX:
+        return None
+    rows = [
+        [
+            Cell(name),
+            *(
+                Cell(
+                    f"{found.correlation[i, j]:+.2f}".replace("-", "−")
+                    if abs(found.correlation[i, j]) <= 1.001
+                    else "–",
+                    best=bool(abs(found.correlation[i, j]) > STRONG),
+                )
+                if j < i
+                else Cell("")
+                for j in range(len(names) - 1)
+            ),
+        ]
+        for i, name in enumerate(names)
+    ][1:]
+    return Table("Correlation of the estimates", columns("", *names[:-1]), rows)
+
+
+def _errors(found: Identification) -> Table:
+    rows = []
+    held = found.compared == "validation"
+    for each in found.outputs:
+        row = [Cell(each.name, _unit(each.unit)), Cell(significant(each.spread))]
+        for error in (each.identification, each.validation):
+            if error is None:
+                continue
+            share = error.after / each.spread if each.spread > 0 else float("nan")
+            row += [
+                Cell(significant(error.before)),
+                Cell(significant(error.after), best=True),
+                Cell(f"{100 * share:.1f} %" if share == share else "–"),  # noqa: PLR0124 - NaN
+                Cell(change(error)),
+            ]
+        rows.append(row)
+    group = ("before", "after", "of the spread", "change")
+    heads = [Column("output", numeric=False), Column("spread")]
+    heads += [Column(text, "measurements used") for text in group]
+    heads += [Column(text, "held out") for text in group] if held else []
+    return Table("RMS error of free simulation", heads, rows)
+
+
+def _tests(found: Identification) -> Table:
+    rows = []
+    for each in found.residuals:
+        tests = sorted(each.inputs, key=lambda test: (test.p_value != test.p_value, test.p_value))  # noqa: PLR0124
+        first = tests[0] if tests else None
+        rows.append(
+            [
+                Cell(each.name),
+                Cell(p_value(each.p_white)),
+                Cell(significant(each.first_correlation, 0.1)),
+                Cell(first.name if first else "–"),
+                Cell(significant(first.correlation, 0.1) if first else "–"),
+                Cell(f"{significant(first.lag)} s" if first else "–"),
+                Cell(p_value(first.p_value) if first else "–"),
+            ]
+        )
+    heads = [
+        Column("output", numeric=False),
+        Column("p", "white noise"),
+        Column("next sample", "white noise"),
+        Column("command", "strongest dependence on a command", numeric=False),
+        Column("correlation", "strongest dependence on a command"),
+        Column("lag", "strongest dependence on a command"),
+        Column("p", "strongest dependence on a command"),
+    ]
+    return Table("Tests of the residuals after identification", heads, rows)

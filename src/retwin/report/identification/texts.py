@@ -1,0 +1,183 @@
+"""Estimates and findings of an identification as text, for the page and the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import floor, isfinite, isnan, log10
+
+from retwin.evaluation.identification import Direction, Estimate, Identification, RMSError
+from retwin.update.identification.posterior import Posterior
+
+__all__ = ["change", "combination", "findings", "interval", "significant", "state", "value"]
+
+WHITE = 0.05
+"""p-value below which a residual is not taken for white noise, or depends on an input."""
+SENTENCES = 4
+"""Outputs that have a sentence of their own, at most."""
+STRONG = 0.95
+"""Correlation of two estimates from which they are named."""
+MISFIT = 0.02
+"""Prior predictive p-value below which measurements do not fit the twin."""
+
+
+def significant(number: float, like: float | None = None) -> str:
+    """A number with four digits, or with as many decimals as two digits of `like` have."""
+    if not isfinite(number):
+        return "–"
+    if like is None or not isfinite(like) or like <= 0:
+        return f"{number:.4g}".replace("-", "−")
+    decimals = 1 - floor(log10(like))
+    if decimals > 8 or abs(number) >= 1e6:
+        return f"{number:.4g}".replace("-", "−")
+    return f"{number:.{max(decimals, 0)}f}".replace("-", "−")
+
+
+def value(each: Estimate) -> str:
+    """`0.646 ± 0.012`; the value alone where there is no error."""
+    if not isfinite(each.error) or each.error == 0:
+        return significant(each.value)
+    return f"{significant(each.value, each.error)} ± {significant(each.error, each.error)}"
+
+
+def interval(each: Estimate) -> str:
+    """`0.62 to 0.67`, or that it is wider than the range."""
+    if each.interval is None:
+        return "–"
+    low, high = each.interval
+    if low <= each.low and high >= each.high:
+        return "wider than the range"
+    return f"{significant(low, high - low)} to {significant(high, high - low)}"
+
+
+def state(each: Estimate) -> str:
+    """What is wrong with an estimate; "" if nothing is."""
+    side = {"low": "at its lower bound", "high": "at its upper bound", "": ""}[each.at_bound]
+    return ", ".join(filter(None, ["" if each.identified else "not identified", side]))
+
+
+def combination(direction: Direction) -> str:
+    """`+0.77 gain −0.64 leak`, in widths of the ranges."""
+    return " ".join(
+        f"{size:+.2f} {name}".replace("-", "−") for name, size in direction.components.items()
+    )
+
+
+def change(error: RMSError) -> str:
+    """`−86 % (−91 to −80)`."""
+    if not isfinite(error.ratio):
+        return "–"
+    ends = [error.ratio, *(error.interval or ())]
+    shown = [f"{100 * (end - 1):+.0f}".replace("-", "−") for end in ends]
+    inside = f" (95 % interval {shown[1]} to {shown[2]})" if error.interval else ""
+    return f"{shown[0]} %{inside}"
+
+
+def findings(found: Identification) -> list[str]:
+    """What a reader must know, in sentences, the most important first."""
+    return [*_errors(found), *_open(found), *_residuals(found), *_limits(found)]
+
+
+def _errors(found: Identification) -> Iterator[str]:
+    """The error before and after."""
+    part = found.compared
+    where = "On held-out measurements" if part == "validation" else "On the measurements used"
+    errors = list(found.errors(part).items())
+    units = {each.name: each.unit for each in found.outputs}
+    for name, each in errors[:SENTENCES]:
+        unit = "" if units[name] == "1" else f" {units[name]}"
+        went = "went"
+        if each.interval is not None:
+            went = "fell" if each.interval[1] < 1 else "rose" if each.interval[0] > 1 else "went"
+        yield (
+            f"{where}, the RMS error of {name} in free simulation {went} from "
+            f"{significant(each.before)} to {significant(each.after)}{unit}: {change(each)}."
+        )
+    if len(errors) > SENTENCES:
+        better = sum(each.ratio < 1 for _, each in errors)
+        yield f"It is smaller for {better} of {len(errors)} outputs."
+    undecided = [n for n, e in errors if e.interval and e.interval[0] <= 1 <= e.interval[1]]
+    if undecided:
+        yield f"No change of the error can be shown for {', '.join(undecided)}."
+    if part == "identification":
+        yield (
+            "Nothing was held out: these errors are of the measurements that the parameters were "
+            "fitted to, and smaller than those of others."
+        )
+
+
+def _open(found: Identification) -> Iterator[str]:
+    """What the measurements leave open."""
+    if found.open_parameters:
+        last = found.directions[-1]
+        yield (
+            f"These measurements do not determine {', '.join(found.open_parameters)}. The least "
+            f"determined combination is {combination(last)}, in widths of the ranges: hold one of "
+            "these parameters at a known value, or record commands that separate them."
+        )
+    for each in found.parameters:
+        if each.at_bound:
+            bound = each.low if each.at_bound == "low" else each.high
+            yield (
+                f"{each.name} lies at its {'lower' if each.at_bound == 'low' else 'upper'} bound, "
+                f"{significant(bound)}; the true value may lie beyond it, so no error is given. "
+                "Widen its range if that is possible."
+                if not isinstance(found.found, Posterior)
+                else f"The posterior of {each.name} has its mass at its "
+                f"{'lower' if each.at_bound == 'low' else 'upper'} bound, {significant(bound)}."
+            )
+    names = [each.name for each in found.parameters]
+    strong = [
+        f"{names[j]} and {names[i]} ({found.correlation[i, j]:+.2f})".replace("-", "−")
+        for i in range(len(names))
+        for j in range(i)
+        if abs(found.correlation[i, j]) > STRONG
+    ]
+    if strong:
+        yield f"Estimates that are strongly correlated: {', '.join(strong[:SENTENCES])}."
+
+
+def _residuals(found: Identification) -> Iterator[str]:
+    """What the residuals show."""
+    coloured = [each.name for each in found.residuals if each.p_white < WHITE]
+    if coloured:
+        yield (
+            f"The residuals of {', '.join(coloured)} are not white noise (Ljung and Box, p below "
+            f"{WHITE:g}): noise of the measurements alone does not explain them."
+        )
+    driven = [
+        f"{each.name} on {test.name}"
+        for each in found.residuals
+        for test in each.inputs
+        if test.p_value < WHITE
+    ]
+    if driven:
+        yield (
+            f"Residuals depend on commands ({', '.join(driven[: 2 * SENTENCES])}): the twin lacks "
+            "dynamics that no value of these parameters gives it."
+        )
+
+
+def _limits(found: Identification) -> Iterator[str]:
+    """Limits of the errors, and of the search."""
+    if found.basis == "samples":
+        yield (
+            "Standard errors take the residuals for noise that is correlated from one sample to "
+            "the next (a first-order autoregression), since there are fewer than three "
+            "trajectories, or one of them alone determines a parameter."
+        )
+    result = found.found
+    if isinstance(result, Posterior):
+        if result.misspecified < MISFIT:
+            yield (
+                "No parameters and noise within the prior give such measurements (prior "
+                f"predictive p-value {result.misspecified:.2g}): the twin lacks something."
+            )
+        return
+    agreeing, starts = int(result.figures["starts_agreeing"]), len(result.starts)
+    if starts > 1 and agreeing < 2:
+        yield (
+            f"Only one of {starts} starts of the search found this optimum: a better one may "
+            "exist. More starts cost little."
+        )
+    if any(isnan(each.error) and not each.at_bound for each in found.parameters):
+        yield "Some standard errors cannot be given."
