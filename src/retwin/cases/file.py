@@ -125,7 +125,9 @@ def read_case(path: str | Path) -> Case:
     elif isinstance(twin, StateTwin) and twin.free:
         twin = parametric = twin.parametric()
     records = _records(keys.records, twin, folder, key(place, "records"))
-    sampler = _sampler(keys.commands, twin, records, folder, key(place, "commands"))
+    # A sampler is code; a file of commands is data, which lies beside this file.
+    beside = folder if isinstance(keys.commands, str) else home
+    sampler = _sampler(keys.commands, twin, records, beside, key(place, "commands"))
     correction = keys.correction or ("delay_offset" if _has_segments(sampler) else "additive")
     correction = _chosen(correction, catalog.CORRECTIONS, key(place, "correction"))
     network = keys.network or ("mlp" if _is_static(twin, sampler) else "lstm")

@@ -61,7 +61,7 @@ def updated_case(
             *_channels(opened, twin, is_file=is_file),
             "",
             "[commands]",
-            f"file = {_text(_relative(place / commands, home))}",
+            f"file = {_text(commands)}",
         ]
     lines += ["", "[parameters]"]
     for each, value in zip(twin.parameters, twin.values, strict=True):

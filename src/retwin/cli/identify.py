@@ -119,6 +119,7 @@ def identify(
     from retwin.deploy.identified import HOLDS, save_identification
     from retwin.evaluation import identification as room
     from retwin.evaluation.identification.hold_out import SHARE
+    from retwin.twins import keep_workers
     from retwin.update.identification import identify as run
 
     check_place(out, folder=True, holds=HOLDS)
@@ -134,18 +135,19 @@ def identify(
             got=f"{log}, where there is none",
             remedy="check the name",
         )
-    if rate is None and Path(twin).suffix.lower() in UNRATED:
+    any_rate = Path(twin).suffix.lower() in UNRATED
+    if rate is None and any_rate:
         rate = cases.log_rate(logs[0], columns)
     opened = cases.open_parametric(
         twin, free or (), inputs=names[0], outputs=names[1], rate=rate
     )
-    with bar("identify") as show:
+    with keep_workers(), bar("identify") as show:
         read = cases.read_logs(
             logs,
             opened.twin,
             columns,
             case=opened.case,
-            rows_at_rate=given or opened.own_channels or opened.case is not None,
+            rows_at_rate=given or not any_rate,
             progress=lambda share: show("read, 1 of 3", share),
             max_bytes=max_bytes,
         )

@@ -125,8 +125,9 @@ def _records(found: Identification, shown: list[int]) -> Figure:
 def _typical(measured: Trajectories, after: NDArray) -> int:
     """The trajectory whose error, over all outputs in units of their spread, is the median."""
     error = np.where(measured.mask, measured.observed - after, np.nan)
-    spread = np.nanstd(np.where(measured.mask, measured.observed, np.nan), axis=(0, 1))
-    scaled = error / np.where(np.nan_to_num(spread) > 0, spread, 1.0)
+    values = [measured.observed[..., i][measured.mask[..., i]] for i in range(error.shape[2])]
+    spread = np.array([each.std() if len(each) else 0.0 for each in values])
+    scaled = error / np.where(spread > 0, spread, 1.0)
     seen = np.isfinite(scaled)
     count = np.maximum(seen.sum(axis=(1, 2)), 1)
     mean = np.where(seen, scaled**2, 0.0).sum(axis=(1, 2)) / count

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib import resources
+from math import isfinite
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +14,7 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 from pydantic_core import from_json, to_json
 
-from retwin.evaluation.identification import Identification
+from retwin.evaluation.identification import Identification, RMSError
 from retwin.report.blocks import Cell, Column, Table, columns
 from retwin.report.identification.figures import INPUTS, OUTPUTS, figures
 from retwin.report.identification.texts import (
@@ -33,6 +34,8 @@ __all__ = ["identification_page"]
 
 STRONG = 0.9
 """Correlation from which a cell is emphasised."""
+DIRECTIONS = 8
+"""Combinations of parameters that are shown, at most."""
 MATRIX = 12
 """Parameters of which a table of all correlations is shown, at most."""
 
@@ -147,10 +150,10 @@ def _directions(found: Identification) -> Table:
             Cell(significant(each.error) if each.error < 1e6 else "infinite"),
             Cell("open" if each.open else "determined", tone="open" if each.open else ""),
         ]
-        for each in found.directions
+        for each in found.directions[: -DIRECTIONS - 1 : -1]
     ]
     heads = [*columns("combination", "standard error"), Column("", numeric=False)]
-    return Table("Combinations of parameters, from the best to the least determined", heads, rows)
+    return Table("Combinations of parameters, from the least determined on", heads, rows)
 
 
 def _correlations(found: Identification) -> Table | None:
@@ -189,8 +192,8 @@ def _errors(found: Identification) -> Table:
             row += [
                 Cell(significant(error.before)),
                 Cell(significant(error.after), best=True),
-                Cell(f"{100 * share:.1f} %" if share == share else "–"),  # noqa: PLR0124 - NaN
-                Cell(change(error)),
+                Cell(f"{100 * share:.1f} %" if isfinite(share) else "–"),
+                Cell(change(error, interval=False), _range_of(error)),
             ]
         rows.append(row)
     group = ("before", "after", "of the spread", "change")
@@ -200,11 +203,19 @@ def _errors(found: Identification) -> Table:
     return Table("RMS error of free simulation", heads, rows)
 
 
+def _range_of(error: RMSError) -> str:
+    """The interval of a change, as a smaller line."""
+    if error.interval is None:
+        return ""
+    low, high = (f"{100 * (end - 1):+.0f}".replace("-", "−") for end in error.interval)
+    return f"{low} to {high}"
+
+
 def _tests(found: Identification) -> Table:
     rows = []
     for each in found.residuals:
-        tests = sorted(each.inputs, key=lambda test: (test.p_value != test.p_value, test.p_value))  # noqa: PLR0124
-        first = tests[0] if tests else None
+        known = [test for test in each.inputs if isfinite(test.p_value)]
+        first = min(known, key=lambda test: test.p_value, default=None)
         rows.append(
             [
                 Cell(each.name),

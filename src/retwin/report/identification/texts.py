@@ -62,13 +62,13 @@ def combination(direction: Direction) -> str:
     )
 
 
-def change(error: RMSError) -> str:
-    """`−86 % (−91 to −80)`."""
+def change(error: RMSError, *, interval: bool = True) -> str:
+    """`−86 % (95 % interval −91 to −80)`, or without its interval."""
     if not isfinite(error.ratio):
         return "–"
     ends = [error.ratio, *(error.interval or ())]
     shown = [f"{100 * (end - 1):+.0f}".replace("-", "−") for end in ends]
-    inside = f" (95 % interval {shown[1]} to {shown[2]})" if error.interval else ""
+    inside = f" (95 % interval {shown[1]} to {shown[2]})" if error.interval and interval else ""
     return f"{shown[0]} %{inside}"
 
 

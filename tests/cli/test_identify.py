@@ -1,0 +1,331 @@
+"""`retwin identify`: parameters of any twin from logs, and what the logs do not determine."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fmus import c_fmu
+
+import retwin as rt
+
+RATE = 50.0
+PENDULUM = """<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <body>
+      <joint name="swing" type="hinge" axis="0 1 0" damping="0.02"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.5"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="torque" joint="swing" ctrlrange="-2 2"/></actuator>
+  <sensor><jointpos name="angle" joint="swing"/></sensor>
+</mujoco>
+"""
+MODULE = """
+import numpy as np
+
+
+def filled(commands, gain=0.1, leak=0.05, spare=1.0):
+    level = np.zeros((*commands.shape[:2], 1))
+    for t in range(1, commands.shape[1]):
+        level[:, t] = level[:, t - 1] + gain * commands[:, t - 1] - leak * level[:, t - 1]
+    return level
+
+
+def broken(commands, gain=0.1):
+    raise ZeroDivisionError("no such tank")
+"""
+TANK = """
+name = "tank"
+twin = "identify_module:filled"
+rate = 1
+inputs = { valve = {} }
+outputs = { level = { unit = "m" } }
+commands = { kind = "HoldSampler", duration = 100, hold_durations = [5, 30], low = [0], high = [1] }
+[parameters]
+gain = { unit = "m", low = 0.05, high = 0.2, start = 0.1 }  # kept
+leak = { unit = "1/s", low = 0.01, high = 0.1, start = 0.05 }
+"""
+
+
+def lagged(u: np.ndarray, gain: float, tau: float, step: float) -> np.ndarray:
+    """The exact response of the lag to a held input."""
+    x = np.zeros(len(u))
+    for k in range(1, len(u)):
+        x[k] = gain * u[k - 1] + (x[k - 1] - gain * u[k - 1]) * np.exp(-step / tau)
+    return x
+
+
+def steps(rng: np.random.Generator, count: int, *, low: float = -1, high: float = 1) -> np.ndarray:
+    """A command of random levels."""
+    return np.repeat(rng.uniform(low, high, count // 25 + 1), 25)[:count]
+
+
+def write(path: Path, **columns: np.ndarray) -> Path:
+    """A table of these columns."""
+    text = [",".join(columns), *(",".join(f"{x:.6g}" for x in row) for row in zip(*columns.values(), strict=True))]
+    path.write_text("\n".join(text).replace("nan", "") + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twins, and logs of systems that they describe with other values of their parameters."""
+    folder = tmp_path_factory.mktemp("identify")
+    rng = np.random.default_rng(0)
+    c_fmu(folder, name="plant")
+    for i in range(5):
+        u = steps(rng, 200)
+        x = lagged(u, 1.7, 0.25, 1 / RATE) + 0.02 * rng.normal(size=200)
+        x[rng.integers(200, size=9)] = np.nan
+        write(folder / f"run{i}.csv", time=np.arange(200) / RATE, u=u, x=x)
+    (folder / "robot.xml").write_text(PENDULUM, encoding="utf-8")
+    robot = rt.MuJoCoTwin.from_file(folder / "robot.xml", rate=RATE)
+    torque = np.stack([steps(rng, 150) for _ in range(4)])[..., None]
+    damping = {"joint.swing.damping": 0.09, "joint.swing.frictionloss": 0.03}
+    angle = robot.simulate(torque, seed=0, parameters=damping).observed
+    for i in range(4):
+        values = angle[i, :, 0] + 0.002 * rng.normal(size=150)
+        write(folder / f"swing{i}.csv", t=np.arange(150) / RATE, tau=torque[i, :, 0], angle=values)
+    (folder / "identify_module.py").write_text(MODULE, encoding="utf-8")
+    (folder / "tank.toml").write_text(TANK, encoding="utf-8")
+    for i in range(2):
+        valve, level = steps(rng, 400, low=0), np.zeros(400)
+        for k in range(1, 400):
+            level[k] = level[k - 1] + 0.13 * valve[k - 1] - 0.03 * level[k - 1]
+        write(folder / f"tank{i}.csv", valve=valve, level=level + 0.01 * rng.normal(size=400))
+    return folder
+
+
+@pytest.fixture
+def place(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The same files in the current folder."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    sys.modules.pop("identify_module", None)
+
+
+def result(folder: str = "out") -> dict:
+    """What identification.json holds."""
+    return json.loads(Path(folder, "identification.json").read_text("utf-8"))
+
+
+def contains(found: dict, name: str, truth: float) -> bool:
+    """Whether an interval, widened to be missed once in 10 000 times, contains a true value."""
+    each = found["parameters"][name]
+    return abs(each["value"] - truth) < 8 * each["error"]
+
+
+def test_an_fmu_is_calibrated_to_its_logs(place: Path, call) -> None:
+    runs = sorted(place.glob("run*.csv"))
+    ranges = ["--free", "gain=0.1:5", "--free", "tau=0.02:1"]
+    code, out, err = call("identify", "plant.fmu", *runs, "--inputs", "u", *ranges, "--out", "out")
+    assert code == 0, err
+    found = result()
+    assert contains(found, "gain", 1.7)
+    assert contains(found, "tau", 0.25)
+    assert found["held_out"] == "trajectories"
+    assert found["rate"] == RATE
+    held = found["outputs"]["x"]["validation"]
+    assert held["after"] == pytest.approx(0.02, rel=0.2)
+    assert held["before"] > 10 * held["after"]
+    assert "fell from" in out
+    assert "No log holds seen" in out
+    start = json.loads(Path("out/start_values.json").read_text("utf-8"))
+    assert start == {n: found["parameters"][n]["value"] for n in ("gain", "tau")}
+    code, out, _ = call("twin", "info", "out/updated.toml")
+    assert code == 0
+    twin = rt.cases.get("out/updated.toml").twin
+    measured = rt.load("out/logs.npz")
+    residual = twin.simulate(measured.commands, seed=0).observed - measured.observed
+    assert np.sqrt(np.mean(residual[measured.mask] ** 2)) == pytest.approx(0.02, rel=0.2)
+
+
+def test_a_robot_is_calibrated_by_places_in_its_model(place: Path, call) -> None:
+    logs = sorted(place.glob("swing*.csv"))
+    names = ("joint.swing.damping", "joint.swing.frictionloss")
+    free = ["--free", f"{names[0]}=0:0.5", "--free", f"{names[1]}=0:0.2"]
+    words = ("identify", "robot.xml", *logs, "--column", "torque=tau", *free, "--out", "out")
+    code, _, err = call(*words)
+    assert code == 0, err
+    found = result()
+    assert contains(found, names[0], 0.09)
+    assert contains(found, names[1], 0.03)
+    twin = rt.cases.get("out/updated.toml").twin
+    assert dict(zip(twin.names, twin.values, strict=True))[names[0]] == pytest.approx(0.09, rel=0.1)
+
+
+def test_a_function_is_calibrated_by_its_keyword_arguments(place: Path, call) -> None:
+    channels = ("--inputs", "valve", "--outputs", "level", "--rate", "1")
+    free = ("--free", "gain=0.01:0.5", "--free", "leak=0.001:0.2")
+    name = "identify_module:filled"
+    code, out, err = call(
+        "identify", name, "tank0.csv", "tank1.csv", *channels, *free, "--out", "out"
+    )
+    assert code == 0, err
+    found = result()
+    assert (found["held_out"], found["errors_rest_on"]) == ("time", "samples")
+    assert contains(found, "gain", 0.13)
+    assert contains(found, "leak", 0.03)
+    assert found["outputs"]["level"]["validation"]["interval"][1] < 1
+    assert "each row is a sample at 1 Hz" in out
+    assert rt.cases.get("out/updated.toml").parametric.names == ("gain", "leak")
+
+
+def test_a_case_is_updated_and_keeps_all_else(place: Path, call) -> None:
+    code, _, err = call("identify", "tank.toml", "tank0.csv", "tank1.csv", "--out", "deep/out")
+    assert code == 0, err
+    updated = rt.cases.get("deep/out/updated.toml")
+    before = rt.cases.get("tank.toml")
+    assert updated.sampler == before.sampler
+    assert updated.parametric.parameters[0].high == 0.2
+    values = dict(zip(updated.twin.names, updated.twin.values, strict=True))
+    assert values["gain"] == pytest.approx(0.13, rel=0.02)
+    again = call("identify", "deep/out/updated.toml", "tank0.csv", "--out", "again", "--json")
+    assert json.loads(again[1])["parameters"]["gain"]["start"] == values["gain"]
+
+
+def test_the_same_seed_gives_the_same_bytes(place: Path, call) -> None:
+    for name in ("one", "two"):
+        assert call("identify", "tank.toml", "tank0.csv", "--out", name)[0] == 0
+    first, second = (result(name) for name in ("one", "two"))
+    assert first.pop("seconds") != second.pop("seconds")
+    assert first == second
+    assert Path("one/updated.toml").read_bytes() == Path("two/updated.toml").read_bytes()
+
+
+def test_what_the_logs_do_not_determine_is_said(place: Path, call) -> None:
+    """`spare` changes nothing."""
+    channels = ("--inputs", "valve", "--outputs", "level", "--rate", "1")
+    free = ("--free", "gain=0.01:0.5", "--free", "spare=0:2")
+    name = "identify_module:filled"
+    code, out, err = call("identify", name, "tank0.csv", *channels, *free, "--out", "out")
+    assert code == 0
+    assert "do not determine spare" in out
+    assert "warning: not identified: spare" in err
+    found = result()
+    assert not found["parameters"]["spare"]["identified"]
+    assert found["parameters"]["spare"]["interval"] is None
+    assert found["directions"][-1]["open"]
+    assert "do not determine spare" in Path("out/report.html").read_text("utf-8")
+
+
+def test_a_value_at_its_bound_has_no_error(place: Path, call) -> None:
+    code, out, _ = call(
+        "identify", "tank.toml", "tank0.csv", "--free", "gain=0.05:0.11", "--out", "out"
+    )
+    assert code == 0
+    gain = result()["parameters"]["gain"]
+    assert (gain["at_bound"], gain["error"], gain["interval"]) == ("high", None, None)
+    assert "gain lies at its upper bound, 0.11" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("plant.fmu run0.csv --free gain=0:2 --out out", "for every command.*none for trouble"),
+        ("plant.fmu run0.csv --inputs u --out out", "--free gain=LOW:HIGH; there are gain = 1"),
+        ("robot.xml swing0.csv --out out", "joint.swing.damping = 0.02"),
+        ("plant.fmu none.csv --free gain=1:2 --out out", "LOG: expected an existing file"),
+        ("tank.toml tank0.csv --free gain --free gain=0:1 --out out", "gain twice"),
+        ("tank.toml tank0.csv --free spare=0:2 --out out", "expected some of gain, leak"),
+        ("tank.toml tank0.csv --free gain=3:2 --out out", "contains its present value"),
+        ("tank.toml tank0.csv --free gain=a:b --out out", "with numbers"),
+        ("tank.toml tank0.csv --column level=u --out out", "expected a column 'u'"),
+        ("tank.toml tank0.csv --column nothing=u --out out", "channels of the twin, valve, level"),
+        ("tank.toml tank0.csv --hold-out 1 --out out", "from 0 to below 1"),
+        ("tank.toml tank0.csv --method bayes --loss linear --out out", "none with --method bayes"),
+        ("tank.toml tank0.csv --method magic --out out", "one of least_squares"),
+        ("tank.toml tank0.csv --transient 900 --out out", "less than the 400 s"),
+        ("tank.toml tank0.csv --rate 5 --out out", "the case has its own"),
+        ("tank.toml tank0.csv --out tank.toml", "a folder to replace"),
+        ("robot.xml tank0.csv --free joint.swing.damping=0:1 --out out", "give --time COLUMN"),
+        (
+            "identify_module:broken tank0.csv --inputs valve --outputs level --rate 1 "
+            "--free gain=0:1 --out out",
+            "ZeroDivisionError: no such tank",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_refused_before_any_work(
+    words: str, said: str, place: Path, call
+) -> None:
+    if "robot.xml tank0" in words:
+        shutil.copy("tank0.csv", "rows.csv")
+        text = Path("rows.csv").read_text().replace("valve,level", "torque,angle")
+        Path("tank0.csv").write_text(text)
+    code, out, err = call("identify", *words.split())
+    assert code == (1 if "broken" in words else 2), err
+    assert out == ""
+    assert len(err.strip().splitlines()) == 1
+    assert re.search(said, err), err
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda t: t.replace("valve,level", "valve,other"), "a column for an output of the twin"),
+        (lambda t: t.replace("valve,level", "other,level"), "none for valve"),
+        (lambda t: t.splitlines()[0] + "\n", "a number for every command"),
+        (lambda t: "", "columns ; none for valve"),
+        (lambda t: t.replace("0.", "0.x", 9), "numbers in columns"),
+        (lambda t: "\n".join(x.split(",")[0] + "," for x in t.splitlines()[1:]).join(["valve,level\n", "\n"]), "measurements in the"),
+    ],
+    ids=["no output", "no command", "no rows", "empty", "no numbers", "nothing measured"],
+)
+def test_logs_that_lack_something_are_refused(change, said: str, place: Path, call) -> None:
+    Path("log.csv").write_text(change(Path("tank0.csv").read_text()))
+    code, _, err = call("identify", "tank.toml", "log.csv", "--out", "out")
+    assert (code, len(err.strip().splitlines())) == (2, 1), err
+    assert said in err, err
+    assert not Path("out").exists()
+
+
+def test_a_log_at_another_rate_is_refused(place: Path, call) -> None:
+    case = rt.cases.get("tank.toml")
+    made = case.twin.simulate(np.ones((2, 30, 1)), seed=0)
+    rt.save(made.replace(rate=2.0), "fast.npz")
+    code, _, err = call("identify", "tank.toml", "fast.npz", "--out", "out")
+    assert code == 2
+    assert "1 Hz" in err
+    assert "2 Hz" in err
+
+
+def test_saved_trajectories_are_matched_by_name_and_unit(place: Path, call) -> None:
+    case = rt.cases.get("tank.toml")
+    truth = case.parametric.with_values({"gain": 0.15})
+    rng = np.random.default_rng(1)
+    commands = np.stack([steps(rng, 200, low=0) for _ in range(4)])[..., None]
+    made = truth.simulate(commands, seed=0)
+    made = made.replace(observed=made.observed + 0.01 * rng.normal(size=made.observed.shape))
+    swapped = rt.Channels(("height",), ("m",))
+    rt.save(made.replace(outputs=swapped, labels=None), "saved.npz")
+    words = ("--inputs", "valve", "--outputs", "level", "--rate", "1", "--free", "gain=0:1")
+    name = "identify_module:filled"
+    column = ("--column", "level=height")
+    code, _, err = call("identify", name, "saved.npz", *words, *column, "--out", "out")
+    assert code == 0, err
+    assert contains(result(), "gain", 0.15)
+
+
+@pytest.mark.slow
+def test_a_posterior_is_drawn(place: Path, call) -> None:
+    code, out, err = call(
+        "identify", "tank.toml", "tank0.csv", "tank1.csv", "--method", "bayes", "--out", "out"
+    )
+    assert code == 0, err
+    found = result()
+    assert found["errors_rest_on"] == "posterior"
+    assert contains(found, "gain", 0.13)
+    low, high = found["parameters"]["gain"]["interval"]
+    assert 0.05 < low < high < 0.2
+    assert "posterior mean" in Path("out/report.html").read_text("utf-8")
