@@ -19,9 +19,7 @@ __all__ = ["merged", "parameters_of", "updated_built_in"]
 CONTENTS = "see docs/own_twin.md for what it holds"
 
 
-def merged(
-    path: Path, above: tuple[Path, ...] = ()
-) -> tuple[dict[str, Any], Path | str]:
+def merged(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Path | str]:
     """The settings of a file and of that on which it is based, and the folder of the latter.
 
     A key of this file replaces that of the base; of `parameters`, the settings of each parameter

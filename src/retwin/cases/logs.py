@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -81,7 +81,7 @@ class Logs:
     notes: tuple[str, ...]
 
 
-def log_rate(path: str | Path, columns: Columns = Columns()) -> float | None:  # noqa: B008 - frozen
+def log_rate(path: str | Path, columns: Columns = Columns()) -> float | None:
     """The sample rate of a log in Hz, of a table by the median interval of its times.
 
     Returns None for a table without times. Raises InputError for a log that cannot be read.
@@ -103,13 +103,15 @@ def log_rate(path: str | Path, columns: Columns = Columns()) -> float | None:  #
         got=f"a median interval of {step:g} s",
         remedy="name the column of the times, or give the sample rate and no times",
     )
-    return float(f"{1 / step:.3g}") if abs(float(f"{1 / step:.3g}") * step - 1) < ROUNDED else 1 / step
+    return (
+        float(f"{1 / step:.3g}") if abs(float(f"{1 / step:.3g}") * step - 1) < ROUNDED else 1 / step
+    )
 
 
 def read_logs(
     paths: Sequence[str | Path],
     twin: Twin,
-    columns: Columns = Columns(),  # noqa: B008 - a frozen config
+    columns: Columns = Columns(),
     *,
     case: Case | None = None,
     rows_at_rate: bool = True,
@@ -164,7 +166,7 @@ def read_logs(
             got=repr(name),
             remedy="write CHANNEL=COLUMN, the name in the twin first",
         )
-    notes: dict[str, None] = {}
+    notes: dict[str, list[str]] = {}
     sets, tests = [], []
     for done, path in enumerate(map(Path, paths)):
         own = bool(case is not None and case.records is not None and not columns.names)
@@ -187,9 +189,16 @@ def read_logs(
     unseen = ~joined.mask.any(axis=(0, 1))
     if unseen.any():
         names = ", ".join(np.array(joined.outputs.names)[unseen])
-        notes[f"No log holds {names}; what the other outputs tell is used."] = None
-    test = Trajectories.concatenate(tests) if tests else None
-    return Logs(joined, test, tuple(notes))
+        notes[f"No log holds {names}."] = []
+    kept = Trajectories.concatenate(tests) if tests else None
+    return Logs(joined, kept, tuple(_sentences(notes)))
+
+
+def _sentences(notes: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Notes, each after the files to which it applies, if it is about some."""
+    for text, files in notes.items():
+        more = f" and {len(files) - 2} more" if len(files) > 2 else ""
+        yield f"{', '.join(files[:2])}{more}: {text}." if files else text
 
 
 def _is_table(path: Path) -> bool:
@@ -238,7 +247,7 @@ def _is_iso(cell: str) -> bool:
 
 
 def _table(
-    path: Path, twin: Twin, columns: Columns, notes: dict[str, None], *, rows_at_rate: bool
+    path: Path, twin: Twin, columns: Columns, notes: dict[str, list[str]], *, rows_at_rate: bool
 ) -> Trajectories:
     """A table as one trajectory."""
     header = _header(path)
@@ -255,14 +264,14 @@ def _table(
             got=f"columns {', '.join(header)}",
             remedy="give --time COLUMN, or --rate HZ if each row is a sample at that rate",
         )
-        notes[f"{path.name}: each row is a sample at {twin.rate:g} Hz."] = None
+        notes.setdefault(f"each row is a sample at {twin.rate:g} Hz", []).append(path.name)
     else:
         _check_there(path.name, clock.column, header)
     there = {name: column for name, column in wanted.items() if column in header}
     cells = dict.fromkeys(there.values(), number)
     table = read_columns(path, cells | ({clock.column: clock.number} if clock else {}))
     if clock is not None:
-        notes[_described(path.name, table, clock, twin.rate)] = None
+        notes.setdefault(_described(path.name, table, clock, twin.rate), []).append(path.name)
     missing = np.full(len(next(iter(table.values()))), np.nan)
     record = Record({name: there.get(name, "") for name in wanted}, time=clock)
     source = Provenance(path.name, sha256(path))
@@ -270,14 +279,14 @@ def _table(
 
 
 def _described(name: str, table: Mapping[str, NDArray], clock: TimeColumn, rate: float) -> str:
-    """How the rows of a table come to the sample rate, in a sentence."""
+    """How the rows of a table come to the sample rate."""
     seconds = clock.seconds(table[clock.column], rate, name)
     own = 1 / float(np.median(np.diff(seconds)))
     even = np.allclose(seconds * rate, np.arange(len(seconds)), atol=1e-3)
     how = f"rows at {own:.4g} Hz (median) are brought to {rate:g} Hz"
     if even:
         how = f"a row per sample at {rate:g} Hz"
-    return f"{name}: times in column {clock.column} ({clock.unit}); {how}."
+    return f"times in column {clock.column} ({clock.unit}), {how}"
 
 
 def _check_columns(
@@ -317,7 +326,7 @@ def _check_there(name: str, column: str, header: Sequence[str]) -> None:
 
 
 def _matched(
-    found: Trajectories, twin: Twin, columns: Columns, name: str, notes: dict[str, None]
+    found: Trajectories, twin: Twin, columns: Columns, name: str, notes: dict[str, list[str]]
 ) -> Trajectories:
     """Trajectories with the channels of the twin, in its order."""
     require(
@@ -383,7 +392,7 @@ def _places(
     return places
 
 
-def _healthy(found: Trajectories, notes: dict[str, None]) -> Trajectories:
+def _healthy(found: Trajectories, notes: dict[str, list[str]]) -> Trajectories:
     """The healthy and the unlabelled trajectories; InputError if there is none."""
     kept = np.isin(found.labels, (HEALTHY, UNLABELLED))
     require(
@@ -394,7 +403,7 @@ def _healthy(found: Trajectories, notes: dict[str, None]) -> Trajectories:
         remedy="identify the parameters of a healthy system",
     )
     if not kept.all():
-        notes[f"{int((~kept).sum())} trajectories of other classes are not used."] = None
+        notes[f"{int((~kept).sum())} trajectories of other classes are not used."] = []
     return found[kept]
 
 

@@ -105,8 +105,8 @@ def open_parametric(
     Parameters
     ----------
     name : str
-        A built-in case, a file `case.toml`, or any name that `rt.twins.get` takes: `*.fmu`, `*.xml`,
-        `*.urdf`, `module:function`, `module:object`.
+        A built-in case, a file `case.toml`, or any name that `rt.twins.get` takes: `*.fmu`,
+        `*.xml`, `*.urdf`, `module:function`, `module:object`.
     free : sequence of str
         The free parameters, each as `NAME=LOW:HIGH`, `NAME=LOW:HIGH:START`, or `NAME` where the
         twin states a range. The others keep their values. By default all parameters are free for
@@ -175,10 +175,11 @@ def _known(twin: Twin) -> Iterator[Known]:
     elif isinstance(twin, RebuiltTwin):
         yield from (Known(name, "1", value) for name, value in twin.defaults.items())
     elif isinstance(twin, FunctionTwin):
-        for each in list(inspect.signature(twin.function).parameters.values())[1:]:
-            number = isinstance(each.default, int | float) and not isinstance(each.default, bool)
-            if each.name not in PASSED and number:
-                yield Known(each.name, "1", float(each.default))
+        for taken in list(inspect.signature(twin.function).parameters.values())[1:]:
+            default = taken.default
+            number = isinstance(default, int | float) and not isinstance(default, bool)
+            if taken.name not in PASSED and number:
+                yield Known(taken.name, "1", float(default))
 
 
 def _chosen(known: Sequence[Known], free: Sequence[str], name: str) -> list[Parameter]:
@@ -254,7 +255,9 @@ def _freed(twin: Twin, chosen: Sequence[Parameter]) -> ParametricTwin:
     made = twin.freed(chosen)
     defaults = set(twin.twin.defaults) if isinstance(twin.twin, RebuiltTwin) else None
     unknown = [
-        each.name for each in made.parameters if defaults is not None and set(each.places) - defaults
+        each.name
+        for each in made.parameters
+        if defaults is not None and set(each.places) - defaults
     ]
     require(
         not unknown,

@@ -72,9 +72,9 @@ app = typer.Typer(
 app.command(epilog=example("retwin demo"))(studies.demo)
 app.command(epilog=example("retwin doctor"))(doctor.doctor)
 app.command(epilog=example("retwin bench"))(bench.bench)
-app.command(epilog=example("retwin identify plant.fmu log.csv --free gain=0.1:10 --out identified"))(
-    identify.identify
-)
+app.command(
+    epilog=example("retwin identify plant.fmu log.csv --free gain=0.1:10 --out identified")
+)(identify.identify)
 app.command(epilog=example("retwin fit armpi --twin-data sim.mat --real real.mat --out model"))(
     models.fit
 )

@@ -61,9 +61,7 @@ HoldOut = Annotated[
 Loss = Annotated[
     str | None, _panel("Method", metavar="NAME", help="soft_l1 (default), linear or cauchy.")
 ]
-Starts = Annotated[
-    int | None, _panel("Method", metavar="N", help="Starts of the search; else 4.")
-]
+Starts = Annotated[int | None, _panel("Method", metavar="N", help="Starts of the search; else 4.")]
 SensorRate = Annotated[
     float | None, _panel("Method", metavar="HZ", help="True rate of the sensor, if lower.")
 ]
@@ -78,12 +76,8 @@ Time = Annotated[
 Transient = Annotated[
     float, _panel("Logs", metavar="SECONDS", help="Begin of each log that is not used.")
 ]
-Inputs = Annotated[
-    str, _panel("Twin", metavar="NAMES", help="Of the inputs, joined by commas.")
-]
-Outputs = Annotated[
-    str, _panel("Twin", metavar="NAMES", help="Of the outputs, joined by commas.")
-]
+Inputs = Annotated[str, _panel("Twin", metavar="NAMES", help="Of the inputs, joined by commas.")]
+Outputs = Annotated[str, _panel("Twin", metavar="NAMES", help="Of the outputs, joined by commas.")]
 Rate = Annotated[
     float | None, _panel("Twin", metavar="HZ", help="Samples per second; else the log's.")
 ]
@@ -125,7 +119,9 @@ def identify(
     check_place(out, folder=True, holds=HOLDS)
     settings = _method(method, loss, starts)
     columns = _columns(column, time, transient)
-    names = [tuple(each.strip() for each in o.split(",") if each.strip()) for o in (inputs, outputs)]
+    names = [
+        tuple(each.strip() for each in o.split(",") if each.strip()) for o in (inputs, outputs)
+    ]
     given = rate is not None
     for log in logs:
         require(
@@ -138,9 +134,7 @@ def identify(
     any_rate = Path(twin).suffix.lower() in UNRATED
     if rate is None and any_rate:
         rate = cases.log_rate(logs[0], columns)
-    opened = cases.open_parametric(
-        twin, free or (), inputs=names[0], outputs=names[1], rate=rate
-    )
+    opened = cases.open_parametric(twin, free or (), inputs=names[0], outputs=names[1], rate=rate)
     with keep_workers(), bar("identify") as show:
         read = cases.read_logs(
             logs,
@@ -212,7 +206,7 @@ def _columns(column: list[str] | None, time: str | None, transient: float) -> Co
     clock = None
     if time is not None:
         name, _, unit = time.partition("=")
-        clock = TimeColumn(name, unit or "s")  # type: ignore[arg-type]
+        clock = TimeColumn(name, unit or "s")
     return Columns(names, clock, transient)
 
 
@@ -234,14 +228,15 @@ def _print(found: Identification, values: dict[str, Any], *, as_json: bool) -> N
         (p.name, p.unit, f"{p.start:.4g}", value(p), interval(p), state(p))
         for p in found.parameters
     ]
-    part = "held out" if found.compared == "validation" else "used"
-    errors = [
-        (name, o.unit, f"{o.identification.before:.3g}", f"{o.identification.after:.3g}")
-        + ((f"{o.validation.before:.3g}", f"{o.validation.after:.3g}") if o.validation else ())
-        for name, o in ((each.name, each) for each in found.outputs)
-    ]
-    heads = ("RMS error", "unit", "used: before", "after")
-    heads += ("held out: before", "after ") if part == "held out" else ()
+    held = found.compared == "validation"
+    errors = []
+    for each in found.outputs:
+        pair = [each.identification, each.validation] if held else [each.identification]
+        if any(error is not None and error.samples for error in pair):
+            shown = [f"{x:.3g}" for e in pair if e is not None for x in (e.before, e.after)]
+            errors.append((each.name, each.unit, *shown))
+    heads = ["RMS error", "unit", "used: before", "after"]
+    heads += ["held out: before", "after "] if held else []
     answer(
         values,
         table(("parameter", "unit", "before", "after", "95 % interval", ""), parameters),
@@ -257,4 +252,3 @@ def _print(found: Identification, values: dict[str, Any], *, as_json: bool) -> N
     for name in ("report.html", "identification.json", "updated.toml", "start_values.json"):
         if name in values["files"]:
             note(f"Saved {values['files'][name]}")
-

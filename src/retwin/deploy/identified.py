@@ -97,9 +97,7 @@ def save_identification(
     return {**values, "files": {name: str(Path(folder) / name) for name in names}}
 
 
-def identification_values(
-    found: Identification, opened: OpenedTwin, logs: Logs
-) -> dict[str, Any]:
+def identification_values(found: Identification, opened: OpenedTwin, logs: Logs) -> dict[str, Any]:
     """The contents of identification.json, as plain values; NaN and infinity become null."""
     result = found.found
     bayes = isinstance(result, Posterior)

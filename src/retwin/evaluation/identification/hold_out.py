@@ -63,8 +63,8 @@ def hold_out(
         # By the last sample that was measured, since shorter trajectories are padded.
         seen = measured.mask.any(axis=2)
         last = measured.steps - np.argmax(seen[:, ::-1], axis=1)
-        first = np.round((1 - share) * last).astype(int)
-        late = (np.arange(measured.steps)[None] >= first[:, None])[..., None]
+        first = np.asarray(np.round((1 - share) * last))[:, None, None]
+        late = np.arange(measured.steps)[None, :, None] >= first
         parts = (
             measured.replace(mask=measured.mask & ~late),
             measured.replace(mask=measured.mask & late),

@@ -242,7 +242,8 @@ def _outputs(
     made = []
     for channel, (name, unit) in enumerate(zip(first.outputs.names, first.outputs.units)):  # noqa: B905
         values = [
-            each.observed[..., channel][each.mask[..., channel]] for each, _, _ in simulated.values()
+            each.observed[..., channel][each.mask[..., channel]]
+            for each, _, _ in simulated.values()
         ]
         together = np.concatenate(values)
         errors: dict[Part, RMSError] = {

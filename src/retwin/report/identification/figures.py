@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -238,15 +236,11 @@ def _spectra(measured: Trajectories, errors: list[NDArray], shown: list[int]) ->
 
 
 def _powers(label: str, unit: str, values: NDArray) -> Axis:
-    """A logarithmic axis with ticks at powers of ten, at most seven of them."""
+    """A logarithmic axis with ticks at 1, 2 and 5, or at powers of ten where there are many."""
     low, high = np.log10(values.min()), np.log10(values.max())
-    powers = np.arange(np.ceil(low), np.floor(high) + 1)
-    powers = powers[:: max(1, -(-len(powers) // 7))]
-    if len(powers) < 2:
-        powers = np.array([low, high])
-    return Axis(label, unit, kind="log", ticks=dict(_ticks(powers)))
-
-
-def _ticks(powers: NDArray) -> Iterator[tuple[float, str]]:
-    for power in powers.tolist():
-        yield float(10.0**power), f"{10.0**power:.2g}"
+    powers = np.arange(np.floor(low), np.ceil(high) + 1)
+    powers = powers[:: max(1, -(-len(powers) // 8))]
+    steps = (1.0, 2.0, 5.0) if high - low < 2 else (1.0,)
+    places = [step * 10.0**power for power in powers.tolist() for step in steps]
+    kept = [each for each in places if values.min() <= 1.01 * each and each <= 1.01 * values.max()]
+    return Axis(label, unit, kind="log", ticks={each: f"{each:g}" for each in kept})

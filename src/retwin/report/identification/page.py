@@ -184,6 +184,8 @@ def _errors(found: Identification) -> Table:
     rows = []
     held = found.compared == "validation"
     for each in found.outputs:
+        if not (each.identification.samples or (each.validation and each.validation.samples)):
+            continue
         row = [Cell(each.name, _unit(each.unit)), Cell(significant(each.spread))]
         for error in (each.identification, each.validation):
             if error is None:
@@ -213,7 +215,10 @@ def _range_of(error: RMSError) -> str:
 
 def _tests(found: Identification) -> Table:
     rows = []
+    measured = found.errors(found.compared)
     for each in found.residuals:
+        if each.name not in measured:
+            continue
         known = [test for test in each.inputs if isfinite(test.p_value)]
         first = min(known, key=lambda test: test.p_value, default=None)
         rows.append(

@@ -10,7 +10,7 @@ from retwin.update.identification.posterior import Posterior
 
 __all__ = ["change", "combination", "findings", "interval", "significant", "state", "value"]
 
-WHITE = 0.05
+WHITE = 0.01
 """p-value below which a residual is not taken for white noise, or depends on an input."""
 SENTENCES = 4
 """Outputs that have a sentence of their own, at most."""

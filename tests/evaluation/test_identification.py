@@ -1,0 +1,166 @@
+"""Validation of identified parameters: truth tests of errors, intervals and residual tests."""
+
+from __future__ import annotations
+
+import warnings
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import binom
+
+import retwin as rt
+from retwin.evaluation import hold_out, validate_identification
+from retwin.update.identification import MCMC, LeastSquares, Noise
+
+LEAK, GAIN = 0.1, 0.5
+
+
+def filled(
+    commands: np.ndarray, gain: float = GAIN, leak: float = LEAK, spare: float = 1.0
+) -> np.ndarray:
+    """A first-order lag."""
+    return lfilter([0, gain], [1, leak - 1], commands, axis=1)
+
+
+def build(values: dict[str, float]) -> rt.FunctionTwin:
+    channels = rt.Channels(("u",), ("V",)), rt.Channels(("y",), ("m",))
+    return rt.FunctionTwin(partial(filled, **values), *channels, 1.0)
+
+
+def twin_with(*names: str) -> rt.ParametricTwin:
+    """The lag, with some parameters free."""
+    ends = {"gain": (0.1, 1.0, 0.3), "leak": (0.02, 0.3, 0.2), "spare": (0.0, 2.0, 1.0)}
+    return rt.ParametricTwin.built(build, [rt.Parameter(name, "1", *ends[name]) for name in names])
+
+
+def measured(
+    seed: int, count: int = 1, steps: int = 300, *, memory: float = 0.0, noise: float = 0.2
+) -> rt.Trajectories:
+    """Trajectories of the lag with autoregressive noise."""
+    rng = np.random.default_rng(seed)
+    levels = rng.uniform(-1, 1, (count, steps // 10 + 1))
+    commands = np.repeat(levels, 10, axis=1)[:, :steps, None]
+    made = build({}).simulate(commands, seed=0)
+    white = rng.normal(size=(count, steps + 50, 1)) * noise * np.sqrt(1 - memory**2)
+    return made.replace(observed=made.nominal + lfilter([1], [1, -memory], white, axis=1)[:, 50:])
+
+
+def checked(
+    data: rt.Trajectories, *names: str, share: float = 0.25
+) -> rt.evaluation.Identification:
+    twin = twin_with(*names)
+    used, held = hold_out(data, share, seed=0)
+    found = rt.identify(twin, used, LeastSquares(starts=2), seed=0)
+    return validate_identification(found, twin, used, held)
+
+
+def test_whole_trajectories_are_held_out_where_there_are_enough() -> None:
+    data = measured(0, count=8)
+    used, held = hold_out(data, 0.25, seed=1)
+    assert held is not None
+    assert (len(used), len(held)) == (6, 2)
+    assert set(used.ids) | set(held.ids) == set(data.ids)
+    assert hold_out(data, 0.25, seed=1)[1].ids.tolist() == held.ids.tolist()  # type: ignore[union-attr]
+    four, one = hold_out(data[:4], 0.5, seed=1)
+    assert (len(four), len(one)) == (3, 1)  # type: ignore[arg-type]
+
+
+def test_of_few_trajectories_the_end_is_held_out_and_padding_is_not_counted() -> None:
+    data = rt.Trajectories.concatenate([measured(0, steps=200), measured(1, steps=100)])
+    used, held = hold_out(data, 0.25, seed=0)
+    assert held is not None
+    assert used.mask.sum(axis=(1, 2)).tolist() == [150, 75]
+    assert held.mask.sum(axis=(1, 2)).tolist() == [50, 25]
+    assert not (used.mask & held.mask).any()
+    np.testing.assert_array_equal(used.commands, held.commands)
+
+
+def test_nothing_held_out_is_said() -> None:
+    data = measured(0)
+    assert hold_out(data, 0.0, seed=0) == (data, None)
+    with pytest.raises(rt.InputError, match="from 0 to below 1"):
+        hold_out(data, 1.0, seed=0)
+    found = checked(data, "gain", share=0.0)
+    assert (found.split, found.compared) == ("none", "identification")
+    assert found.outputs[0].validation is None
+
+
+def test_errors_are_those_of_free_simulation_in_the_outputs_unit() -> None:
+    found = checked(measured(2, count=8, noise=0.05), "gain", "leak")
+    (output,) = found.outputs
+    assert output.validation is not None
+    assert output.unit == "m"
+    data, before, after = found.simulated["validation"]
+    rms = [np.sqrt(np.mean((data.observed - each) ** 2)) for each in (before, after)]
+    assert [output.validation.before, output.validation.after] == pytest.approx(rms)
+    assert output.validation.after == pytest.approx(0.05, rel=0.2)
+    assert output.validation.interval is not None
+    assert output.validation.interval[1] < 1
+
+
+def test_standard_errors_from_one_record_hold_for_autoregressive_noise() -> None:
+    """The number of intervals that contain the truth, within limits missed once in 1000."""
+    count, inside = 40, 0
+    for seed in range(count):
+        found = checked(measured(seed, memory=0.8), "gain", share=0.0)
+        assert found.basis == "samples"
+        low, high = found.parameters[0].interval  # type: ignore[misc]
+        inside += low < GAIN < high
+    assert binom.ppf(0.0005, count, 0.95) <= inside
+
+
+def test_a_parameter_without_effect_is_an_open_direction() -> None:
+    with pytest.warns(UserWarning, match="not identified: spare"):
+        found = checked(measured(3), "gain", "spare")
+    assert found.open_parameters == ("spare",)
+    last = found.directions[-1]
+    assert (last.open, list(last.components)) == (True, ["spare"])
+    assert np.isinf(last.error)
+    assert not found.directions[0].open
+
+
+def test_residuals_of_a_right_twin_are_white_and_of_a_wrong_one_follow_the_command() -> None:
+    right = checked(measured(4, steps=4000), "gain", "leak")
+    (test,) = right.residuals
+    assert test.p_white > 1e-3
+    assert test.inputs[0].p_value > 1e-3
+    data = measured(4, steps=4000, noise=0.05)
+    slow = lfilter([0.1], [1, -0.9], data.observed, axis=1)  # a second lag, which the twin lacks
+    (test,) = checked(data.replace(observed=slow), "gain").residuals
+    assert test.p_white < 1e-6
+    assert test.inputs[0].p_value < 1e-3
+
+
+def test_exact_measurements_give_no_test_and_no_warning() -> None:
+    found = checked(measured(5, noise=0.0), "gain")
+    assert np.isnan(found.residuals[0].p_white)
+    assert found.parameters[0].value == pytest.approx(GAIN, abs=1e-5)
+
+
+def test_a_posterior_is_summarised_by_its_draws() -> None:
+    pytest.importorskip("emcee")
+    twin = twin_with("gain", "spare")
+    data = measured(6, steps=120)
+    method = MCMC(walkers=12, steps=120, warm_up=60, starts=1, noise=Noise(discrepancy=False))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # short chains
+        posterior = rt.identify(twin, data, method, seed=0)
+    found = validate_identification(posterior, twin, data)
+    assert found.basis == "posterior"
+    gain, spare = found.parameters
+    assert gain.value == pytest.approx(posterior.mean["gain"])
+    assert gain.error == pytest.approx(posterior.deviation["gain"])
+    assert (gain.identified, spare.identified) == (True, False)
+    assert found.directions[-1].open
+    assert list(found.directions[-1].components)[0] == "spare"
+
+
+def test_a_result_of_another_twin_is_refused() -> None:
+    data = measured(0)
+    found = rt.identify(twin_with("gain"), data, LeastSquares(starts=1), seed=0)
+    with pytest.raises(rt.InputError, match="the twin with the parameters gain"):
+        validate_identification(found, twin_with("leak"), data)
+    with pytest.raises(rt.InputError, match="give what rt.identify returned"):
+        validate_identification(data, twin_with("leak"), data)  # type: ignore[arg-type]
