@@ -38,10 +38,10 @@ LONG = "x" * 300
 HUGE = "99999999999999999999"
 NUMBERS = ("nan", "inf", "-inf", "-1", "0", HUGE, "1e308", "1e-300", "")
 POSSIBLE = {
-    "0": {"seed", "encoder_noise", "index", "port"},
+    "0": {"seed", "encoder_noise", "index", "port", "hold_out"},
     HUGE: {"chunk", "max_bytes", "processes", "workers", "rate"},
     "1e308": {"rate"},
-    "1e-300": {"rate", "seconds"},
+    "1e-300": {"rate", "seconds", "hold_out"},
 }
 """Options for which an odd number may be accepted."""
 LONG_WORK = ("bench", "data fetch", "demo", "diagnose fit", "fit", "monitor demo", "study")
@@ -73,6 +73,8 @@ BASE = {
     "fit": "reach.toml --real real.npz --simulations 20",
     "generate": "model --case reach.toml --per-class 1",
     "export fmu": "model",
+    "identify": "own_of_mutations:reach real.npz --inputs first,second --outputs far,high --rate 10"
+    " --free length=0.5:2",
     "monitor audit": "alarms.jsonl",
     "monitor demo": "--seconds 1 --port 0",
     "monitor fit": "model real.npz",

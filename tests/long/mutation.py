@@ -34,9 +34,9 @@ MODULE = """
 import numpy as np
 
 
-def reach(commands):
+def reach(commands, length=1.0):
     turned = commands.cumsum(axis=-1)
-    return np.stack([np.sin(turned).sum(axis=-1), np.cos(turned).sum(axis=-1)], axis=-1)
+    return length * np.stack([np.sin(turned).sum(axis=-1), np.cos(turned).sum(axis=-1)], axis=-1)
 """
 CASE = """
 name = "reach"

@@ -71,7 +71,7 @@ app = typer.Typer(
 )
 app.command(epilog=example("retwin demo"))(studies.demo)
 app.command(epilog=example("retwin doctor"))(doctor.doctor)
-app.command(epilog=example("retwin bench"))(bench.bench)
+app.command(hidden=True, epilog=example("retwin bench"))(bench.bench)
 app.command(
     epilog=example("retwin identify plant.fmu log.csv --free gain=0.1:10 --out identified")
 )(identify.identify)

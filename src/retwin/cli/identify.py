@@ -61,11 +61,13 @@ HoldOut = Annotated[
 Loss = Annotated[
     str | None, _panel("Method", metavar="NAME", help="soft_l1 (default), linear or cauchy.")
 ]
-Starts = Annotated[int | None, _panel("Method", metavar="N", help="Starts of the search; else 4.")]
+Starts = Annotated[
+    int | None, _panel("Method", metavar="N", help="Starts of the search; else 4.", min=1, max=1000)
+]
 SensorRate = Annotated[
     float | None, _panel("Method", metavar="HZ", help="True rate of the sensor, if lower.")
 ]
-Processes = Annotated[int, _panel("Method", metavar="N", help="Worker processes.")]
+Processes = Annotated[int, _panel("Method", metavar="N", help="Worker processes.", min=1, max=256)]
 Column = Annotated[
     list[str] | None,
     _panel("Logs", metavar="CHANNEL=NAME", help="The column of a channel, if named otherwise."),
@@ -106,7 +108,7 @@ def identify(
 ) -> None:
     """Identify the parameters of your twin from logs.
 
-    Writes a page, identification.json, and updated.toml, a case with the values found. A module
+    Writes report.html, identification.json and a case, updated.toml. A module
     that is named by the twin or its case is run with your rights.
     """
     from retwin import cases
