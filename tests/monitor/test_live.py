@@ -24,6 +24,8 @@ from retwin.monitor import (
     fit_monitor,
     verify,
 )
+from retwin.monitor.machine import PLACES, Counts, Layout, Machine
+from retwin.monitor.updates import Asset
 from retwin.twins import Parameter, ParameterShift, State, StateTwin
 from retwin.update import Dynamics, Library, fit_dynamics
 
@@ -268,6 +270,29 @@ def test_a_store_that_fails_acknowledges_nothing(
                 live.submit([samples(made[50:60], 50)])
     (found,) = live.submit([samples(made[50:60], 50)])
     assert found.counts.used == 10
+
+
+def test_the_earliest_and_the_latest_time_are_restarted_from(store: Store) -> None:
+    made = rows(recorded(2))[:2]
+    with pytest.raises(InputError, match="ahead"):
+        Live(store, ahead=1e300)
+    live = opened(store, "a", "b", ahead=9e9)
+    live.submit([Samples("a", np.array([1 - 2**63]), made[:1])])
+    live.submit([Samples("b", np.array([2**63 - 1]), made[:1])])
+    again = Live(store).submit([Samples("a", np.array([1 - 2**63, SECOND - 2**63]), made)])
+    assert (again[0].counts.used, again[0].counts.repeated) == (1, 1)
+
+
+def test_samples_with_many_holes_are_taken_in_parts(store: Store, monitor: Monitor) -> None:
+    asset = Asset("a", 2, {"twin": "tank"}, 1)
+    machine, counts = Machine(asset, monitor, Layout(monitor), None), Counts()
+    left = Samples("a", BEGIN + 3500 * SECOND * np.arange(50), np.ones((50, 2)))
+    while len(left.times):
+        left, places = machine.accept(left, BEGIN + 10**18, set(), counts), 0
+        while work := machine.next_work():
+            places += len(work.values)
+        assert places < PLACES + 3600
+    assert counts.used == 50
 
 
 def test_producers_share_commits_and_one_that_is_refused_fails_alone(store: Store) -> None:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from retwin.monitor.samples import SECOND
 from retwin.monitor.store import Store
+from retwin.monitor.updates import LEAST
 from retwin.update.dynamics.twin import DynamicsTwin
 
 __all__ = ["gridded"]
@@ -37,7 +38,7 @@ def gridded(
     """
     commands = len(twin.inputs)
     times, values = [np.zeros(0, dtype=np.int64)], [np.zeros((0, commands + len(twin.outputs)))]
-    for part, rows in store.samples(asset, first - 1):
+    for part, rows in store.samples(asset, max(LEAST, first - 1)):
         times.append(part[part <= last])
         values.append(rows[part <= last])
         if part[-1] > last:

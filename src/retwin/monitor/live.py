@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -20,7 +21,7 @@ from retwin.monitor.monitor import Alarm, Monitor, Watched
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import SECOND, Samples
 from retwin.monitor.store import Store
-from retwin.monitor.updates import Asset, Update, one_asset
+from retwin.monitor.updates import MOST, Asset, Update, one_asset
 
 __all__ = ["AssetStatus", "Live", "Received"]
 
@@ -126,7 +127,7 @@ class Live:
         if wait is not None:
             finite("wait", wait, least=0.0, most=MOST_WAIT, unit="s")
         self._wait = wait
-        self._ahead = finite("ahead", ahead, least=0.0, unit="s")
+        self._ahead = finite("ahead", ahead, least=0.0, most=MOST / SECOND, unit="s")
         self._clock = clock
         self._lock = threading.RLock()
         self._monitors: dict[tuple[str, int], tuple[Monitor, Layout]] = {}
@@ -283,14 +284,18 @@ class Live:
 
     def _submitted(self, batch: Sequence[Samples]) -> list[Received]:
         limit = self._clock() + round(self._ahead * SECOND)
-        found = []
+        found, alarms = [], Counter[str]()
         for each in batch:
-            machine = self._machines[each.asset]
-            stored = self.store.present(each.asset, machine.unsure(each.times))
-            found.append(machine.accept(each, limit, stored))
+            machine, counts = self._machines[each.asset], Counts()
+            known = set(self.store.present(each.asset, machine.unsure(each.times)).tolist())
+            left = machine.accept(each, limit, known, counts)
+            while len(left.times):
+                alarms += self._stepped([machine])
+                left = machine.accept(left, limit, known, counts)
+            found.append(counts)
         used = list(dict.fromkeys(each.asset for each in batch))
         machines = [self._machines[name] for name in used]
-        alarms = self._stepped(machines)
+        alarms += self._stepped(machines)
         updates, entries = [], []
         for machine in machines:
             new = machine.new_samples()
@@ -305,13 +310,13 @@ class Live:
         self._announce(committed)
         last = {each.asset: i for i, each in enumerate(batch)}
         return [
-            Received(each.asset, counts, alarms.get(each.asset, 0) * (last[each.asset] == i))
+            Received(each.asset, counts, alarms[each.asset] * (last[each.asset] == i))
             for i, (each, counts) in enumerate(zip(batch, found, strict=True))
         ]
 
-    def _stepped(self, machines: Sequence[Machine]) -> dict[str, int]:
+    def _stepped(self, machines: Sequence[Machine]) -> Counter[str]:
         """Step the monitors of machines through what is complete; alarms by machine."""
-        alarms: dict[str, int] = {}
+        alarms = Counter[str]()
         while ready := [(each, work) for each in machines if (work := each.next_work())]:
             key: Callable[[tuple[Machine, Work]], tuple] = lambda each: (  # noqa: E731
                 id(each[0].monitor),
@@ -319,8 +324,7 @@ class Live:
             )
             for _, group in groupby(sorted(ready, key=key), key):
                 together = list(group)
-                for name, count in _step(together).items():
-                    alarms[name] = alarms.get(name, 0) + count
+                alarms.update(_step(together))
         return alarms
 
     def _announce(self, entries: list[Entry]) -> None:

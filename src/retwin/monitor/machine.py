@@ -7,7 +7,7 @@ and then missing.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from retwin.monitor.monitor import Alarm, Monitor, MonitorState
 from retwin.monitor.samples import SECOND, Samples
-from retwin.monitor.updates import Asset
+from retwin.monitor.updates import LEAST, Asset
 
 __all__ = ["Counts", "Layout", "Machine", "Recent", "Work"]
 
@@ -29,6 +29,9 @@ KEPT = 600
 """Newest samples that are kept for pages."""
 PART = 4096
 """Samples that are stepped at once at most."""
+PLACES = 4 * PART
+"""Places, most of them perhaps without a sample, from which on they are stepped before others are
+taken: that bounds the memory, whatever times samples have."""
 WINDOW, TOLERATED = 100, 20
 """Places of a check of the sample rate, and how many may be missing or have further samples."""
 BEHIND = 10
@@ -193,14 +196,14 @@ class Machine:
     def stepped_time(self) -> int:
         """A time in nanoseconds after which are all samples that were not stepped."""
         assert self._origin is not None
-        return self._origin + round((self._done - 0.5) * self._period)
+        return max(LEAST, self._origin + round((self._done - 0.5) * self._period))
 
     def unsure(self, times: NDArray) -> NDArray:
         """Those times that may be of samples which are stored already."""
         return times if self.newest is None else times[times <= self.newest]
 
-    def accept(self, samples: Samples, limit: int, stored: Iterable[int]) -> Counts:
-        """Take samples in the order of their arrival.
+    def accept(self, samples: Samples, limit: int, known: set[int], counts: Counts) -> Samples:
+        """Take samples in the order of their arrival, until there is enough to step.
 
         Parameters
         ----------
@@ -208,17 +211,29 @@ class Machine:
             Of this machine.
         limit : int
             The latest time that counts.
-        stored : iterable of int
+        known : set of int
             Times of samples that the store has.
+        counts : Counts
+            To which what was done is added.
+
+        Returns
+        -------
+        Samples
+            Those that were not taken yet, and have to be after the work so far was stepped: each
+            may end a hole of many places.
 
         """
-        known, counts = set(stored), Counts()
+        own, taken = Counts(), 0
         for moment, row in zip(samples.times.tolist(), samples.values, strict=True):
+            if len(self._rows) >= PLACES:
+                break
             what = self._placed(moment, row, limit, known)
-            setattr(counts, what, getattr(counts, what) + 1)
+            setattr(own, what, getattr(own, what) + 1)
+            taken += 1
         self._complete()
-        self.counts.add(counts)
-        return counts
+        for each in (self.counts, counts):
+            each.add(own)
+        return Samples(samples.asset, samples.times[taken:], samples.values[taken:])
 
     def hold(self, times: NDArray, values: NDArray) -> None:
         """Take samples of the store that were not stepped."""

@@ -45,6 +45,8 @@ FILE = "monitor.sqlite"
 """The database in the folder of the store, where no other is given."""
 ROWS = 4096
 """Rows that are read at once."""
+AT_ONCE = 500
+"""Times that are looked for at once; a query has a limit."""
 SURPLUS = 0.1
 """Share of `max_samples` by which an asset may exceed it, so that samples are removed in groups."""
 
@@ -267,8 +269,7 @@ class Store:
             return np.zeros(0, dtype=np.int64)
         key, _ = self._asset(asset)
         with self._reading() as connection:
-            found = _present(connection, key, times)
-        return found[np.isin(found, times)]
+            return _present(connection, key, times)
 
     def log(self, kind: str | None = None, after: int = LEAST) -> Iterator[Entry]:
         """The entries of the log in their order, or those of one kind, read part by part.
@@ -391,10 +392,13 @@ class _Held:
 
 
 def _present(connection: Any, key: int, times: NDArray) -> NDArray:
-    """Stored times of an asset from the least to the largest of `times`."""
-    inside = samples.c.time.between(int(times.min()), int(times.max()))
-    chosen = sa.select(samples.c.time).where(samples.c.asset == key, inside)
-    return np.array(connection.execute(chosen).scalars().all(), dtype=np.int64)
+    """Those of the times that samples of an asset have; others between them are not read."""
+    found: list[int] = []
+    for first in range(0, len(times), AT_ONCE):
+        chosen = samples.c.time.in_(times[first : first + AT_ONCE].tolist())
+        own = sa.select(samples.c.time).where(samples.c.asset == key, chosen)
+        found += connection.execute(own).scalars().all()
+    return np.array(found, dtype=np.int64)
 
 
 def _last_entry(connection: Any) -> Entry | None:
