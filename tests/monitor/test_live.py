@@ -334,3 +334,33 @@ def test_alarms_are_explained_beside_the_stream_and_after_a_restart(store: Store
     explained = [entry.data["alarm"] for entry in store.log("cause")]
     assert len(explained) > 1
     assert explained == [entry.sequence for entry in store.log("alarm")]
+
+
+def test_a_report_that_fails_and_the_end_leave_no_alarm_waited_for(store: Store) -> None:
+    live, made = opened(store), rows(recorded(5, LEAK))
+
+    def failing(*_: object) -> None:
+        raise RuntimeError
+
+    with Explanations(live, report=failing) as explanations:
+        live.submit([samples(made[:230])])
+        explanations.wait()
+    logged = [len(list(store.log(kind))) for kind in ("alarm", "cause")]
+    assert logged[0] == logged[1] > 0
+    explanations = Explanations(live)
+    live.submit([samples(made[230:], 230)])
+    explanations.close()
+    explanations.wait()
+
+
+def test_an_alarm_whose_samples_were_removed_says_so(folder: Path, tmp_path: Path) -> None:
+    with Store(tmp_path / "store", max_samples=5) as store:
+        registry = Registry(store, "tank")
+        registry.promote(registry.propose(folder, "first").number)
+        live = opened(store)
+        with Explanations(live) as explanations:
+            live.submit([samples(rows(recorded(5, LEAK)))])
+            explanations.wait()
+        first = next(store.log("cause")).data
+        assert first["name"] == "unknown"
+        assert "max_samples" in first["note"]

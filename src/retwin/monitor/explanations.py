@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 from collections.abc import Callable, Container, Iterable
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.estimate import UNKNOWN
+from retwin.checks import require
 from retwin.errors import InputError, brief
 from retwin.monitor.audit import Entry
 from retwin.monitor.cause import BEFORE, FEWEST, Cause, find_causes, possible_causes
@@ -59,10 +61,12 @@ class Explanations:
         self._queue: queue.Queue[tuple[Entry, int] | None] = queue.Queue()
         self._before: dict[str, int] = {}
         self._closed = threading.Event()
-        explained = {entry.data["alarm"] for entry in live.store.log("cause")}
+        self._taking = threading.Lock()
         self._last = -1
-        self._take(live.store.log("alarm"), explained)
-        live.listen(self._on_entries)
+        explained = {entry.data["alarm"] for entry in live.store.log("cause")}
+        with self._taking:  # alarms that are raised meanwhile are taken after the earlier ones
+            live.listen(self._on_entries)
+            self._take(live.store.log("alarm"), explained)
         self._thread = threading.Thread(target=self._run, name="explanations", daemon=True)
         self._thread.start()
 
@@ -77,9 +81,12 @@ class Explanations:
         self._closed.set()
         self._queue.put(None)
         self._thread.join()
+        while not self._queue.empty():  # what is left is explained after the next start
+            self._queue.get()
+            self._queue.task_done()
 
     def wait(self) -> None:
-        """Return when all alarms so far are explained."""
+        """Return when all alarms so far are explained, or this is closed."""
         self._queue.join()
 
     def causes(self, twin: str, monitor: Monitor) -> dict[str, Any]:
@@ -87,7 +94,10 @@ class Explanations:
         return possible_causes(monitor.twin, self._faults(twin))
 
     def _on_entries(self, entries: list[Entry]) -> None:
-        self._take(each for each in entries if each.kind == "alarm" and each.sequence > self._last)
+        alarms = [each for each in entries if each.kind == "alarm"]
+        if alarms and not self._closed.is_set():
+            with self._taking:
+                self._take(each for each in alarms if each.sequence > self._last)
 
     def _take(self, alarms: Iterable[Entry], explained: Container[int] = ()) -> None:
         """Queue alarms, each with the time of the alarm before it of the same machine."""
@@ -99,9 +109,11 @@ class Explanations:
             self._last = entry.sequence
 
     def _run(self) -> None:
-        while (waiting := self._queue.get()) is not None and not self._closed.is_set():
+        while not self._closed.is_set():
+            waiting = self._queue.get()
             try:
-                self._explain(*waiting)
+                if waiting is not None:
+                    self._explain(*waiting)
             except InputError:
                 pass  # It could not be stored, so the alarm is explained after the next start.
             finally:
@@ -124,7 +136,10 @@ class Explanations:
                 "note": brief(error),
             }
         self._live.log([("cause", found)])
-        self._report(alarm, found)
+        try:
+            self._report(alarm, found)
+        except Exception:  # of who is told; further alarms are explained all the same
+            logging.getLogger(__name__).exception("a cause was found but not reported")
 
     def _found(self, alarm: dict[str, Any], before: int) -> tuple[Cause, int]:
         """The cause of an alarm, and the time of the first sample that it was found from."""
@@ -138,6 +153,13 @@ class Explanations:
         half = round(period / 2)
         begin, end = alarm["time"] - window - half, alarm["time"] + half
         times, values = gridded(store, name, monitor.twin, begin, end)
+        require(
+            len(times) >= 2,
+            "samples",
+            expected="at least two before the alarm in the store",
+            got=len(times),
+            remedy="store more of them: see max_samples",
+        )
         record = _record(monitor.twin, values)
         own = Alarm("", record.steps - 1, 0.0, alarm["output"], alarm["change"], alarm["evidence"])
         known = self.causes(twin, monitor)
