@@ -25,7 +25,9 @@ from retwin.monitor import (
     verify,
 )
 from retwin.monitor.machine import PLACES, Counts, Layout, Machine
-from retwin.monitor.updates import Asset
+from retwin.monitor.program import _offer
+from retwin.monitor.settings import TwinSettings
+from retwin.monitor.updates import Asset, Update
 from retwin.twins import Parameter, ParameterShift, State, StateTwin
 from retwin.update import Dynamics, Library, fit_dynamics
 
@@ -251,6 +253,53 @@ def test_a_new_version_begins_anew(store: Store, monitor: Monitor, tmp_path: Pat
     state = store.state("a")
     assert state is not None
     assert int(state[1]["stream"][1]) == 49
+
+
+def test_status_and_events_continue_after_a_restart(store: Store) -> None:
+    live, made = opened(store), rows(recorded(5, LEAK))
+    half = np.arange(0, 202, 2)
+    live.submit([Samples("a", BEGIN + SECOND * half, made[half])])
+    live.submit([samples(made[202:204], 202)])
+    before = live.status()[0]
+    assert before.ratio > 0
+    assert before.rate
+    live = Live(store)
+    after = live.status()[0]
+    assert (after.ratio, after.rate) == (before.ratio, before.rate)
+    live.submit([Samples("a", BEGIN + SECOND * (204 + half), made[half])])
+    assert events(store) == ["rate"]  # not once more
+    state = store.state("a")
+    assert state is not None
+    arrays = {name: state[1][name] for name in ("stream", "monitor")}
+    store.commit([Update("a", state=arrays, time=state[0])])  # as an earlier program stored it
+    assert Live(store).submit([samples(made[:1], 410)])[0].counts.used == 1
+
+
+def test_another_twin_of_the_same_version_number_begins_anew(
+    store: Store, monitor: Monitor, tmp_path: Path
+) -> None:
+    live, made = opened(store), rows(recorded(2))
+    live.submit([samples(made[:100])])
+    replace(monitor, alpha=0.02).save(tmp_path / "other")
+    registry = Registry(store, "other")
+    registry.promote(registry.propose(tmp_path / "other", "another").number)
+    live.add("a", "other")
+    live.submit([samples(made[100:110], 100)])
+    state = store.state("a")
+    assert state is not None
+    assert int(state[1]["stream"][1]) == 9
+    assert events(store) == ["version"]
+
+
+def test_a_first_start_that_was_cut_off_is_finished_by_the_next_one(
+    folder: Path, tmp_path: Path
+) -> None:
+    with Store(tmp_path / "store") as store:
+        registry, twin, lines = Registry(store, "tank"), TwinSettings(monitor=folder), []
+        registry.propose(folder, "and killed before it was promoted")
+        _offer(registry, twin, lines.append)
+        assert registry.active == registry.versions()[0]
+        assert "is version 1" in lines[0]
 
 
 def test_a_store_that_fails_acknowledges_nothing(

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.estimate import UNKNOWN
-from retwin.checks import require
 from retwin.errors import InputError, brief
 from retwin.monitor.audit import Entry
 from retwin.monitor.cause import BEFORE, FEWEST, Cause, find_causes, possible_causes

@@ -153,9 +153,14 @@ class Live:
             monitor, _ = self._monitor(twin, version)
             channels = len(monitor.twin.inputs) + len(monitor.twin.outputs)
             asset = Asset(name, channels, {**(settings or {}), "twin": twin}, version)
-            if asset not in self.store.assets():
+            known = {each.name: each for each in self.store.assets()}.get(name)
+            if asset != known:
                 self.store.add_asset(asset)
             self.refresh()
+            before = known.settings.get("twin") if known else None
+            if before not in (None, twin):
+                text = f"watched by the twin {twin} from the next sample on, before by {before}"
+                self.log([("event", _event(asset, self._clock(), text))])
 
     def refresh(self) -> None:
         """Read assets and active versions again: after a version was promoted or rolled back.
@@ -172,7 +177,11 @@ class Live:
                 if twin not in active:
                     active[twin] = self._active(twin)
                 if asset.version != active[twin]:
-                    entries.append(("event", _version_event(asset, active[twin])))
+                    text = (
+                        f"watched by version {active[twin]} from the next sample on, before by "
+                        f"{asset.version}"
+                    )
+                    entries.append(("event", _event(asset, self._clock(), text)))
                     asset = replace(asset, version=active[twin])
                     self.store.add_asset(asset)
                 known = self._machines.get(asset.name)
@@ -364,14 +373,15 @@ class Live:
     def _monitor(self, twin: str, version: int) -> tuple[Monitor, Layout]:
         key = twin, version
         if key not in self._monitors:
-            monitor = Monitor.load(Registry(self.store, twin).folder(version))
-            self._monitors[key] = monitor, Layout(monitor)
+            registry = Registry(self.store, twin)
+            monitor = Monitor.load(registry.folder(version))
+            digest = {each.number: each.digest for each in registry.versions()}[version]
+            self._monitors[key] = monitor, Layout(monitor, digest)
         return self._monitors[key]
 
 
-def _version_event(asset: Asset, version: int) -> dict[str, Any]:
-    text = f"watched by version {version} from the next sample on, before by {asset.version}"
-    return {"asset": asset.name, "time": time.time_ns(), "what": "version", "text": text}
+def _event(asset: Asset, moment: int, text: str) -> dict[str, Any]:
+    return {"asset": asset.name, "time": moment, "what": "version", "text": text}
 
 
 def _step(together: Sequence[tuple[Machine, Work]]) -> dict[str, int]:

@@ -114,10 +114,13 @@ class Layout:
     ----------
     monitor : Monitor
         The monitor.
+    digest : str
+        The hexadecimal hash of its files: its states are of no use to another one.
 
     """
 
-    def __init__(self, monitor: Monitor) -> None:
+    def __init__(self, monitor: Monitor, digest: str = "") -> None:
+        self.digest = np.frombuffer(bytes.fromhex(digest), dtype=np.uint8)
         start = monitor.start(1).arrays()
         self._parts = {name: (each.dtype, each.shape[1:]) for name, each in start.items()}
         self._ends = np.cumsum([each[0].size for each in start.values()])
@@ -170,7 +173,6 @@ class Machine:
         self.alarms = 0
         self.last_alarm: int | None = None
         self.void = self.outside = False
-        self.rate = ""
         self.entries: list[tuple[str, dict[str, Any]]] = []
         self.changed = False
         self._period = SECOND / rate
@@ -188,9 +190,20 @@ class Machine:
         self._state = layout.start
         self._new: dict[int, NDArray] = {}
         self._window = [0, 0, 0]
+        self._wrong = [0, 0, 0]
+        """The newest full window if its rate was another one than the twin's."""
         self._late = 0
         self._recent: deque[tuple[NDArray, ...]] = deque()
         self._kept = 0
+
+    @property
+    def rate(self) -> str:
+        """How the sample rate differs from the twin's; "" if it does not."""
+        places, absent, further = self._wrong
+        if not places:
+            return ""
+        rate = self.monitor.twin.rate
+        return f"{rate * (places - absent + further) / places:.4g} Hz instead of {rate:.4g} Hz"
 
     @property
     def stepped_time(self) -> int:
@@ -304,16 +317,26 @@ class Machine:
     def arrays(self) -> dict[str, NDArray]:
         """All that must be stored, beside the samples."""
         own = (self._origin, self._done, self.newest, self.asset.version, *self._window)
-        return {"stream": np.array(own, dtype=np.int64), "monitor": self._state}
+        return {
+            "stream": np.array(own, dtype=np.int64),
+            "monitor": self._state,
+            "status": np.array([self.evidence, *self._wrong], dtype=float),
+            "digest": self.layout.digest,
+        }
 
     def restore(self, arrays: Mapping[str, NDArray]) -> bool:
-        """Continue where `arrays` was stored; False if another version watched."""
+        """Continue where `arrays` was stored; False if another version or monitor watched."""
         origin, done, self.newest, version, *window = arrays["stream"].tolist()
-        if version != self.asset.version or arrays["monitor"].shape != self._state.shape:
-            return False
+        other = not np.array_equal(arrays.get("digest", self.layout.digest), self.layout.digest)
+        shape = arrays["monitor"].shape
+        if version != self.asset.version or other or shape != self._state.shape:
+            return False  # it begins anew
         self._origin, self._done, self._farthest, self._window = origin, done, done, window
         self._state, self._begins = arrays["monitor"], False
         self.void = bool(self.layout.state(self._state[None]).void[0])
+        if "status" in arrays:  # not in states of earlier versions of this program
+            self.evidence, *wrong = arrays["status"].tolist()
+            self._wrong = [int(each) for each in wrong]
         return True
 
     def _place(self, moment: int) -> int:
@@ -403,16 +426,14 @@ class Machine:
         places, absent, further = self._window
         if places < WINDOW:
             return
-        rate = self.monitor.twin.rate
-        wrong = absent + further > TOLERATED
-        text = f"{rate * (places - absent + further) / places:.4g} Hz instead of {rate:.4g} Hz"
-        if wrong != bool(self.rate):
+        before, wrong = self.rate, absent + further > TOLERATED
+        self._wrong = self._window if wrong else [0, 0, 0]
+        self._window = [0, 0, 0]
+        if wrong != bool(before):
             assert self._origin is not None
             moment = self._origin + round(place * self._period)
-            after = f"samples come at {text}" if wrong else "samples come at the right rate again"
-            self._log("event", moment, what="rate", text=after)
-        self.rate = text if wrong else ""
-        self._window = [0, 0, 0]
+            how = self.rate or "the right rate again"
+            self._log("event", moment, what="rate", text=f"samples come at {how}")
 
     def _log(self, kind: str, moment: int, **data: Any) -> None:
         own = {"asset": self.asset.name, "version": self.asset.version, "time": moment}

@@ -171,15 +171,15 @@ def _offer(registry: Registry, twin: TwinSettings, report: Callable[[str], None]
     folder, versions = twin.monitor.resolve(), registry.versions()
     if sha256(folder) not in [each.digest for each in versions]:
         made = registry.propose(folder, f"the folder {twin.monitor.name} at the start")
-        if versions:
-            active = registry.active
+        if active := registry.active:
             report(
                 f"twin {registry.twin}: {twin.monitor} has changed and is version {made.number} "
-                f"now, which is only proposed; version {active.number if active else 0} watches"
+                f"now, which is only proposed; version {active.number} watches"
             )
-    if registry.active is None and not versions:
-        registry.promote(1)
-        report(f"twin {registry.twin}: {twin.monitor} is version 1")
+    if registry.active is None:  # also where an earlier first start was cut off before this
+        number = {each.digest: each.number for each in registry.versions()}[sha256(folder)]
+        registry.promote(number)
+        report(f"twin {registry.twin}: {twin.monitor} is version {number}")
 
 
 def _bound(server: ServerSettings) -> socket.socket:
