@@ -244,7 +244,7 @@ def test_a_filter_that_diverges_voids_the_promise_and_begins_anew(monitor: Monit
     state, found = monitor.step(monitor.start(2), commands, whole.observed)
     assert found.outside.tolist() == [True, False]
     assert found.void[:, -1].tolist() == [True, False]
-    assert all(np.isfinite(each).all() for each in vars(state.filter).values())
+    assert all(np.isfinite(each).all() for each in vars(state.filters[0]).values())
     again = monitor.step(state, whole.commands, whole.observed)[1]
     assert np.isfinite(again.mean).all()
     assert not np.isnan(again.score[:, 100:]).any()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from itertools import count, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.monitor.bets import Dependence, Location, Scale
 from retwin.monitor.detector import Detector, DetectorState
 from retwin.monitor.disturbance import Disturbance, DisturbanceState, fit_disturbance
+from retwin.monitor.predictors import SLOWER, Predictor, agreeing, settled, standardised
 from retwin.monitor.promise import Promise, false_alarms
 from retwin.monitor.scores import ConformalScores, fit_scores, middle, resolution
 from retwin.monitor.slack import Slack
@@ -23,7 +25,6 @@ from retwin.monitor.validity import Validity, ValidityState
 from retwin.serialisation.models import read_model, refusing, write_model
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics.online import FilterState, OnlineFilter
-from retwin.update.dynamics.prediction import root_of, whitened
 from retwin.update.dynamics.twin import DynamicsTwin
 
 __all__ = ["Alarm", "Monitor", "MonitorState", "Watched", "fit_monitor"]
@@ -33,16 +34,12 @@ KIND = "monitor"
 APART = 200
 """Missing samples that are put between two calibration records, so that neither predicts the
 other."""
-SETTLED = 1.05
-"""Ratio of predicted standard deviations, for starts of which one is twice as uncertain, up to
-which the filter knows the states of a machine that it did not see start."""
 PARTS = {
-    "filter": FilterState,
     "disturbance": DisturbanceState,
     "detector": DetectorState,
     "validity": ValidityState,
 }
-"""What the state of a monitor consists of."""
+"""What the state of a monitor consists of, beside the filters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +48,11 @@ class MonitorState:
 
     Attributes
     ----------
-    filter : FilterState
-        Of the n machines.
+    filters : tuple of FilterState
+        Of the n machines, one for each predictive model.
     disturbance, detector, validity
-        Of n * d_y streams, the outputs of the first machine first.
+        Of n * M * d_y streams: those of the first machine first, and of these the d_y outputs of
+        the first of M predictive models.
     samples, blank : NDArray
         (n,), samples since the start, and samples for which no alarm is raised any more.
     void : NDArray
@@ -62,7 +60,7 @@ class MonitorState:
 
     """
 
-    filter: FilterState
+    filters: tuple[FilterState, ...]
     disturbance: DisturbanceState
     detector: DetectorState
     validity: ValidityState
@@ -72,18 +70,18 @@ class MonitorState:
 
     def arrays(self) -> dict[str, NDArray]:
         """All arrays by name, whose first axis is that of machines."""
-        found = {}
-        for part in fields(self):
-            value = getattr(self, part.name)
-            if isinstance(value, np.ndarray):
-                found[part.name] = value
-                continue
+        found = {
+            f"{_filter(number)}.{each.name}": getattr(own, each.name)
+            for number, own in enumerate(self.filters)
+            for each in fields(own)
+        }
+        for name in PARTS:
+            value = getattr(self, name)
             for each in fields(value):
                 array = getattr(value, each.name)
-                if not isinstance(value, FilterState):
-                    array = array.reshape(len(self.void), -1, *array.shape[1:])
-                found[f"{part.name}.{each.name}"] = array
-        return found
+                array = array.reshape(len(self.void), -1, *array.shape[1:])
+                found[f"{name}.{each.name}"] = array
+        return found | {name: getattr(self, name) for name in ("samples", "blank", "void")}
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, NDArray]) -> MonitorState:
@@ -95,7 +93,9 @@ class MonitorState:
                 own = {key: each.reshape(-1, *each.shape[2:]) for key, each in own.items()}
             return kind(**own)
 
+        filters = takewhile(lambda name: f"{name}.states" in arrays, map(_filter, count()))
         return cls(
+            tuple(part(name, FilterState) for name in filters),
             *(part(name, kind) for name, kind in PARTS.items()),
             *(arrays[name] for name in ("samples", "blank", "void")),
         )
@@ -169,28 +169,30 @@ class Monitor:
     A Kalman filter predicts each sample from all earlier ones, an autoregression what its errors
     have in common, and their ranks among those of the calibration are scores. An e-detector sums
     the evidence for a change of these scores (`Detector`), and a test finds out whether the
-    promise applies (`Validity`).
+    promise applies (`Validity`). There are M such predictive models, whose filters follow the
+    machine at different speeds; their evidence is averaged with equal weights, which again is that
+    of an e-detector.
 
     Attributes
     ----------
     twin : DynamicsTwin
         The twin.
     disturbance : Disturbance
-        Of the d_y outputs.
+        Of M * d_y streams, the d_y outputs of the first model first.
     scores : ConformalScores
-        The calibration errors of the d_y outputs.
+        The calibration errors of these streams.
     slack : tuple of Slack
-        The classes of distributions of the scores of the d_y outputs.
+        The classes of distributions of their scores.
     resolution : NDArray
         (d_y,), the steps to which the outputs are rounded; 0 for none.
     arl : float
         Average number of measured samples to a false alarm, at least.
     blanking : float
         Time in s after an alarm in which none is raised.
-    warm_up : float
-        Time in s after the first sample in which no evidence is counted: the states are unknown.
     alpha : float
         Probability of declaring a promise void that applies.
+    predictors : tuple of Predictor
+        The M predictive models.
 
     """
 
@@ -201,15 +203,27 @@ class Monitor:
     resolution: NDArray
     arl: float
     blanking: float = 0.0
-    warm_up: float = 0.0
     alpha: float = 0.01
+    predictors: tuple[Predictor, ...] = (Predictor(),)
+
+    @property
+    def warm_up(self) -> float:
+        """Time in s after the first sample in which no evidence is counted: states are unknown."""
+        return min(each.warm_up for each in self.predictors)
 
     @property
     def promises(self) -> dict[str, Promise]:
         """What is promised of each output."""
+        outputs = self.twin.outputs.names
         return {
-            name: Promise(self.arl, self.twin.rate, slack, self.alpha)
-            for name, slack in zip(self.twin.outputs.names, self.slack, strict=True)
+            name: Promise(
+                self.arl,
+                self.twin.rate,
+                self.slack[i],
+                self.alpha,
+                self.slack[i + len(outputs) :: len(outputs)],
+            )
+            for i, name in enumerate(outputs)
         }
 
     def start(self, count: int) -> MonitorState:
@@ -217,7 +231,7 @@ class Monitor:
         streams = self._streams(count)
         zeros = np.zeros(count, dtype=np.int64)
         return MonitorState(
-            OnlineFilter(self.twin).start(count),
+            tuple(each.start(count) for each in self._filters),
             streams.disturbance.start(),
             streams.detector.start(count * len(self.slack)),
             streams.validity.start(count * len(self.slack)),
@@ -260,33 +274,43 @@ class Monitor:
         )
         seen = np.isfinite(measured)
         known = self._held(state, commands)
-        filtered, mean, covariance = OnlineFilter(self.twin).step(
-            state.filter, known, measured, seen
+        predicted = [
+            online.step(own, known, measured, seen)
+            for online, own in zip(self._filters, state.filters, strict=True)
+        ]
+        error, width = (
+            _by_stream(np.concatenate(each, axis=2))
+            for each in zip(
+                *(
+                    standardised(measured - mean, covariance, seen, self.resolution)
+                    for _, mean, covariance in predicted
+                ),
+                strict=True,
+            )
         )
-        error, width = _standardised(measured - mean, covariance, seen, self.resolution)
         streams = self._streams(count)
-        disturbance, error, scale = streams.disturbance.run(state.disturbance, _by_stream(error))
-        width = _by_stream(width) / scale
+        disturbance, error, scale = streams.disturbance.run(state.disturbance, error)
+        width = width / scale
         low, high = self.scores.score(_by_output(error, count), _by_output(width, count))
         low, high = (_by_stream(_by_machine(each, count)) for each in (low, high))
-        late = state.samples[:, None] + np.arange(samples) < round(self.warm_up * self.twin.rate)
-        hidden = np.repeat(late, len(self.slack), axis=0)
-        low, high = (np.where(hidden, np.nan, each) for each in (low, high))
-        kept = np.isfinite(filtered.states).all(axis=1)
-        kept &= np.isfinite(filtered.spread).all(axis=(1, 2))
-        lost = np.flatnonzero(~kept)
-        if len(lost):
-            fresh = OnlineFilter(self.twin).start(len(lost))
-            fresh = replace(fresh, commands=filtered.commands[lost])
-            filtered = filtered.merged(lost, fresh)
-        void = state.void | ~np.isfinite(mean).all(axis=(1, 2))
-        state = replace(state, filter=filtered, disturbance=disturbance, void=void)
+        outputs, rate = len(self.twin.outputs), self.twin.rate
+        counted = np.stack([p.late(state.samples, samples, rate) for p in self.predictors], axis=1)
+        counted = np.repeat(counted, outputs, axis=1).reshape(low.shape)
+        low, high = (np.where(counted, each, np.nan) for each in (low, high))
+        filters = tuple(
+            _finite(online, filtered)
+            for online, (filtered, _, _) in zip(self._filters, predicted, strict=True)
+        )
+        finite_ = [np.isfinite(each).all(axis=(1, 2)) for _, each, _ in predicted]
+        void = state.void | ~np.all(finite_, axis=0)
+        state = replace(state, filters=filters, disturbance=disturbance, void=void)
         state, found = self._detected(streams, state, low, high, list(np.asarray(ids, dtype=str)))
         state = replace(state, samples=state.samples + samples)
         evidence, alarm, void, alarms = found
+        _, mean, covariance = predicted[0]
         deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
         shape = (count, len(self.slack), samples)
-        score = np.moveaxis(middle(low, high).reshape(shape), 1, 2)
+        score = np.moveaxis(middle(low, high).reshape(shape)[:, :outputs], 1, 2)
         outside = self.twin.outside(known)
         return state, Watched(mean, deviation, score, evidence, alarm, void, outside, alarms)
 
@@ -349,7 +373,7 @@ class Monitor:
                         ids[machine] if ids else str(machine),
                         sample,
                         sample / self.twin.rate,
-                        self.twin.outputs.names[output],
+                        self.twin.outputs.names[output % len(self.twin.outputs)],
                         _described(streams.detector, chosen),
                         float(total[machine, last - 1]),
                     )
@@ -366,7 +390,7 @@ class Monitor:
 
     def _held(self, state: MonitorState, commands: NDArray) -> NDArray:
         """Commands (n, T, d_u), where those that are not finite are as before."""
-        known = np.concatenate([state.filter.commands[:, -1:], commands], axis=1)
+        known = np.concatenate([state.filters[0].commands[:, -1:], commands], axis=1)
         index = np.where(np.isfinite(known), np.arange(known.shape[1])[:, None], 0)
         index = np.maximum.accumulate(index, axis=1)
         held = np.take_along_axis(known, index, axis=1)[:, 1:]
@@ -378,6 +402,10 @@ class Monitor:
             remedy="begin at the first sample whose commands are known",
         )
         return held
+
+    @cached_property
+    def _filters(self) -> tuple[OnlineFilter, ...]:
+        return tuple(each.filter(self.twin) for each in self.predictors)
 
     @cached_property
     def _by_count(self) -> dict[int, _Streams]:
@@ -394,6 +422,7 @@ class Monitor:
         about = {
             "slack": [[each.kappa, each.shift] for each in self.slack],
             "copies": self.scores.copies,
+            "predictors": [[each.process, each.warm_up] for each in self.predictors],
             **{name: getattr(self, name) for name in NUMBERS},
         }
         arrays = {name: getattr(self.disturbance, name) for name in DISTURBANCE}
@@ -416,10 +445,18 @@ class Monitor:
             slack = tuple(Slack(*each) for each in about["slack"])
             twin = DynamicsTwin.load(Path(folder) / "twin")
             numbers = {name: finite(name, about[name], least=0.0) for name in NUMBERS}
+            given = about.get("predictors") or [[1.0, about["warm_up"]]]  # one, before version 0.2
+            predictors = tuple(
+                Predictor(
+                    finite("process", factor, least=0.0), finite("warm_up", warm_up, least=0.0)
+                )
+                for factor, warm_up in given
+            )
+            streams = len(predictors) * len(twin.outputs)
             parts = (disturbance.mean, scores.independent, slack, arrays["resolution"])
             shapes = [len(each) for each in parts]
             require(
-                shapes == [len(twin.outputs)] * 4
+                shapes == [streams] * 3 + [len(twin.outputs)]
                 and np.isfinite(disturbance.coefficients).all()
                 and (disturbance.process > 0).all()
                 and (disturbance.measurement >= 0).all(),
@@ -428,10 +465,18 @@ class Monitor:
                 got=shapes,
                 remedy="save the monitor again",
             )
-            return cls(twin, disturbance, scores, slack, arrays["resolution"], **numbers)
+            return cls(
+                twin,
+                disturbance,
+                scores,
+                slack,
+                arrays["resolution"],
+                **numbers,
+                predictors=predictors,
+            )
 
 
-NUMBERS = ("arl", "blanking", "warm_up", "alpha")
+NUMBERS = ("arl", "blanking", "alpha")
 """Attributes of a monitor that are saved as numbers."""
 DISTURBANCE = ("coefficients", "mean", "process", "measurement")
 """Attributes of the disturbance that are saved as arrays."""
@@ -499,53 +544,78 @@ def fit_monitor(
     arl = false_alarms(false_alarms_at_most, twin.rate)
     finite("blanking", blanking, least=0.0, unit="s")
     measured = np.where(healthy.mask, healthy.observed, np.nan).astype(float)
-    online, seen = OnlineFilter(twin), healthy.mask
-    commands = healthy.commands.astype(float)
-    start = online.start(len(healthy))
-    _, mean, covariance = online.step(start, commands, measured, seen)
+    steps = resolution(np.moveaxis(measured, 2, 0).reshape(measured.shape[2], -1))
+    first = _calibrated(twin, Predictor(), healthy, measured, steps)
     require(
-        np.isfinite(mean).all() and np.isfinite(covariance).all(),
+        first is not None,
         "healthy",
         expected="records with which the filter of the twin stays finite",
         got="others",
         remedy="leave them out, or give the twin more substeps",
     )
-    surer = replace(start, spread=start.spread / 4)
-    warm_up = _settled(covariance, online.step(surer, commands, measured, seen)[2])
-    steps = resolution(np.moveaxis(measured, 2, 0).reshape(measured.shape[2], -1))
+    found = [each for each in (first, *_slower(twin, healthy, measured, steps)) if each]
+    error, width = (np.concatenate(each) for each in list(zip(*found, strict=True))[1:])
+    disturbance = fit_disturbance(error)
+    width = width / disturbance.deviation
+    scores = fit_scores(disturbance.held_out, width)
+    slack = scores.slack(disturbance.parameters)
+    slack = agreeing(slack, *scores.score(disturbance.held_out, width))
+    predictors = tuple(each[0] for each in found)
+    return Monitor(twin, disturbance, scores, slack, steps, arl, blanking, float(alpha), predictors)
+
+
+_Calibrated: TypeAlias = tuple[Predictor, NDArray, NDArray]
+"""A model with its settled errors and widths of their rounding intervals, (d_y, n * T)."""
+
+
+def _slower(
+    twin: DynamicsTwin, healthy: Trajectories, measured: NDArray, steps: NDArray
+) -> list[_Calibrated]:
+    """The model that follows slowly, where it is another one and settles within the records."""
+    if not (twin.process.any() or twin.proportional.any()):
+        return []
+    found = _calibrated(twin, Predictor(SLOWER), healthy, measured, steps)
+    if found is None or found[0].warm_up * twin.rate >= healthy.steps // 2:
+        return []
+    return [found]
+
+
+def _calibrated(
+    twin: DynamicsTwin,
+    predictor: Predictor,
+    healthy: Trajectories,
+    measured: NDArray,
+    steps: NDArray,
+) -> _Calibrated | None:
+    """A model with its warm-up and errors on healthy records; None if it does not stay finite."""
+    online = predictor.filter(twin)
+    start, given = online.start(len(healthy)), (healthy.commands.astype(float), measured)
+    _, mean, covariance = online.step(start, *given, healthy.mask)
+    if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
+        return None
+    warm_up = settled(online, start, (*given, healthy.mask), covariance)
     late = (np.arange(healthy.steps) >= warm_up)[None, :, None]
     error, width = (
         np.pad(each, [(0, 0), (0, APART), (0, 0)], constant_values=np.nan)
         .reshape(-1, measured.shape[2])
         .T
-        for each in _standardised(measured - mean, covariance, seen & late, steps)
+        for each in standardised(measured - mean, covariance, healthy.mask & late, steps)
     )
-    disturbance = fit_disturbance(error)
-    scores = fit_scores(disturbance.held_out, width / disturbance.deviation)
-    slack = scores.slack(disturbance.parameters)
-    return Monitor(
-        twin, disturbance, scores, slack, steps, arl, blanking, warm_up / twin.rate, float(alpha)
-    )
+    return replace(predictor, warm_up=warm_up / twin.rate), error, width
 
 
-def _standardised(
-    error: NDArray, covariance: NDArray, seen: NDArray, steps: NDArray
-) -> tuple[NDArray, NDArray]:
-    """Independent errors (n, T, d_y) of variance 1, and widths of their rounding intervals.
-
-    Errors are NaN where a sample is not seen.
-    """
-    factor = root_of(covariance, seen)
-    made = np.where(seen, whitened(error, factor, seen), np.nan)
-    return made, steps / np.diagonal(factor, axis1=2, axis2=3)
+def _filter(number: int) -> str:
+    """The name of a filter among the arrays of a state."""
+    return f"filter{number or ''}"
 
 
-def _settled(covariance: NDArray, other: NDArray) -> int:
-    """Number of samples (n, T, d_y, d_y) until the start of the filter does not matter."""
-    ratio = np.diagonal(covariance / other, axis1=2, axis2=3)
-    late = (np.abs(np.log(ratio)) > 2 * np.log(SETTLED)).any(axis=(0, 2))
-    half = covariance.shape[1] // 2
-    return int(np.flatnonzero(late[:half])[-1]) + 1 if late[:half].any() else 0
+def _finite(online: OnlineFilter, state: FilterState) -> FilterState:
+    """The state of a filter, begun anew where it is not finite."""
+    kept = np.isfinite(state.states).all(axis=1) & np.isfinite(state.spread).all(axis=(1, 2))
+    lost = np.flatnonzero(~kept)
+    if not len(lost):
+        return state
+    return state.merged(lost, replace(online.start(len(lost)), commands=state.commands[lost]))
 
 
 def _described(detector: Detector, number: int) -> str:

@@ -107,6 +107,8 @@ class Promise:
         The class of distributions.
     alpha : float
         Probability that the monitor ever declares the promise void although it holds.
+    slower : tuple of Slack
+        The classes of the models that follow what is measured more slowly; see `Predictor`.
 
     """
 
@@ -114,13 +116,19 @@ class Promise:
     rate: float
     slack: Slack
     alpha: float = 0.01
+    slower: tuple[Slack, ...] = ()
 
     def __str__(self) -> str:
         """One sentence for pages, logs and the terminal."""
+        others = "".join(
+            f", and those of slower predictions within a factor {each.kappa:g} and a shift of "
+            f"{each.shift:g}"
+            for each in self.slower
+        )
         return (
             f"On average at least {self.arl:.6g} measured samples "
             f"({duration(self.arl / self.rate)}) pass until a false alarm, "
-            f"as long as {self.slack}. "
+            f"as long as {self.slack}{others}. "
             f"Where that is so, it is declared void with a probability of at most {self.alpha:g}."
         )
 

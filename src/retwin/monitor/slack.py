@@ -63,6 +63,18 @@ class Slack:
         """The smallest quantiles of the class at Gaussian ones."""
         return -self.upper(-gaussian)
 
+    def wider(self, factor: float) -> Slack:
+        """The class whose κ is as many times as far from 1, and whose δ is as many times as large.
+
+        Both are rounded up to multiples of 0.01, and at most 10 and 3.
+        """
+        return Slack._up(1 + max(self.kappa - 1, STEP) * factor, max(self.shift, STEP) * factor)
+
+    @classmethod
+    def _up(cls, kappa: float, shift: float) -> Slack:
+        up = [float(np.ceil(each / STEP - 1e-9) * STEP) for each in (kappa, shift)]
+        return cls(min(round(up[0], 2), 10.0), min(round(up[1], 2), 3.0))
+
     @classmethod
     def of_calibration(
         cls, samples: float, *, parameters: int = 0, confidence: float = 0.95
@@ -103,8 +115,7 @@ class Slack:
             wider = np.where((near > 0) & (score > shift), (score - shift) / near, 1.0)
             narrower = np.where((score < CENTRE) & (far > 0), far / (score + shift), 1.0)
         kappa = max(1.0, float(wider.max()), float(narrower.max()))
-        up = [float(np.ceil(each / STEP - 1e-9) * STEP) for each in (kappa, shift)]
-        return cls(min(round(up[0], 2), 10.0), min(round(up[1], 2), 3.0))
+        return cls._up(kappa, float(shift))
 
 
 def effective_samples(scores: NDArray) -> NDArray:

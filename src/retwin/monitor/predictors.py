@@ -1,0 +1,119 @@
+"""Predictive models of a monitor: the twin, following what is measured more or less closely.
+
+No single model of the noise shows every fault. A filter that follows the machine within a few
+samples takes a sensor's offset for a change of the state, and an actuator without effect for a
+disturbance; one that hardly follows keeps predicting what the equations give, but is slow to
+forget what they do not describe. Evidence of all is averaged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.monitor.detector import Detector
+from retwin.monitor.slack import Slack
+from retwin.update.dynamics.online import FilterState, OnlineFilter
+from retwin.update.dynamics.prediction import root_of, whitened
+from retwin.update.dynamics.twin import DynamicsTwin
+
+__all__ = ["SLOWER", "Predictor", "agreeing", "settled", "standardised"]
+
+SLOWER = 1e-4
+"""Factor of the variance of the process noise of the second model, whose filter needs about a
+hundred times as long to follow. Not 0: states that integrate would drift away for ever."""
+SETTLED = 1.05
+"""Ratio of predicted standard deviations, for starts of which one is twice as uncertain, up to
+which the filter knows the states of a machine that it did not see start."""
+WIDER = 1.25 ** np.arange(1, 17)
+"""Factors of the slack of which the first is taken with which the calibration agrees."""
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """One of the predictive models of a monitor.
+
+    Attributes
+    ----------
+    process : float
+        Factor of the variance of the twin's process noise: 1 is the twin as it was fitted, and less
+        follows what is measured more slowly.
+    warm_up : float
+        Time in s after the first sample in which its evidence is not counted: states are unknown.
+
+    """
+
+    process: float = 1.0
+    warm_up: float = 0.0
+
+    def filter(self, twin: DynamicsTwin) -> OnlineFilter:
+        """Its filter."""
+        if self.process == 1:
+            return OnlineFilter(twin)
+        factor = self.process
+        noise = {"process": twin.process * factor, "proportional": twin.proportional * factor}
+        return OnlineFilter(replace(twin, **noise))
+
+    def late(self, samples: NDArray, steps: int, rate: float) -> NDArray:
+        """Whether evidence of the next samples (n, steps) counts, after so many before (n,)."""
+        made: NDArray = samples[:, None] + np.arange(steps) >= round(self.warm_up * rate)
+        return made
+
+
+def standardised(
+    error: NDArray, covariance: NDArray, seen: NDArray, steps: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Independent errors (n, T, d_y) of variance 1, and widths of their rounding intervals.
+
+    Errors are NaN where a sample is not seen.
+    """
+    factor = root_of(covariance, seen)
+    made = np.where(seen, whitened(error, factor, seen), np.nan)
+    return made, steps / np.diagonal(factor, axis1=2, axis2=3)
+
+
+def settled(
+    online: OnlineFilter, start: FilterState, given: tuple[NDArray, ...], covariance: NDArray
+) -> int:
+    """Number of samples (n, T, d_y, d_y) until the start of the filter does not matter."""
+    surer = replace(start, spread=start.spread / 4)
+    other = online.step(surer, *given)[2]
+    ratio = np.diagonal(covariance / other, axis1=2, axis2=3)
+    late = (np.abs(np.log(ratio)) > 2 * np.log(SETTLED)).any(axis=(0, 2))
+    half = covariance.shape[1] // 2
+    return int(np.flatnonzero(late[:half])[-1]) + 1 if late[:half].any() else 0
+
+
+def agreeing(
+    slacks: tuple[Slack, ...], low: NDArray, high: NDArray, alpha: float = 0.05
+) -> tuple[Slack, ...]:
+    """Slacks that are widened until the calibration itself does not contradict them.
+
+    Within the class, the evidence of a detector reaches n / alpha in n samples with a probability
+    of at most alpha. Held-out errors of the calibration that reach it, since they are more
+    dependent than their number of parameters lets expect, are not of that class.
+
+    Parameters
+    ----------
+    slacks : tuple of Slack
+        One for each stream.
+    low, high : ndarray, shape (streams, T)
+        Held-out scores of the calibration; NaN is missing.
+    alpha : float
+        Probability of widening where it is not needed.
+
+    """
+    made = list(slacks)
+    wrong, limit = list(range(len(slacks))), np.isfinite(low).sum(axis=1) / alpha
+    for factor in WIDER:
+        detector = Detector([made[i] for i in wrong])
+        _, evidence = detector.run(detector.start(len(wrong)), low[wrong], high[wrong])
+        above = evidence.max(axis=1) >= limit[wrong]
+        wrong = [i for i, each in zip(wrong, above, strict=True) if each]
+        if not wrong:
+            break
+        for i in wrong:
+            made[i] = slacks[i].wider(float(factor))
+    return tuple(made)
