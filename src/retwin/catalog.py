@@ -247,14 +247,14 @@ NEEDS: Mapping[Need, Sequence[Need]] = {
 
 SOURCES: Mapping[str, SourceEntry] = {
     "dt": SourceEntry(
-        "Digital twin",
+        "Original twin",
         "none",
         diagnoser="retwin.study.sources:recorded_twin",
         recorded=True,
         role="plain",
     ),
     "twin": SourceEntry(
-        "Digital twin",
+        "Original twin",
         "none",
         twin="retwin.study.sources:plain_twin",
         simulates=True,
@@ -264,24 +264,27 @@ SOURCES: Mapping[str, SourceEntry] = {
         "Randomised twin", "none", twin="retwin.study.sources:randomised_twin", parametric=True
     ),
     "ibg": SourceEntry(
-        "IBG alone",
+        "Surrogate only",
         "timing",
         (_SURROGATE,),
         twin="retwin.study.sources:surrogate_alone",
         role="surrogate",
     ),
     "dt_noise": SourceEntry(
-        "IBG + output noise", "healthy", (_SURROGATE,), twin="retwin.study.sources:noisy_surrogate"
+        "Surrogate with output noise",
+        "healthy",
+        (_SURROGATE,),
+        twin="retwin.study.sources:noisy_surrogate",
     ),
     "pi_ls": SourceEntry(
-        "Least squares (Eq. 2)",
+        "Identified twin (least squares)",
         "healthy",
         (_LEAST_SQUARES,),
         twin="retwin.study.sources:least_squares_twin",
         parametric=True,
     ),
     "pi_bayes": SourceEntry(
-        "Bayesian updating (Eq. 3)",
+        "Identified twin (Bayesian)",
         "healthy",
         (_BAYES,),
         twin="retwin.study.sources:posterior_twin",
@@ -289,34 +292,34 @@ SOURCES: Mapping[str, SourceEntry] = {
         extra="bayes",
     ),
     "dann": SourceEntry(
-        "Domain-adversarial",
+        "Domain-adversarial network",
         "unlabelled",
         diagnoser="retwin.study.sources:adversarial",
         recorded=True,
         network=True,
     ),
     "dann_transductive": SourceEntry(
-        "Domain-adversarial, transductive",
+        "Domain-adversarial network (uses test outputs)",
         "transductive",
         diagnoser="retwin.study.sources:adversarial_transductive",
         recorded=True,
         network=True,
     ),
     "mean_corrected": SourceEntry(
-        "IBG + RG mean",
+        "Updated twin (mean only)",
         "healthy",
         (_SURROGATE, _OUTPUT),
         twin="retwin.study.sources:mean_corrected",
     ),
     "ibg_rg": SourceEntry(
-        "IBG + RG",
+        "Updated twin (outputs)",
         "healthy",
         (_SURROGATE, _OUTPUT),
         twin="retwin.study.sources:output_corrected",
         role="updated",
     ),
     "pi_ls_rg": SourceEntry(
-        "Least squares, then IBG + RG",
+        "Identified, then updated twin (outputs)",
         "healthy",
         (_IDENTIFIED, _IDENTIFIED_OUTPUT),
         twin="retwin.study.sources:identified_corrected",
@@ -324,7 +327,7 @@ SOURCES: Mapping[str, SourceEntry] = {
         simulates=True,
     ),
     "dynamics": SourceEntry(
-        "Corrected dynamics",
+        "Updated twin (dynamics)",
         "healthy",
         (_DYNAMICS,),
         twin="retwin.study.sources:corrected_dynamics",
@@ -337,47 +340,47 @@ SOURCES: Mapping[str, SourceEntry] = {
         simulates=True,
     ),
     "narx": SourceEntry(
-        "Polynomial NARX",
+        "Polynomial model (NARX)",
         "healthy",
         (("update", "narx"),),
         twin="retwin.study.sources:black_box",
         simulates=True,
     ),
     "neural_ss": SourceEntry(
-        "Neural state space",
+        "Neural state-space model",
         "healthy",
         (("update", "neural_ss"),),
         twin="retwin.study.sources:black_box",
         simulates=True,
     ),
     "ibg_rg_command": SourceEntry(
-        "IBG + RG, command space",
+        "Updated twin (command space)",
         "healthy",
         (_SURROGATE, _COMMAND),
         twin="retwin.study.sources:command_corrected",
         role="updated",
     ),
     "fine_tuned": SourceEntry(
-        "Fine-tuned on labels",
+        "Classifier fine-tuned on labelled faults",
         "labelled",
         (_SURROGATE, _COMMAND, ("diagnosis", "ibg_rg_command")),
         diagnoser="retwin.study.sources:fine_tuned",
         network=True,
     ),
     "inversion": SourceEntry(
-        "Fault inversion",
+        "Physics inversion",
         "healthy",
         (_SURROGATE, _COMMAND),
         diagnoser="retwin.study.sources:inversion",
     ),
     "inversion_dynamics": SourceEntry(
-        "Fault inversion, corrected dynamics",
+        "Physics inversion (dynamics)",
         "healthy",
         (_DYNAMICS,),
         diagnoser="retwin.study.sources:inversion_dynamics",
     ),
     "inversion_cnn": SourceEntry(
-        "Inversion with classifier", "healthy", pool=("inversion", "ibg_rg_command")
+        "Physics inversion with classifier", "healthy", pool=("inversion", "ibg_rg_command")
     ),
 }
 """In the order in which they are reported."""

@@ -139,7 +139,7 @@ def test_a_bundle_predicts_and_generates_the_same(
 def test_a_finished_study_has_a_report(tmp_path: Path) -> None:
     shutil.copytree(FILES / "study", tmp_path / "study")
     page = rt.write_report(tmp_path / "study")
-    assert "IBG + RG" in page.read_text("utf-8")
+    assert "Updated twin (outputs)" in page.read_text("utf-8")
 
 
 @pytest.mark.parametrize("version", ["", "0.0.9"])

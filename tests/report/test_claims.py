@@ -26,7 +26,7 @@ def test_what_the_calculator_looks_up_equals_the_table(study: Study, write: Writ
     assert section is not None
     table, calculator = section.values["table"], section.scripts["calculator"]
     entry = calculator["sources"][calculator["first"]]
-    assert entry["name"] == "IBG + RG"
+    assert entry["name"] == "Updated twin (outputs)"
     assert [round(11 * each["rate"]) for each in entry["decisions"]] == list(range(1, 11))
     row = next(row for row in table.rows if row[0].text == "20%")
     texts = [f"{cell.text} {cell.below}".strip() for cell in row[1:8]]

@@ -127,10 +127,10 @@ def test_many_sources_are_summarised(study: Study, write: Write) -> None:
         {**given, **interval, "a": "ibg_rg_command", "b": "dt"},
     ]
     text = read(write(study)).text
-    assert "IBG + RG, command space minus Domain-adversarial" in text
-    assert "Fault inversion minus Domain-adversarial" not in text
+    assert "Updated twin (command space) minus Domain-adversarial network" in text
+    assert "Physics inversion minus Domain-adversarial network" not in text
     assert "Pairwise differences in macro-F1" in text
-    assert text.count("On 90 test trajectories, training on IBG + RG, command space") == 1
+    assert text.count("On 90 test trajectories, training on the updated twin (command space)") == 1
 
 
 def test_fidelity(study: Study, write: Write) -> None:
@@ -176,7 +176,7 @@ def test_two_sources_with_a_residual_model_have_figures_of_their_own(
     names = ("tde", "tpe", "noise", "pit", "bands")
     assert {f"figure-{name}{more}" for name in names for more in ("", "-2")} <= set(reader.ids)
     assert len(reader.ids) == len(set(reader.ids))
-    assert "IBG + RG, command space." in reader.text
+    assert "Updated twin (command space)." in reader.text
 
 
 def test_the_paper_item_by_item(study: Study, write: Write) -> None:
@@ -215,8 +215,8 @@ def test_the_model_card_knows_what_went_wrong(study: Study, write: Write) -> Non
         "Healthy diagnosed as M1 stuck real_a/003",
         "M4 bias recognised in 40%",
         "Noise x: generated and observed distributions differ KS distance 0.98, p 0.05",
-        "one chain did not mix reported while computing: Digital twin; IBG + RG",
-        "a command outside reported while computing: Digital twin",
+        "one chain did not mix reported while computing: Original twin; Updated twin (outputs)",
+        "a command outside reported while computing: Original twin",
         "which would not be known in the field",
     ):
         assert given in reader.text, given
@@ -230,9 +230,7 @@ def test_the_model_card_knows_what_went_wrong(study: Study, write: Write) -> Non
 
 def test_verdict_better(study: Study, write: Write) -> None:
     text = read(write(study)).text
-    assert (
-        "On 90 test trajectories, training on IBG + RG is better than on the digital twin" in text
-    )
+    assert "training on the updated twin (outputs) is better than on the original twin" in text
     assert "so the residual model itself helps" in text
 
 
@@ -252,7 +250,7 @@ def test_verdict_worse_whichever_way_the_pair_is_given(study: Study, write: Writ
         each["a"], each["b"] = each["b"], each["a"]
         each["mean_diff"], each["bootstrap_ci95"] = 0.1, [0.05, 0.15]
     text = read(write(study)).text
-    assert "training on IBG + RG is worse than on the digital twin" in text
+    assert "training on the updated twin (outputs) is worse than on the original twin" in text
     assert "−0.150 to −0.050" in text
 
 
@@ -291,7 +289,9 @@ def test_a_source_on_other_data_is_not_called_ahead(study: Study, write: Write, 
         if (each["a"], each["b"], each["metric"]) == ("ibg_rg", "ibg", "macro_f1")
     )
     row["mean_diff"], row["bootstrap_ci95"] = -0.2, [-0.3, -0.1]
-    assert "IBG alone is better than" in read(write(study)).text.replace("Of the sources", "")
+    assert "the surrogate only is better than" in read(write(study)).text.replace(
+        "Of the sources", ""
+    )
     sources["ibg"]["real_data"] = kind
     assert "Of the sources that use comparable data" not in read(write(study)).text
 

@@ -78,9 +78,10 @@ def source_name(source: str) -> str:
 
 
 def source_in_sentence(source: str) -> str:
-    """The source's title in the middle of a sentence."""
+    """The source's title in the middle of a sentence; that of a twin or a model has an article."""
     text = in_sentence(source_name(source))
-    return f"the {text}" if with_role([source], "plain") else text
+    entry = SOURCES.get(source)
+    return f"the {text}" if entry is not None and (entry.twin or entry.recorded) else text
 
 
 def metric_name(metric: str) -> str:
