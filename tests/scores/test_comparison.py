@@ -72,8 +72,8 @@ def test_which_pairs_get_a_verdict(
 
 
 def test_a_requirement_is_open_where_only_the_interval_meets_it() -> None:
-    assert compliance(0.9, (0.8, 0.97), 0.85, 0.95) == "holds"
-    assert compliance(0.8, (0.75, 0.86), 0.85, 0.95) == "open"
-    assert compliance(0.8, (0.75, 0.84), 0.85, 0.95) == "fails"
-    assert compliance(0.9, None, 0.85, 0.95) == "open", "nothing is shown without an interval"
-    assert compliance(0.8, None, 0.85) == "open"
+    assert compliance(0.9, (0.86, 0.94), 0.85, 0.95) == "met"
+    assert compliance(0.9, (0.8, 0.97), 0.85, 0.95) == "undecided", "the value alone shows nothing"
+    assert compliance(0.8, (0.75, 0.84), 0.85, 0.95) == "not met"
+    assert compliance(0.9, None, 0.85, 0.95) == "undecided", "nothing is shown without an interval"
+    assert compliance(float("nan"), None, 0.85) == "not measured"

@@ -65,6 +65,16 @@ class Table:
     columns: Sequence[Column]
     rows: Sequence[Sequence[Cell]]
 
+    def without_empty(self) -> Table:
+        """Without the columns and rows whose cells, except the first, are all empty or dashes."""
+        whole = [row for row in self.rows if len(row) == 1 or not all(map(_empty, row[1:]))]
+        wide = [row for row in whole if len(row) > 1]
+        kept = [
+            k for k in range(len(self.columns)) if k == 0 or not all(_empty(r[k]) for r in wide)
+        ]
+        rows = [row if len(row) == 1 else [row[k] for k in kept] for row in whole]
+        return Table(self.title, [self.columns[k] for k in kept], rows)
+
     @property
     def groups(self) -> list[tuple[str, int]]:
         """Adjacent columns of one group: its name and how many columns it spans."""
@@ -75,6 +85,10 @@ class Table:
             else:
                 runs.append((column.group, 1))
         return runs
+
+
+def _empty(cell: Cell) -> bool:
+    return cell.text in ("", "–") and not (cell.links or cell.forest or cell.below)
 
 
 @dataclass(frozen=True)

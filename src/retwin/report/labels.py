@@ -23,14 +23,19 @@ __all__ = [
     "counted",
     "decimals",
     "digits",
+    "distinct",
     "duration",
     "in_sentence",
     "latent_names",
+    "learned_name",
     "mean_and_deviation",
     "metric_name",
     "number",
     "order",
     "p_value",
+    "percent",
+    "percents",
+    "places",
     "quantity",
     "real_data",
     "reason",
@@ -118,6 +123,14 @@ def latent_names(name: str) -> tuple[str, str]:
     return name.replace("_", " "), name.replace("_", " ")
 
 
+def learned_name(name: str) -> str:
+    """`offset_motor_1` as `Offset, motor 1`; `missed` is the share of missed segments."""
+    kind, _, rest = name.partition("_")
+    titles = {"missed": "Missed segments", "noise": "Noise at rest"}
+    title = titles.get(kind, kind[:1].upper() + kind[1:])
+    return f"{title}, {rest.replace('_', ' ')}" if rest else title
+
+
 def stage_name(key: str) -> str:
     """`surrogate_fit_s` as `Surrogate fit`."""
     words = re.sub(r"_s$", "", key).replace("_", " ").strip()
@@ -158,6 +171,37 @@ def decimals(*values: float) -> int:
     if largest == 0 or largest >= SMALL:
         return 3
     return 2 - math.floor(math.log10(largest))
+
+
+def places(*values: float) -> int:
+    """Decimals that leave three significant digits of the largest value, three decimals at most."""
+    largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
+    return 3 if largest == 0 else max(0, min(3, 2 - math.floor(math.log10(largest))))
+
+
+def distinct(values: Iterable[float]) -> int:
+    """Decimals that tell the values apart, from 3 to 9."""
+    known = {value for value in values if math.isfinite(value)}
+    enough = (d for d in range(3, 9) if len({f"{value:.{d}f}" for value in known}) == len(known))
+    return next(enough, 9)
+
+
+def percent(share: float | None, digits: int = 0) -> str:
+    """A share in percent; 100 % and 0 % only where it is exactly so."""
+    if share is None or not math.isfinite(share):
+        return "–"
+    text = number(100 * share, digits)
+    if (share < 1 and text == number(100, digits)) or (share > 0 and text == number(0, digits)):
+        return percent(share, digits + 1) if digits < 3 else text + " %"
+    return f"{text} %"
+
+
+def percents(interval: Sequence[float] | None) -> str:
+    """`58 to 91 %`."""
+    if interval is None:
+        return "–"
+    low, high = (percent(end).removesuffix(" %") for end in interval)
+    return f"{low} to {high} %"
 
 
 def digits(each: Comparison) -> int:

@@ -13,17 +13,17 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
-from plotly.offline import get_plotlyjs
 
 from retwin.report import labels
 from retwin.report.blocks import Section
-from retwin.report.figure import Figure
+from retwin.report.figure import Figure, Matrices
 from retwin.report.plotly_specs import panel_spec
 from retwin.report.png import png
 from retwin.report.sections import sections_of
 from retwin.report.study import Study, read_study
 from retwin.report.style import CHROME, PALETTE, colour_of, symbol
-from retwin.report.verdict import claims, outcome_of, verdict
+from retwin.report.summary import picture, summary
+from retwin.report.verdict import outcome_of, verdict
 from retwin.scores.bootstrap import MIN_RECORDS
 from retwin.scores.comparison import MIN_RUNS
 from retwin.serialisation.files import write_atomically
@@ -32,6 +32,7 @@ from retwin.serialisation.places import check_place
 __all__ = ["FIGURES", "render", "write_report"]
 
 FIGURES = (
+    "summary",
     "scores",
     "confusion",
     "roc",
@@ -53,6 +54,8 @@ FIGURES = (
     "learning",
 )
 """The files `figures/NAME.png`; of a second source `NAME-2.png`."""
+DOCS = "https://retwin.readthedocs.io/en/latest/report.html"
+"""The documentation of the page, to which each section links."""
 FILTERS = {
     "class_name": labels.class_name,
     "counted": labels.counted,
@@ -62,6 +65,9 @@ FILTERS = {
     "mean_and_deviation": labels.mean_and_deviation,
     "metric": labels.metric_name,
     "number": labels.number,
+    "percent": labels.percent,
+    "percents": labels.percents,
+    "places": lambda values: labels.places(*values),
     "signed": labels.signed,
     "source_in_sentence": labels.source_in_sentence,
     "source_name": labels.source_name,
@@ -98,10 +104,11 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     check_place(page)
     check_place(figures, folder=True)
     sections = sections_of(study)
+    front = picture(study)
+    shown = [each for section in sections for each in (*section.figures, *section.further)]
     images = {
         figure.name: png(figure, emulated=study.results.emulated)
-        for section in sections
-        for figure in (*section.figures, *section.further)
+        for figure in (*([front] if front else []), *shown)
     }
     for name, image in images.items():
         with write_atomically(figures / f"{name}.png") as part:
@@ -140,34 +147,36 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         )
         for section in sections
     }
-    specs = _specs(sections)
+    found = summary(study)
+    front = [found["figure"]] if found and found["figure"] else []
+    specs = _specs([*front, *(figure for each in sections for figure in each.figures)])
     contents = {name: value for each in sections for name, value in each.scripts.items()}
     return environment.get_template("page.html.j2").render(
         sections=sections,
         bodies=bodies,
         verdict=verdict(study),
-        claims=claims(study),
+        summary=found,
+        docs=DOCS,
         colours={**{f"c{place}": pair for place, pair in enumerate(PALETTE)}, **CHROME},
         style=_asset("page.css"),
         script=_asset("page.js"),
         specs=_script_json(specs),
         contents={name: _script_json(content) for name, content in contents.items()},
         scripts={name: _asset(f"{name}.js") for name in contents},
-        plotly=Markup(get_plotlyjs()) if specs or "explorer" in contents else "",
+        plotly=_asset("plotly-gl3d.min.js", "plotly") if specs or "explorer" in contents else "",
     )
 
 
-def _asset(name: str) -> Markup:
-    folder = resources.files(__package__).joinpath("templates")
+def _asset(name: str, folder_name: str = "templates") -> Markup:
+    folder = resources.files(__package__).joinpath(folder_name)
     return Markup(folder.joinpath(name).read_text(encoding="utf-8"))
 
 
-def _specs(sections: Sequence[Section]) -> dict[str, Any]:
+def _specs(figures: Sequence[Figure | Matrices]) -> dict[str, Any]:
     """Plotly's data by the id of the element that shows them."""
     return {
         f"plot-{figure.name}-{place}": panel_spec(panel)
-        for section in sections
-        for figure in section.figures
+        for figure in figures
         if isinstance(figure, Figure)
         for place, panel in enumerate(figure.panels)
     }

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ __all__ = ["panel_spec"]
 
 FORMATS = {"share": ".1f", "percent": ".0%"}
 HOVER = {"share": ".3f", "percent": ".1%"}
+MANY = 4000
+"""Samples beyond which a line is drawn as the smallest and the largest value of groups."""
 UPPER, LOWER = [0.38, 1], [0, 0.3]
 """The parts of the height that two rows take."""
 
@@ -76,7 +79,27 @@ def _axis(axis: Axis) -> dict[str, Any]:
 
 
 def _traces(row: Row, x: Axis) -> list[dict[str, Any]]:
-    return [each for mark in row.marks if (each := _trace(mark, x, row.y)) is not None]
+    drawn = map(_reduced, row.marks)
+    return [each for mark in drawn if (each := _trace(mark, x, row.y)) is not None]
+
+
+def _reduced(mark: Mark) -> Mark:
+    """A line or a band of very many samples as its envelope, so that no peak is lost."""
+    if not isinstance(mark, Line | Band) or len(np.asarray(mark.x)) <= MANY or _breaks(mark):
+        return mark
+    x = np.asarray(mark.x, dtype=float)
+    starts = np.linspace(0, len(x), MANY // 2 + 1).astype(int)[:-1]
+    if isinstance(mark, Band):
+        low = np.minimum.reduceat(np.asarray(mark.low, dtype=float), starts)
+        high = np.maximum.reduceat(np.asarray(mark.high, dtype=float), starts)
+        return replace(mark, x=x[starts], low=low, high=high)
+    y = np.asarray(mark.y, dtype=float)
+    ends = [each.reduceat(y, starts) for each in (np.minimum, np.maximum)]
+    return replace(mark, x=np.repeat(x[starts], 2), y=np.stack(ends, axis=1).ravel())
+
+
+def _breaks(mark: Line | Band) -> bool:
+    return isinstance(mark, Line) and (mark.step or bool(np.any(np.diff(np.asarray(mark.x)) < 0)))
 
 
 def _trace(mark: Mark, x: Axis, y: Axis) -> dict[str, Any] | None:
@@ -105,16 +128,24 @@ def _trace(mark: Mark, x: Axis, y: Axis) -> dict[str, Any] | None:
         case Points():
             return _points(mark, where)
         case Bars():
-            return {
-                "type": "bar",
-                "name": mark.name,
-                "x": _numbers((mark.edges[1:] + mark.edges[:-1]) / 2),
-                "y": _numbers(mark.heights),
-                "width": float(np.diff(mark.edges).mean()),
-                "marker": {"color": f"@{mark.colour}", "line": {"width": 0}},
-                **_hover(mark.name, where),
-            }
+            return _bars(mark, where)
     return None
+
+
+def _bars(mark: Bars, where: str) -> dict[str, Any]:
+    """The outline of the bars, filled; the bundle of the page has no trace of its own for bars."""
+    x = np.repeat(mark.edges, 2)[1:-1]
+    y = np.repeat(mark.heights, 2)
+    return _scatter(
+        mark.name,
+        "lines",
+        x=_numbers([x[0], *x, x[-1]]),
+        y=_numbers([0.0, *y, 0.0]),
+        fill="toself",
+        fillcolor=f"@{mark.colour}",
+        line={"width": 0, "color": f"@{mark.colour}"},
+        **_hover(mark.name, where),
+    )
 
 
 def _points(mark: Points, where: str) -> dict[str, Any]:

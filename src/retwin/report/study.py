@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import require
+from retwin.data.trajectories import HEALTHY
 from retwin.errors import InputError
 from retwin.report.labels import order
 from retwin.results import Results, SourceResults, read_results
@@ -152,6 +153,15 @@ class Study:
         """Class indices of the test trajectories, shape (n,)."""
         labels = self.results.data.test.labels
         return np.array([self.results.classes.index(label) for label in labels], dtype=int)
+
+    @property
+    def healthy(self) -> NDArray:
+        """Whether each test trajectory is healthy, shape (n,); all are where there is no class."""
+        labels = np.array(self.results.data.test.labels, dtype=str)
+        if HEALTHY not in labels:
+            return np.ones(self.results.data.test.size, dtype=bool)
+        healthy: NDArray = labels == HEALTHY
+        return healthy
 
     @property
     def diagnosing(self) -> list[str]:

@@ -1,9 +1,8 @@
-"""The statements at the head of the page: which source is better, and what is claimed of it."""
+"""Which pair of sources the page is about, and which of the two is better."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -13,38 +12,9 @@ from retwin.catalog import METRICS
 from retwin.report.labels import MAIN, order, with_role
 from retwin.report.study import Study
 from retwin.results import Comparison, Results
-from retwin.scores.comparison import alike, compliance, outcome
+from retwin.scores.comparison import alike, outcome
 
-__all__ = ["Claim", "claims", "headline", "outcome_of", "verdict"]
-
-COVERAGE = (0.85, 0.95)
-"""The required coverage of the 90 % band."""
-RECALL = 0.9
-"""The required recall of healthy trajectories."""
-QUICK, SLOW = 600.0, 3600.0
-"""Seconds up to which the update counts as quick, and beyond which as slow."""
-LIGHTS = {"better": "holds", "open": "open", "worse": "fails"}
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A claim about the updated twin.
-
-    Attributes
-    ----------
-    key, title : str
-        Its name in the template `claims.html.j2`, and its title.
-    light : str
-        "holds", "open" or "fails".
-    values : dict
-        The variables of its sentences.
-
-    """
-
-    key: str
-    title: str
-    light: str
-    values: dict[str, Any]
+__all__ = ["headline", "outcome_of", "verdict"]
 
 
 def outcome_of(comparison: Comparison) -> str:
@@ -115,52 +85,3 @@ def _rival(results: Results, metric: str, pair: tuple[str, str]) -> Comparison |
     if best in pair or rank(best) <= rank(pair[0]):
         return None
     return results.compared(best, pair[0]).get(metric)
-
-
-def claims(study: Study) -> list[Claim]:
-    """The claims about the updated twin; what was not measured is not claimed."""
-    pair = headline(study.results)
-    if pair is None:
-        return []
-    found = [_accuracy(study, pair), _calibration(study, pair[0]), _false_alarms(study, pair[0])]
-    return [claim for claim in (*found, _time(study, pair[0])) if claim is not None]
-
-
-def _accuracy(study: Study, pair: tuple[str, str]) -> Claim | None:
-    found = study.results.compared(*pair)
-    metric = next((name for name in METRICS if name in found), None)
-    light = LIGHTS.get(outcome_of(found[metric])) if metric else None
-    if metric is None or light is None:
-        return None
-    return Claim("accuracy", "Accuracy", light, {"found": found[metric]})
-
-
-def _calibration(study: Study, source: str) -> Claim | None:
-    fidelity, each = study.results.fidelity.get(source), study.results.sources[source]
-    figure = fidelity.figures.get("coverage90") if fidelity else None
-    value = each.mean("coverage90") if figure is None else figure.value
-    ends = each.interval("coverage90") if figure is None else figure.ends
-    if not math.isfinite(value):
-        return None
-    low, high = COVERAGE
-    values = {"value": value, "ends": ends, "low": low, "high": high}
-    return Claim("calibration", "Calibration", compliance(value, ends, low, high), values)
-
-
-def _false_alarms(study: Study, source: str) -> Claim | None:
-    each = study.results.sources[source]
-    recall, ends = each.mean("healthy_recall"), each.interval("healthy_recall")
-    if not math.isfinite(recall):
-        return None
-    values = {"value": recall, "ends": ends, "low": RECALL}
-    return Claim("false_alarms", "False alarms", compliance(recall, ends, RECALL), values)
-
-
-def _time(study: Study, source: str) -> Claim | None:
-    each = study.results.sources[source]
-    parts = [part for part in (each.update_s, each.generate_s) if part is not None]
-    if not parts:
-        return None
-    light = "holds" if sum(parts) <= QUICK else "open" if sum(parts) <= SLOW else "fails"
-    values = {"seconds": sum(parts), "generated": each.generated, "quick": QUICK, "slow": SLOW}
-    return Claim("time", "Time", light, values)

@@ -7,6 +7,7 @@ adjusted over all pairs, and on the conditions of `no_verdict`.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 
@@ -143,12 +144,12 @@ def outcome(interval: tuple[float, float] | None, p: float | None, better: int) 
 def compliance(
     value: float, interval: tuple[float, float] | None, low: float, high: float = np.inf
 ) -> str:
-    """Whether a value lies in its required range.
+    """Whether a value lies in its required range: the one rule of every light on the page.
 
     Parameters
     ----------
     value : float
-        The value, finite.
+        The value, NaN where it was not measured.
     interval : (float, float)
         Its confidence interval; None if there is none.
     low, high : float
@@ -157,12 +158,14 @@ def compliance(
     Returns
     -------
     str
-        "open" without an interval; else "holds" if the value lies in the range, "open" if only a
-        part of its interval does, and "fails" if nothing of it does.
+        "met" if the whole interval lies in the range, "not met" if nothing of it does, "undecided"
+        if a part of it does or there is none, "not measured" without a value.
 
     """
+    if math.isnan(value):
+        return "not measured"
     if interval is None:
-        return "open"
-    if low <= value <= high:
-        return "holds"
-    return "open" if interval[0] <= high and interval[1] >= low else "fails"
+        return "undecided"
+    if interval[0] >= low and interval[1] <= high:
+        return "met"
+    return "undecided" if interval[0] <= high and interval[1] >= low else "not met"

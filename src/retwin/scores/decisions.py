@@ -12,7 +12,19 @@ from scipy.special import bdtr, betainc, betaincinv
 from retwin.data.trajectories import HEALTHY
 from retwin.scores.intervals import share_interval
 
-__all__ = ["Cost", "Decision", "decide"]
+__all__ = [
+    "Cost",
+    "Decision",
+    "certain_decision",
+    "decide",
+    "detection_difference",
+    "healthy_needed",
+]
+
+TAIL = 0.025
+"""The probability beyond each end of an interval."""
+DRAWS = 2000
+"""Bootstrap draws of a difference: they determine its ends to a few hundredths of its width."""
 
 
 @dataclass(frozen=True)
@@ -137,11 +149,92 @@ def decide(probabilities: NDArray, truth: NDArray, classes: list[str], rate: flo
     )
 
 
+def healthy_needed(rate: float) -> int:
+    """The number of healthy trajectories from which on a false-alarm rate is certain.
+
+    From so many on there is a threshold, the largest of their values, whose false-alarm rate is
+    at most `rate` with a probability of 97.5 %.
+
+    Parameters
+    ----------
+    rate : float
+        The false-alarm rate, in (0, 1).
+
+    """
+    return math.ceil(math.log(TAIL) / math.log1p(-rate) - 1e-9)
+
+
+def certain_decision(
+    probabilities: NDArray, truth: NDArray, classes: list[str], rate: float
+) -> Decision | None:
+    """The threshold that detects most while its false-alarm rate is certainly at most `rate`.
+
+    Parameters
+    ----------
+    probabilities, truth, classes
+        See `decide`.
+    rate : float
+        The false-alarm rate that the upper end of the interval must not exceed, in (0, 1).
+
+    Returns
+    -------
+    Decision or None
+        None for fewer healthy trajectories than `healthy_needed`.
+
+    """
+    n = int((truth == classes.index(HEALTHY)).sum())
+    if n < healthy_needed(rate):
+        return None
+    rank = min(r for r in range(1, n + 1) if _false_alarms(r, n)[1] <= rate * (1 + 1e-9))
+    return decide(probabilities, truth, classes, (n + 1 - rank) / (n + 1))
+
+
+def detection_difference(
+    a: NDArray, b: NDArray, truth: NDArray, classes: list[str], rate: float, *, seed: int = 0
+) -> tuple[float, tuple[float, float]] | None:
+    """What one model detects more than another at the same false-alarm rate.
+
+    Parameters
+    ----------
+    a, b : array (n, classes)
+        Predicted probabilities of the two models for the same trajectories.
+    truth, classes, rate
+        See `decide`.
+    seed : int
+        Seed of the bootstrap draws.
+
+    Returns
+    -------
+    (float, (float, float)) or None
+        The detected share of `a` minus that of `b`, and the 95 % interval of paired draws of the
+        healthy and of the faulty trajectories, so that it contains how uncertain both thresholds
+        are; None where `decide` gives no threshold.
+
+    """
+    healthy = classes.index(HEALTHY)
+    fault = 1 - np.stack([a[:, healthy], b[:, healthy]])
+    reference, faulty = fault[:, truth == healthy], fault[:, truth != healthy]
+    n, m = reference.shape[1], faulty.shape[1]
+    rank = math.ceil((1 - rate) * (n + 1) - 1e-9)
+    if not 1 <= rank <= n or not m:
+        return None
+
+    def difference(rows: NDArray, columns: NDArray) -> float:
+        thresholds = np.sort(reference[:, rows], axis=1)[:, rank - 1]
+        shares = (faulty[:, columns] > thresholds[:, None]).mean(axis=1)
+        return float(shares[0] - shares[1])
+
+    rng = np.random.default_rng(seed)
+    drawn = [difference(rng.integers(n, size=n), rng.integers(m, size=m)) for _ in range(DRAWS)]
+    low, high = np.quantile(drawn, [TAIL, 1 - TAIL])
+    return difference(np.arange(n), np.arange(m)), (float(low), float(high))
+
+
 def _false_alarms(rank: int, n: int) -> tuple[float, float]:
     """Central 95 % of the false-alarm rate of the threshold at that rank of n healthy ones."""
     if rank == 0:
         return 1.0, 1.0
-    low, high = betaincinv(n + 1 - rank, rank, [0.025, 0.975])
+    low, high = betaincinv(n + 1 - rank, rank, [TAIL, 1 - TAIL])
     return float(low), float(high)
 
 

@@ -292,7 +292,8 @@ def _fidelity_of(work: Work, source: str, healthy: int = 0) -> Fidelity | None:
 def _fidelity_arrays(source: str, found: Fidelity) -> dict[str, NDArray]:
     """The arrays of the report's figures.
 
-    `z/SOURCE/observed` and `/predicted` (k, d), per segment, NaN where z is not identified;
+    `z/SOURCE/observed` and `/predicted` (k, d), per segment, NaN where z is not identified, and
+    `/trajectory` (k,), the index of the trajectory of each observed segment;
     `pit/SOURCE` (3, 20), see `Fidelity.pit_shares`; `bands/SOURCE/…`: `nominal` and `observed`
     (2, P, d), `seen` (2, P), `quantiles` (2, 5, P, d), `ids` (2,), of the trajectory with the
     median energy score and of the one with the worst; `rate` in Hz.
@@ -302,6 +303,7 @@ def _fidelity_arrays(source: str, found: Fidelity) -> dict[str, NDArray]:
     index = list(dict.fromkeys([order[(len(order) - 1) // 2], order[-1]]))
     return {
         f"z/{source}/observed": found.segment_values[:, 0][identified[:, 0]].astype(np.float32),
+        f"z/{source}/trajectory": np.nonzero(identified[:, 0])[0].astype(np.int32),
         f"z/{source}/predicted": found.segment_values[:, 1:][identified[:, 1:]].astype(np.float32),
         f"pit/{source}": found.pit_shares(),
         f"bands/{source}/nominal": found.nominal[index].astype(np.float32),

@@ -155,6 +155,7 @@
     moment = to;
     at("time").value = moment;
     at("now").textContent = `${seconds[moment].toFixed(1)} s`;
+    if (!at("outputs").data) return;
     Plotly.relayout(at("outputs"), { "shapes[0].x0": seconds[moment], "shapes[0].x1": seconds[moment] });
     if (!pose) return;
     const both = [pose.nominal, pose.observed].map((points) => through(points[picked][moment]));
@@ -169,6 +170,7 @@
     infer();
   };
   const draw = () => {
+    if (!page.visible(place)) return;
     outputs();
     if (pose) chains();
   };

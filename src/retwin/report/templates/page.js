@@ -23,7 +23,7 @@ const page = (() => {
   const family = getComputedStyle(document.body).fontFamily;
   const escaped = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
   const styled = (given) => ({
-    gridcolor: "@grid", linecolor: "@rule", zeroline: false, fixedrange: true, automargin: true,
+    gridcolor: "@grid", linecolor: "@rule", zeroline: false, automargin: true,
     ticks: "outside", tickcolor: "@rule", ticklen: 4,
     ...given, title: { standoff: 8, font: { size: 13 }, ...given.title },
   });
@@ -34,8 +34,12 @@ const page = (() => {
     dragmode: false, hoverlabel: { font: { family, size: 13 } },
   };
 
-  // The wheel scrolls the page, also over a picture in space.
-  const config = { displayModeBar: false, scrollZoom: false };
+  // The wheel scrolls the page, also over a picture in space; buttons zoom and download.
+  const config = {
+    displaylogo: false, scrollZoom: false, displayModeBar: root.clientWidth < 600 ? false : "hover",
+    modeBarButtonsToRemove: ["select2d", "lasso2d", "zoomIn2d", "zoomOut2d", "autoScale2d"],
+    toImageButtonOptions: { format: "png", scale: 2 },
+  };
   const plot = (place, data, layout) => {
     const style = getComputedStyle(root);
     const height = layout.height * (root.dataset.print ? 0.72 : 1);
@@ -43,9 +47,12 @@ const page = (() => {
     const painted = { ...paint(layout, style), height, width: place.clientWidth };
     Plotly.react(place, { data: paint(data, style), layout: painted, config });
   };
+  // A plot is drawn when its section is opened, so that the first screen is there at once.
+  const visible = (place) => place && !place.closest("details.part:not([open])");
   const drawn = [() => {
     for (const [id, spec] of Object.entries(specs)) {
       const place = document.getElementById(id);
+      if (!visible(place)) continue;
       const given = { ...spec.layout, ...(place.clientWidth < 600 ? spec.narrow : {}) };
       const axes = Object.entries(given).filter(([key]) => key.includes("axis"));
       const dressed = Object.fromEntries(axes.map(([key, each]) => [key, styled(each)]));
@@ -53,21 +60,44 @@ const page = (() => {
     }
   }];
   const draw = () => drawn.forEach((each) => each());
+  const parts = Array.from(document.querySelectorAll("details.part"));
+  const redraw = () => { cancelAnimationFrame(waiting); waiting = requestAnimationFrame(draw); };
+  let waiting = 0;
 
   draw();
+  parts.forEach((part) => part.addEventListener("toggle", () => part.open && redraw()));
+  // A link to a section, or to something within one, opens it.
+  const unfold = () => {
+    const name = location.hash.slice(1);
+    const target = document.getElementById(name.startsWith("trajectory=") ? "explorer" : name);
+    const part = target && (target.querySelector("details.part") || target.closest("details.part"));
+    if (!part || part.open) return;
+    part.open = true;
+    target.scrollIntoView();
+  };
+  window.addEventListener("hashchange", unfold);
+  unfold();
+  const all = document.getElementById("unfold");
+  all.addEventListener("click", () => {
+    const open = all.getAttribute("aria-pressed") !== "true";
+    parts.forEach((part) => { part.open = open; });
+    all.setAttribute("aria-pressed", String(open));
+    all.textContent = open ? "Close all sections" : "Open all sections";
+  });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
-  let waiting = 0;
   let width = root.clientWidth;
   window.addEventListener("resize", () => {
     if (root.clientWidth === width || root.dataset.print) return;
     width = root.clientWidth;
-    cancelAnimationFrame(waiting);
-    waiting = requestAnimationFrame(draw);
+    redraw();
   });
   // Paper is white and narrower than most screens, and does not scroll.
   const tables = document.querySelectorAll(".scroll > table");
+  let folded = [];
   window.addEventListener("beforeprint", () => {
     root.dataset.print = "yes";
+    folded = parts.filter((part) => !part.open);
+    folded.forEach((part) => { part.open = true; });
     draw();
     tables.forEach((table) => {
       table.style.zoom = Math.min(1, table.parentElement.clientWidth / table.offsetWidth);
@@ -76,8 +106,9 @@ const page = (() => {
   window.addEventListener("afterprint", () => {
     delete root.dataset.print;
     tables.forEach((table) => { table.style.zoom = ""; });
+    folded.forEach((part) => { part.open = false; });
     draw();
   });
 
-  return { axis, drawn, escaped, layout, plot };
+  return { axis, drawn, escaped, layout, plot, visible };
 })();

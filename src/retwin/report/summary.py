@@ -1,0 +1,266 @@
+"""The first page: what was updated, how wrong it was and is, and what was learned."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.report.blocks import Cell, Column, Table
+from retwin.report.figure import Axis, Bars, Figure, Key, Line, Mark, Panel, Row, draw_bands
+from retwin.report.labels import learned_name, number, places, quantity, source_name, span
+from retwin.report.lights import (
+    Alarms,
+    alarms,
+    better_alternatives,
+    change_of,
+    lights,
+    uses,
+    worst,
+)
+from retwin.report.study import Study
+from retwin.report.style import colour_of
+from retwin.report.verdict import headline
+from retwin.scores.intervals import grouped_share_interval, jackknife_interval
+from retwin.scores.segments import median_error_trajectory
+
+__all__ = ["summary"]
+
+MANY_OUTPUTS = 6
+"""Number of outputs beyond which one pair of bars stands for all of them."""
+BAR = 0.38
+"""Width of a bar; groups of bars are 1 apart."""
+
+
+def summary(study: Study) -> dict[str, Any] | None:
+    """The variables of the template `summary.html.j2`; None without an updated twin."""
+    pair = headline(study.results)
+    if pair is None:
+        return None
+    found = lights(study)
+    chosen: Alarms | None = alarms(study, pair[0]) if study.results.classes else None
+    return {
+        "source": pair[0],
+        "plain": pair[1],
+        "lights": found,
+        "uses": uses(study, found),
+        "state": worst(each.state for each in found),
+        "light": {each.key: each for each in found},
+        "alternatives": better_alternatives(study, chosen, pair[0]),
+        "learned": learned(study),
+        "figure": picture(study),
+    }
+
+
+def learned(study: Study) -> Table | None:
+    """What the healthy test trajectories show of the discrepancy, in the machine's units.
+
+    The mean over trajectories of each component of z, its 95 % interval over trajectories, and the
+    range of single segments.
+    """
+    rows = [row for each in (_segment_rows(study), _noise_rows(study)) for row in each]
+    columns = [
+        Column("What was learned", numeric=False),
+        Column("Mean"),
+        Column("95 % interval"),
+        Column("single segments, 5 to 95 %"),
+        Column("generated, mean"),
+    ]
+    return Table("What was learned", columns, rows).without_empty() if rows else None
+
+
+def _segment_rows(study: Study) -> list[list[Cell]]:
+    """Delays, offsets and missed segments, inferred from every healthy test trajectory."""
+    overlay, values = study.results.overlay, study.arrays.get("portrait/z")
+    if overlay is None or values is None:
+        return []
+    rows = []
+    units = [*overlay.latent_units, *[""] * len(overlay.latents)]
+    for column, name in enumerate(overlay.latents):
+        factor, unit = quantity(units[column])
+        row = _row(name, unit, factor * values[study.healthy, :, column].astype(float))
+        rows += [row] if row else []
+    return rows
+
+
+def _noise_rows(study: Study) -> list[list[Cell]]:
+    """The noise at rest of each output, measured and generated."""
+    pair = headline(study.results)
+    fidelity = study.results.fidelity.get(pair[0]) if pair else None
+    if pair is None or fidelity is None:
+        return []
+    observed, predicted, owner = (
+        study.arrays.get(f"z/{pair[0]}/{name}") for name in ("observed", "predicted", "trajectory")
+    )
+    if observed is None or predicted is None:
+        return []
+    units = [*fidelity.latent_units, *[""] * len(fidelity.latents)]
+    rows = []
+    for column, name in enumerate(fidelity.latents):
+        if not name.startswith("noise_"):
+            continue
+        factor, unit = quantity(units[column])
+        values, drawn = (factor * each[:, column].astype(float) for each in (observed, predicted))
+        groups = [values] if owner is None else [values[owner == i] for i in np.unique(owner)]
+        size = max(map(len, groups))
+        padded = [np.pad(each, (0, size - len(each)), constant_values=np.nan) for each in groups]
+        row = _row(name, unit, np.array(padded), float(np.nanmean(drawn)) if len(drawn) else None)
+        rows += [row] if row else []
+    return rows
+
+
+def _row(
+    name: str, unit: str, values: NDArray, generated: float | None = None
+) -> list[Cell] | None:
+    """A row from values (trajectories, segments), NaN where they are not identified."""
+    known = np.isfinite(values)
+    values = values[known.any(axis=1)]
+    if not len(values):
+        return None
+    counts = np.isfinite(values).sum(axis=1)
+    single = values[np.isfinite(values)]
+    title = learned_name(name)
+    if name.startswith("missed"):
+        hits = np.nansum(values, axis=1)
+        ends = grouped_share_interval(hits, counts)
+        percent = None if ends is None else [100 * end for end in ends]
+        mean = 100 * float(hits.sum() / counts.sum())
+        return [
+            Cell(title),
+            Cell(f"{number(mean, 1)} %"),
+            Cell("–" if percent is None else f"{span(percent, 1)} %"),
+            Cell("–"),
+            Cell("–"),
+        ]
+    means = np.nanmean(values, axis=1)
+    ends = jackknife_interval(lambda weights: weights @ means, len(means))
+    low, high = np.quantile(single, [0.05, 0.95])
+    mean = float(means.mean())
+    digits = places(max(abs(mean), abs(low), abs(high)))
+    behind = f" {unit}" if unit not in ("", "1") else ""
+    return [
+        Cell(title),
+        Cell(number(mean, digits) + behind),
+        Cell("–" if ends is None else span(ends, digits) + behind),
+        Cell(span((float(low), float(high)), digits) + behind),
+        Cell("–" if generated is None else number(generated, digits) + behind),
+    ]
+
+
+def picture(study: Study) -> Figure | None:
+    """A typical trajectory with the corrected band, and bars of the error before and after."""
+    pair = headline(study.results)
+    if pair is None:
+        return None
+    shown = _trajectory(study, pair) or _record(study, pair)
+    bars = _bars(study, pair)
+    panels = [each for each in (shown, bars) if each is not None]
+    if not panels:
+        return None
+    colour = colour_of(pair[0])
+    keys = [
+        Key("measured", "ink"),
+        Key(f"before: {source_name(pair[1])}", "muted", "dot"),
+        Key(f"after: {source_name(pair[0])}, 90 % and 50 % bands", colour, "bar"),
+    ]
+    return Figure("summary", panels, keys, columns=2)
+
+
+def _trajectory(study: Study, pair: tuple[str, str]) -> Panel | None:
+    """The healthy test trajectory with the median error, in the output with the largest one."""
+    overlay = study.results.overlay
+    if overlay is None or overlay.source != pair[0] or "portrait/bands" not in study.arrays:
+        return None
+    nominal, observed, times, bands = (
+        study.arrays[f"portrait/{name}"] for name in ("nominal", "observed", "times", "bands")
+    )
+    place = median_error_trajectory(nominal, observed, times, study.healthy)
+    if place is None:
+        return None
+    outputs = study.results.outputs
+    spread = np.nanstd(observed[study.healthy].astype(float), axis=(0, 1))
+    error = np.sqrt(np.nanmean(np.square(observed[place] - nominal[place]), axis=0))
+    column = int(np.argmax(error / np.where(spread > 0, spread, np.inf)))
+    time = np.arange(nominal.shape[1]) / float(study.arrays["portrait/rate"])
+    return _panel(
+        (outputs.names[column], outputs.units[column]),
+        study.results.data.test.ids[place],
+        time,
+        (nominal[place, :, column], observed[place, :, column], bands[place, :, :, column]),
+        colour_of(pair[0]),
+    )
+
+
+def _record(study: Study, pair: tuple[str, str]) -> Panel | None:
+    """The first test record of a study without classes."""
+    names = ("simulation/observed", *(f"simulation/{name}/mean" for name in pair))
+    if any(name not in study.arrays for name in names):
+        return None
+    observed, after, before = (study.arrays[name][0, :, 0] for name in names)
+    bands = study.arrays.get(f"simulation/{pair[0]}/bands")
+    drawn = np.tile(after, (5, 1)) if bands is None else bands[0, :, :, 0]
+    outputs = study.results.outputs
+    time = np.arange(len(observed)) / float(study.arrays["simulation/rate"])
+    output = (outputs.names or ["output"])[0], (outputs.units or [""])[0]
+    record = str(study.arrays["simulation/ids"][0])
+    return _panel(output, record, time, (before, observed, drawn), colour_of(pair[0]))
+
+
+def _panel(
+    output: tuple[str, str],
+    trajectory: str,
+    time: NDArray,
+    values: tuple[NDArray, NDArray, NDArray],
+    colour: str,
+) -> Panel:
+    """A panel of nominal and measured values (P,) and quantiles (5, P) of one output."""
+    factor, unit = quantity(output[1])
+    before, measured, bands = (factor * np.asarray(each, float) for each in values)
+    marks: list[Mark] = [
+        *draw_bands(time, bands, colour),
+        Line(time, before, "before", "muted", "dot", 1.6),
+        Line(time, bands[2], "after, median", colour, width=1.2),
+        Line(time, measured, "measured", "ink", width=1.5),
+    ]
+    limits = float(time[0]), float(time[-1])
+    return Panel(
+        Axis("time", "s", limits),
+        [Row(Axis(output[0], unit), marks)],
+        f"{output[0]} of the typical trajectory {trajectory}: measured, before and after",
+        f"{output[0]} in a typical run ({trajectory})",
+        height=270,
+    )
+
+
+def _bars(study: Study, pair: tuple[str, str]) -> Panel | None:
+    """The error of each output before and after the update."""
+    found = change_of(study)
+    if found is None:
+        return None
+    change, unit = found
+    before, after = change.outputs_before, change.outputs_after
+    names = study.results.outputs.names
+    if len(before) > MANY_OUTPUTS or len(before) != len(names):
+        before, after, names = np.array([change.before]), np.array([change.after]), ["all outputs"]
+    centres = np.arange(len(names), dtype=float)
+    marks: list[Mark] = []
+    for values, shift, title, colour in (
+        (before, -BAR, "before", "muted"),
+        (after, 0.0, "after", colour_of(pair[0])),
+    ):
+        for centre, value in zip(centres, values, strict=True):
+            if math.isfinite(value):
+                edges = np.array([centre + shift, centre + shift + BAR])
+                marks.append(Bars(edges, np.array([value]), title, colour))
+    ticks = {float(centre): name for centre, name in zip(centres, names, strict=True)}
+    shown = "" if unit == "σ" else unit
+    title = "Error, root mean square"
+    return Panel(
+        Axis("", limits=(-0.6, len(names) - 0.4), kind="names", ticks=ticks),
+        [Row(Axis("error" if unit != "σ" else "error / σ", shown, from_zero=True), marks)],
+        "Root mean square error of each output before and after the update",
+        title,
+        height=270,
+    )

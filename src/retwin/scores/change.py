@@ -1,0 +1,97 @@
+"""The error of a twin before and after its update, over the same trajectories."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from retwin.scores.intervals import jackknife_interval
+
+__all__ = ["ErrorChange", "error_change"]
+
+
+@dataclass(frozen=True)
+class ErrorChange:
+    """Root mean square errors of n trajectories, before and after.
+
+    Attributes
+    ----------
+    before, after : float
+        Root mean square over all samples of all trajectories and over outputs.
+    before_interval, after_interval : (float, float) or None
+        Their 95 % intervals over trajectories; None for fewer than five.
+    ratio : float
+        After divided by before.
+    ratio_interval : (float, float) or None
+        The paired 95 % interval of the ratio.
+    outputs_before, outputs_after : array (d,)
+        The same for each output.
+    trajectories : int
+        n.
+
+    """
+
+    before: float
+    before_interval: tuple[float, float] | None
+    after: float
+    after_interval: tuple[float, float] | None
+    ratio: float
+    ratio_interval: tuple[float, float] | None
+    outputs_before: NDArray
+    outputs_after: NDArray
+    trajectories: int
+
+
+def error_change(
+    before: NDArray, after: NDArray, observed: NDArray, scale: ArrayLike = 1.0
+) -> ErrorChange | None:
+    """The change of the error of predictions of the same measured trajectories.
+
+    Parameters
+    ----------
+    before, after : array (n, P, d)
+        Predictions.
+    observed : array (n, P, d)
+        The measured outputs, NaN where nothing was measured.
+    scale : array (d,), optional
+        Factors of the outputs, which bring them to one unit.
+
+    Returns
+    -------
+    ErrorChange or None
+        None if nothing was measured. The intervals are those of the jackknife over trajectories,
+        on the scale of the logarithm.
+
+    """
+    errors = [np.asarray(scale) * (np.asarray(each, float) - observed) for each in (before, after)]
+    seen = np.isfinite(errors[0]) & np.isfinite(errors[1])
+    counts = seen.sum(axis=1)
+    used = counts.any(axis=1)
+    if not used.any():
+        return None
+    squares = [np.where(seen, np.square(each), 0.0).sum(axis=1)[used] for each in errors]
+    counts, n = counts[used], int(used.sum())
+
+    def root(which: int, weights: NDArray) -> NDArray:
+        total: NDArray = weights @ squares[which].sum(axis=1) / (weights @ counts.sum(axis=1))
+        return np.sqrt(total)
+
+    def ratio(weights: NDArray) -> NDArray:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return root(1, weights) / root(0, weights)
+
+    whole = np.full((1, n), 1 / n)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        outputs = [np.sqrt(each.sum(axis=0) / counts.sum(axis=0)) for each in squares]
+    return ErrorChange(
+        float(root(0, whole)[0]),
+        jackknife_interval(lambda weights: root(0, weights), n, positive=True),
+        float(root(1, whole)[0]),
+        jackknife_interval(lambda weights: root(1, weights), n, positive=True),
+        float(ratio(whole)[0]),
+        jackknife_interval(ratio, n, positive=True),
+        *outputs,
+        n,
+    )
