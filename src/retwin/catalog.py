@@ -401,7 +401,7 @@ METRICS: Mapping[str, Metric] = {
     "balanced_accuracy": Metric(
         "Balanced accuracy", headline=True, head="balanced\nacc.", compared=True, family=True
     ),
-    "auroc": Metric("AUROC", headline=True, head="AUROC", compared=True, family=True),
+    "auroc": Metric("Macro AUROC", headline=True, head="macro\nAUROC", compared=True, family=True),
     "healthy_recall": Metric(
         "Healthy recall", headline=True, head="healthy\nrecall", selected=True, compared=True
     ),

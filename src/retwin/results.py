@@ -202,9 +202,13 @@ class CurvePoint(Scored):
 
 
 class Dataset(Part):
-    """A data set: its file, its number of trajectories, and which of them have a role."""
+    """A data set: its file, its number of trajectories, and which of them have a role.
+
+    `rate` is the sample rate of the data in Hz; None in files of versions that did not state it.
+    """
 
     name: str = ""
+    rate: float | None = None
     sha256: str = ""
     n: int | None = None
     used: list[str] | None = None

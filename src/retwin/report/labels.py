@@ -115,8 +115,8 @@ def class_name(name: str) -> str:
 def latent_names(name: str) -> tuple[str, str]:
     """Title of a component of z, and the quantity on its axis."""
     if name.startswith("delay"):
-        return f"TDe{name[5:].replace('_', ' ')}", "delay"
-    for start, title, what in (("offset_", "TPE", "offset"), ("noise_", "Noise", "noise")):
+        return f"Delay{name[5:].replace('_', ' ')}", "delay"
+    for start, title, what in (("offset_", "Offset", "offset"), ("noise_", "Noise", "noise")):
         if name.startswith(start):
             rest = name[len(start) :].replace("_", " ")
             return f"{title} {rest}", f"{what} {rest}"

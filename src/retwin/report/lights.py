@@ -137,6 +137,9 @@ def uses(study: Study, found: Iterable[Light]) -> list[Use]:
 def change_of(study: Study) -> tuple[ErrorChange, str] | None:
     """The error on healthy trajectories before and after the update, and its unit.
 
+    It is the mean absolute error of the median of the draws, on the test trajectories; of a study
+    without classes the root mean square error of the mean of the draws, as in its scores.
+
     Outputs of several units are divided by their standard deviation, and the unit is "σ".
     """
     pair, results = headline(study.results), study.results

@@ -18,7 +18,7 @@ from retwin.report import labels
 from retwin.report.blocks import Section
 from retwin.report.figure import Figure, Matrices
 from retwin.report.plotly_specs import panel_spec
-from retwin.report.png import png
+from retwin.report.png import png, small
 from retwin.report.sections import sections_of
 from retwin.report.study import Study, read_study
 from retwin.report.style import CHROME, PALETTE, colour_of, symbol
@@ -54,6 +54,8 @@ FIGURES = (
     "learning",
 )
 """The files `figures/NAME.png`; of a second source `NAME-2.png`."""
+LEGEND = {"solid": "none", "dash": "7 4", "dot": "2 3", "dashdot": "8 3 2 3"}
+"""Dashes of lines in legends, as lengths of strokes and gaps: those of the plots."""
 DOCS = "https://retwin.readthedocs.io/en/latest/report.html"
 """The documentation of the page, to which each section links."""
 FILTERS = {
@@ -137,8 +139,9 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         "min_runs": MIN_RUNS,
         "min_records": MIN_RECORDS,
         "anchors": {section.key for section in sections},
-        "images": {name: base64.b64encode(data).decode() for name, data in images.items()},
+        "images": {name: base64.b64encode(small(data)).decode() for name, data in images.items()},
         "colour_of": colour_of,
+        "dashes": LEGEND,
         "symbol": symbol,
     }
     bodies = {

@@ -35,9 +35,11 @@ from retwin.report.figure import (
 )
 from retwin.report.style import CHROME, DASHES, colour_of, hexadecimal
 
-__all__ = ["blank", "draw", "dress", "png"]
+__all__ = ["blank", "draw", "dress", "png", "small"]
 
 STYLES: dict[str, Any] = dict(zip(DASHES, ("-", "--", ":", "-."), strict=True))
+SMALL = 0.5
+"""Width of the pictures in the page, as a share of that of the files."""
 SYMBOLS = {"circle": "o", "square": "s", "diamond": "D", "diamond-open": "D"}
 
 
@@ -51,10 +53,19 @@ def png(shown: Figure | Matrices, *, emulated: bool) -> bytes:
     canvas.set_dpi(160)
     drawn = FigureCanvasAgg(canvas)
     drawn.draw()
-    # The page embeds every figure; 256 colours suffice and take a third of the bytes.
+    # 256 colours suffice and take a third of the bytes.
     image = Image.fromarray(np.asarray(drawn.buffer_rgba())).convert("RGB").quantize(256)
     file = io.BytesIO()
     image.save(file, format="png", optimize=True, dpi=(160, 160))
+    return file.getvalue()
+
+
+def small(image: bytes) -> bytes:
+    """The same picture as WebP, as wide as a page shows it: a quarter of the bytes."""
+    whole = Image.open(io.BytesIO(image)).convert("RGB")
+    width, height = (round(SMALL * side) for side in whole.size)
+    file = io.BytesIO()
+    whole.resize((width, height), Image.Resampling.LANCZOS).save(file, format="webp", quality=40)
     return file.getvalue()
 
 
@@ -206,7 +217,7 @@ def _handle(key: Key) -> Line2D | Patch:
             color=colour, alpha=1 if key.colour in CHROME else 0.4, linewidth=0, label=key.text
         )
     if key.mark in SYMBOLS:
-        fill = "white" if key.mark == "diamond" else colour
+        fill = "white" if key.mark.endswith("-open") else colour
         look: dict[str, Any] = {
             "marker": SYMBOLS[key.mark],
             "markerfacecolor": fill,

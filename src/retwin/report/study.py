@@ -112,6 +112,8 @@ class Study:
         }
         if "pose/nominal" in self.arrays:
             shapes |= dict.fromkeys(("pose/nominal", "pose/observed"), (n, samples, None, 3))
+        if "pose/updated" in self.arrays:
+            shapes["pose/updated"] = (n, samples, None, 3)
         for name, shape in shapes.items():
             self._require(name, shape, needed=True)
 

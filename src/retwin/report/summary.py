@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,16 @@ from numpy.typing import NDArray
 
 from retwin.report.blocks import Cell, Column, Table
 from retwin.report.figure import Axis, Bars, Figure, Key, Line, Mark, Panel, Row, draw_bands
-from retwin.report.labels import learned_name, number, places, quantity, source_name, span
+from retwin.report.labels import (
+    learned_name,
+    number,
+    percent,
+    percents,
+    places,
+    quantity,
+    source_name,
+    span,
+)
 from retwin.report.lights import (
     Alarms,
     alarms,
@@ -30,6 +40,8 @@ __all__ = ["summary"]
 
 MANY_OUTPUTS = 6
 """Number of outputs beyond which one pair of bars stands for all of them."""
+SEGMENTS = 10
+"""Number of segments below which no range of them is shown."""
 BAR = 0.38
 """Width of a bar; groups of bars are 1 apart."""
 
@@ -60,33 +72,47 @@ def learned(study: Study) -> Table | None:
     The mean over trajectories of each component of z, its 95 % interval over trajectories, and the
     range of single segments.
     """
-    rows = [row for each in (_segment_rows(study), _noise_rows(study)) for row in each]
+    rows: dict[str, _Row] = {}
+    for name, row in (*_segment_rows(study), *_held_out_rows(study)):
+        # Of a component that both have, the one that more segments identify.
+        if name not in rows or row.count > rows[name].count:
+            rows[name] = row
     columns = [
-        Column("What was learned", numeric=False),
+        Column("Quantity", numeric=False),
         Column("Mean"),
         Column("95 % interval"),
-        Column("single segments, 5 to 95 %"),
+        Column("90 % of the segments"),
         Column("generated, mean"),
+        Column("segments"),
     ]
-    return Table("What was learned", columns, rows).without_empty() if rows else None
+    cells = [row.cells for row in rows.values()]
+    return Table("What was learned", columns, cells).without_empty() if rows else None
 
 
-def _segment_rows(study: Study) -> list[list[Cell]]:
+@dataclass(frozen=True)
+class _Row:
+    """A row of the table, and the number of segments that identify it."""
+
+    cells: list[Cell]
+    count: int
+
+
+def _segment_rows(study: Study) -> list[tuple[str, _Row]]:
     """Delays, offsets and missed segments, inferred from every healthy test trajectory."""
     overlay, values = study.results.overlay, study.arrays.get("portrait/z")
     if overlay is None or values is None:
         return []
-    rows = []
     units = [*overlay.latent_units, *[""] * len(overlay.latents)]
+    rows = []
     for column, name in enumerate(overlay.latents):
         factor, unit = quantity(units[column])
         row = _row(name, unit, factor * values[study.healthy, :, column].astype(float))
-        rows += [row] if row else []
+        rows += [(name, row)] if row else []
     return rows
 
 
-def _noise_rows(study: Study) -> list[list[Cell]]:
-    """The noise at rest of each output, measured and generated."""
+def _held_out_rows(study: Study) -> list[tuple[str, _Row]]:
+    """Delay, and noise at rest of each output, measured and generated."""
     pair = headline(study.results)
     fidelity = study.results.fidelity.get(pair[0]) if pair else None
     if pair is None or fidelity is None:
@@ -99,54 +125,44 @@ def _noise_rows(study: Study) -> list[list[Cell]]:
     units = [*fidelity.latent_units, *[""] * len(fidelity.latents)]
     rows = []
     for column, name in enumerate(fidelity.latents):
-        if not name.startswith("noise_"):
+        if not name.startswith(("noise_", "delay")):
             continue
         factor, unit = quantity(units[column])
         values, drawn = (factor * each[:, column].astype(float) for each in (observed, predicted))
         groups = [values] if owner is None else [values[owner == i] for i in np.unique(owner)]
         size = max(map(len, groups))
         padded = [np.pad(each, (0, size - len(each)), constant_values=np.nan) for each in groups]
-        row = _row(name, unit, np.array(padded), float(np.nanmean(drawn)) if len(drawn) else None)
-        rows += [row] if row else []
+        drawn = drawn[np.isfinite(drawn)]
+        row = _row(name, unit, np.array(padded), float(drawn.mean()) if len(drawn) else None)
+        rows += [(name, row)] if row else []
     return rows
 
 
-def _row(
-    name: str, unit: str, values: NDArray, generated: float | None = None
-) -> list[Cell] | None:
+def _row(name: str, unit: str, values: NDArray, generated: float | None = None) -> _Row | None:
     """A row from values (trajectories, segments), NaN where they are not identified."""
-    known = np.isfinite(values)
-    values = values[known.any(axis=1)]
+    values = values[np.isfinite(values).any(axis=1)]
     if not len(values):
         return None
     counts = np.isfinite(values).sum(axis=1)
-    single = values[np.isfinite(values)]
-    title = learned_name(name)
+    single, total = values[np.isfinite(values)], int(counts.sum())
     if name.startswith("missed"):
         hits = np.nansum(values, axis=1)
         ends = grouped_share_interval(hits, counts)
-        percent = None if ends is None else [100 * end for end in ends]
-        mean = 100 * float(hits.sum() / counts.sum())
-        return [
-            Cell(title),
-            Cell(f"{number(mean, 1)} %"),
-            Cell("–" if percent is None else f"{span(percent, 1)} %"),
-            Cell("–"),
-            Cell("–"),
-        ]
+        texts = [percent(float(hits.sum() / total), 1), percents(ends), "–", "–"]
+        return _Row([Cell(text) for text in (learned_name(name), *texts, str(total))], total)
     means = np.nanmean(values, axis=1)
     ends = jackknife_interval(lambda weights: weights @ means, len(means))
     low, high = np.quantile(single, [0.05, 0.95])
     mean = float(means.mean())
     digits = places(max(abs(mean), abs(low), abs(high)))
     behind = f" {unit}" if unit not in ("", "1") else ""
-    return [
-        Cell(title),
-        Cell(number(mean, digits) + behind),
-        Cell("–" if ends is None else span(ends, digits) + behind),
-        Cell(span((float(low), float(high)), digits) + behind),
-        Cell("–" if generated is None else number(generated, digits) + behind),
+    texts = [
+        number(mean, digits) + behind,
+        "–" if ends is None else span(ends, digits) + behind,
+        "–" if total < SEGMENTS else span((float(low), float(high)), digits) + behind,
+        "–" if generated is None else number(generated, digits) + behind,
     ]
+    return _Row([Cell(text) for text in (learned_name(name), *texts, str(total))], total)
 
 
 def picture(study: Study) -> Figure | None:
@@ -186,7 +202,7 @@ def _trajectory(study: Study, pair: tuple[str, str]) -> Panel | None:
     time = np.arange(nominal.shape[1]) / float(study.arrays["portrait/rate"])
     return _panel(
         (outputs.names[column], outputs.units[column]),
-        study.results.data.test.ids[place],
+        f"a typical healthy run ({study.results.data.test.ids[place]})",
         time,
         (nominal[place, :, column], observed[place, :, column], bands[place, :, :, column]),
         colour_of(pair[0]),
@@ -204,13 +220,13 @@ def _record(study: Study, pair: tuple[str, str]) -> Panel | None:
     outputs = study.results.outputs
     time = np.arange(len(observed)) / float(study.arrays["simulation/rate"])
     output = (outputs.names or ["output"])[0], (outputs.units or [""])[0]
-    record = str(study.arrays["simulation/ids"][0])
+    record = f"test record {study.arrays['simulation/ids'][0]}"
     return _panel(output, record, time, (before, observed, drawn), colour_of(pair[0]))
 
 
 def _panel(
     output: tuple[str, str],
-    trajectory: str,
+    where: str,
     time: NDArray,
     values: tuple[NDArray, NDArray, NDArray],
     colour: str,
@@ -228,8 +244,8 @@ def _panel(
     return Panel(
         Axis("time", "s", limits),
         [Row(Axis(output[0], unit), marks)],
-        f"{output[0]} of the typical trajectory {trajectory}: measured, before and after",
-        f"{output[0]} in a typical run ({trajectory})",
+        f"{output[0]} in {where}: measured, before and after the update",
+        f"{output[0]} in {where}",
         height=270,
     )
 
@@ -256,11 +272,12 @@ def _bars(study: Study, pair: tuple[str, str]) -> Panel | None:
                 marks.append(Bars(edges, np.array([value]), title, colour))
     ticks = {float(centre): name for centre, name in zip(centres, names, strict=True)}
     shown = "" if unit == "σ" else unit
-    title = "Error, root mean square"
+    simulated = study.results.overlay is None
+    title = "Root mean square error" if simulated else "Mean absolute error, healthy runs"
     return Panel(
         Axis("", limits=(-0.6, len(names) - 0.4), kind="names", ticks=ticks),
         [Row(Axis("error" if unit != "σ" else "error / σ", shown, from_zero=True), marks)],
-        "Root mean square error of each output before and after the update",
+        f"{title}, each output, before and after the update",
         title,
         height=270,
     )

@@ -14,12 +14,15 @@ __all__ = ["ErrorChange", "error_change"]
 
 @dataclass(frozen=True)
 class ErrorChange:
-    """Root mean square errors of n trajectories, before and after.
+    """Errors of n trajectories, before and after.
+
+    The error is the mean absolute one, for which a median is the best prediction, unless it is
+    stated otherwise.
 
     Attributes
     ----------
     before, after : float
-        Root mean square over all samples of all trajectories and over outputs.
+        Mean over all samples of all trajectories and over outputs.
     before_interval, after_interval : (float, float) or None
         Their 95 % intervals over trajectories; None for fewer than five.
     ratio : float
@@ -71,25 +74,25 @@ def error_change(
     used = counts.any(axis=1)
     if not used.any():
         return None
-    squares = [np.where(seen, np.square(each), 0.0).sum(axis=1)[used] for each in errors]
+    sums = [np.where(seen, np.abs(each), 0.0).sum(axis=1)[used] for each in errors]
     counts, n = counts[used], int(used.sum())
 
-    def root(which: int, weights: NDArray) -> NDArray:
-        total: NDArray = weights @ squares[which].sum(axis=1) / (weights @ counts.sum(axis=1))
-        return np.sqrt(total)
+    def mean(which: int, weights: NDArray) -> NDArray:
+        total: NDArray = weights @ sums[which].sum(axis=1) / (weights @ counts.sum(axis=1))
+        return total
 
     def ratio(weights: NDArray) -> NDArray:
         with np.errstate(invalid="ignore", divide="ignore"):
-            return root(1, weights) / root(0, weights)
+            return mean(1, weights) / mean(0, weights)
 
     whole = np.full((1, n), 1 / n)
     with np.errstate(invalid="ignore", divide="ignore"):
-        outputs = [np.sqrt(each.sum(axis=0) / counts.sum(axis=0)) for each in squares]
+        outputs = [each.sum(axis=0) / counts.sum(axis=0) for each in sums]
     return ErrorChange(
-        float(root(0, whole)[0]),
-        jackknife_interval(lambda weights: root(0, weights), n, positive=True),
-        float(root(1, whole)[0]),
-        jackknife_interval(lambda weights: root(1, weights), n, positive=True),
+        float(mean(0, whole)[0]),
+        jackknife_interval(lambda weights: mean(0, weights), n, positive=True),
+        float(mean(1, whole)[0]),
+        jackknife_interval(lambda weights: mean(1, weights), n, positive=True),
         float(ratio(whole)[0]),
         jackknife_interval(ratio, n, positive=True),
         *outputs,

@@ -63,7 +63,7 @@ def write_results(
     overlay = _overlay(work)
     shown: dict[str, Any] = {}
     if overlay is not None:
-        arrays |= _overlay_arrays(work, test, overlay) | _poses(work, test)
+        arrays |= _overlay_arrays(work, test, overlay) | _poses(work, test, overlay)
         shown["portrait"] = {
             "source": work.overlay_jobs()[0].name,
             "movement": overlay.latent.names,
@@ -254,6 +254,7 @@ def _data(
         "test": {
             **about["test"],
             "n": len(test),
+            "rate": float(test.rate),
             "ids": test.ids.tolist(),
             "labels": test.labels.tolist(),
         },
@@ -340,20 +341,33 @@ def _overlay_arrays(work: Work, test: Trajectories, overlay: Overlay) -> dict[st
     return {f"portrait/{name}": each.astype(np.float32) for name, each in found.items()}
 
 
-def _poses(work: Work, test: Trajectories) -> dict[str, NDArray]:
+def _poses(work: Work, test: Trajectories, overlay: Overlay | None = None) -> dict[str, NDArray]:
     """Skeletons of all test trajectories at the sensor's rate.
 
-    `pose/nominal` and `pose/observed` (n, P, points, 3) in m.
+    `pose/nominal`, `pose/observed` and, of the median of the updated twin's draws, `pose/updated`
+    (n, P, points, 3) in m.
     """
     body = work.case.body
     if body is None:
         return {}
     every = max(1, round(test.rate / work.case.sensor_rate))
     nominal, observed = (body.skeleton(joints[:, ::every]) for joints in body.poses(test))
-    return {
-        "pose/nominal": nominal.astype(np.float32),
-        "pose/observed": observed.astype(np.float32),
-    }
+    found = {"pose/nominal": nominal, "pose/observed": observed}
+    if overlay is not None:
+        names = overlay.ids.tolist()
+        order = [names.index(name) for name in test.ids.tolist()]
+        median = overlay.bands[order, 2]
+        slow = Trajectories(
+            commands=test.commands[:, ::every],
+            nominal=test.nominal[:, ::every],
+            observed=median.astype(test.observed.dtype),
+            mask=np.ones(median.shape, dtype=bool),
+            rate=test.rate / every,
+            inputs=test.inputs,
+            outputs=test.outputs,
+        )
+        found["pose/updated"] = body.skeleton(body.poses(slow)[1])
+    return {name: each.astype(np.float32) for name, each in found.items()}
 
 
 def _machine() -> dict[str, str]:

@@ -93,7 +93,10 @@ def _length(study: Study) -> str:
     bands, rate = (study.arrays.get(f"portrait/{name}") for name in ("bands", "rate"))
     if bands is None or rate is None:
         return ""
-    return f"{bands.shape[2] / float(rate):.0f} s at {float(rate):g} Hz"
+    seconds, measured = bands.shape[2] / float(rate), study.results.data.test.rate
+    if measured is None or measured == float(rate):
+        return f"{seconds:.0f} s" + (f" at {measured:g} Hz" if measured else "")
+    return f"{seconds:.0f} s at {measured:g} Hz; bands and plots at {float(rate):g} Hz"
 
 
 def _confused(study: Study, source: str) -> list[tuple[str, str, Cell]]:

@@ -117,11 +117,13 @@ def _row(each: Comparison, low: float, high: float) -> list[Cell]:
         )
         forest = Forest(lower, min(max(at, 0), 100), upper, zero)
     result = outcome_of(each)
+    # Draws that are all equal show no uncertainty, which does not mean that there is none.
+    wide = each.interval is not None and each.interval[0] < each.interval[1]
     return [
         Cell(metric_name(each.metric)),
         Cell({"open": "undecided", "": "no verdict"}.get(result, result), tone=result),
         Cell(signed(each.mean_diff, digits(each))),
-        Cell(span(each.interval, digits(each), sign=True)),
+        Cell(span(each.interval, digits(each), sign=True) if wide else "–"),
         Cell("", forest=forest, source=each.a),
         Cell(p_value(each.p_verdict)),
         Cell(f"{number(each.t, 2)} ({number(each.df, 1)})" if each.t is not None else "–"),

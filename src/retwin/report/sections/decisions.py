@@ -7,20 +7,22 @@ from typing import Any
 
 from retwin.data.trajectories import HEALTHY
 from retwin.report.blocks import Cell, Column, Section, Table
-from retwin.report.labels import class_name, number, source_name, span
+from retwin.report.labels import class_name, distinct, number, percent, percents, source_name
+from retwin.report.lights import RATES, alarms
 from retwin.report.study import Study
 from retwin.scores.decisions import Decision, decide
 
 __all__ = ["decisions"]
 
-RATES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
-"""The requested false-alarm rates."""
 TRAJECTORIES, FAULTY, MISSED = 1000, 0.02, 50
 """The example: trajectories, share of faulty ones, cost of a missed fault in false alarms."""
+GROUP = f"Of {TRAJECTORIES}, {100 * FAULTY:.0f} % faulty"
 
 
 def decisions(study: Study) -> Section | None:
-    """A row per false-alarm rate for the source with the best macro-F1, and a calculator.
+    """All sources at one rate, one source at all rates, and a calculator.
+
+    The rate is the one that the page chooses, the source the one with the best macro-F1.
 
     A threshold belongs to one model, so these are the decisions of the model of the first run.
     """
@@ -33,15 +35,19 @@ def decisions(study: Study) -> Section | None:
         return None
     found = [_decide(study, best, rate) for rate in RATES]
     short = [each.requested for each in found if math.isnan(each.threshold)]
+    chosen = alarms(study, best)
+    rate = chosen.decision.guaranteed if chosen and chosen.decision else math.nan
     values = {
         "source": best,
         "healthy": healthy,
-        "table": _table(found),
+        "chosen": chosen,
+        "all": None if math.isnan(rate) else _all_sources(study, sources, rate),
+        "table": _table([each for each in found if math.isfinite(each.threshold)]),
         "missed": MISSED,
         "lowest": short[-1] if short else None,
         "needed": math.ceil(1 / short[-1]) - 1 if short else 0,
     }
-    scripts = {"calculator": _calculator(study, sources, best, healthy)}
+    scripts = {"calculator": _calculator(study, sources, best, healthy) | {"rate": 100 * rate}}
     return Section("decisions", "Decisions", values, scripts=scripts)
 
 
@@ -50,8 +56,35 @@ def _decide(study: Study, source: str, rate: float) -> Decision:
     return decide(first, study.truth, study.results.classes, rate)
 
 
+def _all_sources(study: Study, sources: list[str], rate: float) -> Table:
+    """A row per source at the same false-alarm rate."""
+    columns = [
+        Column("Source", numeric=False),
+        Column("Faults detected"),
+        Column("Detected at the rate"),
+        Column("of these, correct class"),
+        Column("Most often missed", numeric=False),
+        Column(f"cost, 1 : {MISSED}", group=GROUP),
+    ]
+    found = {name: _decide(study, name, rate) for name in sources}
+    best = max(each.detected for each in found.values())
+    rows = []
+    for name, each in found.items():
+        cost = each.cost(trajectories=TRAJECTORIES, faulty=FAULTY, missed=MISSED)
+        rows.append(
+            [
+                Cell(source_name(name), name, source=name),
+                Cell(percent(each.detected), f"[{percents(each.interval)}]", each.detected == best),
+                Cell(percents(each.at_rate)),
+                Cell(percent(each.identified)),
+                Cell(class_name(each.most_missed) or "none"),
+                Cell(number(cost.total, 0)),
+            ]
+        )
+    return Table("All sources at the same false-alarm rate", columns, rows)
+
+
 def _table(found: list[Decision]) -> Table:
-    group = f"Of {TRAJECTORIES}, {FAULTY:.0%} faulty"
     columns = [
         Column("Requested false-alarm rate", numeric=False),
         Column("Alarm threshold"),
@@ -61,25 +94,23 @@ def _table(found: list[Decision]) -> Table:
         Column("of these, correct class"),
         Column("Most often missed", numeric=False),
         Column("Most often confused", numeric=False),
-        Column("false alarms", group=group),
-        Column("missed faults", group=group),
-        Column(f"cost, 1 : {MISSED}", group=group),
+        Column("false alarms", group=GROUP),
+        Column("missed faults", group=GROUP),
+        Column(f"cost, 1 : {MISSED}", group=GROUP),
     ]
-    return Table("Cost of a false-alarm rate", columns, [_row(each) for each in found])
+    digits = distinct(each.threshold for each in found)
+    return Table("Cost of a false-alarm rate", columns, [_row(each, digits) for each in found])
 
 
-def _row(each: Decision) -> list[Cell]:
-    requested = Cell(f"{each.requested:.0%}")
-    if math.isnan(each.threshold):
-        return [requested, *[Cell("–")] * 10]
+def _row(each: Decision, digits: int) -> list[Cell]:
     cost = each.cost(trajectories=TRAJECTORIES, faulty=FAULTY, missed=MISSED)
     return [
-        requested,
-        Cell(number(each.threshold)),
-        Cell(span(each.false_alarms, 2)),
-        Cell(number(each.detected, 2), f"[{span(each.interval, 2)}]"),
-        Cell(span(each.at_rate, 2)),
-        Cell(number(each.identified, 2)),
+        Cell(percent(each.requested)),
+        Cell(number(each.threshold, digits)),
+        Cell(percents(each.false_alarms)),
+        Cell(percent(each.detected), f"[{percents(each.interval)}]"),
+        Cell(percents(each.at_rate)),
+        Cell(percent(each.identified)),
         Cell(class_name(each.most_missed) or "none"),
         Cell(" as ".join(map(class_name, each.most_confused)) or "none"),
         Cell(number(cost.false_alarms, 0)),
@@ -91,6 +122,7 @@ def _row(each: Decision) -> list[Cell]:
 def _calculator(study: Study, sources: list[str], first: str, healthy: int) -> dict[str, Any]:
     """Every distinct decision of each source: there are as many as healthy trajectories."""
     rates = [rank / (healthy + 1) for rank in range(1, healthy + 1)]
+    decided = {name: [_decide(study, name, rate) for rate in rates] for name in sources}
     return {
         "healthy": healthy,
         "first": sources.index(first),
@@ -100,16 +132,16 @@ def _calculator(study: Study, sources: list[str], first: str, healthy: int) -> d
         "sources": [
             {
                 "name": source_name(name),
-                "decisions": [_entry(_decide(study, name, rate)) for rate in rates],
+                "decisions": [_entry(each, distinct(e.threshold for e in found)) for each in found],
             }
-            for name in sources
+            for name, found in decided.items()
         ],
     }
 
 
-def _entry(each: Decision) -> dict[str, Any]:
+def _entry(each: Decision, digits: int) -> dict[str, Any]:
     """The numbers that costs are computed from, and the texts of the table's cells."""
-    cells = _row(each)[1:8]
+    cells = _row(each, digits)[1:8]
     return {
         "rate": each.guaranteed,
         "detected": each.detected,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import zlib
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,10 @@ from retwin.results import OverlayInfo
 
 __all__ = ["explorer", "packed"]
 
-MISSING = -32768
+MISSING = 65535
 """The code of a number that is not defined."""
-STEPS = 65534
-"""The number of steps from the smallest to the largest number."""
+FINE, COARSE, POSE = 16000, 4000, 1500
+"""Steps from the smallest to the largest number: of signals, bands, and poses."""
 
 
 def explorer(study: Study) -> Section | None:
@@ -44,8 +45,20 @@ def explorer(study: Study) -> Section | None:
         "keys": keys,
         "latent": content["latent"] is not None,
         "pose": content["pose"] is not None,
+        "pose_keys": _pose_keys(content["pose"] or {}, overlay.source),
+        "several": bool(content["classes"]),
     }
     return Section("explorer", "Explorer", values, scripts={"explorer": content})
+
+
+def _pose_keys(pose: dict[str, Any], source: str) -> list[Key]:
+    """What the chains of the picture in space are, in their colours."""
+    named = {
+        "nominal": Key("nominal", "observed"),
+        "updated": Key(f"{source_name(source)}, median", colour_of(source)),
+        "observed": Key("measured", "ink"),
+    }
+    return [key for name, key in named.items() if name in pose]
 
 
 def _content(study: Study, overlay: OverlayInfo) -> dict[str, Any]:
@@ -65,11 +78,9 @@ def _content(study: Study, overlay: OverlayInfo) -> dict[str, Any]:
         "rate": float(arrays["portrait/rate"]),
         "inputs": {"names": results.inputs.names, "units": [unit for _, unit in inputs]},
         "outputs": {"names": results.outputs.names, "units": [unit for _, unit in outputs]},
-        "commands": packed(np.array([f for f, _ in inputs]) * arrays["portrait/commands"]),
-        **{
-            name: packed(scale * arrays[f"portrait/{name}"])
-            for name in ("nominal", "observed", "bands")
-        },
+        "commands": packed(np.array([f for f, _ in inputs]) * arrays["portrait/commands"], 1),
+        **{name: packed(scale * arrays[f"portrait/{name}"], 1) for name in ("nominal", "observed")},
+        "bands": packed(scale * arrays["portrait/bands"], 2, COARSE),
         "times": packed(arrays["portrait/times"]),
         "colour": colour_index(overlay.source),
         "latent": _latent(study, overlay),
@@ -102,27 +113,33 @@ def _poses(study: Study) -> dict[str, Any] | None:
     """Chains of points (n, P, points, 3), and the box around all of them."""
     if "pose/observed" not in study.arrays:
         return None
-    nominal, observed = (study.arrays[f"pose/{name}"] for name in ("nominal", "observed"))
-    both = np.concatenate([nominal, observed])
-    low, high = both.min(axis=(0, 1, 2)), both.max(axis=(0, 1, 2))
+    names = [name for name in ("nominal", "observed", "updated") if f"pose/{name}" in study.arrays]
+    chains = {name: study.arrays[f"pose/{name}"] for name in names}
+    low = np.min([each.min(axis=(0, 1, 2)) for each in chains.values()], axis=0)
+    high = np.max([each.max(axis=(0, 1, 2)) for each in chains.values()], axis=0)
     margin = 0.06 * (high - low).max()
     return {
-        "nominal": packed(nominal),
-        "observed": packed(observed),
+        **{name: packed(each, 1, POSE) for name, each in chains.items()},
         "low": np.round(low - margin * np.array([1, 1, 0]), 4).tolist(),
         "high": np.round(high + margin, 4).tolist(),
     }
 
 
-def packed(values: NDArray) -> dict[str, Any]:
-    """Numbers in 16 bits each, in equal steps from the smallest to the largest.
+def packed(values: NDArray, axis: int = -1, steps: int = FINE) -> dict[str, Any]:
+    """Numbers in equal steps from the smallest to the largest, as compressed differences.
 
-    The page's script computes low + step (code + 32767); the code -32768 is a missing number.
+    Codes of 16 bits, differences along `axis` (modulo 65536), all low bytes before all high ones,
+    deflate, base64: signals change little from sample to sample, so that they take few bytes. The
+    page's script computes low + step code; the code 65535 is a missing number.
     """
     known = values[np.isfinite(values)]
     low = float(known.min()) if known.size else 0.0
-    step = (float(known.max()) - low) / STEPS if known.size else 0.0
+    step = (float(known.max()) - low) / steps if known.size else 0.0
     codes = np.zeros(values.shape) if step == 0 else (values - low) / step
-    codes = np.where(np.isfinite(values), np.round(codes) - 32767, MISSING)
-    text = base64.b64encode(codes.astype("<i2").tobytes()).decode()
-    return {"low": low, "step": step, "shape": list(values.shape), "codes": text}
+    whole = np.where(np.isfinite(values), np.round(codes), MISSING).astype(np.uint16)
+    first = np.zeros_like(whole.take([0], axis=axis)) if whole.shape[axis] else whole
+    change = np.diff(whole, axis=axis, prepend=first).astype("<u2")
+    planes = np.ascontiguousarray(change).view(np.uint8).reshape(-1, 2).T
+    text = base64.b64encode(zlib.compress(planes.tobytes(), 9)).decode()
+    axis = axis % values.ndim
+    return {"low": low, "step": step, "shape": list(values.shape), "axis": axis, "codes": text}

@@ -47,7 +47,12 @@ def paper(study: Study) -> Section | None:
             )
             for metric in TABLE1
         ),
-        _row("Figure 2: segments, TDe, TPE", dashes, dashes, Link("Discrepancy", "discrepancy")),
+        _row(
+            "Figure 2: segments, delay (TDe), offset (TPE)",
+            dashes,
+            dashes,
+            Link("Discrepancy", "discrepancy"),
+        ),
         _row(
             "Figure 3: confusions, accuracy",
             dashes,

@@ -27,7 +27,9 @@ def roc(study: Study) -> Section | None:
         if len(curve.areas) > 1:
             marks.append(Band(curve.false_positive, *curve.band, f"{title} ± sd", colour, 0.18))
         marks.append(Line(curve.false_positive, curve.mean, title, colour, dash(name), 2.2))
-        keys.append(Key(f"{title}: area {mean_and_deviation(curve.areas)}", colour, dash(name)))
+        keys.append(
+            Key(f"{title}: micro AUROC {mean_and_deviation(curve.areas)}", colour, dash(name))
+        )
     x, y = (
         Axis(f"{kind} positive rate", limits=(-0.01, 1.01), kind="share", step=0.2)
         for kind in ("false", "true")

@@ -53,7 +53,7 @@ def scores(study: Study) -> Section | None:
     drawn = [name for name in shown if not (many and study.results.classes) or name in SELECTED]
     drawn = [name for name in drawn if METRICS[name].better > 0]
     figures = [_figure(study, drawn)] if drawn else []
-    published = any(key.mark == "diamond" for figure in figures for key in figure.keys)
+    published = any(key.mark == "diamond-open" for figure in figures for key in figure.keys)
     values |= {"figure": next(iter(figures), None), "published": published}
     return Section("scores", "Scores", values, figures)
 
@@ -91,7 +91,7 @@ def _table_values(
     for name, source in study.sources.items():
         used = f"{study.word} data: {real_data(source.real_data)}"
         known = ["fault protocol known"] if source.fault_protocol_known else []
-        row = [Cell(source_name(name), "; ".join([used, *known]), source=name)]
+        row = [Cell(source_name(name), "; ".join([name, used, *known]), source=name)]
         for metric in metrics:
             interval = source.interval(metric)
             text = mean_and_deviation(source.runs(metric))
@@ -151,7 +151,7 @@ def _figure(study: Study, metrics: Sequence[str]) -> Figure:
             heights = [metrics.index(m) + lanes[name] + 0.35 * width for m, _ in known]
             marks.append(_published_points(name, [value for _, value in known], heights))
     if len(marks) > len(metrics) + len(sources):
-        keys.append(Key("paper’s mean ± sd over its runs", "muted", "diamond"))
+        keys.append(Key("paper’s mean ± sd over its runs", "muted", "diamond-open"))
     ticks = {
         place + lane: source_name(name)
         for place in range(len(metrics))

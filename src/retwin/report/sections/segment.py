@@ -46,10 +46,10 @@ class Segment:
 
     @property
     def labels(self) -> tuple[str, str]:
-        """TDe, and TPE with its unit."""
+        """Delay, and offset with its unit."""
         delay = self.error.delay
-        tde = "TDe –" if math.isnan(delay) else f"TDe {number(1000 * delay, 0)} ms"
-        return tde, f"TPE {number(self.error.offset, 1)} {self.unit}".rstrip()
+        tde = "delay –" if math.isnan(delay) else f"delay {number(1000 * delay, 0)} ms"
+        return tde, f"offset {number(self.error.offset, 1)} {self.unit}".rstrip()
 
 
 def segment(study: Study) -> Segment | None:
@@ -90,8 +90,8 @@ def segment_figure(found: Segment) -> Figure:
     tde, tpe = found.labels
     window = error.onset, error.end
     difference = found.observed - found.nominal
-    delay = Dimension(*error.midpoints, "TDe", (64, 24))
-    offset = Dimension((error.settle, error.offset), (error.end, error.offset), "TPE", (0, -40))
+    delay = Dimension(*error.midpoints, "delay", (64, 24))
+    offset = Dimension((error.settle, error.offset), (error.end, error.offset), "offset", (0, -40))
     panels = [
         Panel(
             Axis("time", "s", limits),

@@ -46,7 +46,8 @@
     } else {
       at("result").replaceChildren();
     }
-    const few = `${content.healthy} healthy trajectories cannot guarantee ${rate} %: it requires at least ${Math.ceil(100 / rate) - 1} of them. `;
+    const none = "A false-alarm rate of 0 % cannot be promised by any number of healthy trajectories. ";
+    const few = `${content.healthy} healthy trajectories cannot promise ${rate} %: it requires at least ${Math.ceil(100 / rate) - 1} of them. `;
     const cheapest = best[0].rate ? `a false-alarm rate of ${percent(best[0].rate)}` : "never to raise an alarm";
     at("best").textContent = (decision ? "" : rate ? few : "") +
       `The lowest cost with these settings: ${cheapest} (cost ${best[1].cost.toFixed(0)}).`;
@@ -54,6 +55,8 @@
 
   at("source").append(...content.sources.map((source, i) => new Option(source.name, String(i))));
   at("source").value = String(content.first);
+  // Rounded up, so that the rate is the one that the page chose.
+  at("rate").value = String(content.rate === null ? 20 : Math.ceil(10 * content.rate - 1e-6) / 10);
   at("faulty").value = String(content.faulty);
   at("missed").value = String(content.missed);
   fields.forEach((name) => at(name).addEventListener("input", update));

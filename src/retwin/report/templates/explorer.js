@@ -1,19 +1,30 @@
 // The explorer: draws the trajectory that is picked, and moves through its time.
-(() => {
+(async () => {
   "use strict";
   const place = document.getElementById("explore");
   if (!place) return;
   const content = JSON.parse(document.getElementById("explorer-content").textContent);
   const at = (name) => document.getElementById("explore-" + name);
 
+  if (!window.DecompressionStream) {
+    at("answer").textContent = "The explorer requires a browser of 2023 or later.";
+    return;
+  }
   // See `packed` in explorer.py.
-  const unpack = (packed) => {
+  const unpack = async (packed) => {
     const bytes = Uint8Array.from(atob(packed.codes), (sign) => sign.charCodeAt(0));
-    const view = new DataView(bytes.buffer);
-    const flat = Array.from({ length: bytes.length / 2 }, (_, i) => {
-      const code = view.getInt16(2 * i, true);
-      return code === -32768 ? null : packed.low + packed.step * (code + 32767);
-    });
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+    const plane = new Uint8Array(await new Response(stream).arrayBuffer());
+    const count = plane.length / 2;
+    const stride = packed.shape.slice(packed.axis + 1).reduce((a, b) => a * b, 1);
+    const length = packed.shape[packed.axis];
+    const codes = new Uint16Array(count);
+    const flat = new Array(count);
+    for (let i = 0; i < count; i += 1) {
+      const change = plane[i] + 256 * plane[count + i];
+      codes[i] = Math.floor(i / stride) % length ? codes[i - stride] + change : change;
+      flat[i] = codes[i] === 65535 ? null : packed.low + packed.step * codes[i];
+    }
     const shaped = (values, shape) => {
       if (shape.length < 2) return values;
       const size = values.length / shape[0];
@@ -23,10 +34,13 @@
     return shaped(flat, packed.shape);
   };
   const names = ["commands", "nominal", "observed", "bands", "times"];
-  const data = Object.fromEntries(names.map((name) => [name, unpack(content[name])]));
-  const shares = content.probabilities && unpack(content.probabilities);
+  const data = {};
+  for (const name of names) data[name] = await unpack(content[name]);
+  const shares = content.probabilities && await unpack(content.probabilities);
   const latent = content.latent;
-  const pose = content.pose && { nominal: unpack(content.pose.nominal), observed: unpack(content.pose.observed) };
+  const pose = content.pose && {};
+  const bodies = ["nominal", "updated", "observed"].filter((name) => content.pose && content.pose[name]);
+  for (const name of bodies) pose[name] = await unpack(content.pose[name]);
   const seconds = data.nominal[0].map((_, i) => i / content.rate);
   const column = (rows, i) => rows.map((row) => row[i]);
   const titled = (name, unit) => (unit && unit !== "1" ? `${name}, ${unit}` : name);
@@ -71,7 +85,18 @@
     content.inputs.names.forEach((name, u) => traces.push(
       line(column(data.commands[picked], u), rows > 1 ? `y${rows}` : "y", name, { color: `@c${u % 8}`, width: 1.5, dash: ["solid", "dash", "dot", "dashdot"][u % 4] })));
     page.plot(at("outputs"), traces, layout);
+    if (listening) return;
+    listening = true;
+    // A click anywhere in the plot sets the time.
+    at("outputs").addEventListener("click", (event) => {
+      if (event.target.closest(".modebar")) return;
+      const axis = at("outputs")._fullLayout.xaxis;
+      const x = axis.p2d(event.clientX - at("outputs").getBoundingClientRect().left - axis._offset);
+      const found = Math.round(x * content.rate);
+      if (found >= 0 && found < seconds.length) move(found);
+    });
   };
+  let listening = false;
   const line = (y, yaxis, name, style) => ({
     type: "scatter", mode: "lines", x: seconds, y, yaxis, name, line: style,
     hovertemplate: `${page.escaped(name)} %{y:.4g} at %{x:.1f} s<extra></extra>`,
@@ -92,17 +117,18 @@
     });
     const { low, high } = content.pose;
     const most = Math.max(...low.map((value, i) => high[i] - value));
-    const scene = { aspectmode: "manual", aspectratio: {}, camera: { eye: { x: 1.2, y: -1.31, z: 0.48 }, center: { x: 0, y: 0, z: -0.14 } } };
+    const scene = { aspectmode: "manual", aspectratio: {}, camera: { eye: { x: 1.35, y: -1.48, z: 0.6 }, center: { x: 0, y: 0, z: -0.08 } } };
     ["x", "y", "z"].forEach((name, i) => {
       scene[`${name}axis`] = { range: [low[i], high[i]], title: { text: `${name}, m`, font: { size: 11 } }, tickfont: { size: 10 }, nticks: 5, color: "@muted", gridcolor: "@grid", linecolor: "@rule", zeroline: false, showspikes: false, showbackground: false };
       scene.aspectratio[name] = (high[i] - low[i]) / most;
     });
+    const styles = { nominal: ["@observed", 7, 0.55], updated: [`@c${content.colour}`, 6, 0.9], observed: ["@ink", 4, 1] };
     page.plot(at("pose"), [
-      path(pose.nominal[picked], "@observed"), path(pose.observed[picked], "@c0"),
-      chain(pose.nominal[picked][moment], "nominal", "@observed", 7, 0.55),
-      chain(pose.observed[picked][moment], "observed", "@c0", 5, 1),
+      ...bodies.map((name) => path(pose[name][picked], styles[name][0])),
+      ...bodies.map((name) => chain(pose[name][picked][moment], labels[name], ...styles[name])),
     ], { ...page.layout, height: 420, margin: { l: 24, r: 8, t: 0, b: 0 }, scene, uirevision: "kept" });
   };
+  const labels = { nominal: "nominal", updated: "updated twin", observed: "measured" };
 
   const cell = (tag, text, more = {}) => Object.assign(document.createElement(tag), { textContent: text, ...more });
   const row = (cells) => { const made = document.createElement("tr"); made.append(...cells); return made; };
@@ -158,8 +184,9 @@
     if (!at("outputs").data) return;
     Plotly.relayout(at("outputs"), { "shapes[0].x0": seconds[moment], "shapes[0].x1": seconds[moment] });
     if (!pose) return;
-    const both = [pose.nominal, pose.observed].map((points) => through(points[picked][moment]));
-    Plotly.restyle(at("pose"), Object.fromEntries(["x", "y", "z"].map((name) => [name, both.map((each) => each[name])])), [2, 3]);
+    const now = bodies.map((name) => through(pose[name][picked][moment]));
+    const moved = Object.fromEntries(["x", "y", "z"].map((name) => [name, now.map((each) => each[name])]));
+    Plotly.restyle(at("pose"), moved, bodies.map((_, i) => bodies.length + i));
   };
   const pick = (to) => {
     picked = (to + content.ids.length) % content.ids.length;
@@ -175,13 +202,48 @@
     if (pose) chains();
   };
 
-  content.classes.forEach((name, k) => {
-    const group = Object.assign(document.createElement("optgroup"), { label: name });
-    content.ids.forEach((id, i) => content.truth[i] === k && group.append(new Option(id, String(i))));
-    if (group.children.length) at("pick").append(group);
+  // The root mean square of the measured minus the nominal output, each divided by its range.
+  const ranges = content.outputs.names.map((_, d) => {
+    const all = data.nominal.flatMap((rows) => column(rows, d));
+    return all.reduce((a, b) => Math.max(a, b), -Infinity) - all.reduce((a, b) => Math.min(a, b), Infinity) || 1;
   });
-  const sequence = Array.from(at("pick").options, (option) => Number(option.value));
-  const step = (by) => pick(sequence[(sequence.indexOf(picked) + by + sequence.length) % sequence.length]);
+  const errors = content.ids.map((_, i) => {
+    let total = 0, count = 0;
+    data.observed[i].forEach((row, p) => row.forEach((value, d) => {
+      if (value === null) return;
+      total += ((value - data.nominal[i][p][d]) / ranges[d]) ** 2;
+      count += 1;
+    }));
+    return count ? Math.sqrt(total / count) : 0;
+  });
+  const wrong = content.ids.map((_, i) => Boolean(shares) && shares.some((each) =>
+    each[i].indexOf(Math.max(...each[i])) !== content.truth[i]));
+  const chosen = (name) => (at(name) ? at(name).value : "");
+  let sequence = [];
+  const list = () => {
+    const kept = content.ids.map((_, i) => i).filter((i) =>
+      (chosen("class") === "" || content.truth[i] === Number(chosen("class")))
+      && (chosen("right") === "" || wrong[i] === (chosen("right") === "wrong")));
+    const titles = content.classes.length ? content.classes : [""];
+    const option = (i) => new Option(content.ids[i], String(i));
+    if (chosen("order") === "error") {
+      kept.sort((a, b) => errors[b] - errors[a]);
+      at("pick").replaceChildren(...kept.map(option));
+    } else {
+      at("pick").replaceChildren(...titles.map((name, k) => {
+        const group = Object.assign(document.createElement("optgroup"), { label: name });
+        group.append(...kept.filter((i) => !content.classes.length || content.truth[i] === k).map(option));
+        return group;
+      }).filter((group) => group.children.length));
+    }
+    sequence = Array.from(at("pick").options, (each) => Number(each.value));
+    if (!sequence.length) at("answer").textContent = "No trajectory is like this.";
+    else if (!sequence.includes(picked)) pick(sequence[0]);
+    else at("pick").value = String(picked);
+  };
+  if (at("class")) at("class").append(...content.classes.map((name, k) => new Option(name, String(k))));
+  ["class", "right", "order"].forEach((name) => at(name) && at(name).addEventListener("change", list));
+  const step = (by) => sequence.length && pick(sequence[(sequence.indexOf(picked) + by + sequence.length) % sequence.length]);
   at("time").max = seconds.length - 1;
   at("pick").addEventListener("change", (event) => pick(Number(event.target.value)));
   at("minus").addEventListener("change", outputs);
@@ -202,12 +264,16 @@
     const [what, name] = location.hash.slice(1).split("=");
     const found = what === "trajectory" ? content.ids.indexOf(decodeURIComponent(name)) : -1;
     if (found < 0) return;
+    ["class", "right"].forEach((name) => { if (at(name)) at(name).value = ""; });
+    list();
     pick(found);
     place.scrollIntoView();
   };
   window.addEventListener("hashchange", follow);
   page.drawn.push(draw);
+  list();
   pick(sequence[0]);
   move(moment);
   follow();
+  place.dataset.ready = "yes";
 })();
