@@ -239,6 +239,7 @@ def synthetic(*, runs: int = 10, per_class: int = 10) -> Study:
                 "name": "real_a.mat",
                 "sha256": "b2" * 32,
                 "n": len(truth),
+                "rate": 100.0,
                 "ids": [f"real_a/{i:03d}" for i in range(len(truth))],
                 "labels": [CLASSES[label] for label in truth],
             },

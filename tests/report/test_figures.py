@@ -39,7 +39,7 @@ def test_a_segment_has_the_delay_and_the_offset_that_were_put_in(study: Content)
     assert found is not None
     assert (found.output, found.unit) == ("y", "mm")
     assert found.error.midpoints[0][1] == pytest.approx(150)
-    assert found.labels == ("TDe 80 ms", "TPE 5.0 mm")
+    assert found.labels == ("delay 80 ms", "offset 5.0 mm")
 
 
 def test_no_segment_without_one_that_was_measured(study: Content) -> None:

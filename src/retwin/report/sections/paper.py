@@ -102,7 +102,7 @@ def _distributions(study: Study, known: list[str]) -> list[list[Cell]]:
             f"{number(each[name].value, 2)} (p {number(each[name].p, 2)})" if name in each else "–"
             for each in found
         ]
-        what = f"Figure {figure}: {latent_names(name)[0]}, KS distance"
+        what = f"Figure {figure}: {in_sentence(latent_names(name)[0])}, KS distance"
         link = Link("Discrepancy", "discrepancy")
         rows.append(_row(what, ["–"] * len(known), here, link))
     return rows

@@ -93,18 +93,23 @@ const page = (() => {
   });
   // Paper is white and narrower than most screens, and does not scroll.
   const tables = document.querySelectorAll(".scroll > table");
+  // Height of the first sheet within its margins, less that of the line on top, in CSS pixels.
+  const SHEET = 950;
   let folded = [];
   window.addEventListener("beforeprint", () => {
     root.dataset.print = "yes";
     folded = parts.filter((part) => !part.open);
     folded.forEach((part) => { part.open = true; });
     draw();
+    const first = document.getElementById("summary");
+    first.style.zoom = Math.min(1, SHEET / first.offsetHeight);
     tables.forEach((table) => {
       table.style.zoom = Math.min(1, table.parentElement.clientWidth / table.offsetWidth);
     });
   });
   window.addEventListener("afterprint", () => {
     delete root.dataset.print;
+    document.getElementById("summary").style.zoom = "";
     tables.forEach((table) => { table.style.zoom = ""; });
     folded.forEach((part) => { part.open = false; });
     draw();

@@ -1,0 +1,83 @@
+"""The error before and after an update, and decisions that are certain."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from retwin.scores.change import error_change
+from retwin.scores.decisions import (
+    certain_decision,
+    decide,
+    detection_difference,
+    healthy_needed,
+)
+
+CLASSES = ["Healthy", "Stuck"]
+
+
+def test_errors_are_means_over_what_was_measured() -> None:
+    observed = np.zeros((6, 4, 2))
+    observed[0, 2:] = np.nan
+    before, after = np.full_like(observed, 0.002), np.full_like(observed, -0.001)
+    before[..., 1] = 0.004
+    found = error_change(before, after, observed, scale=[1000.0, 1000.0])
+    assert found is not None
+    assert (found.before, found.after) == pytest.approx((3.0, 1.0))
+    assert found.ratio == pytest.approx(1 / 3)
+    assert found.ratio_interval == pytest.approx((1 / 3, 1 / 3)), "no trajectory differs"
+    np.testing.assert_allclose(found.outputs_before, [2.0, 4.0])
+    assert found.trajectories == 6
+
+
+def test_few_trajectories_have_no_interval_and_none_no_change() -> None:
+    observed = np.zeros((4, 3, 1))
+    found = error_change(observed + 2, observed + 1, observed)
+    assert found is not None
+    assert found.ratio_interval is None
+    assert error_change(observed, observed, np.full_like(observed, np.nan)) is None
+
+
+def probabilities(fault: np.ndarray) -> np.ndarray:
+    return np.stack([1 - fault, fault], axis=1)
+
+
+@pytest.mark.parametrize("rate", [0.05, 0.1, 0.3])
+def test_healthy_needed_is_the_first_number_that_suffices(rate: float) -> None:
+    n = healthy_needed(rate)
+    assert (1 - rate) ** n <= 0.025 < (1 - rate) ** (n - 1)
+
+
+def test_a_certain_decision_keeps_its_rate() -> None:
+    """In 97.5 % of sets of healthy trajectories, the true rate of the threshold is not above."""
+    rng = np.random.default_rng(0)
+    truth = np.repeat([0, 1], [60, 20])
+    kept = 0
+    for _ in range(200):
+        fault = np.concatenate([rng.random(60), 0.5 + 0.5 * rng.random(20)])
+        found = certain_decision(probabilities(fault), truth, CLASSES, 0.1)
+        assert found is not None
+        kept += 1 - found.threshold <= 0.1  # healthy values are uniform
+    assert kept >= binom.ppf(1e-6, 200, 0.975)
+
+
+def test_too_few_for_certainty() -> None:
+    truth = np.repeat([0, 1], [10, 5])
+    fault = np.linspace(0, 1, 15)
+    assert certain_decision(probabilities(fault), truth, CLASSES, 0.1) is None
+
+
+def test_detection_is_compared_at_the_same_rate() -> None:
+    rng = np.random.default_rng(0)
+    truth = np.repeat([0, 1], 40)
+    good = np.concatenate([0.1 * rng.random(40), 0.9 + 0.1 * rng.random(40)])
+    poor = rng.random(80)
+    found = detection_difference(probabilities(good), probabilities(poor), truth, CLASSES, 0.1)
+    assert found is not None
+    difference, (low, high) = found
+    both = [decide(probabilities(each), truth, CLASSES, 0.1).detected for each in (good, poor)]
+    assert difference == pytest.approx(both[0] - both[1])
+    assert 0 < low <= difference <= high
+    same = detection_difference(probabilities(good), probabilities(good), truth, CLASSES, 0.1)
+    assert same == (0.0, (0.0, 0.0))
