@@ -10,6 +10,7 @@ from retwin._lazy import names
 _HOME = {
     "Bundle": "bundle.bundle",
     "Domain": "bundle.verdicts",
+    "ExportedActuator": "actuator.export",
     "ExportedFMU": "fmu.export",
     "Guard": "bundle.guard",
     "Portable": "onnx.portable",
@@ -17,6 +18,7 @@ _HOME = {
     "Simulated": "simulations",
     "SimulationPlan": "simulations",
     "Verdicts": "bundle.verdicts",
+    "export_actuator": "actuator.export",
     "export_fmu": "fmu.export",
     "export_onnx": "onnx.export",
     "fit_guard": "bundle.guard",

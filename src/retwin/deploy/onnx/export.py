@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -40,7 +40,7 @@ from retwin.update.corrections import SampledSensor
 from retwin.update.residual import Mixture, ResidualModel
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["PARITY", "export_onnx"]
+__all__ = ["PARITY", "export_onnx", "write_graph"]
 
 PARITY = 1e-5
 """Greatest difference between onnxruntime and torch, in standard units, of a graph."""
@@ -265,24 +265,56 @@ def _example_commands(bundle: Bundle) -> Tensor:
 
 
 def _write(graph: Graph, path: Path) -> None:
-    """Trace a module and write its ONNX, without the paths of its source files."""
-    count = torch.export.Dim("n", min=2)
-    length = torch.export.Dim("T", min=2)
+    """Trace a module and write its ONNX."""
+    lengths = {name: {1: "T"} for name in graph.any_length}
+    write_graph(graph.module, graph.inputs, path, lengths=lengths, strict=graph.strict)
+
+
+def write_graph(
+    module: nn.Module,
+    inputs: Mapping[str, Tensor],
+    path: Path,
+    *,
+    outputs: Sequence[str] = ("out",),
+    batch: Mapping[str, int] | None = None,
+    lengths: Mapping[str, Mapping[int, str]] | None = None,
+    strict: bool = False,
+) -> None:
+    """Trace a module and write its ONNX, without the paths of its source files.
+
+    Parameters
+    ----------
+    module : nn.Module
+        The module.
+    inputs : mapping of str to Tensor
+        Names of its inputs, and examples of them.
+    path : path
+        The file.
+    outputs : sequence of str
+        Names of its outputs.
+    batch : mapping of str to int, optional
+        The axis of each input that may have any length, of at least 2; by default the first.
+    lengths : mapping of str to mapping of int to str, optional
+        Further such axes of inputs, with their names.
+    strict : bool
+        Whether torch traces the code instead of one run.
+
+    """
+    dims = {"n": torch.export.Dim("n", min=2), "T": torch.export.Dim("T", min=2)}
     shapes = tuple(
-        {0: count, 1: length} if name in graph.any_length else {0: count} for name in graph.inputs
+        {(batch or {}).get(name, 0): dims["n"]}
+        | {axis: dims[each] for axis, each in (lengths or {}).get(name, {}).items()}
+        for name in inputs
     )
     with torch.no_grad(), _quiet():
         traced = torch.export.export(
-            graph.module.eval(),
-            tuple(graph.inputs.values()),
-            dynamic_shapes=shapes,
-            strict=graph.strict,
+            module.eval(), tuple(inputs.values()), dynamic_shapes=shapes, strict=strict
         )
         program = torch.onnx.export(
             traced,
             dynamo=True,
-            input_names=list(graph.inputs),
-            output_names=["out"],
+            input_names=list(inputs),
+            output_names=list(outputs),
             custom_translation_table=translations(),
             verbose=False,
         )

@@ -1,0 +1,310 @@
+"""`export_actuator`: what actuators execute, as TorchScript and ONNX, for many environments."""
+
+from __future__ import annotations
+
+import copy
+import math
+import warnings
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from retwin.checks import needs_extra, positive, require, whole
+from retwin.data.trajectories import Channels
+from retwin.deploy.actuator.draws import Draws, causal_part, drawn
+from retwin.deploy.actuator.module import AT_REST, Actuators, ActuatorStep
+from retwin.nets.networks import Standardise
+from retwin.serialisation.models import write_model
+from retwin.serialisation.places import check_place
+from retwin.twins.twin import checked_commands, checked_seed
+from retwin.update.corrected import CorrectedTwin
+from retwin.update.corrections import DelayOffset
+from retwin.update.surrogate import Surrogate
+
+__all__ = ["ExportedActuator", "export_actuator"]
+
+PARITY = 1e-5
+"""Greatest difference between a written file and torch, relative to the range of each output."""
+STILL = 1e-6
+"""Largest change of a command, relative to its range, that counts as none, as in `Segments`."""
+MAX_DRAWS = 10_000_000
+"""Draws of z at most: more would not fit in memory beside a simulation."""
+DATE = (1980, 1, 1, 0, 0, 0)
+"""The date of the parts of a file: the same twin gives the same bytes."""
+EXAMPLES, STEPS = 3, 40
+"""Environments and steps with which written files are compared with torch."""
+INPUTS = (
+    "command",
+    "uniform",
+    "delay",
+    "offset",
+    "probability",
+    "previous",
+    "reference",
+    "resting",
+    "missed",
+    "history",
+)
+"""Inputs of the ONNX graph, the state last."""
+STATE = INPUTS[5:]
+PARTS = ("before", "network", "after")
+"""Modules of a surrogate in series."""
+
+
+@dataclass(frozen=True)
+class ExportedActuator:
+    """What was written.
+
+    Attributes
+    ----------
+    folder : Path
+        The folder.
+    files : tuple of str
+        Names of its files.
+    inputs, outputs : Channels
+        Commands, and what is executed: positions that the actuators follow effectively, in the
+        unit of the commands, or the outputs of the twin.
+    period : float
+        Time between two steps in s.
+    delay : tuple of float
+        Mean and greatest delay in s.
+    early : float
+        Share of draws whose delay was before the command; they have none.
+    gain : tuple of float
+        Error per unit of distance from the mean target, of each output.
+    emulated : bool
+        Whether the twin was calibrated on an emulated system.
+
+    """
+
+    folder: Path
+    files: tuple[str, ...]
+    inputs: Channels
+    outputs: Channels
+    period: float
+    delay: tuple[float, float]
+    early: float
+    gain: tuple[float, ...]
+    emulated: bool
+
+
+def export_actuator(
+    twin: CorrectedTwin,
+    folder: str | Path,
+    *,
+    commands: NDArray,
+    seed: int,
+    period: float | None = None,
+    draws: int = 16384,
+    onnx: bool = True,
+) -> ExportedActuator:
+    """Write what the actuators of a corrected twin execute, for simulations of many robots.
+
+    The folder holds `actuator.pt` (TorchScript, with its state), `actuator.onnx` (a function of
+    command and state), and the draws of z in `weights.safetensors`. Each environment has one draw
+    per episode: a delay, offsets, and the probability that an actuator misses a segment.
+
+    Parameters
+    ----------
+    twin : CorrectedTwin
+        With `CommandSpace`, or with `DelayOffset` and one output per command; a sensor behind it is
+        left out.
+    folder : path
+        Where to write.
+    commands : NDArray
+        (n, T, d_u), commands like those of the task, at the rate of the twin: z is drawn at the
+        poses of their segments.
+    seed : int
+        Of the draws.
+    period : float, optional
+        Time between two steps in s; by default the sample period of the twin.
+    draws : int
+        Number of draws of z, from 1 to 1e7.
+    onnx : bool
+        Whether an ONNX graph is written too, for which the extra `onnx` must be installed.
+
+    Raises
+    ------
+    InputError
+        A twin that cannot be an actuator, with the reason; no segment in `commands`; or a file that
+        differs from torch by more than 1e-5 of the range of an output.
+
+    """
+    twin, operator = causal_part(twin)
+    whole("draws", draws, least=1, most=MAX_DRAWS)
+    seed = checked_seed(seed)
+    period = 1 / twin.rate if period is None else positive("period", period, unit="s")
+    files = ["model.json", "weights.safetensors", "actuator.pt", *(["actuator.onnx"] * onnx)]
+    check_place(folder, folder=True, holds=[*files, "actuator.onnx"])
+    if onnx:
+        for name in ("onnx", "onnxscript", "onnxruntime"):
+            needs_extra(name, "onnx", "writes and checks ONNX graphs")
+    given = checked_commands(commands, twin.inputs).astype(np.float32, copy=False)
+    found = drawn(twin, given, draws, seed)
+    at_outputs = isinstance(operator, DelayOffset)
+    outputs = twin.outputs if at_outputs else twin.inputs
+    actuators = _actuators(twin, given, found, period, at_outputs)
+    about = {
+        "case": twin.case,
+        "inputs": vars(twin.inputs),
+        "outputs": vars(outputs),
+        "operator": type(operator).__name__,
+        "period": period,
+        "history": actuators.length,
+        "at_rest": AT_REST,
+        "early": found.early,
+        "gain": found.gain.tolist(),
+        "emulated": twin.residual.emulated,
+    }
+    table = {name: getattr(actuators, name) for name in ("delays", "offsets", "probabilities")}
+    with write_model(folder, "actuator", about, table) as inside:
+        _write_script(actuators, inside / "actuator.pt", given)
+        if onnx:
+            _write_onnx(actuators, inside / "actuator.onnx", given)
+    return ExportedActuator(
+        Path(folder),
+        tuple(files),
+        twin.inputs,
+        outputs,
+        period,
+        (float(found.delay.mean()), float(found.delay.max())),
+        found.early,
+        tuple(found.gain.tolist()),
+        twin.residual.emulated,
+    )
+
+
+def _actuators(
+    twin: CorrectedTwin, commands: NDArray, found: Draws, period: float, at_outputs: bool
+) -> Actuators:
+    """The module, with the draws in steps."""
+    low, high = commands.min(axis=(0, 1)), commands.max(axis=(0, 1))
+    extent = np.where(high > low, high - low, 1)
+    change = np.abs(np.diff(commands, axis=1)).max(axis=(0, 1))
+    plant: nn.Module = nn.Identity()
+    if at_outputs:
+        assert isinstance(twin.surrogate, Surrogate)
+        before, network, after = (getattr(twin.surrogate, each) for each in PARTS)
+        network = copy.deepcopy(network).requires_grad_(False)
+        plant = nn.Sequential(_Standard(before, False), network, _Standard(after, True))
+    step = ActuatorStep(
+        plant,
+        gain=found.gain,
+        centre=found.centre,
+        low=found.low,
+        high=found.high,
+        tolerance=torch.as_tensor(STILL * extent, dtype=torch.float32),
+        speed=torch.as_tensor(change * twin.rate * period, dtype=torch.float32),
+        # A motion of the twin ends when a sample equals the one before.
+        rest=float(max(1, round(1 / (twin.rate * period)))),
+    )
+    delay = found.delay / period
+    length = math.floor(float(delay.max())) + 2
+    return Actuators(step, delay, found.offset, found.probability, length).eval()
+
+
+class _Standard(nn.Module):
+    """To standard units of a standardisation, or back: torch.jit cannot read that of `nets`."""
+
+    if TYPE_CHECKING:  # torch.jit reads no annotations of a class
+        mean: Tensor
+        scale: Tensor
+
+    def __init__(self, units: Standardise, back: bool) -> None:
+        super().__init__()
+        self.back = back
+        self.register_buffer("mean", units.mean.clone())
+        self.register_buffer("scale", units.scale.clone())
+
+    def forward(self, values: Tensor) -> Tensor:
+        return values * self.scale + self.mean if self.back else (values - self.mean) / self.scale
+
+
+def _examples(actuators: Actuators, commands: NDArray) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows of draws (EXAMPLES,), commands and noise (STEPS, EXAMPLES, d_u) to compare with."""
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randint(actuators.draws(), (EXAMPLES,), generator=generator)
+    trajectories = np.resize(np.arange(len(commands)), EXAMPLES)
+    times = np.linspace(0, commands.shape[1] - 1, STEPS).round().astype(int)
+    sent = torch.as_tensor(commands[trajectories][:, times]).transpose(0, 1).contiguous()
+    return rows, sent, torch.rand(sent.shape, generator=generator)
+
+
+def _expected(actuators: Actuators, commands: NDArray) -> Tensor:
+    """What the module executes for the examples, (STEPS, EXAMPLES, d_y)."""
+    rows, sent, uniform = _examples(actuators, commands)
+    actuators.start(sent[0], rows)
+    made = torch.stack([actuators(u, noise) for u, noise in zip(sent, uniform, strict=True)])
+    actuators.start(sent[0, :0], rows[:0])
+    return made
+
+
+def _check(what: str, found: Tensor, expected: Tensor) -> None:
+    extent = (expected.amax(dim=(0, 1)) - expected.amin(dim=(0, 1))).clamp_min(1e-30)
+    error = float(((found - expected).abs() / extent).max())
+    require(
+        error <= PARITY,
+        "twin",
+        expected=f"{what} that agrees with torch to {PARITY:g}",
+        got=f"a difference of {error:.2g}",
+        remedy="report this: the file is wrong",
+    )
+
+
+@torch.no_grad()
+def _write_script(actuators: Actuators, path: Path, commands: NDArray) -> None:
+    """The TorchScript file, read again and compared."""
+    expected = _expected(actuators, commands)
+    with warnings.catch_warnings():
+        # Isaac Lab and mjlab read TorchScript, which torch calls deprecated.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.jit.save(torch.jit.script(actuators), str(path))
+        _without_sources(path)
+        again: Any = torch.jit.load(str(path))
+    rows, sent, uniform = _examples(actuators, commands)
+    again.start(sent[0], rows)
+    found = [again(u, noise) for u, noise in zip(sent, uniform, strict=True)]
+    _check("TorchScript", torch.stack(found), expected)
+
+
+def _without_sources(path: Path) -> None:
+    """Leave out the names of source files, which torch writes for its messages."""
+    with zipfile.ZipFile(path) as archive:
+        kept = [(each, archive.read(each)) for each in archive.infolist()]
+    with zipfile.ZipFile(path, "w") as archive:
+        for each, data in kept:
+            if not each.filename.endswith(".debug_pkl"):
+                archive.writestr(zipfile.ZipInfo(each.filename, DATE), data)
+
+
+@torch.no_grad()
+def _write_onnx(actuators: Actuators, path: Path, commands: NDArray) -> None:
+    """The ONNX graph of one step, run by onnxruntime and compared."""
+    import onnxruntime
+
+    from retwin.deploy.onnx.export import write_graph
+
+    expected = _expected(actuators, commands)
+    rows, sent, uniform = _examples(actuators, commands)
+    actuators.start(sent[0], rows)
+    held = {name: getattr(actuators, name) for name in INPUTS[2:]}
+    inputs = {"command": sent[0], "uniform": uniform[0], **held}
+    batch = {name: 1 if name == "history" else 0 for name in inputs}
+    outputs = ("executed", *(f"next_{name}" for name in STATE))
+    write_graph(actuators.step, inputs, path, outputs=outputs, batch=batch)
+    actuators.start(sent[0, :0], rows[:0])
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    values = {name: each.numpy() for name, each in inputs.items()}
+    found = []
+    for u, noise in zip(sent, uniform, strict=True):
+        values |= {"command": u.numpy(), "uniform": noise.numpy()}
+        executed, *state = session.run(None, values)
+        values |= dict(zip(STATE, state, strict=True))
+        found.append(torch.as_tensor(executed))
+    _check("an ONNX graph", torch.stack(found), expected)

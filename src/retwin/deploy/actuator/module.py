@@ -1,0 +1,264 @@
+"""Actuators step by step: the causal form of `CommandSpace` and `DelayOffset`, for torch.jit.
+
+Within an episode an environment keeps its delay, its offsets and its probability of missing a
+segment. T_z(u) of `CommandSpace` then depends on past commands alone, from the end of the first
+segment on: all segments have the same delay, so that no segment is stretched, and the error is the
+same before and after a motion, so that it need not be known how far the motion will go. A gain per
+actuator changes the error in proportion to the command, which T_z interpolates in the same way.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["AT_REST", "ActuatorStep", "Actuators"]
+
+AT_REST = 1e6
+"""Steps at rest with which an episode begins: more than any number of steps that counts as rest."""
+
+
+class ActuatorStep(nn.Module):
+    """One step of n environments as a function of their state; nothing is remembered.
+
+    Parameters
+    ----------
+    plant : nn.Module
+        Commands (n, d_u) to undelayed outputs (n, d_y): the identity, or a network without memory.
+    gain, centre, low, high : Tensor
+        (d_y,), the error in proportion to the distance of the output from `centre`, within the
+        range from `low` to `high`, in which the gain was estimated.
+    tolerance : Tensor
+        (d_u,), the largest change of a command that counts as none.
+    speed : Tensor
+        (d_u,), the largest change per step at which an actuator catches up with a missed segment.
+    rest : float
+        Steps without a change after which a change begins a new segment.
+
+    """
+
+    if TYPE_CHECKING:  # torch.jit reads no annotations of a class
+        gain: Tensor
+        centre: Tensor
+        low: Tensor
+        high: Tensor
+        tolerance: Tensor
+        speed: Tensor
+
+    def __init__(
+        self,
+        plant: nn.Module,
+        *,
+        gain: Tensor,
+        centre: Tensor,
+        low: Tensor,
+        high: Tensor,
+        tolerance: Tensor,
+        speed: Tensor,
+        rest: float,
+    ) -> None:
+        super().__init__()
+        self.plant = plant
+        self.rest = rest
+        numbers = {"gain": gain, "centre": centre, "low": low, "high": high}
+        for name, values in (numbers | {"tolerance": tolerance, "speed": speed}).items():
+            self.register_buffer(name, values)
+
+    def forward(
+        self,
+        command: Tensor,
+        uniform: Tensor,
+        delay: Tensor,
+        offset: Tensor,
+        probability: Tensor,
+        previous: Tensor,
+        reference: Tensor,
+        resting: Tensor,
+        missed: Tensor,
+        history: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Execute a command.
+
+        Parameters
+        ----------
+        command : Tensor, shape (n, d_u)
+            The commands that are sent in this step.
+        uniform : Tensor, shape (n, d_u)
+            Uniform noise in [0, 1): a segment that begins is missed below the probability.
+        delay : Tensor, shape (n, 1)
+            In steps, from 0 to L - 2.
+        offset : Tensor, shape (n, d_y)
+            The error at `centre`, in the output's unit.
+        probability : Tensor, shape (n, d_u)
+            That an actuator misses a segment.
+        previous : Tensor, shape (n, d_u)
+            The commands of the step before.
+        reference : Tensor, shape (n, d_u)
+            What the actuators followed in the step before, without delay and error.
+        resting : Tensor, shape (n, 1)
+            Steps since a command changed.
+        missed : Tensor, shape (n, d_u)
+            1 where an actuator misses the current segment.
+        history : Tensor, shape (L, n, d_y)
+            Undelayed outputs of the last L steps, the newest last.
+
+        Returns
+        -------
+        tuple of Tensor
+            What is executed (n, d_y), and the new state in the order of the arguments.
+
+        """
+        change = (command - previous).abs()
+        moving = (change > self.tolerance).any(dim=1, keepdim=True)
+        begins = moving & (resting >= self.rest)
+        missed = torch.where(begins, (uniform < probability).to(missed.dtype), missed)
+        resting = torch.where(moving, torch.zeros_like(resting), resting + 1.0)
+        limit = torch.maximum(change, self.speed)
+        behind = command - reference
+        followed = reference + torch.minimum(torch.maximum(behind, -limit), limit)
+        # Exactly the command where it is reached: a sum of differences is rounded.
+        followed = torch.where(behind.abs() <= limit, command, followed)
+        reference = torch.where(missed > 0.5, reference, followed)
+        history = torch.cat([history[1:], self.plant(reference)[None]])
+        whole = delay.floor()
+        newer = (history.shape[0] - 1 - whole.to(torch.int64))[None].expand(
+            1, history.shape[1], history.shape[2]
+        )
+        after = history.gather(0, newer)[0]
+        before = history.gather(0, newer - 1)[0]
+        undelayed = after + (delay - whole) * (before - after)
+        error = offset + self.gain * (torch.clamp(undelayed, self.low, self.high) - self.centre)
+        return undelayed + error, command, reference, resting, missed, history
+
+
+class Actuators(nn.Module):
+    """Actuators of n environments with their state and the draws of z: what TorchScript holds.
+
+    Call `start` once, `reset` for environments whose episode begins anew, and the module itself in
+    each step.
+
+    Parameters
+    ----------
+    step : ActuatorStep
+        One step.
+    delays, offsets, probabilities : Tensor
+        (K, 1), (K, d_y) and (K, d_u), the draws of z.
+    length : int
+        Steps in the history, L.
+
+    """
+
+    if TYPE_CHECKING:  # torch.jit reads no annotations of a class
+        delays: Tensor
+        offsets: Tensor
+        probabilities: Tensor
+        delay: Tensor
+        offset: Tensor
+        probability: Tensor
+        previous: Tensor
+        reference: Tensor
+        resting: Tensor
+        missed: Tensor
+        history: Tensor
+
+    def __init__(
+        self,
+        step: ActuatorStep,
+        delays: Tensor,
+        offsets: Tensor,
+        probabilities: Tensor,
+        length: int,
+    ) -> None:
+        super().__init__()
+        self.step = step
+        self.length = length
+        self.at_rest = AT_REST
+        for name, values in (
+            ("delays", delays),
+            ("offsets", offsets),
+            ("probabilities", probabilities),
+            ("delay", delays[:0]),
+            ("offset", offsets[:0]),
+            ("probability", probabilities[:0]),
+            ("previous", probabilities[:0]),
+            ("reference", probabilities[:0]),
+            ("resting", delays[:0]),
+            ("missed", probabilities[:0]),
+            ("history", offsets.new_zeros(length, 0, offsets.shape[1])),
+        ):
+            self.register_buffer(name, values.clone())
+
+    @torch.jit.export
+    def draws(self) -> int:
+        """The number of draws of z, K."""
+        return self.delays.shape[0]
+
+    @torch.jit.export
+    def start(self, command: Tensor, row: Tensor) -> None:
+        """Begin an episode in n environments.
+
+        Parameters
+        ----------
+        command : Tensor, shape (n, d_u)
+            Commands at which the actuators rest.
+        row : Tensor, shape (n,)
+            Which draw of z each environment has, below `draws()`.
+
+        """
+        n = command.shape[0]
+        self.delay = self.delays[row]
+        self.offset = self.offsets[row]
+        self.probability = self.probabilities[row]
+        self.previous = command.clone()
+        self.reference = command.clone()
+        self.resting = torch.full([n, 1], self.at_rest, dtype=command.dtype, device=command.device)
+        self.missed = torch.zeros_like(command)
+        self.history = self.step.plant(command)[None].expand(self.length, -1, -1).clone()
+
+    @torch.jit.export
+    def reset(self, environments: Tensor, command: Tensor, row: Tensor) -> None:
+        """Begin a new episode in some environments.
+
+        Parameters
+        ----------
+        environments : Tensor, shape (m,)
+            Their indices.
+        command : Tensor, shape (m, d_u)
+            Commands at which their actuators rest.
+        row : Tensor, shape (m,)
+            Which draw of z each of them has.
+
+        """
+        # Not in place: under torch.inference_mode tensors of another mode cannot be changed.
+        self.delay = self.delay.index_copy(0, environments, self.delays[row])
+        self.offset = self.offset.index_copy(0, environments, self.offsets[row])
+        self.probability = self.probability.index_copy(0, environments, self.probabilities[row])
+        self.previous = self.previous.index_copy(0, environments, command)
+        self.reference = self.reference.index_copy(0, environments, command)
+        self.resting = self.resting.index_fill(0, environments, self.at_rest)
+        self.missed = self.missed.index_fill(0, environments, 0.0)
+        rested = self.step.plant(command)[None].expand(self.length, -1, -1)
+        self.history = self.history.index_copy(1, environments, rested)
+
+    def forward(self, command: Tensor, uniform: Tensor) -> Tensor:
+        """What is executed (n, d_y) for the commands of this step; see `ActuatorStep`."""
+        executed, previous, reference, resting, missed, history = self.step(
+            command,
+            uniform,
+            self.delay,
+            self.offset,
+            self.probability,
+            self.previous,
+            self.reference,
+            self.resting,
+            self.missed,
+            self.history,
+        )
+        self.previous = previous
+        self.reference = reference
+        self.resting = resting
+        self.missed = missed
+        self.history = history
+        return executed
