@@ -106,6 +106,7 @@ _HOME = {
     "Trajectories": "data.trajectories",
     "Twin": "twins.twin",
     "evaluate": "evaluation.diagnosers",
+    "export_actuator": "deploy.actuator.export",
     "fetch": "data.download",
     "fit_diagnoser": "diagnosis",
     "fit_inversion": "diagnosis",
@@ -163,6 +164,7 @@ if TYPE_CHECKING:
     from retwin.data.io import load, save
     from retwin.data.segments import Segments
     from retwin.data.trajectories import Channels, Trajectories
+    from retwin.deploy.actuator.export import export_actuator
     from retwin.diagnosis import (
         DANN,
         Diagnoser,

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
 import json
+import re
+import sys
+import types
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +24,7 @@ from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.residual import SequenceMixture
 from retwin.update.residual.sequence import SequenceResidual
 
+EXAMPLES = Path(__file__).parents[2] / "examples" / "actuators"
 RATE, STEPS, WIDTH = 50.0, 120, 2
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.:DeprecationWarning")
 
@@ -299,3 +305,151 @@ def test_wrong_arguments_are_named(how: Any, message: str, tmp_path: Path) -> No
     with pytest.raises(InputError, match=message):
         export_actuator(corrected(), tmp_path / "a", **given)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_command_line_exports_with_the_commands_of_a_case(call, tmp_path: Path) -> None:
+    surrogate_, residual = (getattr(corrected(), each) for each in ("surrogate", "residual"))
+    (tmp_path / "case.toml").write_text(CASE)
+    (tmp_path / "joints.py").write_text("def follow(u):\n    return u[:, [0, 1, 0]]\n")
+    twin = rt.CorrectedTwin(surrogate_, residual, case=str(tmp_path / "case.toml"))
+    twin.save(tmp_path / "model")
+    out = tmp_path / "actuator"
+    words = ("export", "actuator", tmp_path / "model", "--out", out, "--torchscript-only")
+    code, printed, err = call(*words, "--period", 0.01, "--draws", 30, "--json")
+    assert code == 0, err
+    answer = json.loads(printed)
+    assert (answer["period"], answer["files"][-1]) == (0.01, "actuator.pt")
+    assert torch.jit.load(out / "actuator.pt").draws() == 30
+    code, _, err = call(*words[:3], "--out", tmp_path / "model" / "model.json")
+    assert (code, "path" in err) == (2, True), err
+    corrected(rt.DelayOffset()).save(tmp_path / "other")
+    code, _, err = call(*words[:2], tmp_path / "other", "--out", tmp_path / "no")
+    assert (code, "3 outputs for 2 commands" in err) == (2, True), err
+    assert not (tmp_path / "no").exists()
+
+
+CASE = """
+name = "joints"
+title = "Two joints"
+twin = "joints:follow"
+rate = 50
+correction = "command_space"
+
+[inputs]
+u0 = { low = -1, high = 1 }
+u1 = { low = -1, high = 1 }
+
+[outputs]
+y0 = {}
+y1 = {}
+y2 = {}
+
+[commands]
+kind = "HoldSampler"
+duration = 4
+"""
+
+
+class Drive:
+    """Stands in for the PD drives of both tools: torques are errors of position."""
+
+    def __init__(self, cfg: Any, *args: Any, **kwargs: Any) -> None:
+        self.cfg, self._num_envs, self._device = cfg, 5, "cpu"
+        self.resets: list[Any] = []
+
+    def initialize(self, mj_model: Any, model: Any, data: Any, device: str) -> None:
+        assert data.nworld == 5
+
+    def reset(self, env_ids: Any = None) -> None:
+        self.resets.append(env_ids)
+
+
+class IsaacLabDrive(Drive):
+    def compute(self, control_action: Any, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> Any:
+        control_action.joint_efforts = control_action.joint_positions - joint_pos
+        return control_action
+
+
+class MjlabDrive(Drive):
+    def compute(self, cmd: Any) -> torch.Tensor:
+        return cmd.position_target - cmd.pos
+
+
+@dataclasses.dataclass
+class ActuatorCmd:
+    """The fields that mjlab documents."""
+
+    position_target: torch.Tensor
+    velocity_target: torch.Tensor
+    effort_target: torch.Tensor
+    pos: torch.Tensor
+    vel: torch.Tensor
+
+
+@dataclasses.dataclass(kw_only=True)
+class DriveCfg:
+    stiffness: float = 1.0
+
+
+def wrapper(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The example, which imports stand-ins."""
+    isaac, mjlab = types.ModuleType("isaaclab.actuators"), types.ModuleType("mjlab.actuator")
+    isaac.IdealPDActuator, isaac.IdealPDActuatorCfg = IsaacLabDrive, DriveCfg  # type: ignore[attr-defined]
+    utils = types.ModuleType("isaaclab.utils")
+    utils.configclass = dataclasses.dataclass(kw_only=True)  # type: ignore[attr-defined]
+    mjlab.IdealPdActuator, mjlab.IdealPdActuatorCfg = MjlabDrive, DriveCfg  # type: ignore[attr-defined]
+    mjlab.ActuatorCmd = ActuatorCmd  # type: ignore[attr-defined]
+    for each in (isaac, mjlab, utils):
+        monkeypatch.setitem(sys.modules, each.__name__.partition(".")[0], types.ModuleType("none"))
+        monkeypatch.setitem(sys.modules, each.__name__, each)
+    monkeypatch.syspath_prepend(EXAMPLES)
+    for each in ("effective", name):
+        monkeypatch.delitem(sys.modules, each, raising=False)
+    return importlib.import_module(name)
+
+
+@pytest.mark.parametrize("name", ["isaac_lab", "mjlab_actuator"])
+def test_the_wrappers_keep_the_documented_signatures(
+    name: str, exported: tuple[rt.CorrectedTwin, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = wrapper(name, monkeypatch)
+    how = {"file": str(exported[1] / "actuator.pt"), "unit": 0.5, "zero": 0.1}
+    cfg = module.RetwinActuatorCfg(**how)
+    if name == "isaac_lab":
+        made = module.RetwinActuator(cfg, ["a", "b"], slice(None), 5, "cpu")
+    else:
+        made = cfg.build(None, [0, 1], ["a", "b"])
+        made.initialize(None, None, types.SimpleNamespace(nworld=5), "cpu")
+
+    def torque(target: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:
+        if name == "mjlab_actuator":
+            return made.compute(ActuatorCmd(target, *[torch.zeros(5, 2)] * 2, joint_pos, joint_pos))
+        action = types.SimpleNamespace(joint_positions=target)
+        return made.compute(action, joint_pos, torch.zeros(5, 2)).joint_efforts
+
+    position, target = torch.zeros(5, 2), torch.full((5, 2), 0.3)
+    made.reset([0, 1, 2, 3, 4])
+    first = torque(position, position)
+    # At rest the torque is that of the offsets, in the joint's unit.
+    model = made.effective.model
+    error = 0.5 * (model.offset + model.step.gain * (-0.2 - model.step.centre))
+    torch.testing.assert_close(first, error, atol=1e-5, rtol=0)
+    before = made.effective.model.delay.clone()
+    for _ in range(20):
+        torque(target, position)
+    made.reset(torch.tensor([1]))
+    torque(target, position)
+    after = made.effective.model.delay
+    assert (before != after).flatten().tolist() == [False, True, False, False, False]
+    assert len(made.resets) == 2
+
+
+@pytest.mark.slow
+def test_the_code_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = EXAMPLES.parents[1] / "docs" / "actuator.md"
+    code = "".join(re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
+    names: dict = {}
+    exec(compile(code, str(page), "exec"), names)
+    assert names["effective"].shape == (4096, 4)
+    assert 0 < names["made"].delay[0] < 0.2

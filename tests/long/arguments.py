@@ -72,6 +72,7 @@ BASE = {
     "diagnose predict": "cnn real.npz",
     "fit": "reach.toml --real real.npz --simulations 20",
     "generate": "model --case reach.toml --per-class 1",
+    "export actuator": "model --torchscript-only",
     "export fmu": "model",
     "identify": "own_of_mutations:reach real.npz --inputs first,second --outputs far,high --rate 10"
     " --free length=0.5:2",

@@ -7,23 +7,22 @@ from typing import Annotated, Literal
 
 import typer
 
-from retwin.cli.options import Json
+from retwin.checks import require
+from retwin.cli.options import Json, OtherCase, Seed
 from retwin.cli.reading import updated_twin
 from retwin.cli.terminal import answer, bar, example, note
 from retwin.serialisation.places import check_place
 
 __all__ = ["app"]
 
+TRAJECTORIES = 256
+"""Trajectories of the case's sampler at whose segments z is drawn."""
+
 app = typer.Typer(
     help="Take an updated twin to other tools.",
     epilog=example("retwin export fmu model --out twin.fmu"),
     no_args_is_help=True,
 )
-
-
-@app.callback()
-def _export() -> None:
-    """Without it, the only command would be the group itself."""
 
 
 @app.command(epilog=example("retwin export fmu model --out twin.fmu --version 3.0"))
@@ -56,6 +55,76 @@ def fmu(
     answer(
         {"saved": str(out), "variables": list(made.variables), "delay": made.delay},
         *([delayed] if made.delay else []),
+        as_json=as_json,
+    )
+    note(f"Saved {out}")
+
+
+@app.command(epilog=example("retwin export actuator model --out actuator --period 0.005"))
+def actuator(
+    model: Annotated[
+        Path, typer.Argument(metavar="MODEL", help="Folder of a corrected twin, of retwin fit.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")],
+    period: Annotated[
+        float | None,
+        typer.Option(metavar="S", help="Seconds between two steps; else the sample period."),
+    ] = None,
+    draws: Annotated[int, typer.Option(metavar="N", help="Draws of the discrepancy.")] = 16384,
+    torchscript_only: Annotated[
+        bool, typer.Option("--torchscript-only", metavar="", help="Write no ONNX graph.")
+    ] = False,
+    case: OtherCase = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Write what the actuators execute, for many simulated robots at once."""
+    import numpy as np
+
+    from retwin import cases
+    from retwin.deploy.actuator.draws import causal_part
+    from retwin.deploy.actuator.export import export_actuator
+
+    check_place(out, folder=True)
+    twin, _ = causal_part(updated_twin(model))
+    require(
+        case or twin.case,
+        "case",
+        expected="the name of a case, whose commands are sampled",
+        got=f"none, and {model} was saved without one",
+        remedy="give --case",
+    )
+    sampler = cases.get(case or twin.case).sampler
+    commands = sampler.sample(TRAJECTORIES, rng=np.random.default_rng(seed))
+    with bar("export") as show:
+        show("compile", 0.0)
+        made = export_actuator(
+            twin,
+            out,
+            commands=commands,
+            seed=seed,
+            period=period,
+            draws=draws,
+            onnx=not torchscript_only,
+        )
+    mean, greatest = made.delay
+    shown = [f"Delays are {1000 * mean:.3g} ms on average and {1000 * greatest:.3g} ms at most."]
+    if made.early:
+        shown.append(f"{made.early:.1%} of the delays were before the command and are 0.")
+    if made.emulated:
+        shown.append("The twin was calibrated on an emulated system.")
+    answer(
+        {
+            "saved": str(out),
+            "files": list(made.files),
+            "outputs": list(made.outputs.names),
+            "period": made.period,
+            "delay": {"mean": mean, "max": greatest},
+            "early": made.early,
+            "gain": list(made.gain),
+            "emulated": made.emulated,
+        },
+        *shown,
         as_json=as_json,
     )
     note(f"Saved {out}")

@@ -141,7 +141,7 @@ def export_actuator(
     seed = checked_seed(seed)
     period = 1 / twin.rate if period is None else positive("period", period, unit="s")
     files = ["model.json", "weights.safetensors", "actuator.pt", *(["actuator.onnx"] * onnx)]
-    check_place(folder, folder=True, holds=[*files, "actuator.onnx"])
+    check_place(folder, folder=True, holds=files)
     if onnx:
         for name in ("onnx", "onnxscript", "onnxruntime"):
             needs_extra(name, "onnx", "writes and checks ONNX graphs")
