@@ -26,6 +26,8 @@ from retwin.cli import app
 DOCS, TESTS = ROOT / "docs", ROOT / "tests"
 HERE = ("extending.md", "own_data.md", "own_simulator.md", "tanks.md")
 """Pages whose blocks run below, one after the other."""
+LONG = ("own_simulator.md",)
+"""Of these, pages that take longer than the fast tests may."""
 APART = ("fmu.md", "pitfalls.md", "scale.md", "tutorial.md")
 """Pages with a test of their own below."""
 SMALL = "--sources dt --per-class 9"
@@ -80,7 +82,9 @@ def test_no_python_block_is_left_out() -> None:
             assert f'"{page.name}"' in running, f"no test runs the Python of {page.name}"
 
 
-@pytest.mark.parametrize("page", HERE)
+@pytest.mark.parametrize(
+    "page", [pytest.param(each, marks=[pytest.mark.slow] * (each in LONG)) for each in HERE]
+)
 def test_the_code_of_a_page_runs(page: str, module: ModuleType) -> None:
     names = run(page, vars(module))
     if page == "extending.md":

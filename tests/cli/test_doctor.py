@@ -100,6 +100,7 @@ def test_what_is_needed_and_missing_is_broken(call, healthy: pytest.MonkeyPatch)
     assert "1 broken: retwin cannot work like this" in whole
 
 
+@pytest.mark.slow
 def test_a_library_that_does_not_load(healthy: pytest.MonkeyPatch, tmp_path: Path) -> None:
     broken = "raise OSError('libmujoco.so.1: cannot open\\nshared object file')"
     (tmp_path / "mujoco.py").write_text(broken)

@@ -70,6 +70,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_state_equations_are_fitted_and_generate(folder: Path, tmp_path: Path, call) -> None:
     case, data, out = folder / "case.toml", folder / "d.csv", tmp_path / "model"
     code, printed, _ = call("fit", case, "--data", data, "--dynamics", "--out", out, "--json")

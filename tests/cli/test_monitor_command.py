@@ -110,6 +110,7 @@ def test_what_is_no_monitor_is_refused(folder: Path, call) -> None:
     assert (code, "monitor" in err) == (2, True), err
 
 
+@pytest.mark.slow
 def test_trajectories_are_watched_by_a_diagnoser(folder: Path, call, tmp_path: Path) -> None:
     case = ("--case", folder / "case.toml")
     code, _, err = call("diagnose", "invert", folder / "model", "--out", tmp_path / "physics")

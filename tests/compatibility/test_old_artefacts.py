@@ -106,7 +106,9 @@ def test_a_corrected_twin_simulates_the_same(name: str, then: Mapping[str, NDArr
     np.testing.assert_allclose(outputs, then[f"{name}/mean"], atol=ERROR)
 
 
-@pytest.mark.parametrize("name", ["cnn", "lstm_classifier", "inversion", "rocket"])
+@pytest.mark.parametrize(
+    "name", ["cnn", "lstm_classifier", "inversion", pytest.param("rocket", marks=pytest.mark.slow)]
+)
 def test_a_diagnoser_gives_the_same_probabilities(
     name: str, then: Mapping[str, NDArray], measured: rt.Trajectories
 ) -> None:

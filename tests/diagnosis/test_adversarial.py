@@ -45,6 +45,7 @@ def target() -> rt.Trajectories:
     return toy(200, seed=1, real=True)
 
 
+@pytest.mark.slow
 def test_ignores_a_difference_that_only_the_twin_has(
     source: rt.Trajectories, target: rt.Trajectories
 ) -> None:

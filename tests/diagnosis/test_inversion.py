@@ -205,6 +205,7 @@ def toy_diagnoser() -> InversionDiagnoser:
     )
 
 
+@pytest.mark.slow
 def test_any_twin_with_actuators(toy_diagnoser: InversionDiagnoser) -> None:
     """Two actuators, three outputs, onsets that nobody knows."""
     for label in TOY:

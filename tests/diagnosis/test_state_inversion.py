@@ -33,6 +33,8 @@ from retwin.twins import (
 from retwin.twins.system_faults import measured_with
 from retwin.update import Dynamics, Library, fit_dynamics
 
+pytestmark = pytest.mark.slow  # they stand on one long fit
+
 RATE, STEPS, KNOWN, EACH = 2.0, 160, 4, 3
 NOISE = 0.02
 BOUNDS = {"low": -1.0, "high": 3.0}
@@ -121,7 +123,6 @@ def diagnosis(diagnoser, records) -> StateDiagnosis:
     return diagnoser.diagnose(records[0][KNOWN:])
 
 
-@pytest.mark.slow
 def test_faults_are_found(diagnosis, records) -> None:
     best = np.array(diagnosis.classes)[diagnosis.probabilities.argmax(axis=1)]
     labels = records[0].labels[KNOWN:]
@@ -132,7 +133,6 @@ def test_faults_are_found(diagnosis, records) -> None:
     np.testing.assert_allclose(diagnosis.probabilities.sum(axis=1), 1.0)
 
 
-@pytest.mark.slow
 def test_sizes_and_onsets_are_in_their_intervals(diagnosis, records) -> None:
     made, faults = records
     inside: dict[str, list[bool]] = {"size": [], "onset": []}
@@ -150,7 +150,6 @@ def test_sizes_and_onsets_are_in_their_intervals(diagnosis, records) -> None:
     assert np.sum(inside["onset"]) >= 7
 
 
-@pytest.mark.slow
 def test_a_fault_that_is_not_known_is_unknown(diagnoser, records) -> None:
     made = records[0][KNOWN:]
     faults = {name: each for name, each in FAULTS.items() if name != "weak"}
@@ -254,7 +253,6 @@ def test_records_of_another_system_are_refused(diagnoser, records) -> None:
         StateInversionDiagnoser(diagnoser.twin, late).diagnose(records[0][:1])
 
 
-@pytest.mark.slow
 def test_the_page_of_faults() -> None:
     page = (Path(__file__).parents[2] / "docs" / "faults.md").read_text("utf-8")
     names: dict = {"__name__": "shown"}

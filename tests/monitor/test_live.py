@@ -364,6 +364,7 @@ def test_producers_share_commits_and_one_that_is_refused_fails_alone(store: Stor
         gate.send(samples(made[:1], 50))
 
 
+@pytest.mark.slow
 def test_alarms_are_explained_beside_the_stream_and_after_a_restart(store: Store) -> None:
     live, made = opened(store), rows(recorded(5, LEAK))
     reported = []

@@ -439,6 +439,7 @@ def drawn_discrepancy(
     return made.observed - made.nominal
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "correction"),
     [

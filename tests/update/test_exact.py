@@ -68,11 +68,13 @@ def test_a_twin_is_corrected_without_a_surrogate(
     assert abs(made.observed - measured.observed).mean() < abs(measured.residual).mean()
 
 
+@pytest.mark.slow
 def test_finite_differences_are_a_warning_on_cost(measured: rt.Trajectories) -> None:
     with pytest.warns(UserWarning, match=r"simulates it once per component of z; .*fit_surrogate"):
         rt.infer_discrepancy(TWIN, measured, rt.CommandSpace())
 
 
+@pytest.mark.slow
 def test_what_needs_a_surrogate_is_refused(measured: rt.Trajectories, tmp_path: Path) -> None:
     residual = rt.fit_residual(TWIN, measured, rt.DelayOffset(), BRIEF, seed=0)
     with pytest.raises(rt.InputError, match="fit one with fit_surrogate"):
@@ -92,6 +94,7 @@ def test_what_needs_a_surrogate_is_refused(measured: rt.Trajectories, tmp_path: 
         rt.fit_residual(TWIN, measured, rt.CommandSpace(), refined, seed=0)
 
 
+@pytest.mark.slow
 def test_a_twin_is_inverted_and_its_diagnoser_is_not_saved(
     measured: rt.Trajectories, tmp_path: Path
 ) -> None:

@@ -116,6 +116,7 @@ def test_the_error_is_that_on_the_commands(surrogate: rt.Surrogate) -> None:
     assert surrogate_variance(TWIN, TWIN, sent, segments) is None, "an exact twin has no error"
 
 
+@pytest.mark.slow
 def test_offsets_of_outputs_and_diagnoses_are_less_certain_too(
     surrogate: rt.Surrogate, tmp_path: Path
 ) -> None:

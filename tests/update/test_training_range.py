@@ -67,6 +67,7 @@ USES: dict[str, Callable[[rt.CorrectedTwin, float], object]] = {
 FAULTS = {"Healthy": None, "Bias": rt.ActuatorBias(0, size=(10.0, 20.0))}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("use", USES)
 def test_commands_beyond_the_training_warn_once_per_call(
     use: str, updated: rt.CorrectedTwin

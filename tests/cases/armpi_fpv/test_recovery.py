@@ -151,6 +151,7 @@ def test_rest_without_movement() -> None:
     assert recover_commands(made.path[:0], arm=ARM).commands.shape == (0, 1020, 4)
 
 
+@pytest.mark.slow
 def test_what_is_no_path_of_the_arm_is_not_explained() -> None:
     rng = np.random.default_rng(7)
     made = Made(2, 8, real=True)

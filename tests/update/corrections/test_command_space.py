@@ -255,6 +255,7 @@ def test_a_fault_does_not_pass_for_a_discrepancy(exact, commands: np.ndarray) ->
     assert error[0, :, 1:].abs().mean() < 2 * error[1:, :, 1:].abs().mean()
 
 
+@pytest.mark.slow
 def test_a_surrogate_with_memory_gives_the_same(exact, commands: np.ndarray) -> None:
     class Remembering:
         def __call__(self, values: Tensor) -> Tensor:
@@ -314,6 +315,7 @@ def test_polling_phases_do_not_compete_for_samples(
         assert mask[i, used].all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_samples", [200, 50])
 def test_the_polling_phase_does_not_change_z(
     two_phases: tuple[rt.Context, Tensor, Tensor], max_samples: int

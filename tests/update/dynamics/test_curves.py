@@ -34,6 +34,8 @@ TANK = StateTwin(
     ),
 )
 
+pytestmark = pytest.mark.slow  # they stand on one long fit
+
 
 def nonlinear(x, u, p):
     return (GAIN * u.valve - LEAK * x.level - SQUARE * x.level**2,)
@@ -136,7 +138,6 @@ def other_outflow(x, u, p):
     return p.pump * u.pump - between, between - outflow
 
 
-@pytest.mark.slow
 def test_the_discrepancy_of_emulated_tanks() -> None:
     """Within 5 % of its range where data are, in the median; inside its 90 % band as promised.
 

@@ -33,7 +33,10 @@ def fitted(interpolation: str) -> DynamicsTwin:
     return fit_dynamics(twin, made.replace(observed=made.observed + noise), settings).twin
 
 
-@pytest.fixture(scope="module", params=["hold", "linear", "spline"])
+@pytest.fixture(
+    scope="module",
+    params=["linear", *(pytest.param(each, marks=pytest.mark.slow) for each in ("hold", "spline"))],
+)
 def twin(request: pytest.FixtureRequest) -> DynamicsTwin:
     return fitted(request.param)
 

@@ -345,6 +345,7 @@ def test_what_was_calibrated_on_emulated_data_is_marked(
     assert rt.generate(back, case, per_class=1, seed=0).emulated
 
 
+@pytest.mark.slow
 def test_refinement_helps_a_poor_model_on_trajectories_it_never_saw(
     identity: rt.Surrogate,
 ) -> None:
@@ -425,6 +426,7 @@ def test_faulty_trajectories_calibrate_without_their_fault_in_the_discrepancy(
     assert size["all"] > 1.3 * size["named"]
 
 
+@pytest.mark.slow
 def test_what_is_calibrated_on_faulty_trajectories_counts_them(
     ibg: rt.Surrogate, emulated: rt.Trajectories, case: rt.Case
 ) -> None:

@@ -122,6 +122,7 @@ def test_bands_hold_records_it_has_not_seen(twin: rt.Surrogate, rg: SequenceResi
     assert 0.82 < rg.fitted.figures["coverage90"] < 0.98
 
 
+@pytest.mark.slow
 def test_a_discrepancy_that_the_past_does_not_predict_is_not_trusted(twin: rt.Surrogate) -> None:
     """One slow wave beside the input: members learn it by heart, and it holds nowhere else."""
     made = twin.simulate(commands_of(1, 20), seed=0)
