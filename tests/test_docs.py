@@ -28,7 +28,7 @@ HERE = ("extending.md", "own_data.md", "own_simulator.md", "tanks.md")
 """Pages whose blocks run below, one after the other."""
 LONG = ("own_simulator.md",)
 """Of these, pages that take longer than the fast tests may."""
-APART = ("fmu.md", "pitfalls.md", "scale.md", "tutorial.md")
+APART = ("fmu.md", "identify.md", "pitfalls.md", "scale.md", "tutorial.md")
 """Pages with a test of their own below."""
 SMALL = "--sources dt --per-class 9"
 """What makes the tutorial's study small enough for a test."""
@@ -112,6 +112,35 @@ def test_the_page_on_fmus(folder: Path) -> None:
     torque = np.ones((2, 50, 1))
     made = run("fmu.md", {"__name__": "__main__", "commands": torque}, code)["made"]
     assert made.observed[0, -1, 0] == pytest.approx(49 * 0.01 / 0.02, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_the_page_on_identification(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Logs are made, the commands run on them, and the result goes to FMPy."""
+    damped = DRIVE.replace(
+        "self.torque / self", "(self.torque - self.friction * self.speed) / self"
+    )
+    damped = damped.replace("0.0, 0.0, 0.01\n", "0.0, 0.0, 0.01\n        self.friction = 0.2\n")
+    friction = 'self.register_variable(Real("friction", start=0.2, **free))'
+    damped = damped.replace(
+        "        self.register", f"        {friction}\n        self.register", 1
+    )
+    (folder / "drive.py").write_text(damped, encoding="utf-8")
+    build = [sys.executable, "-m", "pythonfmu", "build", "-f", "drive.py", "-d", "."]
+    subprocess.run(build, check=True, capture_output=True)
+    (folder / "Drive.fmu").rename("drive.fmu")
+    logs, fmpy, python = blocks(DOCS / "identify.md", "python")
+    names = run("identify.md", {"__name__": "__main__"}, logs)
+    runs = " ".join(f"run{i}.csv" for i in range(5))
+    for line, whole in shown(DOCS / "identify.md"):
+        if whole and not line.startswith("fit"):
+            words = shlex.split(line.replace("run*.csv", runs))
+            result = CliRunner().invoke(app, words, catch_exceptions=False)
+            assert result.exit_code == 0, f"retwin {line}: {result.output}"
+    found = run("identify.md", names, fmpy)["start_values"]
+    assert found == pytest.approx({"inertia": 0.02, "friction": 0.1}, rel=0.05)
+    checked = run("identify.md", names, python)["checked"]
+    assert checked.outputs[0].validation.after < 0.25
 
 
 def test_the_page_on_scale() -> None:

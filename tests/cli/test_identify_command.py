@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,12 +15,13 @@ import pytest
 from fmus import c_fmu
 
 import retwin as rt
+from retwin.cases.updated_case import updated_case
 
 RATE = 50.0
 PENDULUM = """<mujoco>
   <option timestep="0.01"/>
   <worldbody>
-    <body>
+    <body name="bob">
       <joint name="swing" type="hinge" axis="0 1 0" damping="0.02"/>
       <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.5"/>
     </body>
@@ -140,7 +142,8 @@ def test_an_fmu_is_calibrated_to_its_logs(place: Path, call) -> None:
     assert held["after"] == pytest.approx(0.02, rel=0.2)
     assert held["before"] > 10 * held["after"]
     assert "fell from" in out
-    assert "No log holds seen" in out
+    assert "left out: seen" in err
+    assert list(found["outputs"]) == ["x"]
     start = json.loads(Path("out/start_values.json").read_text("utf-8"))
     assert start == {n: found["parameters"][n]["value"] for n in ("gain", "tau")}
     code, out, _ = call("twin", "info", "out/updated.toml")
@@ -323,6 +326,16 @@ def test_saved_trajectories_are_matched_by_name_and_unit(place: Path, call) -> N
     code, _, err = call("identify", name, "saved.npz", *words, *column, "--out", "out")
     assert code == 0, err
     assert contains(result(), "gain", 0.15)
+
+
+def test_a_sensor_of_several_channels_keeps_its_name_in_the_case(place: Path) -> None:
+    free, sensors = ["joint.swing.damping=0:1"], ["body:bob"]
+    opened = rt.cases.open_parametric("robot.xml", free, outputs=sensors, rate=RATE)
+    assert len(opened.twin.outputs) == 3
+    text = updated_case(opened, opened.twin.with_values([0.3]), place / "out", "logs.npz")
+    written = tomllib.loads(text)
+    assert (written["twin"], written["folder"], written["outputs"]) == ("robot.xml", "..", sensors)
+    assert written["parameters"]["joint.swing.damping"]["start"] == 0.3
 
 
 @pytest.mark.slow

@@ -162,5 +162,5 @@ def test_a_result_of_another_twin_is_refused() -> None:
     found = rt.identify(twin_with("gain"), data, LeastSquares(starts=1), seed=0)
     with pytest.raises(rt.InputError, match="the twin with the parameters gain"):
         validate_identification(found, twin_with("leak"), data)
-    with pytest.raises(rt.InputError, match="give what rt\\.identify returned"):
+    with pytest.raises(rt.InputError, match=r"give what rt\.identify returned"):
         validate_identification(data, twin_with("leak"), data)  # type: ignore[arg-type]

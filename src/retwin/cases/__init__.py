@@ -30,6 +30,7 @@ _HOME = {
     "animate": "animation",
     "armpi_parametric": "armpi_fpv.parameters",
     "log_rate": "logs",
+    "measured_outputs": "logs",
     "open_parametric": "opened_twin",
     "read_case": "file",
     "read_logs": "logs",

@@ -23,7 +23,7 @@ from retwin.progress import Progress
 from retwin.serialisation.files import sha256
 from retwin.twins.twin import Twin
 
-__all__ = ["Columns", "Logs", "log_rate", "read_logs"]
+__all__ = ["Columns", "Logs", "log_rate", "measured_outputs", "read_logs"]
 
 TIMES = re.compile(r"(time|t|timestamp|zeit)\W*(s|ms|us|ns)?\W*", re.IGNORECASE)
 """Names of columns that are taken for the times of the rows, with their unit."""
@@ -106,6 +106,19 @@ def log_rate(path: str | Path, columns: Columns = Columns()) -> float | None:
     return (
         float(f"{1 / step:.3g}") if abs(float(f"{1 / step:.3g}") * step - 1) < ROUNDED else 1 / step
     )
+
+
+def measured_outputs(
+    paths: Sequence[str | Path], twin: Twin, columns: Columns = Columns()
+) -> tuple[str, ...]:
+    """Names of the outputs of a twin that some log holds, in the twin's order.
+
+    Raises InputError for a log that cannot be read.
+    """
+    there: set[str] = set()
+    for path in map(Path, paths):
+        there |= set(_header(path) if _is_table(path) else load(path).outputs.names)
+    return tuple(n for n in twin.outputs.names if columns.names.get(n, n) in there)
 
 
 def read_logs(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 from retwin.cases.named_twin import FILES
 from retwin.cases.opened_twin import OpenedTwin
@@ -76,9 +77,14 @@ def _channels(opened: OpenedTwin, twin: ParametricTwin, *, is_file: bool) -> lis
     if not is_file and opened.own_channels:
         return []
     lines = [f"rate = {float(twin.rate)!r}"]
-    for name, channels in (("inputs", twin.inputs), ("outputs", twin.outputs)):
-        listed = ", ".join(map(_text, channels.names))
-        tables = ", ".join(f"{_text(each)} = {{}}" for each in channels.names)
+    inner: Any = twin
+    while isinstance(inner, ParametricTwin):
+        inner = inner.twin
+    # A sensor of a robot model may have several channels.
+    outputs = getattr(inner, "sensors", twin.outputs.names)
+    for name, names in (("inputs", twin.inputs.names), ("outputs", outputs)):
+        listed = ", ".join(map(_text, names))
+        tables = ", ".join(f"{_text(each)} = {{}}" for each in names)
         lines.append(f"{name} = " + (f"[{listed}]" if is_file else f"{{ {tables} }}"))
     return lines
 

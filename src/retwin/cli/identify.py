@@ -16,6 +16,8 @@ from retwin.cli.terminal import answer, bar, command_given, note, table
 from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from retwin.cases.logs import Columns
     from retwin.cases.opened_twin import OpenedTwin
     from retwin.evaluation.identification import Identification
@@ -136,7 +138,7 @@ def identify(
     any_rate = Path(twin).suffix.lower() in UNRATED
     if rate is None and any_rate:
         rate = cases.log_rate(logs[0], columns)
-    opened = cases.open_parametric(twin, free or (), inputs=names[0], outputs=names[1], rate=rate)
+    opened = _opened(twin, logs, columns, free or (), names, rate)
     with keep_workers(), bar("identify") as show:
         read = cases.read_logs(
             logs,
@@ -165,6 +167,29 @@ def identify(
         checked = room.validate_identification(found, opened.twin, used, held_out, seed=seed)
         values = save_identification(checked, opened, read, out, command=command_given())
     _print(checked, values, as_json=as_json)
+
+
+def _opened(
+    twin: str,
+    logs: list[Path],
+    columns: Columns,
+    free: Sequence[str],
+    names: list[tuple[str, ...]],
+    rate: float | None,
+) -> OpenedTwin:
+    """The twin; of an FMU whose outputs nobody named, with those that the logs hold."""
+    from retwin import cases
+
+    inputs, outputs = names
+    opened = cases.open_parametric(twin, free, inputs=inputs, outputs=outputs, rate=rate)
+    if outputs or opened.case is not None or Path(twin).suffix.lower() != ".fmu":
+        return opened
+    held = cases.measured_outputs(logs, opened.twin, columns)
+    if not held or held == opened.twin.outputs.names:
+        return opened
+    others = ", ".join(name for name in opened.twin.outputs.names if name not in held)
+    note(f"Outputs that no log holds are left out: {others}")
+    return cases.open_parametric(twin, free, inputs=inputs, outputs=held, rate=rate)
 
 
 def _method(name: str, loss: str | None, starts: int | None) -> Any:

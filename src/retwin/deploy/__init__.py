@@ -1,6 +1,7 @@
 """Fitted models and large simulations outside this process.
 
-Belongs here: bundles, exports, and simulations of any size into Zarr folders. Not here: fitting.
+Belongs here: bundles, exports, results of an identification, and simulations of any size into Zarr
+folders. Not here: fitting.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ _HOME = {
     "export_fmu": "fmu.export",
     "export_onnx": "onnx.export",
     "fit_guard": "bundle.guard",
+    "save_identification": "identified",
     "simulate_to": "simulations",
 }
 

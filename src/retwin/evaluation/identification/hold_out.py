@@ -61,7 +61,7 @@ def hold_out(
         parts = measured[~chosen], measured[chosen]
     else:
         # By the last sample that was measured, since shorter trajectories are padded.
-        seen = measured.mask.any(axis=2)
+        seen = np.any(measured.mask, axis=2)
         last = measured.steps - np.argmax(seen[:, ::-1], axis=1)
         first = np.asarray(np.round((1 - share) * last))[:, None, None]
         late = np.arange(measured.steps)[None, :, None] >= first
