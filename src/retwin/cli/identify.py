@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
@@ -138,7 +139,7 @@ def identify(
     any_rate = Path(twin).suffix.lower() in UNRATED
     if rate is None and any_rate:
         rate = cases.log_rate(logs[0], columns)
-    opened = _opened(twin, logs, columns, free or (), names, rate)
+    opened, left_out = _opened(twin, logs, columns, free or (), names, rate)
     with keep_workers(), bar("identify") as show:
         read = cases.read_logs(
             logs,
@@ -149,6 +150,9 @@ def identify(
             progress=lambda share: show("read, 1 of 3", share),
             max_bytes=max_bytes,
         )
+        if left_out:
+            text = f"Outputs that no log holds are left out: {', '.join(left_out)}."
+            read = replace(read, notes=(*read.notes, text))
         used, held_out = read.trajectories, read.test
         if held_out is None or hold_out is not None:
             share = SHARE if hold_out is None else hold_out
@@ -176,20 +180,19 @@ def _opened(
     free: Sequence[str],
     names: list[tuple[str, ...]],
     rate: float | None,
-) -> OpenedTwin:
-    """The twin; of an FMU whose outputs nobody named, with those that the logs hold."""
+) -> tuple[OpenedTwin, list[str]]:
+    """The twin, and outputs that it lacks: of an FMU, by default, those that no log holds."""
     from retwin import cases
 
     inputs, outputs = names
     opened = cases.open_parametric(twin, free, inputs=inputs, outputs=outputs, rate=rate)
     if outputs or opened.case is not None or Path(twin).suffix.lower() != ".fmu":
-        return opened
+        return opened, []
     held = cases.measured_outputs(logs, opened.twin, columns)
     if not held or held == opened.twin.outputs.names:
-        return opened
-    others = ", ".join(name for name in opened.twin.outputs.names if name not in held)
-    note(f"Outputs that no log holds are left out: {others}")
-    return cases.open_parametric(twin, free, inputs=inputs, outputs=held, rate=rate)
+        return opened, []
+    others = [name for name in opened.twin.outputs.names if name not in held]
+    return cases.open_parametric(twin, free, inputs=inputs, outputs=held, rate=rate), others
 
 
 def _method(name: str, loss: str | None, starts: int | None) -> Any:
