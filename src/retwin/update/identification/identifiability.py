@@ -24,6 +24,9 @@ UNIFORM = 12**-0.5
 """Standard deviation of a uniform distribution between the bounds, in widths of the bounds."""
 AGREEMENT = 0.05
 """Distance of equally good optima, in widths of the bounds, up to which they agree in any case."""
+NEGLIGIBLE = 0.01
+"""Component of an undetermined direction, below which it does not concern a parameter: along the
+whole range of the others, that parameter changes by less than this share of its own range."""
 MIN_TRAJECTORIES = 3
 """Smallest number of trajectories from which standard errors are estimated."""
 LEVERAGE = 1 - 1e-6
@@ -43,7 +46,8 @@ class Identifiability:
         Names of the parameters.
     errors : NDArray
         (k,), standard errors in the parameters' units, if the residuals of a trajectory correlate
-        from one sample to the next only; infinite where outputs do not depend on the parameter.
+        from one sample to the next only; infinite where outputs do not depend on the parameter. Of
+        a parameter that is identified, what undetermined directions add is limited by the ranges.
     correlation : NDArray
         (k, k), of the estimates; NaN where an error is infinite.
     singular_values : NDArray
@@ -135,8 +139,13 @@ def identifiability(
         part = np.where(np.abs(directions) > 1e-6, directions, 0.0)
         scaled = np.where(part == 0, 0.0, part * uncertainty[:, None])
         errors = np.sqrt(np.sum(scaled**2, axis=0))
+        # No direction is longer than the ranges. So one that is undetermined leaves a parameter
+        # determined that hardly takes part in it.
+        within = np.sqrt(np.sum((part * np.minimum(uncertainty, 1.0)[:, None]) ** 2, axis=0))
         correlation = (scaled.T @ scaled) / np.outer(errors, errors)
     distance = np.abs(alternatives).max(axis=0, initial=0.0)
+    determined = within < UNIFORM
+    errors = np.where(determined, within, errors)
     agree = distance <= np.maximum(4 * errors, AGREEMENT)
     return Identifiability(
         names=names,
@@ -145,7 +154,7 @@ def identifiability(
         singular_values=singular / max(noise, 1e-300),
         directions=directions,
         at_bound=at_bound,
-        identified=(errors < UNIFORM) & agree,
+        identified=determined & agree,
         independent=measured / correlation_time(residual),
     )
 
@@ -193,7 +202,7 @@ def standard_errors(jacobian: NDArray, residual: NDArray) -> NDArray:
     step = without[..., 0] @ back.T
     errors = np.sqrt((count - 1) * np.var(step, axis=0))
     # A direction does not concern a parameter in which it has no component.
-    open_ = np.abs(directions[~nonzero]).max(axis=0, initial=0.0) > 1e-6
+    open_ = np.abs(directions[~nonzero]).max(axis=0, initial=0.0) > NEGLIGIBLE
     return np.where(open_, np.inf, errors)
 
 
