@@ -49,7 +49,8 @@ class Estimate:
     interval : (float, float) or None
         The 95 % interval, None where there is no error.
     identified : bool
-        Whether the measurements narrow it down within its range.
+        Whether the measurements narrow it down within its range: its 95 % interval does not
+        contain all of it, and starts that fit equally well agree.
     at_bound : "low", "high" or ""
         The bound on which it lies; the true value may be beyond it.
 
@@ -121,7 +122,9 @@ def _of_fit(before: ParametricTwin, found: Updated) -> Uncertainty:
     directions = _directions(before.names, local.directions, along, UNIFORM)
     ends = [_end(each, low, high) for each, low, high in zip(values, *before.bounds, strict=True)]
     sides = [end if bound else "" for end, bound in zip(ends, local.at_bound, strict=True)]
-    made = _estimates(before, values, errors, intervals, local.identified, sides)
+    low, high = before.bounds
+    inside = (intervals[:, 0] > low) | (intervals[:, 1] < high)  # else it says nothing
+    made = _estimates(before, values, errors, intervals, local.identified & inside, sides)
     return Uncertainty(made, local.correlation, directions, basis)
 
 

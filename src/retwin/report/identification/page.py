@@ -11,7 +11,6 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
-from plotly.offline import get_plotlyjs
 from pydantic_core import from_json, to_json
 
 from retwin.evaluation.identification import Identification, RMSError
@@ -27,6 +26,7 @@ from retwin.report.identification.texts import (
     value,
 )
 from retwin.report.labels import counted, duration, p_value
+from retwin.report.page import LEGEND
 from retwin.report.plotly_specs import panel_spec
 from retwin.report.style import CHROME, PALETTE, colour_of, symbol
 
@@ -82,6 +82,7 @@ def identification_page(
         "anchors": set(),
         "images": {},
         "colour_of": colour_of,
+        "dashes": LEGEND,
         "symbol": symbol,
     }
     drawn = figures(found)
@@ -109,12 +110,12 @@ def identification_page(
         script=_asset("page.js"),
         # Plotly draws no point for null, which JSON has in place of NaN.
         specs=htmlsafe_json_dumps(from_json(to_json(specs, inf_nan_mode="null"))),
-        plotly=Markup(get_plotlyjs()),
+        plotly=_asset("plotly-gl3d.min.js", "plotly"),
     )
 
 
-def _asset(name: str) -> Markup:
-    file = resources.files("retwin.report").joinpath("templates", name)
+def _asset(name: str, folder: str = "templates") -> Markup:
+    file = resources.files("retwin.report").joinpath(folder, name)
     return Markup(file.read_text(encoding="utf-8"))
 
 
