@@ -100,6 +100,7 @@ def test_errors_are_those_of_free_simulation_in_the_outputs_unit() -> None:
     assert output.validation.interval[1] < 1
 
 
+@pytest.mark.slow
 def test_standard_errors_from_one_record_hold_for_autoregressive_noise() -> None:
     """The number of intervals that contain the truth, within limits missed once in 1000."""
     count, inside = 40, 0
@@ -139,6 +140,7 @@ def test_exact_measurements_give_no_test_and_no_warning() -> None:
     assert found.parameters[0].value == pytest.approx(GAIN, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_a_posterior_is_summarised_by_its_draws() -> None:
     pytest.importorskip("emcee")
     twin = twin_with("gain", "spare")
