@@ -287,6 +287,8 @@ def test_what_cannot_be_used_is_refused_before_any_work(
         (lambda t: t.replace("valve,level", "other,level"), "none for valve"),
         (lambda t: t.splitlines()[0] + "\n", "a number for every command"),
         (lambda t: "", "columns ; none for valve"),
+        (lambda t: t.replace(",", ";"), "columns that are separated by commas, got columns"),
+        (lambda t: t + "0.5,3.4e38\n", "3.4e+38 for level at 400 s; leave the cell empty"),
         (lambda t: t.replace("0.", "0.x", 9), "numbers in columns"),
         (
             lambda t: "\n".join(x.split(",")[0] + "," for x in t.splitlines()[1:]).join(
@@ -295,7 +297,16 @@ def test_what_cannot_be_used_is_refused_before_any_work(
             "measurements in the",
         ),
     ],
-    ids=["no output", "no command", "no rows", "empty", "no numbers", "nothing measured"],
+    ids=[
+        "no output",
+        "no command",
+        "no rows",
+        "empty",
+        "separator",
+        "missing",
+        "no numbers",
+        "nothing measured",
+    ],
 )
 def test_logs_that_lack_something_are_refused(change, said: str, place: Path, call) -> None:
     Path("log.csv").write_text(change(Path("tank0.csv").read_text()))

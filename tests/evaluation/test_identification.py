@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -157,6 +158,25 @@ def test_a_posterior_is_summarised_by_its_draws() -> None:
     assert (gain.identified, spare.identified) == (True, False)
     assert found.directions[-1].open
     assert next(iter(found.directions[-1].components)) == "spare"
+
+
+def diverging(values: dict[str, float]) -> rt.FunctionTwin:
+    """The lag, which gives no numbers for fast leaks."""
+    made = build(values)
+    if values["leak"] > 0.15:
+        return replace(made, function=lambda commands: np.full_like(commands, np.nan))
+    return made
+
+
+def test_values_at_which_a_function_is_not_finite_are_left() -> None:
+    """From the starts of the search some are within that range, and the optimum is not."""
+    data = measured(7, noise=0.05)
+    ends = [rt.Parameter("leak", "1", 0.02, 0.3, 0.03)]
+    found = rt.identify(rt.ParametricTwin.built(diverging, ends), data, seed=0)
+    assert found.values["leak"] == pytest.approx(LEAK, rel=0.02)
+    ends = [rt.Parameter("leak", "1", 0.02, 0.3, 0.2)]
+    with pytest.raises(rt.InputError, match="return finite numbers, got nan for y"):
+        rt.identify(rt.ParametricTwin.built(diverging, ends), data, seed=0)
 
 
 def test_a_result_of_another_twin_is_refused() -> None:

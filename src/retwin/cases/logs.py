@@ -27,6 +27,10 @@ __all__ = ["Columns", "Logs", "log_rate", "measured_outputs", "read_logs"]
 
 TIMES = re.compile(r"(time|t|timestamp|zeit)\W*(s|ms|us|ns)?\W*", re.IGNORECASE)
 """Names of columns that are taken for the times of the rows, with their unit."""
+OTHER_SEPARATORS = (";", "\t", "|")
+"""Separators of columns that are named in place of a comma."""
+LARGEST = 1e30
+"""Magnitude from which a number is no measurement: programs write 3.4e38 for a missing one."""
 ROUNDED = 1e-3
 """Relative accuracy to which a rate is rounded that is computed from times."""
 
@@ -197,6 +201,7 @@ def read_logs(
         if progress is not None:
             progress((done + 1) / len(paths))
     joined = _healthy(Trajectories.concatenate(sets), notes)
+    _check_size(joined)
     if columns.transient:
         joined = _settled(joined, columns.transient)
     unseen = ~joined.mask.any(axis=(0, 1))
@@ -222,7 +227,7 @@ def _header(path: Path) -> list[str]:
     """The names of a table's columns."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as lines:
-            return next(csv.reader(lines, strict=True), [])
+            header = next(csv.reader(lines, strict=True), [])
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(
             str(path),
@@ -230,6 +235,16 @@ def _header(path: Path) -> list[str]:
             got=f"{type(error).__name__}: {error}",
             remedy="name a text file, in UTF-8 and with commas",
         ) from None
+
+    other = next((each for each in OTHER_SEPARATORS if len(header) == 1 and each in header[0]), "")
+    require(
+        not other,
+        path.name,
+        expected="columns that are separated by commas",
+        got=f"columns that are separated by {other!r}",
+        remedy="write the table with commas, and points in numbers",
+    )
+    return header
 
 
 def _clock(path: Path, header: Iterable[str]) -> TimeColumn | None:
@@ -418,6 +433,22 @@ def _healthy(found: Trajectories, notes: dict[str, list[str]]) -> Trajectories:
     if not kept.all():
         notes[f"{int((~kept).sum())} trajectories of other classes are not used."] = []
     return found[kept]
+
+
+def _check_size(found: Trajectories) -> None:
+    """Refuse numbers that stand for missing measurements."""
+    for name, values in (("observed", found.observed), ("commands", found.commands)):
+        large = np.argwhere(np.abs(values) >= LARGEST)
+        channels = found.outputs if name == "observed" else found.inputs
+        if len(large):
+            row, sample, channel = large[0]
+            raise InputError(
+                str(found.ids[row]),
+                expected=f"numbers below {LARGEST:g}",
+                got=f"{values[row, sample, channel]:g} for {channels.names[channel]} at "
+                f"{sample / found.rate:g} s",
+                remedy="leave the cell empty, or write NaN, where a measurement is missing",
+            )
 
 
 def _settled(found: Trajectories, transient: float) -> Trajectories:

@@ -337,4 +337,5 @@ def _takes(function: Function, name: str) -> bool:
 
 def _name(function: Function) -> str:
     """Name of the function, for messages."""
-    return getattr(function, "__qualname__", type(function).__qualname__)
+    inner = function.func if isinstance(function, partial) else function
+    return getattr(inner, "__qualname__", type(inner).__qualname__)

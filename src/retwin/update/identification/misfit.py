@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from pebble import ProcessPool
 
 from retwin.checks import require, whole
 from retwin.data.trajectories import Trajectories
+from retwin.errors import InputError
 from retwin.processes import sendable_errors, worker_pool
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.state_twin import StepWarning
@@ -85,6 +86,9 @@ class Misfit:
         self._commands = observed.commands.astype(np.float64)
         self._measured = observed.observed[:, ::stride].astype(np.float64)
         self.present = self.outputs(np.array([twin.values]))[0]
+        if np.isnan(self.present).any():
+            with suppress(SimulationError):  # what the twin itself refuses has a better message
+                twin.simulate(self._commands, seed=seed)
         require(
             not np.isnan(self.present).any(),
             "twin",
@@ -180,6 +184,11 @@ def _outputs(
         # Parameters within the bounds can be beyond what the twin can simulate.
         observed = np.full((*repeated.shape[:2], len(twin.outputs)), np.nan)
         observed[error.finished.ids.astype(int)] = error.finished.observed
+    except InputError:
+        # So a function fails whose outputs are not finite.
+        if len(theta) > 1:
+            return np.concatenate([_outputs(twin, commands, stride, seed, e[None]) for e in theta])
+        observed = np.full((*repeated.shape[:2], len(twin.outputs)), np.nan)
     made = observed[:, ::stride].astype(np.float64)
     return made.reshape(len(theta), each, *made.shape[1:])
 
