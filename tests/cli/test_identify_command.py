@@ -343,6 +343,17 @@ def test_saved_trajectories_are_matched_by_name_and_unit(place: Path, call) -> N
     assert contains(result(), "gain", 0.15)
 
 
+def test_the_page_needs_nothing_else_and_shows_names_as_text(place: Path, call) -> None:
+    name = "<img src=x onerror=alert(1)>.csv"
+    Path(name).write_bytes(Path("tank0.csv").read_bytes())
+    assert call("identify", "tank.toml", name, "--out", "out")[0] == 0
+    page = Path("out/report.html").read_text("utf-8")
+    assert "<img src=x" not in page
+    assert "&lt;img src=x" in page
+    assert not re.search(r"<script[^>]+src|<link|<iframe", page)
+    assert {f'id="{each}"' in page for each in ("summary", "parameters", "open", "next")} == {True}
+
+
 def test_a_sensor_of_several_channels_keeps_its_name_in_the_case(place: Path) -> None:
     free, sensors = ["joint.swing.damping=0:1"], ["body:bob"]
     opened = rt.cases.open_parametric("robot.xml", free, outputs=sensors, rate=RATE)

@@ -21,6 +21,7 @@ from retwin.report.identification.texts import (
     combination,
     findings,
     interval,
+    percent,
     significant,
     state,
     value,
@@ -210,8 +211,7 @@ def _range_of(error: RMSError) -> str:
     """The interval of a change, as a smaller line."""
     if error.interval is None:
         return ""
-    low, high = (f"{100 * (end - 1):+.0f}".replace("-", "−") for end in error.interval)
-    return f"{low} to {high}"
+    return " to ".join(map(percent, error.interval))
 
 
 def _tests(found: Identification) -> Table:

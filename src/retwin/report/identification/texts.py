@@ -8,12 +8,23 @@ from math import floor, isfinite, isnan, log10
 from retwin.evaluation.identification import Direction, Estimate, Identification, RMSError
 from retwin.update.identification.posterior import Posterior
 
-__all__ = ["change", "combination", "findings", "interval", "significant", "state", "value"]
+__all__ = [
+    "change",
+    "combination",
+    "findings",
+    "interval",
+    "percent",
+    "significant",
+    "state",
+    "value",
+]
 
 WHITE = 0.01
 """p-value below which a residual is not taken for white noise, or depends on an input."""
 SENTENCES = 4
 """Outputs that have a sentence of their own, at most."""
+SMALL = 0.02
+"""Ratio of errors below which a change in percent has decimals."""
 STRONG = 0.95
 """Correlation of two estimates from which they are named."""
 MISFIT = 0.02
@@ -67,9 +78,14 @@ def change(error: RMSError, *, interval: bool = True) -> str:
     if not isfinite(error.ratio):
         return "–"
     ends = [error.ratio, *(error.interval or ())]
-    shown = [f"{100 * (end - 1):+.0f}".replace("-", "−") for end in ends]
+    shown = list(map(percent, ends))
     inside = f" (95 % interval {shown[1]} to {shown[2]})" if error.interval and interval else ""
     return f"{shown[0]} %{inside}"
+
+
+def percent(ratio: float) -> str:
+    """`−86` for a ratio of 0.14; with two decimals where little is left."""
+    return f"{100 * (ratio - 1):+.{2 if ratio < SMALL else 0}f}".replace("-", "−")
 
 
 def findings(found: Identification) -> list[str]:
