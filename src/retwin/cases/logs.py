@@ -117,11 +117,13 @@ def measured_outputs(
 ) -> tuple[str, ...]:
     """Names of the outputs of a twin that some log holds, in the twin's order.
 
-    Raises InputError for a log that cannot be read.
+    They are known of tables without reading them; with another log, all count as held. Raises
+    InputError for a table that cannot be read.
     """
-    there: set[str] = set()
-    for path in map(Path, paths):
-        there |= set(_header(path) if _is_table(path) else load(path).outputs.names)
+    files = list(map(Path, paths))
+    if not all(map(_is_table, files)):
+        return twin.outputs.names
+    there = {name for path in files for name in _header(path)}
     return tuple(n for n in twin.outputs.names if columns.names.get(n, n) in there)
 
 
