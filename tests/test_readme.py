@@ -101,7 +101,15 @@ def test_every_command_shown_exists(page: Path) -> None:
 
 def test_the_readme_shows_every_command() -> None:
     commands = [line for line, _ in shown(ROOT / "README.md")]
-    for name in ("study", "report", "identify", "fit", "generate", "diagnose fit", "diagnose predict"):
+    for name in (
+        "study",
+        "report",
+        "identify",
+        "fit",
+        "generate",
+        "diagnose fit",
+        "diagnose predict",
+    ):
         assert any(line.startswith(name) for line in commands), name
     for name in ("info", "convert", "split", "fetch"):
         assert any(line.startswith(f"data {name}") for line in commands), name

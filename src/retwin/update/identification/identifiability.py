@@ -141,7 +141,9 @@ def identifiability(
         errors = np.sqrt(np.sum(scaled**2, axis=0))
         # No direction is longer than the ranges. So one that is undetermined leaves a parameter
         # determined that hardly takes part in it.
-        within = np.sqrt(np.sum((part * np.minimum(uncertainty, 1.0)[:, None]) ** 2, axis=0))
+        limited = part * np.minimum(uncertainty, 1.0)[:, None]
+        small = np.abs(part) <= NEGLIGIBLE
+        within = np.sqrt(np.sum(np.where(small, limited, scaled) ** 2, axis=0))
         correlation = (scaled.T @ scaled) / np.outer(errors, errors)
     distance = np.abs(alternatives).max(axis=0, initial=0.0)
     determined = within < UNIFORM
