@@ -13,6 +13,9 @@ before it (0 where there are none): the innovations shift by 2 (the contract), o
 An offset of an output whose disturbance has autocorrelation 0.98 is one innovation of 2 and then
 0.04: no detector that knows the disturbance sees more, and one that does not has false alarms.
 
+Two models: the same with the mean evidence of two filters that follow the output, one within two
+samples and one within two hundred, as those of `fit_monitor` do.
+
 Beside it, on the same streams: two-sided CUSUM (k = 0.5, and h = 5.75 for an ARL of 1000 by
 Siegmund's approximation) on standardised residuals and after whitening by the lag-one
 autocorrelation, with the mean, scale and autocorrelation of the same 500 samples; an alarm at every
@@ -46,11 +49,14 @@ from retwin.monitor import (
     fit_scores,
     resolution,
 )
+from retwin.monitor.predictors import agreeing
 
 STREAMS = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
 CALIBRATION, ARL, CENSORED = 500, 1000.0, 20_000
 CHANGE, WATCHED = 100, 400
 WARM_UP, CHUNK = 1000, 500
+GAINS = (0.5, 0.005)
+"""With which two models follow the output; their evidence is averaged."""
 CUSUM_K, CUSUM_H = 0.5, 5.75
 SCENARIOS: dict[str, dict[str, float]] = {
     "Gaussian": {},
@@ -99,23 +105,44 @@ def first_alarms(alarms: NDArray, ends: int) -> NDArray:
     return np.where(alarms.any(axis=1), alarms.argmax(axis=1) + 1, ends)
 
 
-def monitor(healthy: NDArray) -> tuple[Run, dict[str, float]]:
-    """The monitor with the slack that its calibration needs."""
+def innovations(output: NDArray, level: NDArray, gains: tuple[float, ...]) -> NDArray:
+    """Errors (models * streams, T) of filters that follow outputs with gains, from levels on.
+
+    Shapes: output (streams, T), level (models, streams), which changes.
+    """
+    gain = np.array(gains)[:, None]
+    errors = np.empty((*level.shape, output.shape[1]))
+    for t, value in enumerate(output.T):
+        errors[..., t] = value - level
+        level += gain * np.nan_to_num(errors[..., t])
+    return errors.reshape(-1, output.shape[1])
+
+
+def monitor(healthy: NDArray, gains: tuple[float, ...] = (0.0,)) -> tuple[Run, dict[str, float]]:
+    """The monitor with the slack that its calibration needs.
+
+    Its evidence is the mean over models that follow outputs with these gains; 0 does not.
+    """
     began = time.process_time()
-    model = fit_disturbance(healthy)
-    quantum = resolution(healthy)[:, None]
+    last = np.zeros((len(gains), len(healthy)))
+    known = innovations(healthy, last, gains)
+    model = fit_disturbance(known)
+    quantum = np.tile(resolution(healthy)[:, None], (len(gains), 1))
     scores = fit_scores(model.held_out, quantum / model.deviation)
     slacks = scores.slack(model.parameters)
+    slacks = agreeing(slacks, *scores.score(model.held_out, quantum / model.deviation))
     detector = Detector(slacks)
     seconds = time.process_time() - began
-    at_start, _, _ = model.run(model.start(), healthy)
+    at_start, _, _ = model.run(model.start(), known)
 
     def run(output: NDArray) -> NDArray:
-        predictor, state, alarms = at_start, detector.start(len(output)), []
+        predictor, state, alarms = at_start, detector.start(len(known)), []
+        level = last.copy()
         for first in range(0, output.shape[1], CHUNK):
-            predictor, errors, deviation = model.run(predictor, output[:, first : first + CHUNK])
+            part = innovations(output[:, first : first + CHUNK], level, gains)
+            predictor, errors, deviation = model.run(predictor, part)
             state, evidence = detector.run(state, *scores.score(errors, quantum / deviation))
-            alarms.append(evidence >= ARL)
+            alarms.append(evidence.reshape(len(gains), *output.shape[:1], -1).mean(axis=0) >= ARL)
         return first_alarms(np.concatenate(alarms, axis=1), output.shape[1])
 
     return run, {
@@ -249,6 +276,7 @@ def main() -> None:
         made, details[name] = monitor(calibration)
         for what, run, again in (
             ("monitor", made, monitor(own)[0]),
+            ("two models", monitor(calibration, GAINS)[0], monitor(own, GAINS)[0]),
             ("CUSUM on residuals", cusum(calibration, False), cusum(own, False)),
             ("CUSUM after AR(1)", cusum(calibration, True), cusum(own, True)),
         ):

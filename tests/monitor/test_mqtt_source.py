@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import threading
 import time
@@ -11,6 +12,7 @@ from pathlib import Path
 import paho.mqtt.client as paho
 import pytest
 from broker import Broker
+from certificates import Authority
 from collecting import CollectingGate, running, wait
 
 from retwin.errors import InputError
@@ -135,6 +137,39 @@ def test_a_user_and_a_password_from_the_environment(tmp_path, monkeypatch) -> No
     monkeypatch.delenv("WATCH_PASSWORD")
     with pytest.raises(InputError, match="WATCH_PASSWORD"):
         source(broker, [], user="watch", password_env="WATCH_PASSWORD")
+
+
+@pytest.mark.slow
+# paho leaves the socket of a failed handshake to the collector of garbage.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_encrypted_connection_to_the_broker_that_is_trusted(tmp_path) -> None:
+    authority, other = Authority(tmp_path), tmp_path / "other"
+    other.mkdir()
+    Authority(other)
+    cert, key = authority.certify("broker", "urn:tests:broker")
+    own = dict(
+        zip(("cert_file", "key_file"), authority.certify("watch", "urn:tests:watch"), strict=False)
+    )
+    tls = [f"cafile {tmp_path / 'ca.pem'}", f"certfile {cert}", f"keyfile {key}"]
+    tls += ["require_certificate true", "allow_anonymous true"]
+    broker = Broker(tmp_path / "broker", *tls).start()
+    trusted = {"tls": True, "ca_file": tmp_path / "ca.pem"}
+    try:
+        for more, expected in (
+            (trusted | own, "connected"),
+            (trusted, "lost"),
+            (trusted | own | {"ca_file": other / "ca.pem"}, "lost"),
+            ({}, "lost"),
+        ):
+            lines: list[str] = []
+            with running(source(broker, lines, **more), CollectingGate()):
+                wait(lambda lines=lines: bool(lines))
+            assert expected in lines[0], more
+    finally:
+        broker.stop()
+        gc.collect()
+    with pytest.raises(InputError, match="PEM"):
+        source(broker, [], tls=True, ca_file=tmp_path / "none.pem")
 
 
 @pytest.mark.parametrize(

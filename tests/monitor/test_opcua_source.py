@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from broker import free_port
+from certificates import Authority
 from collecting import CollectingGate, running, wait
 
 from retwin.errors import InputError
@@ -26,12 +28,13 @@ NAN = float("nan")
 
 
 class Server:
-    def __init__(self) -> None:
+    def __init__(self, *folder: str) -> None:
         self.port = free_port()
         self.process: subprocess.Popen | None = None
+        self._folder = folder
 
     def start(self) -> None:
-        command = [sys.executable, str(SCRIPT), str(self.port)]
+        command = [sys.executable, str(SCRIPT), str(self.port), *self._folder]
         pipe = subprocess.PIPE
         self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
         assert self.process.stdout.readline() == "ready\n"
@@ -53,10 +56,10 @@ def server() -> Iterator[Server]:
     made.stop()
 
 
-def source(port: int, lines: list[str], **nodes: str) -> OpcUa:
+def source(port: int, lines: list[str], more: dict | None = None, **nodes: str) -> OpcUa:
     own = nodes or {"heater": "ns=2;s=heater", "T1": "ns=2;s=T1"}
     settings = {"type": "opcua", "url": f"opc.tcp://127.0.0.1:{port}/", "nodes": {"line1": own}}
-    model = OpcUaSource.model_validate({**settings, "interval": 0.05})
+    model = OpcUaSource.model_validate({**settings, "interval": 0.05, **(more or {})})
     return OpcUa(model, {"line1": ("heater", "T1")}, {"line1": 10.0}, lines.append)
 
 
@@ -101,7 +104,52 @@ def test_a_server_that_is_away(server) -> None:
     assert [line.split(": ")[1].split(" (")[0] for line in lines] == ["connected", "lost", "back"]
 
 
+@pytest.mark.slow
+def test_messages_are_signed_and_encrypted_for_a_user(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("WATCH_PASSWORD", "secret")
+    monkeypatch.setenv("OTHER_PASSWORD", "another")
+    authority = Authority(tmp_path)
+    cert, key = authority.certify("server", "urn:tests:server")
+    cert.rename(tmp_path / "cert.pem")
+    key.rename(tmp_path / "key.pem")
+    own = authority.certify("own, name", "urn:tests:watch")
+    files = {"cert_file": own[0], "key_file": own[1]}
+    stranger, key = authority.certify("stranger", "urn:tests:stranger")
+    (tmp_path / "trusted").mkdir()
+    shutil.copy(files["cert_file"], tmp_path / "trusted")
+    secure = Server(str(tmp_path))
+    secure.start()
+    good = {"security": "Basic256Sha256", "user": "watch", "password_env": "WATCH_PASSWORD"}
+    good |= {**files, "server_file": tmp_path / "cert.pem"}
+    bad = {
+        "signed": {"security": None, "cert_file": None, "key_file": None, "server_file": None},
+        "password": {"password_env": "OTHER_PASSWORD"},
+        "trusted": {"cert_file": stranger, "key_file": key},
+        "server": {"server_file": stranger},
+        "key": {"key_file": own[0]},
+    }
+    try:
+        gate = CollectingGate()
+        lines: list[str] = []
+        with running(source(secure.port, lines, good), gate):
+            wait(lambda: bool(lines))
+            assert "connected" in lines[0]
+            secure.write("heater", 1, 1000)
+            secure.write("T1", 20, 1000)
+            wait(lambda: BEGIN + 1000 * MS in gate.held.get("line1", {}), lines)
+        for what, change in bad.items():
+            lines = []
+            with running(source(secure.port, lines, good | change), gate):
+                wait(lambda lines=lines: bool(lines))
+            assert "lost" in lines[0], what
+    finally:
+        secure.stop()
+
+
 def test_what_is_wrong_in_the_settings_is_named() -> None:
+    missing = {"security": "Basic256Sha256", "cert_file": "none.pem", "key_file": "none.pem"}
+    with pytest.raises(InputError, match=r"sources\.cert_file"):
+        source(1, [], missing)
     with pytest.raises(InputError, match="a node for each of heater, T1"):
         source(1, [], heater="ns=2;s=heater")
     with pytest.raises(InputError, match="addresses of nodes"):

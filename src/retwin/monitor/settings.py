@@ -156,12 +156,16 @@ class OpcUaSource(Part):
     """Certificate of the monitor."""
     key_file: Beside | None = None
     """Its private key."""
+    server_file: Beside | None = None
+    """Certificate of the server; without it, any server at the address is trusted."""
 
     @model_validator(mode="after")
     def _complete(self) -> OpcUaSource:
         files = (self.cert_file, self.key_file)
         if any((each is None) == (self.security is not None) for each in files):
             raise ValueError("cert_file and key_file together with security")
+        if self.server_file is not None and self.security is None:
+            raise ValueError("server_file only with security")
         return self
 
 

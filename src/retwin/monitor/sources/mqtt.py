@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import ssl
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
@@ -69,6 +70,7 @@ class Mqtt(Source):
         self._channels = channels
         self._before, self._after = settings.topic.split("{asset}")
         self._password = secret("password of the broker", settings.password_env)
+        self._tls = _encryption(settings) if settings.tls else None
         self._connection = 0
         """Number of the connection: an acknowledgement counts in its own one alone."""
         self._waiting: queue.Queue[_Message] = queue.Queue()
@@ -103,17 +105,8 @@ class Mqtt(Source):
         )
         if own.user is not None or self._password is not None:
             client.username_pw_set(own.user or "", self._password)
-        if own.tls:
-            texts = [each and str(each) for each in (own.ca_file, own.cert_file, own.key_file)]
-            try:
-                client.tls_set(*texts)
-            except (OSError, ValueError) as error:
-                raise InputError(
-                    "sources.ca_file",
-                    expected="certificates and a key as PEM files",
-                    got=brief(error),
-                    remedy="give the files that the broker's administrator made",
-                ) from None
+        if self._tls is not None:
+            client.tls_set_context(self._tls)
         client.reconnect_delay_set(*RETRY)
         client.on_connect = self._on_connect
         client.on_subscribe = self._on_subscribe
@@ -160,3 +153,19 @@ class Mqtt(Source):
             found = []
         parts = [(each, gate.send(each)) for each in found]
         self._waiting.put(_Message(self._connection, message.mid, message.qos, parts))
+
+
+def _encryption(settings: MqttSource) -> ssl.SSLContext:
+    """Which brokers are trusted, and who the monitor is; InputError if a file cannot be used."""
+    try:
+        made = ssl.create_default_context(cafile=settings.ca_file)
+        if settings.cert_file is not None:
+            made.load_cert_chain(settings.cert_file, settings.key_file)
+    except (OSError, ValueError) as error:  # an SSLError is an OSError
+        raise InputError(
+            "sources.ca_file",
+            expected="certificates and a key as PEM files",
+            got=brief(error),
+            remedy="give the files that the broker's administrator made",
+        ) from None
+    return made

@@ -67,6 +67,15 @@ class OpcUa(Source):
         # Its warnings would be lines besides those that are reported.
         logging.getLogger("asyncua").setLevel(logging.CRITICAL)
         self._settings = settings
+        for name in ("cert_file", "key_file", "server_file"):
+            file = getattr(settings, name)
+            require(
+                file is None or file.is_file(),
+                f"sources.{name}",
+                expected="a file",
+                got=f"{file}, which is none",
+                remedy="give the files that the server's administrator made",
+            )
         self._password = secret("password of the server", settings.password_env)
         shortest = min(1 / rates[asset] for asset in settings.nodes)
         self._interval = settings.interval or min(shortest / 2, LONGEST)
@@ -146,9 +155,33 @@ class OpcUa(Source):
         if self._password is not None:
             client.set_password(self._password)
         if own.security is not None:
-            files = f"{own.cert_file},{own.key_file}"
-            await client.set_security_string(f"{own.security},SignAndEncrypt,{files}")
+            await self._secure(client)
         return client
+
+    async def _secure(self, client: Any) -> None:
+        """Sign and encrypt, as the application that the certificate names."""
+        own, purpose = self._settings, "encrypts messages to OPC UA servers"
+        tools = needs_extra("asyncua.crypto.uacrypto", "monitor", purpose)
+        policies = needs_extra("asyncua.crypto.security_policies", "monitor", purpose)
+        x509 = needs_extra("cryptography.x509", "monitor", purpose)
+        try:
+            names = (await tools.load_certificate(own.cert_file)).extensions
+            found = names.get_extension_for_class(x509.SubjectAlternativeName).value
+            # A server compares it with the certificate.
+            client.application_uri = found.get_values_for_type(x509.UniformResourceIdentifier)[0]
+            await tools.load_private_key(own.key_file)
+            server = own.server_file and tools.CertProperties(own.server_file)
+            if own.server_file:
+                await tools.load_certificate(own.server_file)
+        except (OSError, ValueError, IndexError, x509.ExtensionNotFound) as error:
+            raise InputError(
+                "sources.cert_file",
+                expected="a certificate with the URI of the application, and its key, as PEM files",
+                got=brief(error),
+                remedy="give the files that the server's administrator made",
+            ) from None
+        policy = getattr(policies, f"SecurityPolicy{own.security}")
+        await client.set_security(policy, own.cert_file, own.key_file, None, server)
 
     async def _on_lost(self, error: Exception) -> None:
         self.lost(brief(error))
