@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import fields, replace
 
 import numpy as np
@@ -10,7 +11,10 @@ import pytest
 import retwin as rt
 from retwin.errors import InputError
 from retwin.monitor.cause import find_causes, possible_causes
+from retwin.monitor.detector import Detector
 from retwin.monitor.monitor import Monitor, MonitorState, Watched, fit_monitor
+from retwin.monitor.predictors import SLOWER, agreeing
+from retwin.monitor.slack import Slack
 from retwin.twins import (
     ActuatorGain,
     Parameter,
@@ -248,3 +252,45 @@ def test_a_filter_that_diverges_voids_the_promise_and_begins_anew(monitor: Monit
     again = monitor.step(state, whole.commands, whole.observed)[1]
     assert np.isfinite(again.mean).all()
     assert not np.isnan(again.score[:, 100:]).any()
+
+
+def test_evidence_is_the_mean_of_two_models(
+    twin: DynamicsTwin, monitor: Monitor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert len(monitor.slack) == 2 * len(twin.outputs)
+    assert [each.process for each in monitor.predictors] == [1.0, SLOWER]
+    assert "slower" in str(monitor.promises["pressure"])
+    monkeypatch.setattr("retwin.monitor.monitor.SLOWER", 1.0)  # the same model twice
+    twice = fit_monitor(twin, record(2, 1), "1 per hour")
+    monkeypatch.setattr("retwin.monitor.monitor._slower", lambda *_: [])
+    once = fit_monitor(twin, record(2, 1), "1 per hour")
+    found = [each.watch(leaking()) for each in (once, twice)]
+    np.testing.assert_allclose(found[1].evidence, found[0].evidence, rtol=1e-9)
+    assert [each.time for each in found[0].alarms] == [each.time for each in found[1].alarms]
+
+
+def test_a_monitor_that_was_saved_with_one_model_opens(
+    twin: DynamicsTwin, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("retwin.monitor.monitor._slower", lambda *_: [])
+    made = fit_monitor(twin, record(2, 1), "1 per hour")
+    made.save(tmp_path / "monitor")
+    (file,) = (tmp_path / "monitor").glob("*.json")
+    about = json.loads(file.read_text())
+    assert about.pop("predictors") == [[1.0, made.warm_up]]
+    file.write_text(json.dumps({**about, "warm_up": made.warm_up}))
+    again = Monitor.load(tmp_path / "monitor")
+    assert next(iter(again.start(1).arrays())) == "filter.states"
+    np.testing.assert_array_equal(again.watch(leaking()).evidence, made.watch(leaking()).evidence)
+
+
+def test_slack_is_widened_where_the_calibration_contradicts_it() -> None:
+    scores = np.random.default_rng(0).normal(size=(2, 2000))
+    scores[1, 1000:1040] = 2.0
+    given = (Slack(1.1, 0.1), Slack(1.1, 0.1))
+    first, second = agreeing(given, scores, scores)
+    assert first == given[0]
+    assert (second.kappa, second.shift) > (1.1, 0.1)
+    detector = Detector(second)
+    _, evidence = detector.run(detector.start(1), scores[1:], scores[1:])
+    assert evidence.max() < 2000 / 0.05
