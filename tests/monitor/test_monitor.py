@@ -254,6 +254,7 @@ def test_a_filter_that_diverges_voids_the_promise_and_begins_anew(monitor: Monit
     assert not np.isnan(again.score[:, 100:]).any()
 
 
+@pytest.mark.slow
 def test_evidence_is_the_mean_of_two_models(
     twin: DynamicsTwin, monitor: Monitor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -269,6 +270,7 @@ def test_evidence_is_the_mean_of_two_models(
     assert [each.time for each in found[0].alarms] == [each.time for each in found[1].alarms]
 
 
+@pytest.mark.slow
 def test_a_monitor_that_was_saved_with_one_model_opens(
     twin: DynamicsTwin, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

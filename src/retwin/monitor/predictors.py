@@ -52,9 +52,8 @@ class Predictor:
         """Its filter."""
         if self.process == 1:
             return OnlineFilter(twin)
-        factor = self.process
-        noise = {"process": twin.process * factor, "proportional": twin.proportional * factor}
-        return OnlineFilter(replace(twin, **noise))
+        process, proportional = (each * self.process for each in (twin.process, twin.proportional))
+        return OnlineFilter(replace(twin, process=process, proportional=proportional))
 
     def late(self, samples: NDArray, steps: int, rate: float) -> NDArray:
         """Whether evidence of the next samples (n, steps) counts, after so many before (n,)."""
