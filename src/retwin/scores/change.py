@@ -95,6 +95,7 @@ def error_change(
         jackknife_interval(lambda weights: mean(1, weights), n, positive=True),
         float(ratio(whole)[0]),
         jackknife_interval(ratio, n, positive=True),
-        *outputs,
+        outputs[0],
+        outputs[1],
         n,
     )

@@ -225,7 +225,8 @@ def detection_difference(
         return float(shares[0] - shares[1])
 
     rng = np.random.default_rng(seed)
-    drawn = [difference(rng.integers(n, size=n), rng.integers(m, size=m)) for _ in range(DRAWS)]
+    rows, columns = (rng.integers(0, size, (DRAWS, size)) for size in (n, m))
+    drawn = [difference(*each) for each in zip(rows, columns, strict=True)]
     low, high = np.quantile(drawn, [TAIL, 1 - TAIL])
     return difference(np.arange(n), np.arange(m)), (float(low), float(high))
 

@@ -49,7 +49,7 @@
     const none = "A false-alarm rate of 0 % cannot be promised by any number of healthy trajectories. ";
     const few = `${content.healthy} healthy trajectories cannot promise ${rate} %: it requires at least ${Math.ceil(100 / rate) - 1} of them. `;
     const cheapest = best[0].rate ? `a false-alarm rate of ${percent(best[0].rate)}` : "never to raise an alarm";
-    at("best").textContent = (decision ? "" : rate ? few : "") +
+    at("best").textContent = (decision ? "" : rate ? few : none) +
       `The lowest cost with these settings: ${cheapest} (cost ${best[1].cost.toFixed(0)}).`;
   };
 
