@@ -132,9 +132,11 @@ def learned_name(name: str) -> str:
 
 
 def stage_name(key: str) -> str:
-    """`surrogate_fit_s` as `Surrogate fit`."""
-    words = re.sub(r"_s$", "", key).replace("_", " ").strip()
-    return words[:1].upper() + words[1:]
+    """`diagnosis ibg` as `Diagnosis, Surrogate only`, `surrogate_fit_s` as `Surrogate fit`."""
+    kind, _, name = re.sub(r"_s$", "", key).partition(" ")
+    words = "predictive bands" if kind == "portrait" else kind.replace("_", " ").strip()
+    title = words[:1].upper() + words[1:]
+    return f"{title}, {source_name(name)}" if name in SOURCES else f"{title} {name}".strip()
 
 
 def counted(count: int, what: str) -> str:

@@ -17,6 +17,7 @@ from markupsafe import Markup
 from retwin.report import labels
 from retwin.report.blocks import Section
 from retwin.report.figure import Figure, Matrices
+from retwin.report.glossary import explained
 from retwin.report.plotly_specs import panel_spec
 from retwin.report.png import png, small
 from retwin.report.sections import sections_of
@@ -145,7 +146,7 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         "symbol": symbol,
     }
     bodies = {
-        section.key: Markup(
+        section.key: explained(
             environment.get_template(f"{section.key}.html.j2").render(section.values)
         )
         for section in sections

@@ -117,7 +117,7 @@
     });
     const { low, high } = content.pose;
     const most = Math.max(...low.map((value, i) => high[i] - value));
-    const scene = { aspectmode: "manual", aspectratio: {}, camera: { eye: { x: 1.35, y: -1.48, z: 0.6 }, center: { x: 0, y: 0, z: -0.08 } } };
+    const scene = { aspectmode: "manual", aspectratio: {}, camera: { eye: { x: 1.2, y: -1.32, z: 0.5 }, center: { x: 0, y: 0, z: -0.1 } } };
     ["x", "y", "z"].forEach((name, i) => {
       scene[`${name}axis`] = { range: [low[i], high[i]], title: { text: `${name}, m`, font: { size: 11 } }, tickfont: { size: 10 }, nticks: 5, color: "@muted", gridcolor: "@grid", linecolor: "@rule", zeroline: false, showspikes: false, showbackground: false };
       scene.aspectratio[name] = (high[i] - low[i]) / most;

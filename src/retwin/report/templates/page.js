@@ -31,13 +31,13 @@ const page = (() => {
   const layout = {
     font: { family, size: 13, color: "@muted" }, paper_bgcolor: "rgba(0,0,0,0)",
     plot_bgcolor: "rgba(0,0,0,0)", margin: { l: 8, r: 12, t: 8, b: 8 }, showlegend: false,
+    modebar: { bgcolor: "rgba(0,0,0,0)", color: "@muted", activecolor: "@ink" },
     dragmode: false, hoverlabel: { font: { family, size: 13 } },
   };
 
   // The wheel scrolls the page, also over a picture in space; buttons zoom and download.
   const config = {
     displaylogo: false, scrollZoom: false, displayModeBar: root.clientWidth < 600 ? false : "hover",
-    modeBarButtonsToRemove: ["select2d", "lasso2d", "zoomIn2d", "zoomOut2d", "autoScale2d"],
     toImageButtonOptions: { format: "png", scale: 2 },
   };
   const plot = (place, data, layout) => {
@@ -45,7 +45,10 @@ const page = (() => {
     const height = layout.height * (root.dataset.print ? 0.72 : 1);
     place.style.height = height + "px";
     const painted = { ...paint(layout, style), height, width: place.clientWidth };
-    Plotly.react(place, { data: paint(data, style), layout: painted, config });
+    const buttons = data.some((each) => each.type === "scatter3d")
+      ? ["toImage", "orbitRotation", "zoom3d", "pan3d", "resetCameraDefault3d"]
+      : ["toImage", "zoom2d", "pan2d", "resetScale2d"];
+    Plotly.react(place, { data: paint(data, style), layout: painted, config: { ...config, modeBarButtons: [buttons] } });
   };
   // A plot is drawn when its section is opened, so that the first screen is there at once.
   const visible = (place) => place && !place.closest("details.part:not([open])");
