@@ -85,7 +85,7 @@ def test_what_is_needed_and_missing_is_broken(call, healthy: pytest.MonkeyPatch)
     real = metadata.version
 
     def without(name: str) -> str:
-        if name in ("plotly", "dask"):
+        if name in ("jinja2", "dask"):
             raise metadata.PackageNotFoundError(name)
         return real(name)
 
@@ -93,7 +93,7 @@ def test_what_is_needed_and_missing_is_broken(call, healthy: pytest.MonkeyPatch)
     code, out, _ = call("doctor")
     assert code == 1
     whole = " ".join(out.split())
-    assert re.search(r'broken plotly plotly is not installed → pip install "plotly', whole)
+    assert re.search(r'broken jinja2 jinja2 is not installed → pip install "jinja2', whole)
     assert re.search(
         r'missing scale .*dask is not installed → pip install "retwin\[scale\]"', whole
     )
