@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 import pytest
 from numpy.typing import NDArray
 
-from retwin.report.figure import Figure, Line, Matrices, Matrix
+from retwin.report.figure import Axis, Band, Figure, Line, Matrices, Matrix, Panel, Row
 from retwin.report.plotly_specs import panel_spec
 from retwin.report.png import draw, png
 from retwin.report.sections import SECTIONS, sections_of
@@ -116,3 +116,20 @@ def test_names_with_dollars_are_no_formulas() -> None:
     matrix = Matrix(bad, "ibg_rg", [[3, 1], [0, 4]], np.array([[0.75, 0.25], [0.0, 1.0]]), 7, 8)
     image = png(Matrices("confusion", [bad, other], [matrix]), emulated=False)
     assert image.startswith(b"\x89PNG")
+
+
+def test_very_many_samples_are_drawn_as_their_envelope() -> None:
+    """No peak is lost, and the page stays small: 40 000 samples, as the Silverbox has."""
+    x = np.linspace(0, 65, 40_000)
+    y = np.sin(7 * x)
+    y[12_345] = 3.0
+    marks = [Line(x, y, "measured", "ink"), Band(x, y - 1, y + 1, "band", "c0")]
+    panel = Panel(Axis("time", "s"), [Row(Axis("output"), marks)], "a long record")
+    line, band = panel_spec(panel)["data"]
+    assert len(line["x"]) == len(line["y"]) <= 4000
+    assert (max(line["y"]), min(line["y"])) == pytest.approx((3.0, -1.0), abs=1e-3)
+    assert max(band["y"]) == pytest.approx(4.0)
+    assert len(band["x"]) <= 4000
+    short = Line(x[:100], y[:100], "measured", "ink")
+    few = panel_spec(Panel(Axis("time"), [Row(Axis("output"), [short])], "short"))["data"][0]
+    assert len(few["y"]) == 100

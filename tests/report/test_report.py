@@ -289,7 +289,7 @@ def test_a_source_on_other_data_is_not_called_ahead(study: Study, write: Write, 
         if (each["a"], each["b"], each["metric"]) == ("ibg_rg", "ibg", "macro_f1")
     )
     row["mean_diff"], row["bootstrap_ci95"] = -0.2, [-0.3, -0.1]
-    assert "the surrogate only is better than" in read(write(study)).text.replace(
+    assert "the surrogate alone is better than" in read(write(study)).text.replace(
         "Of the sources", ""
     )
     sources["ibg"]["real_data"] = kind

@@ -85,6 +85,8 @@ def source_name(source: str) -> str:
 def source_in_sentence(source: str) -> str:
     """The source's title in the middle of a sentence; that of a twin or a model has an article."""
     text = in_sentence(source_name(source))
+    if with_role([source], "surrogate"):
+        text = text.replace(" only", " alone")  # "the surrogate only finds" would be ambiguous
     entry = SOURCES.get(source)
     return f"the {text}" if entry is not None and (entry.twin or entry.recorded) else text
 

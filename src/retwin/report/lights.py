@@ -146,7 +146,8 @@ def change_of(study: Study) -> tuple[ErrorChange, str] | None:
     overlay = results.overlay
     if pair is None:
         return None
-    units = {unit for _, unit in map(quantity, results.outputs.units)}
+    shown = [quantity(unit) for unit in study.output_units]
+    units = {unit for _, unit in shown}
     if overlay is None or overlay.source != pair[0] or "portrait/bands" not in study.arrays:
         return _simulated_change(study, pair, units)
     healthy = study.healthy
@@ -154,7 +155,7 @@ def change_of(study: Study) -> tuple[ErrorChange, str] | None:
         name: study.arrays[f"portrait/{name}"][healthy].astype(float)
         for name in ("nominal", "observed", "bands")
     }
-    scale = np.array([factor for factor, _ in map(quantity, results.outputs.units)])
+    scale = np.array([factor for factor, _ in shown])
     if len(units) > 1:
         spread = np.nanstd(parts["observed"], axis=(0, 1))
         scale, units = 1 / np.where(spread > 0, spread, 1.0), {"σ"}

@@ -161,9 +161,16 @@ class Study:
         """Whether each test trajectory is healthy, shape (n,); all are where there is no class."""
         labels = np.array(self.results.data.test.labels, dtype=str)
         if HEALTHY not in labels:
-            return np.ones(self.results.data.test.size, dtype=bool)
+            test = self.results.data.test
+            return np.ones(len(test.ids) or test.size, dtype=bool)
         healthy: NDArray = labels == HEALTHY
         return healthy
+
+    @property
+    def output_units(self) -> list[str]:
+        """The unit of every output, "" where none is stated."""
+        names, units = self.results.outputs.names, self.results.outputs.units
+        return [*units[: len(names)], *[""] * (len(names) - len(units))]
 
     @property
     def diagnosing(self) -> list[str]:

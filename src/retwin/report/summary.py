@@ -201,7 +201,7 @@ def _trajectory(study: Study, pair: tuple[str, str]) -> Panel | None:
     column = int(np.argmax(error / np.where(spread > 0, spread, np.inf)))
     time = np.arange(nominal.shape[1]) / float(study.arrays["portrait/rate"])
     return _panel(
-        (outputs.names[column], outputs.units[column]),
+        (outputs.names[column], study.output_units[column]),
         f"a typical healthy run ({study.results.data.test.ids[place]})",
         time,
         (nominal[place, :, column], observed[place, :, column], bands[place, :, :, column]),

@@ -140,6 +140,6 @@ def packed(values: NDArray, axis: int = -1, steps: int = FINE) -> dict[str, Any]
     first = np.zeros_like(whole.take([0], axis=axis)) if whole.shape[axis] else whole
     change = np.diff(whole, axis=axis, prepend=first).astype("<u2")
     planes = np.ascontiguousarray(change).view(np.uint8).reshape(-1, 2).T
-    text = base64.b64encode(zlib.compress(planes.tobytes(), 9)).decode()
+    text = base64.b64encode(zlib.compress(planes.tobytes(), 6)).decode()
     axis = axis % values.ndim
     return {"low": low, "step": step, "shape": list(values.shape), "axis": axis, "codes": text}

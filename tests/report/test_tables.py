@@ -1,0 +1,57 @@
+"""Tables without empty parts, terms with their explanation, and digits that tell values apart."""
+
+from __future__ import annotations
+
+from retwin.report.blocks import Cell, Column, Table
+from retwin.report.glossary import explained
+from retwin.report.labels import distinct, learned_name, percent, percents, stage_name
+
+
+def test_columns_and_rows_of_dashes_are_not_drawn() -> None:
+    columns = [Column("Source"), Column("a"), Column("p"), Column("b")]
+    rows = [
+        [Cell("head")],
+        [Cell("one"), Cell("1"), Cell("–"), Cell("2")],
+        [Cell("two"), Cell("–"), Cell("–"), Cell("")],
+        [Cell("three"), Cell("–"), Cell(""), Cell("3")],
+    ]
+    found = Table("A table", columns, rows).without_empty()
+    assert [column.text for column in found.columns] == ["Source", "a", "b"]
+    assert [row[0].text for row in found.rows] == ["head", "one", "three"]
+    assert [cell.text for cell in found.rows[2]] == ["three", "–", "3"]
+
+
+def test_a_term_is_explained_where_it_first_occurs_and_only_in_text() -> None:
+    found = explained('<h3>AUROC</h3><p title="AUROC">AUROC, ROC and AUROC<code>ECE</code></p>')
+    assert found.count("<abbr") == 2
+    assert found.startswith('<h3>AUROC</h3><p title="AUROC"><abbr title="area under the ROC curve')
+    assert found.endswith("and AUROC<code>ECE</code></p>")
+    assert explained("<p>Macro-F1</p>").endswith(">Macro-F1</abbr></p>")
+    assert explained("<p>heroclike</p>") == "<p>heroclike</p>"
+
+
+def test_digits_tell_thresholds_apart() -> None:
+    assert distinct([0.1, 0.2]) == 3
+    assert distinct([0.99991, 0.99992, 0.5]) == 5
+    assert distinct([0.5, 0.5]) == 3
+    assert distinct([1 - 1e-12, 1 - 2e-12]) == 9
+
+
+def test_percent_is_100_only_where_it_is() -> None:
+    assert (percent(1.0), percent(0.999), percent(0.0004), percent(0.0)) == (
+        "100 %",
+        "99.9 %",
+        "0.04 %",
+        "0 %",
+    )
+    assert percents((0.58, 0.914)) == "58 to 91 %"
+    assert percent(float("nan")) == percents(None) == "–"
+
+
+def test_names_for_people() -> None:
+    assert learned_name("offset_motor_1") == "Offset, motor 1"
+    assert learned_name("missed_motor_2") == "Missed segments, motor 2"
+    assert learned_name("delay") == "Delay"
+    assert stage_name("diagnosis ibg_rg") == "Diagnosis, Updated twin (outputs)"
+    assert stage_name("portrait ibg_rg") == "Predictive bands, Updated twin (outputs)"
+    assert stage_name("surrogate_fit_s") == "Surrogate fit"
