@@ -7,7 +7,6 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from retwin.report import labels
+from retwin.report.assets import asset, plotly_js
 from retwin.report.blocks import Section
 from retwin.report.figure import Figure, Matrices
 from retwin.report.glossary import explained
@@ -55,8 +55,6 @@ FIGURES = (
     "learning",
 )
 """The files `figures/NAME.png`; of a second source `NAME-2.png`."""
-LEGEND = {"solid": "none", "dash": "7 4", "dot": "2 3", "dashdot": "8 3 2 3"}
-"""Dashes of lines in legends, as lengths of strokes and gaps: those of the plots."""
 DOCS = "https://retwin.readthedocs.io/en/latest/report.html"
 """The documentation of the page, to which each section links."""
 FILTERS = {
@@ -142,7 +140,6 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         "anchors": {section.key for section in sections},
         "images": {name: base64.b64encode(small(data)).decode() for name, data in images.items()},
         "colour_of": colour_of,
-        "dashes": LEGEND,
         "symbol": symbol,
     }
     bodies = {
@@ -162,18 +159,13 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         summary=found,
         docs=DOCS,
         colours={**{f"c{place}": pair for place, pair in enumerate(PALETTE)}, **CHROME},
-        style=_asset("page.css"),
-        script=_asset("page.js"),
+        style=asset("page.css"),
+        script=asset("page.js"),
         specs=_script_json(specs),
         contents={name: _script_json(content) for name, content in contents.items()},
-        scripts={name: _asset(f"{name}.js") for name in contents},
-        plotly=_asset("plotly-gl3d.min.js", "plotly") if specs or "explorer" in contents else "",
+        scripts={name: asset(f"{name}.js") for name in contents},
+        plotly=plotly_js() if specs or "explorer" in contents else "",
     )
-
-
-def _asset(name: str, folder_name: str = "templates") -> Markup:
-    folder = resources.files(__package__).joinpath(folder_name)
-    return Markup(folder.joinpath(name).read_text(encoding="utf-8"))
 
 
 def _specs(figures: Sequence[Figure | Matrices]) -> dict[str, Any]:

@@ -220,5 +220,5 @@ def _escaped(text: str) -> str:
 
 
 def _numbers(values: ArrayLike | Sequence[float]) -> list[float]:
-    """Five digits, so that the page stays small."""
-    return [float(f"{value:.5g}") for value in np.asarray(values, dtype=float)]
+    """Four digits, so that the page stays small."""
+    return [float(f"{value:.4g}") for value in np.asarray(values, dtype=float)]

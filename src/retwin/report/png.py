@@ -65,7 +65,7 @@ def small(image: bytes) -> bytes:
     whole = Image.open(io.BytesIO(image)).convert("RGB")
     width, height = (round(SMALL * side) for side in whole.size)
     file = io.BytesIO()
-    whole.resize((width, height), Image.Resampling.LANCZOS).save(file, format="webp", quality=40)
+    whole.resize((width, height), Image.Resampling.LANCZOS).save(file, format="webp", quality=30)
     return file.getvalue()
 
 

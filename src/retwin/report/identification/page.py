@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import resources
 from math import isfinite
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +13,7 @@ from markupsafe import Markup
 from pydantic_core import from_json, to_json
 
 from retwin.evaluation.identification import Identification, RMSError
+from retwin.report.assets import asset, plotly_js
 from retwin.report.blocks import Cell, Column, Table, columns
 from retwin.report.identification.figures import INPUTS, OUTPUTS, figures
 from retwin.report.identification.texts import (
@@ -107,17 +107,12 @@ def identification_page(
         tests=_tests(found),
         limited=len(found.outputs) > OUTPUTS or len(found.twin.inputs) > INPUTS,
         colours={**{f"c{place}": pair for place, pair in enumerate(PALETTE)}, **CHROME},
-        style=_asset("page.css"),
-        script=_asset("page.js"),
+        style=asset("page.css"),
+        script=asset("page.js"),
         # Plotly draws no point for null, which JSON has in place of NaN.
         specs=htmlsafe_json_dumps(from_json(to_json(specs, inf_nan_mode="null"))),
-        plotly=_asset("plotly-gl3d.min.js", "plotly"),
+        plotly=plotly_js(),
     )
-
-
-def _asset(name: str, folder: str = "templates") -> Markup:
-    file = resources.files("retwin.report").joinpath(folder, name)
-    return Markup(file.read_text(encoding="utf-8"))
 
 
 def _unit(text: str) -> str:

@@ -103,7 +103,7 @@ def _scores(study: Study, source: str) -> Table:
     heads = columns("Score", source_name(source))
     for rival in each.rivals:
         name = RIVALS.get(rival, rival)
-        heads += [Column("score", group=name), Column("this twin lower by, %", group=name)]
+        heads += [Column("score", group=name), Column("reduction by this twin, %", group=name)]
     rows = []
     for key, title, factor, unit in _lengths(each, "CRPS, mean over outputs"):
         kind, *output = key.split("/", 1)

@@ -81,7 +81,7 @@ const page = (() => {
   window.addEventListener("hashchange", unfold);
   unfold();
   const all = document.getElementById("unfold");
-  all.addEventListener("click", () => {
+  if (all) all.addEventListener("click", () => {
     const open = all.getAttribute("aria-pressed") !== "true";
     parts.forEach((part) => { part.open = open; });
     all.setAttribute("aria-pressed", String(open));
@@ -105,14 +105,15 @@ const page = (() => {
     folded.forEach((part) => { part.open = true; });
     draw();
     const first = document.getElementById("summary");
-    first.style.zoom = Math.min(1, SHEET / first.offsetHeight);
+    if (first) first.style.zoom = Math.min(1, SHEET / first.offsetHeight);
     tables.forEach((table) => {
       table.style.zoom = Math.min(1, table.parentElement.clientWidth / table.offsetWidth);
     });
   });
   window.addEventListener("afterprint", () => {
     delete root.dataset.print;
-    document.getElementById("summary").style.zoom = "";
+    const first = document.getElementById("summary");
+    if (first) first.style.zoom = "";
     tables.forEach((table) => { table.style.zoom = ""; });
     folded.forEach((part) => { part.open = false; });
     draw();
