@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from retwin.errors import InputError
 from retwin.report.lights import lights, uses, worst
 from retwin.report.sections.decisions import decisions
 from retwin.report.study import read_study
+from retwin.report.summary import learned
 from retwin.report.verdict import headline
 from retwin.results import Results
 from retwin.scores.decisions import decide
@@ -189,3 +191,31 @@ def test_the_headline_is_the_last_updated_source_and_the_plain_one() -> None:
     assert of(("ibg_rg", "twin"), ("ibg_rg_command", "ibg")) == ("ibg_rg", "twin")
     assert of(("mine", "yours"), ("mine", "theirs")) == ("mine", "yours")
     assert of() is None
+
+
+def test_what_was_learned_is_in_the_machine_s_units(study: Study, write: Write) -> None:
+    """Delays in ms, offsets in deg, noise in mm, with intervals over trajectories."""
+    _, arrays = study
+    rng = np.random.default_rng(0)
+    arrays["portrait/z"] = np.stack(
+        [rng.normal(46, 2, (90, 2)), rng.normal(5, 0.5, (90, 2))], axis=2
+    ).astype(np.float32)
+    arrays["z/ibg_rg/trajectory"] = np.repeat(np.arange(10), 24)
+    table = learned(read_study(write(study)))
+    assert table is not None
+    rows = {row[0].text: [cell.text for cell in row[1:]] for row in table.rows}
+    assert list(rows)[:2] == ["Delay", "Offset, motor 1"]
+    offset = rows["Offset, motor 1"]
+    assert offset[0].endswith(" deg")
+    assert float(offset[0].split()[0]) == pytest.approx(0.24 * 5, rel=0.1), "10 healthy ones"
+    low, high = (float(end) for end in offset[1].removesuffix(" deg").split(" to "))
+    assert low < 0.24 * 5 < high
+    noise = rows["Noise at rest, x"]
+    assert all(text.endswith(" mm") for text in noise[:3])
+    assert noise[-1] == "240"
+
+
+def test_an_index_of_trajectories_that_does_not_fit_is_refused(study: Study, write: Write) -> None:
+    study[1]["z/ibg_rg/trajectory"] = np.zeros(3)
+    with pytest.raises(InputError, match=r"^z/ibg_rg/trajectory: expected"):
+        read_study(write(study))

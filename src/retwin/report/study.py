@@ -76,6 +76,9 @@ class Study:
         fidelity = self.results.fidelity[source]
         for name in ("observed", "predicted"):
             self._require(f"z/{source}/{name}", (None, len(fidelity.latents)))
+        observed = self.arrays.get(f"z/{source}/observed")
+        if observed is not None:
+            self._require(f"z/{source}/trajectory", (len(observed),))
         self._require(f"pit/{source}", (3, None))
         parts = self.bands(source)
         if parts:
