@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 from retwin.report.blocks import Cell, Column, Table
 from retwin.report.glossary import explained
 from retwin.report.labels import distinct, learned_name, percent, percents, stage_name
+from retwin.report.page import DOCS
 
 
 def test_columns_and_rows_of_dashes_are_not_drawn() -> None:
@@ -55,3 +61,14 @@ def test_names_for_people() -> None:
     assert stage_name("diagnosis ibg_rg") == "Diagnosis, Updated twin (outputs)"
     assert stage_name("portrait ibg_rg") == "Predictive bands, Updated twin (outputs)"
     assert stage_name("surrogate_fit_s") == "Surrogate fit"
+
+
+def test_every_section_links_to_a_heading_of_the_documentation(
+    study: Any, write: Callable[[Any], Path], rendered: Callable[[Path], str]
+) -> None:
+    document = (Path(__file__).parents[2] / "docs" / "report.md").read_text("utf-8")
+    headings = re.findall(r"^## (.*)$", document, flags=re.MULTILINE)
+    anchors = {heading.lower().replace(" ", "-") for heading in headings}
+    linked = re.findall(rf'href="{re.escape(DOCS)}#([^"]*)"', rendered(write(study)))
+    assert len(linked) > 10
+    assert set(linked) <= anchors
