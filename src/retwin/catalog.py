@@ -15,6 +15,7 @@ from retwin.entries import (
     Entry,
     Extra,
     FormatEntry,
+    LogEntry,
     Metric,
     Need,
     PublicFile,
@@ -36,6 +37,7 @@ __all__ = [
     "EXTRAS",
     "FORMATS",
     "IDENTIFICATIONS",
+    "LOGS",
     "METRICS",
     "NEEDS",
     "NETWORKS",
@@ -46,6 +48,7 @@ __all__ = [
     "Entry",
     "Extra",
     "FormatEntry",
+    "LogEntry",
     "Metric",
     "Need",
     "PublicFile",
@@ -203,12 +206,30 @@ FORMATS: Mapping[str, FormatEntry] = {
 }
 """By the suffix of the name; "" is any other folder."""
 
+LOGS: Mapping[str, LogEntry] = {
+    ".mcap": LogEntry("MCAP", "retwin.data.logs.mcap_files:read", "logs"),
+    "": LogEntry("the folder of a ROS 2 bag", "retwin.data.logs.bags:read", "logs"),
+    ".db3": LogEntry("a file of a ROS 2 bag", "retwin.data.logs.bags:read", "logs"),
+    ".bag": LogEntry("ROS 1 bag", "retwin.data.logs.bags:read", "logs"),
+    ".parquet": LogEntry("Parquet", "retwin.data.logs.arrow_tables:read", "logs"),
+    ".arrow": LogEntry("Arrow IPC", "retwin.data.logs.arrow_tables:read", "logs"),
+    ".feather": LogEntry("Feather", "retwin.data.logs.arrow_tables:read", "logs"),
+    ".tdms": LogEntry("TDMS of LabVIEW", "retwin.data.logs.tdms:read", "logs"),
+    ".mf4": LogEntry("MDF 4", "retwin.data.logs.mdf:read", "logs"),
+    ".mdf": LogEntry("MDF 3", "retwin.data.logs.mdf:read", "logs"),
+    ".csv": LogEntry("CSV", "retwin.data.logs.text_tables:read"),
+    ".tsv": LogEntry("CSV with tabulators", "retwin.data.logs.text_tables:read"),
+    ".txt": LogEntry("CSV with any separator", "retwin.data.logs.text_tables:read"),
+}
+"""By the suffix of the name; "" is a folder. They need a mapping to become trajectories."""
+
 EXTRAS: Mapping[str, Extra] = {
     "bayes": Extra("Bayesian updating, the source pi_bayes", "sbi"),
     "compiled": Extra("a C compiler for StateTwin, where the system has none", "ziglang"),
     "fetch": Extra("downloads of public data", "pooch"),
     "flows": Extra("normalising flows as the distribution of the discrepancy", "zuko"),
     "fmu": Extra("twins that are FMUs", "fmpy"),
+    "logs": Extra("logs: ROS bags, MCAP, Parquet, TDMS, MDF; conversion of units", "rosbags"),
     "monitor": Extra("the live monitor: its store, its streams and its page", "sqlalchemy"),
     "onnx": Extra("bundles that need no torch", "onnxruntime"),
     "parquet": Extra("Parquet files as a source of the monitor", "pyarrow"),

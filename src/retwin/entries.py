@@ -15,6 +15,7 @@ __all__ = [
     "Entry",
     "Extra",
     "FormatEntry",
+    "LogEntry",
     "Metric",
     "Need",
     "PublicFile",
@@ -198,6 +199,26 @@ class FormatEntry:
     writer: str = ""
     extra: str = ""
     folder: bool = False
+
+
+@dataclass(frozen=True)
+class LogEntry:
+    """A format of logs, whose signals have times of their own.
+
+    Parameters
+    ----------
+    title : str
+        What it is.
+    reader : str
+        The function that reads it, a `data.logs.signals.Reader`.
+    extra : str
+        The extra of the package that it needs.
+
+    """
+
+    title: str
+    reader: str
+    extra: str = ""
 
 
 @dataclass(frozen=True)

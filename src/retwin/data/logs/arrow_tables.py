@@ -1,0 +1,108 @@
+"""Parquet, Arrow IPC and Feather, by pyarrow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import needs_extra
+from retwin.data.logs.signals import MAX_SIGNALS, Clock, Signal, Skipped, named_unit
+from retwin.data.logs.tables import table_signals
+from retwin.errors import InputError
+
+__all__ = ["read"]
+
+MAX_DEPTH = 8
+"""Structures inside structures at most."""
+MAX_ELEMENTS = 64
+"""Elements of a list of fixed length that become signals."""
+
+
+def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Signal | Skipped]:
+    """The signals of a table: its columns of numbers; see `data.logs.signals.Reader`.
+
+    Fields of structures are `column.field`, elements of lists of one length `column[0]`. The unit
+    is in the title, or in the metadata of the column under `unit`.
+    """
+    arrow = needs_extra("pyarrow", "logs", "reads Parquet and Arrow")
+    needs_extra("pyarrow.compute", "logs", "takes structures apart")
+    table = _table(path, arrow)
+    columns: dict[str, Any] = {}
+    units: dict[str, str] = {}
+    for field, column in zip(table.schema, table.columns, strict=True):
+        name, unit = named_unit(field.name)
+        about = field.metadata or {}
+        unit = unit or about.get(b"unit", b"").decode("utf-8", "replace")
+        for own, leaf in _leaves(arrow, name, column, 0):
+            columns[own], units[own] = leaf, unit
+            if len(columns) > MAX_SIGNALS:
+                raise InputError(
+                    path.name,
+                    expected=f"at most {MAX_SIGNALS} columns",
+                    got="more",
+                    remedy="write those that are wanted to a file of their own",
+                )
+
+    def numeric(name: str) -> tuple[NDArray, int] | str:
+        kind = columns[name].type
+        types = arrow.types
+        if not (
+            types.is_integer(kind)
+            or types.is_floating(kind)
+            or types.is_boolean(kind)
+            or types.is_decimal(kind)
+        ):
+            return f"of type {str(kind)[:40]}"
+        column = columns[name]
+        if types.is_boolean(kind):
+            column = column.cast("int8")
+        made = column.cast("double", safe=False).to_numpy()
+        return np.asarray(made, dtype=float), 0
+
+    def stamps(name: str) -> NDArray:
+        column = columns[name]
+        if arrow.types.is_timestamp(column.type):
+            column = column.cast("timestamp[ns]", safe=False).cast("int64")
+            made = column.to_numpy()
+            missing = np.isnan(made) if made.dtype.kind == "f" else np.zeros(len(made), bool)
+            whole = np.where(missing, 0, made).astype("datetime64[ns]")
+            return np.where(missing, np.datetime64("NaT"), whole)
+        return np.asarray(column.to_numpy())
+
+    yield from table_signals(path.name, units, numeric, stamps, table.num_rows, clock, wanted)
+
+
+def _table(path: Path, arrow: Any) -> Any:
+    if path.suffix.lower() == ".parquet":
+        parquet = needs_extra("pyarrow.parquet", "logs", "reads Parquet")
+        with parquet.ParquetFile(path) as file:
+            return file.read()
+    feather = needs_extra("pyarrow.feather", "logs", "reads Feather")
+    try:
+        return feather.read_table(path, memory_map=False)
+    except arrow.ArrowInvalid:
+        with path.open("rb") as stream, arrow.ipc.open_stream(stream) as batches:
+            return batches.read_all()
+
+
+def _leaves(arrow: Any, name: str, column: Any, depth: int) -> Iterator[tuple[str, Any]]:
+    """The columns inside a column of structures, or of lists of one length."""
+    kind = column.type
+    if depth < MAX_DEPTH and arrow.types.is_struct(kind):
+        for place in range(kind.num_fields):
+            field = arrow.compute.struct_field(column, [place])
+            yield from _leaves(arrow, f"{name}.{kind.field(place).name}", field, depth + 1)
+    elif (
+        depth < MAX_DEPTH
+        and arrow.types.is_fixed_size_list(kind)
+        and kind.list_size <= MAX_ELEMENTS
+    ):
+        for place in range(kind.list_size):
+            element = arrow.compute.list_element(column, place)
+            yield from _leaves(arrow, f"{name}[{place}]", element, depth + 1)
+    else:
+        yield name, column

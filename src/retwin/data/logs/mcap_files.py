@@ -1,0 +1,86 @@
+"""MCAP: ROS 2, ROS 1 and JSON messages, by mcap and rosbags."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from retwin.checks import needs_extra
+from retwin.data.logs.messages import Series, Types, header_stamp
+from retwin.data.logs.signals import Clock, Signal, Skipped
+from retwin.errors import InputError
+
+__all__ = ["read"]
+
+DEFINED = {"ros2msg": False, "ros2idl": True, "ros1msg": False}
+"""Encodings of definitions, and whether they are IDL."""
+
+
+def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Signal | Skipped]:
+    """The fields of all messages; see `data.logs.signals.Reader` and `messages`.
+
+    Types come from the definitions in the file. Checksums are verified.
+
+    Raises
+    ------
+    InputError
+        The file is cut off: its end is missing.
+
+    """
+    mcap = needs_extra("mcap.reader", "logs", "reads MCAP")
+    exceptions = needs_extra("mcap.exceptions", "logs", "reads MCAP")
+    needs_extra("rosbags", "logs", "decodes ROS messages")
+    types, series = Types(), Series(wanted)
+    undecoded: set[int] = set()
+    with path.open("rb") as stream:
+        reader = mcap.NonSeekingReader(stream, validate_crcs=True)
+        try:
+            for schema, channel, message in reader.iter_messages(log_time_order=False):
+                if channel.id in undecoded or not series.wants(channel.topic):
+                    continue
+                decoded = _decoded(types, schema, channel, message.data)
+                if isinstance(decoded, str):
+                    undecoded.add(channel.id)
+                    series.skip(channel.topic, decoded)
+                    continue
+                time = message.log_time
+                if clock.stamps == "header":
+                    stamp = header_stamp(decoded)
+                    if stamp is None:
+                        undecoded.add(channel.id)
+                        series.skip(channel.topic, "without a header stamp")
+                        continue
+                    time = stamp
+                series.add(channel.topic, time, decoded)
+        except exceptions.EndOfFile:
+            raise _cut_off(path) from None
+    yield from series.found()
+
+
+def _decoded(types: Types, schema: Any, channel: Any, data: bytes) -> Any:
+    """A message, or why it cannot be decoded."""
+    encoding = channel.message_encoding
+    if encoding == "json":
+        found = json.loads(data)
+        return found if isinstance(found, dict | list | int | float) else "text"
+    if encoding not in ("cdr", "ros1") or schema is None:
+        return f"messages in the encoding {encoding[:40]!r}, which is not read"
+    name = schema.name
+    if schema.encoding in DEFINED and schema.data.strip():
+        text = schema.data.decode("utf-8", "replace")
+        name = types.define(name, text, idl=DEFINED[schema.encoding])
+    try:
+        return types.decode(data, name, ros1=encoding == "ros1")
+    except KeyError:
+        return f"messages of the type {name[:80]}, which the log does not define"
+
+
+def _cut_off(path: Path) -> InputError:
+    return InputError(
+        path.name,
+        expected="an MCAP file that is whole",
+        got="one that is cut off",
+        remedy=f"recover it: mcap recover {path.name} -o recovered.mcap",
+    )

@@ -1,0 +1,236 @@
+"""Messages as numbers: the fields of ROS messages and JSON objects, each a signal of its own.
+
+A field is `/topic.field.inner`. An element of an array is `position[shoulder]` where the message
+names its elements in a list of texts beside it (`name`, `joint_names`, …), else `position[0]`. An
+element of a list of messages is named by its own text `name`, `child_frame_id` or `key`.
+"""
+
+from __future__ import annotations
+
+import keyword
+import re
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from retwin.data.logs.signals import MAX_SIGNALS, Signal, Skipped
+from retwin.errors import InputError
+
+__all__ = ["Series", "Types", "header_stamp"]
+
+MAX_ELEMENTS = 64
+"""Elements of an array that become signals; images and point clouds have more."""
+MAX_DEPTH = 12
+"""Messages inside messages at most."""
+MAX_NAME = 200
+"""Characters of an element's name."""
+OWN_NAMES = ("name", "child_frame_id", "key")
+"""Texts by which an element of a list of messages is named."""
+TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,3}", re.ASCII)
+STAMP = ("sec", "nanosec", "nsec", "secs", "nsecs")
+"""Fields of a stamp, of which no signals are made."""
+
+
+class Types:
+    """The types of ROS messages: those that a log defines, else those of ROS itself.
+
+    The library makes Python code of definitions, so that each name in them is checked first.
+    """
+
+    def __init__(self) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
+        self._store = get_typestore(Stores.EMPTY)
+        self._known = get_typestore(Stores.LATEST)
+        self._ros1 = get_typestore(Stores.ROS1_NOETIC)
+        self._of_log: set[str] = set()
+
+    def define(self, name: str, text: str, *, idl: bool = False) -> str:
+        """Add the definition of a type, and of those inside it; its normalised name."""
+        from rosbags.typesys import get_types_from_idl, get_types_from_msg
+        from rosbags.typesys.msg import normalize_msgtype
+
+        name = normalize_msgtype(name)
+        if name in self._of_log:
+            return name
+        found: dict[str, Any] = {}
+        if idl:
+            separator = "=" * 80 + "\n"
+            for part in text.split(separator) if separator in text else [text]:
+                body = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
+                if body.strip():
+                    found.update(get_types_from_idl(body))
+        else:
+            found.update(get_types_from_msg(text, name))
+        for own, (constants, fields) in found.items():
+            for each in (*(c[0] for c in constants), *(f[0] for f in fields)):
+                _require_name(each.isidentifier() and not each.startswith("__"), each)
+            _require_name(TYPE_NAME.fullmatch(own) is not None, own)
+        new = {own: fields for own, fields in found.items() if own not in self._store.fielddefs}
+        self._store.register(new)
+        self._of_log |= set(found)
+        return name
+
+    def decode(self, data: bytes, name: str, *, ros1: bool = False) -> Any:
+        """The message of that type; KeyError if the type is not known."""
+        from rosbags.typesys.msg import normalize_msgtype
+
+        name = normalize_msgtype(name)
+        own = name in self._store.fielddefs
+        store = self._store if own else (self._ros1 if ros1 else self._known)
+        if name not in store.fielddefs:
+            raise KeyError(name)
+        return store.deserialize_ros1(data, name) if ros1 else store.deserialize_cdr(data, name)
+
+
+def _require_name(fine: bool, name: str) -> None:
+    if not fine:
+        raise InputError(
+            "message definition",
+            expected="names of types and fields",
+            got=repr(name)[:60],
+            remedy="the log is damaged, or was made to do harm",
+        )
+
+
+def header_stamp(message: Any) -> int | None:
+    """The stamp of a message's header in ns; None if it has none."""
+    header = message.get("header") if isinstance(message, Mapping) else getattr(
+        message, "header", None
+    )
+    if header is None:
+        return None
+    stamp = header.get("stamp") if isinstance(header, Mapping) else getattr(header, "stamp", None)
+    if stamp is None:
+        return None
+    parts = dict(_items(stamp))
+    seconds = next((parts[each] for each in ("sec", "secs") if each in parts), None)
+    rest = next((parts[each] for each in ("nanosec", "nsec", "nsecs") if each in parts), None)
+    if not isinstance(seconds, int) or not isinstance(rest, int):
+        return None
+    return seconds * 10**9 + rest
+
+
+class Series:
+    """Numbers of messages, collected by their names.
+
+    Parameters
+    ----------
+    wanted : frozenset of str or None
+        The names of the signals to keep.
+
+    """
+
+    def __init__(self, wanted: frozenset[str] | None) -> None:
+        self._wanted = wanted
+        self._times: dict[str, array[int]] = {}
+        self._values: dict[str, array[float]] = {}
+        self._skipped: dict[str, str] = {}
+
+    def wants(self, topic: str) -> bool:
+        """Whether a signal of that topic is wanted."""
+        return self._wanted is None or any(
+            each == topic or each.startswith((f"{topic}.", f"{topic}[")) for each in self._wanted
+        )
+
+    def add(self, topic: str, time: int, message: Any) -> None:
+        """The numbers of a message at a time in ns."""
+        for name, value in self._leaves(topic, message, 0):
+            if self._wanted is not None and name not in self._wanted:
+                continue
+            times = self._times.get(name)
+            if times is None:
+                if len(self._times) >= MAX_SIGNALS:
+                    raise InputError(
+                        topic,
+                        expected=f"at most {MAX_SIGNALS} signals",
+                        got="more",
+                        remedy="name those that are wanted in the mapping",
+                    )
+                times = self._times[name] = array("q")
+                self._values[name] = array("d")
+            times.append(time)
+            self._values[name].append(value)
+
+    def skip(self, name: str, reason: str) -> None:
+        """Note that no signal is made of a topic or field."""
+        if len(self._skipped) < MAX_SIGNALS:
+            self._skipped.setdefault(name, reason)
+
+    def found(self) -> Iterator[Signal | Skipped]:
+        """The signals, in the order of their first values, and what was skipped."""
+        for name in list(self._times):
+            times, values = self._times.pop(name), self._values.pop(name)
+            yield Signal(name, np.frombuffer(times, np.int64), np.frombuffer(values, float))
+        for name, reason in self._skipped.items():
+            yield Skipped(name, reason)
+
+    def _leaves(self, name: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
+        if isinstance(value, bool | int | float | np.number | np.bool_):
+            yield name, float(value)
+        elif isinstance(value, str) or value is None:
+            return
+        elif isinstance(value, np.ndarray):
+            yield from self._array(name, value.ravel(), None, depth)
+        elif isinstance(value, list | tuple):
+            yield from self._array(name, value, None, depth)
+        elif depth < MAX_DEPTH:
+            yield from self._fields(name, value, depth)
+
+    def _fields(self, name: str, message: Any, depth: int) -> Iterator[tuple[str, float]]:
+        fields = list(_items(message))
+        if {key for key, _ in fields} <= set(STAMP) and len(fields) == 2:
+            return
+        names = next((value for key, value in fields if _names_elements(key, value)), None)
+        for key, value in fields:
+            inner = f"{name}.{key}"
+            if isinstance(value, list | tuple | np.ndarray):
+                flat = value.ravel() if isinstance(value, np.ndarray) else value
+                same = names is not None and value is not names and len(flat) == len(names)
+                yield from self._array(inner, flat, names if same else None, depth)
+            else:
+                yield from self._leaves(inner, value, depth + 1)
+
+    def _array(
+        self, name: str, values: Sequence[Any] | np.ndarray, names: Sequence[str] | None, depth: int
+    ) -> Iterator[tuple[str, float]]:
+        if len(values) > MAX_ELEMENTS:
+            self.skip(name, f"an array of {len(values)} elements")
+            return
+        for place, value in enumerate(values):
+            own = names[place] if names is not None else _own_name(value)
+            inner = f"{name}[{place if own is None else own[:MAX_NAME]}]"
+            yield from self._leaves(inner, value, depth + 1)
+
+
+def _names_elements(key: str, value: Any) -> bool:
+    """Whether a field names the elements of the arrays beside it."""
+    return (
+        (key in ("name", "names") or key.endswith("_names"))
+        and isinstance(value, list | tuple)
+        and len(value) > 0
+        and all(isinstance(each, str) and each for each in value)
+        and len(set(value)) == len(value)
+    )
+
+
+def _own_name(value: Any) -> str | None:
+    """The text by which an element of a list of messages is named."""
+    if isinstance(value, bool | int | float | str | np.generic):
+        return None
+    parts = dict(_items(value))
+    found = (parts.get(key) for key in OWN_NAMES)
+    return next((each for each in found if isinstance(each, str) and each), None)
+
+
+def _items(message: Any) -> Iterator[tuple[str, Any]]:
+    """The fields of a message: of a dataclass of the library, or of a JSON object."""
+    if isinstance(message, Mapping):
+        yield from ((str(key)[:MAX_NAME], value) for key, value in message.items())
+        return
+    for key in getattr(message, "__dataclass_fields__", ()):
+        if key != "__msgtype__":
+            plain = key[:-1] if key.endswith("_") and keyword.iskeyword(key[:-1]) else key
+            yield plain, getattr(message, key)

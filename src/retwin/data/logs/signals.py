@@ -1,0 +1,169 @@
+"""`Signal` and `Log`: series with times of their own, as readers of logs give them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.errors import InputError
+
+__all__ = [
+    "MAX_SIGNALS",
+    "NANOSECOND",
+    "UNIT_SECONDS",
+    "Clock",
+    "Log",
+    "Reader",
+    "Signal",
+    "Skipped",
+    "named_unit",
+    "to_nanoseconds",
+]
+
+NANOSECOND = 1e-9
+"""A nanosecond in s."""
+MAX_SIGNALS = 10_000
+"""Signals that one log may hold: names that are different in every message would fill memory."""
+LATEST = 2**63 - 1
+"""The latest time in ns, in the year 2262."""
+UNIT_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Units of times that are numbers, in s."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Where a log has its times; formats with times of their own need nothing of it.
+
+    Parameters
+    ----------
+    column : str
+        The column, or the channel of a group, that holds the times; "" for the one that is found.
+    unit : {"", "s", "ms", "us", "ns", "iso"}
+        Its unit, or ISO 8601 text; "" for what is found.
+    format : str
+        The format of times that are other text, as `datetime.strptime` reads it.
+    rate : float or None
+        Rows per s, where there is no column of times.
+    stamps : {"log", "header"}
+        Whether messages have the time of their recording or the stamp of their header.
+
+    """
+
+    column: str = ""
+    unit: Literal["", "s", "ms", "us", "ns", "iso"] = ""
+    format: str = ""
+    rate: float | None = None
+    stamps: Literal["log", "header"] = "log"
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """One series of numbers.
+
+    Parameters
+    ----------
+    name : str
+        Its name in the log: a column, `group/channel`, or `/topic.field`.
+    times : (n,) array
+        Times: in ns from a reader (int64), in s since the begin of the log in a `Log`.
+    values : (n,) array of float
+        Its values, NaN where one is missing.
+    unit : str
+        Its unit as the log has it, "" if it has none.
+    unreadable : int
+        Values that are no numbers, and count as missing.
+
+    """
+
+    name: str
+    times: NDArray
+    values: NDArray
+    unit: str = ""
+    unreadable: int = 0
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A series of which no signal is made, and the reason."""
+
+    name: str
+    reason: str
+
+
+Reader = Callable[[Path, "frozenset[str] | None", Clock], Iterator[Signal | Skipped]]
+"""A function that reads a log: of a path, the names of the signals that are wanted (None for all),
+and the clock. It yields each signal as a whole."""
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """What was read of a log.
+
+    Attributes
+    ----------
+    name : str
+        The name of the file or folder.
+    sha256 : str
+        Its SHA-256.
+    begin : int
+        The time of its first value in ns, since 1970 where the log knows the date.
+    signals : dict of str to Signal
+        The signals by their names, with times in s since `begin`.
+    skipped : dict of str to str
+        What is in the log besides, and why no signal is made of it.
+
+    """
+
+    name: str
+    sha256: str
+    begin: int
+    signals: dict[str, Signal]
+    skipped: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def end(self) -> float:
+        """The time of the last value, in s since the first one."""
+        return max((float(s.times[-1]) for s in self.signals.values() if len(s.times)), default=0.0)
+
+
+def named_unit(name: str) -> tuple[str, str]:
+    """Name and unit of a title such as "T1 [°C]" or "speed (m/s)"; the unit is "" if it has none.
+
+    What is in brackets is an index, and part of the name, if it is a number or follows at once.
+    """
+    found = re.fullmatch(r"\s*(.*?\S)(?:\s+\(([^()]*)\)|\s*\[([^\[\]]*)\])\s*", name)
+    if found is None or re.fullmatch(r"\d+|", unit := (found[2] or found[3] or "").strip()):
+        return name.strip(), ""
+    return found[1], unit
+
+
+def to_nanoseconds(times: NDArray, unit: str, where: str) -> NDArray:
+    """Times (n,) in a unit of `UNIT_SECONDS` as whole ns.
+
+    Raises
+    ------
+    InputError
+        One is not finite, or out of range.
+
+    """
+    times = np.asarray(times)
+    if times.dtype.kind in "iu" and unit == "ns":
+        return times.astype(np.int64)
+    scaled = np.round(times.astype(np.longdouble) * (UNIT_SECONDS[unit] / NANOSECOND))
+    fine = np.abs(scaled) < LATEST  # NaN is not
+    if not fine.all():
+        row = int(np.argmin(fine))
+        raise InputError(
+            where,
+            expected="a time in every row, before the year 2262",
+            got=f"{times[row]} {unit} in row {row}",
+            remedy="check column and unit of [time] in the mapping",
+        )
+    made: NDArray = scaled.astype(np.int64)
+    return made

@@ -1,0 +1,207 @@
+"""Tables whose rows have a time: the column of the times, and the signals of the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from datetime import UTC, datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.logs.signals import UNIT_SECONDS, Clock, Signal, Skipped, to_nanoseconds
+from retwin.errors import InputError
+
+__all__ = ["MISSING", "TIMES", "TIME_NAMES", "numbers", "row_times", "table_signals", "time_column"]
+
+TIME_NAMES = ("time", "timestamp", "timestamps", "t", "datetime", "date", "zeit", "stamp", "clock")
+"""Names by which a column of times is found, the most certain first."""
+TIMES = "times"
+"""Why a column of times is no signal."""
+MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "?"})
+"""Cells that stand for a missing value, in small letters."""
+TRUTH = {"true": "1", "false": "0", "on": "1", "off": "0"}
+"""Cells that stand for 1 and 0."""
+EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+"""The least times since 1970 in these units; smaller ones are in s."""
+
+Column = Callable[[str], NDArray]
+
+
+def time_column(names: Iterable[str]) -> str:
+    """The name of the column that holds the times, "" if none has such a name.
+
+    A name counts without its unit and without what is before its last separator: `Time [s]`.
+    """
+    found: list[tuple[int, int, str]] = []
+    for place, name in enumerate(names):
+        plain = name.lower().strip().strip('"')
+        last = plain.replace("/", " ").replace(".", " ").split("[")[0].split("(")[0].split()
+        parts = [part.strip("_ ") for part in (plain, *last[-1:])]
+        parts += [word for part in parts for word in part.split("_")[:1]]
+        rank = min((TIME_NAMES.index(p) for p in parts if p in TIME_NAMES), default=None)
+        if rank is not None:
+            found.append((rank, place, name))
+    return min(found)[2] if found else ""
+
+
+def row_times(values: NDArray, unit: str, clock: Clock, where: str) -> NDArray:
+    """Times (n,) in ns of the cells of a column.
+
+    Parameters
+    ----------
+    values : (n,) array
+        datetime64, numbers or text.
+    unit : str
+        The unit that the file states, "" if it states none.
+    clock : Clock
+        What the user states, which comes first.
+    where : str
+        File and column, for messages.
+
+    Raises
+    ------
+    InputError
+        A cell is no time.
+
+    """
+    if values.dtype.kind == "M":
+        return _known(values.astype("datetime64[ns]").astype(np.int64), np.isnat(values), where)
+    if values.dtype.kind in "OUS":
+        if clock.format or clock.unit == "iso":
+            return _parsed(values, clock.format, where)
+        try:
+            values = np.array([float(str(cell).replace(",", ".")) for cell in values])
+        except ValueError:
+            if clock.unit:
+                raise _no_time(values, where) from None
+            return _parsed(values, "", where)
+    stated = clock.unit or {"sec": "s", "seconds": "s", "µs": "us", "μs": "us"}.get(unit, unit)
+    if stated not in UNIT_SECONDS:
+        size = float(np.nanmax(np.abs(values), initial=0.0)) if len(values) else 0.0
+        stated = next((name for least, name in EPOCHS if size > least), "s")
+    return to_nanoseconds(values, stated, where)
+
+
+def _increases(cells: NDArray) -> bool:
+    """Whether cells may be times by their order alone: a guess, for what a user then checks."""
+    try:
+        times = row_times(cells, "", Clock(), "")
+    except InputError:
+        return False
+    return len(times) > 1 and bool((np.diff(times) > 0).all())
+
+
+def _known(times: NDArray, missing: NDArray, where: str) -> NDArray:
+    if missing.any():
+        raise InputError(
+            where,
+            expected="a time in every row",
+            got=f"none in row {int(np.argmax(missing))}",
+            remedy="remove that row, or name another column in [time] of the mapping",
+        )
+    return times
+
+
+def _parsed(cells: NDArray, form: str, where: str) -> NDArray:
+    """Times in ns of ISO 8601 text, or of text in a format of `strptime`; UTC without a zone."""
+    made = np.empty(len(cells), np.int64)
+    epoch = datetime(1970, 1, 1, tzinfo=UTC)
+    for row, cell in enumerate(cells):
+        text = str(cell).strip()
+        try:
+            time = datetime.strptime(text, form) if form else datetime.fromisoformat(text)
+        except ValueError:
+            raise _no_time(cells[row : row + 1], f"{where}, row {row}") from None
+        since = (time if time.tzinfo else time.replace(tzinfo=UTC)) - epoch
+        made[row] = (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000
+    return made
+
+
+def _no_time(cells: NDArray, where: str) -> InputError:
+    return InputError(
+        where,
+        expected="times: numbers, ISO 8601, or text in the format of [time] in the mapping",
+        got=repr(str(cells[0]))[:60] if len(cells) else "none",
+        remedy='name column and unit, or give format = "%d.%m.%Y %H:%M:%S" in [time]',
+    )
+
+
+def numbers(cells: NDArray, *, comma: bool = False) -> tuple[NDArray, int]:
+    """Cells (n,) of text as numbers, NaN where one is missing, and how many are no numbers.
+
+    `comma` states that decimals are after a comma.
+    """
+    try:
+        return cells.astype(float), 0
+    except ValueError:
+        pass
+    made = np.full(len(cells), np.nan)
+    bad = 0
+    for row, cell in enumerate(cells.tolist()):
+        text = str(cell).strip()
+        small = text.lower()
+        text = TRUTH.get(small, text.replace(",", ".") if comma else text)
+        try:
+            made[row] = float(text)
+        except ValueError:
+            bad += small not in MISSING
+    return made, bad
+
+
+def table_signals(
+    place: str,
+    titles: Mapping[str, str],
+    column: Callable[[str], tuple[NDArray, int] | str],
+    stamps: Callable[[str], NDArray],
+    rows: int,
+    clock: Clock,
+    wanted: frozenset[str] | None,
+) -> Iterator[Signal | Skipped]:
+    """The signals of one table.
+
+    Parameters
+    ----------
+    place : str
+        The table, for messages.
+    titles : mapping of str to str
+        The unit of each column.
+    column : callable
+        Gives a column's numbers (n,) and how many cells are none, or why it has no numbers.
+    stamps : callable
+        Gives the cells of a column that may hold times.
+    rows : int
+        The number of rows.
+    clock : Clock
+        Where the times are.
+    wanted : frozenset of str or None
+        The names of the columns to give.
+
+    Raises
+    ------
+    InputError
+        There is no column of times, or it holds something else.
+
+    """
+    name = clock.column or ("" if clock.rate else time_column(titles))
+    if not name and not clock.rate and wanted is None:
+        name = next((each for each in list(titles)[:1] if _increases(stamps(each))), "")
+    if (not name and not clock.rate) or (name and name not in titles):
+        raise InputError(
+            place,
+            expected=f"a column of times {clock.column!r}".rstrip(" '"),
+            got=f"the columns {', '.join(list(titles)[:12])}{', …' * (len(titles) > 12)}",
+            remedy="name it in the mapping: [time] column = …, or give the rows per s: rate = …",
+        )
+    if name:
+        times = row_times(stamps(name), titles[name], clock, f"{place}, column {name!r}")
+        yield Skipped(name, TIMES)
+    else:
+        times = np.round(np.arange(rows) * (1e9 / (clock.rate or 1.0))).astype(np.int64)
+    for title, unit in titles.items():
+        if title == name or (wanted is not None and title not in wanted):
+            continue
+        found = column(title)
+        if isinstance(found, str):
+            yield Skipped(title, found)
+        else:
+            yield Signal(title, times, found[0], unit, found[1])

@@ -1,0 +1,263 @@
+"""CSV tables of any separator, with lines before the header, units, and decimal commas."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.logs.signals import Clock, Signal, Skipped, named_unit
+from retwin.data.logs.tables import MISSING, TRUTH, numbers, table_signals
+from retwin.errors import InputError, brief
+
+__all__ = ["read"]
+
+SEPARATORS = (";", "\t", ",", "|")
+"""Separators in the order in which they are tried; blanks come last."""
+HEAD = 200
+"""Lines in which the header and the first rows of numbers are looked for."""
+AGREEING = 12
+"""Rows that must have the same number of columns."""
+LONGEST = 2**20
+"""Characters of a line at most."""
+BLOCK = 65_536
+"""Rows that are converted together."""
+TEXT_SHARE = 0.5
+"""The share of cells that are no numbers from which a column is text."""
+NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf|nan", re.IGNORECASE)
+ISO = re.compile(r"\d{4}-\d\d?-\d\d?[T ]|\d\d?[./]\d\d?[./]\d{2,4}|\d\d?:\d\d")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a text table is written.
+
+    Attributes
+    ----------
+    encoding : str
+        The encoding of its text.
+    separator : str
+        What is between cells; "" for blanks.
+    first : int
+        The line, from 0, of the first row of numbers.
+    names, units : tuple of str
+        The title and the unit of each column.
+    comma : bool
+        Whether decimals are after a comma.
+
+    """
+
+    encoding: str
+    separator: str
+    first: int
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    comma: bool
+
+
+def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Signal | Skipped]:
+    """The signals of a text table; see `data.logs.signals.Reader`.
+
+    Raises
+    ------
+    InputError
+        It is no table of numbers, or a row has another number of cells than the first one.
+
+    """
+    layout = _layout(path)
+    titles = dict(zip(layout.names, layout.units, strict=True))
+    kept = set(titles) if wanted is None else {clock.column, *wanted} & set(titles)
+    if wanted is not None and not clock.rate:  # the column of times may be found by its name
+        kept = set(titles) if not clock.column else kept
+    parts: dict[str, list[NDArray]] = {name: [] for name in titles if name in kept}
+    count = 0
+    for block in _blocks(path, layout):
+        count += len(block)
+        columns = list(zip(*block, strict=True))
+        for place, name in enumerate(layout.names):
+            if name in parts:
+                # As numbers at once, where they are: text takes several times the memory.
+                parts[name].append(_compact(np.array(columns[place], np.str_)))
+
+    def cells(name: str) -> NDArray:
+        own = parts[name]
+        return np.concatenate(own) if own else np.empty(0)
+
+    def column(name: str) -> tuple[NDArray, int] | str:
+        found, bad = numbers(cells(name), comma=layout.comma)
+        return "text" if count and bad > TEXT_SHARE * count else (found, bad)
+
+    yield from table_signals(path.name, titles, column, cells, count, clock, wanted)
+
+
+def _compact(cells: NDArray) -> NDArray:
+    try:
+        return cells.astype(float)
+    except ValueError:
+        return cells
+
+
+def _opened(path: Path, encoding: str) -> TextIO:
+    return path.open(encoding=encoding, newline="")
+
+
+def _blocks(path: Path, layout: Layout) -> Iterator[list[Sequence[str]]]:
+    """The rows of a table, block by block."""
+    width = len(layout.names)
+    with _opened(path, layout.encoding) as file:
+        lines = _lines(file, path)
+        for _ in range(layout.first):
+            next(lines)
+        block: list[Sequence[str]] = []
+        for number, row in enumerate(_rows(lines, layout.separator, path), layout.first + 1):
+            if not row or not any(cell.strip() for cell in row):
+                continue
+            if len(row) == width + 1 and not row[-1].strip():
+                row = row[:-1]  # a separator at the end of each line
+            if len(row) != width:
+                raise InputError(
+                    path.name,
+                    expected=f"{width} cells in every row, as in its header",
+                    got=f"{len(row)} in line {number}",
+                    remedy="repair or remove that line; the last one of a log may be cut off",
+                )
+            block.append(row)
+            if len(block) == BLOCK:
+                yield block
+                block = []
+        if block:
+            yield block
+
+
+def _lines(file: TextIO, path: Path) -> Iterator[str]:
+    """Lines of bounded length without zero characters."""
+    while line := file.readline(LONGEST):
+        if len(line) == LONGEST or "\0" in line:
+            raise InputError(
+                path.name,
+                expected=f"lines of text of less than {LONGEST} characters",
+                got="a longer one" if len(line) == LONGEST else "a zero byte",
+                remedy="check that it is a text table, and whole",
+            )
+        yield line
+
+
+def _rows(lines: Iterator[str], separator: str, path: Path) -> Iterator[Sequence[str]]:
+    if not separator:
+        yield from (line.split() for line in lines)
+        return
+    try:
+        yield from csv.reader(lines, delimiter=separator)
+    except csv.Error as error:
+        raise InputError(
+            path.name,
+            expected="a table of text",
+            got=brief(error),
+            remedy="check quotation marks, and that it is the right file",
+        ) from None
+
+
+def _layout(path: Path) -> Layout:
+    encoding = _encoding(path)
+    with _opened(path, encoding) as file:
+        lines = list(islice(_lines(file, path), HEAD))
+    best: tuple[int, int, str] | None = None
+    for separator in (*SEPARATORS, ""):
+        rows = list(_rows(iter(lines), separator, path))
+        first = _first_row(rows, comma=separator != ",")
+        if first is not None:
+            # More numbers win; blanks only where nothing else separates.
+            count = sum(_is_value(cell, separator != ",") for cell in rows[first] if cell.strip())
+            if _width(rows[first]) > 1 and (best is None or (count > best[0] and separator)):
+                best = (count, first, separator)
+    if best is None:
+        rows = list(_rows(iter(lines), ",", path))
+        first = _first_row(rows, comma=False)
+        if first is None:
+            raise InputError(
+                path.name,
+                expected="a table of numbers",
+                got=repr(lines[0].strip()[:60]) if lines else "an empty file",
+                remedy="check that it is the right file",
+            )
+        best = (1, first, ",")
+    _, first, separator = best
+    rows = list(_rows(iter(lines), separator, path))
+    width = _width(rows[first])
+    names, units = _titles(rows[:first], width)
+    cells = [cell.strip() for row in rows[first:] for cell in row]
+    comma = separator != "," and any(re.fullmatch(r"[+-]?\d*,\d+(e[+-]?\d+)?", c) for c in cells)
+    return Layout(encoding, separator, first, names, units, comma)
+
+
+def _encoding(path: Path) -> str:
+    """UTF-8, UTF-16 by its mark, else the encoding of Western Windows, which has all bytes."""
+    with path.open("rb") as file:
+        begin = file.read(2**20)
+    if begin[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16"
+    try:
+        begin[: begin.rfind(b"\n") + 1].decode("utf-8")
+    except UnicodeDecodeError:
+        return "latin-1"
+    return "utf-8-sig"
+
+
+def _width(row: Sequence[str]) -> int:
+    return len(row) - 1 if len(row) > 1 and not row[-1].strip() else len(row)
+
+
+def _is_value(cell: str, comma: bool) -> bool:
+    text = cell.strip()
+    small = text.lower()
+    if not comma and "," in text:
+        return False
+    return bool(small in MISSING or small in TRUTH or NUMBER.fullmatch(text))
+
+
+def _first_row(rows: Sequence[Sequence[str]], *, comma: bool) -> int | None:
+    """The first row from which on all have the same number of cells, numbers among them."""
+
+    def holds_numbers(row: Sequence[str]) -> bool:
+        cells = row[: _width(row)]
+        values = sum(_is_value(cell, comma) and bool(cell.strip()) for cell in cells)
+        stamps = sum(bool(ISO.match(cell.strip())) for cell in cells)
+        return values + stamps > 0 and 2 * (values + stamps) >= sum(bool(c.strip()) for c in cells)
+
+    for place, row in enumerate(rows):
+        following = [each for each in rows[place : place + AGREEING] if each]
+        # The last line may be cut off; the rows below say so when they are read.
+        same = following[: max(1, len(following) - 1)]
+        if row and all(_width(each) == _width(row) and holds_numbers(each) for each in same):
+            return place
+    return None
+
+
+def _titles(head: Sequence[Sequence[str]], width: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names and units of the columns, from the rows before the first one of numbers."""
+    full = [row[:width] for row in head if _width(row) == width]
+    named = full[-2:]
+    units = [""] * width
+    if not named:
+        names = [f"column{i + 1}" for i in range(width)]
+    else:
+        # A second row of titles holds units: they are shorter, or in brackets.
+        two = len(named) == 2 and all(named[0]) and head[-1][:width] == named[1]
+        titles = named[0] if two else named[-1]
+        pairs = [named_unit(title.strip().lstrip("#").strip()) for title in titles]
+        names, units = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+        if two:
+            units = [cell.strip().strip("[]()") or own for cell, own in zip(named[1], units, strict=True)]
+    names = [name or f"column{i + 1}" for i, name in enumerate(names)]
+    seen: dict[str, int] = {}
+    for place, name in enumerate(names):
+        seen[name] = seen.get(name, 0) + 1
+        names[place] = name if seen[name] == 1 else f"{name}.{seen[name]}"
+    return tuple(names), tuple(units)
