@@ -10,15 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import one_of, positive, require
+from retwin.data.resampling import SAME, Resampling, longest_bridge, resampled
 
 __all__ = ["TimeColumn"]
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "iso": 1.0}
 """Units of times, in s."""
-BRIDGED = 2.5
-"""Longest interval that is bridged by default, in sample periods: one lost sample."""
-SAME = 1e-3
-"""Difference of times, in sample periods, that is rounding."""
 WRONG_UNIT = 100.0
 """Ratio of the interval between rows to the sample period at which the unit is refused; units
 differ by a factor of 1000."""
@@ -132,26 +129,9 @@ class TimeColumn:
         """
         near = SAME / rate
         grid = np.arange(int((seconds[-1] + near) * rate) + 1) / rate
-        made = np.full((len(grid), values.shape[1]), np.nan)
-        longest = self.max_gap or BRIDGED * max(1 / rate, float(np.median(np.diff(seconds))))
-        for channel, own in zip(made.T, values.T, strict=True):
-            known = np.isfinite(own)
-            if not known.any():
-                continue
-            at, own = seconds[known], own[known]
-            before = np.searchsorted(at, grid + near, side="right") - 1
-            after = np.searchsorted(at, grid - near)
-            bridged = (before >= 0) & (after < len(at))
-            bridged[bridged] = (at[after[bridged]] - at[before[bridged]]) <= longest
-            found = _means(at, own, grid, 1 / rate) if held else np.interp(grid, at, own)
-            channel[bridged] = found[bridged]
+        made = np.empty((len(grid), values.shape[1]))
+        longest = self.max_gap or longest_bridge(seconds, 1 / rate)
+        for place, own in enumerate(values.T):
+            how: Resampling = "hold" if held else "linear"
+            made[:, place] = resampled(seconds, own, grid, 1 / rate, how, longest=longest)
         return made
-
-
-def _means(at: NDArray, values: NDArray, grid: NDArray, period: float) -> NDArray:
-    """Means over a period from each time of the grid, of values that are held from `at` on."""
-    until = np.append(at, max(at[-1], grid[-1]) + period)
-    area = np.concatenate([[0.0], np.cumsum(values * np.diff(until))])
-    means = (np.interp(grid + period, until, area) - np.interp(grid, until, area)) / period
-    clipped: NDArray = np.clip(means, values.min(), values.max())  # against rounding
-    return clipped

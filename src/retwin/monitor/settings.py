@@ -9,23 +9,13 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    Strict,
-    ValidationError,
-    ValidationInfo,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, Strict, ValidationInfo, model_validator
 
 from retwin.checks import require
-from retwin.errors import InputError
-from retwin.serialisation.configs import plain_reason, read_toml
 from retwin.serialisation.files import refusing
+from retwin.serialisation.settings import Part, settings_of
 
 __all__ = [
     "FolderSource",
@@ -57,14 +47,6 @@ Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 
-class Part(BaseModel):
-    """What all tables of the file have in common: no unknown keys, and no text for a number."""
-
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
-    )
-
-
 class TwinSettings(Part):
     """A twin: the monitor that watches its machines."""
 
@@ -89,7 +71,7 @@ class FolderSource(Part):
     """Pattern of the files, such as "logs/{asset}/*.csv"; {asset} stands for each machine."""
     asset: Name | None = None
     """The machine, where the pattern has no {asset}."""
-    columns: dict[str, str | list[str]] = {}
+    columns: dict[str, str | list[str]] = Field({})
     """Column of each channel, or several, of which it is the mean; by default as the case has them,
     else the names of the channels."""
     time: str | None = None
@@ -176,7 +158,7 @@ class ServerSettings(Part):
     """Address that it listens on; the default is reached from this machine alone."""
     port: Annotated[int, Field(ge=0, le=PORT)] = 8710
     """Its port; 0 for any that is free."""
-    hosts: list[str] = []
+    hosts: list[str] = Field([])
     """Names of this machine by which others reach it, where it listens on more than loopback."""
     token_env: str = "RETWIN_MONITOR_TOKEN"
     """Variable of the environment with the token that writing needs."""
@@ -205,7 +187,7 @@ class MonitorSettings(Part):
     """The twins by their names."""
     assets: Annotated[dict[Name, AssetSettings], Field(min_length=1)]
     """The machines by their names."""
-    sources: list[Source] = []
+    sources: list[Source] = Field([])
     """Where samples come from, besides those that programs post."""
     server: ServerSettings | None = None
     """The page; none without this table."""
@@ -235,18 +217,11 @@ def read_settings(path: str | Path) -> MonitorSettings:
         the file and the key.
 
     """
-    path = Path(path)
-    remedy = "see docs/monitor.md for what it holds"
-    tables = read_toml(path, expected="a monitor.toml", remedy=remedy)
-    try:
-        return MonitorSettings.model_validate(tables, context=path.parent)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-    raise InputError(
-        f"{path}: {_key(first['loc'])}".removesuffix(": "),
-        expected=_expected(first),
-        got="none" if first["type"] == "missing" else _brief(first),
-        remedy=remedy,
+    return settings_of(
+        MonitorSettings,
+        Path(path),
+        expected="a monitor.toml",
+        remedy="see docs/monitor.md for what it holds",
     )
 
 
@@ -270,26 +245,3 @@ def secret(what: str, env: str | None, file: Path | None = None) -> str | None:
     remedy = f"put the {what} there"
     require(value, place, expected=f"the {what}", got="nothing", remedy=remedy)
     return value
-
-
-def _key(place: tuple[int | str, ...]) -> str:
-    """The key at which pydantic found an error, without the tags of its union of sources."""
-    parts = [str(each) for each in place]
-    if parts[:1] == ["sources"] and len(parts) > 2:
-        parts = [f"sources[{parts[1]}]", *parts[3:]]
-    return ".".join(each for each in parts if each != "function-after[_beside(), path]")
-
-
-def _expected(error: Any) -> str:
-    if error["type"] == "missing":
-        return "a value"
-    if error["type"] == "extra_forbidden":
-        return "a known key"
-    reason = plain_reason(error).removeprefix("Value error, ")
-    return reason[:1].lower() + reason[1:]
-
-
-def _brief(error: Any) -> str:
-    """What was given, but for tables, which are too long to be shown."""
-    value = error["input"]
-    return "another one" if isinstance(value, dict | BaseModel) else repr(value)[:80]

@@ -97,8 +97,8 @@ def _require_name(fine: bool, name: str) -> None:
 
 def header_stamp(message: Any) -> int | None:
     """The stamp of a message's header in ns; None if it has none."""
-    header = message.get("header") if isinstance(message, Mapping) else getattr(
-        message, "header", None
+    header = (
+        message.get("header") if isinstance(message, Mapping) else getattr(message, "header", None)
     )
     if header is None:
         return None

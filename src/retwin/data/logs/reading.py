@@ -157,7 +157,8 @@ def _frames(
         stderr=subprocess.DEVNULL,
         env=environment,
     )
-    assert process.stdin is not None and process.stdout is not None
+    assert process.stdin is not None
+    assert process.stdout is not None
     count = 0
     try:
         process.stdin.write(json.dumps(request).encode())

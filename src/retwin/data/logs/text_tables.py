@@ -254,7 +254,9 @@ def _titles(head: Sequence[Sequence[str]], width: int) -> tuple[tuple[str, ...],
         pairs = [named_unit(title.strip().lstrip("#").strip()) for title in titles]
         names, units = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
         if two:
-            units = [cell.strip().strip("[]()") or own for cell, own in zip(named[1], units, strict=True)]
+            units = [
+                cell.strip().strip("[]()") or own for cell, own in zip(named[1], units, strict=True)
+            ]
     names = [name or f"column{i + 1}" for i, name in enumerate(names)]
     seen: dict[str, int] = {}
     for place, name in enumerate(names):

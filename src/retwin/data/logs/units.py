@@ -1,0 +1,119 @@
+"""Conversion of units, by pint."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import needs_extra, require
+from retwin.errors import InputError, brief
+
+__all__ = ["compatible", "converted", "same_unit"]
+
+LONGEST = 40
+"""Characters of a unit at most."""
+SAFE = re.compile(r"[\w°µμΩ%²³⁰¹⁴-⁹⁻·*/^ ().+-]*")
+POWER_OF_NUMBER = re.compile(r"[\d)]\s*(\*\*|\^)")
+"""Powers of numbers and of brackets, whose evaluation may never end; units need none."""
+NONE = frozenset({"", "1", "-", "none", "unitless", "dimensionless"})
+"""Units of what has no unit."""
+SPELT = {
+    "%": "percent",
+    "C": "degC",
+    "°C": "degC",
+    "F": "degF",
+    "°F": "degF",
+    "°": "deg",
+    "1/min": "rpm",
+    "U/min": "rpm",
+    "min-1": "rpm",
+    "min^-1": "rpm",
+    "m/s2": "m/s^2",
+    "kph": "km/h",
+    "l/min": "liter/min",
+}
+"""Spellings in logs, and those of pint. C is a temperature there, no charge."""
+
+
+def same_unit(first: str, second: str) -> bool:
+    """Whether two units are the same text, or both stand for no unit."""
+    return first == second or (first.lower() in NONE and second.lower() in NONE)
+
+
+def compatible(first: str, second: str) -> bool:
+    """Whether values can be converted from one unit to the other; False for unknown units."""
+    try:
+        one, other = _unit(first), _unit(second)
+        same = _angular(one) == _angular(other)
+        return same_unit(first, second) or (same and bool(one.is_compatible_with(other)))
+    except Exception:  # of pint, whose parser raises many kinds
+        return False
+
+
+def converted(values: NDArray, source: str, target: str, where: str) -> NDArray:
+    """Values (n,) in a unit as those in another one.
+
+    Raises
+    ------
+    InputError
+        A unit is not known, or they measure different quantities. The message names `where`.
+
+    """
+    if same_unit(source, target):
+        return values
+    remedy = "give from_unit and unit as pint spells them, or a factor: scale = …"
+    try:
+        first, second = _unit(source), _unit(target)
+        if _angular(first) != _angular(second):
+            raise ValueError("one is an angle, the other one is not: is a turn 1 or 2π?")
+        ends = _registry().Quantity(np.array([0.0, 1.0]), first).to(second).magnitude
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(
+            where,
+            expected=f"a unit that is converted to {target!r}",
+            got=f"{source!r} ({type(error).__name__}: {brief(error)})",
+            remedy=remedy,
+        ) from None
+    offset, slope = float(ends[0]), float(ends[1] - ends[0])
+    require(
+        np.isfinite([offset, slope]).all() and slope,
+        where,
+        expected=f"a unit that is converted to {target!r}",
+        got=repr(source),
+        remedy=remedy,
+    )
+    # Every unit of pint that is no logarithm is a line; the others are refused.
+    third = float(_registry().Quantity(2.0, first).to(second).magnitude)
+    require(
+        np.isclose(third, offset + 2 * slope, rtol=1e-9, atol=1e-300),
+        where,
+        expected="a unit that is no logarithm",
+        got=repr(source),
+        remedy="convert it before, or map another signal",
+    )
+    made: NDArray = offset + slope * values
+    return made
+
+
+def _unit(text: str) -> Any:
+    text = SPELT.get(text.strip(), text.strip())
+    if len(text) > LONGEST or not SAFE.fullmatch(text) or POWER_OF_NUMBER.search(text):
+        raise ValueError("what is no unit")
+    return _registry().Unit("" if text.lower() in NONE else text)
+
+
+def _angular(unit: Any) -> bool:
+    """Whether a unit counts angles: pint takes 1 rad for 1, so that 1 rpm would be 0.1 Hz."""
+    return "radian" in str(_registry().Quantity(1.0, unit).to_root_units().units)
+
+
+@cache
+def _registry() -> Any:
+    pint = needs_extra("pint", "logs", "converts units")
+    return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
