@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from retwin.arrays import check_finite, check_shapes, floating, measured, named, row_blocks
 from retwin.checks import at_least, require, whole
+from retwin.data.provenance import Provenance
 from retwin.times import sample_rate, to_samples
 
 __all__ = ["HEALTHY", "UNLABELLED", "Channels", "Provenance", "Trajectories"]
@@ -79,23 +80,6 @@ class Channels:
     def numbered(cls, prefix: str, count: int, unit: str = "1") -> Channels:
         """Channels `prefix`1 … `prefix`count, all with the same unit."""
         return cls(tuple(f"{prefix}{i + 1}" for i in range(count)), (unit,) * count)
-
-
-@dataclass(frozen=True)
-class Provenance:
-    """Where data came from.
-
-    Parameters
-    ----------
-    name : str
-        The name of a file, or of the class that simulated them, with its seed.
-    sha256 : str
-        The SHA-256 of the file, in hexadecimal; "" without a file.
-
-    """
-
-    name: str
-    sha256: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from retwin.catalog import FORMATS, FormatEntry, resolve
+from retwin.catalog import FORMATS, LOGS, FormatEntry, resolve
 from retwin.checks import instance, require
 from retwin.data.io.assembly import DataCase, settle
 from retwin.data.trajectories import Trajectories
@@ -19,6 +20,9 @@ from retwin.progress import Progress
 from retwin.serialisation.files import recover, write_atomically
 from retwin.serialisation.places import check_place
 from retwin.times import sample_rate
+
+if TYPE_CHECKING:
+    from retwin.data.logs.mapping import Mapping
 
 __all__ = ["DataCase", "check_target", "load", "save"]
 
@@ -30,6 +34,7 @@ def load(
     rate: float | None = None,
     progress: Progress | None = None,
     max_bytes: int | None = None,
+    mapping: Mapping | str | os.PathLike[str] | None = None,
 ) -> Trajectories:
     """Trajectories from a file or folder, whose name decides how it is read.
 
@@ -39,6 +44,8 @@ def load(
     | folder with `ClassName/*.csv` | rows of nominal and observed, no header |
     | folder with `ClassName/dataset_*.mat` | the layout of the arm's authors |
     | `*.npz`, `*.zarr` | what `save` wrote |
+    | a log (`catalog.LOGS`), with a mapping | signals with times of their own: ROS bags, MCAP, \
+    Parquet, Arrow, TDMS, MDF, CSV |
 
     Parameters
     ----------
@@ -54,12 +61,16 @@ def load(
     max_bytes : int
         The largest size of all that is read, as the file declares it; by default half of the free
         memory, and for Zarr nine tenths of the free disk, to which its arrays are copied.
+    mapping : Mapping or path
+        For a log: its signals as channels, their resampling, and what starts a trajectory; a
+        `data.Mapping`, or a file mapping.toml, which `retwin data map` writes.
 
     Returns
     -------
     Trajectories
         Arrays keep their dtype. Shorter trajectories are padded with mask False. NPZ and Zarr keep
-        the provenance that was saved with them; other formats get the file's name and SHA-256.
+        the provenance that was saved with them; other formats get the file's name and SHA-256. That
+        of a log also says how each channel was resampled and how much of it is missing.
 
     Raises
     ------
@@ -77,6 +88,13 @@ def load(
         got=f"{path}, where there is none",
         remedy="check the name",
     )
+    if mapping is not None:
+        from retwin.data.logs.mapped import read_mapped
+
+        found = read_mapped(
+            path, mapping, case=case, rate=rate, progress=progress, max_bytes=max_bytes
+        )
+        return settle(found, case, None, progress)
     read = resolve(_format(path).reader)
     found = read(path, case=case, rate=rate, progress=progress, max_bytes=max_bytes)
     return settle(found, case, rate, progress)
@@ -131,6 +149,16 @@ def _format(path: Path) -> FormatEntry:
     regular = folder or path.is_file()  # a pipe may never end
     if entry is not None and entry.folder == folder and path.suffix and regular:
         return entry
+    if (folder and (path / "metadata.yaml").is_file()) or (
+        regular and not folder and path.suffix and path.suffix.lower() in LOGS
+    ):
+        raise InputError(
+            "mapping",
+            expected=f"what the signals of {path.name}, a log, stand for",
+            got="none",
+            remedy=f"make one: retwin data map {path.name} --out mapping.toml; then give mapping "
+            "(--mapping)",
+        )
     if folder:
         return FORMATS[".zarr" if (path / "zarr.json").exists() else ""]
     files, folders = (

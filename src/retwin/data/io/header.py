@@ -205,7 +205,7 @@ def _about(trajectories: Trajectories, schema: int) -> dict[str, Any]:
         "rate": trajectories.rate,
         "inputs": vars(trajectories.inputs),
         "outputs": vars(trajectories.outputs),
-        "provenance": [vars(source) for source in trajectories.provenance],
+        "provenance": [source.plain() for source in trajectories.provenance],
         "emulated": trajectories.emulated,
     }
 
@@ -215,6 +215,6 @@ def _read_about(header: Mapping[str, Any]) -> dict[str, Any]:
         "rate": header["rate"],
         "inputs": Channels.of(header["inputs"]),
         "outputs": Channels.of(header["outputs"]),
-        "provenance": tuple(Provenance(s["name"], s["sha256"]) for s in header["provenance"]),
+        "provenance": tuple(map(Provenance.of, header["provenance"])),
         "emulated": bool(header["emulated"]),
     }

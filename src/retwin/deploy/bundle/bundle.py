@@ -112,7 +112,7 @@ class Bundle:
             "python": platform.python_version(),
             "torch": torch.__version__,
             "numpy": np.__version__,
-            "data": [vars(source) for each in data for source in each.provenance],
+            "data": [source.plain() for each in data for source in each.provenance],
             **(notes or {}),
         }
         return cls(twin, guard, facts, diagnoser, provenance)

@@ -1,0 +1,208 @@
+"""Signals of a log as channels: times in order, units converted, on the grid of the samples."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import require
+from retwin.data.logs.mapping import ChannelMapping
+from retwin.data.logs.signals import Log, Signal
+from retwin.data.logs.units import converted, same_unit
+from retwin.data.provenance import Sampling
+from retwin.data.resampling import Resampling, longest_bridge, resampled
+from retwin.data.trajectories import Channels
+from retwin.errors import InputError
+
+__all__ = ["Channel", "channels_of", "in_order", "signal_of", "table_of"]
+
+DISORDER = 10.0
+"""Longest step back in time, in median intervals, that is a matter of order: messages of several
+processes overtake each other. A longer one is a clock that was set."""
+DECIMATED = 1.5
+"""Ratio of the rates from which linear resampling leaves out values."""
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """A channel of the trajectories, and its signal with times in order and values in its unit.
+
+    Attributes
+    ----------
+    name, unit : str
+        Of the channel.
+    signal : Signal
+        Its values, in that unit.
+    how : {"hold", "linear", "none"}
+        How it comes to the sample rate.
+    longest : float
+        The longest interval that is bridged, in s.
+    notes : tuple of str
+        What was done to it.
+
+    """
+
+    name: str
+    unit: str
+    signal: Signal
+    how: Resampling
+    longest: float
+    notes: tuple[str, ...]
+
+    def sampled(self, grid: NDArray, period: float, end: float) -> NDArray:
+        """Its values (N,) on a grid of times, NaN where they are missing."""
+        last = end if self.how == "hold" else None
+        return resampled(
+            self.signal.times,
+            self.signal.values,
+            grid,
+            period,
+            self.how,
+            longest=self.longest,
+            end=last,
+        )
+
+    def sampling(self, rate: float, missing: float) -> Sampling:
+        """What its provenance says, with the share of its samples that are missing."""
+        at = self.signal.times[np.isfinite(self.signal.values)]
+        steps = np.diff(at)
+        own = 1 / float(np.median(steps)) if len(steps) else 0.0
+        notes = list(self.notes)
+        if self.how != "hold" and own > DECIMATED * rate:
+            notes.append("samples left out, not filtered")
+        return Sampling(
+            self.name,
+            self.signal.name,
+            self.how,
+            own,
+            missing,
+            self.longest if self.how != "none" else 0.0,
+            float(steps.max(initial=0.0)),
+            "; ".join(notes),
+        )
+
+
+def table_of(
+    table: Mapping[str, ChannelMapping], wanted: Channels | None, name: str
+) -> list[tuple[str, ChannelMapping, str | None]]:
+    """The channels of a table of the mapping in their order, with the unit that the case has.
+
+    Raises
+    ------
+    InputError
+        They are not those of the case.
+
+    """
+    if wanted is None:
+        return [(each, own, None) for each, own in table.items()]
+    require(
+        set(table) == set(wanted.names),
+        f"mapping: {name}",
+        expected=f"the channels of the case, {', '.join(wanted.names)}",
+        got=", ".join(table) or "none",
+        remedy=f"write a table [{name}.NAME] for each of them",
+    )
+    return [
+        (each, table[each], unit) for each, unit in zip(wanted.names, wanted.units, strict=True)
+    ]
+
+
+def channels_of(
+    log: Log,
+    tables: Sequence[tuple[str, ChannelMapping, str | None]],
+    default: Resampling,
+    period: float,
+) -> list[Channel]:
+    """The channels of some tables, each with its signal.
+
+    Raises
+    ------
+    InputError
+        The log lacks a signal, its times are out of order, or its unit is not converted.
+
+    """
+    return [_channel(log, name, own, unit, default, period) for name, own, unit in tables]
+
+
+def _channel(
+    log: Log,
+    name: str,
+    own: ChannelMapping,
+    unit: str | None,
+    default: Resampling,
+    period: float,
+) -> Channel:
+    signal, notes = in_order(signal_of(log, own.signal), log.name)
+    if signal.unreadable:
+        notes.append(f"{signal.unreadable} values are no numbers")
+    values = signal.values
+    if own.scale != 1 or own.shift != 0:
+        values = values * own.scale + own.shift
+        notes.append(f"times {own.scale:g} plus {own.shift:g}")
+        source = own.from_unit or own.unit or unit or "1"
+    else:
+        source = own.from_unit or signal.unit or own.unit or unit or "1"
+        if not (own.from_unit or signal.unit or own.unit) and unit and unit != "1":
+            notes.append(f"no unit in the log, taken as {unit}")
+    target = unit or own.unit or source
+    if not same_unit(source, target):
+        values = converted(values, source, target, f"{log.name}, {own.signal}")
+        notes.append(f"{source} to {target}")
+    if own.clock_offset:
+        notes.append(f"clock {own.clock_offset:+g} s")
+    values = np.where(np.isfinite(values), values, np.nan)
+    made = replace(signal, times=signal.times + own.clock_offset, values=values, unit=target)
+    known = made.times[np.isfinite(made.values)]
+    longest = own.max_gap or longest_bridge(known, period)
+    return Channel(name, target, made, own.resample or default, longest, tuple(notes))
+
+
+def signal_of(log: Log, name: str) -> Signal:
+    """The signal of that name; InputError, with those that are alike, if the log has none."""
+    found = log.signals.get(name)
+    if found is not None and len(found.times):
+        return found
+    alike = difflib.get_close_matches(name, log.signals, n=3, cutoff=0.3)
+    others = ", ".join(alike or list(log.signals)[:3]) or "none"
+    raise InputError(
+        log.name,
+        expected=f"the signal {name!r} of the mapping",
+        got=f"it without values ({log.skipped[name]})" if name in log.skipped else others,
+        remedy="name it as the log does; `retwin data map` lists all signals",
+    )
+
+
+def in_order(signal: Signal, where: str) -> tuple[Signal, list[str]]:
+    """The signal with times that increase, and notes of what was done for that.
+
+    Raises
+    ------
+    InputError
+        A step back in time is no matter of order.
+
+    """
+    steps = np.diff(signal.times)
+    if (steps > 0).all():
+        return signal, []
+    typical = float(np.median(np.abs(steps)))
+    worst = int(np.argmin(steps))
+    require(
+        -steps[worst] <= DISORDER * typical,
+        f"{where}, {signal.name}",
+        expected="times that increase",
+        got=f"a step back of {-steps[worst]:g} s at {signal.times[worst]:g} s",
+        remedy='split the log there, or use the times of recording: stamps = "log" in [time]',
+    )
+    order = np.argsort(signal.times, kind="stable")
+    times, values = signal.times[order], signal.values[order]
+    last = np.append(np.diff(times) > 0, True)  # of values with the same time the last one counts
+    notes = []
+    if (steps < 0).any():
+        notes.append(f"{int((steps < 0).sum())} values put in order")
+    if not last.all():
+        notes.append(f"{int((~last).sum())} values with the time of another left out")
+    return replace(signal, times=times[last], values=values[last]), notes

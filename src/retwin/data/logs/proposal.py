@@ -1,0 +1,325 @@
+"""A mapping that is proposed by what a log holds: rates, units, names, constant signals, pauses."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from retwin.data.io.assembly import DataCase
+from retwin.data.logs.cutting import union_of_times
+from retwin.data.logs.mapping import ChannelMapping, Cut, Mapping, TimeSettings
+from retwin.data.logs.signals import Log, Signal
+from retwin.data.logs.tables import TIMES
+from retwin.data.logs.units import compatible
+from retwin.data.resampling import BRIDGED
+from retwin.errors import InputError
+
+__all__ = ["Fact", "Proposal", "facts_of", "proposed"]
+
+COMMAND = re.compile(
+    r"(^|[^a-z])(cmd|command(s|ed)?|set_?point(s)?|target(s)?|ref(erence)?|desired|demand|goal|"
+    r"input(s)?|control|u|soll(wert)?|sp)([^a-z]|\d|$)"
+)
+"""Words in the names of commands."""
+OVERHEAD = re.compile(r"covariance|/rosout|/parameter_events|/tf_static|\.seq$|/diagnostics")
+"""Names of what describes the log and not the system."""
+MAX_CHANNELS = 24
+"""Channels that are proposed without a case; the other signals are listed."""
+MAX_LISTED = 200
+"""Signals that are listed in comments."""
+ALIKE = 0.72
+"""Least score of a name that is taken for a channel's."""
+PAUSE, PAUSE_PERIODS = 1.0, 20.0
+"""The shortest pause in s, and in sample periods, between two trajectories."""
+SCHEMA = "https://retwin.readthedocs.io/mapping.schema.json"
+
+
+@dataclass(frozen=True)
+class Fact:
+    """What is seen of a signal.
+
+    Attributes
+    ----------
+    name, unit : str
+        Of the signal.
+    count : int
+        Its values.
+    rate : float
+        Their median rate in Hz, 0 if there are less than two.
+    longest : float
+        The longest interval between two of them, in s.
+    low, high : float
+        Their range.
+    constant : bool
+        Whether all are equal, or there are none.
+
+    """
+
+    name: str
+    unit: str
+    count: int
+    rate: float
+    longest: float
+    low: float
+    high: float
+    constant: bool
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A proposed mapping.
+
+    Attributes
+    ----------
+    text : str
+        The mapping.toml.
+    mapping : Mapping or None
+        The same without the channels for which no signal was found; None if no output is left.
+    facts : tuple of Fact
+        What is seen of all signals.
+    open_channels : tuple of str
+        Channels of the case for which no signal was found; the user names it in the file.
+
+    """
+
+    text: str
+    mapping: Mapping | None
+    facts: tuple[Fact, ...]
+    open_channels: tuple[str, ...] = field(default=())
+
+
+def facts_of(log: Log) -> list[Fact]:
+    """What is seen of the signals of a log."""
+    return [_fact(each) for each in log.signals.values()]
+
+
+def _fact(signal: Signal) -> Fact:
+    known = np.isfinite(signal.values)
+    values, at = signal.values[known], np.sort(signal.times[known])
+    steps = np.diff(at)
+    typical = float(np.median(steps)) if len(steps) else 0.0
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
+    return Fact(
+        signal.name,
+        signal.unit,
+        len(values),
+        1 / typical if typical > 0 else 0.0,
+        float(steps.max(initial=0.0)),
+        low,
+        high,
+        not low < high,
+    )
+
+
+def proposed(
+    log: Log, time: TimeSettings, *, case: DataCase | None = None, delay: float | None = None
+) -> Proposal:
+    """A mapping of the signals of a log to channels.
+
+    With a case, each of its channels gets the signal whose name is most like its own, and whose
+    unit fits. Without, signals that change are commands or outputs by their names.
+
+    Parameters
+    ----------
+    log : Log
+        All signals.
+    time : TimeSettings
+        The clock with which they were read.
+    case : DataCase, optional
+        Its channels and sample rate are those of the mapping.
+    delay : float, optional
+        The median time in s from the header stamps of messages to their recording, if these differ.
+
+    Raises
+    ------
+    InputError
+        No signal changes, or none occurs twice.
+
+    """
+    facts = facts_of(log)
+    moving = [
+        each for each in facts if not each.constant and each.rate and not OVERHEAD.search(each.name)
+    ]
+    if not moving:
+        raise InputError(
+            log.name,
+            expected="signals that change",
+            got=f"{len(facts)} that are constant or have one value",
+            remedy="check that it is the right log",
+        )
+    if case is None:
+        chosen = _by_name(moving)
+    else:
+        chosen = _for_case(moving, case)
+    used = [fact for table in chosen.values() for fact in table.values() if fact is not None]
+    rate = case.rate if case is not None else _round(np.median([each.rate for each in used]))
+    cut = _cut([log.signals[each.name] for each in used], 1 / rate)
+    tables = {
+        name: {channel: _channel(fact, name, rate, cut) for channel, fact in table.items() if fact}
+        for name, table in chosen.items()
+    }
+    unknown = tuple(c for table in chosen.values() for c, fact in table.items() if fact is None)
+    mapping = None
+    if tables["outputs"]:
+        settings = {"rate": rate, "time": time, "cut": cut, **tables}
+        mapping = Mapping(**settings)
+    text = _text(log, time, rate, cut, chosen, tables, facts, case, delay)
+    return Proposal(text, mapping, tuple(facts), unknown)
+
+
+def _round(value: float) -> float:
+    return float(f"{float(value):.3g}")
+
+
+Chosen = dict[str, dict[str, "Fact | None"]]
+
+
+def _by_name(moving: Sequence[Fact]) -> Chosen:
+    """Commands and outputs by the words in their names."""
+    chosen: Chosen = {"commands": {}, "outputs": {}}
+    for fact in moving[:MAX_CHANNELS]:
+        table = "commands" if COMMAND.search(fact.name.lower()) else "outputs"
+        chosen[table][fact.name.lstrip("/")] = fact
+    if not chosen["outputs"]:  # they are what is measured, in any case
+        chosen = {"commands": {}, "outputs": chosen["commands"]}
+    return chosen
+
+
+def _for_case(moving: Sequence[Fact], case: DataCase) -> Chosen:
+    """For each channel of the case the signal that is most like it, each signal once."""
+    channels = [
+        (table, name, unit)
+        for table, some in (("commands", case.inputs), ("outputs", case.outputs))
+        for name, unit in zip(some.names, some.units, strict=True)
+    ]
+    scores = [
+        (_alike(name, unit, fact, command=table == "commands"), table, name, fact)
+        for table, name, unit in channels
+        for fact in moving
+    ]
+    chosen: Chosen = {"commands": {}, "outputs": {}}
+    for table, name, _ in channels:
+        chosen[table][name] = None
+    taken: set[str] = set()
+    for score, table, name, fact in sorted(scores, key=lambda each: -each[0]):
+        if score >= ALIKE and chosen[table][name] is None and fact.name not in taken:
+            chosen[table][name] = fact
+            taken.add(fact.name)
+    return chosen
+
+
+def _alike(name: str, unit: str, fact: Fact, *, command: bool) -> float:
+    """How much the name of a signal is like that of a channel; 1 is the same."""
+    wanted = re.sub(r"[^a-z0-9]", "", name.lower())
+    parts = re.findall(r"[a-z0-9]+", fact.name.lower())
+    endings = {"".join(parts[place:]) for place in range(len(parts))} | set(parts)
+    if not wanted or not parts:
+        return 0.0
+    if wanted in endings:
+        score = 1.0
+    else:
+        score = 0.95 * max(difflib.SequenceMatcher(None, wanted, e).ratio() for e in endings)
+    marked = COMMAND.search(fact.name.lower()) is not None
+    score += 0.1 if marked == command else -0.1
+    if fact.unit and unit not in ("", "1"):
+        score += 0.1 if compatible(fact.unit, unit) else -0.3
+    return score
+
+
+def _cut(signals: Sequence[Signal], period: float) -> Cut:
+    """A cut at the pauses of a log, if there are any."""
+    steps = np.diff(union_of_times(signals))
+    longer = steps[steps > max(PAUSE, PAUSE_PERIODS * period)]
+    # A slow log has no pauses: its intervals are all alike.
+    if not len(longer) or len(longer) > 0.05 * len(steps):
+        return Cut()
+    least = max(PAUSE, PAUSE_PERIODS * period)
+    return Cut(by="gap", gap=_round(max(least, float(longer.min()) / 2)))
+
+
+def _channel(fact: Fact, table: str, rate: float, cut: Cut) -> ChannelMapping:
+    longest = BRIDGED * max(1 / rate, 1 / fact.rate)
+    # A command that is sent when it changes holds until the next one.
+    if table == "commands":
+        inside = min(fact.longest, cut.gap or math.inf)
+        longest = max(longest, 1.01 * inside)
+    return ChannelMapping(
+        signal=fact.name,
+        resample="hold" if table == "commands" else "linear",
+        max_gap=float(f"{longest:.3g}") * (1.01 if table == "commands" else 1.0),
+    )
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _comment(text: str) -> str:
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def _seen(fact: Fact) -> str:
+    unit = f" {fact.unit}" if fact.unit else ""
+    return _comment(
+        f"{fact.count} values, {fact.rate:.4g} Hz, {fact.low:.4g} to {fact.high:.4g}{unit}, "
+        f"longest interval {fact.longest:.3g} s"
+    )
+
+
+def _text(
+    log: Log,
+    time: TimeSettings,
+    rate: float,
+    cut: Cut,
+    chosen: Chosen,
+    tables: dict[str, dict[str, ChannelMapping]],
+    facts: Sequence[Fact],
+    case: DataCase | None,
+    delay: float | None,
+) -> str:
+    """The mapping.toml, with what is seen of the log in comments."""
+    lines = [f"#:schema {SCHEMA}", f"# Proposed for {_comment(log.name)}; check it.", ""]
+    lines += [f"rate = {rate!r} # Hz", 'label = "" # class of all trajectories, such as "Healthy"']
+    lines += ["", "[time]"]
+    column = time.column or next((n for n, why in log.skipped.items() if why == TIMES), "")
+    given = {**time.model_dump(exclude_defaults=True), **({"column": column} if column else {})}
+    lines += [f"{key} = {_value(value)}" for key, value in given.items()]
+    if delay is not None:
+        lines.append(f"# messages were recorded {delay:.3g} s after their header stamps (median)")
+    lines += ["", "[cut]", f"by = {_quoted(cut.by)} # none, gap, trigger or length"]
+    lines += [f"gap = {cut.gap!r} # s"] if cut.gap else []
+    for table in chosen:
+        for name, fact in chosen[table].items():
+            lines += ["", f"[{table}.{_quoted(name)}]"]
+            if fact is None:
+                lines += [
+                    'signal = "" # none has such a name: choose one of those below',
+                ]
+                continue
+            own = tables[table][name]
+            lines += [f"# {_seen(fact)}", f"signal = {_quoted(own.signal)}"]
+            if not fact.unit and case is None:
+                lines.append('# unit = "…" # the log states none')
+            lines += [f"resample = {_quoted(own.resample or '')}", f"max_gap = {own.max_gap!r} # s"]
+    used = {fact.name for table in chosen.values() for fact in table.values() if fact}
+    rest = [each for each in facts if each.name not in used]
+    if rest or log.skipped:
+        lines += ["", "# Not mapped:"]
+    for each in rest[:MAX_LISTED]:
+        what = f"constant, {each.low:g}" if each.constant and each.count else _seen(each)
+        lines.append(f"#   {_comment(_quoted(each.name))}: {what}")
+    others = [(n, why) for n, why in log.skipped.items() if why != TIMES]
+    lines += [f"#   {_comment(_quoted(n))}: {_comment(why)}" for n, why in others[:MAX_LISTED]]
+    left = max(0, len(rest) - MAX_LISTED) + max(0, len(others) - MAX_LISTED)
+    lines += [f"#   and {left} more"] if left else []
+    return "\n".join(lines) + "\n"
+
+
+def _value(value: object) -> str:
+    return _quoted(value) if isinstance(value, str) else repr(value)
