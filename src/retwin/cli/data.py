@@ -1,28 +1,38 @@
-"""`retwin data`: describe, convert, split and fetch trajectories."""
+"""`retwin data`: describe, map, convert, split and fetch trajectories."""
 
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
 from retwin.checks import require
 from retwin.cli.completion import complete_files
-from retwin.cli.options import CaseOption, Json, MaxBytes, Rate, Seed
+from retwin.cli.options import CaseOption, Json, LogMapping, MaxBytes, Rate, Seed
 from retwin.cli.reading import data_case, read
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data import download
 from retwin.data.io import check_target, save
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.serialisation.files import sha256
+from retwin.serialisation.files import sha256, write_atomically
+from retwin.serialisation.places import check_place
+from retwin.times import sample_rate
+
+if TYPE_CHECKING:
+    from retwin.data.logs.mapping import Mapping
+    from retwin.data.logs.proposal import Proposal
 
 __all__ = ["app"]
 
+SHOWN = 40
+"""Signals of a log that are listed."""
+
 app = typer.Typer(
-    help="Describe, convert, split and fetch trajectories.",
+    help="Describe, map, convert, split and fetch trajectories.",
     epilog=example("retwin data info real.mat --case armpi"),
     no_args_is_help=True,
 )
@@ -39,13 +49,79 @@ def info(
     ],
     case: CaseOption = None,
     rate: Rate = None,
+    mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
     """Describe files: classes, samples, channels, missing values, SHA-256."""
     system = data_case(case)
-    facts = [_facts(read(file, system, rate, max_bytes=max_bytes), file) for file in files]
-    answer(facts, *map(_table, facts), as_json=as_json)
+    facts = [
+        _facts(read(file, system, rate, max_bytes=max_bytes, mapping=mapping), file)
+        for file in files
+    ]
+    shown = [table for each in facts for table in (_table(each), *_samplings(each))]
+    answer(facts, *shown, as_json=as_json)
+
+
+@app.command("map", epilog=example("retwin data map run.mcap --case armpi --out mapping.toml"))
+def map_log(
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="ROS bag, MCAP, Parquet, TDMS, MDF, CSV, …")
+    ],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="New mapping.toml; its picture beside.")
+    ],
+    case: CaseOption = None,
+    time: Annotated[
+        str, typer.Option("--time", metavar="COLUMN", help="Column of the times, if not found.")
+    ] = "",
+    rate: Annotated[
+        float | None,
+        typer.Option("--rate", metavar="HZ", help="Rows per second, if it has no times."),
+    ] = None,
+    max_bytes: MaxBytes = None,
+    as_json: Json = False,
+) -> None:
+    """Propose what a log's signals stand for, and draw it with the trajectories they make."""
+    from retwin.data.logs.mapping import TimeSettings
+    from retwin.data.logs.proposal import propose_mapping
+    from retwin.report.log_picture import log_picture
+
+    picture = out.with_suffix(".png")
+    require(
+        out.suffix.lower() == ".toml",
+        "--out",
+        expected="a name that ends in .toml",
+        got=out,
+        remedy="give another name, such as mapping.toml",
+    )
+    for place in (out, picture):
+        check_place(place)
+    if rate is not None:
+        rate = sample_rate("--rate", rate)
+    system = data_case(case)
+    with bar("map") as show:
+        made = propose_mapping(
+            log,
+            case=system,
+            time=TimeSettings(column=time, rate=rate),
+            progress=lambda share: show(log.name, share),
+            max_bytes=max_bytes,
+        )
+        drawn = log_picture(made.log, made.mapping, case=system)
+    for place, contents in ((out, made.text.encode()), (picture, drawn)):
+        with write_atomically(place) as part:
+            part.write_bytes(contents)
+    signals = [asdict(each) for each in made.facts]
+    channels = _mapped(made.mapping)
+    answer(
+        {"signals": signals, "channels": channels, "open": made.open_channels},
+        _seen(made, channels),
+        as_json=as_json,
+    )
+    note(f"Wrote {out} and {picture}: check them, then give --mapping {out}")
+    if made.open_channels:
+        note(f"No signal was found for {', '.join(made.open_channels)}: name it in {out}")
 
 
 @app.command(epilog=example("retwin data convert sim.mat sim.npz --case armpi"))
@@ -54,11 +130,12 @@ def convert(
     target: Annotated[Path, typer.Argument(metavar="OUT", help="New *.npz or *.zarr.")],
     case: CaseOption = None,
     rate: Rate = None,
+    mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
 ) -> None:
     """Write trajectories in retwin's own format, with channels, rate and provenance."""
     check_target(target)
-    trajectories = read(source, data_case(case), rate, max_bytes=max_bytes)
+    trajectories = read(source, data_case(case), rate, max_bytes=max_bytes, mapping=mapping)
     save(trajectories, target)
     note(f"Wrote {target}: {trajectories}")
 
@@ -76,6 +153,7 @@ def split(
     seed: Seed = 0,
     case: CaseOption = None,
     rate: Rate = None,
+    mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
 ) -> None:
     """Split trajectories in two, at random, with the same shares of every class."""
@@ -88,7 +166,7 @@ def split(
         got=second,
         remedy="give each part its own file",
     )
-    whole = read(file, data_case(case), rate, max_bytes=max_bytes)
+    whole = read(file, data_case(case), rate, max_bytes=max_bytes, mapping=mapping)
     parts = whole.split(fraction, seed=seed)
     for part, target in zip(parts, (first, second), strict=True):
         save(part, target)
@@ -124,10 +202,64 @@ def fetch(
     answer(path, str(path))
 
 
+def _mapped(mapping: Mapping | None) -> dict[str, str]:
+    """The channel of each signal of a mapping."""
+    tables = (mapping.commands, mapping.outputs) if mapping is not None else ()
+    return {own.signal: channel for each in tables for channel, own in each.items()}
+
+
+def _seen(made: Proposal, channels: dict[str, str]) -> Table:
+    """The signals of a log, those that are mapped first."""
+    facts = sorted(made.facts, key=lambda each: each.name not in channels)
+    rows = [
+        (
+            each.name,
+            each.unit,
+            str(each.count),
+            f"{each.rate:.4g}",
+            f"{each.longest:.3g}",
+            "constant" if each.constant else f"{each.low:.4g} to {each.high:.4g}",
+            channels.get(each.name, ""),
+        )
+        for each in facts[:SHOWN]
+    ]
+    if len(facts) > SHOWN:
+        rows.append((f"and {len(facts) - SHOWN} more", "", "", "", "", "", ""))
+    head = ("signal", "unit", "values", "Hz", "longest s", "range", "channel")
+    return table(head, rows, numbers=head[2:5])
+
+
+def _samplings(facts: dict[str, Any]) -> list[Table]:
+    """For each log, how its channels came to their samples."""
+    head = ("channel", "signal", "Hz", "resampled", "missing", "bridged s", "longest s", "note")
+    return [
+        table(
+            head,
+            [
+                (
+                    each["channel"],
+                    each["signal"],
+                    f"{each['rate']:.4g}",
+                    each["method"],
+                    f"{each['missing']:.2%}",
+                    f"{each['bridged']:.3g}",
+                    f"{each['longest']:.3g}",
+                    each["note"],
+                )
+                for each in source["sampling"]
+            ],
+            numbers=("Hz", "missing", "bridged s", "longest s"),
+        )
+        for source in facts["provenance"]
+        if "sampling" in source
+    ]
+
+
 def _facts(trajectories: Trajectories, file: Path) -> dict[str, Any]:
     """The facts about one file, as JSON values."""
     counts = Counter(trajectories.labels.tolist())
     mask = trajectories.mask
+    count = int(trajectories.lengths.sum()) * mask.shape[2]  # padding is not missing
     return {
         "file": str(file),
         "sha256": sha256(file),
@@ -137,10 +269,10 @@ def _facts(trajectories: Trajectories, file: Path) -> dict[str, Any]:
         "rate": trajectories.rate,
         "inputs": _pairs(trajectories.inputs),
         "outputs": _pairs(trajectories.outputs),
-        "missing": float(1 - mask.mean()) if mask.size else 0.0,
+        "missing": max(0.0, 1 - int(mask.sum()) / count) if count else 0.0,
         "emulated": trajectories.emulated,
         "dtype": str(trajectories.observed.dtype),
-        "provenance": [{"name": s.name, "sha256": s.sha256} for s in trajectories.provenance],
+        "provenance": [source.plain() for source in trajectories.provenance],
     }
 
 
@@ -162,5 +294,6 @@ def _table(facts: dict[str, Any]) -> Table:
         ("outputs", channels("outputs")),
         ("missing", f"{facts['missing']:.2%}"),
         ("made from", "\n".join(f"{s['name']} {s['sha256']}" for s in facts["provenance"])),
+        *(("", each) for source in facts["provenance"] for each in source.get("notes", ())),
     ]
     return table(("file", facts["file"]), rows)

@@ -16,6 +16,7 @@ __all__ = [
     "CaseArgument",
     "CaseOption",
     "Json",
+    "LogMapping",
     "MaxBytes",
     "Measured",
     "Model",
@@ -49,6 +50,10 @@ PerClass = Annotated[int, typer.Option(metavar="N", help="Trajectories per class
 Rate = Annotated[
     float | None,
     typer.Option("--rate", metavar="HZ", help="Samples per second, if the file has none."),
+]
+LogMapping = Annotated[
+    Path | None,
+    typer.Option("--mapping", metavar="FILE", help="For a log: what `retwin data map` wrote."),
 ]
 MaxBytes = Annotated[
     int | None,

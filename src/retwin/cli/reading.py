@@ -61,8 +61,9 @@ def read(
     rate: float | None = None,
     *,
     max_bytes: int | None = None,
+    mapping: Path | None = None,
 ) -> Trajectories:
-    """The trajectories of a file, with a bar while they are read."""
+    """The trajectories of a file, with a bar while they are read; of a log by its mapping."""
     with bar("read") as show:
         return load(
             file,
@@ -70,4 +71,5 @@ def read(
             rate=rate,
             progress=lambda share: show(file.name, share),
             max_bytes=max_bytes,
+            mapping=mapping,
         )

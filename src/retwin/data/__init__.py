@@ -20,6 +20,7 @@ _HOME = {
     "UNLABELLED": "trajectories",
     "cache_folder": "download",
     "fetch": "download",
+    "propose_mapping": "logs.proposal",
     "read_mapping": "logs.mapping",
     "load": "io",
     "read_zarr": "io.zarr_folder",

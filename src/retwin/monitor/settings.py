@@ -71,7 +71,7 @@ class FolderSource(Part):
     """Pattern of the files, such as "logs/{asset}/*.csv"; {asset} stands for each machine."""
     asset: Name | None = None
     """The machine, where the pattern has no {asset}."""
-    columns: dict[str, str | list[str]] = Field({})
+    columns: dict[str, str | list[str]] = Field(default={})
     """Column of each channel, or several, of which it is the mean; by default as the case has them,
     else the names of the channels."""
     time: str | None = None
@@ -158,7 +158,7 @@ class ServerSettings(Part):
     """Address that it listens on; the default is reached from this machine alone."""
     port: Annotated[int, Field(ge=0, le=PORT)] = 8710
     """Its port; 0 for any that is free."""
-    hosts: list[str] = Field([])
+    hosts: list[str] = Field(default=[])
     """Names of this machine by which others reach it, where it listens on more than loopback."""
     token_env: str = "RETWIN_MONITOR_TOKEN"
     """Variable of the environment with the token that writing needs."""
@@ -187,7 +187,7 @@ class MonitorSettings(Part):
     """The twins by their names."""
     assets: Annotated[dict[Name, AssetSettings], Field(min_length=1)]
     """The machines by their names."""
-    sources: list[Source] = Field([])
+    sources: list[Source] = Field(default=[])
     """Where samples come from, besides those that programs post."""
     server: ServerSettings | None = None
     """The page; none without this table."""

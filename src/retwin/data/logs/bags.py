@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from retwin.checks import needs_extra
-from retwin.data.logs.messages import Series, Types, header_stamp
+from retwin.data.logs.messages import Series, Stamps, Types
 from retwin.data.logs.signals import Clock, Signal, Skipped
 from retwin.errors import InputError
 
@@ -56,6 +56,7 @@ def _collect(
 ) -> None:
     """Decode the messages of some connections."""
     skipped: set[str] = set()
+    stamped = Stamps(clock, series).time
     for connection, time, data in reader.messages(connections) if connections else ():
         topic = connection.topic
         if topic in skipped:
@@ -67,13 +68,7 @@ def _collect(
             reason = f"messages of the type {connection.msgtype}, which the bag does not define"
             series.skip(topic, reason)
             continue
-        if clock.stamps == "header":
-            stamp = header_stamp(message)
-            if stamp is None:
-                skipped.add(topic)
-                series.skip(topic, "without a header stamp")
-                continue
-            time = stamp
+        time = stamped(topic, time, message)
         series.add(topic, time, message)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import require
 from retwin.data.logs.mapping import ChannelMapping
-from retwin.data.logs.signals import Log, Signal
+from retwin.data.logs.signals import NO_STAMP, Log, Signal
 from retwin.data.logs.units import converted, same_unit
 from retwin.data.provenance import Sampling
 from retwin.data.resampling import Resampling, longest_bridge, resampled
@@ -139,6 +139,11 @@ def _channel(
     signal, notes = in_order(signal_of(log, own.signal), log.name)
     if signal.unreadable:
         notes.append(f"{signal.unreadable} values are no numbers")
+    topics = [topic for topic, why in log.skipped.items() if why == NO_STAMP]
+    if any(
+        signal.name == each or signal.name.startswith((f"{each}.", f"{each}[")) for each in topics
+    ):
+        notes.append("no header stamps, time of recording")
     values = signal.values
     if own.scale != 1 or own.shift != 0:
         values = values * own.scale + own.shift

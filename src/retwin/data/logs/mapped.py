@@ -143,6 +143,7 @@ class Parts:
 
     @property
     def every(self) -> list[Channel]:
+        """All channels, in the order of the columns of the blocks."""
         return [*self.commands, *self.ideal, *self.measured]
 
     @property

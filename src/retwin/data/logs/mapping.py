@@ -34,7 +34,8 @@ class TimeSettings(Part):
     rate: Positive | None = None
     """Rows per s, where there is no column of times."""
     stamps: Literal["log", "header"] = "log"
-    """Whether ROS messages have the time of their recording, or the stamp of their header."""
+    """Whether ROS messages have the time of their recording, or the stamp of their header, where
+    they have one."""
 
     @property
     def clock(self) -> Clock:
@@ -107,11 +108,11 @@ class Mapping(Part):
     """Where the log has its times."""
     cut: Cut = Cut()
     """What starts a trajectory."""
-    commands: dict[Name, ChannelMapping] = Field({})
+    commands: dict[Name, ChannelMapping] = Field(default={})
     """The commands by their names, in their order."""
     outputs: Annotated[dict[Name, ChannelMapping], Field(min_length=1)]
     """The measured outputs by their names, in their order."""
-    nominal: dict[Name, ChannelMapping] = Field({})
+    nominal: dict[Name, ChannelMapping] = Field(default={})
     """The ideal outputs, where the log holds them: one for each output. By default the twin of the
     case simulates them."""
 

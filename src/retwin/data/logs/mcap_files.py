@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from retwin.checks import needs_extra
-from retwin.data.logs.messages import Series, Types, header_stamp
+from retwin.data.logs.messages import Series, Stamps, Types
 from retwin.data.logs.signals import Clock, Signal, Skipped
 from retwin.errors import InputError
 
@@ -34,6 +34,7 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
     needs_extra("rosbags", "logs", "decodes ROS messages")
     types, series = Types(), Series(wanted)
     undecoded: set[int] = set()
+    stamped = Stamps(clock, series).time
     with path.open("rb") as stream:
         reader = mcap.NonSeekingReader(stream, validate_crcs=True)
         try:
@@ -45,14 +46,7 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
                     undecoded.add(channel.id)
                     series.skip(channel.topic, decoded)
                     continue
-                time = message.log_time
-                if clock.stamps == "header":
-                    stamp = header_stamp(decoded)
-                    if stamp is None:
-                        undecoded.add(channel.id)
-                        series.skip(channel.topic, "without a header stamp")
-                        continue
-                    time = stamp
+                time = stamped(channel.topic, message.log_time, decoded)
                 series.add(channel.topic, time, decoded)
         except exceptions.EndOfFile:
             raise _cut_off(path) from None

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from retwin.data.logs.signals import MAX_SIGNALS, Signal, Skipped
+from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, Clock, Signal, Skipped
 from retwin.errors import InputError
 
-__all__ = ["Series", "Types", "header_stamp"]
+__all__ = ["Series", "Stamps", "Types"]
 
 MAX_ELEMENTS = 64
 """Elements of an array that become signals; images and point clouds have more."""
@@ -95,7 +95,7 @@ def _require_name(fine: bool, name: str) -> None:
         )
 
 
-def header_stamp(message: Any) -> int | None:
+def _header_stamp(message: Any) -> int | None:
     """The stamp of a message's header in ns; None if it has none."""
     header = (
         message.get("header") if isinstance(message, Mapping) else getattr(message, "header", None)
@@ -203,6 +203,38 @@ class Series:
             own = names[place] if names is not None else _own_name(value)
             inner = f"{name}[{place if own is None else own[:MAX_NAME]}]"
             yield from self._leaves(inner, value, depth + 1)
+
+
+class Stamps:
+    """The times of messages: of their recording, or the stamps of their headers.
+
+    A topic whose first message has no stamp has the times of recording, which is noted.
+
+    Parameters
+    ----------
+    clock : Clock
+        Which of them are wanted.
+    series : Series
+        What notes topics without stamps.
+
+    """
+
+    def __init__(self, clock: Clock, series: Series) -> None:
+        self._wanted = clock.stamps == "header"
+        self._series = series
+        self._has: dict[str, bool] = {}
+
+    def time(self, topic: str, recorded: int, message: Any) -> int:
+        """The time of a message of a topic in ns."""
+        if not self._wanted or self._has.get(topic) is False:
+            return recorded
+        stamp = _header_stamp(message) or 0  # a stamp of 0 was never set
+        if topic not in self._has:
+            self._has[topic] = stamp > 0
+            if not stamp:
+                self._series.skip(topic, NO_STAMP)
+                return recorded
+        return stamp
 
 
 def _names_elements(key: str, value: Any) -> bool:

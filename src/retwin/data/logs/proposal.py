@@ -5,22 +5,28 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from retwin.data.io.assembly import DataCase
+from retwin.data.logs.channels import in_order
 from retwin.data.logs.cutting import union_of_times
 from retwin.data.logs.mapping import ChannelMapping, Cut, Mapping, TimeSettings
-from retwin.data.logs.signals import Log, Signal
+from retwin.data.logs.reading import log_format, read_log
+from retwin.data.logs.signals import NANOSECOND, NO_STAMP, Log, Signal
 from retwin.data.logs.tables import TIMES
 from retwin.data.logs.units import compatible
 from retwin.data.resampling import BRIDGED
 from retwin.errors import InputError
+from retwin.progress import Progress
+from retwin.serialisation.sizes import Budget
 
-__all__ = ["Fact", "Proposal", "facts_of", "proposed"]
+__all__ = ["Fact", "Proposal", "facts_of", "propose_mapping", "proposed"]
 
 COMMAND = re.compile(
     r"(^|[^a-z])(cmd|command(s|ed)?|set_?point(s)?|target(s)?|ref(erence)?|desired|demand|goal|"
@@ -35,6 +41,10 @@ MAX_LISTED = 200
 """Signals that are listed in comments."""
 ALIKE = 0.72
 """Least score of a name that is taken for a channel's."""
+STAMPED = (".mcap", "", ".db3", ".bag")
+"""Formats whose messages may have header stamps."""
+LATE = 60.0
+"""Median time in s from stamp to recording at which the stamps are those of another clock."""
 PAUSE, PAUSE_PERIODS = 1.0, 20.0
 """The shortest pause in s, and in sample periods, between two trajectories."""
 SCHEMA = "https://retwin.readthedocs.io/mapping.schema.json"
@@ -77,6 +87,8 @@ class Proposal:
 
     Attributes
     ----------
+    log : Log
+        What was read of the log.
     text : str
         The mapping.toml.
     mapping : Mapping or None
@@ -88,10 +100,90 @@ class Proposal:
 
     """
 
+    log: Log
     text: str
     mapping: Mapping | None
     facts: tuple[Fact, ...]
     open_channels: tuple[str, ...] = field(default=())
+
+
+def propose_mapping(
+    path: str | os.PathLike[str],
+    *,
+    case: DataCase | None = None,
+    time: TimeSettings | None = None,
+    progress: Progress | None = None,
+    max_bytes: int | None = None,
+) -> Proposal:
+    """A mapping for a log, by what is seen of all its signals.
+
+    Messages with header stamps get the times of these, since a measurement is as old as its stamp
+    says and not as its recording.
+
+    Parameters
+    ----------
+    path : path
+        A log of one of the formats in `catalog.LOGS`.
+    case : DataCase, optional
+        Its channels and sample rate are those of the mapping.
+    time : TimeSettings, optional
+        Where the times are, if they are not found.
+    progress : callable, optional
+        Called with the share that is done, from 0 to 1.
+    max_bytes : int, optional
+        The memory that the signals may take; by default half of what is free.
+
+    Returns
+    -------
+    Proposal
+        The mapping as text, and as `Mapping` where it is complete enough to be tried.
+
+    Raises
+    ------
+    InputError
+        It is no log, damaged or too large, its times are not found, or no signal changes.
+
+    """
+    path = Path(path)
+    time = time or TimeSettings()
+    limit = Budget(path.name, max_bytes).left
+    log = read_log(path, clock=time.clock, budget=Budget(path.name, limit))
+    if progress is not None:
+        progress(0.5)
+    proposal = proposed(log, time, case=case)
+    if log_format(path) in STAMPED and time.stamps == "log" and proposal.mapping is not None:
+        stamped = time.model_copy(update={"stamps": "header"})
+        delay = _delay(path, proposal, stamped, Budget(path.name, limit))
+        if delay is not None:
+            proposal = proposed(log, stamped, case=case, delay=delay)
+    return proposal
+
+
+def _delay(path: Path, proposal: Proposal, stamped: TimeSettings, budget: Budget) -> float | None:
+    """The median time in s from stamps to recording; None if the stamps are of no use."""
+    assert proposal.mapping is not None
+    names = proposal.mapping.signals
+    try:
+        other = read_log(path, wanted=names, clock=stamped.clock, budget=budget)
+        for name in names:
+            in_order(other.signals[name], path.name)
+    except (InputError, KeyError):
+        return None
+    pairs = [(proposal.log.signals[name], other.signals[name]) for name in names]
+    if any(len(one.times) != len(two.times) for one, two in pairs):
+        return None
+    begin = (proposal.log.begin - other.begin) * NANOSECOND
+    unstamped = [topic for topic, why in other.skipped.items() if why == NO_STAMP]
+    delays = np.concatenate(
+        [
+            one.times - two.times + begin
+            for one, two in pairs
+            if not any(one.name.startswith(topic) for topic in unstamped)
+        ]
+        or [np.array([-1.0])]
+    )
+    found = float(np.median(delays))
+    return found if 0 <= found < LATE else None
 
 
 def facts_of(log: Log) -> list[Fact]:
@@ -153,24 +245,30 @@ def proposed(
             got=f"{len(facts)} that are constant or have one value",
             remedy="check that it is the right log",
         )
-    if case is None:
-        chosen = _by_name(moving)
-    else:
-        chosen = _for_case(moving, case)
+    chosen = _by_name(moving) if case is None else _for_case(moving, case)
     used = [fact for table in chosen.values() for fact in table.values() if fact is not None]
     rate = case.rate if case is not None else _round(np.median([each.rate for each in used]))
     cut = _cut([log.signals[each.name] for each in used], 1 / rate)
     tables = {
-        name: {channel: _channel(fact, name, rate, cut) for channel, fact in table.items() if fact}
+        name: {
+            channel: _channel(fact, log.signals[fact.name], name, rate, cut)
+            for channel, fact in table.items()
+            if fact
+        }
         for name, table in chosen.items()
     }
     unknown = tuple(c for table in chosen.values() for c, fact in table.items() if fact is None)
     mapping = None
     if tables["outputs"]:
-        settings = {"rate": rate, "time": time, "cut": cut, **tables}
-        mapping = Mapping(**settings)
+        mapping = Mapping(
+            rate=rate,
+            time=time,
+            cut=cut,
+            commands=tables["commands"],
+            outputs=tables["outputs"],
+        )
     text = _text(log, time, rate, cut, chosen, tables, facts, case, delay)
-    return Proposal(text, mapping, tuple(facts), unknown)
+    return Proposal(log, text, mapping, tuple(facts), unknown)
 
 
 def _round(value: float) -> float:
@@ -243,16 +341,17 @@ def _cut(signals: Sequence[Signal], period: float) -> Cut:
     return Cut(by="gap", gap=_round(max(least, float(longer.min()) / 2)))
 
 
-def _channel(fact: Fact, table: str, rate: float, cut: Cut) -> ChannelMapping:
+def _channel(fact: Fact, signal: Signal, table: str, rate: float, cut: Cut) -> ChannelMapping:
     longest = BRIDGED * max(1 / rate, 1 / fact.rate)
     # A command that is sent when it changes holds until the next one.
     if table == "commands":
-        inside = min(fact.longest, cut.gap or math.inf)
-        longest = max(longest, 1.01 * inside)
+        steps = np.diff(np.sort(signal.times[np.isfinite(signal.values)]))
+        longest = max(longest, float(steps[steps <= (cut.gap or math.inf)].max(initial=0.0)))
+    exponent = math.floor(math.log10(longest)) - 2
     return ChannelMapping(
         signal=fact.name,
         resample="hold" if table == "commands" else "linear",
-        max_gap=float(f"{longest:.3g}") * (1.01 if table == "commands" else 1.0),
+        max_gap=_round(math.ceil(longest / 10**exponent - 1e-6) * 10**exponent),
     )
 
 
@@ -314,7 +413,7 @@ def _text(
     for each in rest[:MAX_LISTED]:
         what = f"constant, {each.low:g}" if each.constant and each.count else _seen(each)
         lines.append(f"#   {_comment(_quoted(each.name))}: {what}")
-    others = [(n, why) for n, why in log.skipped.items() if why != TIMES]
+    others = [(n, why) for n, why in log.skipped.items() if why not in (TIMES, NO_STAMP)]
     lines += [f"#   {_comment(_quoted(n))}: {_comment(why)}" for n, why in others[:MAX_LISTED]]
     left = max(0, len(rest) - MAX_LISTED) + max(0, len(others) - MAX_LISTED)
     lines += [f"#   and {left} more"] if left else []

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Collection, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,7 +205,7 @@ def _received(
     return Signal(str(about["name"]), times, values, unit, bad)
 
 
-def _text(stream: BinaryIO) -> dict[str, Any] | None:
+def _text(stream: IO[bytes]) -> dict[str, Any] | None:
     """The JSON of a frame, None at the end of the stream."""
     head = stream.read(FRAME.size)
     if len(head) < FRAME.size or (size := FRAME.unpack(head)[0]) > MAX_TEXT:
@@ -217,9 +217,9 @@ def _text(stream: BinaryIO) -> dict[str, Any] | None:
     return found if isinstance(found, dict) else None
 
 
-def _array(stream: BinaryIO, count: int, dtype: str) -> NDArray | None:
+def _array(stream: IO[bytes], count: int, dtype: str) -> NDArray | None:
     made = np.empty(count, dtype)
-    view = memoryview(made).cast("B") if count else memoryview(b"")
+    view = memoryview(made.view(np.uint8).data)
     done = 0
     while done < len(view):
         part = stream.readinto(view[done:])  # type: ignore[attr-defined]

@@ -16,6 +16,7 @@ from retwin.errors import InputError
 __all__ = [
     "MAX_SIGNALS",
     "NANOSECOND",
+    "NO_STAMP",
     "UNIT_SECONDS",
     "Clock",
     "Log",
@@ -32,6 +33,8 @@ MAX_SIGNALS = 10_000
 """Signals that one log may hold: names that are different in every message would fill memory."""
 LATEST = 2**63 - 1
 """The latest time in ns, in the year 2262."""
+NO_STAMP = "without header stamps: the time of recording"
+"""What is noted of topics whose messages have no stamps, where those are wanted."""
 UNIT_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Units of times that are numbers, in s."""
 
@@ -51,7 +54,8 @@ class Clock:
     rate : float or None
         Rows per s, where there is no column of times.
     stamps : {"log", "header"}
-        Whether messages have the time of their recording or the stamp of their header.
+        Whether messages have the time of their recording or the stamp of their header. Topics
+        without stamps have the time of their recording in any case.
 
     """
 
