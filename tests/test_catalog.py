@@ -71,9 +71,9 @@ def test_a_new_format_is_one_module_and_one_entry(tmp_path: Path) -> None:
     assert again.rate == 5.0
     with pytest.raises(InputError, match=r"ends in \.npz or \.zarr or \.txt"):
         save(example(), tmp_path / "a.csv")
-    (tmp_path / "a.csv").touch()
+    (tmp_path / "a.dat").touch()
     with pytest.raises(InputError, match=r"a file \*\.mat or \*\.npz or \*\.txt, a folder"):
-        load(tmp_path / "a.csv")
+        load(tmp_path / "a.dat")
 
 
 @pytest.mark.parametrize(

@@ -700,8 +700,8 @@ def test_without_zarr_one_line_says_how_to_install_it(tmp_path, monkeypatch):
 
 def test_missing_and_unknown_paths(tmp_path):
     refused("existing file or folder", tmp_path / "none.mat", rate=1)
-    (tmp_path / "a.txt").write_text("1")
-    refused(r"\*.mat or \*.npz", tmp_path / "a.txt", rate=1)
+    (tmp_path / "a.dat").write_text("1")
+    refused(r"\*.mat or \*.npz", tmp_path / "a.dat", rate=1)
     (tmp_path / "b.zarr").write_text("1")
     refused(r"\*.zarr", tmp_path / "b.zarr")
     for name in ("a", "a.mat", "a.csv", "a.zip"):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from retwin import catalog
 from retwin.checks import require
 from retwin.cli.completion import one_of
-from retwin.cli.options import CaseOption, Json, MaxBytes, Measured, Probabilities, Seed
+from retwin.cli.options import CaseOption, Json, LogMapping, MaxBytes, Measured, Probabilities, Seed
 from retwin.cli.reading import case_named, data_case, read, saved, updated_twin
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data.trajectories import Trajectories
@@ -53,6 +53,7 @@ def fit(
         float | None, typer.Option(metavar="HZ", help="Sample rate of the features.")
     ] = None,
     seed: Seed = 0,
+    mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
 ) -> None:
     """Train a diagnoser on labelled trajectories."""
@@ -61,7 +62,7 @@ def fit(
     check_place(out, folder=True, holds=("model.json", "weights.safetensors"))
     system = case_named(case)
     chosen = catalog.make(catalog.CLASSIFIERS, classifier, "classifier")
-    training = read(file, system, max_bytes=max_bytes)
+    training = read(file, system, max_bytes=max_bytes, mapping=mapping)
     with bar("train") as show:
         diagnoser = rt.fit_diagnoser(
             training,
@@ -95,6 +96,7 @@ def invert(
         bool,
         typer.Option("--random-onset", metavar="", help="Infer the onset of stuck motors."),
     ] = False,
+    mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
 ) -> None:
     """Derive a diagnoser from a corrected twin; only healthy trajectories are used."""
@@ -117,7 +119,7 @@ def invert(
             remedy="give their file after the model",
         )
     else:
-        calibration = read(real, system, max_bytes=max_bytes)
+        calibration = read(real, system, max_bytes=max_bytes, mapping=mapping)
         rt.fit_inversion(
             updated.surrogate, updated.residual, calibration, system.faults, twin=system.twin
         ).save(out)
@@ -130,6 +132,7 @@ def predict(
     file: Measured,
     case: CaseOption = None,
     out: Probabilities = None,
+    mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
@@ -140,7 +143,7 @@ def predict(
     if out is not None:
         check_place(out)
     diagnoser = rt.load_diagnoser(saved(model))
-    trajectories = read(file, data_case(case), max_bytes=max_bytes)
+    trajectories = read(file, data_case(case), max_bytes=max_bytes, mapping=mapping)
     probabilities, severities = _diagnosed(diagnoser, trajectories)
     _check_finite(trajectories, probabilities)
     labels = trajectories.labels.tolist()

@@ -12,7 +12,16 @@ import typer
 from retwin import catalog
 from retwin.checks import require
 from retwin.cli.completion import one_of
-from retwin.cli.options import CaseArgument, Json, MaxBytes, Model, OtherCase, PerClass, Seed
+from retwin.cli.options import (
+    CaseArgument,
+    Json,
+    LogMapping,
+    MaxBytes,
+    Model,
+    OtherCase,
+    PerClass,
+    Seed,
+)
 from retwin.cli.plans import Workers, carry_out
 from retwin.cli.reading import read, updated_twin
 from retwin.cli.terminal import answer, bar, note, table
@@ -112,6 +121,7 @@ def fit(
     refine: Refine = False,
     dynamics: StateEquations = False,
     seed: Seed = 0,
+    mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
@@ -123,7 +133,7 @@ def fit(
         out, folder=True, holds=("model.json", "weights.safetensors", "surrogate", "residual")
     )
     system = _system(case, network, correction, density, refine)
-    measured = _measured(system, real, data, max_bytes)
+    measured = _measured(system, real, data, max_bytes, mapping)
     # The path is absolute, since a model is also used from other folders.
     name = str(Path(case).resolve()) if Path(case).suffix.lower() == ".toml" else case
     if dynamics:
@@ -295,7 +305,11 @@ def _system(
 
 
 def _measured(
-    system: Case, real: Path | None, data: Path | None, max_bytes: int | None
+    system: Case,
+    real: Path | None,
+    data: Path | None,
+    max_bytes: int | None,
+    mapping: Path | None,
 ) -> Trajectories:
     """The real trajectories to calibrate on."""
     import retwin as rt
@@ -308,7 +322,7 @@ def _measured(
         remedy="give --real FILE; or --data FILE, for a case that defines how it is split",
     )
     if real is not None:
-        return read(real, system, max_bytes=max_bytes)
+        return read(real, system, max_bytes=max_bytes, mapping=mapping)
     assert data is not None
     if system.records is None:
         raise rt.InputError(

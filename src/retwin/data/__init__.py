@@ -20,9 +20,9 @@ _HOME = {
     "UNLABELLED": "trajectories",
     "cache_folder": "download",
     "fetch": "download",
+    "load": "io",
     "propose_mapping": "logs.proposal",
     "read_mapping": "logs.mapping",
-    "load": "io",
     "read_zarr": "io.zarr_folder",
     "save": "io",
 }
