@@ -1,7 +1,7 @@
 # make install | demo | test | test-all | test-long | coverage | lint | docs | bench | package
 PYTHON ?= python3
 BIN := .venv/bin
-EXTRAS := bayes,docs,fetch,flows,fmu,monitor,onnx,parquet,postgres,render,rocket,scale,dev
+EXTRAS := bayes,docs,fetch,flows,fmu,logs,monitor,onnx,parquet,postgres,render,rocket,scale,dev
 # One torch thread per test process: more threads than cores cost several times the time.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n 2
 

@@ -1,15 +1,20 @@
-"""Writes the JSON schemas of `monitor.toml` and of the registry's steps: python schemas.py."""
+"""Writes the JSON schemas of `monitor.toml`, `mapping.toml` and the registry's steps."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
+from retwin.data.logs.mapping import Mapping
 from retwin.monitor.registry import Step
 from retwin.monitor.settings import MonitorSettings
 
 DOCS = Path(__file__).parents[1]
-SCHEMAS = {"monitor.schema.json": MonitorSettings, "registry.schema.json": Step}
+SCHEMAS = {
+    "mapping.schema.json": Mapping,
+    "monitor.schema.json": MonitorSettings,
+    "registry.schema.json": Step,
+}
 
 
 def written(name: str) -> str:

@@ -16,6 +16,8 @@ from retwin.errors import InputError
 
 __all__ = ["read"]
 
+FILES = (b"ARROW1", b"FEA1\0\0")
+"""How files of Arrow begin that are no streams."""
 MAX_DEPTH = 8
 """Structures inside structures at most."""
 MAX_ELEMENTS = 64
@@ -81,11 +83,12 @@ def _table(path: Path, arrow: Any) -> Any:
         parquet = needs_extra("pyarrow.parquet", "logs", "reads Parquet")
         with parquet.ParquetFile(path) as file:
             return file.read()
-    feather = needs_extra("pyarrow.feather", "logs", "reads Feather")
-    try:
-        return feather.read_table(path, memory_map=False)
-    except arrow.ArrowInvalid:
-        with path.open("rb") as stream, arrow.ipc.open_stream(stream) as batches:
+    with path.open("rb") as stream:
+        if stream.read(6) in FILES or path.suffix.lower() == ".feather":
+            feather = needs_extra("pyarrow.feather", "logs", "reads Feather")
+            return feather.read_table(path, memory_map=False)
+        stream.seek(0)
+        with arrow.ipc.open_stream(stream) as batches:
             return batches.read_all()
 
 

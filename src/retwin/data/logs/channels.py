@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import require
 from retwin.data.logs.mapping import ChannelMapping
-from retwin.data.logs.signals import NO_STAMP, Log, Signal
+from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Log, Signal
 from retwin.data.logs.units import converted, same_unit
 from retwin.data.provenance import Sampling
 from retwin.data.resampling import Resampling, longest_bridge, resampled
@@ -171,8 +171,9 @@ def signal_of(log: Log, name: str) -> Signal:
     found = log.signals.get(name)
     if found is not None and len(found.times):
         return found
-    alike = difflib.get_close_matches(name, log.signals, n=3, cutoff=0.3)
-    others = ", ".join(alike or list(log.signals)[:3]) or "none"
+    there = [*log.signals, *(other for other, why in log.skipped.items() if why == UNWANTED)]
+    alike = difflib.get_close_matches(name, there[:MAX_SIGNALS], n=3, cutoff=0.3)
+    others = ", ".join(alike or there[:3]) or "none"
     raise InputError(
         log.name,
         expected=f"the signal {name!r} of the mapping",

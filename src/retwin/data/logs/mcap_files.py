@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
                     continue
                 time = stamped(channel.topic, message.log_time, decoded)
                 series.add(channel.topic, time, decoded)
-        except exceptions.EndOfFile:
+        except (exceptions.EndOfFile, struct.error):
             raise _cut_off(path) from None
     yield from series.found()
 

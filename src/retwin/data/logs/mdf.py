@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from retwin.checks import needs_extra
-from retwin.data.logs.signals import Clock, Signal, Skipped, to_nanoseconds
+from retwin.data.logs.signals import UNWANTED, Clock, Signal, Skipped, to_nanoseconds
 from retwin.errors import InputError
 
 __all__ = ["read"]
@@ -43,6 +43,7 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
         for name, group, index in places:
             title = f"{group}/{name}" if name in several else name
             if wanted is not None and title not in wanted:
+                yield Skipped(title, UNWANTED)
                 continue
             yield _signal(path, file, title, (group, index), max(begin, 0))
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, Clock, Signal, Skipped
+from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Clock, Signal, Skipped
 from retwin.errors import InputError
 
 __all__ = ["Series", "Stamps", "Types"]
@@ -131,14 +131,18 @@ class Series:
 
     def wants(self, topic: str) -> bool:
         """Whether a signal of that topic is wanted."""
-        return self._wanted is None or any(
+        fine = self._wanted is None or any(
             each == topic or each.startswith((f"{topic}.", f"{topic}[")) for each in self._wanted
         )
+        if not fine:
+            self.skip(topic, UNWANTED)
+        return fine
 
     def add(self, topic: str, time: int, message: Any) -> None:
         """The numbers of a message at a time in ns."""
         for name, value in self._leaves(topic, message, 0):
             if self._wanted is not None and name not in self._wanted:
+                self.skip(name, UNWANTED)
                 continue
             times = self._times.get(name)
             if times is None:

@@ -116,7 +116,7 @@ def read_log(
         else:
             skipped[each[0]] = each[1]
     require(
-        signals or wanted == (),
+        signals or wanted is not None,  # what is missing then is named with what is alike
         path.name,
         expected="signals that hold numbers",
         got=", ".join(f"{name} ({why})" for name, why in list(skipped.items())[:5]) or "none",

@@ -18,6 +18,7 @@ __all__ = [
     "NANOSECOND",
     "NO_STAMP",
     "UNIT_SECONDS",
+    "UNWANTED",
     "Clock",
     "Log",
     "Reader",
@@ -33,6 +34,8 @@ MAX_SIGNALS = 10_000
 """Signals that one log may hold: names that are different in every message would fill memory."""
 LATEST = 2**63 - 1
 """The latest time in ns, in the year 2262."""
+UNWANTED = "not named in the mapping"
+"""What is noted of signals that are there but not read."""
 NO_STAMP = "without header stamps: the time of recording"
 """What is noted of topics whose messages have no stamps, where those are wanted."""
 UNIT_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

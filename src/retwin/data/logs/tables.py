@@ -8,7 +8,14 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.data.logs.signals import UNIT_SECONDS, Clock, Signal, Skipped, to_nanoseconds
+from retwin.data.logs.signals import (
+    UNIT_SECONDS,
+    UNWANTED,
+    Clock,
+    Signal,
+    Skipped,
+    to_nanoseconds,
+)
 from retwin.errors import InputError
 
 __all__ = ["MISSING", "TIMES", "TIME_NAMES", "numbers", "row_times", "table_signals", "time_column"]
@@ -198,7 +205,10 @@ def table_signals(
     else:
         times = np.round(np.arange(rows) * (1e9 / (clock.rate or 1.0))).astype(np.int64)
     for title, unit in titles.items():
-        if title == name or (wanted is not None and title not in wanted):
+        if title == name:
+            continue
+        if wanted is not None and title not in wanted:
+            yield Skipped(title, UNWANTED)
             continue
         found = column(title)
         if isinstance(found, str):

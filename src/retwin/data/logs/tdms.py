@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import needs_extra
-from retwin.data.logs.signals import Clock, Signal, Skipped
+from retwin.data.logs.signals import UNWANTED, Clock, Signal, Skipped
 from retwin.data.logs.tables import row_times, time_column
 from retwin.errors import InputError
 
@@ -41,7 +41,10 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
             own = clock.column.removeprefix(f"{group.name}/") or time_column(channels)
             for name, channel in channels.items():
                 title = f"{group.name}/{name}"
-                if name == own or (wanted is not None and title not in wanted):
+                if name == own:
+                    continue
+                if wanted is not None and title not in wanted:
+                    yield Skipped(title, UNWANTED)
                     continue
                 dtype = channel.dtype
                 if dtype is None or dtype.kind not in "iufb":

@@ -1,0 +1,362 @@
+"""Logs of every format become trajectories by a mapping, and say what is missing in them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from log_files import BEGIN, COUNT, HEATER, RATE, SPEED, SPEEDS, TIMES, mcap, ros2_bag
+
+from retwin.data import Provenance, load, propose_mapping, read_mapping, save
+from retwin.data.logs.channels import in_order
+from retwin.data.logs.cutting import pieces
+from retwin.data.logs.mapped import mapped
+from retwin.data.logs.mapping import Cut, Mapping
+from retwin.data.logs.reading import read_log
+from retwin.data.logs.signals import Clock, Log, Signal, named_unit
+from retwin.data.logs.units import compatible, converted
+from retwin.data.resampling import resampled
+from retwin.errors import InputError
+from retwin.serialisation.sizes import Budget
+
+
+def written(folder: Path, name: str) -> Path:
+    SPEEDS[name][0](folder / name)
+    return folder / name
+
+
+def mapping(speed: str, heater: str, **more) -> Mapping:
+    return Mapping.model_validate(
+        {
+            "rate": float(RATE),
+            "commands": {"heater": {"signal": heater}},
+            "outputs": {"speed": {"signal": speed, "unit": "m/s"}},
+            **more,
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        each if each in ("a.csv", "a.mcap") else pytest.param(each, marks=pytest.mark.slow)
+        for each in SPEEDS
+    ],
+)
+def test_a_log_of_the_reference_library_becomes_a_trajectory(name: str, tmp_path: Path) -> None:
+    path = written(tmp_path, name)
+    made = load(path, mapping=mapping(*SPEEDS[name][1:]))
+    assert (len(made), made.rate) == (1, RATE)
+    measured = made.mask[0, :, 0]
+    assert measured.sum() >= COUNT - 2
+    # Where topics have other times, the command comes first and the output is interpolated.
+    lag = 0.004 if name == "a.mcap" else 0.0
+    expected = 2 * np.maximum(np.arange(made.steps) / RATE - lag, 0)
+    np.testing.assert_allclose(made.observed[0, measured, 0], expected[measured], atol=1e-5)
+    np.testing.assert_allclose(made.commands[0, :COUNT, 0], HEATER[: made.steps])
+    assert made.outputs.units == ("m/s",)
+    (source,) = made.provenance
+    assert [each.channel for each in source.sampling] == ["heater", "speed"]
+    assert source.sampling[1].rate == pytest.approx(RATE)
+    assert source.sampling[1].missing == pytest.approx(1 - measured.mean())
+
+
+def log(**signals: tuple[np.ndarray, np.ndarray]) -> Log:
+    """A log of signals with times in s."""
+    found = {name: Signal(name, *map(np.asarray, each)) for name, each in signals.items()}
+    return Log("run.csv", "", 0, found)
+
+
+def made_of(found: Log, **settings):
+    return mapped(found, mapping("y", "u", **settings), budget=Budget("run.csv"))
+
+
+def test_joints_are_found_by_their_names_in_any_order(tmp_path: Path) -> None:
+    mcap(tmp_path / "a.mcap")
+    found = read_log(tmp_path / "a.mcap", budget=Budget("a"))
+    np.testing.assert_allclose(found.signals["/joint_states.position[elbow]"].values, -SPEED)
+    np.testing.assert_allclose(found.signals["/plant.tanks[b].level"].values, SPEED)
+    np.testing.assert_allclose(found.signals["/plant.flows[2]"].values, SPEED, rtol=1e-6)
+    assert "protobuf" in found.skipped["/camera"]
+    assert found.begin == BEGIN
+    assert not any("header.stamp" in name for name in found.signals)
+
+
+def test_header_stamps_are_the_times_of_the_measurement(tmp_path: Path) -> None:
+    mcap(tmp_path / "a.mcap")
+    names = ["/plant.speed", "/heating.heater.power"]
+    found = read_log(
+        tmp_path / "a.mcap", wanted=names, clock=Clock(stamps="header"), budget=Budget("a")
+    )
+    for name in names:  # JSON without header was recorded at once
+        np.testing.assert_allclose(found.signals[name].times, TIMES, atol=1e-9)
+    assert "time of recording" in found.skipped["/heating"]
+    proposal = propose_mapping(tmp_path / "a.mcap")
+    assert proposal.mapping is not None
+    assert proposal.mapping.time.stamps == "header"
+    assert "0.004 s after their header stamps" in proposal.text
+
+
+@pytest.mark.slow
+def test_the_three_ways_to_write_a_ros_2_bag_hold_the_same(tmp_path: Path) -> None:
+    ros2_bag(tmp_path / "sql")
+    ros2_bag(tmp_path / "own", mcap=True)
+    paths = [tmp_path / "sql", tmp_path / "own", tmp_path / "sql" / "sql.db3"]
+    first, *others = (read_log(path, budget=Budget("a")) for path in paths)
+    for other in others:
+        assert other.signals.keys() == first.signals.keys()
+        for name, signal in first.signals.items():
+            np.testing.assert_array_equal(other.signals[name].values, signal.values)
+            np.testing.assert_array_equal(other.signals[name].times, signal.times)
+
+
+@pytest.mark.parametrize(
+    ("text", "times", "unit", "last"),
+    [
+        ("t;v (m/s)\n0,0;1,5\n0,1;2,5\n", [0.0, 0.1], "m/s", 2.5),
+        ("time\tv\n[ms]\t[V]\n0\t1\n100\t2.5\n", [0.0, 0.1], "V", 2.5),
+        (
+            "# bench\nTimestamp,v\n2024-01-01T00:00:00,1\n2024-01-01T00:00:00.25,x\n",
+            [0, 0.25],
+            "",
+            None,
+        ),
+        ("time  v\n0  1e3\n1  -2.\n", [0, 1], "", -2.0),
+        ("\ufefftime,v,\n0,true,\n2,,\n", [0, 2], "", None),
+        ("1700000000000,1\n1700000000500,2\n", [0, 0.5], "", 2.0),
+    ],
+    ids=["decimal comma", "row of units", "iso", "blanks", "comma at the end", "no header"],
+)
+def test_text_tables_of_any_kind(
+    text: str, times: list[float], unit: str, last: float | None, tmp_path: Path
+) -> None:
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    found = read_log(tmp_path / "a.csv", budget=Budget("a"))
+    (signal,) = found.signals.values()
+    np.testing.assert_allclose(signal.times, times, atol=1e-9)
+    assert signal.unit == unit
+    assert signal.values[-1] == last or (last is None and np.isnan(signal.values[-1]))
+
+
+def test_a_gap_is_missing_and_never_bridged() -> None:
+    at = np.arange(0, 10, 0.01)
+    kept = (at < 4) | (at > 4.5)
+    made = made_of(log(u=(at, np.ones(1000)), y=(at[kept], at[kept])))
+    hole = (np.arange(made.steps) / RATE > 3.995) & (np.arange(made.steps) / RATE < 4.505)
+    assert not made.mask[0, hole, 0].any()
+    assert made.mask[0, ~hole, 0].all()
+    own = made.provenance[0].sampling[1]
+    assert own.missing == pytest.approx(hole.mean(), abs=2e-3)
+    assert own.longest == pytest.approx(0.52, abs=0.02)
+    assert own.bridged == pytest.approx(0.025)
+    bridged = made_of(
+        log(u=(at, np.ones(1000)), y=(at[kept], at[kept])),
+        outputs={"speed": {"signal": "y", "max_gap": 0.6}},
+    )
+    assert bridged.mask.all()
+
+
+def test_a_missing_command_ends_the_trajectory() -> None:
+    at = np.arange(0, 10, 0.01)
+    kept = (at < 4) | (at > 4.5)
+    made = made_of(log(y=(at, at), u=(at[kept], np.ones(kept.sum()))))
+    assert len(made) == 2
+    assert made.ids.tolist() == ["run 0 s", "run 4.51 s"]
+    assert "1 times a trajectory ends where a command is missing" in made.provenance[0].notes
+    held = made_of(
+        log(y=(at, at), u=(at[kept], np.ones(kept.sum()))),
+        commands={"heater": {"signal": "u", "max_gap": 1.0}},
+    )
+    assert len(held) == 1
+
+
+def test_held_commands_keep_the_area_of_their_pulses() -> None:
+    at = np.arange(0, 10, 0.001)
+    pulse = ((at >= 2.003) & (at < 2.007)).astype(float)
+    made = made_of(log(u=(at, pulse), y=(at, at)))
+    assert made.commands.sum() / RATE == pytest.approx(0.004, rel=1e-6)
+    assert "not filtered" in made.provenance[0].sampling[1].note
+
+
+def test_resampling_of_each_kind() -> None:
+    at, values = np.array([0.0, 1.0, 2.0, 5.0]), np.array([0.0, 2.0, np.nan, 8.0])
+    grid = np.arange(0, 7) * 1.0
+
+    def of(how, **more):
+        return resampled(at, values, grid, 1.0, how, longest=2.0, **more)
+
+    np.testing.assert_array_equal(of("linear"), [0, 2, *[np.nan] * 3, 8, np.nan])
+    np.testing.assert_array_equal(of("hold", end=6.0), [0, 2, *[np.nan] * 3, 8, 8])
+    np.testing.assert_array_equal(of("none"), [0, 2, *[np.nan] * 3, 8, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("cut", "starts"),
+    [
+        ({"by": "none"}, [0.0]),
+        ({"by": "gap", "gap": 1.0}, [0.0, 6.0]),
+        ({"by": "length", "length": 3.0}, [0.0, 3.0, 6.0]),
+        ({"by": "trigger", "signal": "u", "before": 0.5}, [0.5, 6.5]),
+        ({"by": "trigger", "signal": "u", "edge": "falling", "length": 1.0}, [2.0, 8.0]),
+    ],
+)
+def test_what_starts_a_trajectory(cut: dict, starts: list[float]) -> None:
+    own = np.arange(400) / 100
+    at = np.concatenate([own, 6 + own])
+    u = Signal("u", at, np.tile((own >= 1) & (own < 2), 2).astype(float))
+    found = pieces(Cut.model_validate(cut), [u], [u], u)
+    np.testing.assert_allclose([each.start for each in found], starts, atol=1e-9)
+
+
+def test_units_offsets_and_clocks() -> None:
+    at = np.arange(0, 10, 0.01)
+    made = made_of(
+        log(u=(at, at), y=(at + 0.5, 180 * at)),
+        outputs={"speed": {"signal": "y", "from_unit": "deg", "unit": "rad", "clock_offset": -0.5}},
+        commands={"heater": {"signal": "u", "scale": 2.0, "shift": 1.0, "resample": "linear"}},
+    )
+    np.testing.assert_allclose(made.observed[0, :, 0], np.pi * np.arange(made.steps) / RATE)
+    np.testing.assert_allclose(made.commands[0, :, 0], 2 * np.arange(made.steps) / RATE + 1)
+    assert "deg to rad; clock -0.5 s" in made.provenance[0].sampling[1].note
+    for source, target, value in (("°C", "K", 274.15), ("rpm", "deg/s", 6.0), ("%", "1", 0.01)):
+        assert converted(np.ones(1), source, target, "")[0] == pytest.approx(value)
+    for source in ("9**9**9**9", "m", "rpm", "()." * 9):
+        with pytest.raises(InputError, match="scale"):
+            converted(np.ones(1), source, "Hz" if source == "rpm" else "W", "a log")
+    with pytest.raises(InputError, match="no logarithm"):
+        converted(np.ones(1), "dBm", "W", "a log")
+    assert not compatible("V", "nonsense")
+
+
+def test_times_out_of_order() -> None:
+    """Messages may overtake each other; a clock that was set is refused."""
+    at = np.arange(0, 1, 0.01)
+    swapped = at.copy()
+    swapped[[20, 21]] = swapped[[21, 20]]
+    twice = np.append(at, at[-1])
+    assert in_order(Signal("y", swapped, at), "a")[1] == ["1 values put in order"]
+    assert len(in_order(Signal("y", twice, twice), "a")[0].times) == 100
+    with pytest.raises(InputError, match=r"a step back of 0\.5 s at 0\.99 s"):
+        in_order(Signal("y", np.concatenate([at, at + 0.49]), np.zeros(200)), "a")
+
+
+def test_what_does_not_suit_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, "a.csv")
+    for settings, message in (
+        (mapping("sped", "heater"), r"expected the signal 'sped' of the mapping, got speed"),
+        (mapping("speed", "heater", rate=1e6), r"expected values about 1e-06 s apart"),
+        (
+            mapping("speed", "heater", cut={"by": "trigger", "signal": "heater", "level": 7.0}),
+            "a level that 'heater' crosses, rising, got 7, while its values are from 0 to 1",
+        ),
+        (mapping("speed", "heater", time={"column": "t"}), "a column of times 't'"),
+        (mapping("speed", "heater", time={"column": "speed"}), "speed"),
+    ):
+        with pytest.raises(InputError, match=message) as caught:
+            load(path, mapping=settings)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match=r"make one: retwin data map a\.csv"):
+        load(path)
+    save(load(path, mapping=mapping("speed", "heater")), tmp_path / "a.npz")
+    with pytest.raises(InputError, match="expected a log"):
+        load(tmp_path / "a.npz", mapping=mapping("speed", "heater"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[", "expected a mapping.toml"),
+        ("rate = 1.0", "outputs: expected a value, got none"),
+        ("[outputs.y]\nsignal = ''", "outputs.y.signal"),
+        ("[outputs.y]\nsignal = 'y'\ntopic = 1", "outputs.y.topic: expected a known key"),
+        ("[outputs.y]\nsignal = 'y'\nresample = 'cubic'", "outputs.y.resample: expected 'hold'"),
+        ("[outputs.y]\nsignal = 'y'\nmax_gap = -1.0", "outputs.y.max_gap"),
+        ("rate = inf\n[outputs.y]\nsignal = 'y'", "rate: expected"),
+        ("[cut]\nby = 'gap'\n[outputs.y]\nsignal = 'y'", "cut: expected `gap` with by"),
+        ("[nominal.x]\nsignal = 'y'\n[outputs.y]\nsignal = 'y'", r"\[nominal\] for each"),
+    ],
+)
+def test_mapping_files_that_are_refused(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "mapping.toml").write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        read_mapping(tmp_path / "mapping.toml")
+    assert "mapping.toml" in str(caught.value)
+
+
+class Reach:
+    """A case of two commands and one output, whose twin adds them."""
+
+    from retwin.data.trajectories import Channels
+
+    inputs = Channels(("shoulder", "elbow"), ("rad", "rad"))
+    outputs = Channels(("level",), ("m",))
+    rate = 50.0
+    classes = ("Healthy",)
+    twin: Reach
+
+    def complete(self, trajectories, *, progress=None):
+        return trajectories
+
+    def simulate(self, commands, *, seed):
+        total = commands.sum(axis=2, keepdims=True)
+        return self.Trajectories(commands, total, total, self.rate)
+
+    from retwin.data.trajectories import Trajectories
+
+
+def test_a_proposal_matches_the_channels_of_a_case_and_can_be_used(tmp_path: Path) -> None:
+    at = np.arange(0, 20, 0.01)
+    at = at[(at < 8) | (at > 12)]
+    rows = [
+        f"{t:.3f},{np.degrees(np.sin(t)):.5f},{np.degrees(np.cos(t)):.5f},{100 * t:.3f},{t:.3f},7"
+        for t in at
+    ]
+    head = "time,cmd/shoulder [deg],cmd/elbow [deg],tank.level [cm],other,serial"
+    (tmp_path / "run.csv").write_text("\n".join([head, *rows]))
+    case = Reach()
+    case.twin = case
+    proposal = propose_mapping(tmp_path / "run.csv", case=case)
+    assert not proposal.open_channels
+    (tmp_path / "m.toml").write_text(proposal.text)
+    assert read_mapping(tmp_path / "m.toml") == proposal.mapping.model_copy(
+        update={"time": read_mapping(tmp_path / "m.toml").time}
+    )
+    made = load(tmp_path / "run.csv", case=case, mapping=tmp_path / "m.toml")
+    assert (len(made), made.rate) == (2, 50.0)
+    assert (made.inputs, made.outputs) == (case.inputs, case.outputs)
+    np.testing.assert_allclose(made.observed[0, :100, 0], np.arange(100) / 50, atol=1e-6)
+    np.testing.assert_allclose(made.nominal, made.commands.sum(axis=2, keepdims=True))
+    assert "constant, 7" in proposal.text
+    save(made, tmp_path / "a.npz")
+    assert load(tmp_path / "a.npz").provenance == made.provenance
+
+
+def test_a_channel_without_a_signal_stays_open(tmp_path: Path) -> None:
+    at = np.arange(0, 5, 0.01)
+    rows = [f"{t:.3f},{t},{-t}" for t in at]
+    (tmp_path / "run.csv").write_text("\n".join(["time,shoulder,level", *rows]))
+    proposal = propose_mapping(tmp_path / "run.csv", case=Reach())
+    assert proposal.open_channels == ("elbow",)
+    (tmp_path / "m.toml").write_text(proposal.text)
+    with pytest.raises(InputError, match=r"commands\.elbow\.signal"):
+        read_mapping(tmp_path / "m.toml")
+
+
+def test_names_and_units_of_titles() -> None:
+    for title, expected in (
+        ("T1 [°C]", ("T1", "°C")),
+        ("v (m/s)", ("v", "m/s")),
+        ("f(x)", ("f(x)", "")),
+        ("q[3]", ("q[3]", "")),
+        ("speed", ("speed", "")),
+    ):
+        assert named_unit(title) == expected
+
+
+def test_provenance_of_other_files_stays_as_it_was() -> None:
+    plain = Provenance("a.mat", "0" * 64)
+    assert plain.plain() == {"name": "a.mat", "sha256": "0" * 64}
+    assert Provenance.of(plain.plain()) == plain
+    assert re.fullmatch("0+", plain.sha256)
