@@ -24,7 +24,7 @@ import retwin as rt
 from retwin.cli import app
 
 DOCS, TESTS = ROOT / "docs", ROOT / "tests"
-HERE = ("extending.md", "own_data.md", "own_simulator.md", "tanks.md")
+HERE = ("extending.md", "logs.md", "own_data.md", "own_simulator.md", "tanks.md")
 """Pages whose blocks run below, one after the other."""
 LONG = ("own_simulator.md",)
 """Of these, pages that take longer than the fast tests may."""
@@ -90,6 +90,9 @@ def test_the_code_of_a_page_runs(page: str, module: ModuleType) -> None:
     if page == "extending.md":
         tried = rt.generate(names["case"].twin, names["case"], per_class=20, seed=2)
         assert rt.evaluate(names["nearest"], tried).macro_f1 > 0.8
+    if page == "logs.md":
+        assert [len(names["bench"]), names["bench"].steps] == [2, 1250]
+        assert 0.015 < names["bench"].provenance[0].sampling[1].missing < 0.03
     if page == "own_simulator.md":
         assert 0.8 < names["fidelity"].figures["coverage90"].value < 1.0
 

@@ -14,8 +14,10 @@ import pytest
 from log_files import SPEEDS, csv, mcap, ros2_bag, tdms
 
 from retwin.data import load
+from retwin.data.logs import text_tables
 from retwin.data.logs.mapping import Mapping
 from retwin.data.logs.reading import read_log
+from retwin.data.logs.signals import Clock
 from retwin.errors import InputError
 from retwin.serialisation.sizes import Budget
 
@@ -35,20 +37,17 @@ def refused(path: Path, match: str) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.97])
-@pytest.mark.parametrize(
-    "name",
-    [
-        each if each == "a.csv" else pytest.param(each, marks=pytest.mark.slow)
-        for each in SPEEDS
-        if each != "bag"
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.5, 0.95])
+@pytest.mark.parametrize("name", [each for each in SPEEDS if each != "bag"])
 def test_logs_that_are_cut_off(name: str, share: float, tmp_path: Path) -> None:
     path = tmp_path / name
     SPEEDS[name][0](path)
     data = path.read_bytes()
-    path.write_bytes(data[: int(share * len(data))])
+    cut = int(share * len(data))
+    if name == "a.csv":  # in a row that lacks a cell; a cut at the end of one is not seen
+        cut = data[:cut].rfind(b";") if cut else 0
+    path.write_bytes(data[:cut])
     assert name in refused(path, "expected .* got ")
 
 
@@ -109,6 +108,7 @@ def test_mcap_files_that_do_harm(write: Callable[..., None], match: str, tmp_pat
     refused(tmp_path / "a.mcap", match)
 
 
+@pytest.mark.slow
 def test_a_record_that_declares_more_than_there_is(tmp_path: Path) -> None:
     mcap(tmp_path / "a.mcap")
     data = bytearray((tmp_path / "a.mcap").read_bytes())
@@ -118,13 +118,13 @@ def test_a_record_that_declares_more_than_there_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_parquet_file_of_a_billion_equal_rows(tmp_path: Path) -> None:
+def test_a_parquet_file_of_many_equal_rows(tmp_path: Path) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
-    ones = pa.table({"time": np.zeros(2**22), "y": np.zeros(2**22)})
+    ones = pa.table({"time": np.zeros(2**20), "y": np.zeros(2**20)})
     with parquet.ParquetWriter(tmp_path / "a.parquet", ones.schema) as writer:
-        for _ in range(64):
+        for _ in range(48):
             writer.write_table(ones)
     assert (tmp_path / "a.parquet").stat().st_size < 2**22
     refused(tmp_path / "a.parquet", r"expected contents of at most 67\.1 MB")
@@ -132,12 +132,14 @@ def test_a_parquet_file_of_a_billion_equal_rows(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_tdms_file_that_declares_more_samples_than_it_has(tmp_path: Path) -> None:
+    """Those that are there are read, and nothing is allocated for the others."""
     tdms(tmp_path / "a.tdms")
     data = (tmp_path / "a.tdms").read_bytes()
     declared = struct.pack("<Q", 100)  # of the first segment
     assert declared in data
     (tmp_path / "a.tdms").write_bytes(data.replace(declared, struct.pack("<Q", 2**40)))
-    refused(tmp_path / "a.tdms", r"a\.tdms: expected")
+    found = read_log(tmp_path / "a.tdms", budget=Budget("a", LIMIT))
+    assert {len(each.times) for each in found.signals.values()} == {300}
 
 
 def database(path: Path, *statements: str) -> None:
@@ -148,6 +150,7 @@ def database(path: Path, *statements: str) -> None:
     connection.close()
 
 
+@pytest.mark.slow
 def test_a_database_that_computes_what_it_holds(tmp_path: Path) -> None:
     """A view would be evaluated for ever."""
     database(
@@ -161,6 +164,7 @@ def test_a_database_that_computes_what_it_holds(tmp_path: Path) -> None:
     refused(tmp_path / "b?mode=rw.db3", "a path without")
 
 
+@pytest.mark.slow
 def test_a_bag_takes_files_of_its_own_folder_only(tmp_path: Path) -> None:
     ros2_bag(tmp_path / "bag")
     (tmp_path / "bag" / "bag.db3").rename(tmp_path / "elsewhere.db3")
@@ -186,9 +190,13 @@ def test_a_bag_takes_files_of_its_own_folder_only(tmp_path: Path) -> None:
 )
 def test_text_that_is_no_table(text: str, match: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(text)
-    refused(tmp_path / "a.csv", match)
+    with pytest.raises(InputError, match=match) as caught:
+        list(text_tables.read(tmp_path / "a.csv", None, Clock()))
+    assert "a.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_times_that_are_far_apart_take_no_memory(tmp_path: Path) -> None:
     """One stamp in the year 2100 would make a grid of 10¹¹ samples."""
     csv(tmp_path / "a.csv")

@@ -65,6 +65,7 @@ BASE = {
     "data convert": "set",
     "data fetch": "armpi",
     "data info": "set",
+    "data map": "log.csv",
     "data split": "real.npz",
     "demo": "--runs 1",
     "diagnose fit": "real.npz",
@@ -120,7 +121,7 @@ def suffix(name: str, target: Any) -> str:
     """The suffix that a command wants of that name."""
     if target.metavar == "FOLDER":
         return ""
-    return {"bench": ".json", "twin animate": ".gif"}.get(
+    return {"bench": ".json", "data map": ".toml", "twin animate": ".gif"}.get(
         name, ".csv" if "predict" in name else ".npz"
     )
 

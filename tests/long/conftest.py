@@ -9,6 +9,7 @@ from pathlib import Path
 import mutation
 import numpy as np
 import pytest
+from log_files import SPEEDS
 from scipy.io import savemat
 
 import retwin as rt
@@ -40,6 +41,10 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
             rt.save(real[::4], root / name / "real.npz")
     if "zarr" in mutation.NAMES:
         rt.save(real[::4], root / "zarr" / "a.zarr")
+    for name in mutation.NAMES:
+        if name.startswith("log-"):
+            file = name.replace("log-", "a.")
+            SPEEDS[file][0](root / name / file)
     tables = np.concatenate([made.nominal, made.observed], axis=-1).astype(float)[::4]
     cells = np.empty((2, 1, len(tables)), object)
     for i, table in enumerate(tables):

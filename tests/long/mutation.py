@@ -78,6 +78,7 @@ class Format:
     commands: tuple[str, ...]
 
 
+LOGS = ("csv", "feather", "mcap", "mf4", "parquet", "tdms")
 SEALED = ("bundle verify sealed", "bundle predict sealed real.npz")
 FORMATS = {
     "npz": Format(
@@ -110,8 +111,11 @@ FORMATS = {
     ),
     "onnx": Format("sealed", SEALED),
     "results": Format("study/results.json", ("report study",)),
+    **{
+        f"log-{kind}": Format(f"a.{kind}", (f"data map a.{kind} --out made.toml",)) for kind in LOGS
+    },
 }
-EXTRAS = {"zarr": "zarr", "onnx": "onnxruntime"}
+EXTRAS = {"zarr": "zarr", "onnx": "onnxruntime"} | {f"log-{kind}": "rosbags" for kind in LOGS}
 """What the formats need that not every installation has."""
 NAMES = [name for name in FORMATS if importlib.util.find_spec(EXTRAS.get(name, "numpy"))]
 

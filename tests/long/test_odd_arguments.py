@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import arguments
+import log_files
 import mutation
 import pytest
 import typer
@@ -23,6 +24,7 @@ def together(samples: Path, tmp_path: Path) -> Path:
     shutil.copy(samples / "npz" / "a.npz", folder / "real.npz")
     shutil.copy(samples / "case" / "case.toml", folder / "reach.toml")
     shutil.copy(samples / "case" / "own_of_mutations.py", folder)
+    log_files.csv(folder / "log.csv")
     (folder / "alarms.jsonl").touch()  # a log without entries
     return folder
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import needs_extra
-from retwin.data.logs.signals import MAX_SIGNALS, Clock, Signal, Skipped, named_unit
-from retwin.data.logs.tables import table_signals
+from retwin.data.logs.signals import MAX_SIGNALS, UNWANTED, Clock, Signal, Skipped, named_unit
+from retwin.data.logs.tables import table_signals, time_column
 from retwin.errors import InputError
 
 __all__ = ["read"]
@@ -32,7 +32,8 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
     """
     arrow = needs_extra("pyarrow", "logs", "reads Parquet and Arrow")
     needs_extra("pyarrow.compute", "logs", "takes structures apart")
-    table = _table(path, arrow)
+    table, left_out = _table(path, arrow, wanted, clock)
+    yield from (Skipped(name, UNWANTED) for name in left_out)
     columns: dict[str, Any] = {}
     units: dict[str, str] = {}
     for field, column in zip(table.schema, table.columns, strict=True):
@@ -78,18 +79,33 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
     yield from table_signals(path.name, units, numeric, stamps, table.num_rows, clock, wanted)
 
 
-def _table(path: Path, arrow: Any) -> Any:
+def _table(
+    path: Path, arrow: Any, wanted: frozenset[str] | None, clock: Clock
+) -> tuple[Any, list[str]]:
+    """The table with the columns that may be wanted, and the names of the others."""
     if path.suffix.lower() == ".parquet":
         parquet = needs_extra("pyarrow.parquet", "logs", "reads Parquet")
         with parquet.ParquetFile(path) as file:
-            return file.read()
+            titles = {each: named_unit(each)[0] for each in file.schema_arrow.names}
+            if wanted is None:
+                return file.read(), []
+            # A wide file has many columns that a mapping does not name.
+            names = {clock.column or time_column(titles.values()), *wanted}
+            kept = [title for title, name in titles.items() if _names(name, names)]
+            others = [name for title, name in titles.items() if title not in kept]
+            return file.read(columns=kept), others
     with path.open("rb") as stream:
         if stream.read(6) in FILES or path.suffix.lower() == ".feather":
             feather = needs_extra("pyarrow.feather", "logs", "reads Feather")
-            return feather.read_table(path, memory_map=False)
+            return feather.read_table(path, memory_map=False), []
         stream.seek(0)
         with arrow.ipc.open_stream(stream) as batches:
-            return batches.read_all()
+            return batches.read_all(), []
+
+
+def _names(column: str, names: set[str]) -> bool:
+    """Whether one of the names is that column, or something inside it."""
+    return any(n == column or n.startswith((f"{column}.", f"{column}[")) for n in names)
 
 
 def _leaves(arrow: Any, name: str, column: Any, depth: int) -> Iterator[tuple[str, Any]]:

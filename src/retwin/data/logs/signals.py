@@ -24,6 +24,7 @@ __all__ = [
     "Reader",
     "Signal",
     "Skipped",
+    "even_times",
     "named_unit",
     "to_nanoseconds",
 ]
@@ -148,6 +149,11 @@ def named_unit(name: str) -> tuple[str, str]:
     if found is None or re.fullmatch(r"\d+|", unit := (found[2] or found[3] or "").strip()):
         return name.strip(), ""
     return found[1], unit
+
+
+def even_times(count: int, rate: float, where: str) -> NDArray:
+    """The times in ns of `count` samples at a rate in Hz; raises as `to_nanoseconds` does."""
+    return to_nanoseconds(np.arange(count) / rate, "s", where)
 
 
 def to_nanoseconds(times: NDArray, unit: str, where: str) -> NDArray:

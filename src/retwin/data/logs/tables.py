@@ -14,6 +14,7 @@ from retwin.data.logs.signals import (
     Clock,
     Signal,
     Skipped,
+    even_times,
     to_nanoseconds,
 )
 from retwin.errors import InputError
@@ -195,7 +196,7 @@ def table_signals(
     if (not name and not clock.rate) or (name and name not in titles):
         raise InputError(
             place,
-            expected=f"a column of times {clock.column!r}".rstrip(" '"),
+            expected=f"a column of times{f' {clock.column!r}' * bool(clock.column)}",
             got=f"the columns {', '.join(list(titles)[:12])}{', …' * (len(titles) > 12)}",
             remedy="name it in the mapping: [time] column = …, or give the rows per s: rate = …",
         )
@@ -203,7 +204,7 @@ def table_signals(
         times = row_times(stamps(name), titles[name], clock, f"{place}, column {name!r}")
         yield Skipped(name, TIMES)
     else:
-        times = np.round(np.arange(rows) * (1e9 / (clock.rate or 1.0))).astype(np.int64)
+        times = even_times(rows, clock.rate or 1.0, place)
     for title, unit in titles.items():
         if title == name:
             continue

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import needs_extra
-from retwin.data.logs.signals import UNWANTED, Clock, Signal, Skipped
+from retwin.data.logs.signals import UNWANTED, Clock, Signal, Skipped, even_times, to_nanoseconds
 from retwin.data.logs.tables import row_times, time_column
 from retwin.errors import InputError
 
@@ -88,8 +88,7 @@ def _waveform_times(channel: Any, count: int) -> NDArray | None:
         start = max(start, 0)  # LabVIEW writes the year 1904 where there is no time
     offset = channel.properties.get("wf_start_offset", 0.0)
     offset = float(offset) if isinstance(offset, float | int) and abs(offset) < 1e9 else 0.0
-    made: NDArray = start + np.round((offset + np.arange(count) * step) * 1e9).astype(np.int64)
-    return made
+    return start + to_nanoseconds(offset + np.arange(count) * step, "s", channel.name)
 
 
 def _group_times(path: Path, channel: Any, group: str, count: int, clock: Clock) -> NDArray:
@@ -98,7 +97,7 @@ def _group_times(path: Path, channel: Any, group: str, count: int, clock: Clock)
         cells = np.asarray(channel[:])
         return row_times(cells, _unit(channel), clock, f"{path.name}, {group}/{channel.name}")
     if clock.rate:
-        return np.round(np.arange(count) * (1e9 / clock.rate)).astype(np.int64)
+        return even_times(count, clock.rate, path.name)
     raise InputError(
         path.name,
         expected=f"times of the {count} samples of group {group!r}",
