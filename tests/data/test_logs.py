@@ -230,6 +230,16 @@ def test_units_offsets_and_clocks() -> None:
     assert not compatible("V", "nonsense")
 
 
+def test_a_channel_may_be_the_mean_of_signals() -> None:
+    at = np.arange(0, 10, 0.01)
+    found = log(u=(at, at), y=(at, at), z=(at, 3 * at), late=(at + 0.1, at))
+    made = made_of(found, outputs={"speed": {"signal": ["y", "z"]}})
+    np.testing.assert_allclose(made.observed[0, :, 0], 2 * np.arange(made.steps) / RATE)
+    assert made.provenance[0].sampling[1].signal == "y, z"
+    with pytest.raises(InputError, match="the times and the unit of 'y'"):
+        made_of(found, outputs={"speed": {"signal": ["y", "late"]}})
+
+
 def test_times_out_of_order() -> None:
     """Messages may overtake each other; a clock that was set is refused."""
     at = np.arange(0, 1, 0.01)

@@ -23,7 +23,6 @@ from retwin.serialisation.places import check_place
 from retwin.times import sample_rate
 
 if TYPE_CHECKING:
-    from retwin.data.logs.mapping import Mapping
     from retwin.data.logs.proposal import Proposal
 
 __all__ = ["app"]
@@ -113,10 +112,9 @@ def map_log(
         with write_atomically(place) as part:
             part.write_bytes(contents)
     signals = [asdict(each) for each in made.facts]
-    channels = _mapped(made.mapping)
     answer(
-        {"signals": signals, "channels": channels, "open": made.open_channels},
-        _seen(made, channels),
+        {"signals": signals, "channels": made.channels, "open": made.open_channels},
+        _seen(made),
         as_json=as_json,
     )
     note(f"Wrote {out} and {picture}: check them, then give --mapping {out}")
@@ -202,14 +200,9 @@ def fetch(
     answer(path, str(path))
 
 
-def _mapped(mapping: Mapping | None) -> dict[str, str]:
-    """The channel of each signal of a mapping."""
-    tables = (mapping.commands, mapping.outputs) if mapping is not None else ()
-    return {own.signal: channel for each in tables for channel, own in each.items()}
-
-
-def _seen(made: Proposal, channels: dict[str, str]) -> Table:
+def _seen(made: Proposal) -> Table:
     """The signals of a log, those that are mapped first."""
+    channels = made.channels
     facts = sorted(made.facts, key=lambda each: each.name not in channels)
     rows = [
         (

@@ -133,10 +133,10 @@ def _thinned(times: NDArray, values: NDArray) -> tuple[NDArray, NDArray]:
     kept: list[int] = []
     for part in parts:
         own = values[part]
-        if np.isfinite(own).any():
-            kept += sorted({int(part[np.nanargmin(own)]), int(part[np.nanargmax(own)])})
-        else:
-            kept.append(int(part[0]))  # a hole stays one
+        holes = part[~np.isfinite(own)][:1].tolist()  # a hole stays one
+        if len(holes) < len(own):
+            holes += [int(part[np.nanargmin(own)]), int(part[np.nanargmax(own)])]
+        kept += sorted(set(holes))
     return times[kept], values[kept]
 
 

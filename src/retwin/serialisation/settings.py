@@ -60,6 +60,7 @@ def _expected(error: Any) -> str:
     if error["type"] == "extra_forbidden":
         return "a known key"
     reason = plain_reason(error).removeprefix("Value error, ")
+    reason = reason.replace("String should have", "a text of")
     return reason[:1].lower() + reason[1:]
 
 

@@ -136,7 +136,7 @@ def _channel(
     default: Resampling,
     period: float,
 ) -> Channel:
-    signal, notes = in_order(signal_of(log, own.signal), log.name)
+    signal, notes = in_order(_mean_of(log, own.signals), log.name)
     if signal.unreadable:
         notes.append(f"{signal.unreadable} values are no numbers")
     topics = [topic for topic, why in log.skipped.items() if why == NO_STAMP]
@@ -155,7 +155,7 @@ def _channel(
             notes.append(f"no unit in the log, taken as {unit}")
     target = unit or own.unit or source
     if not same_unit(source, target):
-        values = converted(values, source, target, f"{log.name}, {own.signal}")
+        values = converted(values, source, target, f"{log.name}, {signal.name}")
         notes.append(f"{source} to {target}")
     if own.clock_offset:
         notes.append(f"clock {own.clock_offset:+g} s")
@@ -164,6 +164,28 @@ def _channel(
     known = made.times[np.isfinite(made.values)]
     longest = own.max_gap or longest_bridge(known, period)
     return Channel(name, target, made, own.resample or default, longest, tuple(notes))
+
+
+def _mean_of(log: Log, names: Sequence[str]) -> Signal:
+    """The signal of that name, or the mean of several, which is missing where one is."""
+    found = [signal_of(log, name) for name in names]
+    first = found[0]
+    if len(found) == 1:
+        return first
+    for other in found[1:]:
+        require(
+            np.array_equal(first.times, other.times) and same_unit(first.unit, other.unit),
+            f"{log.name}, {other.name}",
+            expected=f"the times and the unit of {first.name!r}, with which it is averaged",
+            got="others",
+            remedy="map one of them alone",
+        )
+    return replace(
+        first,
+        name=", ".join(names),
+        values=np.mean([each.values for each in found], axis=0),
+        unreadable=sum(each.unreadable for each in found),
+    )
 
 
 def signal_of(log: Log, name: str) -> Signal:

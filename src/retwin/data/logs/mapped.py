@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -189,6 +190,7 @@ class Parts:
             )
         n, stem = len(self.commands), Path(log.name).stem
         width = len(self.measured)
+        digits = max(1, math.ceil(math.log10(self.rate)))  # starts differ by two samples at least
         return [
             Raw(
                 where=f"{log.name} at {start:g} s",
@@ -196,7 +198,7 @@ class Parts:
                 nominal=block[:, n : self.needed] if self.ideal else np.zeros((len(block), width)),
                 observed=block[:, self.needed :],
                 commands=block[:, :n] if n else None,
-                id=f"{stem} {start:.6f}".rstrip("0").rstrip(".") + " s",
+                id=f"{stem} {start:.{digits}f}".rstrip("0").rstrip(".") + " s",
             )
             for start, block in self.blocks
         ]

@@ -77,8 +77,9 @@ class Cut(Part):
 class ChannelMapping(Part):
     """A channel, and the signal that it is made from."""
 
-    signal: Name
-    """Signal of the log: a column, "group/channel", or "/topic.field"."""
+    signal: Name | Annotated[list[Name], Field(min_length=1)]
+    """Signal of the log: a column, "group/channel", or "/topic.field"; or several with the same
+    times, of which it is the mean."""
     unit: Annotated[str, Field(max_length=100)] | None = None
     """Unit of the channel; by default that of the case, else that of the signal."""
     from_unit: Annotated[str, Field(max_length=100)] | None = None
@@ -95,6 +96,11 @@ class ChannelMapping(Part):
     max_gap: Positive | None = None
     """Longest interval in s between values that is bridged, and missing beyond; by default 2.5
     times the sample period or the median interval, whichever is longer."""
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The signal, or the several of which it is the mean."""
+        return (self.signal,) if isinstance(self.signal, str) else tuple(self.signal)
 
 
 class Mapping(Part):
@@ -126,7 +132,7 @@ class Mapping(Part):
     def signals(self) -> frozenset[str]:
         """The signals that are needed of the log."""
         tables = (self.commands, self.outputs, self.nominal)
-        found = {each.signal for table in tables for each in table.values()}
+        found = {name for table in tables for each in table.values() for name in each.signals}
         return frozenset(found | ({self.cut.signal} if self.cut.signal else set()))
 
 

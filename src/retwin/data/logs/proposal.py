@@ -8,7 +8,7 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +95,8 @@ class Proposal:
         The same without the channels for which no signal was found; None if no output is left.
     facts : tuple of Fact
         What is seen of all signals.
+    channels : dict of str to str
+        The channel of each signal that was chosen.
     open_channels : tuple of str
         Channels of the case for which no signal was found; the user names it in the file.
 
@@ -104,6 +106,7 @@ class Proposal:
     text: str
     mapping: Mapping | None
     facts: tuple[Fact, ...]
+    channels: dict[str, str] = field(default_factory=dict)
     open_channels: tuple[str, ...] = field(default=())
 
 
@@ -153,14 +156,19 @@ def propose_mapping(
     proposal = proposed(log, time, case=case)
     if log_format(path) in STAMPED and time.stamps == "log" and proposal.mapping is not None:
         stamped = time.model_copy(update={"stamps": "header"})
-        delay = _delay(path, proposal, stamped, Budget(path.name, limit))
-        if delay is not None:
-            proposal = proposed(log, stamped, case=case, delay=delay)
+        other = _stamped(path, proposal, stamped, Budget(path.name, limit))
+        if other is not None:
+            made = proposed(log, stamped, case=case, delay=other[1])
+            proposal = replace(made, log=other[0])
     return proposal
 
 
-def _delay(path: Path, proposal: Proposal, stamped: TimeSettings, budget: Budget) -> float | None:
-    """The median time in s from stamps to recording; None if the stamps are of no use."""
+def _stamped(
+    path: Path, proposal: Proposal, stamped: TimeSettings, budget: Budget
+) -> tuple[Log, float] | None:
+    """The signals of a mapping at the stamps of their headers, and the median time in s from there
+    to the recording; None if the stamps are of no use.
+    """
     assert proposal.mapping is not None
     names = proposal.mapping.signals
     try:
@@ -183,7 +191,7 @@ def _delay(path: Path, proposal: Proposal, stamped: TimeSettings, budget: Budget
         or [np.array([-1.0])]
     )
     found = float(np.median(delays))
-    return found if 0 <= found < LATE else None
+    return (other, found) if 0 <= found < LATE else None
 
 
 def facts_of(log: Log) -> list[Fact]:
@@ -268,7 +276,10 @@ def proposed(
             outputs=tables["outputs"],
         )
     text = _text(log, time, rate, cut, chosen, tables, facts, case, delay)
-    return Proposal(log, text, mapping, tuple(facts), unknown)
+    channels = {
+        fact.name: channel for table in chosen.values() for channel, fact in table.items() if fact
+    }
+    return Proposal(log, text, mapping, tuple(facts), channels, unknown)
 
 
 def _round(value: float) -> float:
@@ -402,9 +413,9 @@ def _text(
                 ]
                 continue
             own = tables[table][name]
-            lines += [f"# {_seen(fact)}", f"signal = {_quoted(own.signal)}"]
-            if not fact.unit and case is None:
-                lines.append('# unit = "…" # the log states none')
+            lines += [f"# {_seen(fact)}", f"signal = {_quoted(fact.name)}"]
+            if not fact.unit:
+                lines += [_unit_wanted(name, case)]
             lines += [f"resample = {_quoted(own.resample or '')}", f"max_gap = {own.max_gap!r} # s"]
     used = {fact.name for table in chosen.values() for fact in table.values() if fact}
     rest = [each for each in facts if each.name not in used]
@@ -418,6 +429,15 @@ def _text(
     left = max(0, len(rest) - MAX_LISTED) + max(0, len(others) - MAX_LISTED)
     lines += [f"#   and {left} more"] if left else []
     return "\n".join(lines) + "\n"
+
+
+def _unit_wanted(channel: str, case: DataCase | None) -> str:
+    """A comment that asks for the unit that the log does not state."""
+    if case is None:
+        return '# unit = "…" # the log states none'
+    some = (case.inputs, case.outputs)
+    units = dict(pair for each in some for pair in zip(each.names, each.units, strict=True))
+    return f'# from_unit = "…" # the log states none: taken as {_comment(units[channel])}'
 
 
 def _value(value: object) -> str:
