@@ -182,3 +182,55 @@ def test_nothing_but_the_result_is_printed(file):
     result = run("info", file, "--json")
     assert json.loads(result.stdout)
     assert result.stderr == ""
+
+
+@pytest.fixture
+def bench(tmp_path):
+    """A log of a bench that paused, and lost its sensor for a second."""
+    at = np.concatenate([np.arange(0, 5, 0.02), np.arange(9, 15, 0.02)])
+    rows = [
+        f"{t:.2f};{int(t) % 2};{'' if 2 < t < 3 else round(100 * t, 1)};7".replace(".", ",")
+        for t in at
+    ]
+    path = tmp_path / "bench.csv"
+    path.write_text("\n".join(["time [s];pump_cmd [V];level [cm];serial", *rows]))
+    return path
+
+
+def test_a_log_is_mapped_drawn_and_described(bench, call):
+    code, out, err = call("data", "info", str(bench))
+    assert (code, out) == (2, "")
+    assert "make one: retwin data map bench.csv --out mapping.toml" in err
+    out_file = bench.with_name("mapping.toml")
+    code, out, err = call("data", "map", str(bench), "--out", str(out_file))
+    assert code == 0, err
+    assert "pump_cmd" in out
+    assert "constant" in out
+    assert out_file.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    code, out, _ = call("data", "info", str(bench), "--mapping", str(out_file), "--json")
+    assert code == 0
+    (facts,) = json.loads(out)
+    assert (facts["trajectories"], facts["rate"]) == (2, 50.0)
+    (source,) = facts["provenance"]
+    command, level = source["sampling"]
+    assert (command["method"], command["missing"]) == ("hold", 0.0)
+    assert level["missing"] == pytest.approx(facts["missing"])
+    assert 0.08 < level["missing"] < 0.1
+    code, out, _ = call("data", "info", str(bench), "--mapping", str(out_file))
+    assert "in trajectories" in " ".join(out.split())
+    assert "linear" in out
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("mapping.csv", "expected a name that ends in .toml"),
+        ("bench.csv/m.toml", "expected a place that can be written"),
+    ],
+)
+def test_a_mapping_is_written_to_a_good_place_or_not_at_all(name, message, bench, call):
+    before = sorted(bench.parent.iterdir())
+    code, out, err = call("data", "map", str(bench), "--out", str(bench.parent / name))
+    assert (code, out) == (2, "")
+    assert message in err
+    assert sorted(bench.parent.iterdir()) == before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -124,10 +125,19 @@ def test_the_three_ways_to_write_a_ros_2_bag_hold_the_same(tmp_path: Path) -> No
             None,
         ),
         ("time  v\n0  1e3\n1  -2.\n", [0, 1], "", -2.0),
+        ("v,timestamp_ms\n1,0\n2.5,100\n", [0.0, 0.1], "", 2.5),
         ("\ufefftime,v,\n0,true,\n2,,\n", [0, 2], "", None),
         ("1700000000000,1\n1700000000500,2\n", [0, 0.5], "", 2.0),
     ],
-    ids=["decimal comma", "row of units", "iso", "blanks", "comma at the end", "no header"],
+    ids=[
+        "decimal comma",
+        "row of units",
+        "iso",
+        "blanks",
+        "unit in name",
+        "comma at the end",
+        "no header",
+    ],
 )
 def test_text_tables_of_any_kind(
     text: str, times: list[float], unit: str, last: float | None, tmp_path: Path
@@ -199,7 +209,7 @@ def test_resampling_of_each_kind() -> None:
         ({"by": "gap", "gap": 1.0}, [0.0, 6.0]),
         ({"by": "length", "length": 3.0}, [0.0, 3.0, 6.0]),
         ({"by": "trigger", "signal": "u", "before": 0.5}, [0.5, 6.5]),
-        ({"by": "trigger", "signal": "u", "edge": "falling", "length": 1.0}, [2.0, 8.0]),
+        ({"by": "trigger", "signal": "u", "edge": "falling", "length": 9.0}, [2.0, 8.0]),
     ],
 )
 def test_what_starts_a_trajectory(cut: dict, starts: list[float]) -> None:
@@ -208,6 +218,7 @@ def test_what_starts_a_trajectory(cut: dict, starts: list[float]) -> None:
     u = Signal("u", at, np.tile((own >= 1) & (own < 2), 2).astype(float))
     found = pieces(Cut.model_validate(cut), [u], [u], u)
     np.testing.assert_allclose([each.start for each in found], starts, atol=1e-9)
+    assert all(one.stop <= other.start for one, other in pairwise(found))
 
 
 def test_units_offsets_and_clocks() -> None:

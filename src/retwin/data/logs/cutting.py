@@ -134,7 +134,8 @@ def _triggered(cut: Cut, trigger: Signal, end: float) -> list[Piece]:
         )
     starts = crossings - cut.before
     nexts = np.append(starts[1:], np.inf)
-    stops = np.minimum(nexts, end) if cut.length is None else starts + cut.length
+    # No sample is in two trajectories, of which one might calibrate and the other one test.
+    stops = np.minimum(nexts, end if cut.length is None else starts + cut.length)
     return [
         Piece(float(a), float(b), bool(cut.length is not None or b < end))
         for a, b in zip(starts, stops, strict=True)

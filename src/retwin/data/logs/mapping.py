@@ -61,7 +61,8 @@ class Cut(Part):
     before: Seconds = 0.0
     """Time in s before the trigger at which the trajectory begins."""
     length: Positive | None = None
-    """Length in s of a trajectory; for `trigger` by default until the next one begins."""
+    """Length in s of a trajectory, which for `trigger` ends when the next one begins, at the
+    latest."""
     min_length: Positive | None = None
     """Shorter trajectories are left out; in s, by default two samples."""
 

@@ -19,7 +19,16 @@ from retwin.data.logs.signals import (
 )
 from retwin.errors import InputError
 
-__all__ = ["MISSING", "TIMES", "TIME_NAMES", "numbers", "row_times", "table_signals", "time_column"]
+__all__ = [
+    "MISSING",
+    "TIMES",
+    "TIME_NAMES",
+    "numbers",
+    "row_times",
+    "table_signals",
+    "time_column",
+    "unit_in",
+]
 
 TIME_NAMES = ("time", "timestamp", "timestamps", "t", "datetime", "date", "zeit", "stamp", "clock")
 """Names by which a column of times is found, the most certain first."""
@@ -50,6 +59,12 @@ def time_column(names: Iterable[str]) -> str:
         if rank is not None:
             found.append((rank, place, name))
     return min(found)[2] if found else ""
+
+
+def unit_in(name: str) -> str:
+    """The unit with which a name such as `time_ms` ends, "" if there is none."""
+    last = name.lower().rpartition("_")[2] if "_" in name else ""
+    return last if last in UNIT_SECONDS else ""
 
 
 def row_times(values: NDArray, unit: str, clock: Clock, where: str) -> NDArray:
@@ -192,7 +207,10 @@ def table_signals(
     """
     name = clock.column or ("" if clock.rate else time_column(titles))
     if not name and not clock.rate and wanted is None:
-        name = next((each for each in list(titles)[:1] if _increases(stamps(each))), "")
+        dated = (each for each in titles if stamps(each).dtype.kind == "M")
+        name = next(
+            dated, next((each for each in list(titles)[:1] if _increases(stamps(each))), "")
+        )
     if (not name and not clock.rate) or (name and name not in titles):
         raise InputError(
             place,
@@ -201,7 +219,8 @@ def table_signals(
             remedy="name it in the mapping: [time] column = …, or give the rows per s: rate = …",
         )
     if name:
-        times = row_times(stamps(name), titles[name], clock, f"{place}, column {name!r}")
+        unit = titles[name] or unit_in(name)
+        times = row_times(stamps(name), unit, clock, f"{place}, column {name!r}")
         yield Skipped(name, TIMES)
     else:
         times = even_times(rows, clock.rate or 1.0, place)

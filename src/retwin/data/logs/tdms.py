@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import needs_extra
 from retwin.data.logs.signals import UNWANTED, Clock, Signal, Skipped, even_times, to_nanoseconds
-from retwin.data.logs.tables import row_times, time_column
+from retwin.data.logs.tables import row_times, time_column, unit_in
 from retwin.errors import InputError
 
 __all__ = ["read"]
@@ -95,7 +95,12 @@ def _group_times(path: Path, channel: Any, group: str, count: int, clock: Clock)
     """Times in ns of a group without waveform properties."""
     if channel is not None and len(channel) == count:
         cells = np.asarray(channel[:])
-        return row_times(cells, _unit(channel), clock, f"{path.name}, {group}/{channel.name}")
+        return row_times(
+            cells,
+            _unit(channel) or unit_in(channel.name),
+            clock,
+            f"{path.name}, {group}/{channel.name}",
+        )
     if clock.rate:
         return even_times(count, clock.rate, path.name)
     raise InputError(
