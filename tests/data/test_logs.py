@@ -241,6 +241,20 @@ def test_units_offsets_and_clocks() -> None:
     assert not compatible("V", "nonsense")
 
 
+@pytest.mark.slow
+def test_nothing_is_left_in_the_folder_of_temporary_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """asammdf unpacks to a temporary file, which a damaged file makes it leave."""
+    path = written(tmp_path, "a.mf4")
+    path.write_bytes(path.read_bytes()[:-500])
+    (tmp_path / "own").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "own"))
+    with pytest.raises(InputError, match="whole"):
+        read_log(path, budget=Budget("a"))
+    assert not list((tmp_path / "own").iterdir())
+
+
 def test_a_channel_may_be_the_mean_of_signals() -> None:
     at = np.arange(0, 10, 0.01)
     found = log(u=(at, at), y=(at, at), z=(at, 3 * at), late=(at + 0.1, at))

@@ -18,7 +18,7 @@ CASES = {
     "bundle": 250,
     "onnx": 200,
     "results": 100,
-    **{f"log-{kind}": 60 for kind in mutation.LOGS},
+    **{f"log-{kind}": 50 for kind in mutation.LOGS},
 }
 """Mutations of each format before a release."""
 

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import IO, Any
@@ -20,6 +21,7 @@ from retwin.checks import require
 from retwin.data.logs.signals import MAX_SIGNALS, NANOSECOND, Clock, Log, Signal
 from retwin.data.logs.worker import FRAME
 from retwin.errors import InputError
+from retwin.processes import scratch_folder
 from retwin.progress import Progress
 from retwin.serialisation.files import sha256
 from retwin.serialisation.sizes import Budget
@@ -149,36 +151,40 @@ def _frames(
 ) -> Iterator[Signal | tuple[str, str]]:
     """What the process that reads the log sends."""
     paths = [os.path.abspath(each) for each in sys.path if each]
-    environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system", "OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(
-        [sys.executable, "-I", "-c", CODE.format(path=paths)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        env=environment,
-    )
-    assert process.stdin is not None
-    assert process.stdout is not None
-    count = 0
-    try:
-        process.stdin.write(json.dumps(request).encode())
-        process.stdin.close()
-        while True:
-            about = _text(process.stdout)
-            if about is None:
-                raise _ended(path, process)
-            if "done" in about:
-                return
-            if "begun" in about:
-                continue
-            count += 1
-            if count > MAX_SIGNALS:
-                raise _refused(path, "more signals than can be")
-            yield _received(path, about, process, budget)
-    finally:
-        process.kill()
-        process.stdout.close()
-        process.wait()
+    # Libraries unpack to temporary files, which they leave where they fail.
+    with scratch_folder() as scratch:
+        own = {"ARROW_DEFAULT_MEMORY_POOL": "system", "OMP_NUM_THREADS": "1"}
+        places = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), scratch)
+        process = subprocess.Popen(
+            [sys.executable, "-I", "-c", CODE.format(path=paths)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, **own, **places},
+        )
+        assert process.stdin is not None
+        assert process.stdout is not None
+        count = 0
+        try:
+            with suppress(BrokenPipeError):  # it ended at once, which the next lines notice
+                process.stdin.write(json.dumps(request).encode())
+                process.stdin.close()
+            while True:
+                about = _text(process.stdout)
+                if about is None:
+                    raise _ended(path, process)
+                if "done" in about:
+                    return
+                if "begun" in about:
+                    continue
+                count += 1
+                if count > MAX_SIGNALS:
+                    raise _refused(path, "more signals than can be")
+                yield _received(path, about, process, budget)
+        finally:
+            process.kill()
+            process.stdout.close()
+            process.wait()
 
 
 def _received(
