@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from log_files import BEGIN, COUNT, HEATER, RATE, SPEED, SPEEDS, TIMES, mcap, ros2_bag
 
+import retwin as rt
 from retwin.data import Provenance, load, propose_mapping, read_mapping, save
 from retwin.data.logs import text_tables
 from retwin.data.logs.channels import in_order
@@ -367,6 +368,23 @@ def test_a_proposal_matches_the_channels_of_a_case_and_can_be_used(tmp_path: Pat
     assert "constant, 7" in proposal.text
     save(made, tmp_path / "a.npz")
     assert load(tmp_path / "a.npz").provenance == made.provenance
+
+
+def test_identification_reads_a_log_by_its_mapping(tmp_path: Path) -> None:
+    path = written(tmp_path, "a.csv")
+    (tmp_path / "m.toml").write_text(
+        '[commands.heater]\nsignal = "heater"\n[outputs.speed]\nsignal = "speed"\n'
+    )
+    inputs, outputs = rt.Channels(("heater",), ("1",)), rt.Channels(("speed",), ("m/s",))
+    twin = rt.FunctionTwin(lambda commands: 3 * commands, inputs, outputs, 50.0)
+    found = rt.cases.read_logs([path], twin, rt.cases.Columns(mapping=tmp_path / "m.toml"))
+    assert found.trajectories.rate == 50.0
+    np.testing.assert_allclose(found.trajectories.nominal, 3 * found.trajectories.commands)
+    seen = found.trajectories.mask[0, :, 0]
+    expected = 2 * np.arange(len(seen)) / 50
+    np.testing.assert_allclose(found.trajectories.observed[0, seen, 0], expected[seen], atol=1e-9)
+    assert "log's 2.99 s are in trajectories" in found.notes[0]
+    assert not any("nominal" in note for note in found.notes)
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from retwin.cases.columns import Record, number, read_columns, record_in
 from retwin.cases.time_column import TimeColumn
 from retwin.checks import finite, require
 from retwin.data.io import load
+from retwin.data.logs.mapping import NO_NOMINAL, read_mapping
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
@@ -48,6 +49,9 @@ class Columns:
     transient : float
         Duration in s at the begin of each trajectory whose outputs are not used, while the real
         system still moves from a state that the twin does not start in.
+    mapping : path, optional
+        A mapping.toml, as for `rt.load`, for logs whose signals have times of their own; then
+        columns and times are those that it names.
 
     Raises
     ------
@@ -59,6 +63,7 @@ class Columns:
     names: Mapping[str, str] = field(default_factory=dict)
     time: TimeColumn | None = None
     transient: float = 0.0
+    mapping: str | Path | None = None
 
     def __post_init__(self) -> None:
         finite("transient", self.transient, least=0.0, unit="s", remedy="leave it out")
@@ -88,9 +93,12 @@ class Logs:
 def log_rate(path: str | Path, columns: Columns = Columns()) -> float | None:
     """The sample rate of a log in Hz, of a table by the median interval of its times.
 
-    Returns None for a table without times. Raises InputError for a log that cannot be read.
+    That of a log with a mapping is the mapping's. Returns None for a table without times. Raises
+    InputError for a log that cannot be read.
     """
     path = Path(path)
+    if columns.mapping is not None:
+        return read_mapping(columns.mapping).rate
     if not _is_table(path):
         return load(path).rate
     clock = columns.time or _clock(path, _header(path))
@@ -188,13 +196,22 @@ def read_logs(
     notes: dict[str, list[str]] = {}
     sets, tests = [], []
     for done, path in enumerate(map(Path, paths)):
+        mapped = columns.mapping is not None
         own = bool(case is not None and case.records is not None and not columns.names)
+        own = own and not mapped
         if own and (_is_table(path) or path.is_dir()):
             assert case is not None
             assert case.records is not None
             calibration, test = case.records(path)
             sets.append(calibration)
             tests.append(test)
+        elif mapped:
+            rate = None if read_mapping(columns.mapping or "").rate else twin.rate
+            found = load(path, rate=rate, max_bytes=max_bytes, mapping=columns.mapping)
+            sets.append(_matched(found, twin, columns, path.name, notes))
+            for note in found.provenance[0].notes:
+                if note != NO_NOMINAL:  # the twin simulates them
+                    notes.setdefault(note, []).append(path.name)
         elif _is_table(path):
             sets.append(_table(path, twin, columns, notes, rows_at_rate=rows_at_rate))
         else:

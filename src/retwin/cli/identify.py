@@ -81,6 +81,9 @@ Time = Annotated[
 Transient = Annotated[
     float, _panel("Logs", metavar="SECONDS", help="Begin of each log that is not used.")
 ]
+LogMapping = Annotated[
+    Path | None, _panel("Logs", metavar="FILE", help="What `retwin data map` wrote for them.")
+]
 Inputs = Annotated[str, _panel("Twin", metavar="NAMES", help="Of the inputs, joined by commas.")]
 Outputs = Annotated[str, _panel("Twin", metavar="NAMES", help="Of the outputs, joined by commas.")]
 Rate = Annotated[
@@ -102,6 +105,7 @@ def identify(
     column: Column = None,
     time: Time = None,
     transient: Transient = 0.0,
+    mapping: LogMapping = None,
     inputs: Inputs = "",
     outputs: Outputs = "",
     rate: Rate = None,
@@ -123,7 +127,7 @@ def identify(
 
     check_place(out, folder=True, holds=HOLDS)
     settings = _method(method, loss, starts)
-    columns = _columns(column, time, transient)
+    columns = replace(_columns(column, time, transient), mapping=mapping)
     names = [
         tuple(each.strip() for each in o.split(",") if each.strip()) for o in (inputs, outputs)
     ]

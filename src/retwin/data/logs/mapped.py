@@ -15,7 +15,7 @@ from retwin.checks import require
 from retwin.data.io.assembly import DataCase, Raw, assemble
 from retwin.data.logs.channels import Channel, channels_of, in_order, signal_of, table_of
 from retwin.data.logs.cutting import Piece, pieces
-from retwin.data.logs.mapping import Mapping, read_mapping
+from retwin.data.logs.mapping import NO_NOMINAL, Mapping, read_mapping
 from retwin.data.logs.reading import read_log
 from retwin.data.logs.signals import Log
 from retwin.data.provenance import Provenance
@@ -29,7 +29,6 @@ __all__ = ["Parts", "mapped", "parts_of", "read_mapped"]
 
 SPARSE = 100.0
 """Samples per value of a log from which its times, or the sample rate, are wrong."""
-NO_NOMINAL = "no nominal outputs: they are 0; give the case, whose twin simulates them"
 
 
 def read_mapped(

@@ -12,12 +12,14 @@ from retwin.data.logs.signals import Clock
 from retwin.data.resampling import Resampling
 from retwin.serialisation.settings import Part, settings_of
 
-__all__ = ["ChannelMapping", "Cut", "Mapping", "TimeSettings", "read_mapping"]
+__all__ = ["NO_NOMINAL", "ChannelMapping", "Cut", "Mapping", "TimeSettings", "read_mapping"]
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=500)]
+NO_NOMINAL = "no nominal outputs: they are 0; give the case, whose twin simulates them"
+"""What the provenance says of a log that was read without a twin."""
 REMEDY = "see docs/logs.md for what it holds"
 
 
