@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
+import tomllib
 from itertools import pairwise
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 from log_files import BEGIN, COUNT, HEATER, RATE, SPEED, SPEEDS, TIMES, mcap, ros2_bag
@@ -415,3 +418,13 @@ def test_provenance_of_other_files_stays_as_it_was() -> None:
     assert plain.plain() == {"name": "a.mat", "sha256": "0" * 64}
     assert Provenance.of(plain.plain()) == plain
     assert re.fullmatch("0+", plain.sha256)
+
+
+def test_the_mapping_of_the_documentation_is_read_and_follows_the_schema(tmp_path: Path) -> None:
+    docs = Path(__file__).parents[2] / "docs"
+    text = (docs / "logs.md").read_text("utf-8").split("```toml\n")[1].split("```")[0]
+    (tmp_path / "mapping.toml").write_text(text)
+    found = read_mapping(tmp_path / "mapping.toml")
+    assert found.cut.signal in found.signals
+    assert found.outputs["elbow"].from_unit == "deg"
+    jsonschema.validate(tomllib.loads(text), json.loads((docs / "mapping.schema.json").read_text()))

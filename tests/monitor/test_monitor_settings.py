@@ -53,7 +53,9 @@ def test_the_example_of_the_registry_is_a_log_that_follows_the_schema(tmp_path: 
         jsonschema.validate(each.data, schema("registry.schema.json"))
 
 
-@pytest.mark.parametrize("name", ["monitor.schema.json", "registry.schema.json"])
+@pytest.mark.parametrize(
+    "name", ["mapping.schema.json", "monitor.schema.json", "registry.schema.json"]
+)
 def test_the_schemas_are_those_of_the_models(name: str) -> None:
     written = runpy.run_path(str(DOCS / "scripts" / "schemas.py"))["written"]
     assert (DOCS / name).read_text("utf-8") == written(name), "run docs/scripts/schemas.py"
