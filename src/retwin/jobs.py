@@ -1,6 +1,6 @@
-"""Tasks for numbered chunks: in this process, in worker processes, or on a Dask cluster.
+"""Tasks: in this process, in worker processes, or on a Dask cluster.
 
-All three call the same function with the same numbers; both kinds of workers give futures.
+All three call the same function with the same arguments; both kinds of workers give futures.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from retwin.modules import add_known, known
 from retwin.processes import sendable_errors, worker_pool
 from retwin.progress import Progress
 
-__all__ = ["alone", "each"]
+__all__ = ["alone", "each", "on_cluster"]
 
 ATTEMPTS = 3
 """How often a chunk is begun while worker processes die, before that is an error."""
@@ -76,7 +76,7 @@ def each(
         return
     _check_sendable(job)
     if scheduler is not None:
-        with _on_cluster(scheduler, task, job) as submit:
+        with on_cluster(scheduler, task, job) as submit:
             yield from _as_they_come(submit, numbers)
     else:
         with worker_pool(workers) as pool:
@@ -127,10 +127,29 @@ def _as_they_come(
 
 
 @contextmanager
-def _on_cluster(
+def on_cluster(
     address: str, task: Callable[..., Result], job: object
-) -> Iterator[Callable[[int], Future[Answer[Result]]]]:
-    """Submit tasks to the Dask cluster whose scheduler is at `address`."""
+) -> Iterator[Callable[[Any], Future[Answer[Result]]]]:
+    """A function that submits `task(job, argument)` to a Dask cluster.
+
+    Parameters
+    ----------
+    address : str
+        The address of the scheduler, such as `tcp://10.0.0.1:8786`.
+    task : callable
+        A function that workers can import.
+    job : object
+        What all tasks share; it is pickled and sent once.
+
+    Raises
+    ------
+    InputError
+        There is no scheduler at that address, the package distributed is missing, or its workers
+        may not start processes, as the task does.
+    RuntimeError
+        Workers died of a task.
+
+    """
     distributed = needs_extra("distributed", "scale", "speaks to a Dask scheduler")
     try:
         client = distributed.Client(address, set_as_default=False, timeout=20)
@@ -146,7 +165,7 @@ def _on_cluster(
         # The job is sent once. As the result of a task it is made again if its worker dies.
         sent = client.submit(_same, (known(), pickle.dumps(job)), pure=False)
         try:
-            yield lambda number: executor.submit(_on_worker, task, sent, number)
+            yield lambda argument: executor.submit(_on_worker, task, sent, argument)
         except distributed.KilledWorker as error:
             raise RuntimeError(f"workers of the cluster died of a chunk: {error}") from None
         except AssertionError as error:
@@ -163,10 +182,10 @@ def _on_cluster(
             executor.shutdown(wait=False)
 
 
-def _in_worker(task: Callable[..., Result], job: object, number: int) -> Answer[Result]:
+def _in_worker(task: Callable[..., Result], job: object, argument: Any) -> Answer[Result]:
     with sendable_errors(), warnings.catch_warnings(record=True) as given:
         warnings.simplefilter("default")
-        result = task(job, number)
+        result = task(job, argument)
     return result, [(str(each.message), _sendable(each.category)) for each in given]
 
 
@@ -176,14 +195,16 @@ def _sendable(category: type[Warning]) -> type[Warning]:
     return category if own else UserWarning
 
 
-def _on_worker(task: Callable[..., Result], sent: tuple[dict[str, str], bytes], number: int) -> Any:
+def _on_worker(
+    task: Callable[..., Result], sent: tuple[dict[str, str], bytes], argument: Any
+) -> Any:
     """As `_in_worker`, for a process that may not know the modules beside the user's case.
 
     The job is unpickled here: what goes wrong is then an exception of the task, not of Dask.
     """
     modules, job = sent
     add_known(modules)
-    return _in_worker(task, pickle.loads(job), number)
+    return _in_worker(task, pickle.loads(job), argument)
 
 
 def _same(sent: Job) -> Job:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +18,9 @@ from retwin.nets.networks import LSTM
 from retwin.nets.training import Training
 from retwin.report import write_report
 from retwin.study import possible_sources
+from retwin.study.files import Roles
+from retwin.study.pool import run_jobs
+from retwin.study.work import Work
 from retwin.twins.function import FunctionTwin
 from retwin.twins.parametric import Parameter, ParametricTwin
 from retwin.update.corrections import Additive
@@ -147,6 +152,36 @@ def test_results_hold_simulations_instead_of_diagnoses(folder: Path) -> None:
     pair = [row for row in results["comparisons"] if (row["a"], row["b"]) == ("pi_ls", "twin")]
     assert all(row["bootstrap_ci95"][1] < 0 for row in pair)
     assert results["fidelity"]["ibg_rg"]["trajectories"] == 6
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
+    from distributed import LocalCluster
+
+    data = rt.StudyData(real=folder.parent / "real.npz")
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        victims = [worker.pid for worker in cluster.workers.values()]
+
+        def kill(stage: str, share: float) -> None:
+            if stage.startswith("run") and 0.2 < share < 0.9 and len(victims) == 2:
+                os.kill(victims.pop(), signal.SIGKILL)
+
+        address = cluster.scheduler_address
+        rt.run_study(plant(), PLAN, data, tmp_path / "study", scheduler=address, report=kill)
+        with pytest.raises(rt.InputError, match="none with a scheduler"):
+            rt.run_study(plant(), PLAN, data, tmp_path / "study", processes=2, scheduler=address)
+        (tmp_path / "other").mkdir()
+        rt.save(measured(6, seed=5), tmp_path / "other/real.npz")
+        work = Work(tmp_path / "other", plant(), PLAN, Roles.of([((0, 1, 2), (3, 4, 5))]))
+        with pytest.raises(rt.InputError, match=r"see at the same path.*no such file"):
+            run_jobs(work, 1, lambda stage, share: None, address)
+    assert len(victims) == 1
+    with np.load(tmp_path / "study/arrays.npz") as made, np.load(folder / "arrays.npz") as wanted:
+        assert made.files == wanted.files
+        for name in wanted.files:
+            assert made[name].tobytes() == wanted[name].tobytes(), name
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from rich.table import Table
 from retwin import catalog
 from retwin.cli.completion import complete_sources, one_of
 from retwin.cli.options import CaseArgument, Json, Seed
+from retwin.cli.plans import Scheduler
 from retwin.cli.terminal import answer, bar, command_given, note, plain, resumable, table
 from retwin.errors import InputError
 
@@ -128,6 +129,7 @@ def study(
     learning_curve: LearningCurve = False,
     seed: Seed = 0,
     processes: Processes = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Compare updated twins with other sources on real trajectories."""
@@ -155,7 +157,7 @@ def study(
     if sources == "all":
         plan = replace(plan, sources=possible_sources(system, plan))
     given = StudyData(twin_data, calibration, test, real, data)
-    _run(system, plan, given, out, processes, as_json=as_json)
+    _run(system, plan, given, out, processes, scheduler, as_json=as_json)
 
 
 def report(
@@ -201,18 +203,32 @@ def demo(
         data = StudyData(twin=recorded if recorded.exists() else None, real=real)
     target = out or Path("demo", "real" if folder else "emulated")
     plan = StudyPlan(runs=runs, seed=seed, folds=folds)
-    _run(rt.cases.get("armpi"), plan, data, target, None, as_json=as_json)
+    _run(rt.cases.get("armpi"), plan, data, target, as_json=as_json)
 
 
 def _run(
-    case: Any, plan: Any, data: Any, out: Path, processes: int | None, *, as_json: bool
+    case: Any,
+    plan: Any,
+    data: Any,
+    out: Path,
+    processes: int | None = None,
+    scheduler: str | None = None,
+    *,
+    as_json: bool,
 ) -> None:
     from retwin.report import write_report
     from retwin.study import run_study
 
     with resumable(), bar("study") as show:
         results = run_study(
-            case, plan, data, out, processes=processes, report=show, command=command_given()
+            case,
+            plan,
+            data,
+            out,
+            processes=processes,
+            scheduler=scheduler,
+            report=show,
+            command=command_given(),
         )
         show("report", 1.0)
         page = write_report(out)

@@ -91,6 +91,7 @@ def run_study(
     out: str | Path,
     *,
     processes: int | None = None,
+    scheduler: str | None = None,
     report: Report | None = None,
     command: str = "",
 ) -> Results:
@@ -109,6 +110,9 @@ def run_study(
         Its plan may name other sources, more runs, or a learning curve; finished results are kept.
     processes : int, optional
         Jobs at a time, one thread each, at least 1; by default one per core.
+    scheduler : str, optional
+        The address of a Dask scheduler, whose workers do the jobs in place of processes. `out` is
+        a folder that all of them see at the same path.
     report : callable, optional
         Called with the name of the present stage and the share that is done.
     command : str
@@ -123,10 +127,18 @@ def run_study(
     ------
     InputError
         If data or plan do not suit the case, if `out` holds another study or another process
-        works on it, or if `processes` is below 1.
+        works on it, if `processes` is below 1 or given beside `scheduler`, if there is no such
+        scheduler, or if one of its workers does not see `out`.
 
     """
     workers = (os.cpu_count() or 1) if processes is None else whole("processes", processes, least=1)
+    require(
+        processes is None or scheduler is None,
+        "processes",
+        expected="none with a scheduler, which has its own",
+        got=processes,
+        remedy="leave one of the two out",
+    )
     out = Path(out)
     report = report or (lambda _stage, _share: None)
     with in_use(out):
@@ -139,8 +151,8 @@ def run_study(
             _prepare(case, plan, data, out, found, report)
         roles = Roles.of(json.loads((work_folder / "roles.json").read_text("utf-8")))
         _check_healthy(plan, Files(work_folder).real_data(), roles)
-        work = Work(work_folder, case, plan, roles)
-        run_jobs(work, workers, report)
+        work = Work(work_folder.resolve(), case, plan, roles)
+        run_jobs(work, workers, report, scheduler)
         report("scores", 1.0)
         about, provenance = _about(case, plan, data, digests), {"seed": plan.seed}
         return write_results(work, out, about=about, provenance={"command": command, **provenance})

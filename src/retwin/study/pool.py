@@ -1,11 +1,13 @@
-"""`run_jobs`: jobs in worker processes with one torch thread each.
+"""`run_jobs`: jobs in worker processes with one torch thread each, or on a Dask cluster.
 
 More threads than cores take several times as long.
 """
 
 from __future__ import annotations
 
+import json
 import multiprocessing
+import platform
 import queue
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -13,6 +15,8 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from graphlib import TopologicalSorter
 from typing import Any
 
+from retwin.checks import require
+from retwin.jobs import on_cluster
 from retwin.processes import worker_pool
 from retwin.study.files import Job
 from retwin.study.work import Work
@@ -23,7 +27,12 @@ _messages: Any = None
 """Queue to the parent process, set in each worker when it starts."""
 
 
-def run_jobs(work: Work, processes: int, report: Callable[[str, float], None]) -> None:
+def run_jobs(
+    work: Work,
+    processes: int,
+    report: Callable[[str, float], None],
+    scheduler: str | None = None,
+) -> None:
     """Run all jobs that have no result yet, each when the jobs that it needs are done.
 
     An exception or Ctrl-C ends the workers; results that are finished remain.
@@ -36,12 +45,30 @@ def run_jobs(work: Work, processes: int, report: Callable[[str, float], None]) -
         Number of worker processes, at least 1.
     report : callable
         Called with the name of a job and the share of all work that is done.
+    scheduler : str, optional
+        The address of a Dask scheduler, whose workers do the jobs in place of processes. They see
+        the folder of the study at the same path.
+
+    Raises
+    ------
+    InputError
+        There is no such scheduler, or a worker does not see the folder.
 
     """
     graph = work.graph()
     shares = {job: float(work.files.path(job).exists()) for job in graph}
     missing = [job for job, share in shares.items() if not share]
     if not missing:
+        return
+    if scheduler is not None:
+
+        def done(job: Job) -> None:
+            shares[job] = 1.0
+            report(str(job), sum(shares.values()) / len(shares))
+
+        report("jobs on the cluster", sum(shares.values()) / len(shares))
+        with on_cluster(scheduler, _do_on_cluster, work) as submit:
+            _finish(graph, set(missing), submit, done)
         return
     # Spawned, as the workers are.
     messages = multiprocessing.get_context("spawn").Queue()
@@ -60,12 +87,13 @@ def run_jobs(work: Work, processes: int, report: Callable[[str, float], None]) -
 def _finish(
     graph: Mapping[Job, Sequence[Job]],
     missing: set[Job],
-    start: Callable[[Job], Future[None]],
+    start: Callable[[Job], Future[Any]],
+    done: Callable[[Job], None] = lambda job: None,
 ) -> None:
     """Start each job when those that it needs are done; the first failure is raised at once."""
     order = TopologicalSorter(graph)
     order.prepare()
-    running: dict[Future[None], Job] = {}
+    running: dict[Future[Any], Job] = {}
     while order.is_active():
         for job in order.get_ready():
             if job in missing:
@@ -75,6 +103,7 @@ def _finish(
         if running:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 future.result()
+                done(running[future])
                 order.done(running.pop(future))
 
 
@@ -94,10 +123,14 @@ def _listen(
 
 
 def _start_worker(messages: Any) -> None:
-    import torch
-
     global _messages
     _messages = messages
+    _one_thread()
+
+
+def _one_thread() -> None:
+    import torch
+
     torch.set_num_threads(1)
     # Recurrent networks produce denormal numbers, which are several times slower. This must come
     # before any computation.
@@ -108,3 +141,17 @@ def _do(work: Work, job: Job) -> None:
     _messages.put((job, 0.0))
     work.do(job, lambda share: _messages.put((job, 0.99 * share)))
     _messages.put((job, 1.0))
+
+
+def _do_on_cluster(work: Work, job: Job) -> None:
+    _one_thread()
+    roles = work.folder / "roles.json"
+    seen = roles.read_text("utf-8") if roles.exists() else "no such file"
+    require(
+        seen == json.dumps(work.roles.folds),
+        "out",
+        expected="a folder that all workers see at the same path",
+        got=f"{roles}, of which {platform.node()} sees {'another one' if roles.exists() else seen}",
+        remedy="share the folder with all machines of the cluster, or leave --scheduler out",
+    )
+    work.do(job)
