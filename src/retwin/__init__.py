@@ -118,6 +118,7 @@ _HOME = {
     "load": "data.io",
     "load_diagnoser": "diagnosis",
     "measure_fidelity": "evaluation.fidelity",
+    "next_experiments": "evaluation.experiments.propose",
     "run_study": "study",
     "save": "data.io",
     "write_report": "report",
@@ -177,6 +178,7 @@ if TYPE_CHECKING:
     )
     from retwin.errors import InputError
     from retwin.evaluation.diagnosers import evaluate
+    from retwin.evaluation.experiments.propose import next_experiments
     from retwin.evaluation.fidelity import measure_fidelity
     from retwin.nets.networks import CNN, LSTM, MLP, TCN, LSTMClassifier, StateSpace
     from retwin.nets.training import Training

@@ -82,6 +82,7 @@ BASE = {
     "monitor fit": "model real.npz",
     "monitor replay": "model real.npz",
     "monitor run": "--config reach.toml",
+    "next": "reach.toml model --real real.npz --candidates 5 --count 1",
     "study": "reach.toml --real real.npz --folds 2 --sources dt,ibg --runs 1 --per-class 5",
     "twin animate": "real.npz --case reach.toml",
     "twin info": "own_of_mutations:reach --inputs first,second --outputs far,high",

@@ -29,6 +29,7 @@ from retwin.cli import (
     identify,
     models,
     monitor,
+    proposals,
     studies,
     twins,
 )
@@ -79,6 +80,9 @@ app.command(epilog=example("retwin fit armpi --twin-data sim.mat --real real.mat
     models.fit
 )
 app.command(epilog=example("retwin generate model --per-class 400 --out made.npz"))(models.generate)
+app.command("next", epilog=example("retwin next armpi model --real real.mat --out next.npz"))(
+    proposals.propose
+)
 app.command(epilog=example("retwin study armpi --twin-data sim.mat --real real.mat --out study"))(
     studies.study
 )

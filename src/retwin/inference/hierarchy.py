@@ -109,6 +109,17 @@ class Hierarchy:
         shift = covariance @ weighted
         return covariance + shift @ self.covariance @ shift.mT
 
+    def information(self, design: Design, solution: Solution) -> Tensor:
+        """(R, F, F) what each row tells about the coefficients, with x integrated out."""
+        weighted = design.features / self._variances(design)[..., None]
+        left = design.features - solution.covariance @ weighted
+        made: Tensor = weighted.mT @ left
+        return made
+
+    def scatter(self, design: Design) -> Tensor:
+        """(R, P) variances of x when the coefficients are known."""
+        return self._variances(design)
+
     def learned(self, design: Design, solution: Solution, expected: Tensor) -> Hierarchy:
         """The most probable hyperparameters for the problem linearised at its solution.
 

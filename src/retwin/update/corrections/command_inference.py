@@ -27,7 +27,7 @@ from retwin.update.corrections.missed_segments import Fit, LatentPrior, Search, 
 from retwin.update.corrections.offset_features import OffsetFeatures
 from retwin.update.corrections.sample_noise import SampleNoise
 
-__all__ = ["infer_commands"]
+__all__ = ["Belief", "infer_commands", "infer_with_belief"]
 
 MAX_ROUNDS = 12
 """Rounds of expectation-maximisation at most, with a search for missed segments in each."""
@@ -69,23 +69,43 @@ def infer_commands(
         A trajectory has no sample at which all outputs are measured, while another has one.
 
     """
+    return infer_with_belief(
+        context,
+        observed,
+        mask,
+        delay_range=delay_range,
+        max_samples=max_samples,
+        identified_below=identified_below,
+    )[0]
+
+
+def infer_with_belief(
+    context: Context,
+    observed: Tensor,
+    mask: Tensor,
+    *,
+    delay_range: tuple[float, float],
+    max_samples: int,
+    identified_below: float,
+) -> tuple[Discrepancy, Belief | None]:
+    """As `infer_commands`, and what was learned of the prior; None without any segment."""
     _require_samples(mask)
     problem = CommandProblem.of(
         context, observed, mask, delay_range=delay_range, max_samples=max_samples
     )
     problem = replace(problem, own_delays=True)
     if not problem.valid.shape[1]:
-        return _empty(problem)
+        return _empty(problem), None
     uncertain, problem = problem, problem.where_certain
     start = problem.zero
     problem.per_segment(start)[..., 0] = first_delays(problem, start, problem.delay_range)
-    first = _Belief.of(problem, start)
+    first = Belief.of(problem, start)
 
-    def infer(found: Search, belief: _Belief) -> Search:
+    def infer(found: Search, belief: Belief) -> Search:
         white, prior, noise = belief.whitened(problem), belief.prior(problem), belief.noise
         return searched(white, prior, noise, found.fit, partial(_suspects, white, prior, noise))
 
-    def learn(found: Search, belief: _Belief) -> _Belief:
+    def learn(found: Search, belief: Belief) -> Belief:
         return belief.learned(problem.with_missed(found.fit.missed), found.fit.solution)
 
     fit = Fit.of_prior(problem, first.prior(problem), start)
@@ -95,14 +115,15 @@ def infer_commands(
         infer=infer,
         learn=learn,
         rounds=MAX_ROUNDS,
-        converged=_Belief.near,
+        converged=Belief.near,
     )
     if uncertain.common is not None:
         problem = uncertain
         found = infer(Search(fit, fit.missed, fit.evidence), belief)
     problem = belief.whitened(problem).with_missed(found.fit.missed)
     last = fitted(problem, belief.prior(problem), belief.noise, found.fit.x)
-    return _discrepancy(problem, last.solution, found.probability, belief, identified_below)
+    made = _discrepancy(problem, last.solution, found.probability, belief, identified_below)
+    return made, belief
 
 
 def _require_samples(mask: Tensor) -> None:
@@ -155,8 +176,8 @@ def _suspects(
 
 
 @dataclass(frozen=True, eq=False)
-class _Belief:
-    """Hyperparameters, learned from all trajectories together."""
+class Belief:
+    """Hyperparameters of the prior and the noise, learned from all trajectories together."""
 
     features: OffsetFeatures
     hierarchy: Hierarchy  # of delays and offsets
@@ -165,7 +186,7 @@ class _Belief:
     noise: Noise  # its size, in `CommandProblem.unit`
 
     @classmethod
-    def of(cls, problem: CommandProblem, start: Tensor) -> _Belief:
+    def of(cls, problem: CommandProblem, start: Tensor) -> Belief:
         """Wide, from first delays only."""
         delay = problem.per_segment(start)[..., 0][problem.valid]
         jitter = 1.4826 * (delay - delay.median()).abs().median() + FIRST_JITTER * problem.width
@@ -197,7 +218,7 @@ class _Belief:
         gaussian = self.hierarchy.prior(self.features.design(problem))
         return LatentPrior(gaussian, self.odds.expand(problem.missed.shape))
 
-    def learned(self, problem: CommandProblem, solution: Solution) -> _Belief:
+    def learned(self, problem: CommandProblem, solution: Solution) -> Belief:
         """The most probable hyperparameters, given what was inferred and how certain that is."""
         white, x = self.whitened(problem), solution.x
         samples = self.samples.learned(white, self.noise, x)
@@ -207,7 +228,7 @@ class _Belief:
         spread, variance = self.features.spread.square(), self.hierarchy.variance
         share, delay = (variance[1:-1] / spread).mean(), variance.new_tensor([DELAY_VARIANCE])
         expected = torch.cat([delay, share * spread, delay])
-        return _Belief(
+        return Belief(
             self.features,
             self.hierarchy.learned(self.features.design(problem), solution, expected),
             ((missed + 0.5) / (problem.healthy.sum() + 20.0)).logit(),
@@ -215,7 +236,7 @@ class _Belief:
             white.learned_noise(self.noise, white.residual(x), floor=FLOOR),
         )
 
-    def near(self, other: _Belief) -> bool:
+    def near(self, other: Belief) -> bool:
         """Whether all standard deviations are about those of `other`."""
         pairs = (
             (self.hierarchy.variance.sqrt(), other.hierarchy.variance.sqrt()),
@@ -228,7 +249,7 @@ def _discrepancy(
     problem: CommandProblem,
     solution: Solution,
     probability: Tensor,
-    belief: _Belief,
+    belief: Belief,
     identified_below: float,
 ) -> Discrepancy:
     """z*, each segment's covariance, and which components the outputs identify."""

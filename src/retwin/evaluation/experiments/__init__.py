@@ -1,0 +1,3 @@
+"""Which trajectories to record next, and whether there are enough."""
+
+from __future__ import annotations

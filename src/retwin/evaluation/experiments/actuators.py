@@ -1,0 +1,135 @@
+"""What is not yet known of the actuators' errors, and what would tell it, for `CommandSpace`.
+
+The inference of `CommandSpace` learns the mean error of every actuator as a regression on its
+motion and on the pose. The posterior of that regression is used here as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from retwin.checks import require
+from retwin.data.trajectories import Trajectories
+from retwin.inference.design import Knowledge
+from retwin.inference.solver import solve
+from retwin.update.corrected import CorrectedTwin
+from retwin.update.corrections import Chain, CommandSpace, Context, Discrepancy, sample_mask
+from retwin.update.corrections.command_inference import Belief, infer_with_belief
+from retwin.update.corrections.command_problem import CommandProblem
+from retwin.update.corrections.delay_range import range_in_samples
+
+__all__ = ["ActuatorKnowledge"]
+
+
+@dataclass(frozen=True, eq=False)
+class ActuatorKnowledge:
+    """The posterior of the regression, and what it belongs to.
+
+    Attributes
+    ----------
+    twin : CorrectedTwin
+        With `CommandSpace`, alone or before a sensor.
+    operator : CommandSpace
+        With its range of delays.
+    belief : Belief
+        Learned from the calibration trajectories.
+    unit : Tensor
+        (d_y,), the unit of its noise.
+    context, found : Context, Discrepancy
+        Of the calibration trajectories.
+
+    """
+
+    twin: CorrectedTwin
+    operator: CommandSpace
+    belief: Belief
+    unit: Tensor
+    context: Context
+    found: Discrepancy
+
+    @classmethod
+    def of(cls, twin: CorrectedTwin, calibration: Trajectories) -> ActuatorKnowledge:
+        """What healthy trajectories tell."""
+        correction = twin.residual.correction
+        operator = correction.first if isinstance(correction, Chain) else correction
+        assert isinstance(operator, CommandSpace)
+        context = twin.residual.context(twin.surrogate, calibration.commands)
+        observed = torch.tensor(calibration.observed)
+        mask = sample_mask(correction, observed, torch.tensor(calibration.mask), context.rate)
+        limits = range_in_samples(operator.delay_range, context, observed, mask)
+        found, belief = infer_with_belief(
+            context,
+            observed,
+            mask,
+            delay_range=limits,
+            max_samples=operator.max_samples,
+            identified_below=operator.identified_below,
+        )
+        require(
+            belief is not None,
+            "calibration",
+            expected="trajectories with segments of motion",
+            got="commands that never change",
+            remedy="give those that the twin was calibrated on",
+        )
+        assert belief is not None
+        seen = CommandProblem.of(
+            context, observed, mask, delay_range=limits, max_samples=operator.max_samples
+        )
+        timed = (limits[0] / context.rate, limits[1] / context.rate)
+        return cls(twin, replace(operator, delay_range=timed), belief, seen.unit, context, found)
+
+    def knowledge(self, commands: NDArray) -> Knowledge:
+        """The knowledge about delays and offsets, in units of their scatter, at the segments."""
+        problem = self._problem(commands)
+        design = self.belief.features.design(problem)
+        n, segments, width = problem.missed.shape
+        used = torch.zeros(n, segments, problem.size, dtype=torch.bool)
+        used[..., : 1 + width] = problem.valid[..., None]
+        rows = used.flatten(1)
+        scatter = self.belief.hierarchy.scatter(design)
+        return Knowledge(self.belief.hierarchy.covariance, design.features[rows], scatter[rows])
+
+    @torch.no_grad()
+    def roots(self, commands: NDArray) -> Tensor:
+        """(n, F, F) roots of the information that outputs of commands would give."""
+        problem = self._problem(commands)
+        prior = self.belief.prior(problem).gaussian
+        # Outputs as expected: the solution is the mean of the prior, only its curvature is new.
+        expected = problem.observed - problem.residual(prior.mean)
+        samples = replace(self.belief.samples, gain=problem.gain())
+        problem = replace(problem, observed=expected, whitening=samples.whitening())
+        found = solve(problem, prior, self.belief.noise, prior.mean, bounds=problem.bounds)
+        told = self.belief.hierarchy.information(self.belief.features.design(problem), found)
+        values, vectors = torch.linalg.eigh((told + told.mT) / 2)
+        return (vectors * values.clamp_min(0).sqrt()[..., None, :]).mT
+
+    def mean(self, commands: NDArray) -> Tensor:
+        """The mean z (n, M, d_z) of the segments of commands, none of which is missed."""
+        context = self.twin.residual.context(self.twin.surrogate, commands)
+        problem = self._problem_of(context)
+        mean = problem.per_segment(self.belief.prior(problem).gaussian.mean)
+        width = problem.missed.shape[2]
+        return torch.cat([mean[..., : 1 + width], torch.zeros_like(problem.missed)], dim=-1)
+
+    def _problem(self, commands: NDArray) -> CommandProblem:
+        return self._problem_of(self.twin.residual.context(self.twin.surrogate, commands))
+
+    def _problem_of(self, context: Context) -> CommandProblem:
+        """The problem of outputs that the sensor is to sample, and that are not known yet."""
+        low, high = self.operator.delay_range or (0.0, 0.0)
+        mask = torch.ones(context.nominal.shape, dtype=torch.bool)
+        correction = self.twin.residual.correction
+        problem = CommandProblem.of(
+            context,
+            context.nominal,
+            sample_mask(correction, context.nominal, mask, context.rate),
+            delay_range=(low * context.rate, high * context.rate),
+            max_samples=self.operator.max_samples,
+            unit=self.unit,
+        )
+        return replace(problem, own_delays=True)

@@ -1,0 +1,294 @@
+"""`next_experiments`: the commands whose outputs would tell most, and what they would narrow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from retwin.checks import at_least, finite, instance, require, whole
+from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.evaluation.experiments.actuators import ActuatorKnowledge
+from retwin.evaluation.experiments.segments import SegmentKnowledge
+from retwin.inference.design import Knowledge, chosen
+from retwin.progress import Progress
+from retwin.twins.samplers import CommandSampler
+from retwin.twins.twin import checked_seed
+from retwin.update.corrected import CorrectedTwin
+from retwin.update.corrections import Chain, CommandSpace, SampledSensor
+from retwin.update.residual import ResidualModel, infer_discrepancy
+
+__all__ = ["Expected", "Measured", "Proposal", "next_experiments"]
+
+MIN_TRAJECTORIES = 3
+"""Healthy trajectories at least: fewer do not show how much segments scatter."""
+REFERENCES = 64
+"""Trajectories of the sampler at whose segments the twin is to predict."""
+RANDOM = 32
+"""Random continuations with which the chosen one is compared."""
+ORDERS = 10
+"""Random orders of the calibration trajectories, for the learning curve."""
+FURTHER = 60
+"""Further trajectories at most of which it is said how many are needed."""
+LEVEL = 0.9
+"""Probability of the intervals."""
+BAND = float(norm.ppf(0.975))
+"""Half the width of the band outside of which a segment is faulty, in standard deviations: one
+healthy segment in twenty is outside."""
+PARTS = 4
+"""Parts of the candidates, one after the other: memory."""
+FAULT = 3.0
+"""Size of the fault whose recall is given, in standard deviations of the scatter."""
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What so many healthy trajectories are expected to give; intervals are those of 90 %.
+
+    Attributes
+    ----------
+    trajectories : int
+        Their number.
+    excess : tuple of float
+        Share by which bands are wider than with any number of trajectories: mean, low, high.
+
+    """
+
+    trajectories: int
+    excess: tuple[float, float, float]
+
+    @property
+    def recall(self) -> tuple[float, float, float]:
+        """Probability that a fault of three standard deviations of the scatter leaves the band."""
+        mean, low, high = map(_recall, self.excess)
+        return mean, high, low
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What so many of the calibration trajectories gave, over random choices of them.
+
+    Attributes
+    ----------
+    trajectories : int
+        Their number.
+    error : tuple of float
+        Root mean square error of the predicted mean of z of the other trajectories, relative to the
+        standard deviation of z: mean, and the ends of the 90 % interval.
+
+    """
+
+    trajectories: int
+    error: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """What to record next.
+
+    Attributes
+    ----------
+    commands : (k, T, d_u) array
+        The proposed commands, the most informative first.
+    gains : tuple of float
+        Information about the predictions in nats that each gives, those before it given.
+    random_gain : float
+        The same of the first of random commands of the sampler, on average.
+    ahead : tuple of Expected
+        After each proposed trajectory; the first is now.
+    ahead_random : tuple of Expected
+        The same for random commands, with the interval over their draws.
+    curve : tuple of Measured
+        Learning curve on subsets of the calibration trajectories.
+    needed, needed_random : int or None
+        How many chosen or random trajectories are expected to be enough; None if more than 60.
+    tolerance : float
+        The excess that is small enough.
+
+    """
+
+    commands: NDArray
+    gains: tuple[float, ...]
+    random_gain: float
+    ahead: tuple[Expected, ...]
+    ahead_random: tuple[Expected, ...]
+    curve: tuple[Measured, ...]
+    needed: int | None
+    needed_random: int | None
+    tolerance: float
+
+    @property
+    def enough(self) -> bool:
+        """Whether bands are within the tolerance already."""
+        return self.ahead[0].excess[0] <= self.tolerance
+
+
+def next_experiments(
+    twin: CorrectedTwin,
+    calibration: Trajectories,
+    sampler: CommandSampler,
+    *,
+    seed: int,
+    count: int = 3,
+    candidates: int = 200,
+    tolerance: float = 0.05,
+    progress: Progress | None = None,
+) -> Proposal:
+    """Propose commands whose outputs would tell most about what is unsure now.
+
+    Candidates are commands of the sampler, within its limits. They are chosen one after the other
+    by how much their outputs, given those before, would tell about the discrepancy at other
+    commands of the sampler: with `CommandSpace` by the posterior of its inference, otherwise by
+    that of a linear regression of z on features of the commands.
+
+    Parameters
+    ----------
+    twin : CorrectedTwin
+        With one z per segment.
+    calibration : Trajectories
+        The healthy trajectories that it was calibrated on, at least three; others are left out.
+    sampler : CommandSampler
+        The distribution of the commands for which the twin is to predict.
+    seed : int
+        The same seed gives the same proposal on the same machine.
+    count : int
+        Trajectories to propose.
+    candidates : int
+        Draws of the sampler from which these are chosen, at least `count`.
+    tolerance : float
+        Share by which bands may be wider than with any number of trajectories, above 0.
+    progress : callable, optional
+        Called with the share that is done.
+
+    Returns
+    -------
+    Proposal
+        The commands, what they are expected to narrow, and what was measured so far.
+
+    Raises
+    ------
+    InputError
+        A twin without one z per segment, fewer than three healthy trajectories, or a number that is
+        out of range.
+
+    """
+    show = progress or (lambda _: None)
+    _check(twin, sampler, count, candidates)
+    finite("tolerance", tolerance, least=1e-6, most=10)
+    rng = np.random.default_rng(checked_seed(seed))
+    healthy = calibration[np.flatnonzero(np.isin(calibration.labels, [HEALTHY, ""]))]
+    remedy = "record any healthy ones first"
+    at_least("calibration", healthy, MIN_TRAJECTORIES, "healthy trajectories", remedy=remedy)
+    references = sampler.sample(REFERENCES, rng=rng)
+    known, curve = _known(twin, healthy, references, rng)
+    show(0.6)
+    now = known.knowledge(references)
+    drawn = sampler.sample(candidates, rng=rng)
+    roots = torch.cat([known.roots(part) for part in np.array_split(drawn, PARTS) if len(part)])
+    show(0.9)
+    picked, after = chosen(now, roots, max(count, min(FURTHER, candidates)))
+    every = [now, *after]
+    walks = [_walk(now, roots, rng, len(every) - 1) for _ in range(RANDOM)]
+    random = np.array([[each.excess for each in walk] for walk in walks])
+    gains = [_gain(*pair) for pair in pairwise(every)]
+    excess = np.array([each.excess for each in every])
+    return Proposal(
+        commands=drawn[picked[:count]],
+        gains=tuple(gains[:count]),
+        random_gain=float(now.gains(roots).mean()),
+        ahead=tuple(
+            Expected(len(healthy) + k, _spread(excess[k : k + 1])) for k in range(count + 1)
+        ),
+        ahead_random=tuple(
+            Expected(len(healthy) + k, _spread(random[:, k])) for k in range(count + 1)
+        ),
+        curve=curve,
+        needed=_first(excess, tolerance),
+        needed_random=_first(random.mean(axis=0), tolerance),
+        tolerance=tolerance,
+    )
+
+
+def _check(twin: object, sampler: CommandSampler, count: int, candidates: int) -> None:
+    whole("count", count, least=1, most=FURTHER)
+    whole("candidates", candidates, least=count, most=100_000)
+    instance("twin", twin, CorrectedTwin, remedy="give a corrected twin with one z per segment")
+    assert isinstance(twin, CorrectedTwin)
+    require(
+        isinstance(twin.residual, ResidualModel) and not bool(twin.residual.events.all()),
+        "twin",
+        expected="a corrected twin with one z per segment",
+        got=f"{type(twin.residual.correction).__name__}, with one per sample",
+        remedy="fit it with CommandSpace or DelayOffset",
+    )
+    require(
+        sampler.rate == twin.rate,
+        "sampler",
+        expected=f"commands at the rate of the twin, {twin.rate:g} Hz",
+        got=f"{sampler.rate:g} Hz",
+        remedy="give the sampler of the case that the twin was fitted for",
+    )
+
+
+def _walk(
+    known: Knowledge, roots: torch.Tensor, rng: np.random.Generator, count: int
+) -> list[Knowledge]:
+    """The knowledge before and after each of some random experiments."""
+    found = [known]
+    for index in rng.permutation(len(roots))[:count]:
+        found.append(found[-1].after(roots[index]))
+    return found
+
+
+def _gain(before: Knowledge, after: Knowledge) -> float:
+    return float(0.5 * (before.variance / after.variance).log().mean())
+
+
+def _first(excess: NDArray, tolerance: float) -> int | None:
+    """The first number of trajectories with which the excess is small enough."""
+    small = np.flatnonzero(excess <= tolerance)
+    return int(small[0]) if len(small) else None
+
+
+def _spread(values: NDArray) -> tuple[float, float, float]:
+    """Mean and ends of the interval."""
+    low, high = np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return float(values.mean()), float(low), float(high)
+
+
+def _recall(excess: float) -> float:
+    """Probability that a fault leaves the band, which contains 95 % of healthy segments."""
+    size = FAULT / (1 + excess)
+    return float(norm.cdf(size - BAND) + norm.cdf(-size - BAND))
+
+
+def _known(
+    twin: CorrectedTwin, healthy: Trajectories, references: NDArray, rng: np.random.Generator
+) -> tuple[ActuatorKnowledge | SegmentKnowledge, tuple[Measured, ...]]:
+    """What is known, and the learning curve so far."""
+    correction = twin.residual.correction
+    sensed = isinstance(correction, Chain) and isinstance(correction.second, SampledSensor)
+    operator = correction.first if isinstance(correction, Chain) and sensed else correction
+    if isinstance(operator, CommandSpace):
+        actuators = ActuatorKnowledge.of(twin, healthy)
+        own = SegmentKnowledge.of(twin, actuators.context, actuators.found, references)
+        return actuators, _measured_curve(own, rng)
+    context, found = infer_discrepancy(twin.surrogate, healthy, correction)
+    segments = SegmentKnowledge.of(twin, context, found, references)
+    return segments, _measured_curve(segments, rng)
+
+
+def _measured_curve(known: SegmentKnowledge, rng: np.random.Generator) -> tuple[Measured, ...]:
+    """What subsets of the calibration trajectories tell about the others."""
+    total = known.trajectories
+    sizes = sorted(set(np.geomspace(2, total - 1, 5).round().astype(int).tolist()))
+    found: dict[int, list[float]] = {size: [] for size in sizes}
+    for _ in range(ORDERS):
+        order = rng.permutation(total)
+        for size in sizes:
+            found[size].append(known.subset(order[:size]).error(order[size:]))
+    return tuple(Measured(size, _spread(np.array(rows))) for size, rows in found.items())
