@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -159,3 +161,12 @@ def test_the_actuators_posterior_is_that_of_the_inference(
     made = propose(rt.CorrectedTwin(ibg, residual), healthy, case)
     assert made.ahead[0].excess[0] > made.ahead[1].excess[0] > 0
     assert made.gains[0] > made.random_gain > 0
+
+
+@pytest.mark.slow
+def test_the_code_of_the_page_runs() -> None:
+    page = Path(__file__).parents[2] / "docs" / "next.md"
+    code = "".join(re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
+    found: dict = {}
+    exec(compile(code, str(page), "exec"), found)
+    assert found["made"].commands.shape[0] == 3
