@@ -27,7 +27,6 @@ from retwin.report.identification.texts import (
     value,
 )
 from retwin.report.labels import counted, duration, p_value
-from retwin.report.page import LEGEND
 from retwin.report.plotly_specs import panel_spec
 from retwin.report.style import CHROME, PALETTE, colour_of, symbol
 
@@ -83,7 +82,6 @@ def identification_page(
         "anchors": set(),
         "images": {},
         "colour_of": colour_of,
-        "dashes": LEGEND,
         "symbol": symbol,
     }
     drawn = figures(found)
