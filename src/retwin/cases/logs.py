@@ -125,9 +125,12 @@ def measured_outputs(
 ) -> tuple[str, ...]:
     """Names of the outputs of a twin that some log holds, in the twin's order.
 
-    They are known of tables without reading them; with another log, all count as held. Raises
-    InputError for a table that cannot be read.
+    They are known of tables without reading them, and by a mapping; with another log, all count as
+    held. Raises InputError for a table that cannot be read.
     """
+    if columns.mapping is not None:
+        own = read_mapping(columns.mapping).outputs
+        return tuple(n for n in twin.outputs.names if columns.names.get(n, n) in own)
     files = list(map(Path, paths))
     if not all(map(_is_table, files)):
         return twin.outputs.names
