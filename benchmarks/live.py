@@ -2,29 +2,46 @@
 
     python benchmarks/live.py
     python benchmarks/live.py memory
+    python benchmarks/live.py http
 
 An emulated tank with one input and one output. Latency is the time from `Gate.send` to the result,
 when samples, state and alarms of one machine are durable. The load is that of 100 machines at 10 Hz
 whose samples arrive in batches of 0.1 s, as CPU time of all threads over the wall clock time. The
 replay is of one day at 1 Hz in one call. Memory is resident memory after 0.2 and after 2 million
-samples of 100 machines. The latency of the disk is that of a commit of SQLite alone.
+samples of 100 machines. The latency of the disk is that of a commit of SQLite alone. Over HTTP, the
+latency is that of a request with one sample, without other work and while the causes of alarms of
+other machines are inferred.
 """
 
 from __future__ import annotations
 
+import http.client
+import json
+import secrets
 import sqlite3
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 from record import record
 
 import retwin as rt
-from retwin.monitor import Gate, Live, Monitor, Registry, Samples, Store, fit_monitor
+from retwin.monitor import (
+    Explanations,
+    Gate,
+    Live,
+    Monitor,
+    Registry,
+    Samples,
+    Store,
+    fit_monitor,
+)
+from retwin.monitor.server import create_app, listening, serving
 from retwin.twins import Parameter, State, StateTwin
 from retwin.update import Dynamics, Library, fit_dynamics
 
@@ -88,6 +105,9 @@ def main() -> None:
     if sys.argv[1:] == ["memory"]:
         record("live memory", f"live monitor, {MACHINES} machines", memory(monitor, begin))
         return
+    if sys.argv[1:] == ["http"]:
+        record("live http", f"live monitor, {MACHINES} machines", over_http(monitor, begin))
+        return
     figures = (
         latency_of_disk() | latency(monitor, begin) | load(monitor, begin) | replay(calibrated(1.0))
     )
@@ -129,6 +149,44 @@ def latency(monitor: Monitor, begin: int) -> dict[str, float]:
     return {
         "latency, median (ms)": 1e3 * float(np.median(taken)),
         "latency, 99 % (ms)": 1e3 * float(np.quantile(taken, 0.99)),
+    }
+
+
+def over_http(monitor: Monitor, begin: int) -> dict[str, float]:
+    """Seconds of requests with a sample, alone and while causes are inferred."""
+    values = rows(recorded(10.0, 1, 10 * SENT, 2))[0]
+    changed = values[:200] + [0.0, 0.2] * (np.arange(200) >= 120)[:, None]
+    token, taken, k = secrets.token_urlsafe(), {"alone": [0.0], "causes": [0.0]}, 0
+    with ExitStack() as running:
+        live = running.enter_context(opened(monitor, MACHINES))
+        gate = running.enter_context(Gate(live))
+        explanations = running.enter_context(Explanations(live))
+        bound = running.enter_context(listening("127.0.0.1", 0))
+        running.enter_context(serving(create_app(live, gate, token=token), bound))
+        connection = http.client.HTTPConnection(*bound.getsockname()[:2])
+        headers = {"authorization": f"Bearer {token}"}
+        for what, own in taken.items():
+            if what == "causes":
+                for i in range(1, 13):
+                    times = begin + np.arange(len(changed)) * SECOND // 10
+                    live.submit([Samples(f"m{i}", times, changed)])
+                explained = threading.Thread(target=explanations.wait)
+                explained.start()
+            while len(own) <= SENT if what == "alone" else explained.is_alive():
+                pump, level = values[k]
+                sample = {"asset": "m0", "time_ns": begin + k * SECOND // 10}
+                body = json.dumps({**sample, "values": {"pump": pump, "level": level}})
+                started = time.perf_counter()
+                connection.request("POST", "/samples", body, headers)
+                assert connection.getresponse().read()
+                own.append(time.perf_counter() - started)
+                time.sleep(0.01)
+                k += 1
+        connection.close()
+    return {
+        f"latency over HTTP, {what}, {name} (ms)": 1e3 * float(np.quantile(own[1:], share))
+        for what, own in taken.items()
+        for name, share in (("median", 0.5), ("99 %", 0.99))
     }
 
 
