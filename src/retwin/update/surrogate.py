@@ -25,6 +25,7 @@ from retwin.times import sample_rate
 from retwin.twins.command_range import CommandRange
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
+from retwin.update.kernels.generation import along_pieces
 from retwin.update.piecewise_linear import evaluate_piecewise_linear
 from retwin.update.training_range import training_checked
 
@@ -146,6 +147,9 @@ class Surrogate(nn.Module):
 
     def _piecewise_linear(self, commands: Tensor) -> Tensor:
         """As `forward`, up to rounding, by interpolation along linear pieces of the commands."""
+        compiled = along_pieces(self, commands.numpy())
+        if compiled is not None:
+            return torch.from_numpy(compiled)
 
         def function(rows: Tensor) -> Tensor:
             return torch.cat([self(some) for some in rows.split(SAMPLES_PER_BATCH)])

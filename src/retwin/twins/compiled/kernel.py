@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -11,6 +13,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import lru_cache
 from importlib.util import find_spec
 from itertools import product
@@ -42,13 +45,20 @@ def compilers() -> Iterator[list[str]]:
 
 
 @lru_cache(maxsize=COMPILED)
-def compiled(source: str) -> ctypes.CDLL | None:
+def compiled(source: str, *, contract: bool = False, quiet: bool = False) -> ctypes.CDLL | None:
     """The functions of a C99 source; None, with a warning, where no compiler can make them.
+
+    Libraries are kept in the user's cache folder, so that each is compiled once per machine.
 
     Parameters
     ----------
     source : str
         See `Model.source`.
+    contract : bool
+        Whether a product and a sum may be rounded once, which is faster: results are then not those
+        of torch to the last digit.
+    quiet : bool
+        Whether the warning is left out.
 
     Returns
     -------
@@ -57,31 +67,82 @@ def compiled(source: str) -> ctypes.CDLL | None:
 
     """
     reasons = []
+    flags = [*FLAGS, "-ffp-contract=fast"] if contract else [*FLAGS]
     for command, native in product(compilers(), ([NATIVE], [])):
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            file, library = Path(folder, "model.c"), Path(folder, "model.so")
-            file.write_text(source, "utf-8")
-            try:
-                subprocess.run(
-                    [*command, *FLAGS, *native, str(file), "-o", str(library), "-lm"],
-                    check=True,
-                    capture_output=True,
-                    timeout=TIMEOUT,
-                    text=True,
-                )
-                return ctypes.CDLL(str(library))
-            except subprocess.CalledProcessError as error:
-                reasons.append(
-                    f"{command[0]}: {(error.stderr or 'failed').strip().splitlines()[0]}"
-                )
-            except (OSError, subprocess.TimeoutExpired) as error:
-                reasons.append(f"{command[0]}: {error}")
-    warnings.warn(
-        "the model runs in torch, some thousand times slower, since there is no C compiler "
-        f"({'; '.join(reasons) or 'none is installed'}); install one, or retwin[compiled]",
-        stacklevel=2,
-    )
+        try:
+            return _library(source, (*command, *flags, *native))
+        except subprocess.CalledProcessError as error:
+            reasons.append(f"{command[0]}: {(error.stderr or 'failed').strip().splitlines()[0]}")
+        except (OSError, subprocess.TimeoutExpired) as error:
+            reasons.append(f"{command[0]}: {error}")
+    if not quiet:
+        warnings.warn(
+            "the model runs in torch, some thousand times slower, since there is no C compiler "
+            f"({'; '.join(reasons) or 'none is installed'}); install one, or retwin[compiled]",
+            stacklevel=2,
+        )
     return None
+
+
+def _library(source: str, command: tuple[str, ...]) -> ctypes.CDLL:
+    """The library that a compiler makes of a source, from the cache if it has made it before."""
+    kept = _kept(source, command)
+    if kept is not None and _own(kept):
+        try:
+            return ctypes.CDLL(str(kept))
+        except OSError:  # it is damaged, or from another system
+            kept.unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        file, library = Path(folder, "model.c"), Path(folder, "model.so")
+        file.write_text(source, "utf-8")
+        subprocess.run(
+            [*command, str(file), "-o", str(library), "-lm"],
+            check=True,
+            capture_output=True,
+            timeout=TIMEOUT,
+            text=True,
+        )
+        loaded = ctypes.CDLL(str(library))
+        if kept is not None:
+            with suppress(OSError):  # a cache that cannot be written is no reason to fail
+                kept.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                part = kept.with_suffix(f".{os.getpid()}")
+                shutil.copyfile(library, part)
+                part.replace(kept)
+        return loaded
+
+
+def _kept(source: str, command: tuple[str, ...]) -> Path | None:
+    """Where the library is kept, by all that its code depends on; None without a home folder."""
+    try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        made = Path(command[0]).stat()
+    except (OSError, RuntimeError):
+        return None
+    parts = (source, *command, str(made.st_mtime_ns), str(made.st_size), _instructions())
+    name = hashlib.sha256("\0".join(parts).encode()).hexdigest()
+    return Path(home, "retwin", "compiled", f"{name}.so")
+
+
+@lru_cache(maxsize=1)
+def _instructions() -> str:
+    """What this processor can execute, which the native code depends on."""
+    try:
+        text = Path("/proc/cpuinfo").read_text("utf-8")
+    except OSError:
+        return f"{platform.machine()} {platform.processor()} {platform.node()}"
+    names = ("flags", "model name", "Features", "cpu family", "model\t")
+    return "\n".join(sorted({line for line in text.splitlines() if line.startswith(names)}))
+
+
+def _own(file: Path) -> bool:
+    """Whether a file, and its folder, are this user's, and nobody else can write to them."""
+    try:
+        about = [each.stat() for each in (file, file.parent)]
+    except OSError:
+        return False
+    user = getattr(os, "getuid", lambda: about[0].st_uid)()
+    return all(each.st_uid == user and not each.st_mode & 0o022 for each in about)
 
 
 def call(
@@ -107,7 +168,7 @@ def call(
     period : float
         The sample period in s.
     common : sequence of NDArray
-        Double arrays of all trajectories, of the shapes that `simulate.c` gives, contiguous.
+        Arrays of all trajectories, of the types and shapes that the C source gives, contiguous.
     rows : sequence of NDArray or None
         Those with a first axis of n; None is NULL.
 

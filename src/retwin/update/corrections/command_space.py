@@ -19,6 +19,7 @@ from retwin.update.corrections.correction import Context, Discrepancy, Head
 from retwin.update.corrections.delay_range import checked_range, range_in_samples
 from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.warp import gather_samples
+from retwin.update.kernels.generation import at_effective_commands
 from retwin.update.piecewise_linear import distinct
 
 __all__ = ["CommandSpace"]
@@ -96,6 +97,11 @@ class CommandSpace:
         """The same (n, S, d_y) at the samples `when` (n, S) only."""
         if not getattr(context.surrogate, "memoryless", False):
             return gather_samples(self.apply(context, z), when)
+        made = at_effective_commands(
+            context.surrogate, context.faulty_commands, context.segments, z, when, context.frozen
+        )
+        if made is not None:
+            return made
         different, place = distinct(_commands(context, z, when))
         return context.surrogate(different[None])[0, place]
 

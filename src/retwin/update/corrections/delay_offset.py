@@ -23,6 +23,7 @@ from retwin.update.corrections.correction import Context, Discrepancy, Head
 from retwin.update.corrections.delay_range import checked_range, range_in_samples
 from retwin.update.corrections.delays import at_bound, first_delays
 from retwin.update.corrections.path_problem import PathProblem, path_at
+from retwin.update.kernels.generation import delayed_path
 
 __all__ = ["DelayOffset"]
 
@@ -96,7 +97,9 @@ class DelayOffset:
         """The corrected path (n, T, d_y), continuous, for z (n, M, 1 + d_y)."""
         if context.segments.max_count == 0:
             return context.path
-        return path_at(context.segments, context.path, z.to(context.path))
+        z = z.to(context.path)
+        made = delayed_path(context.segments, context.path, z)
+        return path_at(context.segments, context.path, z) if made is None else made
 
     def completed(self, context: Context, observed: Tensor, mask: Tensor) -> DelayOffset:
         """The operator with the range of delays that measured outputs show, where none is given."""

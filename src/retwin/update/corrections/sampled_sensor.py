@@ -19,6 +19,7 @@ from retwin.checks import require
 from retwin.data.segments import Segments
 from retwin.errors import InputError
 from retwin.update.corrections.warp import gather_samples
+from retwin.update.kernels.generation import joined_samples
 
 __all__ = ["SampledSensor"]
 
@@ -202,6 +203,9 @@ class SampledSensor:
         every, phase = self.timing(rate)[0], when[:, :1]
         if every == 1:
             return values
+        made = joined_samples(values, phase[:, 0], steps, every)
+        if made is not None:
+            return made
         last = (steps - 1 - phase) // every
         following = (torch.arange(values.shape[1]) + 1).minimum(last)
         ends = torch.stack([values, gather_samples(values, following) - values])

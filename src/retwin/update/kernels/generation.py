@@ -1,0 +1,139 @@
+"""Generation by compiled kernels, for surrogates without memory in single precision.
+
+Every function has the arguments of its counterpart in torch, or gives None where it does not apply:
+no C compiler, a gradient, another precision, another kind of network. Results differ from torch's
+by the rounding of single precision.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import lru_cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from retwin.data.segments import Segments
+from retwin.twins.compiled.kernel import call, compiled
+from retwin.update.piecewise_linear import TOLERANCE
+
+__all__ = ["along_pieces", "at_effective_commands", "delayed_path", "joined_samples", "library"]
+
+SOURCES = ("network.c", "pieces.c", "warp.c")
+OUTPUTS = 6
+"""Outputs of a layer that are computed together, as in `network.c`."""
+DENSITY = 3.0
+"""Points of a ramp per standard deviation of the commands that it covers, beyond five; too few are
+found out, and cost a second evaluation. With 3 the default network of the arm takes least time."""
+
+
+@lru_cache(maxsize=1)
+def library() -> ctypes.CDLL | None:
+    """The compiled kernels; None without a C compiler."""
+    folder = files("retwin.update.kernels")
+    source = "".join((folder / name).read_text("utf-8") for name in SOURCES)
+    return compiled(source, contract=True, quiet=True)
+
+
+def along_pieces(surrogate: Any, commands: NDArray) -> NDArray | None:
+    """The outputs (n, T, d_y) of a surrogate; see `evaluate_piecewise_linear`."""
+    kernel, packed = library(), _packed(surrogate)
+    if kernel is None or packed is None or commands.shape[1] < 2 or not len(commands):
+        return None
+    values = np.ascontiguousarray(commands, np.float32)
+    out = np.empty((*values.shape[:2], len(packed[2])), np.float32)
+    call(kernel, "pieces", values.shape[:2], DENSITY, packed, (values, out))
+    return out
+
+
+def at_effective_commands(
+    surrogate: Any, reference: Tensor, segments: Segments, z: Tensor, when: Tensor, frozen: Tensor
+) -> Tensor | None:
+    """The outputs (n, S, d_y) at the samples `when` (n, S) of effective commands.
+
+    See `effective_commands` for the other arguments.
+    """
+    kernel, packed = library(), _packed(surrogate)
+    plain = _plain(reference, z) and not when.is_floating_point() and len(reference) == len(z)
+    if kernel is None or packed is None or not plain or not reference.numel():
+        return None
+    n, steps, _ = reference.shape
+    out = np.empty((n, when.shape[1], len(packed[2])), np.float32)
+    size = reference.abs().amax(dim=0).amax(dim=0).double().numpy()
+    rows = (_floats(reference), *_times(segments), _floats(z), _whole(frozen), _whole(when), out)
+    sizes = (n, steps, segments.max_count, when.shape[1])
+    call(kernel, "executed", sizes, 0.0, (*packed[:2], size), rows)
+    return torch.from_numpy(out)
+
+
+def delayed_path(segments: Segments, path: Tensor, z: Tensor) -> Tensor | None:
+    """The path (n, T, d_y), delayed and offset by z (n, M, 1 + d_y); see `path_at`."""
+    kernel = library()
+    if kernel is None or not _plain(path, z) or not path.numel() or not segments.max_count:
+        return None
+    out = np.empty(tuple(path.shape), np.float32)
+    sizes = (len(path), path.shape[1], segments.max_count, path.shape[2])
+    call(kernel, "delayed", sizes, 0.0, (), (_floats(path), *_times(segments), _floats(z), out))
+    return torch.from_numpy(out)
+
+
+def joined_samples(values: Tensor, phase: Tensor, steps: int, every: int) -> Tensor | None:
+    """The record (n, steps, d_y) of values (n, R, d_y), the first at `phase` (n,), joined."""
+    kernel = library()
+    if kernel is None or not _plain(values) or not values.numel():
+        return None
+    n, samples, width = values.shape
+    out = np.empty((n, steps, width), np.float32)
+    sizes = (n, steps, samples, every, width)
+    call(kernel, "joined", sizes, 0.0, (), (_floats(values), _whole(phase), out))
+    return torch.from_numpy(out)
+
+
+def _plain(*tensors: Tensor) -> bool:
+    """Whether no gradient is wanted, and all are in single precision on the processor."""
+    graded = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
+    return not graded and all(
+        each.dtype == torch.float32 and each.device.type == "cpu" for each in tensors
+    )
+
+
+def _packed(surrogate: Any) -> tuple[NDArray, NDArray, NDArray] | None:
+    """Widths, numbers and tolerances of a network, as the kernels take them; None of another."""
+    layers = list(getattr(surrogate, "network", ()))
+    dense = layers[::2]
+    suits = (
+        getattr(surrogate, "memoryless", False)
+        and all(isinstance(each, nn.Linear) for each in dense)
+        and all(isinstance(each, nn.SiLU) for each in layers[1::2])
+        and len(dense) == len(layers) // 2 + 1
+    )
+    if not suits or not _plain(*(each.weight.detach() for each in dense)):
+        return None
+    mean, scale = surrogate.after.mean, surrogate.after.scale
+    numbers = [surrogate.before.mean, surrogate.before.scale, mean, scale]
+    for each in dense:
+        rows = torch.cat([each.weight.detach(), each.bias.detach()[:, None]], dim=1)
+        rows = nn.functional.pad(rows, (0, 0, 0, -len(rows) % OUTPUTS))
+        numbers.append(rows.unflatten(0, (-1, OUTPUTS)).mT.flatten())
+    widths = [len(dense), dense[0].in_features, *(each.out_features for each in dense)]
+    packed = torch.cat(numbers).numpy().astype(np.float32)
+    return np.array(widths, np.int64), packed, _floats(TOLERANCE * scale)
+
+
+def _times(segments: Segments) -> tuple[NDArray, NDArray, NDArray]:
+    """Starts and settle times (n, M), and the number (n,) of segments."""
+    ends = (np.ascontiguousarray(each, np.float64) for each in (segments.start, segments.settle))
+    start, settle = ends
+    return start, settle, segments.valid.sum(axis=1).astype(np.int64)
+
+
+def _floats(values: Tensor) -> NDArray:
+    return np.ascontiguousarray(values.detach().numpy(), np.float32)
+
+
+def _whole(values: Tensor) -> NDArray:
+    return np.ascontiguousarray(values.numpy(), np.int64)
