@@ -16,6 +16,7 @@ __all__ = [
     "floating",
     "floats",
     "interpolated",
+    "is_finite",
     "measured",
     "named",
     "row_blocks",
@@ -105,7 +106,7 @@ def check_finite(name: str, array: NDArray) -> None:
 
     """
     for rows in row_blocks(array):
-        if _is_finite(array[rows]):
+        if is_finite(array[rows]):
             continue
         bad = ~np.isfinite(array[rows])
         if bad.any():
@@ -151,7 +152,7 @@ def measured(observed: NDArray, mask: ArrayLike | None) -> tuple[NDArray, NDArra
     masked = zeroed = True
     for rows in row_blocks(observed):
         values, present = observed[rows], flags[rows]
-        if present.all() and _is_finite(values):
+        if present.all() and is_finite(values):
             continue
         infinite = np.isinf(values)
         if infinite.any():
@@ -225,7 +226,7 @@ def interpolated(values: NDArray, at: ArrayLike, stride: int = 1) -> NDArray:
     return (1 - fraction) * left + fraction * right
 
 
-def _is_finite(values: NDArray) -> bool:
+def is_finite(values: NDArray) -> bool:
     """Whether the sum of all is finite, from which it follows that each is."""
     with np.errstate(over="ignore", invalid="ignore"):
         return bool(np.isfinite(values.sum()))

@@ -225,6 +225,12 @@ class Trajectories:
 
     def replace(self, **changes: Any) -> Trajectories:
         """A copy with some attributes changed, checked again."""
+        if changes.keys() == {"labels"}:  # the arrays, which take long to check, are the same
+            labels = named("labels", changes["labels"], [UNLABELLED] * len(self)).view()
+            labels.flags.writeable = False
+            made = object.__new__(Trajectories)
+            made.__dict__.update(self.__dict__, labels=labels)
+            return made
         return replace(self, **changes)
 
     def padded(self, steps: int) -> Trajectories:

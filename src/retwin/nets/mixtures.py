@@ -62,6 +62,8 @@ class GaussianMixture(MixtureSameFamily):
     ) -> GaussianMixture:
         """The same mixture for a larger batch."""
         shape = torch.Size(batch_shape)
+        if shape == self.batch_shape:
+            return self
         return GaussianMixture(
             self.mixture_distribution.logits.expand(*shape, -1),
             self.means.expand(*shape, -1, -1),

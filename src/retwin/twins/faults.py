@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from numbers import Real
 from typing import Any, Protocol, runtime_checkable
 
@@ -19,6 +20,7 @@ from retwin.checks import one_per, require
 from retwin.data.segments import Segments
 from retwin.errors import InputError
 from retwin.times import to_samples
+from retwin.twins.compiled.commands import biased_references
 
 __all__ = [
     "ActuatorBias",
@@ -140,6 +142,9 @@ def onset_samples(onset: float | tuple[float, float], steps: int, rate: float) -
     return low, min(high, steps - 1)
 
 
+_onset_samples = lru_cache(maxsize=1024)(onset_samples)
+
+
 @dataclass(frozen=True)
 class Stuck:
     """The actuator's response is held from an onset on.
@@ -177,7 +182,7 @@ class Stuck:
 
         Raises InputError if the earliest onset is after the end.
         """
-        return onset_samples(self.onset, steps, rate)
+        return _onset_samples(self.onset, steps, rate)
 
     def drawn(self, rng: np.random.Generator, *, steps: int, segments: int, rate: float) -> Stuck:
         """The same fault with its onset drawn; see `Fault.drawn`."""
@@ -252,6 +257,12 @@ class ActuatorBias:
         drawn = rng.uniform(*self.size, size=count) * (2.0 * rng.integers(2, size=count) - 1.0)
         return replace(self, bias=tuple(drawn.tolist()))
 
+    def levels(self, count: int) -> tuple[float, ...]:
+        """The bias of each of so many segments; those given repeat. Raises where it is open."""
+        if not self.bias:
+            raise _open(self)
+        return (self.bias * -(-count // len(self.bias)))[:count]
+
     def command(self, commands: NDArray, segments: Segments, rate: float) -> NDArray:
         """The commands with the biased reference of one actuator; see `Fault.command`."""
         if not self.bias:
@@ -260,7 +271,7 @@ class ActuatorBias:
         if not valid.any():
             bias: NDArray | float = self.bias[0]
         else:
-            levels = np.resize(self.bias, valid.sum())
+            levels = np.array(self.levels(int(valid.sum())))
             clean = commands[:, self.actuator]
             bias = _along(clean, segments.start[0][valid], segments.settle[0][valid], levels)
         biased = commands.copy()
@@ -366,9 +377,25 @@ def faulty_commands(
 
     """
     out = commands.copy()
+    count = segments.valid.sum(axis=1).tolist()
+    # What is computed together: many trajectories with the same kind of fault are common.
+    biased = [type(each) is ActuatorBias and n > 0 for each, n in zip(faults, count, strict=True)]
+    rows = zip(faults, biased, count, strict=True)
+    biases = [
+        fault.levels(n) if suits and isinstance(fault, ActuatorBias) else ()
+        for fault, suits, n in rows
+    ]
+    actuators = [
+        getattr(fault, "actuator", -1) if suits else -1
+        for fault, suits in zip(faults, biased, strict=True)
+    ]
+    together = any(biased) and biased_references(commands, out, actuators, biases, segments)
     for i, fault in enumerate(faults):
-        if fault is not None:
-            out[i] = fault.command(commands[i], segments[i : i + 1], rate)
+        if fault is None or (together and biased[i]):
+            continue
+        effective = fault.command(commands[i], segments[i : i + 1], rate)
+        if effective is not commands[i]:
+            out[i] = effective
     return out
 
 
@@ -433,6 +460,10 @@ def frozen_from(
     onsets = np.full((len(faults), actuators), steps)
     for i, fault in enumerate(faults):
         if fault is None:
+            continue
+        if type(fault) is Stuck and not isinstance(fault.onset, tuple):
+            held = to_samples(fault.onset, rate)
+            onsets[i, fault.actuator] = held if held < steps - 1 else steps
             continue
         response = fault.response(rising, rate)
         if response is rising:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.twins.compiled.commands import ramped
+
 __all__ = ["draw_onsets", "ramps_and_holds"]
 
 TRAJECTORIES_PER_BLOCK = 32
@@ -44,6 +46,10 @@ def ramps_and_holds(
         Commands in the unit of the levels.
 
     """
+    if dtype is np.float32:
+        made = ramped(start, levels, spans, onsets, steps)
+        if made is not None:
+            return made
     commands = np.empty((len(start), steps, start.shape[1]), dtype)
     for begin in range(0, len(start), TRAJECTORIES_PER_BLOCK):
         block = slice(begin, begin + TRAJECTORIES_PER_BLOCK)

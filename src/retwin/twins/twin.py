@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.arrays import check_finite
+from retwin.arrays import check_finite, is_finite
 from retwin.checks import instance, require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Provenance, Trajectories
@@ -419,6 +419,8 @@ def _not_finite(twin: Twin, nominal: NDArray, observed: NDArray) -> dict[int, st
     """Trajectories with outputs that are not finite, and the first such output of each."""
     reasons = {}
     for outputs in (observed, nominal):
+        if is_finite(outputs):
+            continue
         bad = ~np.isfinite(outputs)
         for i in np.flatnonzero(bad.any(axis=(1, 2))):
             sample, channel = np.argwhere(bad[i])[0]

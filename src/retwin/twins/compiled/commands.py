@@ -1,0 +1,87 @@
+"""Ramps and holds, and biased references, in one compiled pass: `commands.c`.
+
+Results are those of the same functions in numpy, to the last digit. A function that does not apply,
+without a C compiler or for another precision, gives None.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from functools import lru_cache
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.data.segments import Segments
+
+__all__ = ["biased_references", "ramped"]
+
+
+@lru_cache(maxsize=1)
+def library() -> ctypes.CDLL | None:
+    """The compiled functions; None without a C compiler."""
+    # Imported here: a description of a twin needs no torch, which the kernel's threads need.
+    from retwin.twins.compiled.kernel import compiled
+
+    source = files("retwin.twins.compiled").joinpath("commands.c").read_text("utf-8")
+    return compiled(source, quiet=True)
+
+
+def ramped(
+    start: NDArray, levels: NDArray, spans: NDArray, onsets: NDArray, steps: int
+) -> NDArray | None:
+    """Commands (n, steps, d_u) in single precision; see `ramps_and_holds`.
+
+    None also where a ramp begins before the one before it has ended.
+    """
+    kernel = library()
+    if kernel is None or not levels.size:
+        return None
+    from retwin.twins.compiled.kernel import call
+
+    n, segments, width = levels.shape
+    out, done = np.empty((n, steps, width), np.float32), np.empty(n, np.uint8)
+    given = (np.ascontiguousarray(each, np.float64) for each in (start, levels, spans, onsets))
+    call(kernel, "ramps", (n, steps, segments, width), 0.0, (), (*given, out, done))
+    return out if done.all() else None
+
+
+def biased_references(
+    commands: NDArray,
+    out: NDArray,
+    actuators: Sequence[int],
+    biases: Sequence[Sequence[float]],
+    segments: Segments,
+) -> bool:
+    """Write the references of trajectories with a biased actuator, and whether that was possible.
+
+    Parameters
+    ----------
+    commands, out : ndarray, shape (n, T, d_u)
+        Clean commands, and a copy of them, which is changed.
+    actuators : sequence of int
+        (n,), the actuator; below 0 for none.
+    biases : sequence of sequence of float
+        (n,), the bias of each segment that exists.
+    segments : Segments
+        Those of the commands.
+
+    """
+    kernel = library()
+    if kernel is None or commands.dtype != np.float32 or not commands.size:
+        return False
+    from retwin.twins.compiled.kernel import call
+
+    levels = np.zeros(segments.start.shape)
+    for row, bias in enumerate(biases):
+        levels[row, : len(bias)] = bias
+    start, settle = (
+        np.ascontiguousarray(each, np.float64) for each in (segments.start, segments.settle)
+    )
+    count = segments.valid.sum(axis=1).astype(np.int64)
+    given = (np.array(actuators, np.int64), start, settle, count, levels)
+    sizes = (*commands.shape[:2], segments.max_count, commands.shape[2])
+    call(kernel, "biases", sizes, 0.0, (), (*given, np.ascontiguousarray(commands), out))
+    return True
