@@ -398,7 +398,7 @@ def simulate_in_chunks(
     good = np.setdiff1d(np.arange(len(commands)), list(failed)) if failed else slice(None)
     mask = np.arange(commands.shape[1])[:, None] < known[good, None, None]
     simulated = Trajectories(
-        commands=commands[good].copy(),  # the caller may change its own array afterwards
+        commands=_kept(commands[good]),
         nominal=nominal[good],
         observed=observed[good],
         mask=np.broadcast_to(mask, observed[good].shape),
@@ -413,6 +413,13 @@ def simulate_in_chunks(
     if failed:
         raise SimulationError(failed, simulated)
     return simulated
+
+
+def _kept(commands: NDArray) -> NDArray:
+    """The commands, copied if the caller may change its own array afterwards."""
+    frozen = not commands.flags.writeable and getattr(commands.base, "base", None) is None
+    owner = commands if commands.base is None else commands.base
+    return commands if frozen and not owner.flags.writeable else commands.copy()
 
 
 def _not_finite(twin: Twin, nominal: NDArray, observed: NDArray) -> dict[int, str]:

@@ -202,6 +202,7 @@ def generate(
     commands = case.sampler.sample(
         len(faults), rng=np.random.default_rng(for_commands), onsets=onsets
     )
+    commands.flags.writeable = False  # no twin changes them, so that none needs a copy
     made = twin.simulate(
         commands, faults=faults, seed=int(for_twin.generate_state(1)[0]), progress=progress
     )

@@ -107,7 +107,10 @@ class ResidualModel(Residual):
 
     def distribution(self, features: Tensor) -> Blocks:
         """The distribution q_ψ for features (..., F) of segments, see `describe`."""
-        parts = zip(self.predict(features).widened(self.spread).blocks, self.degrees, strict=True)
+        predicted = self.predict(features)
+        if bool((self.spread != 1).any()):
+            predicted = predicted.widened(self.spread)
+        parts = zip(predicted.blocks, self.degrees, strict=True)
         return Blocks(
             [block if math.isinf(degrees) else Student(block, degrees) for block, degrees in parts]
         )
