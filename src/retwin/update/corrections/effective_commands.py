@@ -7,6 +7,7 @@ from torch import Tensor
 
 from retwin.data.segments import Segments
 from retwin.update.corrections.warp import Knots, gather_samples, interpolate
+from retwin.update.kernels.generation import effective_commands_at
 
 __all__ = ["effective_commands"]
 
@@ -52,6 +53,9 @@ def effective_commands(
         return _one_by_one(reference, segments, z, times, frozen, own_delays)
     if frozen is None:
         return _moving(reference, segments, z, times)
+    made = effective_commands_at(reference, segments, z, times, frozen)
+    if made is not None:
+        return made
     since = frozen.to(z.dtype)
     moving = _moving(reference, segments, z, torch.cat([times, since], dim=1))
     free, stopped = moving.split([times.shape[1], reference.shape[2]], dim=1)

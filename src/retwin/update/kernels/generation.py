@@ -21,7 +21,15 @@ from retwin.data.segments import Segments
 from retwin.twins.compiled.kernel import call, compiled
 from retwin.update.piecewise_linear import TOLERANCE
 
-__all__ = ["along_pieces", "at_effective_commands", "delayed_path", "joined_samples", "library"]
+__all__ = [
+    "along_pieces",
+    "at_effective_commands",
+    "delayed_path",
+    "effective_commands_at",
+    "joined_samples",
+    "library",
+    "outputs_and_jacobians",
+]
 
 SOURCES = ("network.c", "pieces.c", "warp.c")
 OUTPUTS = 6
@@ -64,9 +72,41 @@ def at_effective_commands(
     n, steps, _ = reference.shape
     out = np.empty((n, when.shape[1], len(packed[2])), np.float32)
     size = reference.abs().amax(dim=0).amax(dim=0).double().numpy()
-    rows = (_floats(reference), *_times(segments), _floats(z), _whole(frozen), _whole(when), out)
+    rows = (_floats(reference), *_times(segments), _floats(z), _doubles(frozen), _doubles(when), out)
     sizes = (n, steps, segments.max_count, when.shape[1])
     call(kernel, "executed", sizes, 0.0, (*packed[:2], size), rows)
+    return torch.from_numpy(out)
+
+
+def outputs_and_jacobians(surrogate: Any, commands: Tensor) -> tuple[Tensor, Tensor] | None:
+    """The outputs (k, d_y) for commands (k, d_u), and their Jacobians (k, d_y, d_u)."""
+    kernel, packed = library(), _packed(surrogate)
+    if kernel is None or packed is None or not commands.numel():
+        return None
+    shape = len(commands), len(packed[2])
+    outputs = np.empty(shape, np.float32)
+    jacobian = np.empty((*shape, commands.shape[1]), np.float32)
+    call(kernel, "slopes", shape[:1], 0.0, packed[:2], (_floats(commands), outputs, jacobian))
+    return torch.from_numpy(outputs), torch.from_numpy(jacobian)
+
+
+def effective_commands_at(
+    reference: Tensor, segments: Segments, z: Tensor, times: Tensor, frozen: Tensor
+) -> Tensor | None:
+    """The effective commands (n, S, d_u) in double precision; see `effective_commands`."""
+    kernel, tensors = library(), (reference, z, times, frozen)
+    graded = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
+    if kernel is None or graded or z.dtype != torch.float64 or not times.numel():
+        return None
+    if bool((times[:, 1:] < times[:, :-1]).any()):  # the kernel takes times in order
+        return None
+    n, samples = times.shape
+    out = np.empty((n, samples, reference.shape[2]))
+    size = reference.abs().amax(dim=0).amax(dim=0).clamp_min(1e-12)
+    source = np.arange(n) * len(reference) // n
+    rows = (source, *_times(segments), *map(_doubles, (z, frozen, times)), out)
+    sizes = (n, reference.shape[1], segments.max_count, samples, reference.shape[2])
+    call(kernel, "commands", sizes, 0.0, (_doubles(size), _doubles(reference)), rows)
     return torch.from_numpy(out)
 
 
@@ -133,6 +173,10 @@ def _times(segments: Segments) -> tuple[NDArray, NDArray, NDArray]:
 
 def _floats(values: Tensor) -> NDArray:
     return np.ascontiguousarray(values.detach().numpy(), np.float32)
+
+
+def _doubles(values: Tensor) -> NDArray:
+    return np.ascontiguousarray(values.detach().numpy(), np.float64)
 
 
 def _whole(values: Tensor) -> NDArray:

@@ -40,8 +40,8 @@ static network unpacked(const i64 *widths, const float *numbers)
     return net;
 }
 
-/* x / (1 + exp(-x)); exp by a polynomial of the part of the exponent below one half. */
-static inline vector silu(vector x)
+/* 1 / (1 + exp(-x)); exp by a polynomial of the part of the exponent below one half. */
+static inline vector sigmoid(vector x)
 {
     const float magic = 12582912.0f; /* 1.5 * 2^23: the sum's last bits are the nearest integer */
     vector e = -x, one = x * 0.0f + 1.0f;
@@ -57,16 +57,19 @@ static inline vector silu(vector x)
     p = p * r + 0.5f;
     p = p * r * r + r + 1.0f;
     whole exponent = ((whole)shifted - 0x4B400000) << 23;
-    return x / (one + (vector)((whole)p + exponent));
+    return one / (one + (vector)((whole)p + exponent));
 }
 
+enum kind { ACTIVATED, LINEAR, TANGENT }; /* the last without the constant term */
+
 /* Inputs x (in, BLOCK) to outputs y (out, BLOCK), both rounded up to whole groups of OUTPUTS. */
-static void layer(const float *w, i64 in, i64 out, const float *x, float *y, int last)
+static void layer(const float *w, i64 in, i64 out, const float *x, float *y, enum kind kind)
 {
+    float constant = kind == TANGENT ? 0.0f : 1.0f;
     for (i64 j = 0; j < out; j += OUTPUTS, w += OUTPUTS * (in + 1)) {
         vector sum[OUTPUTS][VECTORS];
         for (int o = 0; o < OUTPUTS; o++)
-            for (int k = 0; k < VECTORS; k++) sum[o][k] = (vector){0} + w[OUTPUTS * in + o];
+            for (int k = 0; k < VECTORS; k++) sum[o][k] = (vector){0} + constant * w[OUTPUTS * in + o];
         const float *row = w;
         for (i64 i = 0; i < in; i++, row += OUTPUTS) {
             const vector *value = (const vector *)(x + i * BLOCK);
@@ -75,11 +78,22 @@ static void layer(const float *w, i64 in, i64 out, const float *x, float *y, int
         }
         for (int o = 0; o < OUTPUTS; o++)
             for (int k = 0; k < VECTORS; k++)
-                ((vector *)(y + (j + o) * BLOCK))[k] = last ? sum[o][k] : silu(sum[o][k]);
+                ((vector *)(y + (j + o) * BLOCK))[k] =
+                    kind == ACTIVATED ? sum[o][k] * sigmoid(sum[o][k]) : sum[o][k];
     }
 }
 
 static size_t scratch_bytes(network net) { return 2 * net.widest * BLOCK * sizeof(float) + 64; }
+
+/* Commands in standard units (d_u, BLOCK); the last of fewer than BLOCK is repeated. */
+static void standardised(network net, i64 count, const float *u, float *x)
+{
+    i64 inputs = net.widths[0];
+    for (i64 c = 0; c < inputs; c++)
+        for (i64 k = 0; k < BLOCK; k++)
+            x[c * BLOCK + k] =
+                (u[(k < count ? k : count - 1) * inputs + c] - net.mean[c]) / net.scale[c];
+}
 
 /* Outputs (m, d_y) of commands (m, d_u). */
 static void evaluate(network net, i64 m, const float *u, float *y, void *scratch)
@@ -88,15 +102,11 @@ static void evaluate(network net, i64 m, const float *u, float *y, void *scratch
     i64 inputs = net.widths[0], outputs = net.widths[net.layers];
     for (i64 begin = 0; begin < m; begin += BLOCK) {
         i64 count = m - begin < BLOCK ? m - begin : BLOCK;
-        for (i64 c = 0; c < inputs; c++)
-            for (i64 k = 0; k < BLOCK; k++) {
-                const float *from = u + (begin + (k < count ? k : count - 1)) * inputs;
-                a[c * BLOCK + k] = (from[c] - net.mean[c]) / net.scale[c];
-            }
+        standardised(net, count, u + begin * inputs, a);
         const float *w = net.weights;
         for (i64 l = 0; l < net.layers; l++) {
             i64 in = net.widths[l], out = net.widths[l + 1];
-            layer(w, in, out, a, b, l + 1 == net.layers);
+            layer(w, in, out, a, b, l + 1 == net.layers ? LINEAR : ACTIVATED);
             w += (out + OUTPUTS - 1) / OUTPUTS * OUTPUTS * (in + 1);
             float *other = a;
             a = b;
@@ -109,12 +119,51 @@ static void evaluate(network net, i64 m, const float *u, float *y, void *scratch
     }
 }
 
-EXPORT void rows(i64 m, double unused, const i64 *widths, const float *numbers, const float *u,
-                 float *y)
+/* The derivative of x sigmoid(x) times tangents t (d, widest, BLOCK), and x sigmoid(x) itself. */
+static void activated(i64 out, i64 d, i64 widest, float *x, float *t)
+{
+    for (i64 j = 0; j < out * VECTORS; j++) {
+        vector value = ((vector *)x)[j], share = sigmoid(value), one = value * 0.0f + 1.0f;
+        vector slope = share * (one + value * (one - share));
+        ((vector *)x)[j] = value * share;
+        for (i64 c = 0; c < d; c++) ((vector *)(t + c * widest * BLOCK))[j] *= slope;
+    }
+}
+
+/* Outputs (m, d_y) of commands (m, d_u), and their Jacobians (m, d_y, d_u), in forward mode. */
+EXPORT void slopes(i64 m, double unused, const i64 *widths, const float *numbers, const float *u,
+                   float *y, float *jacobian)
 {
     network net = unpacked(widths, numbers);
-    void *scratch = malloc(scratch_bytes(net));
+    i64 d = net.widths[0], outputs = net.widths[net.layers], size = net.widest * BLOCK;
+    void *scratch = malloc(2 * (1 + d) * size * sizeof(float) + 64);
+    float *a = (float *)(((size_t)scratch + 63) & ~(size_t)63), *b = a + (1 + d) * size;
     (void)unused;
-    evaluate(net, m, u, y, scratch);
+    for (i64 begin = 0; begin < m; begin += BLOCK) {
+        i64 count = m - begin < BLOCK ? m - begin : BLOCK;
+        standardised(net, count, u + begin * d, a);
+        memset(a + size, 0, d * size * sizeof(float));
+        for (i64 c = 0; c < d; c++)
+            for (i64 k = 0; k < BLOCK; k++) a[(1 + c) * size + c * BLOCK + k] = 1.0f / net.scale[c];
+        const float *w = net.weights;
+        for (i64 l = 0; l < net.layers; l++) {
+            i64 in = net.widths[l], out = net.widths[l + 1];
+            i64 padded = (out + OUTPUTS - 1) / OUTPUTS * OUTPUTS;
+            layer(w, in, out, a, b, LINEAR);
+            for (i64 c = 1; c <= d; c++) layer(w, in, out, a + c * size, b + c * size, TANGENT);
+            if (l + 1 < net.layers) activated(padded, d, net.widest, b, b + size);
+            w += padded * (in + 1);
+            float *other = a;
+            a = b;
+            b = other;
+        }
+        for (i64 k = 0; k < count; k++)
+            for (i64 o = 0; o < outputs; o++) {
+                i64 at = (begin + k) * outputs + o;
+                y[at] = a[o * BLOCK + k] * net.out_scale[o] + net.out_mean[o];
+                for (i64 c = 0; c < d; c++)
+                    jacobian[at * d + c] = a[(1 + c) * size + o * BLOCK + k] * net.out_scale[o];
+            }
+    }
     free(scratch);
 }

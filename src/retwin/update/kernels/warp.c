@@ -10,7 +10,7 @@ typedef struct {
 } warp;
 
 static warp warped_time(i64 segments, i64 count, const double *start, const double *settle,
-                        const float *z, i64 width, double *knots)
+                        const double *z, i64 width, double *knots)
 {
     warp w = {segments, count, count ? 2 * count - 1 : 0, start, settle, knots,
               knots + 2 * segments};
@@ -55,14 +55,20 @@ static double source_time(warp w, double t, i64 before, i64 after, double share)
 }
 
 /* A path (T, d) at a fractional sample, held beyond its ends. */
-static void interpolated(const float *path, i64 steps, i64 d, double t, double *out)
+static void interpolated(const double *path, i64 steps, i64 d, double t, double *out)
 {
     t = t < 0.0 ? 0.0 : t > steps - 1 ? steps - 1 : t;
     i64 below = (i64)t;
     if (below > steps - 2) below = steps > 1 ? steps - 2 : 0;
     double share = t - below;
-    const float *left = path + below * d, *right = steps > 1 ? left + d : left;
-    for (i64 c = 0; c < d; c++) out[c] = left[c] + share * ((double)right[c] - left[c]);
+    const double *left = path + below * d, *right = steps > 1 ? left + d : left;
+    for (i64 c = 0; c < d; c++) out[c] = left[c] + share * (right[c] - left[c]);
+}
+
+static const double *doubled(i64 n, const float *from, double *to)
+{
+    for (i64 k = 0; k < n; k++) to[k] = from[k];
+    return to;
 }
 
 /* The path delayed and offset by z (M, 1 + d), at every sample. */
@@ -70,37 +76,39 @@ EXPORT void delayed(i64 n, i64 steps, i64 segments, i64 d, double unused, const 
                     const double *start, const double *settle, const i64 *count, const float *z,
                     float *out)
 {
-    double *knots = malloc((4 * segments + d) * sizeof(double)), *value = knots + 4 * segments;
+    i64 width = segments * (1 + d);
+    double *knots = malloc((4 * segments + d + width + steps * d) * sizeof(double));
+    double *value = knots + 4 * segments, *own = value + d, *whole_path = own + width;
     (void)unused;
     for (i64 row = 0; row < n; row++, start += segments, settle += segments) {
-        warp w = warped_time(segments, count[row], start, settle, z, 1 + d, knots);
+        doubled(width, z + row * width, own);
+        doubled(steps * d, path + row * steps * d, whole_path);
+        warp w = warped_time(segments, count[row], start, settle, own, 1 + d, knots);
         for (i64 k = 0; k < steps; k++, out += d) {
             i64 before, after;
             double share = between(w, k, &before, &after);
-            interpolated(path, steps, d, source_time(w, k, before, after, share), value);
+            interpolated(whole_path, steps, d, source_time(w, k, before, after, share), value);
             /* A knot has the offset of its segment if it is the settling, of the one before if not. */
             i64 a = (before + 1) / 2 - 1, b = (after + 1) / 2 - 1;
             for (i64 c = 0; c < d; c++) {
-                double left = before ? z[a * (1 + d) + 1 + c] : 0.0;
-                double right = after ? z[b * (1 + d) + 1 + c] : 0.0;
+                double left = before ? own[a * (1 + d) + 1 + c] : 0.0;
+                double right = after ? own[b * (1 + d) + 1 + c] : 0.0;
                 out[c] = (float)(value[c] + left + share * (right - left));
             }
         }
-        path += steps * d;
-        z += segments * (1 + d);
     }
     free(knots);
 }
 
 typedef struct {
     i64 steps, width;
-    const float *reference;
+    const double *reference;
     const double *size;                  /* (d_u,), the largest command of each actuator */
     double *first, *last, *error;        /* (M, d_u) twice, and (1 + M, d_u) */
 } actuators;
 
 /* Commands at the ends of the segments, and the error of every actuator after each. */
-static void errors(actuators a, warp w, const float *z)
+static void errors(actuators a, warp w, const double *z)
 {
     i64 d = a.width;
     for (i64 c = 0; c < d; c++) a.error[c] = 0.0;
@@ -144,39 +152,75 @@ static void moving(actuators a, warp w, double t, double *out)
     }
 }
 
-/* The network's outputs (n, S, d_y) for the effective commands at the samples `when` (n, S). */
+/* Room for the doubles of one trajectory: knots, ends of the segments, errors, held commands. */
+static i64 doubles_of(i64 segments, i64 d) { return 4 * segments + (3 * segments + 1 + d) * d; }
+
+/* The effective commands (S, d_u) of one trajectory at times (S,), held from `frozen` (d_u,) on. */
+static void effective(actuators a, i64 segments, i64 count, const double *start,
+                      const double *settle, const double *z, const double *frozen, i64 samples,
+                      const double *times, double *room, double *out)
+{
+    i64 d = a.width;
+    double *held = room + 4 * segments + (3 * segments + 1) * d;
+    warp w = warped_time(segments, count, start, settle, z, 1 + 2 * d, room);
+    a.first = room + 4 * segments;
+    a.last = a.first + segments * d;
+    a.error = a.last + segments * d;
+    errors(a, w, z);
+    for (i64 c = 0; c < d; c++)
+        if (frozen[c] <= times[samples - 1]) moving(a, w, frozen[c], held + c * d);
+    for (i64 k = 0; k < samples; k++, out += d) {
+        moving(a, w, times[k], out);
+        for (i64 c = 0; c < d; c++)
+            if (times[k] >= frozen[c]) out[c] = held[c * d + c];
+    }
+}
+
+/* Effective commands (n, S, d_u); row i of the others has row source[i] of the reference. The
+   times of a row are in order. */
+EXPORT void commands(i64 n, i64 steps, i64 segments, i64 samples, i64 d, double unused,
+                     const double *size, const double *reference, const i64 *source,
+                     const double *start, const double *settle, const i64 *count, const double *z,
+                     const double *frozen, const double *times, double *out)
+{
+    double *room = malloc(doubles_of(segments, d) * sizeof(double));
+    (void)unused;
+    for (i64 row = 0; row < n; row++) {
+        actuators a = {steps, d, reference + source[row] * steps * d, size, 0, 0, 0};
+        effective(a, segments, count[row], start + row * segments, settle + row * segments,
+                  z + row * segments * (1 + 2 * d), frozen + row * d, samples,
+                  times + row * samples, room, out + row * samples * d);
+    }
+    free(room);
+}
+
+/* The network's outputs (n, S, d_y) for the effective commands at times `when` (n, S), in order. */
 EXPORT void executed(i64 n, i64 steps, i64 segments, i64 samples, double unused, const i64 *widths,
                      const float *numbers, const double *size, const float *reference,
                      const double *start, const double *settle, const i64 *count, const float *z,
-                     const i64 *frozen, const i64 *when, float *out)
+                     const double *frozen, const double *when, float *out)
 {
     network net = unpacked(widths, numbers);
     i64 d = net.widths[0], outputs = net.widths[net.layers], all = GROUP * samples;
+    i64 width = segments * (1 + 2 * d);
     void *scratch = malloc(scratch_bytes(net));
-    double *doubles = malloc((4 * segments + (3 * segments + 1 + 3 + d) * d) * sizeof(double));
-    double *ends = doubles + 4 * segments, *now = ends + (3 * segments + 1) * d, *held = now + d;
+    double *room = malloc((doubles_of(segments, d) + width + (steps + samples) * d) * sizeof(double));
+    double *own = room + doubles_of(segments, d), *sent = own + width, *now = sent + steps * d;
     float *points = malloc(all * (d + outputs) * sizeof(float)), *values = points + all * d;
     i64 *place = malloc(all * sizeof(i64));
     (void)unused;
     for (i64 done = 0; done < n; done += GROUP) {
         i64 rows = n - done < GROUP ? n - done : GROUP, different = 0;
         for (i64 row = done; row < done + rows; row++) {
-            const float *own = z + row * segments * (1 + 2 * d);
-            warp w = warped_time(segments, count[row], start + row * segments,
-                                 settle + row * segments, own, 1 + 2 * d, doubles);
-            actuators a = {steps, d, reference + row * steps * d, size,
-                           ends, ends + segments * d, ends + 2 * segments * d};
-            errors(a, w, own);
-            for (i64 c = 0; c < d; c++)
-                if (frozen[row * d + c] < steps) moving(a, w, frozen[row * d + c], held + c * d);
+            actuators a = {steps, d, doubled(steps * d, reference + row * steps * d, sent), size,
+                           0, 0, 0};
+            effective(a, segments, count[row], start + row * segments, settle + row * segments,
+                      doubled(width, z + row * width, own), frozen + row * d, samples,
+                      when + row * samples, room, now);
             for (i64 k = 0; k < samples; k++) {
-                i64 at = when[row * samples + k];
                 float *point = points + different * d;
-                moving(a, w, at, now);
-                for (i64 c = 0; c < d; c++)
-                    point[c] = (float)(at < frozen[row * d + c] ? now[c] : held[c * d + c]);
-                int same = k && !memcmp(point, point - d, d * sizeof(float));
-                different += !same;
+                for (i64 c = 0; c < d; c++) point[c] = (float)now[k * d + c];
+                different += !(k && !memcmp(point, point - d, d * sizeof(float)));
                 place[(row - done) * samples + k] = different - 1;
             }
         }
@@ -186,7 +230,7 @@ EXPORT void executed(i64 n, i64 steps, i64 segments, i64 samples, double unused,
     }
     free(place);
     free(points);
-    free(doubles);
+    free(room);
     free(scratch);
 }
 
