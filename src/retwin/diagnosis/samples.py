@@ -24,6 +24,7 @@ class Precise:
     def __init__(self, surrogate: Surrogate) -> None:
         self.memoryless = surrogate.memoryless
         self.predict = surrogate.predict
+        self.single = surrogate  # its derivatives need no double precision
         self.model = copy.deepcopy(surrogate).double()
 
     def __call__(self, commands: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from retwin.update.corrections.correction import Context, DifferentiableTwin
 from retwin.update.corrections.delays import delay_bounds
 from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.warp import gather_samples, interpolate, within
-from retwin.update.kernels.generation import outputs_and_jacobians
+from retwin.update.kernels.generation import jacobians
 from retwin.update.piecewise_linear import distinct
 
 __all__ = ["CommandProblem"]
@@ -367,10 +367,10 @@ class CommandProblem:
     def _by_command(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residual (n, S, d_y), and the surrogate's Jacobian (n, S, d_y, d_u)."""
         different, place = distinct(self.commands(x))
-        made = outputs_and_jacobians(self.surrogate, different)
-        if made is not None:
-            values, slopes = (each[place].double() for each in made)
-            return self.observed - values / self.unit, slopes / self.unit[:, None]
+        slopes = jacobians(self.surrogate, different)
+        if slopes is not None:
+            outputs = self.surrogate(different[None])[0, place].double()
+            return self.observed - outputs / self.unit, slopes[place].double() / self.unit[:, None]
         with torch.enable_grad():
             inputs = different[None].requires_grad_()
             outputs = self.surrogate(inputs)

@@ -26,9 +26,9 @@ __all__ = [
     "at_effective_commands",
     "delayed_path",
     "effective_commands_at",
+    "jacobians",
     "joined_samples",
     "library",
-    "outputs_and_jacobians",
 ]
 
 SOURCES = ("network.c", "pieces.c", "warp.c")
@@ -78,16 +78,20 @@ def at_effective_commands(
     return torch.from_numpy(out)
 
 
-def outputs_and_jacobians(surrogate: Any, commands: Tensor) -> tuple[Tensor, Tensor] | None:
-    """The outputs (k, d_y) for commands (k, d_u), and their Jacobians (k, d_y, d_u)."""
-    kernel, packed = library(), _packed(surrogate)
+def jacobians(surrogate: Any, commands: Tensor) -> Tensor | None:
+    """The Jacobians (k, d_y, d_u) of a surrogate's outputs at commands (k, d_u).
+
+    None depends on the others. Of a surrogate in double precision that has the attribute `single`,
+    these are the derivatives of that one.
+    """
+    kernel, packed = library(), _packed(getattr(surrogate, "single", surrogate))
     if kernel is None or packed is None or not commands.numel():
         return None
     shape = len(commands), len(packed[2])
     outputs = np.empty(shape, np.float32)
-    jacobian = np.empty((*shape, commands.shape[1]), np.float32)
-    call(kernel, "slopes", shape[:1], 0.0, packed[:2], (_floats(commands), outputs, jacobian))
-    return torch.from_numpy(outputs), torch.from_numpy(jacobian)
+    found = np.empty((*shape, commands.shape[1]), np.float32)
+    call(kernel, "slopes", shape[:1], 0.0, packed[:2], (_floats(commands), outputs, found))
+    return torch.from_numpy(found)
 
 
 def effective_commands_at(
