@@ -207,7 +207,8 @@ def extremes(values: NDArray) -> tuple[NDArray, NDArray, NDArray]:
 
 def _reduced(function: np.ufunc, series: NDArray) -> NDArray:
     """The reduction (n, d) of (n, T, d) over time, by halves: numpy's own is many times slower
-    where d is small."""
+    where d is small.
+    """
     while series.shape[1] > 1:
         half = series.shape[1] // 2
         rest = series[:, 2 * half :]

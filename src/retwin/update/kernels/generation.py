@@ -72,7 +72,14 @@ def at_effective_commands(
     n, steps, _ = reference.shape
     out = np.empty((n, when.shape[1], len(packed[2])), np.float32)
     size = reference.abs().amax(dim=0).amax(dim=0).double().numpy()
-    rows = (_floats(reference), *_times(segments), _floats(z), _doubles(frozen), _doubles(when), out)
+    rows = (
+        _floats(reference),
+        *_times(segments),
+        _floats(z),
+        _doubles(frozen),
+        _doubles(when),
+        out,
+    )
     sizes = (n, steps, segments.max_count, when.shape[1])
     call(kernel, "executed", sizes, 0.0, (*packed[:2], size), rows)
     return torch.from_numpy(out)
