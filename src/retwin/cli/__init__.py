@@ -16,7 +16,6 @@ from errno import ENAMETOOLONG
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 from retwin._version import __version__
 from retwin.cli import (
@@ -33,6 +32,7 @@ from retwin.cli import (
     studies,
     twins,
 )
+from retwin.cli.commands import Commands, Group
 from retwin.cli.terminal import (
     BAD_INPUT,
     FAILED,
@@ -53,7 +53,7 @@ from retwin.errors import InputError, place_of
 __all__ = ["app", "main"]
 
 
-class FirstScreen(TyperGroup):
+class FirstScreen(Group):
     """All commands; its help fits into 24 lines of 80."""
 
     def get_params(self, ctx: Any) -> list[Any]:
@@ -64,7 +64,7 @@ class FirstScreen(TyperGroup):
         return params
 
 
-app = typer.Typer(
+app = Commands(
     help="Update digital twins so that they behave like the real machine.",
     cls=FirstScreen,
     no_args_is_help=True,
@@ -97,15 +97,12 @@ app.add_typer(monitor.app, name="monitor")
 
 @app.callback(invoke_without_command=True)
 def options(
-    version: Annotated[
-        bool, typer.Option("--version", metavar="", help="Print the version and exit.")
-    ] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
     quiet: Annotated[
         bool,
         typer.Option(
             "--quiet",
             "-q",
-            metavar="",
             envvar="RETWIN_QUIET",
             show_envvar=False,
             help="No progress, no notes: only results.",

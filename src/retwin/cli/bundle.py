@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from retwin.cli.commands import Commands
 from retwin.cli.diagnose import EMULATED, diagnoses, write_probabilities
 from retwin.cli.options import (
     CaseOption,
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["app"]
 
-app = typer.Typer(
+app = Commands(
     help="Everything that was fitted, in one sealed folder.",
     epilog=example("retwin bundle predict bundle real.mat --case armpi"),
     no_args_is_help=True,

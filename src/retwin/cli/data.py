@@ -11,6 +11,7 @@ import typer
 from rich.table import Table
 
 from retwin.checks import require
+from retwin.cli.commands import Commands
 from retwin.cli.completion import complete_files
 from retwin.cli.options import CaseOption, Json, LogMapping, MaxBytes, Rate, Seed
 from retwin.cli.reading import data_case, read
@@ -30,7 +31,7 @@ __all__ = ["app"]
 SHOWN = 40
 """Signals of a log that are listed."""
 
-app = typer.Typer(
+app = Commands(
     help="Describe, map, convert, split and fetch trajectories.",
     epilog=example("retwin data info real.mat --case armpi"),
     no_args_is_help=True,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from retwin import catalog
 from retwin.checks import require
+from retwin.cli.commands import Commands
 from retwin.cli.completion import one_of
 from retwin.cli.options import CaseOption, Json, LogMapping, MaxBytes, Measured, Probabilities, Seed
 from retwin.cli.reading import case_named, data_case, read, saved, updated_twin
@@ -29,7 +30,7 @@ __all__ = ["EMULATED", "app", "diagnoses", "write_probabilities"]
 
 EMULATED = "These trajectories are EMULATED: no real measurements."
 
-app = typer.Typer(
+app = Commands(
     help="Train a diagnoser, and use it.",
     epilog=example("retwin diagnose predict cnn real.mat --case armpi"),
     no_args_is_help=True,
@@ -94,7 +95,7 @@ def invert(
     ] = None,
     random_onset: Annotated[
         bool,
-        typer.Option("--random-onset", metavar="", help="Infer the onset of stuck motors."),
+        typer.Option("--random-onset", help="Infer the onset of stuck motors."),
     ] = False,
     mapping: LogMapping = None,
     max_bytes: MaxBytes = None,

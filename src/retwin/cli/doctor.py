@@ -84,7 +84,7 @@ class Check:
 def doctor(
     deep: Annotated[
         bool,
-        typer.Option("--deep", metavar="", help="Also load torch and others, which takes seconds."),
+        typer.Option("--deep", help="Also load torch and others, which takes seconds."),
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -150,9 +150,13 @@ def _summary(checks: list[Check]) -> str:
     counts = Counter(check.state for check in checks)
     if counts["broken"]:
         return f"[bold red]{counts['broken']} broken[/]: retwin cannot work like this."
-    besides = [f"{counts[state]} {state}" for state in ("warning", "missing") if counts[state]]
-    more = f" ({', '.join(besides)})" if besides else ""
-    return f"[green]Everything that is needed is here[/]{more}."
+    text = "[green]retwin works on this machine.[/]"
+    absent = [each.name for each in checks if each.state == "missing"]
+    if absent:
+        text += f" Not found, and optional: {', '.join(absent)}."
+    if counts["warning"]:
+        text += f" [yellow]{counts['warning']} warning{'s' * (counts['warning'] > 1)}[/] above."
+    return text
 
 
 def _installation(deep: bool) -> Iterator[Check]:

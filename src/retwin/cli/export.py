@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from retwin.checks import require
+from retwin.cli.commands import Commands
 from retwin.cli.options import Json, OtherCase, Seed
 from retwin.cli.reading import updated_twin
 from retwin.cli.terminal import answer, bar, example, note
@@ -18,7 +19,7 @@ __all__ = ["app"]
 TRAJECTORIES = 256
 """Trajectories of the case's sampler at whose segments z is drawn."""
 
-app = typer.Typer(
+app = Commands(
     help="Take an updated twin to other tools.",
     epilog=example("retwin export fmu model --out twin.fmu"),
     no_args_is_help=True,
@@ -36,7 +37,7 @@ def fmu(
     ] = "2.0",
     source_only: Annotated[
         bool,
-        typer.Option("--source-only", metavar="", help="Write no binary for this machine."),
+        typer.Option("--source-only", help="Write no binary for this machine."),
     ] = False,
     as_json: Json = False,
 ) -> None:

@@ -93,15 +93,12 @@ Density = Annotated[
         autocompletion=one_of(catalog.DENSITIES),
     ),
 ]
-Refine = Annotated[
-    bool, model_option("--refine", metavar="", help="Fine-tune on outputs afterwards.")
-]
+Refine = Annotated[bool, model_option("--refine", help="Fine-tune on outputs afterwards.")]
 
 StateEquations = Annotated[
     bool,
     model_option(
         "--dynamics",
-        metavar="",
         help="Correct the state equations, which are learned first if the twin is no StateTwin.",
     ),
 ]

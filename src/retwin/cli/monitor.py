@@ -17,6 +17,7 @@ import typer
 
 from retwin import catalog
 from retwin.checks import finite, positive, require
+from retwin.cli.commands import Commands
 from retwin.cli.options import Json, MaxBytes, OtherCase
 from retwin.cli.reading import case_named, read, saved
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
@@ -33,7 +34,7 @@ __all__ = ["app"]
 UNEXPLAINED = 0.5
 """Probability from which on it is printed that a cause does not explain all."""
 
-app = typer.Typer(
+app = Commands(
     help="Watch a machine with its corrected twin.",
     epilog=example("retwin monitor replay watch day1.npz"),
     no_args_is_help=True,

@@ -44,7 +44,8 @@ Measured = Annotated[
     Path, typer.Argument(metavar="FILE", help="Trajectories; labels are not needed.")
 ]
 Probabilities = Annotated[
-    Path | None, typer.Option("--out", metavar="FILE", help="CSV file for all probabilities.")
+    Path | None,
+    typer.Option("--out", metavar="FILE", help="CSV file for all probabilities."),
 ]
 PerClass = Annotated[int, typer.Option(metavar="N", help="Trajectories per class.")]
 Rate = Annotated[
@@ -71,6 +72,4 @@ Seed = Annotated[
         callback=lambda seed: whole("--seed", seed, most=MAX_SEED),
     ),
 ]
-Json = Annotated[
-    bool, typer.Option("--json", metavar="", help="Print JSON instead, and nothing else.")
-]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead, and nothing else.")]

@@ -37,7 +37,8 @@ data_option, compared_option = (
 )
 
 StudyFolder = Annotated[
-    Path, typer.Option(metavar="FOLDER", help="Called again, the study goes on there.")
+    Path,
+    typer.Option(metavar="FOLDER", help="Called again, the study goes on there."),
 ]
 RealSet = Annotated[
     Path | None, data_option(metavar="FILE", help="One real set, split into folds.")
@@ -92,16 +93,14 @@ CalibrateOn = Annotated[
     ),
 ]
 RandomOnset = Annotated[
-    bool, compared_option("--random-onset", metavar="", help="Draw the onset of stuck motors.")
+    bool, compared_option("--random-onset", help="Draw the onset of stuck motors.")
 ]
 EncoderNoise = Annotated[
     float, compared_option(metavar="X", help="Noise on frozen joints, in command units.")
 ]
 LearningCurve = Annotated[
     bool,
-    compared_option(
-        "--learning-curve", metavar="", help="Also calibrate on 1, 2, 4, 6 … healthy ones."
-    ),
+    compared_option("--learning-curve", help="Also calibrate on 1, 2, 4, 6 … healthy ones."),
 ]
 Processes = Annotated[
     int | None, typer.Option(metavar="N", help="Jobs at a time; else one per core.")
@@ -173,7 +172,10 @@ def report(
 def demo(
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Else demo/real, or demo/emulated without real data."),
+        typer.Option(
+            metavar="FOLDER",
+            help="Else demo/real, or demo/emulated without real data.",
+        ),
     ] = None,
     runs: Annotated[int, typer.Option(metavar="N", help="Runs.")] = 1,
     seed: Seed = 0,

@@ -12,6 +12,7 @@ from retwin import twins
 from retwin.catalog import CASES, TWINS
 from retwin.checks import require
 from retwin.cli.animate import animate
+from retwin.cli.commands import Commands
 from retwin.cli.completion import complete_faults, complete_twins, one_of
 from retwin.cli.options import Json, MaxBytes, Seed
 from retwin.cli.plans import Scheduler, Workers, carry_out
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = ["app"]
 
-app = typer.Typer(
+app = Commands(
     help="List, describe and simulate twins.",
     epilog=example("retwin twin info armpi"),
     no_args_is_help=True,
@@ -53,7 +54,7 @@ Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Samples per seco
 RAMPS = 5
 """Ramps in a trajectory whose commands no case draws: enough to reach levels far apart."""
 NoMeshes = Annotated[
-    bool, typer.Option("--no-meshes", metavar="", help="Leave out the meshes of a model file.")
+    bool, typer.Option("--no-meshes", help="Leave out the meshes of a model file.")
 ]
 Servos = Annotated[
     list[str] | None,
@@ -180,9 +181,7 @@ def simulate(
     servo: Servos = None,
     no_meshes: NoMeshes = False,
     seed: Seed = 0,
-    clip: Annotated[
-        bool, typer.Option("--clip", metavar="", help="Clip commands to the limits.")
-    ] = False,
+    clip: Annotated[bool, typer.Option("--clip", help="Clip commands to the limits.")] = False,
     workers: Workers = None,
     scheduler: Scheduler = None,
     chunk: Annotated[int, typer.Option(metavar="N", help="Trajectories per chunk.", min=1)] = 256,

@@ -1,0 +1,92 @@
+"""`Commands`: a Typer application whose errors about missing files name the option."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from retwin.errors import InputError
+
+__all__ = ["Commands", "Group"]
+
+GENERIC = ("path", "folder", "file")
+"""Arguments of functions, as which readers name any file."""
+
+Made = TypeVar("Made", bound=Callable[..., Any])
+
+
+class Command(TyperCommand):
+    """A command whose errors about missing files name the option that named the file."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Arguments and options, `--help` among them."""
+        return _without_types(super().get_params(ctx))
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command."""
+        try:
+            return super().invoke(ctx)
+        except InputError as error:
+            named = _naming(error, self.params, ctx.params)
+            if not named:
+                raise
+            raise InputError(
+                named, expected=error.expected, got=error.got, remedy=error.remedy
+            ) from error
+
+
+class Group(TyperGroup):
+    """Commands under one name."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """The options, `--help` among them."""
+        return _without_types(super().get_params(ctx))
+
+
+class Commands(typer.Typer):
+    """An application of such commands."""
+
+    def __init__(self, *, cls: type[TyperGroup] = Group, **settings: Any) -> None:
+        super().__init__(cls=cls, **settings)
+
+    def command(
+        self, name: str | None = None, *, cls: type[TyperCommand] | None = None, **settings: Any
+    ) -> Callable[[Made], Made]:
+        """Add a function as a command."""
+        return super().command(name, cls=cls or Command, **settings)
+
+
+def _without_types(params: list[Any]) -> list[Any]:
+    """The parameters; those that take no value are listed without "<bool>"."""
+    for each in params:
+        if getattr(each, "is_flag", False):
+            each.metavar = ""
+    return params
+
+
+def _naming(error: InputError, params: Iterable[Any], values: Mapping[str, Any]) -> str:
+    """The option or argument that named the missing file of an error; "" if none is missing."""
+    for each in params:
+        option = each.opts[0] if each.param_type_name == "option" else each.metavar or each.name
+        for path in _paths(each, values.get(each.name)):
+            if os.path.exists(path):
+                continue
+            if str(path) in (error.argument, error.argument.strip("'")):
+                return f"{option.strip('[].')} {error.argument}"
+            if error.argument in GENERIC and str(path) in error.got:
+                return str(option.strip("[]."))
+    return ""
+
+
+def _paths(param: Any, value: Any) -> Iterator[Path]:
+    """The paths that were given for a parameter; those of case files are text."""
+    for each in value if isinstance(value, list | tuple) else [value]:
+        if isinstance(each, Path):
+            yield each
+        elif isinstance(each, str) and param.metavar == "CASE" and each.lower().endswith(".toml"):
+            yield Path(each)
