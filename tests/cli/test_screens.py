@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +19,7 @@ from test_readme import check
 import retwin as rt
 from retwin.cli import app
 from retwin.cli.terminal import answer, bar, be_quiet, note, show_warnings, table
+from retwin.progress import FinishedStage
 
 WITHOUT_TABLES = {
     *("data convert", "data split", "data fetch", "twin simulate", "twin animate"),
@@ -172,6 +174,16 @@ def test_a_log_shows_the_progress_of_long_work_only(
     assert lines[0] == "fit: net [1] 20%, 8 s left"
     assert lines[-2:] == ["fit: distribution 0%", "fit: distribution 50%, 20 s left"]
     assert len(lines) == 11
+
+
+def test_finished_stages_stay(on_screen, capsys: pytest.CaptureFixture[str]) -> None:
+    with bar("study") as show:
+        show("surrogate", 0.4)
+        show(FinishedStage("surrogate"), 0.5)
+        show("diagnoses", 0.6)
+    shown = Console().render_str(capsys.readouterr().err).plain
+    assert re.search(r"✓\S* 0:00  surrogate\s*\n", shown)
+    assert "✓ 0:00  diagnoses" not in shown
 
 
 def test_quiet_leaves_out_bars_and_notes(on_screen, capsys: pytest.CaptureFixture[str]) -> None:

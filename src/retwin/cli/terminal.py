@@ -26,6 +26,7 @@ from rich.table import Table
 from rich.text import Text
 
 from retwin.errors import place_of
+from retwin.progress import FinishedStage
 
 __all__ = [
     "BAD_INPUT",
@@ -174,7 +175,8 @@ def bar(what: str) -> Iterator[Callable[[str, float], None]]:
     ------
     callable
         Function of the current step's name and the share that is done. A share smaller than the
-        one before starts a new part of the work, with its own remaining time.
+        one before starts a new part of the work, with its own remaining time. A `FinishedStage`
+        leaves a line with its name and the time since the work began.
 
     """
     console = _stderr()
@@ -197,7 +199,12 @@ def bar(what: str) -> Iterator[Callable[[str, float], None]]:
     ) as bars:
         task = bars.add_task(what, total=1.0)
 
+        begun = time.monotonic()
+
         def show(text: str, share: float) -> None:
+            if isinstance(text, FinishedStage):
+                bars.console.print(_finished(text, time.monotonic() - begun))
+                return
             if share < bars.tasks[task].completed:
                 bars.reset(task, total=1.0)
             described = plain(f"{what}: {text}" if text else what).plain
@@ -212,6 +219,9 @@ def _lines(console: Console, what: str) -> Callable[[str, float], None]:
 
     def show(text: str, share: float) -> None:
         nonlocal since, first, tenth
+        if isinstance(text, FinishedStage):
+            console.print(_finished(text, time.monotonic() - begun), soft_wrap=True)
+            return
         now, before, tenth = time.monotonic(), tenth, int(10 * share)
         if before < 0 or tenth < before:
             since, first = now, share
@@ -222,6 +232,12 @@ def _lines(console: Console, what: str) -> Callable[[str, float], None]:
         console.print(plain(f"{what}: {text} {share:.0%}{after}"), soft_wrap=True)
 
     return show
+
+
+def _finished(stage: str, seconds: float) -> Text:
+    """The line that a finished stage leaves, with the time since the work began."""
+    minutes, rest = divmod(round(seconds), 60)
+    return Text.assemble(("✓", "green"), f" {minutes}:{rest:02d}  ", plain(stage))
 
 
 def _stderr() -> Console:

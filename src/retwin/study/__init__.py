@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from retwin.checks import at_least, finite, require, whole
 from retwin.data.io import load, save
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
+from retwin.progress import Report
 from retwin.results import Results
 from retwin.serialisation.files import sha256, write_atomically
 from retwin.serialisation.identity import identity
@@ -29,6 +30,7 @@ from retwin.serialisation.places import in_use
 from retwin.study.files import Files, Roles
 from retwin.study.plan import StudyPlan
 from retwin.study.pool import run_jobs
+from retwin.study.progress import Stages
 from retwin.study.results import write_results
 from retwin.study.sources import lacking, not_installed
 from retwin.study.work import Work
@@ -36,9 +38,6 @@ from retwin.update.corrected import generate
 from retwin.update.surrogate import MIN_TRAJECTORIES
 
 __all__ = ["StudyData", "StudyPlan", "possible_sources", "run_study"]
-
-Report = Callable[[str, float], None]
-"""Called with the name of the present stage and the share that is done."""
 
 EMULATED_PER_CLASS = 10
 """Emulated trajectories per class where there are no real ones: 90 for the arm, as measured."""
@@ -114,7 +113,8 @@ def run_study(
         The address of a Dask scheduler, whose workers do the jobs in place of processes. `out` is
         a folder that all of them see at the same path.
     report : callable, optional
-        Called with the name of the present stage and the share that is done.
+        Called with the name of the present stage and the share of the whole that is done, which
+        never falls; and with a `retwin.progress.FinishedStage` when a stage is done.
     command : str
         The call of the study, for the provenance.
 
@@ -147,15 +147,19 @@ def run_study(
         _check_free(out, found)
         _check_possible(case, plan)
         work_folder = out / "work"
+        stages = Stages(report)
         if not (work_folder / "roles.json").exists():
-            _prepare(case, plan, data, out, found, report)
+            _prepare(case, plan, data, out, found, stages.prepare)
         roles = Roles.of(json.loads((work_folder / "roles.json").read_text("utf-8")))
         _check_healthy(plan, Files(work_folder).real_data(), roles)
         work = Work(work_folder.resolve(), case, plan, roles)
-        run_jobs(work, workers, report, scheduler)
-        report("scores", 1.0)
-        about, provenance = _about(case, plan, data, digests), {"seed": plan.seed}
-        return write_results(work, out, about=about, provenance={"command": command, **provenance})
+        run_jobs(work, workers, stages, scheduler)
+        stages.prepare("scores", 0.0)
+        about = _about(case, plan, data, digests)
+        provenance: dict[str, Any] = {"command": command, "seed": plan.seed}
+        results = write_results(work, out, about=about, provenance=provenance)
+        stages.finish("scores")
+        return results
 
 
 def _digests(data: StudyData) -> dict[str, dict[str, str]]:

@@ -19,6 +19,7 @@ from retwin.checks import require
 from retwin.jobs import on_cluster
 from retwin.processes import worker_pool
 from retwin.study.files import Job
+from retwin.study.progress import Stages
 from retwin.study.work import Work
 
 __all__ = ["run_jobs"]
@@ -27,12 +28,7 @@ _messages: Any = None
 """Queue to the parent process, set in each worker when it starts."""
 
 
-def run_jobs(
-    work: Work,
-    processes: int,
-    report: Callable[[str, float], None],
-    scheduler: str | None = None,
-) -> None:
+def run_jobs(work: Work, processes: int, stages: Stages, scheduler: str | None = None) -> None:
     """Run all jobs that have no result yet, each when the jobs that it needs are done.
 
     An exception or Ctrl-C ends the workers; results that are finished remain.
@@ -43,8 +39,8 @@ def run_jobs(
         The jobs.
     processes : int
         Number of worker processes, at least 1.
-    report : callable
-        Called with the name of a job and the share of all work that is done.
+    stages : Stages
+        Where progress is reported.
     scheduler : str, optional
         The address of a Dask scheduler, whose workers do the jobs in place of processes. They see
         the folder of the study at the same path.
@@ -60,20 +56,15 @@ def run_jobs(
     missing = [job for job, share in shares.items() if not share]
     if not missing:
         return
+    stages.begin(shares)
     if scheduler is not None:
-
-        def done(job: Job) -> None:
-            shares[job] = 1.0
-            report(str(job), sum(shares.values()) / len(shares))
-
-        report("jobs on the cluster", sum(shares.values()) / len(shares))
         with on_cluster(scheduler, _do_on_cluster, work) as submit:
-            _finish(graph, set(missing), submit, done)
+            _finish(graph, set(missing), submit, lambda job: stages.work(job, 1.0))
         return
     # Spawned, as the workers are.
     messages = multiprocessing.get_context("spawn").Queue()
     stop = threading.Event()
-    listener = threading.Thread(target=_listen, args=(messages, shares, report, stop), daemon=True)
+    listener = threading.Thread(target=_listen, args=(messages, stages, stop), daemon=True)
     listener.start()
     try:
         with worker_pool(min(processes, len(missing)), _start_worker, (messages,)) as pool:
@@ -107,19 +98,14 @@ def _finish(
                 order.done(running.pop(future))
 
 
-def _listen(
-    messages: Any,
-    shares: dict[Job, float],
-    report: Callable[[str, float], None],
-    stop: threading.Event,
-) -> None:
-    while not stop.is_set():
+def _listen(messages: Any, stages: Stages, stop: threading.Event) -> None:
+    """Report what the workers send until all is done, and what they sent last."""
+    while True:
         try:
-            job, share = messages.get(timeout=0.2)
+            stages.work(*messages.get(timeout=0.2))
         except queue.Empty:
-            continue
-        shares[job] = max(shares[job], share)
-        report(str(job), sum(shares.values()) / len(shares))
+            if stop.is_set():
+                return
 
 
 def _start_worker(messages: Any) -> None:

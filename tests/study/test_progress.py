@@ -1,0 +1,57 @@
+"""The progress of a study: one share that never falls, and every stage once when it is done."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from retwin.progress import FinishedStage
+from retwin.study.files import Job
+from retwin.study.progress import Stages
+
+JOBS = [
+    Job("surrogate", 0),
+    Job("residual", 0, 0, "output"),
+    Job("residual", 0, 1, "output"),
+    Job("diagnosis", 0, 0, "ibg_rg"),
+    Job("diagnosis", 0, 1, "ibg_rg"),
+]
+
+
+def reported(*, done: int = 0) -> list[tuple[str, float]]:
+    """What a study reports whose first jobs are done already."""
+    told: list[tuple[str, float]] = []
+    stages = Stages(lambda stage, share: told.append((stage, share)))
+    for share in (0.0, 0.5, 1.0):
+        stages.prepare("twin data", share)
+    stages.prepare("real data", 0.2)
+    stages.begin({job: float(place < done) for place, job in enumerate(JOBS)})
+    for job in JOBS[done:]:
+        for share in (0.0, 0.6, 0.3, 1.0):
+            stages.work(job, share)
+    stages.prepare("scores", 0.0)
+    stages.finish("scores")
+    return told
+
+
+def test_the_share_never_falls_and_jobs_are_almost_all_of_it() -> None:
+    shares = [share for _, share in reported()]
+    assert all(a <= b for a, b in pairwise(shares))
+    assert shares[0] == 0.0
+    assert 0.9 < shares[-1] < 1.0
+
+
+def test_each_stage_ends_once_when_all_runs_and_folds_are_done() -> None:
+    ended = [stage for stage, _ in reported() if isinstance(stage, FinishedStage)]
+    assert len(ended) == len(set(ended)) == 5
+    assert ended[:3] == ["twin data", "surrogate", "residual model: output"]
+    assert ended[3].startswith("diagnoses: ")
+    assert ended[4] == "scores"
+    last = max(i for i, (stage, _) in enumerate(reported()) if stage == "residual model: output")
+    assert sum(stage == "residual model: output" for stage, _ in reported()[:last]) >= 8
+
+
+def test_what_was_done_before_is_not_done_again() -> None:
+    ended = [stage for stage, _ in reported(done=3) if isinstance(stage, FinishedStage)]
+    assert "surrogate" not in ended
+    shares = [share for stage, share in reported(done=3) if stage.startswith("diagnoses")]
+    assert shares[0] > 0.4
