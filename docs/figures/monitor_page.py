@@ -14,10 +14,12 @@ import os
 import secrets
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import quote
 
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Page, sync_playwright
 from style import write
 
 from retwin.monitor.demo import demonstration
@@ -28,8 +30,9 @@ ASSET = "incubator 2"
 AFTER = 3000  # ms after the alarm, so that three minutes of the open lid are seen
 
 
-def photographed(folder: Path) -> bytes:
-    """The page at the first alarm, as PNG."""
+@contextmanager
+def opened(folder: Path, *, height: int = 1000) -> Iterator[tuple[Page, str]]:
+    """A browser's page of that height in pixels, and the address of the demonstration."""
     browser = shutil.which(os.environ.get("RETWIN_BROWSER") or "chromium")
     with (
         listening("127.0.0.1", 0) as bound,
@@ -47,13 +50,19 @@ def photographed(folder: Path) -> bytes:
         sync_playwright() as play,
     ):
         started = play.chromium.launch(executable_path=browser, args=["--no-sandbox"])
-        page = started.new_page(viewport={"width": 1100, "height": 1000}, color_scheme="light")
-        page.goto(f"http://127.0.0.1:{bound.getsockname()[1]}/#/asset/{quote(ASSET)}")
+        size = {"width": 1100, "height": height}
+        page = started.new_page(viewport=size, color_scheme="light")
+        yield page, f"http://127.0.0.1:{bound.getsockname()[1]}/"
+        started.close()
+
+
+def photographed(folder: Path) -> bytes:
+    """The page at the first alarm, as PNG."""
+    with opened(folder) as (page, address):
+        page.goto(f"{address}#/asset/{quote(ASSET)}")
         page.get_by_text("Cause: lid").wait_for(timeout=PATIENCE)
         page.wait_for_timeout(AFTER)
-        made = page.screenshot()
-        started.close()
-    return made
+        return page.screenshot()
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -20,6 +21,7 @@ __all__ = [
     "ORANGE",
     "PINK",
     "RULE",
+    "animation",
     "blank",
     "dress",
     "note",
@@ -68,3 +70,19 @@ def write(name: str, file: io.BytesIO) -> None:
     IMAGES.mkdir(exist_ok=True)
     image = Image.open(file).convert("RGB").quantize(COLOURS)
     image.save(IMAGES / f"{name}.png", optimize=True)
+
+
+def animation(name: str, frames: Sequence[Image.Image], fps: float) -> None:
+    """docs/images/NAME.webp, which repeats; its last frame stays for three seconds."""
+    IMAGES.mkdir(exist_ok=True)
+    durations = [round(1000 / fps)] * (len(frames) - 1) + [3000]
+    first, *rest = frames
+    first.save(
+        IMAGES / f"{name}.webp",
+        save_all=True,
+        append_images=rest,
+        duration=durations,
+        loop=0,
+        quality=60,
+        method=4,
+    )

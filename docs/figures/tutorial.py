@@ -52,7 +52,9 @@ def run(last: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         try:
-            for code in re.findall(r"^```python\n(.*?)^```", PAGE.read_text("utf-8"), re.M | re.S):
+            for code in re.findall(
+                r"^```python[^\n]*\n(.*?)^```", PAGE.read_text("utf-8"), re.M | re.S
+            ):
                 exec(compile(code, str(PAGE), "exec"), names)
                 if last in code:
                     break

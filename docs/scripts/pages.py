@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
+import sys
 from pathlib import Path
 from typing import Any, get_origin
 
@@ -19,6 +20,9 @@ from typer.cli import get_docs_for_click
 import retwin
 from retwin.cli import app
 
+sys.path.insert(0, str(Path(__file__).parent))  # MkDocs runs hooks as single files
+from executing import executed
+
 ROOT = Path(__file__).parents[2]
 OUTSIDE = {
     "CONTRIBUTING.md": "contributing.md",
@@ -27,6 +31,12 @@ OUTSIDE = {
     "tests/testing/crane.xml": "crane.xml",
 }
 """Files and folders outside of docs/ that the site has too, and their names there."""
+EXECUTED = ("tutorial.md",)
+"""Pages whose Python runs when the site is built; the examples of the API do, too."""
+FOLDED = ("results.md",)
+"""Pages whose tables are folded."""
+TABLE = re.compile(r"^\|.*\n(?:\|.*\n?){3,}", re.MULTILINE)
+DETAILS = '<details markdown="1"><summary>Table</summary>\n\n{table}\n\n</details>\n'
 ABOUT_COMMANDS = """
 Results go to stdout; progress, notes, warnings and errors to stderr. `retwin --quiet …`, or
 `RETWIN_QUIET=1` in the environment, leaves out progress and notes. Where a command prints a table,
@@ -60,12 +70,20 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Links that lead out of docs/, or into it from outside, stay within the site."""
+    """Links stay within the site, examples are executed, and long tables are folded."""
     for path, name in OUTSIDE.items():
         markdown = markdown.replace(f"](../{path})", f"]({name})")
     if page.file.src_uri in OUTSIDE.values():
         markdown = re.sub(r"\]\(docs/", "](", markdown)
-    return markdown
+    name = page.file.src_uri
+    if name in EXECUTED or name.startswith("api/"):
+        markdown = executed(markdown, re.sub(r"\W", "_", name))
+    return folded(markdown) if name in FOLDED else markdown
+
+
+def folded(markdown: str) -> str:
+    """The page with its tables folded, so that its figures come first."""
+    return TABLE.sub(lambda found: DETAILS.format(table=found[0]), markdown)
 
 
 def listing(folder: Path) -> str:
@@ -130,6 +148,9 @@ def overview() -> str:
 def reference(room: str) -> str:
     """The page of one room."""
     lines = [f"# retwin.{room}", "", *_first(_module(room)), ""]
+    example = ROOT / "docs" / "examples" / f"{room}.md"
+    if example.exists():
+        lines += ["## Examples", "", example.read_text("utf-8"), ""]
     for name in modules()[room]:
         lines += [f"::: {_path(name)}", "    options:", f"      heading: {_shown(name)}", ""]
     return "\n".join(lines)
