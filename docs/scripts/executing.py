@@ -39,7 +39,10 @@ def executed(markdown: str, session: str) -> str:
     def marked(found: re.Match[str]) -> str:
         code = found[1]
         marks = f'session="{session}" workdir="{folder.name}"'
-        parts = [f'```python exec="on" source="above" result="text" {marks}\n{code}```\n']
+        if "print(" in code:
+            parts = [f'```python exec="on" source="above" result="text" {marks}\n{code}```\n']
+        else:  # without a box for what it prints
+            parts = [found[0], f'\n```python exec="on" {marks}\n{code}```\n']
         for name in SAVED.findall(code):
             shown = SHOW.format(name=name)
             parts.append(f'\n```python exec="on" html="on" {marks}\n{shown}```\n')
