@@ -56,11 +56,11 @@ def faults() -> None:
     """The same commands, healthy and with six faults."""
     shown = (
         ("actuator stuck from 2 s", twins.Stuck(0, onset=2.0)),
-        ("actuator at 60 %", twins.ActuatorGain(0, size=(0.6, 0.6))),
+        ("actuator at 60 %", twins.ActuatorGain(0, size=(-0.4, -0.4))),
         ("sensor bias", twins.SensorBias(0, size=(0.4, 0.4))),
         ("sensor drift from 2 s", twins.SensorDrift(0, onset=2.0, size=(0.2, 0.2))),
         ("sensor frozen from 2 s", twins.SensorFreeze(0, onset=2.0)),
-        ("time constant doubled", twins.ParameterShift("time constant", size=(2.0, 2.0))),
+        ("time constant doubled", twins.ParameterShift("time constant", size=(0.2, 0.2))),
     )
     given = commands(1, 4).repeat(len(shown), axis=0)
     made = motor().simulate(given, faults=[fault for _, fault in shown], seed=0)

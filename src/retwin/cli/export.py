@@ -73,7 +73,7 @@ def actuator(
     ] = None,
     draws: Annotated[int, typer.Option(metavar="N", help="Draws of the discrepancy.")] = 16384,
     torchscript_only: Annotated[
-        bool, typer.Option("--torchscript-only", metavar="", help="Write no ONNX graph.")
+        bool, typer.Option("--torchscript-only", help="Write no ONNX graph.")
     ] = False,
     case: OtherCase = None,
     seed: Seed = 0,
