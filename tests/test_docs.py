@@ -207,6 +207,18 @@ def test_the_site_needs_no_network(site: Path) -> None:
 
 
 @pytest.mark.slow
+def test_search_equations_and_outputs_are_in_the_site(site: Path) -> None:
+    assert "var __index" in (site / "search" / "search_index.js").read_text("utf-8")[:20]
+    assert (site / "katex" / "katex.min.js").exists()
+    theory = (site / "theory.html").read_text("utf-8")
+    assert all(rf"\tag{{{number}}}" in theory for number in range(1, 12))
+    tutorial = (site / "tutorial.html").read_text("utf-8")
+    assert "coverage90: 0." in tutorial
+    assert "data:image/png;base64," in tutorial
+    assert "<summary>Table</summary>" in (site / "results.html").read_text("utf-8")
+
+
+@pytest.mark.slow
 def test_the_references_are_whole(site: Path) -> None:
     names = "".join(page.read_text("utf-8") for page in (site / "api").glob("*.html"))
     missing = [name for name in rt.__all__ if f"retwin.{name}" not in names and name[0] != "_"]
