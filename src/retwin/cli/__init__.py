@@ -52,15 +52,18 @@ from retwin.errors import InputError, place_of
 
 __all__ = ["app", "main"]
 
+UNSHOWN = ("quiet", "help", "install_completion", "show_completion")
+"""Options for which the first screen has no line."""
+
 
 class FirstScreen(Group):
     """All commands; its help fits into 24 lines of 80."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """The options; those that Typer adds are in the documentation."""
+        """The options; --quiet and those that Typer adds are in the documentation."""
         params: list[Any] = [*super().get_params(ctx)]
         for each in params:
-            each.hidden = each.name in ("help", "install_completion", "show_completion")
+            each.hidden = each.name in UNSHOWN
         return params
 
 
