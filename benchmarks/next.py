@@ -51,7 +51,9 @@ def stretched(commands: np.ndarray) -> np.ndarray:
     return (first + room.min(axis=0).clip(1)[:, None] * moved).astype(commands.dtype)
 
 
-def best(known: ActuatorKnowledge, way: str, candidates: np.ndarray, references: np.ndarray):
+def best(
+    known: ActuatorKnowledge, way: str, candidates: np.ndarray, references: np.ndarray
+) -> np.ndarray:
     """The next trajectories."""
     if way == "random":
         return candidates[:BATCH]
