@@ -15,6 +15,7 @@ from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.experiments.actuators import ActuatorKnowledge
 from retwin.evaluation.experiments.segments import SegmentKnowledge
 from retwin.inference.design import Knowledge, chosen
+from retwin.nets.student import widening
 from retwin.progress import Progress
 from retwin.twins.samplers import CommandSampler
 from retwin.twins.twin import checked_seed
@@ -193,9 +194,12 @@ def next_experiments(
     picked, after = chosen(now, roots, max(count, min(FURTHER, candidates)))
     every = [now, *after]
     walks = [_walk(now, roots, rng, len(every) - 1) for _ in range(RANDOM)]
+    # The scatter too is estimated from few trajectories.
+    unsure = _widenings(twin, len(healthy), len(every))
     random = np.array([[each.excess for each in walk] for walk in walks])
+    random = (1 + random) * unsure - 1
     gains = [_gain(*pair) for pair in pairwise(every)]
-    excess = np.array([each.excess for each in every])
+    excess = (1 + np.array([each.excess for each in every])) * unsure - 1
     return Proposal(
         commands=drawn[picked[:count]],
         gains=tuple(gains[:count]),
@@ -232,6 +236,13 @@ def _check(twin: object, sampler: CommandSampler, count: int, candidates: int) -
         got=f"{sampler.rate:g} Hz",
         remedy="give the sampler of the case that the twin was fitted for",
     )
+
+
+def _widenings(twin: CorrectedTwin, trajectories: int, count: int) -> NDArray:
+    """(count,) factors of bands since the scatter is estimated, from so many trajectories on."""
+    degrees = min(twin.residual.degrees)
+    total = trajectories + np.arange(count)
+    return np.array([widening(degrees * each / trajectories) for each in total])
 
 
 def _walk(
