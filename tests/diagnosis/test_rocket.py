@@ -12,9 +12,12 @@ from retwin.diagnosis import RocketDiagnoser
 from retwin.testing import check_diagnoser
 
 # Not imported, which takes seconds in every worker.
-pytestmark = pytest.mark.skipif(
-    not (find_spec("numba") and find_spec("sktime")), reason="needs retwin[rocket]"
-)
+pytestmark = [
+    pytest.mark.slow,  # sktime compiles for most of a minute
+    pytest.mark.skipif(
+        not (find_spec("numba") and find_spec("sktime")), reason="needs retwin[rocket]"
+    ),
+]
 
 SMALL = rt.Rocket(504)
 

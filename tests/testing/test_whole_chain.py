@@ -304,6 +304,7 @@ def test_padding_changes_no_discrepancy(short: Toy) -> None:
         torch.testing.assert_close(means, theirs, atol=1e-6, rtol=1e-6, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_padding_changes_no_likelihood(short: Toy) -> None:
     """What the RG learns, and how likely it calls what it learned from, stay what they were."""
     record = lossy(short.measured(3), seed=4)

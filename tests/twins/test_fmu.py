@@ -214,6 +214,7 @@ TROUBLES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_run_that_fails_ends_alone(lag: Path, workers: int) -> None:
     twin = FMUTwin.from_file(lag, RATE, ["u", "trouble"], ["x"], timeout=1.5, workers=workers)

@@ -49,6 +49,7 @@ def test_the_case_can_be_sent_to_another_process(case: rt.Case) -> None:
     assert own.observed.tobytes() == sent.observed.tobytes()
 
 
+@pytest.mark.slow
 def test_random_onset_is_an_option(case: rt.Case) -> None:
     made = rt.generate(case.twin, case.with_random_onset(), per_class=60, seed=0)
     stuck = made.with_label("Motor_1_Stuck").observed

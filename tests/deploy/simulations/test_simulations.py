@@ -192,6 +192,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_killed_and_resumed(tmp_path: Path, whole: dict[str, Any]) -> None:
     folder, target = clean(whole), tmp_path / "a.zarr"
     script = SCRIPT.format(tests=str(Path(__file__).parent), calls=str(folder), target=str(target))

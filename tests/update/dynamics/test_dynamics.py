@@ -100,6 +100,7 @@ def test_the_learned_curve_is_the_missing_one(fitted: FittedDynamics) -> None:
     assert np.abs(here - wanted).max() < 0.05 * np.ptp(wanted)
 
 
+@pytest.mark.slow
 def test_a_true_parameter_shift_is_not_explained_by_the_discrepancy() -> None:
     shifted = record(stiffness=55.0, damping=1.5, cubic=0.0)
     found = fit_dynamics(LINEAR, shifted)
@@ -144,6 +145,7 @@ def noisy() -> FittedDynamics:
     return fit_dynamics(LINEAR, with_process_noise(0), Dynamics(Library(degree=2, knots=())))
 
 
+@pytest.mark.slow
 def test_process_and_measurement_noise_are_separated(noisy: FittedDynamics) -> None:
     assert np.sqrt(noisy.twin.process) == pytest.approx([0.0, 0.01], rel=0.25)
     assert np.sqrt(noisy.twin.noise) == pytest.approx([NOISE], rel=0.35)

@@ -57,6 +57,7 @@ def test_a_twin_whose_parameters_explain_every_term_is_fitted() -> None:
     assert is_finite(found.twin)
 
 
+@pytest.mark.slow
 def test_an_exact_twin_and_exact_outputs_have_finite_bands() -> None:
     twin = lag(lambda x, u, p: (u.u - p.rate * x.x,), Parameter("rate", "1/s", 0.1, 9.0, 2.0))
     record = measured(twin, deviation=0.0)
@@ -93,6 +94,7 @@ def test_an_output_that_was_never_measured_is_refused() -> None:
         fit_dynamics(twin, record.replace(mask=mask), QUICK)
 
 
+@pytest.mark.slow
 def test_a_start_at_its_bound_is_a_warning() -> None:
     def slope(x, u):
         return (u.u - 2 * x.x,)

@@ -159,6 +159,7 @@ def drifting() -> rt.Trajectories:
     return observed.replace(observed=observed.observed + error)
 
 
+@pytest.mark.slow
 def test_misspecification_is_reported_and_explained_by_a_discrepancy() -> None:
     observed = drifting()
     with pytest.warns(UserWarning, match="misspecified"):
@@ -183,6 +184,7 @@ def test_bands_of_the_updated_twin_hold_held_out_trajectories() -> None:
     assert inside.mean() == pytest.approx(0.9, abs=0.04)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_draws_from_the_prior_can_be_all_simulations(observed: rt.Trajectories) -> None:
     method = NPE(simulations=50, rounds=1, samples=100, max_epochs=1, noise=WHITE)

@@ -97,6 +97,7 @@ def outputs_inside(twin: rt.Surrogate, model: rt.ResidualModel, test: rt.Traject
     return float(held[:, STEPS:].mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("persistence", [0.0, pytest.param(0.7, marks=pytest.mark.slow)])
 def test_intervals_from_two_trajectories_hold(twin: rt.Surrogate, persistence: float) -> None:
     """90 % intervals hold 0.92 of z on average over calibration sets, 0.95 of those that persist.
@@ -167,6 +168,7 @@ def test_persistence_is_found_from_four_trajectories(twin: rt.Surrogate) -> None
     assert found[0.0] < 0.35
 
 
+@pytest.mark.slow
 def test_one_trajectory_and_one_segment_give_a_wide_distribution(twin: rt.Surrogate) -> None:
     machine = Machine(twin, 0.5)
     one = machine.fitted(1, 0)

@@ -216,16 +216,19 @@ def _between_samples(
         except InputError:  # its simulation is not finite
             continue
         before, after = (_errors(each, best[0], parts) for each in (best[1], found[1]))
-        if wilcoxon(before - after, alternative="greater").pvalue < CHANCE:
+        gain = before - after
+        if gain.any() and wilcoxon(gain, alternative="greater").pvalue < CHANCE:
             best = found
     return best
 
 
 def _errors(found: Linearised, estimation: Estimation, parts: Sequence[NDArray]) -> NDArray:
     """Logarithm of the squared error of each part; the estimation gives the scale of outputs."""
-    scaled = np.where(estimation.seen, found.residual, 0.0) / np.sqrt(estimation.variance)
-    sums = np.array([np.sum(scaled[part] ** 2) for part in parts])
-    made: NDArray = np.log(np.maximum(sums, np.finfo(float).tiny))
+    smallest = np.finfo(float).tiny  # of an output that the twin explains exactly
+    squares = np.where(estimation.seen, found.residual, 0.0) ** 2
+    scaled = squares / np.maximum(estimation.variance, smallest)
+    sums = np.array([np.sum(scaled[part]) for part in parts])
+    made: NDArray = np.log(np.maximum(sums, smallest))
     return made
 
 
