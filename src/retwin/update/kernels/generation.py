@@ -39,9 +39,13 @@ DENSITY = 3.0
 found out, and cost a second evaluation. With 3 the default network of the arm takes least time."""
 
 
-@lru_cache(maxsize=1)
 def library() -> ctypes.CDLL | None:
-    """The compiled kernels; None without a C compiler."""
+    """The compiled kernels; None without a C compiler, and where torch traces a graph."""
+    return None if torch.compiler.is_compiling() or torch.jit.is_tracing() else _library()
+
+
+@lru_cache(maxsize=1)
+def _library() -> ctypes.CDLL | None:
     folder = files("retwin.update.kernels")
     source = "".join((folder / name).read_text("utf-8") for name in SOURCES)
     return compiled(source, contract=True, quiet=True)
@@ -179,7 +183,7 @@ def _times(segments: Segments) -> tuple[NDArray, NDArray, NDArray]:
     """Starts and settle times (n, M), and the number (n,) of segments."""
     ends = (np.ascontiguousarray(each, np.float64) for each in (segments.start, segments.settle))
     start, settle = ends
-    return start, settle, segments.valid.sum(axis=1).astype(np.int64)
+    return start, settle, np.asarray(segments.valid).sum(axis=1).astype(np.int64)
 
 
 def _floats(values: Tensor) -> NDArray:

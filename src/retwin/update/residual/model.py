@@ -108,7 +108,8 @@ class ResidualModel(Residual):
     def distribution(self, features: Tensor) -> Blocks:
         """The distribution q_ψ for features (..., F) of segments, see `describe`."""
         predicted = self.predict(features)
-        if bool((self.spread != 1).any()):
+        # A graph that is exported has no branches that depend on values.
+        if torch.compiler.is_compiling() or bool((self.spread != 1).any()):
             predicted = predicted.widened(self.spread)
         parts = zip(predicted.blocks, self.degrees, strict=True)
         return Blocks(
