@@ -221,6 +221,24 @@ def test_a_log_is_mapped_drawn_and_described(bench, call):
     assert "linear" in out
 
 
+def test_a_log_is_mapped_to_the_channels_of_a_twin(bench, call):
+    robot = bench.with_name("robot.xml")
+    robot.write_text(
+        """<mujoco><worldbody><body><joint name="lift" type="slide"/><geom size="1"/></body>
+        </worldbody><actuator><motor name="pump" joint="lift"/></actuator>
+        <sensor><jointpos name="level" joint="lift"/></sensor></mujoco>"""
+    )
+    words = ("data", "map", str(bench), "--out", str(bench.with_name("m.toml")), "--case")
+    code, out, err = call(*words, str(robot), "--json")
+    assert code == 0, err
+    made = json.loads(out)
+    assert (made["channels"], made["open"]) == ({"pump_cmd": "pump", "level": "level"}, [])
+    assert "rate = 50.0" in bench.with_name("m.toml").read_text("utf-8")
+    code, _, err = call(*words, str(robot.with_name("other.xml")))
+    assert code == 2
+    assert "no file of that name" in err
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [

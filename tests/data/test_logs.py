@@ -14,6 +14,7 @@ import pytest
 from log_files import BEGIN, COUNT, HEATER, RATE, SPEED, SPEEDS, TIMES, mcap, ros2_bag
 
 import retwin as rt
+from retwin.cases.twin_data import TwinData
 from retwin.data import Provenance, load, propose_mapping, read_mapping, save
 from retwin.data.logs import text_tables
 from retwin.data.logs.channels import in_order
@@ -390,6 +391,38 @@ def test_identification_reads_a_log_by_its_mapping(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.trajectories.observed[0, seen, 0], expected[seen], atol=1e-9)
     assert "log's 2.99 s are in trajectories" in found.notes[0]
     assert not any("nominal" in note for note in found.notes)
+
+
+def test_a_proposal_for_a_twin_has_the_rate_of_the_log_and_the_units_of_the_twin(
+    tmp_path: Path,
+) -> None:
+    at = np.arange(0, 5, 0.02002)  # a clock that is slow by 0.1 %
+    rows = [f"{t:.5f},{t:g},{60 * t:.5f},{-t:g}" for t in at]
+    (tmp_path / "run.csv").write_text("\n".join(["time,motor/cmd,speed [rpm],other", *rows]))
+    twin = TwinData(
+        rt.Channels(("voltage",), ("V",)), rt.Channels(("speed", "current"), ("rad/s", "A"))
+    )
+    proposal = propose_mapping(tmp_path / "run.csv", case=twin)
+    assert proposal.open_channels == ("current",)
+    # The only command that is left, and the only signal that is named like one.
+    assert proposal.channels == {"motor/cmd": "voltage", "speed": "speed"}
+    head, open_table = proposal.text.split('[outputs."current"]')
+    assert "rate = 50.0" in head
+    assert "or delete this table" in open_table
+    (tmp_path / "m.toml").write_text(head)
+    made = load(tmp_path / "run.csv", mapping=tmp_path / "m.toml")  # as identify does: no case
+    assert made.inputs == twin.inputs
+    assert made.outputs == rt.Channels(("speed",), ("rad/s",))
+    np.testing.assert_allclose(
+        made.observed[0, :200, 0], 2 * np.pi * np.arange(200) / 50, atol=1e-3
+    )
+
+
+def test_a_command_of_another_unit_is_not_taken_for_the_one_that_is_left(tmp_path: Path) -> None:
+    rows = [f"{t},{t},{-t}" for t in range(50)]
+    (tmp_path / "run.csv").write_text("\n".join(["time,valve_cmd [K],level", *rows]))
+    twin = TwinData(rt.Channels(("voltage",), ("V",)), rt.Channels(("level",), ("m",)))
+    assert propose_mapping(tmp_path / "run.csv", case=twin).open_channels == ("voltage",)
 
 
 @pytest.mark.slow

@@ -396,7 +396,10 @@ def _matched(
         expected=f"the commands {', '.join(twin.inputs.names)} and at least one of the outputs "
         f"{', '.join(twin.outputs.names)}",
         got=f"commands {found.inputs}, outputs {found.outputs}",
-        remedy="give --column CHANNEL=NAME for channels that have another name in the log",
+        remedy="give --column CHANNEL=NAME for channels that have another name in the log"
+        if columns.mapping is None
+        else "rename the tables of the mapping, or have it proposed for the twin: retwin data map "
+        "LOG --case plant.fmu",
     )
     shape = (*found.observed.shape[:2], len(outputs))
     observed, mask = np.zeros(shape), np.zeros(shape, dtype=bool)

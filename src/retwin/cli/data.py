@@ -13,7 +13,7 @@ from rich.table import Table
 from retwin.checks import require
 from retwin.cli.commands import Commands
 from retwin.cli.completion import complete_files
-from retwin.cli.options import CaseOption, Json, LogMapping, MaxBytes, Rate, Seed
+from retwin.cli.options import CaseOption, Json, LogMapping, MaxBytes, Rate, Seed, case_option
 from retwin.cli.reading import data_case, read
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data import download
@@ -71,7 +71,9 @@ def map_log(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="New mapping.toml; its picture beside.")
     ],
-    case: CaseOption = None,
+    case: Annotated[
+        str | None, case_option(help="Case or twin with the channels: case.toml, plant.fmu, …")
+    ] = None,
     time: Annotated[
         str, typer.Option("--time", metavar="COLUMN", help="Column of the times, if not found.")
     ] = "",
@@ -83,6 +85,7 @@ def map_log(
     as_json: Json = False,
 ) -> None:
     """Propose what a log's signals stand for, and draw it with the trajectories they make."""
+    from retwin.cases.twin_data import log_case
     from retwin.data.logs.mapping import TimeSettings
     from retwin.data.logs.proposal import propose_mapping
     from retwin.report.log_picture import log_picture
@@ -99,7 +102,7 @@ def map_log(
         check_place(place)
     if rate is not None:
         rate = sample_rate("--rate", rate)
-    system = data_case(case)
+    system = None if case is None else log_case(case)
     with bar("map") as show:
         made = propose_mapping(
             log,

@@ -26,6 +26,7 @@ __all__ = [
     "Rate",
     "Real",
     "Seed",
+    "case_option",
 ]
 
 CASE = "Built-in case, case.toml, or module:object."

@@ -7,7 +7,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -47,6 +47,8 @@ LATE = 60.0
 """Median time in s from stamp to recording at which the stamps are those of another clock."""
 PAUSE, PAUSE_PERIODS = 1.0, 20.0
 """The shortest pause in s, and in sample periods, between two trajectories."""
+JITTER = 0.005
+"""Relative difference up to which a measured rate stands for one of two digits."""
 SCHEMA = "https://retwin.readthedocs.io/mapping.schema.json"
 
 
@@ -128,7 +130,7 @@ def propose_mapping(
     path : path
         A log of one of the formats in `catalog.LOGS`.
     case : DataCase, optional
-        Its channels and sample rate are those of the mapping.
+        Its channels and sample rate are those of the mapping; with rate 0 that of the log is.
     time : TimeSettings, optional
         Where the times are, if they are not found.
     progress : callable, optional
@@ -154,9 +156,16 @@ def propose_mapping(
     if progress is not None:
         progress(0.5)
     proposal = proposed(log, time, case=case)
-    if log_format(path) in STAMPED and time.stamps == "log" and proposal.mapping is not None:
+    mapping = proposal.mapping
+    if log_format(path) in STAMPED and time.stamps == "log":
         stamped = time.model_copy(update={"stamps": "header"})
-        other = _stamped(path, proposal, stamped, Budget(path.name, limit))
+        # Where a signal is still to be named, it may be any that changes.
+        names: Collection[str] = (
+            mapping.signals
+            if mapping is not None and not proposal.open_channels
+            else [each.name for each in proposal.facts if _moves(each)]
+        )
+        other = _stamped(path, proposal, names, stamped, Budget(path.name, limit))
         if other is not None:
             made = proposed(log, stamped, case=case, delay=other[1])
             proposal = replace(made, log=other[0])
@@ -164,13 +173,11 @@ def propose_mapping(
 
 
 def _stamped(
-    path: Path, proposal: Proposal, stamped: TimeSettings, budget: Budget
+    path: Path, proposal: Proposal, names: Collection[str], stamped: TimeSettings, budget: Budget
 ) -> tuple[Log, float] | None:
-    """The signals of a mapping at the stamps of their headers, and the median time in s from there
+    """Signals at the stamps of their headers, and the median time in s from there
     to the recording; None if the stamps are of no use.
     """
-    assert proposal.mapping is not None
-    names = proposal.mapping.signals
     try:
         other = read_log(path, wanted=names, clock=stamped.clock, budget=budget)
         for name in names:
@@ -243,9 +250,7 @@ def proposed(
 
     """
     facts = facts_of(log)
-    moving = [
-        each for each in facts if not each.constant and each.rate and not OVERHEAD.search(each.name)
-    ]
+    moving = [each for each in facts if _moves(each)]
     if not moving:
         raise InputError(
             log.name,
@@ -255,11 +260,17 @@ def proposed(
         )
     chosen = _by_name(moving) if case is None else _for_case(moving, case)
     used = [fact for table in chosen.values() for fact in table.values() if fact is not None]
-    rate = case.rate if case is not None else _round(np.median([each.rate for each in used]))
+    rate = case.rate if case is not None else 0.0
+    # Signals that are not chosen yet may be the faster ones.
+    known = used if all(all(table.values()) for table in chosen.values()) else moving
+    rate = rate or _plain(float(np.median([each.rate for each in known])))
     cut = _cut([log.signals[each.name] for each in used], 1 / rate)
+    units = _units(case)
     tables = {
         name: {
-            channel: _channel(fact, log.signals[fact.name], name, rate, cut)
+            channel: _channel(fact, log.signals[fact.name], name, rate, cut).model_copy(
+                update={"unit": units.get(channel)}
+            )
             for channel, fact in table.items()
             if fact
         }
@@ -282,8 +293,19 @@ def proposed(
     return Proposal(log, text, mapping, tuple(facts), channels, unknown)
 
 
+def _moves(fact: Fact) -> bool:
+    """Whether a signal may be a channel: it changes, and does not describe the log."""
+    return not fact.constant and fact.rate > 0 and not OVERHEAD.search(fact.name)
+
+
 def _round(value: float) -> float:
     return float(f"{float(value):.3g}")
+
+
+def _plain(rate: float) -> float:
+    """A measured rate without the jitter of its times: 50 for 49.95."""
+    plain = float(f"{rate:.2g}")
+    return plain if abs(plain / rate - 1) < JITTER else _round(rate)
 
 
 Chosen = dict[str, dict[str, "Fact | None"]]
@@ -320,7 +342,20 @@ def _for_case(moving: Sequence[Fact], case: DataCase) -> Chosen:
         if score >= ALIKE and chosen[table][name] is None and fact.name not in taken:
             chosen[table][name] = fact
             taken.add(fact.name)
+    # Where one command is left and one signal that is named like a command, they are a pair.
+    left = [name for name, fact in chosen["commands"].items() if fact is None]
+    units = _units(case)
+    marked = [
+        each for each in moving if each.name not in taken and COMMAND.search(each.name.lower())
+    ]
+    if len(left) == len(marked) == 1 and _may_be(marked[0].unit, units.get(left[0], "")):
+        chosen["commands"][left[0]] = marked[0]
     return chosen
+
+
+def _may_be(unit: str, wanted: str) -> bool:
+    """Whether values in a unit, perhaps unknown, can be those of a channel."""
+    return not unit or not wanted or compatible(unit, wanted)
 
 
 def _alike(name: str, unit: str, fact: Fact, *, command: bool) -> float:
@@ -408,14 +443,14 @@ def _text(
         for name, fact in chosen[table].items():
             lines += ["", f"[{table}.{_quoted(name)}]"]
             if fact is None:
-                lines += [
-                    'signal = "" # none has such a name: choose one of those below',
-                ]
+                # The outputs that a mapping lacks are not compared by identify.
+                more = ", or delete this table" if _spare(case, table) else ""
+                lines += [f'signal = "" # none has such a name: choose one of those below{more}']
+                lines += _units_wanted(name, "", case)
                 continue
             own = tables[table][name]
             lines += [f"# {_seen(fact)}", f"signal = {_quoted(fact.name)}"]
-            if not fact.unit:
-                lines += [_unit_wanted(name, case)]
+            lines += _units_wanted(name, fact.unit, case)
             lines += [f"resample = {_quoted(own.resample or '')}", f"max_gap = {own.max_gap!r} # s"]
     used = {fact.name for table in chosen.values() for fact in table.values() if fact}
     rest = [each for each in facts if each.name not in used]
@@ -431,13 +466,29 @@ def _text(
     return "\n".join(lines) + "\n"
 
 
-def _unit_wanted(channel: str, case: DataCase | None) -> str:
-    """A comment that asks for the unit that the log does not state."""
+def _units(case: DataCase | None) -> dict[str, str]:
+    """The unit of each channel of a case that has one."""
+    some = () if case is None else (case.inputs, case.outputs)
+    pairs = [pair for each in some for pair in zip(each.names, each.units, strict=True)]
+    return {name: unit for name, unit in pairs if unit not in ("", "1")}
+
+
+def _spare(case: DataCase | None, table: str) -> bool:
+    """Whether a mapping may lack channels of a table: the outputs of a twin without a case."""
+    return table == "outputs" and case is not None and not case.rate
+
+
+def _units_wanted(channel: str, stated: str, case: DataCase | None) -> list[str]:
+    """The unit of a channel, and a comment that asks for what neither log nor case states."""
     if case is None:
-        return '# unit = "…" # the log states none'
-    some = (case.inputs, case.outputs)
-    units = dict(pair for each in some for pair in zip(each.names, each.units, strict=True))
-    return f'# from_unit = "…" # the log states none: taken as {_comment(units[channel])}'
+        return [] if stated else ['# unit = "…" # the log states none']
+    unit = _units(case).get(channel)
+    if unit is None:
+        lack = "the twin states none" if stated else "neither the log nor the twin states one"
+        return [f'# from_unit = "…" # {lack}: no conversion without', '# unit = "…" # both']
+    asked = [f'# from_unit = "…" # the log states none: taken as {_comment(unit)}']
+    # Written out, since the unit of a case is not known to a command without it.
+    return ([] if stated else asked) + [f"unit = {_quoted(unit)}"]
 
 
 def _value(value: object) -> str:
