@@ -103,6 +103,30 @@ def spoilt(value: float, column: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
+    ("case", "words", "message"),
+    [
+        ("tanks", (), "No trajectory has a label and the case has no faults: all count as Healthy"),
+        ("armpi", (), "expected at least one trajectory labelled 'Healthy', got labels none"),
+        ("armpi", ("--calibrate-on", "all"), "got labels none; label the trajectories"),
+    ],
+)
+def test_trajectories_without_labels_are_healthy_only_where_there_are_no_faults(
+    call, case: str, words: tuple[str, ...], message: str, tmp_path: Path
+) -> None:
+    system = rt.cases.get(case)
+    made = rt.generate(system.twin, system, per_class=3, seed=0)
+    rt.save(made.replace(labels=None), tmp_path / "real.npz")
+    code, _, err = call(
+        *("fit", case, "--real", tmp_path / "real.npz", *words),
+        # Labels are checked before twin data are read, which are not there.
+        *("--twin-data", tmp_path / "none.npz", "--out", tmp_path / "model"),
+    )
+    assert code == 2
+    assert message in err
+    assert ("none.npz" in err) == (case == "tanks")
+
+
+@pytest.mark.parametrize(
     ("cells", "labels", "key", "message"),
     [
         ([GOOD], ["Healthy"], "X_other", "X_array"),

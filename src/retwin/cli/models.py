@@ -136,6 +136,7 @@ def fit(
     if dynamics:
         _fit_dynamics(system, measured, out, name, seed, as_json=as_json)
         return
+    measured = _labelled(system, measured)
     faults = system.faults if calibrate_on == "all" else calibrate_on
     calibrating(measured, faults)  # before the surrogate is trained, which takes minutes
     size = system.per_class if simulations is None else simulations
@@ -163,6 +164,14 @@ def fit(
         )
     rt.CorrectedTwin(ibg, rg, case=name).save(out)
     _print_fit(ibg, rg, out, as_json=as_json)
+
+
+def _labelled(system: Case, measured: Trajectories) -> Trajectories:
+    """The same with labels where there can be only one: a case without faults is healthy."""
+    if measured.known_labels or set(system.faults) - {HEALTHY}:
+        return measured
+    note(f"No trajectory has a label and the case has no faults: all count as {HEALTHY}")
+    return measured.replace(labels=[HEALTHY] * len(measured))
 
 
 def _fit_dynamics(

@@ -359,7 +359,9 @@ def calibrating(
         "calibration",
         expected=f"at least one trajectory labelled {wanted}",
         got=f"labels {sorted(calibration.known_labels) or 'none'}",
-        remedy="label healthy trajectories, or calibrate on 'all'",
+        remedy="label healthy trajectories, or calibrate on 'all'"
+        if isinstance(calibrate_on, str)
+        else "label the trajectories",
     )
     return keep
 
