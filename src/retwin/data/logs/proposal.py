@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 import math
 import os
 import re
@@ -17,9 +16,9 @@ from retwin.data.io.assembly import DataCase
 from retwin.data.logs.channels import in_order
 from retwin.data.logs.cutting import union_of_times
 from retwin.data.logs.mapping import ChannelMapping, Cut, Mapping, TimeSettings
+from retwin.data.logs.proposal_text import Chosen, Draft, Fact, mapping_text, units_of
 from retwin.data.logs.reading import log_format, read_log
 from retwin.data.logs.signals import NANOSECOND, NO_STAMP, Log, Signal
-from retwin.data.logs.tables import TIMES
 from retwin.data.logs.units import compatible
 from retwin.data.resampling import BRIDGED
 from retwin.errors import InputError
@@ -37,8 +36,6 @@ OVERHEAD = re.compile(r"covariance|/rosout|/parameter_events|/tf_static|\.seq$|/
 """Names of what describes the log and not the system."""
 MAX_CHANNELS = 24
 """Channels that are proposed without a case; the other signals are listed."""
-MAX_LISTED = 200
-"""Signals that are listed in comments."""
 ALIKE = 0.72
 """Least score of a name that is taken for a channel's."""
 STAMPED = (".mcap", "", ".db3", ".bag")
@@ -49,38 +46,6 @@ PAUSE, PAUSE_PERIODS = 1.0, 20.0
 """The shortest pause in s, and in sample periods, between two trajectories."""
 JITTER = 0.005
 """Relative difference up to which a measured rate stands for one of two digits."""
-SCHEMA = "https://retwin.readthedocs.io/mapping.schema.json"
-
-
-@dataclass(frozen=True)
-class Fact:
-    """What is seen of a signal.
-
-    Attributes
-    ----------
-    name, unit : str
-        Of the signal.
-    count : int
-        Its values.
-    rate : float
-        Their median rate in Hz, 0 if there are less than two.
-    longest : float
-        The longest interval between two of them, in s.
-    low, high : float
-        Their range.
-    constant : bool
-        Whether all are equal, or there are none.
-
-    """
-
-    name: str
-    unit: str
-    count: int
-    rate: float
-    longest: float
-    low: float
-    high: float
-    constant: bool
 
 
 @dataclass(frozen=True)
@@ -265,7 +230,7 @@ def proposed(
     known = used if all(all(table.values()) for table in chosen.values()) else moving
     rate = rate or _plain(float(np.median([each.rate for each in known])))
     cut = _cut([log.signals[each.name] for each in used], 1 / rate)
-    units = _units(case)
+    units = units_of(case)
     tables = {
         name: {
             channel: _channel(fact, log.signals[fact.name], name, rate, cut).model_copy(
@@ -286,7 +251,7 @@ def proposed(
             commands=tables["commands"],
             outputs=tables["outputs"],
         )
-    text = _text(log, time, rate, cut, chosen, tables, facts, case, delay)
+    text = mapping_text(log, Draft(time, rate, cut, chosen, tables), facts, case, delay)
     channels = {
         fact.name: channel for table in chosen.values() for channel, fact in table.items() if fact
     }
@@ -306,9 +271,6 @@ def _plain(rate: float) -> float:
     """A measured rate without the jitter of its times: 50 for 49.95."""
     plain = float(f"{rate:.2g}")
     return plain if abs(plain / rate - 1) < JITTER else _round(rate)
-
-
-Chosen = dict[str, dict[str, "Fact | None"]]
 
 
 def _by_name(moving: Sequence[Fact]) -> Chosen:
@@ -344,7 +306,7 @@ def _for_case(moving: Sequence[Fact], case: DataCase) -> Chosen:
             taken.add(fact.name)
     # Where one command is left and one signal that is named like a command, they are a pair.
     left = [name for name, fact in chosen["commands"].items() if fact is None]
-    units = _units(case)
+    units = units_of(case)
     marked = [
         each for each in moving if each.name not in taken and COMMAND.search(each.name.lower())
     ]
@@ -399,97 +361,3 @@ def _channel(fact: Fact, signal: Signal, table: str, rate: float, cut: Cut) -> C
         resample="hold" if table == "commands" else "linear",
         max_gap=_round(math.ceil(longest / 10**exponent - 1e-6) * 10**exponent),
     )
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _comment(text: str) -> str:
-    return "".join(c if c.isprintable() else " " for c in text)
-
-
-def _seen(fact: Fact) -> str:
-    unit = f" {fact.unit}" if fact.unit else ""
-    return _comment(
-        f"{fact.count} values, {fact.rate:.4g} Hz, {fact.low:.4g} to {fact.high:.4g}{unit}, "
-        f"longest interval {fact.longest:.3g} s"
-    )
-
-
-def _text(
-    log: Log,
-    time: TimeSettings,
-    rate: float,
-    cut: Cut,
-    chosen: Chosen,
-    tables: dict[str, dict[str, ChannelMapping]],
-    facts: Sequence[Fact],
-    case: DataCase | None,
-    delay: float | None,
-) -> str:
-    """The mapping.toml, with what is seen of the log in comments."""
-    lines = [f"#:schema {SCHEMA}", f"# Proposed for {_comment(log.name)}; check it.", ""]
-    lines += [f"rate = {rate!r} # Hz", 'label = "" # class of all trajectories, such as "Healthy"']
-    lines += ["", "[time]"]
-    column = time.column or next((n for n, why in log.skipped.items() if why == TIMES), "")
-    given = {**time.model_dump(exclude_defaults=True), **({"column": column} if column else {})}
-    lines += [f"{key} = {_value(value)}" for key, value in given.items()]
-    if delay is not None:
-        lines.append(f"# messages were recorded {delay:.3g} s after their header stamps (median)")
-    lines += ["", "[cut]", f"by = {_quoted(cut.by)} # none, gap, trigger or length"]
-    lines += [f"gap = {cut.gap!r} # s"] if cut.gap else []
-    for table in chosen:
-        for name, fact in chosen[table].items():
-            lines += ["", f"[{table}.{_quoted(name)}]"]
-            if fact is None:
-                # The outputs that a mapping lacks are not compared by identify.
-                more = ", or delete this table" if _spare(case, table) else ""
-                lines += [f'signal = "" # none has such a name: choose one of those below{more}']
-                lines += _units_wanted(name, "", case)
-                continue
-            own = tables[table][name]
-            lines += [f"# {_seen(fact)}", f"signal = {_quoted(fact.name)}"]
-            lines += _units_wanted(name, fact.unit, case)
-            lines += [f"resample = {_quoted(own.resample or '')}", f"max_gap = {own.max_gap!r} # s"]
-    used = {fact.name for table in chosen.values() for fact in table.values() if fact}
-    rest = [each for each in facts if each.name not in used]
-    if rest or log.skipped:
-        lines += ["", "# Not mapped:"]
-    for each in rest[:MAX_LISTED]:
-        what = f"constant, {each.low:g}" if each.constant and each.count else _seen(each)
-        lines.append(f"#   {_comment(_quoted(each.name))}: {what}")
-    others = [(n, why) for n, why in log.skipped.items() if why not in (TIMES, NO_STAMP)]
-    lines += [f"#   {_comment(_quoted(n))}: {_comment(why)}" for n, why in others[:MAX_LISTED]]
-    left = max(0, len(rest) - MAX_LISTED) + max(0, len(others) - MAX_LISTED)
-    lines += [f"#   and {left} more"] if left else []
-    return "\n".join(lines) + "\n"
-
-
-def _units(case: DataCase | None) -> dict[str, str]:
-    """The unit of each channel of a case that has one."""
-    some = () if case is None else (case.inputs, case.outputs)
-    pairs = [pair for each in some for pair in zip(each.names, each.units, strict=True)]
-    return {name: unit for name, unit in pairs if unit not in ("", "1")}
-
-
-def _spare(case: DataCase | None, table: str) -> bool:
-    """Whether a mapping may lack channels of a table: the outputs of a twin without a case."""
-    return table == "outputs" and case is not None and not case.rate
-
-
-def _units_wanted(channel: str, stated: str, case: DataCase | None) -> list[str]:
-    """The unit of a channel, and a comment that asks for what neither log nor case states."""
-    if case is None:
-        return [] if stated else ['# unit = "…" # the log states none']
-    unit = _units(case).get(channel)
-    if unit is None:
-        lack = "the twin states none" if stated else "neither the log nor the twin states one"
-        return [f'# from_unit = "…" # {lack}: no conversion without', '# unit = "…" # both']
-    asked = [f'# from_unit = "…" # the log states none: taken as {_comment(unit)}']
-    # Written out, since the unit of a case is not known to a command without it.
-    return ([] if stated else asked) + [f"unit = {_quoted(unit)}"]
-
-
-def _value(value: object) -> str:
-    return _quoted(value) if isinstance(value, str) else repr(value)
