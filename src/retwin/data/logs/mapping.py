@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from retwin.data.logs.signals import Clock
 from retwin.data.resampling import Resampling
@@ -104,6 +104,13 @@ class ChannelMapping(Part):
     def signals(self) -> tuple[str, ...]:
         """The signal, or the several of which it is the mean."""
         return (self.signal,) if isinstance(self.signal, str) else tuple(self.signal)
+
+    @field_validator("signal", mode="before")
+    @classmethod
+    def _named(cls, signal: object) -> object:
+        if signal == "":
+            raise ValueError("the name of a signal: `retwin data map` lists them in comments")
+        return signal
 
 
 class Mapping(Part):
