@@ -391,6 +391,12 @@ def test_identification_reads_a_log_by_its_mapping(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.trajectories.observed[0, seen, 0], expected[seen], atol=1e-9)
     assert "log's 2.99 s are in trajectories" in found.notes[0]
     assert not any("nominal" in note for note in found.notes)
+    assert not any("states no units" in note for note in found.notes)
+    bare = rt.FunctionTwin(
+        lambda commands: 3 * commands, inputs, rt.Channels(("speed",), ("1",)), 50.0
+    )
+    notes = rt.cases.read_logs([path], bare, columns).notes
+    assert any("the twin states no units of speed (m/s)" in note for note in notes)
 
 
 def test_a_proposal_for_a_twin_has_the_rate_of_the_log_and_the_units_of_the_twin(

@@ -401,6 +401,11 @@ def _matched(
         else "rename the tables of the mapping, or have it proposed for the twin: retwin data map "
         "LOG --case plant.fmu",
     )
+    taken = _units_taken(found.inputs, twin.inputs, inputs)
+    taken += _units_taken(found.outputs, twin.outputs, outputs)
+    if taken:
+        text = f"the twin states no units of {', '.join(taken)}: taken as those of the log"
+        notes.setdefault(text, []).append(name)
     shape = (*found.observed.shape[:2], len(outputs))
     observed, mask = np.zeros(shape), np.zeros(shape, dtype=bool)
     for channel, at in enumerate(outputs):
@@ -443,6 +448,16 @@ def _places(
             )
         places.append(at)
     return places
+
+
+def _units_taken(own: Channels, wanted: Channels, places: Sequence[int | None]) -> list[str]:
+    """Channels of a twin without a unit, with the unit that the log has."""
+    channels = zip(wanted.names, wanted.units, places, strict=True)
+    return [
+        f"{channel} ({own.units[at]})"
+        for channel, unit, at in channels
+        if at is not None and unit == "1" and own.units[at] != "1"
+    ]
 
 
 def _healthy(found: Trajectories, notes: dict[str, list[str]]) -> Trajectories:
