@@ -17,7 +17,6 @@ from retwin.errors import InputError
 from retwin.testing import TWIN_CHECKS, TwinSubject
 from retwin.twins import FunctionTwin, Parameter, State, StateTwin
 from retwin.twins.compiled import steps
-from retwin.twins.interpolation import INTERPOLATIONS
 from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.update import Dynamics, DynamicsTwin, Library, OutsideTrainingWarning, fit_dynamics
 from retwin.update.dynamics import FittedDynamics
@@ -269,18 +268,6 @@ def test_predictions_with_uncertain_parameters_are_the_exact_conditional_ones() 
         np.testing.assert_allclose(found.mean[0, k], wanted, rtol=1e-9)
         left = joint[np.ix_(now, now)] - gain @ joint[np.ix_(earlier, now)]
         np.testing.assert_allclose(found.covariance[0, k], left, rtol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("interpolation", INTERPOLATIONS[1:])
-def test_commands_between_samples_are_those_of_the_record(interpolation: str) -> None:
-    true = replace(OSCILLATOR, interpolation=interpolation)
-    made = true.simulate(forces(2, 5, samples=200), seed=0, parameters=TRUTH)
-    noise = NOISE * np.random.default_rng(6).normal(size=made.observed.shape)
-    observed = made.replace(observed=made.observed + noise)
-    line = Dynamics(library=Library(degree=1, knots=(), friction=False))
-    fitted = fit_dynamics(OSCILLATOR, observed, line)
-    assert fitted.twin.equations.interpolation == interpolation
 
 
 @pytest.mark.parametrize("interpolation", ["hold", "linear", "spline"])

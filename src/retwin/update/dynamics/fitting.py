@@ -11,13 +11,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.stats import wilcoxon
 
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
-from retwin.errors import InputError
 from retwin.progress import Progress
-from retwin.twins.interpolation import INTERPOLATIONS
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
@@ -29,7 +26,7 @@ from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
 from retwin.update.dynamics.memory import Memory
 from retwin.update.dynamics.network import TanhNetwork
-from retwin.update.dynamics.noise import CHANCE, fit_noise, folds, widening
+from retwin.update.dynamics.noise import fit_noise, folds, widening
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of
@@ -155,10 +152,10 @@ def fit_dynamics(
         got=int(observed.mask.sum()),
         remedy="give more or longer trajectories, or free fewer parameters",
     )
-    parts = folds(observed.mask, settings.folds)
-    alone, fitted = _between_samples(base, observed, unknowns, parts)
+    alone, fitted = _without_discrepancy(base, observed, unknowns)
     report(0.05)
     power = alone.power(fitted.residual)
+    parts = folds(observed.mask, settings.folds)
     alone = replace(alone, variance=power)
     best = chosen(alone, fitted.point, settings, parts, report)
     equations, memory = best.equations, best.memory
@@ -195,41 +192,6 @@ def fit_dynamics(
         seconds=time.perf_counter() - began,
         reason=notes,
     )
-
-
-def _between_samples(
-    base: StateTwin, observed: Trajectories, unknowns: Unknowns, parts: Sequence[NDArray]
-) -> tuple[Estimation, Linearised]:
-    """The fit of the twin itself, with the commands between samples that the record shows.
-
-    A twin that gives its interpolation keeps it. Otherwise another one than holding is taken if it
-    reduces the error of nearly all parts of the record, so that the gain is no chance: a wrong one
-    is an error of half a sample, which no discrepancy explains.
-    """
-    if base.interpolation is not None or base.step is not None:
-        return _without_discrepancy(base, observed, unknowns)
-    held, *others = (replace(base, interpolation=each) for each in INTERPOLATIONS)
-    best = _without_discrepancy(held, observed, unknowns)
-    for other in others:
-        try:
-            found = _without_discrepancy(other, observed, unknowns)
-        except InputError:  # its simulation is not finite
-            continue
-        before, after = (_errors(each, best[0], parts) for each in (best[1], found[1]))
-        gain = before - after
-        if gain.any() and wilcoxon(gain, alternative="greater").pvalue < CHANCE:
-            best = found
-    return best
-
-
-def _errors(found: Linearised, estimation: Estimation, parts: Sequence[NDArray]) -> NDArray:
-    """Logarithm of the squared error of each part; the estimation gives the scale of outputs."""
-    smallest = np.finfo(float).tiny  # of an output that the twin explains exactly
-    squares = np.where(estimation.seen, found.residual, 0.0) ** 2
-    scaled = squares / np.maximum(estimation.variance, smallest)
-    sums = np.array([np.sum(scaled[part]) for part in parts])
-    made: NDArray = np.log(np.maximum(sums, smallest))
-    return made
 
 
 def _without_discrepancy(
