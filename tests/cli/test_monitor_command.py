@@ -42,7 +42,8 @@ library = { degree = 0, knots = [], friction = false }
 """
 
 
-@pytest.fixture(scope="module")
+# One for the session: a second module of that name would be refused.
+@pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("watched")
     (made / "watched_module.py").write_text(MODULE)

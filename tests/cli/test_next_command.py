@@ -26,4 +26,4 @@ def test_the_command_saves_commands_and_says_what_they_narrow(
     assert made.commands.shape[0] == 2
     assert not made.mask.any()
     code, _, err = call(*words, "--out", tmp_path / "next.txt")
-    assert (code, "path" in err) == (2, True), err
+    assert (code, "--out" in err) == (2, True), err

@@ -90,7 +90,6 @@ def map_log(
     from retwin.data.logs.proposal import propose_mapping
     from retwin.report.log_picture import log_picture
 
-    picture = out.with_suffix(".png")
     require(
         out.suffix.lower() == ".toml",
         "--out",
@@ -98,6 +97,7 @@ def map_log(
         got=out,
         remedy="give another name, such as mapping.toml",
     )
+    picture = out.with_suffix(".png")
     for place in (out, picture):
         check_place(place)
     if rate is not None:

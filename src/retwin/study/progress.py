@@ -53,6 +53,7 @@ class Stages:
     report: Report
     _shares: dict[Job, float] = field(default_factory=dict)
     _highest: float = 0.0
+    _finished: set[str] = field(default_factory=set)
 
     def prepare(self, stage: str, share: float) -> None:
         """A share of the data is read or simulated."""
@@ -61,8 +62,10 @@ class Stages:
             self.finish(stage)
 
     def finish(self, stage: str) -> None:
-        """A stage is done."""
-        self._tell(FinishedStage(stage), self._highest)
+        """A stage is done; the first call counts."""
+        if stage not in self._finished:
+            self._finished.add(stage)
+            self._tell(FinishedStage(stage), self._highest)
 
     def begin(self, shares: Mapping[Job, float]) -> None:
         """The jobs of the study, and which share of each is done already."""
