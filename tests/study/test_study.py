@@ -111,7 +111,10 @@ def test_calling_again_does_nothing_new(finished: tuple[dict, Path], case: rt.Ca
     assert {p: p.stat().st_mtime_ns for p in (out / "work").rglob("*") if p.is_file()} == stamps
 
 
-@pytest.mark.parametrize("sign_of_progress", ["work/run-0/surrogate", "work/run-0/fold-0/dt.npz"])
+@pytest.mark.parametrize(
+    "sign_of_progress",
+    ["work/run-0/surrogate", pytest.param("work/run-0/fold-0/dt.npz", marks=pytest.mark.long)],
+)
 def test_killed_and_called_again_it_ends_the_same(
     finished: tuple[dict, Path], tmp_path: Path, sign_of_progress: str
 ) -> None:

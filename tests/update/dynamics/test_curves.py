@@ -138,6 +138,7 @@ def other_outflow(x, u, p):
     return p.pump * u.pump - between, between - outflow
 
 
+@pytest.mark.long
 def test_the_discrepancy_of_emulated_tanks() -> None:
     """Within 5 % of its range where data are, in the median; inside its 90 % band as promised.
 

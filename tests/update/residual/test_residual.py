@@ -152,7 +152,7 @@ def flow(identity: rt.Surrogate) -> rt.ResidualModel:
     return rt.fit_residual(identity, calibration, rt.DelayOffset(), density, seed=0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_flow_recovers_the_distribution_too(
     flow: rt.ResidualModel, identity: rt.Surrogate, tmp_path: Path
 ) -> None:
