@@ -110,7 +110,7 @@ class Hierarchy:
         return covariance + shift @ self.covariance @ shift.mT
 
     def information(self, design: Design, solution: Solution) -> Tensor:
-        """(R, F, F) what each row tells about the coefficients, with x integrated out."""
+        """(R, F, F) the information of each row about the coefficients, with x integrated out."""
         weighted = design.features / self._variances(design)[..., None]
         left = design.features - solution.covariance @ weighted
         made: Tensor = weighted.mT @ left

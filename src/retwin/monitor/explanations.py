@@ -138,7 +138,7 @@ class Explanations:
         self._live.log([("cause", found)])
         try:
             self._report(alarm, found)
-        except Exception:  # of who is told; further alarms are explained all the same
+        except Exception:  # of the caller; further alarms are explained all the same
             logging.getLogger(__name__).exception("a cause was found but not reported")
 
     def _found(self, alarm: dict[str, Any], before: int) -> tuple[Cause, int]:

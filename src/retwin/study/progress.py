@@ -57,7 +57,7 @@ class Stages:
 
     def prepare(self, stage: str, share: float) -> None:
         """A share of the data is read or simulated."""
-        self._tell(stage, PREPARED * share)
+        self._share(stage, PREPARED * share)
         if share >= 1.0:
             self.finish(stage)
 
@@ -65,7 +65,7 @@ class Stages:
         """A stage is done; the first call counts."""
         if stage not in self._finished:
             self._finished.add(stage)
-            self._tell(FinishedStage(stage), self._highest)
+            self._share(FinishedStage(stage), self._highest)
 
     def begin(self, shares: Mapping[Job, float]) -> None:
         """The jobs of the study, and which share of each is done already."""
@@ -76,13 +76,13 @@ class Stages:
         before, self._shares[job] = self._shares[job], max(self._shares[job], share)
         whole = sum(SECONDS[each.kind] for each in self._shares)
         done = sum(SECONDS[each.kind] * share for each, share in self._shares.items())
-        self._tell(_named(job), PREPARED + (WORKED - PREPARED) * done / whole)
+        self._share(_named(job), PREPARED + (WORKED - PREPARED) * done / whole)
         if before < 1.0 and all(
             share >= 1.0 for each, share in self._shares.items() if _named(each) == _named(job)
         ):
             self.finish(_named(job))
 
-    def _tell(self, stage: str, share: float) -> None:
+    def _share(self, stage: str, share: float) -> None:
         self._highest = max(self._highest, share)
         self.report(stage, self._highest)
 

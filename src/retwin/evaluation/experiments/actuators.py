@@ -104,8 +104,8 @@ class ActuatorKnowledge:
         samples = replace(self.belief.samples, gain=problem.gain())
         problem = replace(problem, observed=expected, whitening=samples.whitening())
         found = solve(problem, prior, self.belief.noise, prior.mean, bounds=problem.bounds)
-        told = self.belief.hierarchy.information(self.belief.features.design(problem), found)
-        values, vectors = torch.linalg.eigh((told + told.mT) / 2)
+        information = self.belief.hierarchy.information(self.belief.features.design(problem), found)
+        values, vectors = torch.linalg.eigh((information + information.mT) / 2)
         return (vectors * values.clamp_min(0).sqrt()[..., None, :]).mT
 
     def mean(self, commands: NDArray) -> Tensor:

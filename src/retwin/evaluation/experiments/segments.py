@@ -2,7 +2,8 @@
 
 z of a segment is taken as linear in features of its commands, with a scatter of its own. The
 coefficients have a posterior, from z* and its covariance of the calibration trajectories: where the
-outputs do not determine z, a segment tells nothing. The scatter remains, however much is measured.
+outputs do not determine z, a segment gives no information. The scatter remains, however much is
+measured.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class SegmentKnowledge:
     def of(
         cls, twin: CorrectedTwin, context: Context, found: Discrepancy, commands: NDArray
     ) -> SegmentKnowledge:
-        """What `found` tells about z at commands like `commands` (n, T, d_u)."""
+        """What `found` shows of z at commands like `commands` (n, T, d_u)."""
         residual = twin.residual
         assert isinstance(residual, ResidualModel)
         valid = torch.as_tensor(context.segments.valid)
@@ -217,7 +218,7 @@ def _regression(design: Tensor, z: Tensor, error: Tensor) -> tuple[Tensor, Tenso
     mean, covariance = torch.zeros(size, features, dtype=z.dtype), torch.diag(prior.flatten())
     for _ in range(ROUNDS):
         precision = torch.linalg.inv(scatter)
-        # z is as uncertain as its scatter at most; then it tells nothing.
+        # z is as uncertain as its scatter at most; then it gives no information.
         about = precision - precision @ _within(error, scatter) @ precision
         information = torch.einsum("mij,mf,mg->ifjg", about, design, design)
         information = information.flatten(2).flatten(0, 1) + torch.diag(1 / prior.flatten())
