@@ -61,7 +61,7 @@ def best(
         candidates = np.concatenate([candidates, stretched(candidates)])
     now, roots = known.knowledge(references), known.roots(candidates)
     if way == "coefficients":
-        # What is told about all coefficients alike: predictions are their principal axes.
+        # Information on all coefficients alike: predictions are their principal axes.
         values, vectors = torch.linalg.eigh(now.covariance)
         kept = values > 1e-12 * values.max()
         axes = vectors[:, kept].mT / values[kept].sqrt()[:, None]

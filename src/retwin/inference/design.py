@@ -1,6 +1,6 @@
 """Optimal experiments for unknowns with a Gaussian posterior: information, and what it narrows.
 
-Experiments are compared by what they tell about predictions, not about the unknowns themselves: the
+Experiments are compared by their information on predictions, not on the unknowns themselves: the
 mean information gain about the predictions of interest, half the logarithm of the ratio of their
 variances before and after (Bickford Smith et al., Prediction-oriented Bayesian active learning,
 AISTATS 2023). An unknown that moves no prediction earns nothing.
@@ -66,7 +66,7 @@ class Knowledge:
 
 
 def chosen(known: Knowledge, roots: Tensor, count: int) -> tuple[list[int], list[Knowledge]]:
-    """The experiments that tell most, one after the other, each given those before.
+    """The most informative experiments, one after the other, each given those before.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is not yet known of the actuators' errors, and what would tell it, for `CommandSpace`.
+"""What is not yet known of the actuators' errors, and what would reduce it, for `CommandSpace`.
 
 The inference of `CommandSpace` learns the mean error of every actuator as a regression on its
 motion and on the pose. The posterior of that regression is used here as it is.
@@ -53,7 +53,7 @@ class ActuatorKnowledge:
 
     @classmethod
     def of(cls, twin: CorrectedTwin, calibration: Trajectories) -> ActuatorKnowledge:
-        """What healthy trajectories tell."""
+        """The information in healthy trajectories."""
         correction = twin.residual.correction
         operator = correction.first if isinstance(correction, Chain) else correction
         assert isinstance(operator, CommandSpace)

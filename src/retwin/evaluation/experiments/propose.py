@@ -1,4 +1,4 @@
-"""`next_experiments`: the commands whose outputs would tell most, and what they would narrow."""
+"""`next_experiments`: commands with the most informative outputs, and what they would narrow."""
 
 from __future__ import annotations
 
@@ -139,10 +139,10 @@ def next_experiments(
     tolerance: float = 0.05,
     progress: Progress | None = None,
 ) -> Proposal:
-    """Propose commands whose outputs would tell most about what is unsure now.
+    """Propose commands whose outputs are most informative about what is uncertain now.
 
     Candidates are commands of the sampler, within its limits. They are chosen one after the other
-    by how much their outputs, given those before, would tell about the discrepancy at other
+    by how much their outputs, given those before, would inform on the discrepancy at other
     commands of the sampler: with `CommandSpace` by the posterior of its inference, otherwise by
     that of a linear regression of z on features of the commands.
 
@@ -294,7 +294,7 @@ def _known(
 
 
 def _measured_curve(known: SegmentKnowledge, rng: np.random.Generator) -> tuple[Measured, ...]:
-    """What subsets of the calibration trajectories tell about the others."""
+    """How well subsets of the calibration trajectories predict the others."""
     total = known.trajectories
     sizes = sorted(set(np.geomspace(2, total - 1, 5).round().astype(int).tolist()))
     found: dict[int, list[float]] = {size: [] for size in sizes}

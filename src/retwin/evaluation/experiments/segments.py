@@ -1,4 +1,4 @@
-"""What is not yet known of a discrepancy with one z per segment, and what would tell it.
+"""What is not yet known of a discrepancy with one z per segment, and what would reduce it.
 
 z of a segment is taken as linear in features of its commands, with a scatter of its own. The
 coefficients have a posterior, from z* and its covariance of the calibration trajectories: where the
@@ -97,7 +97,7 @@ class SegmentKnowledge:
         return int(self.observed[0].max()) + 1
 
     def subset(self, trajectories: NDArray) -> SegmentKnowledge:
-        """What some of the calibration trajectories alone tell."""
+        """The information in some of the calibration trajectories alone."""
         owner, design, z, error = self.observed
         kept = torch.isin(owner, torch.as_tensor(trajectories))
         parts = _regression(design[kept], z[kept], error[kept])
