@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import IO
 
@@ -16,6 +17,8 @@ import pytest
 
 import retwin as rt
 from retwin.cli import main
+from retwin.monitor import fit_monitor
+from retwin.update import fit_dynamics
 
 PROGRAM = Path(sys.executable).with_name("retwin")
 
@@ -71,6 +74,33 @@ leak = { unit = "1/s", low = 0.01, high = 0.1, start = 0.05 }
 [records]
 calibration = { valve = "u1", level = "y1" }
 test = { valve = "u2", level = "y2" }
+"""
+
+WATCHED_MODULE = """
+import retwin as rt
+from retwin.twins import Parameter, State, StateTwin
+
+tank = StateTwin(
+    (State("level", "m"),),
+    lambda x, u: x.level,
+    rt.Channels(("valve",), ("1",)),
+    rt.Channels(("level",), ("m",)),
+    1.0,
+    derivative=lambda x, u, p: (p.gain * u.valve - p.leak * x.level,),
+    parameters=(
+        Parameter("gain", "m", 0.05, 0.2, 0.1),
+        Parameter("leak", "1/s", 0.01, 0.1, 0.05),
+    ),
+)
+"""
+WATCHED_CASE = """
+name = "watched_tank"
+twin = "watched_module:tank"
+commands = { kind = "HoldSampler", duration = 100, hold_durations = [5, 30], low = [0], high = [1] }
+[faults]
+leaking = { kind = "ParameterShift", parameter = "leak", size = [0.02, 0.5] }
+[dynamics]
+library = { degree = 0, knots = [], friction = false }
 """
 
 Call = Callable[..., tuple[int, str, str]]
@@ -188,3 +218,30 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     np.savetxt("record.csv", columns, delimiter=",", header="u1,u2,y1,y2", comments="")
     yield tmp_path
     sys.modules.pop("own_module", None)
+
+
+# One for the whole session, since a second module of that name would be refused.
+@pytest.fixture(scope="session")
+def watched(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a case, records, a corrected twin and its calibrated monitor."""
+    made = tmp_path_factory.mktemp("watched")
+    (made / "watched_module.py").write_text(WATCHED_MODULE)
+    (made / "case.toml").write_text(WATCHED_CASE)
+    system = rt.cases.get(str(made / "case.toml"))
+    rng = np.random.default_rng(0)
+    for name, late in (("fit", 0.06), ("healthy", 0.06), ("leak", 0.16)):
+        valve = np.repeat(rng.random((1, 40, 1)), 10, axis=1)
+        level, levels = 0.0, []
+        for k, u in enumerate(valve[0, :, 0]):
+            levels.append(level)
+            leak = 0.06 if k < 300 else late
+            level = u * 0.1 / leak + (level - u * 0.1 / leak) * np.exp(-leak)
+        output = np.array(levels)[None, :, None] + 1e-3 * rng.normal(size=(1, 400, 1))
+        data = system.twin.simulate(valve, seed=0)
+        rt.save(data.replace(observed=output), made / f"{name}.npz")
+    fitted = fit_dynamics(system.twin, rt.load(made / "fit.npz"), system.dynamics).twin
+    replace(fitted, case=str(made / "case.toml")).save(made / "model")
+    fit_monitor(fitted, rt.load(made / "healthy.npz"), "1 per day", blanking=30).save(
+        made / "watch"
+    )
+    return made

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import paho.mqtt.client as paho
 import pytest
-from test_monitor_command import folder as watched
 
 import retwin as rt
 from retwin.monitor import Registry, Store
@@ -24,7 +23,6 @@ from retwin.monitor import Registry, Store
 sys.path.append(str(Path(__file__).parents[1] / "monitor"))
 from broker import Broker
 
-__all__ = ["watched"]
 SETTINGS = """
 store = "store"
 [twins.tank]
