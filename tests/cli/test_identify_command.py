@@ -215,7 +215,7 @@ def test_the_same_seed_gives_the_same_bytes(place: Path, call) -> None:
 def test_what_the_logs_do_not_determine_is_said(place: Path, call) -> None:
     """`spare` changes nothing."""
     channels = ("--inputs", "valve", "--outputs", "level", "--rate", "1")
-    free = ("--free", "gain=0.01:0.5", "--free", "spare=0:2")
+    free = [f"--free={each}" for each in ("gain=0.01:0.5", "leak=0.01:0.1", "spare=0:2")]
     name = "identify_module:filled"
     code, out, err = call("identify", name, "tank0.csv", *channels, *free, "--out", "out")
     assert code == 0

@@ -13,6 +13,8 @@ from scipy.stats import binom
 
 import retwin as rt
 from retwin.evaluation import hold_out, validate_identification
+from retwin.evaluation.identification.parameters import estimates
+from retwin.report.identification.texts import findings, state
 from retwin.update.identification import MCMC, LeastSquares, Noise
 
 LEAK, GAIN = 0.1, 0.5
@@ -121,6 +123,67 @@ def test_a_parameter_without_effect_is_an_open_direction() -> None:
     assert (last.open, list(last.components)) == (True, ["spare"])
     assert np.isinf(last.error)
     assert not found.directions[0].open
+
+
+@pytest.mark.parametrize(
+    ("interval", "side", "identified", "said"),
+    [
+        ((0.2, 0.4), "", True, ""),
+        ((0.2, 0.8), "", False, "not identified: interval covers 60 % of the range"),
+        (
+            (-0.05, 0.07),
+            "",
+            False,
+            "not identified: interval covers 7 % of the range and leaves it",
+        ),
+        ((0.9, 1.3), "", False, "not identified: interval covers 10 % of the range and leaves it"),
+        (
+            (-3.0, 4.0),
+            "",
+            False,
+            "not identified: interval covers 100 % of the range and leaves it",
+        ),
+        (
+            (0.0, 0.002),
+            "",
+            False,
+            "not identified: interval covers 0.2 % of the range and leaves it",
+        ),
+        ((0.99, 1.0), "high", False, "at its upper bound"),
+    ],
+)
+def test_a_parameter_is_identified_if_its_interval_is_within_half_of_its_range_and_not_at_an_end(
+    interval: tuple[float, float], side: str, identified: bool, said: str
+) -> None:
+    twin = rt.ParametricTwin.built(build, [rt.Parameter("gain", "1", 0.0, 1.0, 0.5)])
+    middle, half = sum(interval) / 2, (interval[1] - interval[0]) / 2
+    ends, one = np.array([interval]), np.array([half / 2])
+    (made,) = estimates(twin, np.array([middle]), one, ends, np.array([True]), [side], bounded=True)
+    assert (made.identified, state(made)) == (identified, said)
+    (other,) = estimates(twin, np.array([middle]), one, ends, np.array([False]), [side])
+    assert not other.identified, "starts disagree"
+    assert state(other)
+
+
+def test_an_interval_that_leaves_a_positive_range_is_named() -> None:
+    """Noise hides a small coupling: the estimate is inside its range, its interval is not."""
+    coupled = np.random.default_rng(8).normal(size=(5, 60, 1))
+
+    def made(values: dict[str, float]) -> rt.FunctionTwin:
+        own = build({})
+        return replace(own, function=lambda u: values["coupling"] * u)
+
+    twin = rt.ParametricTwin.built(made, [rt.Parameter("coupling", "1", 0.0, 1.0, 0.5)])
+    data = twin.simulate(coupled, parameters={"coupling": 0.05}, seed=0)
+    noise = np.random.default_rng(9).normal(size=coupled.shape)
+    found = rt.identify(twin, data.replace(observed=data.observed + noise), seed=0)
+    checked = validate_identification(found, twin, data)
+    (coupling,) = checked.parameters
+    assert coupling.interval is not None
+    assert coupling.interval[0] < 0 < coupling.value
+    assert checked.open_parameters == ("coupling",)
+    assert "covers" in state(coupling)
+    assert any("not shown to differ from 0" in each for each in findings(checked))
 
 
 def test_residuals_of_a_right_twin_are_white_and_of_a_wrong_one_follow_the_command() -> None:

@@ -108,7 +108,10 @@ def identification_values(found: Identification, opened: OpenedTwin, logs: Logs)
         "twin": opened.name,
         "method": "bayes" if bayes else "least squares",
         "emulated": logs.trajectories.emulated,
-        "parameters": {each.name: _without_name(asdict(each)) for each in found.parameters},
+        "parameters": {
+            each.name: {**_without_name(asdict(each)), "covered": each.covered}
+            for each in found.parameters
+        },
         "errors_rest_on": found.basis,
         "correlations": _correlations([each.name for each in found.parameters], found.correlation),
         "directions": [asdict(each) for each in found.directions],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ from retwin.update.identification.identifiability import UNIFORM
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.posterior import Posterior
 
-__all__ = ["Basis", "Direction", "Estimate", "Uncertainty", "uncertainty_of"]
+__all__ = ["WIDEST", "Basis", "Direction", "Estimate", "Uncertainty", "estimates", "uncertainty_of"]
 
 NEAR = 0.01
 """Distance from a bound, in widths of the range, within which draws count as on it."""
@@ -24,6 +24,9 @@ CROWDED = 0.1
 distribution it is 0.01."""
 OPEN = 0.8
 """Posterior standard deviation, over that of the prior, from which a direction counts as open."""
+WIDEST = 0.5
+"""Share of a range that the 95 % interval of an identified parameter covers at most: the
+measurements then halve what was known before."""
 SMALL = 0.1
 """Least component of a direction that is listed."""
 Basis = Literal["trajectories", "samples", "posterior", "none"]
@@ -49,8 +52,9 @@ class Estimate:
     interval : (float, float) or None
         The 95 % interval, None where there is no error.
     identified : bool
-        Whether the measurements narrow it down within its range: its 95 % interval does not
-        contain all of it, and starts that fit equally well agree.
+        Whether the measurements determine it: its 95 % interval lies within its range, of which it
+        covers half at most, it is not at a bound, and starts that fit equally well agree. A range
+        of positive values ends at 0 or above, so that the interval then excludes 0.
     at_bound : "low", "high" or ""
         The bound on which it lies; the true value may be beyond it.
 
@@ -66,6 +70,24 @@ class Estimate:
     interval: tuple[float, float] | None
     identified: bool
     at_bound: Literal["low", "high", ""]
+
+    @property
+    def covered(self) -> float | None:
+        """The share of its range that its 95 % interval covers; None where there is no interval.
+
+        Parts of the interval beyond the range do not count.
+        """
+        if self.interval is None:
+            return None
+        low, high = max(self.interval[0], self.low), min(self.interval[1], self.high)
+        return max(0.0, high - low) / (self.high - self.low)
+
+    @property
+    def leaves(self) -> bool:
+        """Whether its 95 % interval reaches an end of its range."""
+        return self.interval is not None and not (
+            self.low < self.interval[0] and self.interval[1] < self.high
+        )
 
 
 @dataclass(frozen=True)
@@ -121,10 +143,10 @@ def _of_fit(before: ParametricTwin, found: Updated) -> Uncertainty:
         along = np.where(singular > 0, 1 / singular, np.inf)
     directions = _directions(before.names, local.directions, along, UNIFORM)
     ends = [_end(each, low, high) for each, low, high in zip(values, *before.bounds, strict=True)]
-    sides = [end if bound else "" for end, bound in zip(ends, local.at_bound, strict=True)]
-    low, high = before.bounds
-    inside = (intervals[:, 0] > low) | (intervals[:, 1] < high)  # else it says nothing
-    made = _estimates(before, values, errors, intervals, local.identified & inside, sides)
+    # A search leaves a parameter without effect where it began, which may be a bound.
+    bound = local.at_bound & np.isfinite(local.errors)
+    sides = [end if at else "" for end, at in zip(ends, bound, strict=True)]
+    made = estimates(before, values, errors, intervals, local.identified, sides)
     return Uncertainty(made, local.correlation, directions, basis)
 
 
@@ -143,7 +165,7 @@ def _of_posterior(before: ParametricTwin, found: Posterior) -> Uncertainty:
     directions = _directions(before.names, vectors.T, along, OPEN * UNIFORM)
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = np.atleast_2d(np.corrcoef(scaled.T))
-    made = _estimates(
+    made = estimates(
         before,
         found.samples.mean(axis=0),
         deviation * width,
@@ -159,35 +181,39 @@ def _end(value: float, low: float, high: float) -> Literal["low", "high"]:
     return "low" if value - low < high - value else "high"
 
 
-def _estimates(
+def estimates(
     before: ParametricTwin,
     values: NDArray,
     errors: NDArray,
     intervals: NDArray,
-    identified: NDArray,
+    agreed: NDArray,
     sides: Sequence[str],
     *,
     bounded: bool = False,
 ) -> tuple[Estimate, ...]:
-    """One estimate per parameter; at a bound a fit has no error, whose theory ends there."""
+    """One estimate per parameter; at a bound a fit has no error, whose theory ends there.
+
+    `agreed` states which may be identified by what is known beside their intervals.
+    """
     made = []
     for i, each in enumerate(before.parameters):
         lost = (bool(sides[i]) and not bounded) or np.isnan(errors[i])
         known = not lost and np.isfinite(intervals[i]).all()
-        made.append(
-            Estimate(
-                each.name,
-                each.unit,
-                each.low,
-                each.high,
-                before.values[i],
-                float(values[i]),
-                float("nan") if lost else float(errors[i]),
-                (float(intervals[i][0]), float(intervals[i][1])) if known else None,
-                bool(identified[i]),
-                sides[i],  # type: ignore[arg-type]
-            )
+        estimate = Estimate(
+            each.name,
+            each.unit,
+            each.low,
+            each.high,
+            before.values[i],
+            float(values[i]),
+            float("nan") if lost else float(errors[i]),
+            (float(intervals[i][0]), float(intervals[i][1])) if known else None,
+            False,
+            sides[i],  # type: ignore[arg-type]
         )
+        narrow = estimate.covered is not None and estimate.covered <= WIDEST
+        inside = narrow and not estimate.leaves and not sides[i]
+        made.append(replace(estimate, identified=bool(agreed[i]) and inside))
     return tuple(made)
 
 

@@ -132,7 +132,7 @@ class Identification:
 
     @property
     def open_parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that the measurements do not determine."""
+        """Names of the parameters that are not identified, those at a bound among them."""
         return tuple(each.name for each in self.parameters if not each.identified)
 
     @property

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from math import floor, isfinite, isnan, log10
 
 from retwin.evaluation.identification import Direction, Estimate, Identification, RMSError
+from retwin.evaluation.identification.parameters import WIDEST
 from retwin.update.identification.posterior import Posterior
 
 __all__ = [
@@ -25,6 +26,8 @@ SENTENCES = 4
 """Outputs that have a sentence of their own, at most."""
 SMALL = 0.02
 """Ratio of errors below which a change in percent has decimals."""
+SMALL_SHARE = 0.01
+"""Share of a range below which it is given with more digits."""
 STRONG = 0.95
 """Correlation of two estimates from which they are named."""
 MISFIT = 0.02
@@ -62,8 +65,21 @@ def interval(each: Estimate) -> str:
 
 def state(each: Estimate) -> str:
     """What is wrong with an estimate; "" if nothing is."""
-    side = {"low": "at its lower bound", "high": "at its upper bound", "": ""}[each.at_bound]
-    return ", ".join(filter(None, ["" if each.identified else "not identified", side]))
+    if each.at_bound:
+        return "at its lower bound" if each.at_bound == "low" else "at its upper bound"
+    if each.identified:
+        return ""
+    if each.covered is None:
+        return "not identified"
+    if each.covered <= WIDEST and not each.leaves:
+        return "not identified: other starts of the search fit as well elsewhere"
+    leaves = " and leaves it" if each.leaves else ""
+    return f"not identified: interval covers {_share(each.covered)} of the range{leaves}"
+
+
+def _share(share: float) -> str:
+    """`38 %`; below one percent with a digit."""
+    return f"{100 * share:.2g} %" if share < SMALL_SHARE else f"{100 * share:.0f} %"
 
 
 def combination(direction: Direction) -> str:
@@ -123,13 +139,16 @@ def _errors(found: Identification) -> Iterator[str]:
 
 def _open(found: Identification) -> Iterator[str]:
     """What the measurements leave open."""
-    if found.open_parameters:
+    unknown = [each for each in found.parameters if not each.identified and not each.at_bound]
+    if unknown:
         last = found.directions[-1]
-        yield (
-            f"These measurements do not determine {', '.join(found.open_parameters)}. The least "
-            f"determined combination is {combination(last)}, in widths of the ranges: hold one of "
-            "these parameters at a known value, or record commands that separate them."
+        least = (
+            f" The least determined combination is {combination(last)}, in widths of the ranges: "
+            "hold one of these parameters at a known value, or record commands that separate them."
         )
+        names = ", ".join(each.name for each in unknown)
+        yield f"These measurements do not determine {names}.{least if last.open else ''}"
+    yield from filter(None, map(_not_apart, unknown))
     for each in found.parameters:
         if each.at_bound:
             bound = each.low if each.at_bound == "low" else each.high
@@ -150,6 +169,17 @@ def _open(found: Identification) -> Iterator[str]:
     ]
     if strong:
         yield f"Estimates that are strongly correlated: {', '.join(strong[:SENTENCES])}."
+
+
+def _not_apart(each: Estimate) -> str:
+    """From which end of its range a parameter is not shown to differ; "" if it is from both."""
+    if each.interval is None or not each.leaves or each.covered == 1:
+        return ""
+    at_end = f"{significant(each.high)}, at which its range ends"
+    if each.interval[0] <= each.low:
+        at_end = f"{significant(each.low)}, at which its range begins"
+    shown = interval(each)
+    return f"The 95 % interval of {each.name} is {shown}: it is not shown to differ from {at_end}."
 
 
 def _residuals(found: Identification) -> Iterator[str]:
