@@ -142,12 +142,12 @@ def _open(found: Identification) -> Iterator[str]:
     unknown = [each for each in found.parameters if not each.identified and not each.at_bound]
     if unknown:
         last = found.directions[-1]
-        least = (
+        combined = (
             f" The least determined combination is {combination(last)}, in widths of the ranges: "
             "hold one of these parameters at a known value, or record commands that separate them."
         )
-        names = ", ".join(each.name for each in unknown)
-        yield f"These measurements do not determine {names}.{least if last.open else ''}"
+        listed = ", ".join(each.name for each in unknown)
+        yield f"These measurements do not determine {listed}.{combined if last.open else ''}"
     yield from filter(None, map(_not_apart, unknown))
     for each in found.parameters:
         if each.at_bound:
