@@ -364,6 +364,38 @@ def test_a_sensor_of_several_channels_keeps_its_name_in_the_case(place: Path) ->
     assert written["parameters"]["joint.swing.damping"]["start"] == 0.3
 
 
+@pytest.mark.parametrize(
+    ("shape", "said", "correction"),
+    [
+        ("ramps", "move in ramps and rest", "delay_offset"),
+        ("levels", "change in steps", "additive"),
+        ("sweep", "change all the time", "additive"),
+    ],
+)
+def test_the_correction_of_the_case_suits_the_commands_of_the_logs(
+    place: Path, shape: str, said: str, correction: str
+) -> None:
+    levels = np.random.default_rng(2).uniform(size=(3, 8))
+    at, one = np.arange(200), np.arange(8) * 25
+    commands = {
+        "ramps": np.stack([np.interp(at % 25, [0, 9], [0, 1]) + row.repeat(25) for row in levels]),
+        "levels": levels.repeat(25, axis=1),
+        "sweep": np.stack([np.interp(at, one, row) for row in levels]),
+    }[shape][..., None]
+    opened = rt.cases.open_parametric(
+        "identify_module:filled", ["gain=0:1"], inputs=["valve"], outputs=["level"], rate=1.0
+    )
+    logs = opened.twin.simulate(commands, seed=0)
+    rt.save(logs, "logs.npz")
+    text = updated_case(opened, opened.twin.with_values([0.3]), place, "logs.npz", logs)
+    assert said in " ".join(line.removeprefix("# ") for line in text.splitlines())
+    assert tomllib.loads(text)["correction"] == correction
+    Path("updated.toml").write_text(text, encoding="utf-8")
+    case = rt.cases.get("updated.toml")
+    assert isinstance(case.correction, {"additive": rt.Additive}.get(correction, rt.DelayOffset))
+    assert case.state_surrogate.sufficient > 0, "the function shows no state equations"
+
+
 @pytest.mark.slow
 def test_a_posterior_is_drawn(place: Path, call, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("emcee")

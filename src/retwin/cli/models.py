@@ -233,9 +233,10 @@ def _fit_dynamics(
 
 def _state_surrogate(system: Case, measured: Trajectories, seed: int) -> FittedStateSurrogate:
     """State equations that stand in for the case's twin, which is no `StateTwin`."""
+    from retwin.twins import keep_workers
     from retwin.update import fit_state_surrogate
 
-    with bar("fit") as show:
+    with keep_workers(), bar("fit") as show:
         found = fit_state_surrogate(
             system.twin,
             system.sampler,

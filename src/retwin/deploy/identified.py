@@ -83,7 +83,7 @@ def save_identification(
     start = start_values(found.twin)
     with write_atomically(folder, folder=True) as part:
         save(logs.trajectories, part / "logs.npz")
-        text = updated_case(opened, found.twin, part, "logs.npz")
+        text = updated_case(opened, found.twin, part, "logs.npz", logs.trajectories)
         (part / "updated.toml").write_text(text, encoding="utf-8")
         values["updated_case"] = _refused(part / "updated.toml", found.twin)
         if values["updated_case"]:

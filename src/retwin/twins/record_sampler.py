@@ -11,7 +11,7 @@ from retwin.twins.command_range import CommandRange, power_spectra
 from retwin.twins.limits import Limits
 from retwin.twins.samplers import MultisineSampler, RampSampler
 
-__all__ = ["sampler_from"]
+__all__ = ["moves_and_rests", "sampler_from"]
 
 MARGIN = 0.1
 """Share of the width of a record's range by which commands go beyond it, at either end."""
@@ -57,7 +57,7 @@ def sampler_from(
     contained = CommandRange.of(values, rate)
     low, high = _wider(contained, limits)
     segments = Segments.from_commands(values)
-    if _moves_and_rests(segments):
+    if moves_and_rests(segments):
         return _ramps(values, rate, segments, low, high)
     steps = min(values.shape[1], MAX_SAMPLES)
     parts = values[:, : values.shape[1] // steps * steps].reshape(-1, steps, values.shape[2])
@@ -97,7 +97,7 @@ def _wider(contained: CommandRange, limits: Limits | None) -> tuple[NDArray, NDA
     return np.maximum(wide[0], limits.low), np.minimum(wide[1], limits.high)
 
 
-def _moves_and_rests(segments: Segments) -> bool:
+def moves_and_rests(segments: Segments) -> bool:
     """Whether the commands of a record have several segments, with rest in them."""
     if segments.max_count < 2:
         return False

@@ -155,7 +155,9 @@ class _Search:
         """
         made = _noisy(self.twin, self.indices, logs)
         commands, measured, seen = self._given
-        found = made.filter(commands, measured, seen, changes=self._changes)
+        found = made.filter(
+            commands, measured, seen, changes=self._changes, simulated=self._simulated
+        )
         density = Prediction(self.observed, *found).log_density()
         sums = np.array([density[part].sum() for part in self.parts])
         return np.where(np.isfinite(sums), sums, -IMPOSSIBLE)
@@ -177,6 +179,13 @@ class _Search:
         for part, move in zip(self.parts, own, strict=True):
             made[part] = move
         return made
+
+    @cached_property
+    def _simulated(self) -> NDArray:
+        """States (n, T, d_x) without noise, the same for all noise that is tried."""
+        commands, twin = self._given[0], self.twin
+        theta = twin.start(len(commands), known_start=True)[0]
+        return twin.equations.steps().run(commands, theta, changes=self._changes)[1]
 
     def visited(self, constant: NDArray | None = None) -> _Visited:
         """All points of a search for the maximum.

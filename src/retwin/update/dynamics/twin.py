@@ -284,6 +284,7 @@ class DynamicsTwin:
         more: tuple[NDArray | float, NDArray | float] = (0.0, 0.0),
         known_start: bool = True,
         moves: NDArray | float = 0.0,
+        simulated: NDArray | None = None,
     ) -> tuple[NDArray, NDArray, NDArray]:
         """The extended Kalman filter on arrays; nothing is checked.
 
@@ -300,6 +301,9 @@ class DynamicsTwin:
             states may be anywhere in their range in calibration.
         moves : ndarray, shape (n, q + d_x), optional
             What is added to `values`.
+        simulated : ndarray, shape (n, T, d_x), optional
+            The states without noise, if they are known; otherwise they are simulated where process
+            noise is in proportion to them.
 
         Returns
         -------
@@ -310,7 +314,9 @@ class DynamicsTwin:
         theta, spread = self.start(len(commands), known_start=known_start)
         steps, theta, process = self.equations.steps(), theta + moves, self.process
         if self.proportional.any():
-            process = self.process_variance(steps.run(commands, theta, changes=changes)[1])
+            if simulated is None:
+                simulated = steps.run(commands, theta, changes=changes)[1]
+            process = self.process_variance(simulated)
         variances = (process + more[0], self.noise + more[1])
         given = (commands, theta, (measured, seen), spread, variances, changes)
         return steps.filter(*given)[:3]

@@ -21,6 +21,7 @@ from retwin.twins.samplers import CommandSampler
 from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import Twin, checked_seed
+from retwin.update.state_surrogate.equations import Scale
 from retwin.update.state_surrogate.search import Found, relative_error, searched
 from retwin.update.state_surrogate.simulations import (
     MIN_SIMULATIONS,
@@ -61,6 +62,9 @@ class StateSurrogate:
         more states are tried.
     allowed : float, default 0.1
         Largest such error that is no error message.
+    sufficient : float, default 0
+        Share of the twin's discrepancy on measured trajectories; the search ends where the error of
+        held-out simulations is below it. By default it goes on until they are predicted no better.
     unknown_start : bool, default False
         Whether the states at the first sample are free, since real records begin anywhere; by
         default they are those with which the twin begins.
@@ -73,6 +77,7 @@ class StateSurrogate:
     spread: float = 1.0
     accuracy: float = 0.01
     allowed: float = 0.1
+    sufficient: float = 0.0
     unknown_start: bool = False
 
     def __post_init__(self) -> None:
@@ -85,6 +90,7 @@ class StateSurrogate:
         finite("spread", self.spread, most=1.0)
         positive("accuracy", self.accuracy)
         positive("allowed", self.allowed)
+        finite("sufficient", self.sufficient, least=0.0, most=SMALL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,6 +208,7 @@ def fit_state_surrogate(
     training = simulations.made(settings.simulations, rng)
     held_out, test = (simulations.made(settings.simulations // 4, rng) for _ in range(2))
     check_outputs(training)
+    expected = None if observed is None else twin.simulate(own[-1], seed=0)
     report(0.2)
     found, history = searched(
         training,
@@ -209,6 +216,7 @@ def fit_state_surrogate(
         orders=settings.states,  # type: ignore[arg-type]  # a tuple
         hidden=settings.hidden,
         accuracy=settings.accuracy,
+        enough=_enough(settings.sufficient, training, expected, observed),
         seed=seed,
         progress=lambda share: report(0.2 + 0.7 * share),
     )
@@ -219,8 +227,11 @@ def fit_state_surrogate(
         "simulations": float(len(training)),
     }
     figures |= _tested(made, test, found, simulations.seconds, settings.allowed)
-    for commands in own if observed is None else own[-1:]:
-        figures |= _compared(twin, made, commands, observed, settings.allowed)
+    if expected is not None:
+        figures |= _compared(made, expected, observed, settings.allowed)
+    else:
+        for commands in own:
+            figures |= _compared(made, twin.simulate(commands, seed=0), None, settings.allowed)
     report(1.0)
     duration = time.perf_counter() - began
     return FittedStateSurrogate(made, figures, history, duration, simulations.reason)
@@ -307,20 +318,32 @@ def _tested(
     } | {"speed": seconds / max(duration, 1e-12)}
 
 
-def _compared(
-    twin: Twin,
-    made: StateTwin,
-    own: NDArray,
+def _enough(
+    share: float,
+    training: Trajectories,
+    expected: Trajectories | None,
     observed: Trajectories | None,
-    allowed: float,
+) -> float:
+    """The relative error of simulations that is a share of the twin's discrepancy, 0 if unknown."""
+    if expected is None or observed is None or not share:
+        return 0.0
+    seen = observed.mask & expected.mask
+    used = training.mask.all(axis=2)
+    deviation = Scale.of(training.observed[used][None]).deviation
+    sizes = relative_error(observed.observed - expected.observed, seen, deviation)
+    return share * float(sizes[seen.any(axis=(0, 1))].min(initial=np.inf))
+
+
+def _compared(
+    made: StateTwin, expected: Trajectories, observed: Trajectories | None, allowed: float
 ) -> dict[str, float]:
     """Errors on the user's own commands, at the present values of the parameters.
 
-    Raises InputError where an error is not small compared with the discrepancy of the twin; without
-    measurements, where it is larger than allowed.
+    `expected` are the simulations of the twin. Raises InputError where an error is not small
+    compared with the discrepancy of the twin; without measurements, where it is larger than
+    allowed.
     """
-    expected = twin.simulate(own, seed=0)
-    error = made.simulate(own, seed=0).observed - expected.observed
+    error = made.simulate(expected.commands, seed=0).observed - expected.observed
     seen, ones = expected.mask, np.ones(len(made.outputs))
     if observed is None:
         compared, largest = expected.observed - expected.observed.mean(axis=(0, 1)), allowed

@@ -86,6 +86,7 @@ def searched(
     accuracy: float,
     seed: int,
     progress: Progress,
+    enough: float = 0.0,
 ) -> tuple[Found, dict[int, float]]:
     """The equations with the number of states that predicts held-out simulations best.
 
@@ -104,6 +105,8 @@ def searched(
         Of the first weights.
     progress : callable
         Called with the share of the work that is done.
+    enough : float
+        The error from which on nothing is searched any more.
 
     Returns
     -------
@@ -119,7 +122,7 @@ def searched(
 
     def begun(order: int, width: int) -> Found:
         equations = Equations.begun(part, order, width, np.random.default_rng(rng))
-        return fitted(part, other, equations, STRONGEST)
+        return fitted(part, other, equations, STRONGEST, enough)
 
     best: Found | None = None
     history: dict[int, float] = {}
@@ -131,22 +134,33 @@ def searched(
         if best is None or found.error < WORTH * best.error:
             best, worse = found, 0
         progress(0.6 * (1 - 0.7 ** len(history)))
-        if best.error < accuracy or (worse == PATIENCE and np.isfinite(best.error)):
+        if best.error < max(accuracy, enough) or (worse == PATIENCE and np.isfinite(best.error)):
             break
     assert best is not None
-    if best.error >= accuracy:
+    if best.error >= max(accuracy, enough):
         best = min(best, begun(best.order, 2 * hidden), key=lambda each: each.error)
         history[best.order] = best.error
     progress(0.7)
     if steps < training.steps and np.isfinite(best.error):
-        best = fitted(training, held_out, best.equations, WEAKEST)
+        whole = _error_of(best.equations, held_out) if enough else np.inf
+        if whole > enough:
+            best = fitted(training, held_out, best.equations, WEAKEST, enough)
+        else:
+            best = Found(best.equations, whole)
     return best, history
 
 
 def fitted(
-    training: Trajectories, held_out: Trajectories, equations: Equations, variance: float
+    training: Trajectories,
+    held_out: Trajectories,
+    equations: Equations,
+    variance: float,
+    enough: float = 0.0,
 ) -> Found:
-    """The equations whose search begins at some weights, with an assumed variance."""
+    """The equations whose search begins at some weights, with an assumed variance.
+
+    It ends where the error of held-out simulations is `enough`.
+    """
     twin = equations.trainable(training.inputs, training.outputs, training.rate)
     starts = dict.fromkeys((f"start_{each.name}" for each in twin.states), 0.0)
     weights = dict(zip(twin.names, equations.flat, strict=False))
@@ -168,10 +182,19 @@ def fitted(
         worse = 0 if error < WORTH * best.error else worse + 1
         if error < best.error:
             best = Found(equations.with_weights(shared), error)
-        if worse == PATIENCE:
+        if worse == PATIENCE or best.error < enough:
             break
         variance = max(variance / STEP, WEAKEST)
     return best
+
+
+def _error_of(equations: Equations, made: Trajectories) -> float:
+    """The largest relative error of an output in simulations."""
+    twin = equations.trainable(made.inputs, made.outputs, made.rate)
+    theta = np.tile(np.append(equations.flat, np.zeros(len(twin.states))), (len(made), 1))
+    simulated = twin.steps().run(made.commands.astype(np.float64), theta)[0]
+    deviation = equations.outputs.deviation
+    return float(relative_error(made.observed - simulated, made.mask, deviation).max())
 
 
 def _components(outputs: NDArray) -> int:
