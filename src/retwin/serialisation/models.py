@@ -113,6 +113,11 @@ def _limited(where: str) -> Iterator[None]:
     budget = Budget(where)
 
     class Limit(TorchDispatchMode):
+        @classmethod
+        def _should_skip_dynamo(cls) -> bool:
+            """False, since what torch wraps otherwise imports its compiler, which takes a second."""
+            return False
+
         def __torch_dispatch__(
             self, operator: Any, types: Any, args: Any = (), kwargs: Any = None
         ) -> Any:
