@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
 from scipy.io import savemat
 from test_architecture import ROOMS
 
 import retwin as rt
-from retwin.cli import app
+from retwin.cli import command_tree
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -49,7 +48,7 @@ def shown(page: Path) -> list[tuple[str, bool]]:
 
 def check(line: str, *, whole: bool) -> None:
     """Compare a command with the command line; `whole`: no argument may be missing."""
-    command: Any = typer.main.get_command(app)
+    command: Any = command_tree()
     words = shlex.split(re.split(r"\s(?:&&|\||>)\s", line)[0], comments=True)
     while words and hasattr(command, "commands") and not words[0].startswith("-"):
         assert words[0] in command.commands, f"no command {words[0]!r} in: retwin {line}"

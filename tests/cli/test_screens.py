@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
 from rich.console import Console
 from test_readme import check
 
 import retwin as rt
-from retwin.cli import app
+from retwin.cli import command_tree
 from retwin.cli.terminal import answer, bar, be_quiet, note, show_warnings, table
 from retwin.progress import FinishedStage
 
@@ -36,7 +35,7 @@ def commands(command: Any, *words: str) -> Iterator[tuple[str, Any]]:
         yield from commands(each, *words, name)
 
 
-ALL: dict[str, Any] = dict(commands(typer.main.get_command(app)))
+ALL: dict[str, Any] = dict(commands(command_tree()))
 
 
 @pytest.fixture
@@ -61,7 +60,7 @@ def test_all_commands_fit_one_screen(narrow) -> None:
     lines = out.rstrip("\n").splitlines()
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 80
-    for name, command in typer.main.get_command(app).commands.items():  # type: ignore[attr-defined]
+    for name, command in command_tree().commands.items():  # type: ignore[attr-defined]
         if command.hidden:
             continue
         (line,) = (line for line in lines if line.startswith(f"│ {name} "))

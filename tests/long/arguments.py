@@ -18,18 +18,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import typer
-from mutation import broken, call, files_in
+from mutation import broken, call, files_in, import_all
 
-# What the commands import, so that the cases need not.
+# The heaviest of what the commands import, so that the cases need not.
 import retwin.cases.animation
-import retwin.cli.benchmark
 import retwin.deploy.bundle.guard
 import retwin.deploy.onnx.portable
-import retwin.deploy.simulations.job
 import retwin.report.page
 import retwin.study  # noqa: F401
-from retwin.cli import app
+from retwin.cli import command_tree
 
 with contextlib.suppress(ImportError):  # when it is imported, it writes a file of its own
     import onnxruntime  # noqa: F401
@@ -129,7 +126,7 @@ def suffix(name: str, target: Any) -> str:
 
 def cases() -> Iterator[tuple[str, list[str], bool]]:
     """Each command, its words with an odd value, and whether that may be accepted."""
-    for name, command in leaves(typer.main.get_command(app)):
+    for name, command in leaves(command_tree()):
         if name not in BASE:
             continue
         places = [each for each in command.params if is_target(each)]
@@ -185,7 +182,7 @@ def run_mutated(samples: Path, work: Path, first: int, count: int) -> Iterator[s
     folder, output = work / "folder", work / "stderr"
     shutil.copytree(samples, folder)
     before = files_in(folder)
-    commands = dict(leaves(typer.main.get_command(app)))
+    commands = dict(leaves(command_tree()))
     names = sorted(commands)
     for seed in range(first, first + count):
         name = names[seed % len(names)]
@@ -215,11 +212,14 @@ def run(samples: Path, work: Path, chosen: Sequence[str]) -> Iterator[str]:
     """Every requirement that an odd argument of a command makes it break."""
     folder, output = work / "folder", work / "stderr"
     shutil.copytree(samples, folder)
-    before = files_in(folder)
+    before, modules, tried = files_in(folder), work / "modules", ""
     for name, words, possible in cases():
         if name not in chosen:
             continue
-        ended = call(folder, words, output)
+        ended = call(folder, words, output, modules if name != tried else None)
+        if name != tried:
+            tried = name
+            import_all(modules)
         made = frozenset(name for name in ended.files if name.startswith("new-"))
         problem = broken(ended, before, made)
         if not problem and ended.code == 0 and not possible:

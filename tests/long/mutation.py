@@ -310,6 +310,13 @@ def broken(ended: Ended, before: frozenset[str], made: frozenset[str]) -> str:
     return ""
 
 
+def import_all(modules: Path) -> None:
+    """Import here what a child has imported, so that the next ones need not."""
+    for module in modules.read_text().split():
+        with contextlib.suppress(Exception):
+            importlib.import_module(module)
+
+
 def run(samples: Path, work: Path, first: int, count: int, name: str) -> Iterator[str]:
     """Every requirement that a mutated file of the format makes a command break."""
     form, sample, output = FORMATS[name], samples / name, work / f"{name}.stderr"
@@ -321,10 +328,7 @@ def run(samples: Path, work: Path, first: int, count: int, name: str) -> Iterato
         assert (ended.code, ended.stderr) == (0, ""), (name, command, ended)
         made.append(ended.files - files_in(sample))
         shutil.rmtree(folder)
-        # What the command imports is imported here, so that the cases need not.
-        for module in modules.read_text().split():
-            with contextlib.suppress(Exception):
-                importlib.import_module(module)
+        import_all(modules)
     for seed in range(first, first + count):
         command, allowed = form.commands[seed % len(made)], made[seed % len(made)]
         shutil.copytree(sample, folder)

@@ -9,9 +9,8 @@ import arguments
 import log_files
 import mutation
 import pytest
-import typer
 
-from retwin.cli import app
+from retwin.cli import command_tree
 
 
 @pytest.fixture
@@ -30,7 +29,7 @@ def together(samples: Path, tmp_path: Path) -> Path:
 
 
 def test_every_command_with_a_number_or_a_target_is_tried() -> None:
-    for name, command in arguments.leaves(typer.main.get_command(app)):
+    for name, command in arguments.leaves(command_tree()):
         odd = [each for each in command.params if arguments.is_odd(each)]
         assert name in arguments.BASE or not odd, name
 

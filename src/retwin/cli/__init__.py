@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import sys
 from errno import ENAMETOOLONG
+from functools import lru_cache
 from typing import Annotated, Any
 
 import typer
@@ -50,7 +51,7 @@ from retwin.cli.terminal import (
 )
 from retwin.errors import InputError, place_of
 
-__all__ = ["app", "main"]
+__all__ = ["app", "command_tree", "main"]
 
 UNSHOWN = ("quiet", "help", "install_completion", "show_completion")
 """Options for which the first screen has no line."""
@@ -119,6 +120,12 @@ def options(
         raise typer.Exit
 
 
+@lru_cache(maxsize=1)
+def command_tree() -> Any:
+    """The tree of all commands with their options, made once per process."""
+    return typer.main.get_command(app)
+
+
 def main() -> None:
     """Run the command line and exit with its code.
 
@@ -132,7 +139,7 @@ def _run() -> int:
     """Run the command; print an error as one line, and return the exit code."""
     try:
         # Typer ends Ctrl-C with this code and no message; older versions raise Abort.
-        code: int = app(prog_name="retwin", standalone_mode=False) or 0
+        code: int = command_tree()(prog_name="retwin", standalone_mode=False) or 0
         if code != INTERRUPTED:
             return code
         complain_of_interruption(kept=False)

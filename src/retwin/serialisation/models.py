@@ -115,7 +115,7 @@ def _limited(where: str) -> Iterator[None]:
     class Limit(TorchDispatchMode):
         @classmethod
         def _should_skip_dynamo(cls) -> bool:
-            """False, since what torch wraps otherwise imports its compiler, which takes a second."""
+            """False, since what torch wraps here imports its compiler, which takes a second."""
             return False
 
         def __torch_dispatch__(
