@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -188,6 +189,26 @@ def test_the_same_twin_gives_the_same_bytes(corrected: DynamicsTwin, tmp_path: P
         path = export_fmu(corrected, tmp_path / folder / "t.fmu", compiled=False).path
         parts.append(path.read_bytes())
     assert parts[0] == parts[1]
+
+
+def test_it_reports_states_and_commands_outside_the_calibration(
+    corrected: DynamicsTwin, tmp_path: Path
+) -> None:
+    path = export_fmu(corrected, tmp_path / "twin.fmu").path
+    pump = next(each for each in description(path).modelVariables if each.name == "pump")
+    low, high = corrected.domain.low[-1], corrected.domain.high[-1]
+    assert (float(pump.min), float(pump.max), float(pump.nominal)) == (low, high, high)
+    commands = commanded(1, 9)[0].clip(low, high)
+    within = simulated(path, commands, 0.5)
+    assert not within["outside_training"].any()
+    for factor in (1.04, 1.5):
+        beyond = np.full_like(commands, factor * high)
+        found = simulated(path, beyond, 0.5)["outside_training"]
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            corrected.simulate(beyond[None], seed=0)
+        assert found.any() == bool(warned)
+        assert found[-1]
 
 
 @pytest.mark.parametrize("version", ["2.0", "3.0"])

@@ -20,6 +20,7 @@ import retwin as rt
 from retwin.deploy.fmu.export import export_fmu
 from retwin.errors import InputError
 from retwin.nets.mixtures import Blocks
+from retwin.twins.command_range import CommandRange
 from retwin.twins.compiled.kernel import compilers
 from retwin.update.corrections import Chain, SampledSensor
 from retwin.update.residual import SequenceMixture, SequenceResidual
@@ -230,6 +231,41 @@ def test_states_are_kept_and_steps_may_be_of_any_length(tmp_path: Path) -> None:
             slave.doStep(10 / RATE, 1 / RATE)
             assert slave.getReal([reference["y1"]]) == ends[-1]
     assert ends[0] == ends[1]
+
+
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_it_reports_commands_outside_the_training_range(version: str, tmp_path: Path) -> None:
+    """As `CommandRange` does, with values and speeds; a spectrum is known only at the end."""
+    twin, rng = surrogate(NETWORKS["mlp"]), np.random.default_rng(2)
+    training = rng.uniform([-1.0, 3.0], [1.0, 5.0], (4, STEPS, 2)).cumsum(axis=1) / STEPS
+    twin.trained = trained = CommandRange.of(training, RATE)
+    path = export_fmu(twin, tmp_path / "twin.fmu", version=version).path
+    found = fmpy.read_model_description(str(path), validate=True)
+    inputs = [each for each in found.modelVariables if each.causality == "input"]
+    assert tuple(float(each.min) for each in inputs) == trained.low
+    assert tuple(float(each.max) for each in inputs) == trained.high
+    greatest = np.abs([trained.low, trained.high]).max(axis=0).tolist()
+    assert [float(each.nominal) for each in inputs] == greatest
+    assert all(float(each.min) <= float(each.start) <= float(each.max) for each in inputs)
+    beyond, sudden = training[:1].copy(), training[:1].copy()
+    beyond[0, -9:, 1] += 2 * (trained.high[1] - trained.low[1])
+    sudden[0, ::2, 0] += 2 * trained.speed[0] / RATE
+    for commands in (training[:1], beyond, sudden):
+        times = np.arange(STEPS) / RATE
+        kinds = [("time", float), ("u1", float), ("u2", float)]
+        rows = [(time, *u) for time, u in zip(times, commands[0].tolist(), strict=True)]
+        messages: list[str] = []
+        made = fmpy.simulate_fmu(
+            str(path), stop_time=times[-1], step_size=1 / RATE, output_interval=1 / RATE,
+            input=np.array(rows, kinds), record_events=False,
+            logger=lambda *given, messages=messages: messages.append(str(given[-1])),
+        )  # fmt: skip
+        wrong = (trained.scores(commands, RATE)[:, :2] > 1).any()
+        assert made["outside_training"].any() == wrong
+        assert len(messages) == wrong
+        assert all("outside the training range" in each for each in messages)
+    other = export_fmu(surrogate(NETWORKS["linear"]), tmp_path / "other.fmu", compiled=False)
+    assert "outside_training" not in other.variables, "it cannot report what it does not know"
 
 
 def test_what_depends_on_the_future_is_refused(tmp_path: Path) -> None:

@@ -142,6 +142,18 @@ class CommandRange:
             )
         return found
 
+    @property
+    def bounds(self) -> tuple[NDArray, NDArray, NDArray]:
+        """Lowest and highest value, and highest speed, (d_u,) each, that are within the range.
+
+        See `scores`, which compares the spectrum too.
+        """
+        low, high, speed = (np.array(each) for each in (self.low, self.high, self.speed))
+        margin = (TOLERANCE + self.chance) * (high - low)
+        margin = np.where(high > low, margin, ROUNDING * np.abs(low))
+        fastest = (1 + SPEED_TOLERANCE) * (1 + 2 * self.chance) * np.where(speed > 0, speed, inf)
+        return low - margin, high + margin, fastest
+
     def shares(self, commands: NDArray, rate: float) -> NDArray:
         """Share of the power of each trajectory's commands that lies above the band, (n, d_u)."""
         frequency = _frequencies(commands, rate)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import uuid
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
@@ -28,10 +28,12 @@ class Variable:
     name, unit, about : str
         Its name, unit ("" for none) and description.
     role : str
-        "time", "input", "output", "parameter" (tunable), "fixed" (before the begin), "seed" or
-        "noise".
+        "time", "input", "output", "parameter" (tunable), "fixed" (before the begin), "seed",
+        "noise" or "outside".
     start : float
         Its value at the begin, but for outputs.
+    limits : (float, float), optional
+        Its least and greatest value.
 
     """
 
@@ -40,6 +42,7 @@ class Variable:
     about: str
     role: str
     start: float = 0.0
+    limits: tuple[float, float] | None = None
 
 
 def variables_of(
@@ -48,6 +51,9 @@ def variables_of(
     first: Sequence[float],
     parameters: Sequence[tuple[Parameter, float]],
     starts: Sequence[tuple[str, str, float]],
+    *,
+    limits: Sequence[tuple[float, float]] | None = None,
+    ranged: bool = False,
 ) -> list[Variable]:
     """All variables in the order of twin.c.
 
@@ -61,13 +67,18 @@ def variables_of(
         Parameters that may be set, with their values.
     starts : sequence of (str, str, float)
         Name, unit and start value of each state.
+    limits : sequence of (float, float), optional
+        Least and greatest value of each command.
+    ranged : bool
+        Whether the FMU compares the commands with those of the training.
 
     """
     us, ys = (list(zip(each.names, each.units, strict=True)) for each in (inputs, outputs))
+    ends: Sequence[tuple[float, float] | None] = [None] * len(us) if limits is None else limits
     made = [Variable("time", "s", "", "time")]
     made += [
-        Variable(name, unit, "command", "input", value)
-        for (name, unit), value in zip(us, first, strict=True)
+        Variable(name, unit, "command", "input", value, each)
+        for (name, unit), value, each in zip(us, first, ends, strict=True)
     ]
     made += [Variable(name, unit, "output, drawn if noise is true", "output") for name, unit in ys]
     quantities = (("mean", "its mean"), ("q05", "its 5 % quantile"), ("q95", "its 95 % quantile"))
@@ -89,6 +100,9 @@ def variables_of(
     ]
     made.append(Variable("seed", "", "seed of the noise", "seed"))
     made.append(Variable("noise", "", "whether outputs are drawn from their distribution", "noise"))
+    if ranged:
+        about = "whether commands or states are outside the training range, where outputs are "
+        made.append(Variable("outside_training", "", f"{about}extrapolated", "outside"))
     return list(_distinct(made))
 
 
@@ -102,7 +116,7 @@ def _distinct(variables: Sequence[Variable]) -> Iterator[Variable]:
             name, number = f"{base}.{number}", number + 1
         taken.add(name)
         unit, about = _printable(each.unit), _printable(each.about)
-        yield Variable(name, "" if unit == "1" else unit, about, each.role, each.start)
+        yield replace(each, name=name, unit="" if unit == "1" else unit, about=about)
 
 
 def _printable(text: str) -> str:
@@ -118,7 +132,10 @@ CAUSALITY = {
     "fixed": ("parameter", "fixed"),
     "seed": ("parameter", "fixed"),
     "noise": ("parameter", "tunable"),
+    "outside": ("output", "discrete"),
 }
+OUTPUTS = ("output", "outside")
+"""Roles of outputs."""
 """Causality and variability by role."""
 
 
@@ -186,7 +203,7 @@ def description(
     outputs = [
         (place if two else reference)
         for place, (reference, each) in enumerate(shown, 1)
-        if each.role == "output"
+        if each.role in OUTPUTS
     ]
     if two:
         for part, tag in (("Outputs", "Unknown"), ("InitialUnknowns", "Unknown")):
@@ -202,7 +219,7 @@ def description(
 
 def _add_variable(listed: Element, reference: int, each: Variable, *, two: bool) -> None:
     """Add a variable to the list of ModelVariables."""
-    kinds = {"seed": "Integer" if two else "Int32", "noise": "Boolean"}
+    kinds = {"seed": "Integer" if two else "Int32", "noise": "Boolean", "outside": "Boolean"}
     kind = kinds.get(each.role, "Real" if two else "Float64")
     common = {"name": each.name, "valueReference": str(reference)}
     if each.about:
@@ -217,17 +234,27 @@ def _add_variable(listed: Element, reference: int, each: Variable, *, two: bool)
     if kind in ("Integer", "Int32", "Boolean") and each.role == "noise":
         variability = "tunable"
     common |= {"causality": causality, "variability": variability}
-    if each.role == "output":
+    if each.role in OUTPUTS:
         common["initial"] = "calculated"
     else:
         start = {"Integer": "0", "Int32": "0", "Boolean": "false"}.get(
             kind, repr(float(each.start))
         )
         values["start"] = start
+    values |= _range(each)
     if two:
         SubElement(SubElement(listed, "ScalarVariable", common), kind, values)
     else:
         SubElement(listed, kind, {**common, **values})
+
+
+def _range(each: Variable) -> dict[str, str]:
+    """The attributes of a variable with limits; its nominal value is the greatest magnitude."""
+    if each.limits is None:
+        return {}
+    low, high = map(float, each.limits)
+    found = {"min": low, "max": high, "nominal": max(abs(low), abs(high))}
+    return {name: repr(value) for name, value in found.items() if name != "nominal" or value > 0}
 
 
 def build_description(identifier: str) -> bytes:

@@ -3,6 +3,25 @@
 #include <stdlib.h>
 #include "fmi2Functions.h"
 
+#define LEFT                                                                                        \
+    "commands or states are outside the training range; the outputs there are extrapolated"
+
+/* The value of a Boolean variable, -1 if there is no such variable. */
+static int flag(Twin *twin, uint32_t reference)
+{
+    if (reference == NOISY)
+        return twin->noisy != 0;
+#ifdef RANGED
+    if (reference == OUTSIDE) {
+        if (!twin->begun)
+            begin(twin), twin->begun = 0;
+        evaluate(twin);
+        return twin->outside;
+    }
+#endif
+    return -1;
+}
+
 typedef struct {
     Twin twin;
     fmi2CallbackFunctions callbacks;
@@ -15,6 +34,14 @@ static fmi2Status refused(Instance *of, const char *message)
         of->callbacks.logger(of->callbacks.componentEnvironment, of->name, fmi2Error, "logStatusError",
                              "%s", message);
     return fmi2Error;
+}
+
+/* A message at the first sample that is outside the range of training. */
+static void warn(Instance *of)
+{
+    if (of->twin.outside && !of->twin.warned++ && of->callbacks.logger)
+        of->callbacks.logger(of->callbacks.componentEnvironment, of->name, fmi2Warning,
+                             "logStatusWarning", "%s", LEFT);
 }
 
 const char *fmi2GetTypesPlatform(void)
@@ -145,9 +172,10 @@ fmi2Status fmi2GetBoolean(fmi2Component c, const fmi2ValueReference vr[], size_t
                           fmi2Boolean value[])
 {
     for (size_t i = 0; i < n; i++) {
-        if (vr[i] != NOISY)
+        int found = flag(&((Instance *)c)->twin, vr[i]);
+        if (found < 0)
             return refused(c, "fmi2GetBoolean: unknown value reference");
-        value[i] = ((Instance *)c)->twin.noisy ? fmi2True : fmi2False;
+        value[i] = found ? fmi2True : fmi2False;
     }
     return fmi2OK;
 }
@@ -158,7 +186,7 @@ fmi2Status fmi2SetBoolean(fmi2Component c, const fmi2ValueReference vr[], size_t
     Twin *twin = &((Instance *)c)->twin;
     for (size_t i = 0; i < n; i++) {
         if (vr[i] != NOISY)
-            return refused(c, "fmi2SetBoolean: unknown value reference");
+            return refused(c, "fmi2SetBoolean: this variable cannot be set");
         twin->noisy = value[i] != fmi2False;
     }
     twin->ready = 0;
@@ -257,6 +285,7 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real step, fmi2Boolean
         return refused(c, "fmi2DoStep: a step that is not positive");
     if (!advance_to(&((Instance *)c)->twin, time + step))
         return refused(c, "fmi2DoStep: the states do not stay finite");
+    warn(c);
     return fmi2OK;
 }
 

@@ -3,6 +3,25 @@
 #include <stdlib.h>
 #include "fmi3Functions.h"
 
+#define LEFT                                                                                        \
+    "commands or states are outside the training range; the outputs there are extrapolated"
+
+/* The value of a Boolean variable, -1 if there is no such variable. */
+static int flag(Twin *twin, uint32_t reference)
+{
+    if (reference == NOISY)
+        return twin->noisy != 0;
+#ifdef RANGED
+    if (reference == OUTSIDE) {
+        if (!twin->begun)
+            begin(twin), twin->begun = 0;
+        evaluate(twin);
+        return twin->outside;
+    }
+#endif
+    return -1;
+}
+
 typedef struct {
     Twin twin;
     fmi3LogMessageCallback log;
@@ -14,6 +33,13 @@ static fmi3Status refused(Instance *of, const char *message)
     if (of && of->log)
         of->log(of->environment, fmi3Error, "logStatusError", message);
     return fmi3Error;
+}
+
+/* A message at the first sample that is outside the range of training. */
+static void warn(Instance *of)
+{
+    if (of->twin.outside && !of->twin.warned++ && of->log)
+        of->log(of->environment, fmi3Warning, "logStatusWarning", LEFT);
 }
 
 const char *fmi3GetVersion(void)
@@ -158,9 +184,10 @@ fmi3Status fmi3GetBoolean(fmi3Instance c, const fmi3ValueReference vr[], size_t 
                           fmi3Boolean value[], size_t m)
 {
     for (size_t i = 0; i < n; i++) {
-        if (vr[i] != NOISY || m != n)
+        int found = flag(&((Instance *)c)->twin, vr[i]);
+        if (found < 0 || m != n)
             return refused(c, "fmi3GetBoolean: unknown value reference");
-        value[i] = ((Instance *)c)->twin.noisy != 0;
+        value[i] = found != 0;
     }
     return fmi3OK;
 }
@@ -171,7 +198,7 @@ fmi3Status fmi3SetBoolean(fmi3Instance c, const fmi3ValueReference vr[], size_t 
     Twin *twin = &((Instance *)c)->twin;
     for (size_t i = 0; i < n; i++) {
         if (vr[i] != NOISY || m != n)
-            return refused(c, "fmi3SetBoolean: unknown value reference");
+            return refused(c, "fmi3SetBoolean: this variable cannot be set");
         twin->noisy = value[i] ? 1 : 0;
     }
     twin->ready = 0;
@@ -264,6 +291,7 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 step, fmi3Bo
         return refused(c, "fmi3DoStep: a step that is not positive");
     if (!advance_to(&((Instance *)c)->twin, time + step))
         return refused(c, "fmi3DoStep: the states do not stay finite");
+    warn(c);
     *last = time + step;
     return fmi3OK;
 }

@@ -9,7 +9,11 @@
  *   VALUES[NQ], PLACE[NQ] parameters and start values, and their value references, -1 for none
  *   FACTOR[NQ][NR]        of the covariance of these, FACTOR FACTOR^T
  *   START[NX]             deviations by which starts differ between instances
- *   PROCESS[NX], NOISE[NY] variances of process and measurement noise */
+ *   PROCESS[NX], NOISE[NY] variances of process and measurement noise
+ *
+ * and, where there was a calibration, RANGED and
+ *
+ *   LEAST[NX + NU], GREATEST[NX + NU] values beyond which states and commands are outside of it */
 
 #define QUANTILE 1.6448536269514722
 
@@ -25,7 +29,7 @@ typedef struct {
     double error[NY];            /* measurement noise of the present sample */
     int64_t samples;             /* samples since the begin */
     uint64_t drawn;              /* random numbers so far */
-    int32_t seed, noisy, begun, ready;
+    int32_t seed, noisy, begun, ready, outside, warned;
 } Twin;
 
 static double normal(Twin *twin)
@@ -128,6 +132,19 @@ static void next(Twin *twin)
     twin->ready = 0;
 }
 
+#ifdef RANGED
+/* Whether the present states or commands leave the range of the calibration. */
+static int outside(const Twin *twin)
+{
+    for (int i = 0; i < NX + NU; i++) {
+        double value = i < NX ? twin->z[i] : twin->v[COMMAND + i - NX];
+        if (value < LEAST[i] || value > GREATEST[i])
+            return 1;
+    }
+    return 0;
+}
+#endif
+
 /* Outputs at the present states and commands. */
 static void evaluate(Twin *twin)
 {
@@ -167,6 +184,9 @@ static void evaluate(Twin *twin)
         twin->v[HIGH + i] = mean[i] + half;
         twin->v[OUTPUT + i] = mean[i] + drawn + twin->v[BIAS + i];
     }
+#ifdef RANGED
+    twin->outside = outside(twin);
+#endif
     twin->ready = 1;
 }
 

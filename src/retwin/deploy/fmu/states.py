@@ -26,6 +26,7 @@ def states_text(twin: StateTwin | DynamicsTwin) -> Text:
         Its commands are splines between samples, which are not known before later samples are.
 
     """
+    ranged = not isinstance(twin, StateTwin)
     corrected = _as_corrected(twin) if isinstance(twin, StateTwin) else twin
     interpolation = corrected.equations.interpolation
     require(
@@ -35,10 +36,10 @@ def states_text(twin: StateTwin | DynamicsTwin) -> Text:
         got="splines, which depend on commands that an FMU does not know yet",
         remedy='make the twin with interpolation="linear"',
     )
-    variables, places = _variables(corrected)
+    variables, places = _variables(corrected, ranged)
     parts = map(written_beside, ("variables.c", "random.c", "states.c"))
     return Text(
-        "\n".join([_model(corrected, variables, places), *parts]),
+        "\n".join([_model(corrected, places, ranged), *parts]),
         variables,
         corrected.rate,
         corrected.case,
@@ -81,7 +82,7 @@ def _as_corrected(twin: StateTwin) -> DynamicsTwin:
     )
 
 
-def _variables(twin: DynamicsTwin) -> tuple[list[Variable], list[int]]:
+def _variables(twin: DynamicsTwin, ranged: bool) -> tuple[list[Variable], list[int]]:
     """The variables, and the value references of parameters and starts; -1 for none."""
     equations = twin.equations
     inputs, outputs = len(equations.inputs), len(equations.outputs)
@@ -98,23 +99,26 @@ def _variables(twin: DynamicsTwin) -> tuple[list[Variable], list[int]]:
         (each.name, each.unit, value)
         for each, value in zip(equations.states, values[-states:], strict=True)
     ]
-    made = variables_of(
-        equations.inputs, equations.outputs, twin.domain.mean[states:].tolist(), parameters, starts
-    )
-    first = 1 + 2 * inputs + 5 * outputs
+    ends = twin.domain.low[states:].tolist(), twin.domain.high[states:].tolist()
+    given = equations.limits
+    limits = None if given is None and not ranged else list(zip(*ends, strict=True))
+    first = twin.domain.mean[states:].tolist()
+    channels = (equations.inputs, equations.outputs)
+    made = variables_of(*channels, first, parameters, starts, limits=limits, ranged=ranged)
+    following = 1 + 2 * inputs + 5 * outputs
     places = []
     for own in [*shown, *[True] * states]:
-        places.append(first if own else -1)
-        first += own
+        places.append(following if own else -1)
+        following += own
     return made, places
 
 
-def _model(twin: DynamicsTwin, variables: Sequence[Variable], places: Sequence[int]) -> str:
+def _model(twin: DynamicsTwin, places: Sequence[int], ranged: bool) -> str:
     """The equations of a twin and its numbers as C."""
-    states = len(twin.process)
+    states, outputs = len(twin.process), len(twin.outputs)
     sizes = {
         "NR": twin.factor.shape[1],
-        "NV": len(variables) - 2,
+        "NV": 1 + 2 * len(twin.inputs) + 5 * outputs + sum(each >= 0 for each in places),
         "SUBSTEPS": twin.equations.substeps,
         "LINEAR": int(twin.equations.interpolation == "linear"),
     }
@@ -127,7 +131,11 @@ def _model(twin: DynamicsTwin, variables: Sequence[Variable], places: Sequence[i
         "NOISE": twin.noise,
         "FIRST": twin.domain.mean[states:],
     }
+    if ranged:
+        low, high = twin.bounds
+        arrays = {**arrays, "LEAST": low, "GREATEST": high}
     lines = [f"#define {name} {size}" for name, size in sizes.items()]
+    lines += ["#define RANGED"] * ranged
     lines += [f"#define {name} {value!r}" for name, value in numbers.items()]
     lines += [constants(name, values) for name, values in arrays.items()]
     lines.append(constants("PLACE", places, "int"))

@@ -12,6 +12,11 @@
  *   PAST_MEAN[NU + NY] ... LIMIT[NY]      its units, calibration and bounds
  *   PERSISTENCE[1 + NY]                   correlation of the noise from sample to sample, that which
  *                                         selects components first
+ *
+ * and, where the commands of the training are known, RANGED and
+ *
+ *   LEAST[NU], GREATEST[NU], FASTEST[NU]  values, and change from sample to sample, beyond which a
+ *                                         command is outside of them
  */
 
 #ifdef MEMBERS
@@ -26,8 +31,9 @@ typedef struct {
     double begin;          /* time of the first sample */
     double before[MEMORY]; /* what all networks remember, and the noise, before the present sample */
     double after[MEMORY];  /* after it */
+    double last[NU + 1];   /* commands of the sample before */
     int64_t samples;       /* samples since the begin */
-    int32_t seed, noisy, begun, ready;
+    int32_t seed, noisy, begun, ready, outside, warned;
 } Twin;
 
 /* Outputs y[NY] of the surrogate for commands u[NU]. */
@@ -183,6 +189,21 @@ static void begin(Twin *twin)
     twin->ready = 0;
 }
 
+#ifdef RANGED
+/* Whether the present commands leave the range of training. */
+static int outside(const Twin *twin)
+{
+    for (int i = 0; i < NU; i++) {
+        double u = twin->v[COMMAND + i];
+        if (u < LEAST[i] || u > GREATEST[i])
+            return 1;
+        if (twin->samples && fabs(u - twin->last[i]) > FASTEST[i])
+            return 1;
+    }
+    return 0;
+}
+#endif
+
 /* Outputs at the present sample, for the present commands. */
 static void evaluate(Twin *twin)
 {
@@ -205,6 +226,9 @@ static void evaluate(Twin *twin)
         twin->v[HIGH + i] = path[i] + high[i];
         twin->v[OUTPUT + i] = path[i] + (twin->noisy ? z[i] : mean[i]) + twin->v[BIAS + i];
     }
+#ifdef RANGED
+    twin->outside = outside(twin);
+#endif
     twin->ready = 1;
 }
 
@@ -216,6 +240,7 @@ static int advance_to(Twin *twin, double time)
     while (twin->begin + (double)(twin->samples + 1) * PERIOD <= time + 1e-6 * PERIOD) {
         evaluate(twin);
         memcpy(twin->before, twin->after, sizeof twin->before);
+        memcpy(twin->last, twin->v + COMMAND, NU * sizeof *twin->last);
         twin->samples++;
         twin->ready = 0;
     }

@@ -39,13 +39,15 @@ def surrogate_text(twin: Surrogate | CorrectedTwin) -> Text:
     )
     inputs, outputs = len(surrogate.inputs), len(surrogate.outputs)
     network = c_network(surrogate.config, inputs, outputs)
+    first, limits, ranged = _commands(surrogate)
     networks = [network]
     parts = [
         network.defined("SURROGATE"),
         f"#define REMEMBERED {network.memory}\n#define PERIOD {1 / surrogate.rate!r}\n",
         constants("SURROGATE_WEIGHTS", weights_of(surrogate.config, surrogate.network), "float"),
-        constants("FIRST", flat(surrogate.before.mean)),
+        constants("FIRST", first),
         *_units(BEFORE=surrogate.before, AFTER=surrogate.after),
+        *ranged,
     ]
     if residual is not None:
         encoder, texts = _residual_parts(residual)
@@ -58,13 +60,30 @@ def surrogate_text(twin: Surrogate | CorrectedTwin) -> Text:
     defined += "".join(f"#define USES_{kind}\n" for kind in kinds)
     shared = ["variables.c", "networks.c", *(["random.c"] if residual is not None else [])]
     source = [defined, *map(written_beside, shared), *parts, written_beside("surrogate.c")]
-    first = surrogate.before.mean.tolist()
+    channels = (surrogate.inputs, surrogate.outputs)
     return Text(
         "\n".join(source),
-        variables_of(surrogate.inputs, surrogate.outputs, first, (), ()),
+        variables_of(*channels, first, (), (), limits=limits, ranged=bool(ranged)),
         surrogate.rate,
         "" if isinstance(twin, Surrogate) else twin.case,
     )
+
+
+def _commands(
+    surrogate: Surrogate,
+) -> tuple[list[float], list[tuple[float, float]] | None, list[str]]:
+    """Commands before any are given, those of the training, and what is outside as C text.
+
+    A range that was not computed from commands, of an older model, has no speeds.
+    """
+    trained, mean = surrogate.trained, surrogate.before.mean.double().numpy()
+    if trained is None:
+        return mean.tolist(), None, []
+    low, high, speed = trained.bounds
+    arrays = {"LEAST": low, "GREATEST": high, "FASTEST": speed / surrogate.rate}
+    text = ["#define RANGED", *(constants(name, values) for name, values in arrays.items())]
+    limits = list(zip(trained.low, trained.high, strict=True))
+    return np.clip(mean, trained.low, trained.high).tolist(), limits, text
 
 
 def _refuse(wrong: bool, got: str, remedy: str) -> None:

@@ -1,6 +1,6 @@
 /* Value references: 0 the time, commands, outputs, their means, 5 % and 95 % quantiles, gains of the
- * commands and biases of the outputs by faults, then what else NV variables are, seed and noise. Above
- * this text stand NU, NY and NV. */
+ * commands and biases of the outputs by faults, then what else NV variables are, seed, noise, and, if
+ * RANGED is defined, whether the range of training is left. Above this text stand NU, NY and NV. */
 
 #include <math.h>
 #include <stddef.h>
@@ -16,3 +16,4 @@
 #define BIAS (GAIN + NU)
 #define SEED NV
 #define NOISY (NV + 1)
+#define OUTSIDE (NV + 2)

@@ -367,6 +367,13 @@ class DynamicsTwin:
             theta[:, -states:] = (low + high) / 2
         return theta, np.tile(np.diag((high - low) ** 2 / 12), (count, 1, 1))
 
+    @property
+    def bounds(self) -> tuple[NDArray, NDArray]:
+        """Values (d_x + d_u,) of states and commands beyond which `simulate` warns."""
+        low, high = self.domain.low, self.domain.high
+        margin = BEYOND * np.where(high > low, high - low, self.domain.scale)
+        return low - margin, high + margin
+
     def outside(self, commands: NDArray) -> NDArray:
         """Whether commands (n, T, d_u) leave the range that they had in calibration: (n,) bool."""
         low, high = (each[len(self.process) :] for each in (self.domain.low, self.domain.high))
