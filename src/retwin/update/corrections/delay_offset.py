@@ -16,6 +16,7 @@ from torch import Tensor
 from retwin.checks import positive
 from retwin.data.trajectories import Channels
 from retwin.inference.em import expectation_maximisation
+from retwin.inference.losses import StudentT
 from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
 from retwin.inference.solver import Solution, blocks, solve
@@ -112,8 +113,8 @@ class DelayOffset:
 
         Offsets start from the median of the steady part, delays from a grid; both are then refined
         together, because a delay and an offset trade off during motion. Outliers lose their weight
-        (Tukey), so glitches do not change z. Outputs are compared in `Context.unit`, and of a
-        sample the outputs that were measured count.
+        (Student's t at first, then Tukey), so glitches do not change z. Outputs are compared in
+        `Context.unit`, and of a sample the outputs that were measured count.
         """
         limits = range_in_samples(self.delay_range, context, observed, mask)
         parts = [
@@ -147,9 +148,12 @@ class DelayOffset:
         problem = problem.with_motion(z[..., 0])
         bounds = problem.bounds
         belief = _learned(problem, problem.residual(z.flatten(1)))
+        # A fast motion half a sample beside the grid is beyond the cutoff of Tukey's loss, and the
+        # rounding of the few samples that count would decide where its delay goes from there.
+        first = replace(belief[0], loss=StudentT()), belief[1]
         solution, belief = expectation_maximisation(
             Solution.of_prior(belief[1], z.flatten(1)),
-            belief,
+            first,
             infer=lambda found, belief: solve(
                 problem, belief[1], belief[0], found.x, bounds=bounds, reweightings=1
             ),
