@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import textwrap
 import tomllib
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from log_files import BEGIN, COUNT, HEATER, RATE, SPEED, SPEEDS, TIMES, mcap, ros2_bag
 
 import retwin as rt
-from retwin.cases.twin_data import TwinData
+from retwin.cases.twin_data import TwinData, log_case
 from retwin.data import Provenance, load, propose_mapping, read_mapping, save
 from retwin.data.logs import text_tables
 from retwin.data.logs.channels import in_order
@@ -422,6 +423,47 @@ def test_a_proposal_for_a_twin_has_the_rate_of_the_log_and_the_units_of_the_twin
     np.testing.assert_allclose(
         made.observed[0, :200, 0], 2 * np.pi * np.arange(200) / 50, atol=1e-3
     )
+
+
+def test_a_function_a_case_and_an_object_give_the_channels_of_a_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = """
+        import retwin as rt
+
+        def filled(commands, gain=1.0):
+            return gain * commands
+
+        channels = rt.Channels(("valve",), ("V",)), rt.Channels(("level",), ("m",))
+        tank = rt.FunctionTwin(filled, *channels, 10.0)
+    """
+    (tmp_path / "channels_of_logs.py").write_text(textwrap.dedent(code))
+    monkeypatch.syspath_prepend(tmp_path)
+    names = {"inputs": ["valve"], "outputs": ["level", "speed"]}
+    function = log_case("channels_of_logs:filled", **names)
+    assert (function.inputs.names, function.outputs.names) == (("valve",), ("level", "speed"))
+    assert function.rate == 0
+    with pytest.raises(InputError, match="expected the names of the channels"):
+        log_case("channels_of_logs:filled")
+    tank = log_case("channels_of_logs:tank")
+    assert (tank.rate, tank.outputs) == (10.0, rt.Channels(("level",), ("m",)))
+    assert log_case("retwin.cases.cascaded_tanks.case:tanks").classes == ("Healthy",)
+    with pytest.raises(InputError, match="the case has its own"):
+        log_case("tanks", **names)
+    rows = [f"{t / 10},{t % 7},{t % 7}" for t in range(60)]
+    (tmp_path / "run.csv").write_text("\n".join(["time,valve,level [cm]", *rows]))
+    text = """
+        rate = 10.0
+        commands.valve = { signal = "valve" }
+        outputs.level = { signal = "level" }
+    """
+    (tmp_path / "m.toml").write_text(textwrap.dedent(text))
+    some = log_case("channels_of_logs:filled", **names, mapping=tmp_path / "m.toml")
+    found = load(tmp_path / "run.csv", case=some, mapping=tmp_path / "m.toml")
+    assert (found.rate, found.outputs) == (10, rt.Channels(("level",), ("cm",)))
+    made = load(tmp_path / "run.csv", case=tank, mapping=tmp_path / "m.toml")
+    assert made.outputs == tank.outputs
+    assert made.observed.max() == pytest.approx(0.06), "cm"
 
 
 def test_a_command_of_another_unit_is_not_taken_for_the_one_that_is_left(tmp_path: Path) -> None:

@@ -1,12 +1,18 @@
-"""`log_case`: what a log is mapped to, the channels of a case or of the file of a twin."""
+"""`log_case`: what a log is mapped to, the channels of a case or of a twin that is none."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import inspect
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from retwin import cases, twins
+from retwin import cases, catalog, twins
+from retwin.checks import require
 from retwin.data.io import DataCase
+from retwin.data.logs.mapping import Mapping, read_mapping
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins import FILES
@@ -23,9 +29,10 @@ class TwinData:
     inputs, outputs : Channels
         Those of the twin.
     rate : float
-        0: an FMU or a model has no sample rate of its own, and takes that of the log.
+        Its sample rate in Hz; 0 for an FMU, a model or a function, which has none of its own and
+        takes that of the log.
     classes : tuple of str
-        None are known.
+        None are known, so that any are taken.
 
     """
 
@@ -34,6 +41,15 @@ class TwinData:
     rate: float = 0.0
     classes: tuple[str, ...] = ()
 
+    def measured(self, mapping: Mapping) -> TwinData:
+        """The same with those of its outputs that a mapping has."""
+        pairs = zip(self.outputs.names, self.outputs.units, strict=True)
+        kept = [pair for pair in pairs if pair[0] in mapping.outputs]
+        if not kept:  # other names, which reading refuses
+            return self
+        names, units = zip(*kept, strict=True)
+        return replace(self, outputs=Channels(names, units))
+
     def complete(
         self, trajectories: Trajectories, *, progress: Progress | None = None
     ) -> Trajectories:
@@ -41,12 +57,88 @@ class TwinData:
         return trajectories
 
 
-def log_case(name: str) -> DataCase:
-    """The case of that name, or the channels of a twin: `*.fmu`, `*.xml`, `*.urdf`.
+def log_case(
+    name: str,
+    *,
+    inputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+    mapping: str | os.PathLike[str] | None = None,
+) -> DataCase:
+    """The case of that name, or the channels of a twin that is none.
 
-    Raises InputError where there is none.
+    Parameters
+    ----------
+    name : str
+        A built-in case, `case.toml`, `*.fmu`, `*.xml`, `*.urdf`, `module:object` naming a case or a
+        twin, or `module:function`.
+    inputs, outputs : sequence of str
+        Names of the channels: those of a function, or some of a file's.
+    mapping : path, optional
+        A mapping.toml; of a twin that is no case, outputs that it lacks are left out.
+
+    Raises
+    ------
+    InputError
+        There is none, a function without names of its channels, or names for what has its own.
+
     """
-    if Path(name).suffix.lower() not in FILES:
+    is_file = Path(name).suffix.lower() in FILES
+    if not is_file and (":" not in name or _is_case(name)):
+        require(
+            not inputs and not outputs,
+            "inputs, outputs",
+            expected="none of them, since the case has its own",
+            got=", ".join([*inputs, *outputs]),
+            remedy="leave them out",
+        )
         return cases.data_case(name)
-    twin = twins.get(name)
-    return TwinData(twin.inputs, twin.outputs)
+    if is_file:
+        twin = twins.get(name, inputs=inputs, outputs=outputs)
+        rate = 0.0
+    elif _takes_commands(name):
+        require(
+            inputs and outputs,
+            "--inputs, --outputs",
+            expected="the names of the channels, which a function does not have",
+            got=f"inputs {', '.join(inputs) or 'none'}, outputs {', '.join(outputs) or 'none'}",
+            remedy="name both, joined by commas",
+        )
+        # A function has no rate of its own, and its channels do not depend on it.
+        twin = twins.get(name, inputs=inputs, outputs=outputs, rate=1.0)
+        rate = 0.0
+    else:
+        twin = twins.get(name, inputs=inputs, outputs=outputs)
+        rate = twin.rate
+    made = TwinData(twin.inputs, twin.outputs, rate)
+    return made if mapping is None else made.measured(read_mapping(mapping))
+
+
+def _object(name: str) -> Any:
+    """What a name `module:object` stands for; None if there is none, which `get` then says."""
+    try:
+        return catalog.resolve(name)
+    except (ImportError, AttributeError, ValueError):
+        return None
+
+
+def _is_case(name: str) -> bool:
+    from retwin.cases.case import Case  # which needs torch
+
+    found = _object(name)
+    if callable(found) and not _takes_commands(name):
+        found = found()
+    return isinstance(found, Case)
+
+
+def _takes_commands(name: str) -> bool:
+    """Whether a name stands for a function of commands, which no twin is."""
+    from retwin.twins.twin import Twin
+
+    found = _object(name)
+    if not callable(found) or (isinstance(found, Twin) and not isinstance(found, type)):
+        return False
+    try:
+        inspect.signature(found).bind()
+    except (TypeError, ValueError):
+        return True
+    return False

@@ -13,11 +13,22 @@ from rich.table import Table
 from retwin.checks import require
 from retwin.cli.commands import Commands
 from retwin.cli.completion import complete_files
-from retwin.cli.options import CaseOption, Json, LogMapping, MaxBytes, Rate, Seed, case_option
+from retwin.cli.options import (
+    CaseOption,
+    Inputs,
+    Json,
+    LogMapping,
+    MaxBytes,
+    Outputs,
+    Rate,
+    Seed,
+    case_option,
+    channel_names,
+)
 from retwin.cli.reading import data_case, read
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.data import download
-from retwin.data.io import check_target, save
+from retwin.data.io import DataCase, check_target, save
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.serialisation.files import sha256, write_atomically
 from retwin.serialisation.places import check_place
@@ -41,20 +52,27 @@ File = Annotated[
     Path, typer.Argument(metavar="FILE", help="File or folder of trajectories.", show_default=False)
 ]
 
+ChannelsOf = Annotated[
+    str | None,
+    case_option(help="Case or twin with the channels: case.toml, plant.fmu, module:function, …"),
+]
+
 
 @app.command(epilog=example("retwin data info real.mat sim.mat --case armpi"))
 def info(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILES", help="Files or folders of trajectories.")
     ],
-    case: CaseOption = None,
+    case: ChannelsOf = None,
     rate: Rate = None,
     mapping: LogMapping = None,
+    inputs: Inputs = "",
+    outputs: Outputs = "",
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
     """Describe files: classes, samples, channels, missing values, SHA-256."""
-    system = data_case(case)
+    system = _channels_of(case, inputs, outputs, mapping)
     facts = [
         _facts(read(file, system, rate, max_bytes=max_bytes, mapping=mapping), file)
         for file in files
@@ -71,9 +89,7 @@ def map_log(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="New mapping.toml; its picture beside.")
     ],
-    case: Annotated[
-        str | None, case_option(help="Case or twin with the channels: case.toml, plant.fmu, …")
-    ] = None,
+    case: ChannelsOf = None,
     time: Annotated[
         str, typer.Option("--time", metavar="COLUMN", help="Column of the times, if not found.")
     ] = "",
@@ -81,11 +97,12 @@ def map_log(
         float | None,
         typer.Option("--rate", metavar="HZ", help="Rows per second, if it has no times."),
     ] = None,
+    inputs: Inputs = "",
+    outputs: Outputs = "",
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
     """Propose what a log's signals stand for, and draw it with the trajectories they make."""
-    from retwin.cases.twin_data import log_case
     from retwin.data.logs.mapping import TimeSettings
     from retwin.data.logs.proposal import propose_mapping
     from retwin.report.log_picture import log_picture
@@ -102,7 +119,7 @@ def map_log(
         check_place(place)
     if rate is not None:
         rate = sample_rate("--rate", rate)
-    system = None if case is None else log_case(case)
+    system = _channels_of(case, inputs, outputs, None)
     with bar("map") as show:
         made = propose_mapping(
             log,
@@ -202,6 +219,25 @@ def fetch(
             name, folder=folder, progress=lambda share: show(name, share), max_bytes=max_bytes
         )
     answer(path, str(path))
+
+
+def _channels_of(
+    name: str | None, inputs: str, outputs: str, mapping: Path | None
+) -> DataCase | None:
+    """What files need of the case or the twin of that name, if one is given."""
+    names = [channel_names(each) for each in (inputs, outputs)]
+    if name is None:
+        require(
+            not any(names),
+            "--inputs, --outputs",
+            expected="the twin to which they belong, --case plant.fmu or module:function",
+            got=", ".join([*names[0], *names[1]]),
+            remedy="give --case too, or leave them out",
+        )
+        return None
+    from retwin.cases.twin_data import log_case
+
+    return log_case(name, inputs=names[0], outputs=names[1], mapping=mapping)
 
 
 def _seen(made: Proposal) -> Table:

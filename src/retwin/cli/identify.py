@@ -12,7 +12,7 @@ from retwin import catalog
 from retwin.checks import one_of, require
 from retwin.cli.completion import complete_twins
 from retwin.cli.completion import one_of as completing
-from retwin.cli.options import Json, MaxBytes, Seed
+from retwin.cli.options import TWIN, Inputs, Json, MaxBytes, Outputs, Seed, channel_names
 from retwin.cli.terminal import answer, bar, command_given, note, table
 from retwin.serialisation.places import check_place
 
@@ -84,10 +84,8 @@ Transient = Annotated[
 LogMapping = Annotated[
     Path | None, _panel("Logs", metavar="FILE", help="What `retwin data map` wrote for them.")
 ]
-Inputs = Annotated[str, _panel("Twin", metavar="NAMES", help="Of the inputs, joined by commas.")]
-Outputs = Annotated[str, _panel("Twin", metavar="NAMES", help="Of the outputs, joined by commas.")]
 Rate = Annotated[
-    float | None, _panel("Twin", metavar="HZ", help="Samples per second; else the log's.")
+    float | None, _panel(TWIN, metavar="HZ", help="Samples per second; else the log's.")
 ]
 
 
@@ -128,9 +126,7 @@ def identify(
     check_place(out, folder=True, holds=HOLDS)
     settings = _method(method, loss, starts)
     columns = replace(_columns(column, time, transient), mapping=mapping)
-    names = [
-        tuple(each.strip() for each in o.split(",") if each.strip()) for o in (inputs, outputs)
-    ]
+    names = [channel_names(each) for each in (inputs, outputs)]
     given = rate is not None
     for log in logs:
         require(

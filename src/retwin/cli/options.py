@@ -13,20 +13,24 @@ from retwin.checks import whole
 from retwin.cli.completion import one_of
 
 __all__ = [
+    "TWIN",
     "CaseArgument",
     "CaseOption",
+    "Inputs",
     "Json",
     "LogMapping",
     "MaxBytes",
     "Measured",
     "Model",
     "OtherCase",
+    "Outputs",
     "PerClass",
     "Probabilities",
     "Rate",
     "Real",
     "Seed",
     "case_option",
+    "channel_names",
 ]
 
 CASE = "Built-in case, case.toml, or module:object."
@@ -57,6 +61,20 @@ LogMapping = Annotated[
     Path | None,
     typer.Option("--mapping", metavar="FILE", help="For a log: what `retwin data map` wrote."),
 ]
+TWIN = "Twin"
+"""The panel of help with the options of a twin that is no case."""
+Inputs = Annotated[
+    str,
+    typer.Option(
+        "--inputs", metavar="NAMES", help="Of the inputs, joined by commas.", rich_help_panel=TWIN
+    ),
+]
+Outputs = Annotated[
+    str,
+    typer.Option(
+        "--outputs", metavar="NAMES", help="Of the outputs, joined by commas.", rich_help_panel=TWIN
+    ),
+]
 MaxBytes = Annotated[
     int | None,
     typer.Option(metavar="N", help="Most that a file may hold; else by what is free.", min=1),
@@ -74,3 +92,8 @@ Seed = Annotated[
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead, and nothing else.")]
+
+
+def channel_names(text: str) -> tuple[str, ...]:
+    """The names in the value of `--inputs` or `--outputs`."""
+    return tuple(each.strip() for each in text.split(",") if each.strip())

@@ -36,12 +36,12 @@ class DataCase(Protocol):
 
     @property
     def rate(self) -> float:
-        """Samples per second."""
+        """Samples per second; 0 where any will do, as with a twin that has no rate of its own."""
         ...
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """The class names, in their fixed order."""
+        """The class names, in their fixed order; () where any will do."""
         ...
 
     def complete(
@@ -209,7 +209,7 @@ def settle(
     if case is None:
         return trajectories
     require(
-        trajectories.rate == case.rate,
+        case.rate in (0, trajectories.rate),
         "rate",
         expected=f"{case.rate:g} Hz, the sample rate of the case",
         got=f"{trajectories.rate:g} Hz",
@@ -222,8 +222,12 @@ def settle(
     for name, prefix, channels, wanted in channels_of:
         # A set that was saved before anyone named its channels may be named now.
         unnamed = Channels.numbered(prefix, len(wanted))
+        # What has no classes is a twin, of which a unit of "1" may be one that nobody stated.
+        units = zip(channels.units, wanted.units, strict=False)
+        open_units = not case.classes and all(b in (a, "1") for a, b in units)
+        same = channels.names == wanted.names and open_units
         require(
-            channels in (wanted, unnamed),
+            channels in (wanted, unnamed) or same,
             name,
             expected=f"the channels of the case, {wanted}",
             got=channels,
@@ -231,15 +235,17 @@ def settle(
         )
     unknown = sorted(trajectories.known_labels - set(case.classes))
     require(
-        not unknown,
+        not unknown or not case.classes,
         "labels",
         expected=f"classes of the case, {', '.join(case.classes)}",
         got=f"the unknown class {''.join(unknown[:1])!r}",
         remedy="rename the class, or give the case that the data belong to",
     )
-    settled = trajectories.replace(
-        outputs=case.outputs, inputs=case.inputs if width else trajectories.inputs
-    )
+    settled = trajectories
+    if case.classes:
+        settled = trajectories.replace(
+            outputs=case.outputs, inputs=case.inputs if width else trajectories.inputs
+        )
     if width or not len(case.inputs):
         return settled
     return case.complete(settled, progress=progress)
@@ -290,7 +296,7 @@ def _check_finite(raws: Sequence[Raw], commands: Sequence[NDArray]) -> None:
 def _common_rate(raws: Sequence[Raw], case: DataCase | None, rate: float | None) -> float:
     """The sample rate of the set in Hz: given, the case's, or that in every file."""
     found = [(rate, "the argument")] if rate is not None else []
-    found += [(float(case.rate), "the case")] if case is not None else []
+    found += [(float(case.rate), "the case")] if case is not None and case.rate else []
     found += [(raw.rate, raw.where) for raw in raws if raw.rate is not None]
     require(
         found,
@@ -308,7 +314,7 @@ def _common_rate(raws: Sequence[Raw], case: DataCase | None, rate: float | None)
             got=f"{value:g} Hz in {where}",
             remedy="resample, or load the parts one by one",
         )
-    return first if case is None else float(case.rate)
+    return first if case is None else float(case.rate or first)
 
 
 def _close(rate: float, other: float) -> bool:

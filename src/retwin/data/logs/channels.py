@@ -87,9 +87,15 @@ class Channel:
 
 
 def table_of(
-    table: Mapping[str, ChannelMapping], wanted: Channels | None, name: str
+    table: Mapping[str, ChannelMapping],
+    wanted: Channels | None,
+    name: str,
+    *,
+    stated: bool = True,
 ) -> list[tuple[str, ChannelMapping, str | None]]:
     """The channels of a table of the mapping in their order, with the unit that the case has.
+
+    Without `stated`, a unit of "1" is one that nobody has stated.
 
     Raises
     ------
@@ -107,7 +113,8 @@ def table_of(
         remedy=f"write a table [{name}.NAME] for each of them",
     )
     return [
-        (each, table[each], unit) for each, unit in zip(wanted.names, wanted.units, strict=True)
+        (each, table[each], unit if stated or unit != "1" else None)
+        for each, unit in zip(wanted.names, wanted.units, strict=True)
     ]
 
 

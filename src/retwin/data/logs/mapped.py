@@ -103,10 +103,11 @@ def parts_of(
     period = 1 / rate
     inputs, outputs = (case.inputs, case.outputs) if case is not None else (None, None)
     given = mapping.commands or (inputs is not None and not mapping.nominal)
-    commands = channels_of(
-        log, table_of(mapping.commands, inputs if given else None, "commands"), "hold", period
-    )
-    measured = channels_of(log, table_of(mapping.outputs, outputs, "outputs"), "linear", period)
+    stated = case is None or bool(case.classes)
+    taken = table_of(mapping.commands, inputs if given else None, "commands", stated=stated)
+    commands = channels_of(log, taken, "hold", period)
+    taken = table_of(mapping.outputs, outputs, "outputs", stated=stated)
+    measured = channels_of(log, taken, "linear", period)
     ideal = channels_of(
         log,
         table_of(mapping.nominal, outputs, "nominal") if mapping.nominal else [],
@@ -262,8 +263,8 @@ def _finished(
 
 def _rate(mapping: Mapping, case: DataCase | None, rate: float | None) -> float:
     """The sample rate in Hz: the mapping's, the case's, or the one that is given."""
-    found = mapping.rate or (case.rate if case is not None else rate)
-    if found is None:
+    found = mapping.rate or (case.rate if case is not None else None) or rate
+    if not found:
         raise InputError(
             "mapping: rate",
             expected="the sample rate of the trajectories in Hz",
