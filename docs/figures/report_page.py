@@ -24,13 +24,14 @@ MARKED = (
     "Error on healthy runs",
     "Ready for:",
     "Not ready for:",
+    "Next:",
     "One rule for all lights",
     "in a typical healthy run",
     "What was learned",
     "What speaks against it",
 )
 """What is marked, from 1 on, by the text with which it begins or that it holds."""
-SIZE = {"width": 1180, "height": 1560}
+SIZE = {"width": 1300, "height": 1720}
 MARK = """(element, [number, colour]) => {
   const box = element.getBoundingClientRect(), mark = document.createElement("div");
   mark.textContent = number;

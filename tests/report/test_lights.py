@@ -14,7 +14,7 @@ from retwin.errors import InputError
 from retwin.report.lights import lights, uses, worst
 from retwin.report.sections.decisions import decisions
 from retwin.report.study import read_study
-from retwin.report.summary import learned
+from retwin.report.summary import learned, summary
 from retwin.report.verdict import headline
 from retwin.results import Results
 from retwin.scores.decisions import decide
@@ -131,7 +131,10 @@ def test_few_healthy_trajectories_promise_no_rate(
     chosen = found["false_alarms"].values["alarms"]
     assert (chosen.rate, chosen.healthy, chosen.needed) == (0.1, 10, 36)
     assert found["false_alarms"].state == "undecided"
-    assert "record at least 36 healthy runs" in rendered(folder)
+    page = rendered(folder)
+    assert "with 10 healthy runs the rate is not certain" in page
+    assert "Record at least 36 healthy runs (10 now)" in page
+    assert "5 % cannot be promised by fewer than 19 healthy runs" in page
 
 
 def test_a_plain_twin_that_finds_more_makes_detection_fail(study: Study, write: Write) -> None:
@@ -170,6 +173,23 @@ def test_few_training_runs_leave_training_data_undecided(single: Study, write: W
     training = next(each for each in uses(whole, lights(whole)) if each.key == "training")
     assert training.conditions["error"] == "met"
     assert training.conditions["gain"] == "undecided"
+
+
+def test_the_next_steps_follow_from_what_is_missing(single: Study, write: Write) -> None:
+    """What is undecided or worse has a step; what is decided has none."""
+    with_errors(single, 10, 9.5, 0.5)
+    found = summary(read_study(write(single)))
+    assert found is not None
+    steps = {each.key: each.values for each in found["steps"]}
+    assert {"record", "repeat"} <= set(steps)
+    assert (steps["record"]["alarms"], steps["record"]["now"]) == (36, 10)
+    assert "correction" not in steps
+    with_errors(single, 5, 10, 0.1)
+    found = summary(read_study(write(single)))
+    assert found is not None
+    steps = {each.key: each.values for each in found["steps"]}
+    assert steps["correction"]["worse"]
+    assert steps["record"]["error"] is None, "more trajectories would not change it"
 
 
 def test_what_was_not_measured_is_not_met(study: Study, write: Write) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import binom
 
-from retwin.scores.change import error_change
+from retwin.scores.change import ErrorChange, error_change, needed_to_decide
 from retwin.scores.decisions import (
     certain_decision,
     decide,
@@ -37,6 +39,26 @@ def test_few_trajectories_have_no_interval_and_none_no_change() -> None:
     assert found is not None
     assert found.ratio_interval is None
     assert error_change(observed, observed, np.full_like(observed, np.nan)) is None
+
+
+def test_the_trajectories_that_decide_a_ratio_decide_it() -> None:
+    """With as many as were said, the interval excludes 1 where the ratio stays as it is."""
+    rng = np.random.default_rng(3)
+
+    def change(count: int) -> ErrorChange:
+        after = np.exp(0.4 * rng.standard_normal((count, 1, 1))) * 0.85
+        found = error_change(np.ones((count, 1, 1)), after, np.zeros((count, 1, 1)))
+        assert found is not None
+        return found
+
+    few = replace(change(10), ratio=0.85, ratio_interval=(0.66, 1.1))
+    needed = needed_to_decide(few)
+    assert needed == 26, "10 (ln(1.1 / 0.85) / ln(1 / 0.85))² = 25.2"
+    ends = change(4 * needed).ratio_interval
+    assert ends is not None
+    assert ends[1] < 1
+    for ends, ratio in (((0.5, 0.9), 0.7), ((1.1, 1.5), 1.3), (None, 0.7), ((0.5, 2.0), 0.999)):
+        assert needed_to_decide(replace(few, ratio=ratio, ratio_interval=ends)) is None
 
 
 def probabilities(fault: np.ndarray) -> np.ndarray:

@@ -39,11 +39,13 @@ __all__ = [
     "quantity",
     "real_data",
     "reason",
+    "sentence",
     "signed",
     "source_in_sentence",
     "source_name",
     "span",
     "stage_name",
+    "times",
     "with_role",
     "with_unit",
 ]
@@ -101,6 +103,11 @@ def in_sentence(title: str) -> str:
     return title if title[:2].isupper() else f"{title[:1].lower()}{title[1:]}"
 
 
+def sentence(text: str) -> str:
+    """A text at the beginning of a sentence."""
+    return f"{text[:1].upper()}{text[1:]}"
+
+
 def order(sources: Iterable[str]) -> list[str]:
     """Sources in the catalog's order, then the unknown ones."""
     known = {name: place for place, name in enumerate(SOURCES)}
@@ -147,6 +154,11 @@ def counted(count: int, what: str) -> str:
     return f"{count} {what if count == 1 else several}"
 
 
+def times(count: int) -> str:
+    """`once`, `twice`, `3 times`."""
+    return {1: "once", 2: "twice"}.get(count, f"{count} times")
+
+
 def real_data(text: str | None) -> str:
     """The real data that a source learns from."""
     return "not stated" if text is None else REAL_DATA.get(text, text)
@@ -178,9 +190,9 @@ def decimals(*values: float) -> int:
 
 
 def places(*values: float) -> int:
-    """Decimals that leave three significant digits of the largest value, three decimals at most."""
+    """Decimals that leave three significant digits of the largest value, nine decimals at most."""
     largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
-    return 3 if largest == 0 else max(0, min(3, 2 - math.floor(math.log10(largest))))
+    return 3 if largest == 0 else max(0, min(9, 2 - math.floor(math.log10(largest))))
 
 
 def distinct(values: Iterable[float]) -> int:

@@ -18,6 +18,7 @@ from retwin.report.assets import asset, plotly_js
 from retwin.report.blocks import Section
 from retwin.report.figure import Figure, Matrices
 from retwin.report.glossary import explained
+from retwin.report.lights import RATE
 from retwin.report.plotly_specs import panel_spec
 from retwin.report.png import png, small
 from retwin.report.sections import sections_of
@@ -55,7 +56,9 @@ FIGURES = (
     "learning",
 )
 """The files `figures/NAME.png`; of a second source `NAME-2.png`."""
-DOCS = "https://retwin.readthedocs.io/en/latest/report.html"
+PAGES = "https://retwin.readthedocs.io/en/latest/"
+"""The documentation."""
+DOCS = f"{PAGES}report.html"
 """The documentation of the page, to which each section links."""
 FILTERS = {
     "class_name": labels.class_name,
@@ -69,10 +72,12 @@ FILTERS = {
     "percent": labels.percent,
     "percents": labels.percents,
     "places": lambda values: labels.places(*values),
+    "sentence": labels.sentence,
     "signed": labels.signed,
     "source_in_sentence": labels.source_in_sentence,
     "source_name": labels.source_name,
     "span": labels.span,
+    "times": labels.times,
     "outcome": outcome_of,
     "reason": labels.reason,
     "one_line": lambda text: Markup(" ").join(text.split()),
@@ -140,6 +145,10 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         "anchors": {section.key for section in sections},
         "images": {name: base64.b64encode(small(data)).decode() for name, data in images.items()},
         "colour_of": colour_of,
+        "rate": RATE,
+        "docs": DOCS,
+        "corrections": f"{PAGES}corrections.html",
+        "monitor": f"{PAGES}monitor.html",
         "symbol": symbol,
     }
     bodies = {
@@ -150,14 +159,19 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
     }
     found = summary(study)
     front = [found["figure"]] if found and found["figure"] else []
+    verdicts = verdict(study)
+    first = (
+        environment.get_template("summary.html.j2").render(summary=found, verdict=verdicts)
+        if found
+        else ""
+    )
     specs = _specs([*front, *(figure for each in sections for figure in each.figures)])
     contents = {name: value for each in sections for name, value in each.scripts.items()}
     return environment.get_template("page.html.j2").render(
         sections=sections,
         bodies=bodies,
-        verdict=verdict(study),
-        summary=found,
-        docs=DOCS,
+        verdict=verdicts,
+        summary=explained(first),
         colours={**{f"c{place}": pair for place, pair in enumerate(PALETTE)}, **CHROME},
         style=asset("page.css"),
         script=asset("page.js"),

@@ -30,9 +30,10 @@ from retwin.report.lights import (
     uses,
     worst,
 )
+from retwin.report.steps import next_steps
 from retwin.report.study import Study
 from retwin.report.style import colour_of
-from retwin.report.verdict import headline
+from retwin.report.verdict import headline, verdict
 from retwin.scores.intervals import grouped_share_interval, jackknife_interval
 from retwin.scores.segments import median_error_trajectory
 
@@ -53,14 +54,17 @@ def summary(study: Study) -> dict[str, Any] | None:
         return None
     found = lights(study)
     chosen: Alarms | None = alarms(study, pair[0]) if study.results.classes else None
+    others, ready = better_alternatives(study, chosen, pair[0]), uses(study, found)
+    best = verdict(study)
     return {
         "source": pair[0],
         "plain": pair[1],
         "lights": found,
-        "uses": uses(study, found),
+        "uses": ready,
         "state": worst(each.state for each in found),
         "light": {each.key: each for each in found},
-        "alternatives": better_alternatives(study, chosen, pair[0]),
+        "alternatives": others,
+        "steps": next_steps(study, found, ready, others, best["rival"] if best else None),
         "learned": learned(study),
         "figure": picture(study),
     }
@@ -81,9 +85,9 @@ def learned(study: Study) -> Table | None:
         Column("Quantity", numeric=False),
         Column("Mean"),
         Column("95 % interval"),
-        Column("90 % of the segments"),
-        Column("generated, mean"),
-        Column("segments"),
+        Column("Range of 90 % of the segments"),
+        Column("Generated mean"),
+        Column("Segments"),
     ]
     cells = [row.cells for row in rows.values()]
     return Table("What was learned", columns, cells).without_empty() if rows else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.scores.intervals import jackknife_interval
 
-__all__ = ["ErrorChange", "error_change"]
+__all__ = ["ErrorChange", "error_change", "needed_to_decide"]
+
+MAX_FACTOR = 20
+"""Multiple of the present trajectories beyond which no number of them is given."""
 
 
 @dataclass(frozen=True)
@@ -98,4 +102,35 @@ def error_change(
         outputs[0],
         outputs[1],
         n,
+    )
+
+
+def needed_to_decide(change: ErrorChange) -> int | None:
+    """About how many trajectories would make the interval of the ratio exclude 1.
+
+    The width of the interval, on the scale of the logarithm, shrinks with the square root of the
+    number of trajectories; the ratio is taken to stay as it is.
+
+    Parameters
+    ----------
+    change : ErrorChange
+        The change of the error.
+
+    Returns
+    -------
+    int or None
+        More than there are; None if the ratio is decided already, has no interval, is 1, or would
+        take more than 20 times as many.
+
+    """
+    if change.ratio_interval is None or change.ratio <= 0 or change.ratio == 1:
+        return None
+    low, high = change.ratio_interval
+    if low > 1 or high < 1 or low <= 0:
+        return None
+    ratio = math.log(change.ratio)
+    toward = math.log(high) - ratio if ratio < 0 else ratio - math.log(low)
+    needed = math.ceil(change.trajectories * (toward / ratio) ** 2)
+    return (
+        None if needed > MAX_FACTOR * change.trajectories else max(needed, change.trajectories + 1)
     )

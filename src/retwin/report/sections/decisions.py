@@ -10,6 +10,7 @@ from retwin.report.blocks import Cell, Column, Section, Table
 from retwin.report.labels import class_name, distinct, number, percent, percents, source_name
 from retwin.report.lights import RATES, alarms
 from retwin.report.study import Study
+from retwin.report.verdict import headline
 from retwin.scores.decisions import Decision, decide
 
 __all__ = ["decisions"]
@@ -22,12 +23,15 @@ GROUP = f"Of {TRAJECTORIES}, {100 * FAULTY:.0f} % faulty"
 def decisions(study: Study) -> Section | None:
     """All sources at one rate, one source at all rates, and a calculator.
 
-    The rate is the one that the page chooses, the source the one with the best macro-F1.
+    The rate and the source are those of the first page; without its source there, it is the one
+    with the best macro-F1.
 
     A threshold belongs to one model, so these are the decisions of the model of the first run.
     """
     sources = [name for name in study.diagnosing if study.sources[name].real_data != "transductive"]
+    pair = headline(study.results)
     best = max(sources, key=lambda name: study.sources[name].mean("macro_f1"), default=None)
+    best = pair[0] if pair is not None and pair[0] in sources else best
     if best is None or HEALTHY not in study.results.classes:
         return None
     healthy = int((study.truth == study.results.classes.index(HEALTHY)).sum())
@@ -42,7 +46,7 @@ def decisions(study: Study) -> Section | None:
         "healthy": healthy,
         "chosen": chosen,
         "all": None if math.isnan(rate) else _all_sources(study, sources, rate),
-        "table": _table([each for each in found if math.isfinite(each.threshold)]),
+        "table": _table(best, [each for each in found if math.isfinite(each.threshold)]),
         "missed": MISSED,
         "lowest": short[-1] if short else None,
         "needed": math.ceil(1 / short[-1]) - 1 if short else 0,
@@ -84,7 +88,7 @@ def _all_sources(study: Study, sources: list[str], rate: float) -> Table:
     return Table("All sources at the same false-alarm rate", columns, rows)
 
 
-def _table(found: list[Decision]) -> Table:
+def _table(source: str, found: list[Decision]) -> Table:
     columns = [
         Column("Requested false-alarm rate", numeric=False),
         Column("Alarm threshold"),
@@ -99,7 +103,8 @@ def _table(found: list[Decision]) -> Table:
         Column(f"cost, 1 : {MISSED}", group=GROUP),
     ]
     digits = distinct(each.threshold for each in found)
-    return Table("Cost of a false-alarm rate", columns, [_row(each, digits) for each in found])
+    title = f"Cost of a false-alarm rate, {source_name(source)}"
+    return Table(title, columns, [_row(each, digits) for each in found])
 
 
 def _row(each: Decision, digits: int) -> list[Cell]:
