@@ -111,6 +111,56 @@ def test_same_trajectory_gives_same_bytes(
     assert film("c.gif", 0) != film("d.gif", 1)
 
 
+@dataclass(frozen=True)
+class Offset:
+    """An updated twin: each simulation is off by a constant of its own, of some mm."""
+
+    plain: rt.Twin
+    rate: float = 100.0
+
+    @property
+    def inputs(self) -> rt.Channels:
+        return self.plain.inputs
+
+    @property
+    def outputs(self) -> rt.Channels:
+        return self.plain.outputs
+
+    def simulate(self, commands: NDArray, *, seed: int, **_: object) -> rt.Trajectories:
+        drawn = 0.01 * np.random.default_rng(seed).standard_normal((len(commands), 1, 3))
+        nominal = np.full((*commands.shape[:2], 3), (0.1, 0.1, 0.2))
+        return rt.Trajectories(commands, nominal, nominal + drawn, self.rate)
+
+
+@pytest.mark.parametrize("size", [(320, 240), (480, 240)])
+def test_an_updated_twin_is_in_the_film(
+    short: rt.Trajectories, case: rt.Case, tmp_path: Path, size: tuple[int, int]
+) -> None:
+    """Its draws around the tip, and its band in a chart that time uncovers."""
+
+    def film(name: str, **more: object) -> list[NDArray]:
+        path = tmp_path / name
+        animate(short, case, path, fps=2, size=size, renderer="stick", **more)  # type: ignore[arg-type]
+        return pictures(path)
+
+    plain, shown = film("a.gif"), film("b.gif", updated=Offset(case.twin))
+    assert all(each.shape == (size[1], size[0], 3) for each in shown)
+
+    def green(picture: NDArray) -> int:
+        red, also, blue = (picture[..., i].astype(int) for i in range(3))
+        return int(((also > red + 40) & (also > blue + 15)).sum())
+
+    assert green(plain[-1]) == 0
+    assert green(shown[0]) > 20
+    assert green(shown[-1]) > 2 * green(shown[0]), "the veil is gone at the end"
+    assert (film("c.gif", updated=Offset(case.twin), seed=1)[-1] != shown[-1]).any()
+    with pytest.raises(InputError, match="updated: expected a twin with the rate 100"):
+        film("d.gif", updated=Offset(case.twin, rate=50.0))
+    with pytest.raises(InputError, match="from 320x240 to"):
+        animate(short, case, tmp_path / "d.gif", size=(160, 160), updated=Offset(case.twin))
+    assert not (tmp_path / "d.gif").exists()
+
+
 def test_mp4(short: rt.Trajectories, case: rt.Case, tmp_path: Path) -> None:
     from imageio_ffmpeg import count_frames_and_secs, read_frames
 

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from retwin.cli.options import CaseOption
-from retwin.cli.reading import read
+from retwin.cli.options import CaseOption, Seed
+from retwin.cli.reading import read, updated_twin
 from retwin.cli.terminal import answer, bar
 from retwin.errors import InputError
 
@@ -42,6 +42,11 @@ def animate(
     renderer: Annotated[
         Renderer, typer.Option(help="What draws; auto: the best here.")
     ] = Renderer.auto,
+    model: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="A corrected twin, whose band is shown as well."),
+    ] = None,
+    seed: Seed = 0,
 ) -> None:
     """Film a trajectory: the nominal motion as a ghost, the observed one solid."""
     from retwin import cases
@@ -51,6 +56,7 @@ def animate(
     check_film(out)
     shape = _size(size)
     found = cases.get(case or "armpi")
+    updated = None if model is None else updated_twin(model)
     trajectories = read(file, found)
     with bar("animate") as show:
         path = film(
@@ -61,6 +67,8 @@ def animate(
             fps=fps,
             size=shape,
             renderer=renderer.value,
+            updated=updated,
+            seed=seed,
             progress=lambda share: show("draw", share),
         )
     answer(path, str(path))

@@ -6,6 +6,7 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.cases.animation.captions import captioned
+from retwin.cases.animation.chart import Chart, Layout, charted
 from retwin.cases.animation.film import check_film, write_film
 from retwin.cases.animation.scene import mujoco_pictures
 from retwin.cases.animation.shots import Pictures, Shots
@@ -25,10 +27,15 @@ from retwin.serialisation.files import write_atomically
 
 if TYPE_CHECKING:  # a case loads torch, which the worker that draws does not need
     from retwin.cases.case import Body, Case
+    from retwin.twins.twin import Twin
 
 __all__ = ["Renderer", "animate"]
 
 Renderer = Literal["auto", "mujoco", "stick"]
+DRAWS, SHOWN = 200, 16
+"""Draws of an updated twin for its band, and how many of them the picture shows."""
+SMALL, WITH_CHART = (160, 160), (320, 240)
+"""The smallest width and height in pixels, without and with a chart."""
 
 
 def animate(
@@ -40,14 +47,17 @@ def animate(
     fps: float = 25.0,
     size: tuple[int, int] = (640, 480),
     renderer: Renderer = "auto",
+    updated: Twin | None = None,
+    seed: int = 0,
     progress: Progress | None = None,
 ) -> Path:
     """Film one trajectory in real time, without a screen.
 
     The nominal motion is a translucent ghost, the observed motion is solid; lines trace the paths
     of their tips. Only outputs are measured: the observed pose is an inference, the pose nearest to
-    the nominal one that explains the outputs. MuJoCo draws in a worker process, so a script calls
-    this under `if __name__ == "__main__":`.
+    the nominal one that explains the outputs. Of an updated twin, draws of the tip are shown,
+    without a fault, and a chart of its bands for the output that deviates most. MuJoCo draws in a
+    worker process, so a script calls this under `if __name__ == "__main__":`.
 
     Parameters
     ----------
@@ -62,10 +72,16 @@ def animate(
     fps : float, default 25.0
         Frames per second, from 1 to 100.
     size : (int, int), default (640, 480)
-        Width and height in pixels, even numbers from 160 to 4096.
+        Width and height in pixels, even numbers from 160 to 4096; with an updated twin from 320
+        and 240.
     renderer : {"auto", "mujoco", "stick"}
         "mujoco" draws the body's model, "stick" its skeleton with matplotlib. "auto" takes MuJoCo
         where it is available, else the skeleton, with a warning that names what is missing.
+    updated : Twin, optional
+        A corrected twin of the same system, which draws outputs for the trajectory's commands. It
+        shows what it can predict only if it was not calibrated on this trajectory.
+    seed : int, default 0
+        Seed of these draws, at least 0.
     progress : callable, optional
         Called with the finished fraction.
 
@@ -78,32 +94,97 @@ def animate(
     ------
     InputError
         No such trajectory, a case without a body, another suffix, a size or frame rate out of
-        range, MP4 without the extra `render`, or "mujoco" where it cannot draw.
+        range, MP4 without the extra `render`, "mujoco" where it cannot draw, or an updated twin
+        of another system.
 
     """
-    _check(fps, size, renderer)
+    _check(fps, size, renderer, least=SMALL if updated is None else WITH_CHART)
     suffix = check_film(path)
     body = _body_of(case)
     one = _chosen(trajectories, case, index)
-    shots = _shots(case.complete(one), body, fps)
+    one = case.complete(one)
+    shots, layout, chart = _shots(one, body, fps), Layout(size, (0, 0)), None
+    if updated is not None:
+        drawn = _draws(updated, one, seed)
+        shots = replace(shots, drawn=_tips(body, one, drawn[:SHOWN], fps))
+        layout, chart = Layout.of(size), _chart(one, drawn)
     target = Path(path)
     with (
         write_atomically(target) as part,
-        _pictures(shots, body, size, renderer) as pictures,
+        _pictures(shots, body, layout.picture, renderer) as pictures,
     ):
-        reported = _reported(pictures, len(shots), progress)
-        write_film(captioned(reported, shots), part, suffix, fps=fps, size=size)
+        reported = captioned(_reported(pictures, len(shots), progress), shots)
+        whole = reported if chart is None else charted(reported, shots, chart, layout)
+        write_film(whole, part, suffix, fps=fps, size=size)
     return target
 
 
-def _check(fps: float, size: tuple[int, int], renderer: str) -> None:
+def _draws(updated: Twin, one: Trajectories, seed: int) -> NDArray:
+    """Outputs (draws, T, d_y) of the updated twin for the commands of a trajectory."""
+    for name, has, needs in (
+        ("inputs", updated.inputs.names, one.inputs.names),
+        ("outputs", updated.outputs.names, one.outputs.names),
+        ("rate", updated.rate, one.rate),
+    ):
+        require(
+            has == needs,
+            "updated",
+            expected=f"a twin with the {name} {needs} of the trajectory",
+            got=f"one with {has}",
+            remedy="give the corrected twin that was fitted for these data",
+        )
+    made = updated.simulate(np.repeat(one.commands, DRAWS, axis=0), seed=seed)
+    require(
+        bool(np.isfinite(made.observed).all()),
+        "updated",
+        expected="finite outputs for these commands",
+        got="outputs that are not",
+        remedy="fit it on commands like these",
+    )
+    return made.observed
+
+
+def _tips(body: Body, one: Trajectories, drawn: NDArray, fps: float) -> NDArray:
+    """The positions (draws, frames, 3) of the tip that explain drawn outputs, in m."""
+    count = len(drawn)
+    several = Trajectories(
+        commands=np.repeat(one.commands, count, axis=0),
+        nominal=np.repeat(one.nominal, count, axis=0),
+        observed=drawn,
+        mask=np.ones(drawn.shape, dtype=bool),
+        rate=one.rate,
+        inputs=one.inputs,
+        outputs=one.outputs,
+    )
+    tips: NDArray = body.skeleton(body.poses(several)[1][:, _samples(one, fps)])[..., -1, :]
+    return tips
+
+
+def _chart(one: Trajectories, drawn: NDArray) -> Chart:
+    """The chart of the output that deviates most from the nominal one."""
+    observed = np.where(one.mask[0], one.observed[0], np.nan) - one.nominal[0]
+    error = (
+        np.nanmean(np.square(observed), axis=0) if one.mask.any() else np.zeros(len(one.outputs))
+    )
+    column = int(np.nanargmax(np.where(np.isfinite(error), error, -1.0)))
+    unit = one.outputs.units[column]
+    factor, shown = (1000.0, "mm") if unit == "m" else (1.0, unit)
+    return Chart(
+        title=f"{one.outputs.names[column]} minus nominal" + (f", {shown}" if shown else ""),
+        time=np.arange(one.steps) / one.rate,
+        observed=factor * observed[:, column],
+        drawn=factor * (drawn[..., column] - one.nominal[0, :, column]),
+    )
+
+
+def _check(fps: float, size: tuple[int, int], renderer: str, *, least: tuple[int, int]) -> None:
     """Refuse settings out of range."""
     finite("fps", fps, least=1, most=100, unit="frames per second", remedy="25 is common")
     # Video codecs halve the resolution of colour.
     require(
-        all(160 <= side <= 4096 and side % 2 == 0 for side in size),
+        all(a <= side <= 4096 and side % 2 == 0 for a, side in zip(least, size, strict=True)),
         "size",
-        expected="an even width and height from 160 to 4096 pixels",
+        expected=f"an even width and height from {least[0]}x{least[1]} to 4096x4096 pixels",
         got=f"{size[0]}x{size[1]}",
         remedy="640x480 is common",
     )
@@ -149,9 +230,8 @@ def _chosen(trajectories: Trajectories, case: Case, index: int | str) -> Traject
 
 def _shots(one: Trajectories, body: Body, fps: float) -> Shots:
     """Poses and skeletons at the times of the frames."""
-    count = 1 + int((one.steps - 1) / one.rate * fps + 1e-9)
-    seconds = np.arange(count) / fps
-    at = np.minimum(np.round(seconds * one.rate).astype(int), one.steps - 1)
+    at = _samples(one, fps)
+    seconds = np.arange(len(at)) / fps
     nominal, observed = (joints[0, at] for joints in body.poses(one))
     return Shots(
         title=" · ".join(filter(None, (one.ids[0], one.labels[0].replace("_", " ")))),
@@ -162,6 +242,13 @@ def _shots(one: Trajectories, body: Body, fps: float) -> Shots:
         nominal_points=body.skeleton(nominal),
         observed_points=body.skeleton(observed),
     )
+
+
+def _samples(one: Trajectories, fps: float) -> NDArray:
+    """The sample at the time of each frame."""
+    count = 1 + int((one.steps - 1) / one.rate * fps + 1e-9)
+    samples: NDArray = np.round(np.arange(count) / fps * one.rate).astype(int)
+    return np.minimum(samples, one.steps - 1)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.cases.animation.shots import GHOST, SOLID, Pictures, Shots
+from retwin.cases.animation.shots import GHOST, SOLID, UPDATED, Pictures, Shots
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
@@ -57,10 +57,14 @@ def _write(draw: ImageDraw, size: tuple[int, int], shots: Shots, second: float) 
     if shots.emulated:
         draw.text((margin, margin + 1.5 * text), "EMULATED: no real measurements", ALARM, title)
     line = height - margin
-    for colour, text_line in (
+    legend = [
         (SOLID, "observed: only the tip is measured, the pose is the nearest to the nominal"),
         (GHOST, "nominal (ghost)"),
-    ):
+    ]
+    if len(shots.drawn):
+        legend[0] = (SOLID, "observed; the pose is inferred from the tip")
+        legend.append((UPDATED, f"updated twin, {len(shots.drawn)} draws of the tip"))
+    for colour, text_line in legend:
         mark = (margin, line - 0.5 * text, margin + 1.4 * text, line - 0.25 * text)
         draw.rectangle(mark, fill=tuple(round(255 * part) for part in colour))
         draw.text((margin + 2 * text, line), text_line, MUTED, _font(0.9 * text), anchor="ls")

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pebble import ProcessExpired, ProcessPool
 
-from retwin.cases.animation.shots import GHOST, PAPER, RING, SOLID, Pictures, Shots, rings
+from retwin.cases.animation.shots import GHOST, PAPER, RING, SOLID, UPDATED, Pictures, Shots, rings
 from retwin.checks import require
 from retwin.errors import InputError
 from retwin.processes import worker_pool
@@ -186,7 +186,8 @@ def _schedule(pool: ProcessPool, stage: Stage, shots: Shots, first: int) -> Futu
     end = min(first + FRAMES_PER_TASK, len(shots))
     joints = np.stack([shots.nominal[first:end], shots.observed[first:end]])
     tips = np.stack([shots.nominal_points[:end, -1], shots.observed_points[:end, -1]])
-    task: Future[NDArray] = pool.schedule(_draw, (stage, joints, tips), timeout=TIMEOUT)
+    trails = [shots.trails(frame) for frame in range(first, end)]
+    task: Future[NDArray] = pool.schedule(_draw, (stage, joints, tips, trails), timeout=TIMEOUT)
     return task
 
 
@@ -214,17 +215,21 @@ def _draw_with(backend: str) -> None:
     os.environ.pop("PYOPENGL_PLATFORM", None)
 
 
-def _draw(stage: Stage, joints: NDArray, tips: NDArray) -> NDArray:
+def _draw(stage: Stage, joints: NDArray, tips: NDArray, trails: Sequence[NDArray]) -> NDArray:
     """Pictures (frames, height, width, 3) for joints (2, frames, joints), nominal and observed.
 
-    Runs in the worker. `tips` (2, all frames so far, 3) are in m. Failures are raised as
-    RuntimeError, because OpenGL's errors cannot be sent to another process.
+    Runs in the worker. `tips` (2, all frames so far, 3) and the `trails` (draws, points, 3) of each
+    frame are in m. Failures are raised as RuntimeError, because OpenGL's errors cannot be sent to
+    another process.
     """
     try:
         scene = _scene(stage)
         before = tips.shape[1] - joints.shape[1]
         return np.stack(
-            [scene.picture(joints[:, i], tips[:, : before + i + 1]) for i in range(joints.shape[1])]
+            [
+                scene.picture(joints[:, i], tips[:, : before + i + 1], trails[i])
+                for i in range(joints.shape[1])
+            ]
         )
     except InputError:
         raise
@@ -293,7 +298,7 @@ class Scene:
         mujoco.mj_forward(self._model, self._data)
         self._background = self._rendered()
 
-    def picture(self, joints: NDArray, tips: NDArray) -> NDArray:
+    def picture(self, joints: NDArray, tips: NDArray, trails: NDArray) -> NDArray:
         """Draw one frame.
 
         Parameters
@@ -302,6 +307,8 @@ class Scene:
             Nominal and observed joint positions in rad or m.
         tips : ndarray, shape (2, points, 3)
             Traces of the nominal and the observed tip in m.
+        trails : ndarray, shape (draws, points, 3)
+            Traces of the tip that an updated twin draws, in m; each ends in a ball.
 
         Returns
         -------
@@ -312,7 +319,7 @@ class Scene:
         for addresses, values in zip(self._addresses, joints, strict=True):
             self._data.qpos[addresses] = values
         self._mujoco.mj_kinematics(self._model, self._data)
-        solid = self._rendered(OBSERVED, tuple(tips))
+        solid = self._rendered(OBSERVED, tuple(tips), trails)
         # The ghost is behind the solid body: two surfaces in one place would flicker.
         ghost = self._rendered(NOMINAL)
         ghost_only = (ghost != self._background).any(axis=2) & (solid == self._background).all(
@@ -322,7 +329,12 @@ class Scene:
         solid[ghost_only] = (1 - GHOST_OPACITY) * background + GHOST_OPACITY * ghost[ghost_only]
         return solid
 
-    def _rendered(self, group: int | None = None, tips: Sequence[NDArray] = ()) -> NDArray:
+    def _rendered(
+        self,
+        group: int | None = None,
+        tips: Sequence[NDArray] = (),
+        trails: Sequence[NDArray] | NDArray = (),
+    ) -> NDArray:
         """The picture of the floor, the bodies of one group, and traces."""
         for each in (NOMINAL, OBSERVED):
             self._option.geomgroup[each] = each == group
@@ -333,6 +345,9 @@ class Scene:
         for trace, colour in zip(tips, (GHOST, SOLID), strict=False):
             self._line(trace, colour, 3.0)
             self._ball(trace[-1], colour)
+        for trail in trails:
+            self._line(trail, UPDATED, 1.0)
+            self._ball(trail[-1], UPDATED, 0.010)
         picture: NDArray = self._renderer.render()
         return picture
 
@@ -345,9 +360,9 @@ class Scene:
             geom = self._added(kind, colour)
             self._mujoco.mjv_connector(geom, kind, width * min(self._stage.size) / 480, begin, end)
 
-    def _ball(self, point: NDArray, colour: Sequence[float]) -> None:
-        """Draw a ball at a point (3,) in m."""
-        size = np.full(3, 0.018 * self._stage.reach)
+    def _ball(self, point: NDArray, colour: Sequence[float], radius: float = 0.018) -> None:
+        """Draw a ball at a point (3,) in m; its radius is a share of the reach."""
+        size = np.full(3, radius * self._stage.reach)
         self._added(self._mujoco.mjtGeom.mjGEOM_SPHERE, colour, size, point)
 
     def _added(

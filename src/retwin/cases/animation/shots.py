@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["GHOST", "PAPER", "RING", "SOLID", "Pictures", "Shots", "rings"]
+__all__ = ["GHOST", "PAPER", "RING", "SOLID", "UPDATED", "Pictures", "Shots", "rings"]
 
 Pictures = Iterable[NDArray]
 """Pictures (height, width, 3) of uint8."""
 
 GHOST = (0.47, 0.53, 0.60)
 SOLID = (0.00, 0.41, 0.66)
+UPDATED = (0.00, 0.53, 0.37)
 PAPER = (0.97, 0.975, 0.98)
 RING = (0.79, 0.81, 0.84)
-"""Colours of the nominal and the observed motion, of the background, and of the floor's rings."""
+"""Colours of the nominal motion, the observed one, the updated twin, background and rings."""
+TRAIL = 1.0
+"""Seconds of its past path that a draw of the updated twin shows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +39,8 @@ class Shots:
         Joint positions in rad or m.
     nominal_points, observed_points : ndarray, shape (frames, k, 3)
         Points of the skeleton in m.
+    drawn : ndarray, shape (draws, frames, 3), optional
+        Positions of the tip in m that an updated twin draws; by default there are none.
 
     """
 
@@ -46,9 +51,16 @@ class Shots:
     observed: NDArray
     nominal_points: NDArray
     observed_points: NDArray
+    drawn: NDArray = field(default_factory=lambda: np.empty((0, 0, 3)))
 
     def __len__(self) -> int:
         return len(self.seconds)
+
+    def trails(self, frame: int) -> NDArray:
+        """The paths (draws, frames, 3) of the draws that lead to a frame."""
+        past = np.searchsorted(self.seconds, self.seconds[frame] - TRAIL - 1e-9)
+        trails: NDArray = self.drawn[:, past : frame + 1]
+        return trails
 
     @property
     def root(self) -> NDArray:

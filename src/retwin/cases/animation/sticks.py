@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.cases.animation.shots import GHOST, PAPER, RING, SOLID, Shots, rings
+from retwin.cases.animation.shots import GHOST, PAPER, RING, SOLID, UPDATED, Shots, rings
 
 __all__ = ["stick_pictures"]
 
@@ -17,7 +17,7 @@ DPI = 100
 
 
 def stick_pictures(shots: Shots, size: tuple[int, int]) -> Iterator[NDArray]:
-    """Draw the two skeletons and the paths of their tips.
+    """Draw the two skeletons, the paths of their tips, and the draws of an updated twin.
 
     Parameters
     ----------
@@ -53,7 +53,18 @@ def stick_pictures(shots: Shots, size: tuple[int, int]) -> Iterator[NDArray]:
         )
         chain.set(marker="o", markersize=1.7 * thick * unit, solid_capstyle="round")
         drawn.append((points, trace, chain))
+    trails: list[Any] = [
+        axes.plot([], [], [], color=UPDATED, linewidth=0.8 * unit, alpha=0.6, zorder=3)[0]
+        for _ in shots.drawn
+    ]
+    tips: Any
+    (tips,) = axes.plot([], [], [], color=UPDATED, marker="o", linestyle="", zorder=6)
+    tips.set_markersize(3.5 * unit)
     for i in range(len(shots)):
+        for trail, path in zip(trails, shots.trails(i), strict=True):
+            trail.set_data_3d(*path.T)
+        if trails:
+            tips.set_data_3d(*shots.drawn[:, i].T)
         for points, trace, chain in drawn:
             trace.set_data_3d(*points[: i + 1, -1].T)
             chain.set_data_3d(*points[i].T)
