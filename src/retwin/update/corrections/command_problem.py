@@ -355,8 +355,8 @@ class CommandProblem:
             columns = [(residual - self._residual(x + each)) / each.sum() for each in moves]
             return residual, torch.stack(columns, dim=-1)
         # Without memory the chain rule is local: the surrogate's Jacobian, sample by sample.
-        residual, by_command = self._by_command(x)
-        delay, offset = self._command_jacobians(x)
+        commands, delay, offset = self._command_jacobians(x)
+        residual, by_command = self._by_command(commands.float())
         by_delay = torch.einsum("nsyu,nmsu->nsym", by_command, delay)[..., None]
         by_offset = torch.einsum("nsyu,nmsu->nsymu", by_command, offset)
         parts = [by_delay, by_offset]
@@ -364,9 +364,9 @@ class CommandProblem:
             parts.append(torch.einsum("nsyu,nmsu->nsymu", by_command, delay))
         return residual, torch.cat(parts, dim=-1).flatten(3)
 
-    def _by_command(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def _by_command(self, commands: Tensor) -> tuple[Tensor, Tensor]:
         """The residual (n, S, d_y), and the surrogate's Jacobian (n, S, d_y, d_u)."""
-        different, place = distinct(self.commands(x))
+        different, place = distinct(commands)
         slopes = jacobians(self.surrogate, different)
         if slopes is not None:
             outputs = self.surrogate(different[None])[0, place].double()
@@ -381,8 +381,8 @@ class CommandProblem:
         jacobian = torch.cat(rows).movedim(0, 1)[place].double() / self.unit[..., None]
         return self.observed - outputs.detach()[0, place].double() / self.unit, jacobian
 
-    def _command_jacobians(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Jacobians (n, M, S, d_u) of the commands by each segment's delay, and by its offsets.
+    def _command_jacobians(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The commands (n, S, d_u), and their Jacobians (n, M, S, d_u) by delays and by offsets.
 
         An actuator's command depends on its own offset only, so all are moved at once.
         """
@@ -396,7 +396,7 @@ class CommandProblem:
         x = (self.per_segment(x)[:, None] + moves).flatten(0, 1)
         commands = self._effective(x, rows).unflatten(0, (n, len(moves)))
         delay, offset = ((commands[:, 1:] - commands[:, :1]) / COMMAND_STEP).split(segments, dim=1)
-        return delay, offset
+        return commands[:, 0], delay, offset
 
     def _effective(self, x: Tensor, rows: Tensor) -> Tensor:
         """Effective commands for x (k, M, size) of the trajectories `rows` (k,), in order."""
