@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 from scipy.stats import multivariate_normal, multivariate_t, norm
 from torch import Tensor
 
+from retwin.inference import solver
 from retwin.inference.em import expectation_maximisation
 from retwin.inference.evidence import added_evidence, best_per_row
 from retwin.inference.losses import StudentT, Tukey
@@ -113,6 +114,28 @@ def test_robust_regression_is_that_of_scipy(curve: float) -> None:
         assert found.objective[i] - wanted.fun < 1e-3
         deviation = found.covariance[i].diagonal().sqrt().numpy()
         np.testing.assert_array_less(np.abs(found.x[i].numpy() - wanted.x), 0.05 * deviation)
+
+
+def test_extrapolated_steps_are_fewer_and_end_no_higher(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reweighting converges linearly where a fifth of the samples are outliers."""
+    problem, prior = Linear.drawn(20, 40, seed=8), prior_of(20, seed=9)
+    problem.observed[:, ::5] += 3.0
+    steps: list[int] = []
+    plain = Linear.linearised
+
+    def counted(self: Linear, x: Tensor) -> tuple[Tensor, Tensor]:
+        steps[-1] += len(x)
+        return plain(self, x)
+
+    monkeypatch.setattr(Linear, "linearised", counted)
+    objectives = []
+    for ratio in (0.0, solver.LARGEST_RATIO):
+        monkeypatch.setattr(solver, "LARGEST_RATIO", ratio)
+        steps.append(0)
+        noise = noise_of(0.3, StudentT(1.0))
+        objectives.append(solve(problem, prior, noise, prior.mean, reweightings=1).objective)
+    assert steps[1] < 0.8 * steps[0]
+    assert float((objectives[1] - objectives[0]).max()) < 1e-3
 
 
 @pytest.mark.parametrize("loss", [StudentT(4.0), StudentT(1.5), Tukey()])

@@ -2,7 +2,8 @@
 
 All rows of a problem are solved together. Robust noise is handled by iteratively reweighted least
 squares, damping follows Levenberg and Marquardt (Nocedal and Wright, Numerical Optimization, 2006,
-chapter 10), and the evidence is Laplace's (Tierney and Kadane, J. Am. Stat. Assoc. 81, 82, 1986):
+chapter 10), steps that converge linearly, as reweighting does, are extrapolated (Aitken, Proc. R.
+Soc. Edinburgh 46, 289, 1927), and the evidence is Laplace's (Tierney and Kadane, J. Am. Stat. Assoc. 81, 82, 1986):
 a normalised prior makes rows with more freedom pay for it (MacKay, Neural Comput. 4, 415, 1992).
 """
 
@@ -29,6 +30,10 @@ DAMPING = 1e-6
 """Damping to begin with, relative to the diagonal of the curvature: next to none."""
 DAMPING_AFTER_FAILURE = 1e-3
 """Damping at least, after a step that did not decrease the objective."""
+ALIGNED = 0.9
+"""Cosine of the angle between successive moves above which they are extrapolated."""
+LARGEST_RATIO = 0.8
+"""Largest ratio of successive moves that is extrapolated: a move is made at most five times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +215,7 @@ def solve(
         x, energy, x.new_full((len(x), size, size), torch.nan), torch.full_like(energy, -torch.inf)
     )
     rows, damping = torch.arange(len(x)), torch.full_like(energy, DAMPING)
+    before = torch.zeros_like(x)
     for count in range(MAX_STEPS + 1):
         step = gauss_newton_step(
             problem,
@@ -236,9 +242,13 @@ def solve(
             break
         if len(going) < len(rows):
             problem, prior, rows = problem[going], prior[going], rows[going]
-            x, energy, damping = x[going], energy[going], damping[going]
+            x, energy, damping, before = x[going], energy[going], damping[going], before[going]
             linearised = linearised[0][going], linearised[1][going]
-        trial = step.x[going]
+        move = step.x[going] - x
+        factor = _extrapolation(move, before, step.curvature[going])
+        trial = x + factor[:, None] * move
+        if bounds is not None:
+            trial = bounds.moved(x, trial - x)
         tried = problem.linearised(trial)
         there = noise.misfit(problem, tried[0]).sum(dim=1) + prior.energy(trial)
         better = there <= energy
@@ -246,8 +256,25 @@ def solve(
         energy = torch.where(better, there, energy)
         linearised = _chosen(better, tried, linearised)
         raised = (8 * damping).clamp(DAMPING_AFTER_FAILURE, 1e6)
+        raised = torch.where(factor > 1, damping, raised)
         damping = torch.where(better, (damping / 4).clamp_min(1e-9), raised)
+        before = torch.where(better[:, None], move, 0.0)
     return found
+
+
+def _extrapolation(move: Tensor, before: Tensor, metric: Tensor) -> Tensor:
+    """The factor (R,) of moves (R, P) that converge linearly, as reweighting does: 1 / (1 - ρ).
+
+    ρ is the part of the move before that is left, in the metric (R, P, P). The sum of a geometric
+    series is what such moves would reach (Aitken's method). Moves in another direction than before
+    have the factor 1.
+    """
+    left = (metric @ torch.stack([move, before], dim=-1)).mT
+    own, common = (left[:, 0] * move).sum(dim=1), (left[:, 0] * before).sum(dim=1)
+    last = (left[:, 1] * before).sum(dim=1).clamp_min(1e-30)
+    ratio = (common / last).clamp(0.0, LARGEST_RATIO)
+    aligned = (common > 0) & (common.square() > ALIGNED**2 * own * last)
+    return torch.where(aligned, 1 / (1 - ratio), 1.0)
 
 
 def _left(joined: Tensor, move: Tensor) -> Tensor:
