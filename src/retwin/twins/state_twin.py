@@ -78,8 +78,9 @@ class StateTwin:
         Numbers of the equations, with their units, bounds, and starts, which are used by default.
     substeps : int, default 1
         Steps of the integration per sample, up to 10 000.
-    interpolation : {"hold", "linear", "spline"}
-        The commands between samples, see `INTERPOLATIONS`; `step` has no such time.
+    interpolation : {"hold", "linear", "spline"}, optional
+        The commands between samples, see `INTERPOLATIONS`; `step` has no such time. By default
+        they are held, and `fit_dynamics` chooses by the calibration record.
     limits : Limits, optional
         Range of the commands.
 
@@ -114,7 +115,7 @@ class StateTwin:
     step: Callable[..., Any] | None = None
     parameters: Sequence[Parameter] = ()
     substeps: int = 1
-    interpolation: str = "hold"
+    interpolation: str | None = None
     limits: Limits | None = None
 
     def __post_init__(self) -> None:
@@ -138,9 +139,10 @@ class StateTwin:
         )
         sample_rate("rate", self.rate)
         whole("substeps", self.substeps, least=1, most=MOST_SUBSTEPS)
-        one_of("interpolation", self.interpolation, INTERPOLATIONS)
+        if self.interpolation is not None:
+            one_of("interpolation", self.interpolation, INTERPOLATIONS)
         require(
-            self.step is None or (self.substeps == 1 and self.interpolation == "hold"),
+            self.step is None or (self.substeps == 1 and self.interpolation in {None, "hold"}),
             "step",
             expected="substeps=1 and interpolation='hold'",
             got=f"substeps={self.substeps}, interpolation={self.interpolation!r}",
@@ -328,7 +330,8 @@ class StateTwin:
         """
         from retwin.twins.compiled.steps import Steps
 
-        return Steps(self.model, 1 / self.rate, substeps or self.substeps, self.interpolation)
+        interpolation = self.interpolation or INTERPOLATIONS[0]
+        return Steps(self.model, 1 / self.rate, substeps or self.substeps, interpolation)
 
     def _outputs(
         self,

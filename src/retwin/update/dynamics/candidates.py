@@ -8,17 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import require
+from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.state_twin import StateTwin
 from retwin.update.dynamics.corrected import CorrectedEquations
 from retwin.update.dynamics.estimation import Estimation, correlation_time
 from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
 from retwin.update.dynamics.memory import Memory
-from retwin.update.dynamics.noise import edges
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.unknowns import Unknowns
 
-__all__ = ["Candidate", "chosen"]
+__all__ = ["Candidate", "best_of", "better", "searched", "without_discrepancy"]
 
 STRONGEST = 100.0
 """Variance of the error of an effective sample that is assumed first, over that of the samples of
@@ -29,9 +30,12 @@ search follows."""
 CONSISTENT = 0.9
 """Ratio of the observed to the assumed variance from which they agree."""
 DECIDED = 2.0
-"""Number of standard errors by which a memory must lower the logarithms of held-out errors."""
+"""Number of standard errors by which a memory, or commands that are not held between samples, must
+lower the logarithms of held-out errors."""
 MAX_STRENGTHS = 30
 """Number of variances at most."""
+ERROR_STEPS = 2
+"""Times that the error of each output is estimated anew where the twin alone is fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +72,35 @@ class Candidate:
         return cls(equations, memory, estimation, found, held_out, squares)
 
 
-def chosen(
+def without_discrepancy(
+    base: StateTwin, observed: Trajectories, unknowns: Unknowns
+) -> tuple[Estimation, Linearised]:
+    """The fit of the twin itself."""
+    starts = np.tile(unknowns.start[unknowns.free], (len(observed), 1))
+    estimation = Estimation(base, observed, unknowns, observed.mask, np.ones(len(base.outputs)))
+    found = estimation.linearised(Point(unknowns.mean, starts))
+    require(
+        found.finite,
+        "twin",
+        expected="a simulation of the commands that is finite",
+        got="one that is not, at the present parameters",
+        remedy="identify the twin first, or choose other starts of its parameters",
+    )
+    for _ in range(ERROR_STEPS):
+        estimation = replace(estimation, variance=estimation.power(found.residual))
+        found = estimation.minimised(found)
+    return replace(estimation, variance=estimation.power(found.residual)), found
+
+
+def searched(
     alone: Estimation,
     point: Point,
     settings: Dynamics,
     parts: Sequence[NDArray],
+    far: Sequence[NDArray],
     progress: Progress,
-) -> Candidate:
-    """The simplest candidate whose held-out errors are those of the best one, up to chance.
+) -> list[Candidate]:
+    """All candidates, the simplest first.
 
     Parameters
     ----------
@@ -85,14 +110,13 @@ def chosen(
         Its optimum.
     settings : Dynamics
         The forms that are tried.
-    parts : sequence of NDArray
-        Parts (n, T) of the samples that are held out in turn.
+    parts, far : sequence of NDArray
+        Parts (n, T) of the samples that are held out in turn, in time and at the edges.
     progress : callable
         Called with the share of the work that is done.
 
     """
     tried: list[Candidate] = []
-    far = edges(alone.simulated(point)[1], alone.commands, settings.folds)
     for number, equations in enumerate(_forms(alone, point, settings)):
         own, found = _followed(equations, None, alone, point, STRONGEST)
         tried.append(Candidate.tested(equations, None, own, found, parts, far))
@@ -101,17 +125,23 @@ def chosen(
             strength = float(np.mean(own.variance / alone.variance))
             own, found = _followed(equations, slow, alone, found.point, strength)
             tried.append(Candidate.tested(equations, slow, own, found, parts, far))
-        progress(1 - 0.95 * 0.6 ** (number + 1))
+        progress(1 - 0.6 ** (number + 1))
+    return tried
+
+
+def best_of(tried: Sequence[Candidate]) -> Candidate:
+    """The simplest candidate whose held-out errors are those of the best one, up to chance."""
     best = tried[_simplest([each.squares for each in tried])]
     without = [each for each in tried if each.memory is None]
     other = without[_simplest([each.squares for each in without])]
-    return other if best.memory and not _decided(best, other) else best
+    return other if best.memory and not better(best, other) else best
 
 
-def _decided(candidate: Candidate, other: Candidate) -> bool:
+def better(candidate: Candidate, other: Candidate) -> bool:
     """Whether a candidate has lower held-out errors in nearly all parts.
 
-    A memory is a state more, and with a short time constant much like a parameter.
+    It is asked for what can imitate other errors: a memory is a state more, and with a short time
+    constant much like a parameter.
     """
     before, after = (np.log(np.concatenate(each.squares)) for each in (other, candidate))
     change = (after - before)[np.isfinite(after - before)]

@@ -109,7 +109,7 @@ class Estimation:
         """Measured minus simulated outputs (n, T, d_y); 0 where a sample does not count."""
         return np.where(self.seen, self.measured - self.simulated(point)[0], 0.0)
 
-    def _derivatives(self, point: Point) -> Iterator[tuple[slice, NDArray, NDArray]]:
+    def derivatives(self, point: Point) -> Iterator[tuple[slice, NDArray, NDArray]]:
         """Some trajectories, their residual (c, T, d_y), and derivatives (c, T, d_y, P) of outputs.
 
         Both are 0 where a sample does not count.
@@ -131,7 +131,7 @@ class Estimation:
         residual = np.full(self.seen.shape, np.nan)
         products = np.zeros((len(self.variance), width, width + 1))
         own = np.zeros((len(self.variance), len(self.observed), len(starts), width + 1))
-        for rows, error, slope in self._derivatives(point):
+        for rows, error, slope in self.derivatives(point):
             residual[rows] = error
             with np.errstate(over="ignore", invalid="ignore"):
                 for i in range(len(products)):
@@ -324,7 +324,7 @@ class Estimation:
         scale = 1 / np.sqrt(self.variance)
 
         def parts() -> Iterator[tuple[int, slice, NDArray, NDArray]]:
-            for rows, error, slope in self._derivatives(at.point):
+            for rows, error, slope in self.derivatives(at.point):
                 for i, fold in enumerate(folds):
                     held = slope[fold[rows]][..., : len(by_unit)]
                     yield i, rows, error[fold[rows]], held @ by_unit

@@ -18,7 +18,7 @@ from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
-from retwin.update.dynamics.candidates import chosen
+from retwin.update.dynamics.between_samples import chosen
 from retwin.update.dynamics.corrected import CorrectedEquations
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.estimation import Estimation, root
@@ -29,14 +29,12 @@ from retwin.update.dynamics.network import TanhNetwork
 from retwin.update.dynamics.noise import fit_noise, folds, widening
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.twin import DynamicsTwin
-from retwin.update.dynamics.unknowns import Unknowns, state_twin_of, unknowns_of
+from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 
 __all__ = ["FittedDynamics", "assembled", "fit_dynamics"]
 
 NONLINEAR = 1.5
 """Ratio of the errors of a simulation to those of a linear step, from which on the step is none."""
-ERROR_STEPS = 2
-"""Times that the error of each output is estimated anew where the twin alone is fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,12 +150,9 @@ def fit_dynamics(
         got=int(observed.mask.sum()),
         remedy="give more or longer trajectories, or free fewer parameters",
     )
-    alone, fitted = _without_discrepancy(base, observed, unknowns)
-    report(0.05)
-    power = alone.power(fitted.residual)
     parts = folds(observed.mask, settings.folds)
-    alone = replace(alone, variance=power)
-    best = chosen(alone, fitted.point, settings, parts, report)
+    alone, fitted, best = chosen(base, observed, unknowns, settings, parts, report)
+    power = alone.variance
     equations, memory = best.equations, best.memory
     estimation, found, held_out = best.estimation, best.found, best.held_out
     corrected = equations.states, (memory.speed(equations) if memory else equations.domain.speed)
@@ -192,26 +187,6 @@ def fit_dynamics(
         seconds=time.perf_counter() - began,
         reason=notes,
     )
-
-
-def _without_discrepancy(
-    base: StateTwin, observed: Trajectories, unknowns: Unknowns
-) -> tuple[Estimation, Linearised]:
-    """The fit of the twin itself."""
-    starts = np.tile(unknowns.start[unknowns.free], (len(observed), 1))
-    estimation = Estimation(base, observed, unknowns, observed.mask, np.ones(len(base.outputs)))
-    found = estimation.linearised(Point(unknowns.mean, starts))
-    require(
-        found.finite,
-        "twin",
-        expected="a simulation of the commands that is finite",
-        got="one that is not, at the present parameters",
-        remedy="identify the twin first, or choose other starts of its parameters",
-    )
-    for _ in range(ERROR_STEPS):
-        estimation = replace(estimation, variance=estimation.power(found.residual))
-        found = estimation.minimised(found)
-    return estimation, found
 
 
 def assembled(
