@@ -285,16 +285,15 @@ def test_what_cannot_be_used_is_refused_before_any_work(
     [
         (lambda t: t.replace("valve,level", "valve,other"), "a column for an output of the twin"),
         (lambda t: t.replace("valve,level", "other,level"), "none for valve"),
-        (lambda t: t.splitlines()[0] + "\n", "a number for every command"),
-        (lambda t: "", "columns ; none for valve"),
-        (lambda t: t.replace(",", ";"), "columns that are separated by commas, got columns"),
+        (lambda t: t.splitlines()[0] + "\n", "a table of numbers, got 'valve,level'"),
+        (lambda t: "", "a table of numbers, got an empty file"),
         (lambda t: t + "0.5,3.4e38\n", "3.4e+38 for level at 400 s; leave the cell empty"),
-        (lambda t: t.replace("0.", "0.x", 9), "numbers in columns"),
+        (lambda t: t.replace("0.", "0.x", 9), "expected numbers in the rows below its header"),
         (
             lambda t: "\n".join(x.split(",")[0] + "," for x in t.splitlines()[1:]).join(
                 ["valve,level\n", "\n"]
             ),
-            "measurements in the",
+            "no value at all of level",
         ),
     ],
     ids=[
@@ -302,7 +301,6 @@ def test_what_cannot_be_used_is_refused_before_any_work(
         "no command",
         "no rows",
         "empty",
-        "separator",
         "missing",
         "no numbers",
         "nothing measured",

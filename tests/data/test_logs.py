@@ -383,7 +383,7 @@ def test_identification_reads_a_log_by_its_mapping(tmp_path: Path) -> None:
     inputs, outputs = rt.Channels(("heater",), ("1",)), rt.Channels(("speed",), ("m/s",))
     twin = rt.FunctionTwin(lambda commands: 3 * commands, inputs, outputs, 50.0)
     columns = rt.cases.Columns(mapping=tmp_path / "m.toml")
-    assert rt.cases.measured_outputs([path], twin, columns) == ("speed",)
+    assert rt.cases.LogReader(columns).measured_outputs([path], twin) == ("speed",)
     found = rt.cases.read_logs([path], twin, columns)
     assert found.trajectories.rate == 50.0
     np.testing.assert_allclose(found.trajectories.nominal, 3 * found.trajectories.commands)

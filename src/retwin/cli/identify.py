@@ -19,7 +19,7 @@ from retwin.serialisation.places import check_place
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from retwin.cases.logs import Columns
+    from retwin.cases.logs import Columns, LogReader
     from retwin.cases.opened_twin import OpenedTwin
     from retwin.evaluation.identification import Identification
 
@@ -116,7 +116,7 @@ def identify(
     Writes report.html, identification.json and a case, updated.toml. A module
     that is named by the twin or its case is run with your rights.
     """
-    from retwin import cases
+    from retwin.cases import LogReader
     from retwin.deploy.identified import HOLDS, save_identification
     from retwin.evaluation import identification as room
     from retwin.evaluation.identification.hold_out import SHARE
@@ -137,18 +137,15 @@ def identify(
             remedy="check the name",
         )
     any_rate = Path(twin).suffix.lower() in UNRATED
-    if rate is None and any_rate:
-        rate = cases.log_rate(logs[0], columns)
-    opened, left_out = _opened(twin, logs, columns, free or (), names, rate)
+    reader = LogReader(columns, max_bytes)
+    opened, left_out = _opened(twin, logs, reader, free or (), names, rate)
     with keep_workers(), bar("identify") as show:
-        read = cases.read_logs(
+        read = reader.trajectories(
             logs,
             opened.twin,
-            columns,
             case=opened.case,
             rows_at_rate=given or not any_rate,
             progress=lambda share: show("read, 1 of 3", share),
-            max_bytes=max_bytes,
         )
         if left_out:
             text = f"Outputs that no log holds are left out: {', '.join(left_out)}."
@@ -176,23 +173,31 @@ def identify(
 def _opened(
     twin: str,
     logs: list[Path],
-    columns: Columns,
+    reader: LogReader,
     free: Sequence[str],
     names: list[tuple[str, ...]],
     rate: float | None,
 ) -> tuple[OpenedTwin, list[str]]:
-    """The twin, and outputs that it lacks: of an FMU, by default, those that no log holds."""
-    from retwin import cases
+    """The twin, at the rate of the log if it takes any, and outputs that it lacks.
+
+    Those are, of an FMU and by default, the ones that no log holds.
+    """
+    from retwin.cases import open_parametric
 
     inputs, outputs = names
-    opened = cases.open_parametric(twin, free, inputs=inputs, outputs=outputs, rate=rate)
-    if outputs or opened.case is not None or Path(twin).suffix.lower() != ".fmu":
-        return opened, []
-    held = cases.measured_outputs(logs, opened.twin, columns)
-    if not held or held == opened.twin.outputs.names:
-        return opened, []
+    opened = open_parametric(twin, free, inputs=inputs, outputs=outputs, rate=rate)
+    suffix = Path(twin).suffix.lower()
+    if rate is None and suffix in UNRATED:
+        rate = reader.rate(logs[0], opened.twin)
+    held = opened.twin.outputs.names
+    if not outputs and opened.case is None and suffix == ".fmu":
+        held = reader.measured_outputs(logs, opened.twin) or held
     others = [name for name in opened.twin.outputs.names if name not in held]
-    return cases.open_parametric(twin, free, inputs=inputs, outputs=held, rate=rate), others
+    if others:
+        outputs = held
+    if others or (rate is not None and rate != opened.twin.rate):
+        opened = open_parametric(twin, free, inputs=inputs, outputs=outputs, rate=rate)
+    return opened, others
 
 
 def _method(name: str, loss: str | None, starts: int | None) -> Any:
@@ -220,7 +225,8 @@ def _method(name: str, loss: str | None, starts: int | None) -> Any:
 
 def _columns(column: list[str] | None, time: str | None, transient: float) -> Columns:
     """Which columns of a log are the channels of the twin."""
-    from retwin.cases import Columns, TimeColumn
+    from retwin.cases import Columns
+    from retwin.data.logs.mapping import TimeSettings
 
     names = {}
     for text in column or ():
@@ -233,11 +239,9 @@ def _columns(column: list[str] | None, time: str | None, transient: float) -> Co
             remedy="write for instance --column speed=omega_measured",
         )
         names[channel] = name
-    clock = None
-    if time is not None:
-        name, _, unit = time.partition("=")
-        clock = TimeColumn(name, unit or "s")
-    return Columns(names, clock, transient)
+    name, _, unit = (time or "").partition("=")
+    one_of("--time", unit, ("", "s", "ms", "us", "ns", "iso"), remedy="write for instance stamp=ms")
+    return Columns(names, TimeSettings(column=name, unit=unit), transient)  # type: ignore[arg-type]
 
 
 def _plan(opened: OpenedTwin, used: Any, method: str) -> str:

@@ -25,7 +25,15 @@ from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["Fact", "Proposal", "facts_of", "propose_mapping", "proposed"]
+__all__ = [
+    "Fact",
+    "Proposal",
+    "channel_mapping",
+    "cut_at_pauses",
+    "facts_of",
+    "propose_mapping",
+    "proposed",
+]
 
 COMMAND = re.compile(
     r"(^|[^a-z])(cmd|command(s|ed)?|set_?point(s)?|target(s)?|ref(erence)?|desired|demand|goal|"
@@ -229,11 +237,11 @@ def proposed(
     # Signals that are not chosen yet may be the faster ones.
     known = used if all(all(table.values()) for table in chosen.values()) else moving
     rate = rate or _plain(float(np.median([each.rate for each in known])))
-    cut = _cut([log.signals[each.name] for each in used], 1 / rate)
+    cut = cut_at_pauses([log.signals[each.name] for each in used], 1 / rate)
     units = units_of(case)
     tables = {
         name: {
-            channel: _channel(fact, log.signals[fact.name], name, rate, cut).model_copy(
+            channel: channel_mapping(log.signals[fact.name], name, rate, cut).model_copy(
                 update={"unit": units.get(channel)}
             )
             for channel, fact in table.items()
@@ -338,7 +346,7 @@ def _alike(name: str, unit: str, fact: Fact, *, command: bool) -> float:
     return score
 
 
-def _cut(signals: Sequence[Signal], period: float) -> Cut:
+def cut_at_pauses(signals: Sequence[Signal], period: float) -> Cut:
     """A cut at the pauses of a log, if there are any."""
     steps = np.diff(union_of_times(signals))
     longer = steps[steps > max(PAUSE, PAUSE_PERIODS * period)]
@@ -349,15 +357,17 @@ def _cut(signals: Sequence[Signal], period: float) -> Cut:
     return Cut(by="gap", gap=_round(max(least, float(longer.min()) / 2)))
 
 
-def _channel(fact: Fact, signal: Signal, table: str, rate: float, cut: Cut) -> ChannelMapping:
-    longest = BRIDGED * max(1 / rate, 1 / fact.rate)
+def channel_mapping(signal: Signal, table: str, rate: float, cut: Cut) -> ChannelMapping:
+    """How a signal becomes a channel of a table of the mapping, at a rate in Hz."""
+    own = _fact(signal).rate
+    longest = BRIDGED * max(1 / rate, 1 / own if own else 0.0)
     # A command that is sent when it changes holds until the next one.
     if table == "commands":
         steps = np.diff(np.sort(signal.times[np.isfinite(signal.values)]))
         longest = max(longest, float(steps[steps <= (cut.gap or math.inf)].max(initial=0.0)))
     exponent = math.floor(math.log10(longest)) - 2
     return ChannelMapping(
-        signal=fact.name,
+        signal=signal.name,
         resample="hold" if table == "commands" else "linear",
         max_gap=_round(math.ceil(longest / 10**exponent - 1e-6) * 10**exponent),
     )

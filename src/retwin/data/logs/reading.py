@@ -16,11 +16,12 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.catalog import LOGS
+from retwin.catalog import LOGS, resolve
 from retwin.checks import require
+from retwin.data.logs import text_tables
 from retwin.data.logs.signals import MAX_SIGNALS, NANOSECOND, Clock, Log, Signal
 from retwin.data.logs.worker import FRAME
-from retwin.errors import InputError
+from retwin.errors import InputError, brief
 from retwin.processes import scratch_folder
 from retwin.progress import Progress
 from retwin.serialisation.files import sha256
@@ -35,6 +36,9 @@ BYTES_PER_VALUE = 16
 MAX_TEXT = 2**16
 """Bytes of a frame's text at most."""
 DAMAGED = "get or make the file again, or repair it with the tools of its format"
+SAFE = 2**24
+"""Bytes of a table of text up to which it is read here: its reader is Python alone, and a process
+takes half a second to start."""
 CODE = "import sys; sys.path[:] = {path!r}; from retwin.data.logs.worker import main; main()"
 
 
@@ -100,17 +104,19 @@ def read_log(
     kind = log_format(path)
     files = _files(path)
     budget.take(0)
+    size = sum(each.stat().st_size for each in files)
     request = {
         "path": str(path.resolve()),
         "format": kind,
         "wanted": None if wanted is None else sorted(wanted),
         "clock": asdict(clock or Clock()),
         "max_bytes": budget.left,
-        "size": sum(each.stat().st_size for each in files),
+        "size": size,
     }
     signals: dict[str, Signal] = {}
     skipped: dict[str, str] = {}
-    for each in _frames(path, request, budget):
+    here = size <= SAFE and resolve(LOGS[kind].reader) is text_tables.read
+    for each in (_read_here if here else _frames)(path, request, budget):
         if isinstance(each, Signal):
             signals[each.name] = each
             if progress is not None and wanted:
@@ -130,6 +136,28 @@ def read_log(
         for name, each in signals.items()
     }
     return Log(path.resolve().name, sha256(path), begin, shifted, skipped)
+
+
+def _read_here(
+    path: Path, request: dict[str, Any], budget: Budget
+) -> Iterator[Signal | tuple[str, str]]:
+    """What the reader of a small table of text finds, with the limits of the other way."""
+    wanted = None if request["wanted"] is None else frozenset(request["wanted"])
+    count = 0
+    try:
+        for each in text_tables.read(path, wanted, Clock(**request["clock"])):
+            count += 1
+            if count > MAX_SIGNALS:
+                raise _refused(path, "more signals than can be")
+            if isinstance(each, Signal):
+                budget.take(BYTES_PER_VALUE * len(each.times))
+                yield each
+            else:
+                yield each.name, each.reason
+    except InputError:
+        raise
+    except Exception as error:
+        raise _refused(path, f"{type(error).__name__}: {brief(error)}") from None
 
 
 def _files(path: Path) -> list[Path]:

@@ -57,6 +57,9 @@ class Clock:
         The format of times that are other text, as `datetime.strptime` reads it.
     rate : float or None
         Rows per s, where there is no column of times.
+    otherwise : float or None
+        Rows per s, where no column of times is found by its name; none is then guessed by its
+        values.
     stamps : {"log", "header"}
         Whether messages have the time of their recording or the stamp of their header. Topics
         without stamps have the time of their recording in any case.
@@ -68,6 +71,7 @@ class Clock:
     format: str = ""
     rate: float | None = None
     stamps: Literal["log", "header"] = "log"
+    otherwise: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from retwin.data.logs.signals import (
 from retwin.errors import InputError
 
 __all__ = [
+    "EVEN",
     "MISSING",
     "TIMES",
     "TIME_NAMES",
@@ -34,6 +35,8 @@ TIME_NAMES = ("time", "timestamp", "timestamps", "t", "datetime", "date", "zeit"
 """Names by which a column of times is found, the most certain first."""
 TIMES = "times"
 """Why a column of times is no signal."""
+EVEN = "no times: rows at a given rate"
+"""What is noted of a table without a column of times."""
 MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "?"})
 """Cells that stand for a missing value, in small letters."""
 TRUTH = {"true": "1", "false": "0", "on": "1", "off": "0"}
@@ -206,12 +209,13 @@ def table_signals(
 
     """
     name = clock.column or ("" if clock.rate else time_column(titles))
-    if not name and not clock.rate and wanted is None:
+    rate = clock.rate or (None if name else clock.otherwise)
+    if not name and not rate and wanted is None:
         dated = (each for each in titles if stamps(each).dtype.kind == "M")
         name = next(
             dated, next((each for each in list(titles)[:1] if _increases(stamps(each))), "")
         )
-    if (not name and not clock.rate) or (name and name not in titles):
+    if (not name and not rate) or (name and name not in titles):
         raise InputError(
             place,
             expected=f"a column of times{f' {clock.column!r}' * bool(clock.column)}",
@@ -223,7 +227,8 @@ def table_signals(
         times = row_times(stamps(name), unit, clock, f"{place}, column {name!r}")
         yield Skipped(name, TIMES)
     else:
-        times = even_times(rows, clock.rate or 1.0, place)
+        times = even_times(rows, rate or 1.0, place)
+        yield Skipped("", EVEN)
     for title, unit in titles.items():
         if title == name:
             continue

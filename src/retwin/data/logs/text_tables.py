@@ -32,6 +32,8 @@ BLOCK = 65_536
 TEXT_SHARE = 0.5
 """The share of cells that are no numbers from which a column is text."""
 NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf|nan", re.IGNORECASE)
+STARTS = re.compile(r"[+-]?[.,]?\d")
+"""How a number begins, and hardly a title."""
 ISO = re.compile(r"\d{4}-\d\d?-\d\d?[T ]|\d\d?[./]\d\d?[./]\d{2,4}|\d\d?:\d\d")
 
 
@@ -175,7 +177,7 @@ def _layout(path: Path) -> Layout:
         if first is not None:
             # More numbers win; blanks only where nothing else separates.
             count = sum(_is_value(cell, separator != ",") for cell in rows[first] if cell.strip())
-            if _width(rows[first]) > 1 and (best is None or (count > best[0] and separator)):
+            if _width(rows, first) > 1 and (best is None or (count > best[0] and separator)):
                 best = (count, first, separator)
     if best is None:
         rows = list(_rows(iter(lines), ",", path))
@@ -190,8 +192,8 @@ def _layout(path: Path) -> Layout:
         best = (1, first, ",")
     _, first, separator = best
     rows = list(_rows(iter(lines), separator, path))
-    width = _width(rows[first])
-    names, units = _titles(rows[:first], width)
+    width = _width(rows, first)
+    names, units = _titles(_head(rows[:first], width, path), width)
     cells = [cell.strip() for row in rows[first:] for cell in row]
     comma = separator != "," and any(re.fullmatch(r"[+-]?\d*,\d+(e[+-]?\d+)?", c) for c in cells)
     return Layout(encoding, separator, first, names, units, comma)
@@ -210,8 +212,35 @@ def _encoding(path: Path) -> str:
     return "utf-8-sig"
 
 
-def _width(row: Sequence[str]) -> int:
-    return len(row) - 1 if len(row) > 1 and not row[-1].strip() else len(row)
+def _width(rows: Sequence[Sequence[str]], first: int) -> int:
+    """The number of columns: one less where each line ends with a separator, and has no title."""
+    count = len(rows[first])
+    ends = [row[-1] for row in rows[first:] if len(row) == count]
+    titled = any(row[-1].strip() for row in rows[:first] if len(row) == count)
+    return count if count == 1 or titled or any(map(str.strip, ends)) else count - 1
+
+
+def _head(rows: Sequence[Sequence[str]], width: int, path: Path) -> Sequence[Sequence[str]]:
+    """The rows above the numbers with a title, or a unit, for each column.
+
+    Raises InputError for one that seems to hold damaged numbers, which would be left out.
+    """
+    full = [(number, row) for number, row in enumerate(rows, 1) if _cells(row, width) == width]
+    for number, row in full[1:]:
+        filled = [cell.strip() for cell in row if cell.strip()]
+        if filled and all(STARTS.match(cell) for cell in filled):
+            raise InputError(
+                path.name,
+                expected="numbers in the rows below its header",
+                got=f"{' '.join(filled)[:60]!r} in line {number}",
+                remedy="repair or remove that line",
+            )
+    return [row for _, row in full]
+
+
+def _cells(row: Sequence[str], width: int) -> int:
+    """The cells of a row, without an empty one behind a last separator."""
+    return len(row) - 1 if len(row) == width + 1 and not row[-1].strip() else len(row)
 
 
 def _is_value(cell: str, comma: bool) -> bool:
@@ -226,30 +255,28 @@ def _first_row(rows: Sequence[Sequence[str]], *, comma: bool) -> int | None:
     """The first row from which on all have the same number of cells, numbers among them."""
 
     def holds_numbers(row: Sequence[str]) -> bool:
-        cells = row[: _width(row)]
-        values = sum(_is_value(cell, comma) and bool(cell.strip()) for cell in cells)
-        stamps = sum(bool(ISO.match(cell.strip())) for cell in cells)
-        return values + stamps > 0 and 2 * (values + stamps) >= sum(bool(c.strip()) for c in cells)
+        values = sum(_is_value(cell, comma) and bool(cell.strip()) for cell in row)
+        stamps = sum(bool(ISO.match(cell.strip())) for cell in row)
+        return values + stamps > 0 and 2 * (values + stamps) >= sum(bool(c.strip()) for c in row)
 
     for place, row in enumerate(rows):
         following = [each for each in rows[place : place + AGREEING] if each]
         # The last line may be cut off; the rows below say so when they are read.
         same = following[: max(1, len(following) - 1)]
-        if row and all(_width(each) == _width(row) and holds_numbers(each) for each in same):
+        if row and all(len(each) == len(row) and holds_numbers(each) for each in same):
             return place
     return None
 
 
 def _titles(head: Sequence[Sequence[str]], width: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names and units of the columns, from the rows before the first one of numbers."""
-    full = [row[:width] for row in head if _width(row) == width]
-    named = full[-2:]
+    named = [row[:width] for row in head][-2:]
     units = [""] * width
     if not named:
         names = [f"column{i + 1}" for i in range(width)]
     else:
         # A second row of titles holds units: they are shorter, or in brackets.
-        two = len(named) == 2 and all(named[0]) and head[-1][:width] == named[1]
+        two = len(named) == 2 and all(named[0])
         titles = named[0] if two else named[-1]
         pairs = [named_unit(title.strip().lstrip("#").strip()) for title in titles]
         names, units = [pair[0] for pair in pairs], [pair[1] for pair in pairs]

@@ -1,0 +1,215 @@
+"""A mapping of the signals of a log to the channels of a twin that have their names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from retwin.checks import require
+from retwin.data.logs.mapping import ChannelMapping, Cut, TimeSettings
+from retwin.data.logs.mapping import Mapping as LogMapping
+from retwin.data.logs.proposal import channel_mapping, cut_at_pauses
+from retwin.data.logs.signals import UNWANTED, Log, named_unit
+from retwin.data.logs.tables import EVEN, TIMES
+from retwin.data.trajectories import Channels
+from retwin.errors import InputError
+from retwin.twins.twin import Twin
+
+__all__ = [
+    "check_named",
+    "check_there",
+    "has_times",
+    "mapping_by_names",
+    "missing_commands",
+    "resampling_of",
+    "signals_of",
+]
+
+ROUNDED = 1e-3
+"""Relative difference of rates that count as equal."""
+LISTED = 12
+"""Signals that a message lists, at most."""
+
+
+def signals_of(log: Log, channels: Iterable[str], named: Mapping[str, str]) -> dict[str, str]:
+    """The signal of each channel that has one.
+
+    That is the signal of its name, or the only one whose name ends so after a dot or a slash, as
+    `/encoder.speed` does. No name is taken that is merely alike: `retwin data map` proposes these,
+    and a user checks them.
+
+    Parameters
+    ----------
+    log : Log
+        All its signals.
+    channels : iterable of str
+        Names of channels.
+    named : mapping of str to str
+        Signals that the user names, by channel.
+
+    Raises
+    ------
+    InputError
+        Several signals end like a channel, or there is none of a name that the user gives.
+
+    """
+    found = {}
+    for channel in channels:
+        wanted = named.get(channel, channel)
+        plain = named_unit(wanted)[0]
+        exact = next((each for each in (wanted, plain) if each in log.signals), None)
+        ending = [each for each in log.signals if each.endswith((f"/{plain}", f".{plain}"))]
+        if exact is None and channel in named and not ending:
+            check_there(log.name, wanted, log.signals)
+        require(
+            exact is not None or len(ending) < 2,
+            log.name,
+            expected=f"one signal for {channel}",
+            got=", ".join(ending[:LISTED]),
+            remedy=f"give --column {channel}=NAME",
+        )
+        if exact is not None or ending:
+            found[channel] = exact or ending[0]
+    return found
+
+
+def check_there(name: str, column: str, there: Iterable[str]) -> None:
+    """Refuse a column that a log lacks."""
+    require(
+        column in there,
+        name,
+        expected=f"a column {column!r}",
+        got=f"columns {_listed(there)}",
+        remedy="name the columns as the header of the file does",
+    )
+
+
+def _listed(names: Iterable[str]) -> str:
+    every = list(names)
+    more = f", … ({len(every)} in all)" if len(every) > LISTED else ""
+    return ", ".join(every[:LISTED]) + more
+
+
+def check_named(log: Log, twin: Twin, named: Mapping[str, str], *, table: bool) -> None:
+    """Refuse a log that lacks a command or all outputs, or whose times are a channel.
+
+    `table` states that it is a table of text.
+    """
+    names = (*twin.inputs.names, *twin.outputs.names)
+    taken = [name for name, why in log.skipped.items() if why == TIMES]
+    both = [each for each in names if named.get(each, each) in taken]
+    require(
+        not both,
+        log.name,
+        expected="a column with the times of the rows that is no channel of the twin",
+        got=f"the channel {both[0]}, whose values increase" if both else "",
+        remedy="give --time COLUMN, or --rate HZ if each row is a sample at that rate",
+    )
+    found = signals_of(log, names, named)
+    text = {name for name, why in log.skipped.items() if why not in (TIMES, UNWANTED)}
+    unread = [each for each in names if named.get(each, each) in text]
+    require(
+        not unread,
+        log.name,
+        expected=f"numbers in columns {', '.join(unread)}",
+        got=log.skipped[named.get(unread[0], unread[0])] if unread else "",
+        remedy="check that it is the right column, and how it writes numbers",
+    )
+    what, all_of = ("column", "columns") if table else ("signal", "signals")
+    lacking = [each for each in twin.inputs.names if each not in found]
+    mapped = "or a mapping: retwin data map LOG --case TWIN --out mapping.toml"
+    require(
+        not lacking,
+        log.name,
+        expected=f"a {what} for every command, {', '.join(twin.inputs.names)}",
+        got=f"{all_of} {_listed(log.signals)}; none for {', '.join(lacking)}",
+        remedy=f"give --column {lacking[0]}=NAME, --inputs with the names of the inputs that "
+        f"were recorded, {mapped}"
+        if lacking
+        else "",
+    )
+    require(
+        any(each in found for each in twin.outputs.names),
+        log.name,
+        expected=f"a {what} for an output of the twin, {', '.join(twin.outputs.names)}",
+        got=f"{all_of} {_listed(log.signals)}",
+        remedy=f"give --column {twin.outputs.names[0]}=NAME, {mapped}",
+    )
+
+
+def mapping_by_names(log: Log, twin: Twin, named: Mapping[str, str], *, table: bool) -> LogMapping:
+    """The mapping of the signals that have the names of a twin's channels, at its rate.
+
+    A pause separates trajectories, as in the mapping that `retwin data map` proposes. Commands are
+    held: in a table no longer than values of outputs are joined, since an empty cell is a missing
+    value; in another log until they are sent again.
+    """
+    found = signals_of(log, (*twin.inputs.names, *twin.outputs.names), named)
+    signals = [log.signals[each] for each in found.values()]
+    cut = cut_at_pauses(signals, 1 / twin.rate) if signals else Cut()
+
+    def channels(own: Channels, kind: str) -> dict[str, ChannelMapping]:
+        made = {}
+        for name, unit in zip(own.names, own.units, strict=True):
+            if name not in found:
+                continue
+            signal = log.signals[found[name]]
+            wanted = unit if unit != "1" else None
+            if table:
+                made[name] = ChannelMapping(signal=signal.name, unit=wanted)
+            else:
+                proposed = channel_mapping(signal, kind, twin.rate, cut)
+                made[name] = proposed.model_copy(update={"unit": wanted})
+        return made
+
+    return LogMapping(
+        rate=twin.rate,
+        cut=cut,
+        commands=channels(twin.inputs, "commands"),
+        outputs=channels(twin.outputs, "outputs"),
+    )
+
+
+def missing_commands(log: Log, mapping: LogMapping) -> None:
+    """Refuse a table in which a command is missing before the last one.
+
+    A trajectory would end there, in the middle of a record. Other logs have commands when they are
+    sent, and values that are no numbers are rare in them.
+    """
+    for name, each in mapping.commands.items():
+        (signal,) = (log.signals[own] for own in each.signals)
+        known = np.flatnonzero(np.isfinite(signal.values))
+        last = int(known[-1]) + 1 if len(known) else 0
+        holes = np.flatnonzero(~np.isfinite(signal.values[:last]))
+        if len(holes) or last < 2:
+            at = f", none at {signal.times[holes[0]]:g} s" if len(holes) else ""
+            raise InputError(
+                log.name,
+                expected=f"a number for every command until the log ends, two at least; for {name}",
+                got=f"{len(known)} of {last}{at}",
+                remedy="fill in the missing commands, which are known inputs, or give the rows "
+                "before and after them as two logs",
+            )
+
+
+def has_times(log: Log, time: TimeSettings) -> bool:
+    """Whether the values of a log have times, and not just an order."""
+    return bool(time.rate) or EVEN not in log.skipped.values()
+
+
+def resampling_of(log: Log, mapping: LogMapping, rate: float) -> str:
+    """How the values of a log come to the sample rate."""
+    place = next((name for name, why in log.skipped.items() if why == TIMES), "")
+    where = f"times in column {place}, " if place else ""
+    own = []
+    for name in mapping.signals:
+        at = log.signals[name].times
+        steps = np.diff(at)
+        if len(steps) and not np.allclose((at - at[0]) * rate, np.arange(len(at)), atol=1e-3):
+            own.append(1 / float(np.median(steps)) if np.median(steps) > 0 else 0.0)
+    if not own:
+        return f"{where}a row per sample at {rate:g} Hz"
+    low, high = min(own), max(own)
+    shown = f"{low:.4g}" if high < (1 + ROUNDED) * low else f"{low:.4g} to {high:.4g}"
+    return f"{where}values at {shown} Hz (median) are brought to {rate:g} Hz"
