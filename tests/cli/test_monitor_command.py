@@ -40,6 +40,28 @@ def test_a_leak_is_reported_with_its_time_and_cause(watched: Path, call) -> None
     assert "leaking from" in printed
 
 
+def test_a_log_is_watched_by_its_mapping(watched: Path, call, tmp_path: Path) -> None:
+    record = rt.load(watched / "leak.npz")
+    names = (*record.inputs.names, *record.outputs.names)
+    columns = [*record.commands[0].T, *record.observed[0].T]
+    at = np.arange(record.steps) / record.rate
+    text = [";".join(("time", *names))]
+    text += [";".join(f"{x:.9g}" for x in row) for row in zip(at, *columns, strict=True)]
+    (tmp_path / "leak.csv").write_text("\n".join(text))
+    mapping = [f"rate = {record.rate}"]
+    for kind, some in (("commands", record.inputs), ("outputs", record.outputs)):
+        for name, unit in zip(some.names, some.units, strict=True):
+            mapping.append(f'{kind}.{name} = {{ signal = "{name}", unit = "{unit}" }}')
+    (tmp_path / "m.toml").write_text("\n".join(mapping))
+    replay = ("monitor", "replay", watched / "watch", tmp_path / "leak.csv")
+    code, _, err = call(*replay)
+    assert (code, "retwin data map" in err) == (2, True), err
+    code, printed, err = call(*replay, "--mapping", tmp_path / "m.toml", "--json")
+    assert code == 0, err
+    (found,) = json.loads(printed)["records"]
+    assert 300 <= found["alarms"][0]["time"] <= 315
+
+
 def test_what_cannot_calibrate_leaves_nothing(watched: Path, call, tmp_path) -> None:
     faulty = rt.load(watched / "healthy.npz").replace(labels=np.array(["leaking"]))
     rt.save(faulty, tmp_path / "faulty.npz")

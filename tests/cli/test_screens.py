@@ -67,6 +67,20 @@ def test_all_commands_fit_one_screen(narrow) -> None:
         assert "…" not in line
 
 
+RECORDED = (
+    *("data info", "data convert", "data split", "identify", "fit", "next", "study"),
+    *("diagnose fit", "diagnose invert", "diagnose predict", "bundle save", "bundle predict"),
+    *("monitor fit", "monitor replay"),
+)
+"""Commands that take recorded data, which may be a log."""
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_recorded_data_may_be_a_log_with_a_mapping(name: str) -> None:
+    (option,) = (each for each in ALL[name].params if "--mapping" in each.opts)
+    assert option.help == "For a log: what `retwin data map` wrote.", "the same everywhere"
+
+
 @pytest.mark.parametrize("name", ALL)
 def test_help_shows_an_example_that_works(name: str, narrow) -> None:
     code, out, _ = narrow(*name.split(), "--help")

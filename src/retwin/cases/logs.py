@@ -273,7 +273,7 @@ class LogReader:
                 )
             if progress is not None:
                 progress((done + 1) / len(paths))
-        joined = _healthy(Trajectories.concatenate(_padded(sets)), notes)
+        joined = _healthy(Trajectories.concatenate(sets), notes)
         _check_size(joined)
         if self.columns.transient:
             joined = _settled(joined, self.columns.transient)
@@ -321,11 +321,6 @@ class LogReader:
             budget = Budget(path.name, self.max_bytes)
             known = self._read[path, clock] = read_log(path, clock=clock, budget=budget)
         return known
-
-
-def _padded(sets: Sequence[Trajectories]) -> list[Trajectories]:
-    steps = max(each.steps for each in sets)
-    return [each.padded(steps) for each in sets]
 
 
 def _add_notes(

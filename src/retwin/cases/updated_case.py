@@ -26,7 +26,7 @@ HEADER = """\
 """
 STEP = 2
 """Samples within which a command that moves is a step, and no ramp."""
-SUFFICIENT = 0.05
+SUFFICIENT = 0.1
 """Error of learned state equations, over the discrepancy of the twin, that is small beside it: the
 root mean square of both together is 0.1 % larger."""
 STATE_EQUATIONS = (

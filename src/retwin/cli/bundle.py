@@ -12,6 +12,7 @@ from retwin.cli.diagnose import EMULATED, diagnoses, write_probabilities
 from retwin.cli.options import (
     CaseOption,
     Json,
+    LogMapping,
     MaxBytes,
     Measured,
     Model,
@@ -51,6 +52,7 @@ def save(
     ] = None,
     case: OtherCase = None,
     seed: Seed = 0,
+    mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
 ) -> None:
     """Fit a guard and put it, the twin and the diagnoser into one sealed folder."""
@@ -63,7 +65,7 @@ def save(
     twin = rt.CorrectedTwin.load(saved(model))
     system = rt.cases.get(case or twin.case)
     classifier = None if diagnoser is None else rt.load_diagnoser(diagnoser)
-    calibration = read(real, system, max_bytes=max_bytes)
+    calibration = read(real, system, max_bytes=max_bytes, mapping=mapping)
     with bar("bundle") as show:
         guard = fit_guard(twin, system, calibration, seed=seed, progress=lambda s: show("guard", s))
     notes = {"seed": seed, "command": command_given()}
@@ -107,6 +109,7 @@ def predict(
     file: Measured,
     case: CaseOption = None,
     out: Probabilities = None,
+    mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
@@ -117,7 +120,7 @@ def predict(
     if out is not None:
         check_place(out)
     bundle = _opened(folder)
-    trajectories = read(file, data_case(case), max_bytes=max_bytes)
+    trajectories = read(file, data_case(case), max_bytes=max_bytes, mapping=mapping)
     found = bundle.predict(trajectories)
     diagnosed = diagnoses(trajectories, found.classes, found.probabilities)
     verdicts = zip(found.verdicts.verdict.tolist(), found.verdicts.reason.tolist(), strict=True)

@@ -12,7 +12,16 @@ from retwin import catalog
 from retwin.checks import one_of, require
 from retwin.cli.completion import complete_twins
 from retwin.cli.completion import one_of as completing
-from retwin.cli.options import TWIN, Inputs, Json, MaxBytes, Outputs, Seed, channel_names
+from retwin.cli.options import (
+    TWIN,
+    Inputs,
+    Json,
+    LogMapping,
+    MaxBytes,
+    Outputs,
+    Seed,
+    channel_names,
+)
 from retwin.cli.terminal import answer, bar, command_given, note, table
 from retwin.serialisation.places import check_place
 
@@ -80,9 +89,6 @@ Time = Annotated[
 ]
 Transient = Annotated[
     float, _panel("Logs", metavar="SECONDS", help="Begin of each log that is not used.")
-]
-LogMapping = Annotated[
-    Path | None, _panel("Logs", metavar="FILE", help="What `retwin data map` wrote for them.")
 ]
 Rate = Annotated[
     float | None, _panel(TWIN, metavar="HZ", help="Samples per second; else the log's.")

@@ -8,8 +8,9 @@ import signal
 import tempfile
 import threading
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,7 +19,7 @@ import typer
 from retwin import catalog
 from retwin.checks import finite, positive, require
 from retwin.cli.commands import Commands
-from retwin.cli.options import Json, MaxBytes, OtherCase
+from retwin.cli.options import Json, LogMapping, MaxBytes, OtherCase
 from retwin.cli.reading import case_named, read, saved
 from retwin.cli.terminal import BAD_INPUT, answer, bar, complain, example, note, table
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -33,6 +34,9 @@ __all__ = ["app"]
 
 UNEXPLAINED = 0.5
 """Probability from which on it is printed that a cause does not explain all."""
+
+Reading = Callable[..., Trajectories]
+"""`cli.reading.read` with the options of the command."""
 
 app = Commands(
     help="Watch a machine with its corrected twin.",
@@ -62,6 +66,7 @@ def fit(
         float | None, typer.Option(metavar="S", help="Time without alarms after an alarm: 60.")
     ] = None,
     case: OtherCase = None,
+    mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
@@ -70,6 +75,7 @@ def fit(
     from retwin.update import DynamicsTwin
 
     check_place(out, folder=True, holds=("model.json", "weights.safetensors", "twin", "diagnoser"))
+    reading = partial(read, max_bytes=max_bytes, mapping=mapping)
     if kind_of(saved(model)) in catalog.DIAGNOSERS:
         require(
             blanking is None,
@@ -78,11 +84,11 @@ def fit(
             got=blanking,
             remedy="leave it out",
         )
-        _fit_trajectories(model, healthy, out, false_alarms, case, max_bytes, as_json)
+        _fit_trajectories(model, healthy, out, false_alarms, case, reading, as_json)
         return
     twin = DynamicsTwin.load(model)
     system = case_named(case or twin.case or None)
-    records = [_healthy(read(file, system, max_bytes=max_bytes), file) for file in healthy]
+    records = [_healthy(reading(file, system), file) for file in healthy]
     with bar("calibrate") as show:
         show("monitor", 0.0)
         given = Trajectories.concatenate(records)
@@ -108,20 +114,22 @@ def replay(
         list[Path], typer.Argument(metavar="LOG...", help="Records, in the order of time.")
     ],
     case: OtherCase = None,
+    mapping: LogMapping = None,
     max_bytes: MaxBytes = None,
     as_json: Json = False,
 ) -> None:
     """Watch recorded data as if they came now: alarms, their causes, and the promise."""
     from retwin.monitor import Monitor
 
+    reading = partial(read, max_bytes=max_bytes, mapping=mapping)
     if kind_of(saved(monitor)) == "trajectory_monitor":
-        _replay_trajectories(monitor, logs, case, max_bytes, as_json)
+        _replay_trajectories(monitor, logs, case, reading, as_json)
         return
     made = Monitor.load(monitor)
     system = case_named(case or made.twin.case or None)
     found, rows = [], []
     for file in logs:
-        record = read(file, system, max_bytes=max_bytes)
+        record = reading(file, system)
         watched = made.watch(record)
         causes = _causes(made, record, watched.alarms, system)
         found.append((file, record, watched, causes))
@@ -147,7 +155,7 @@ def _fit_trajectories(
     out: Path,
     false_alarms: str,
     case: str | None,
-    max_bytes: int | None,
+    reading: Reading,
     as_json: bool,
 ) -> None:
     """Calibrate a monitor of trajectories, by a diagnoser."""
@@ -155,7 +163,7 @@ def _fit_trajectories(
     from retwin.monitor import fit_trajectory_monitor
 
     system = case_named(case)
-    records = [_healthy(read(file, system, max_bytes=max_bytes), file) for file in healthy]
+    records = [_healthy(reading(file, system), file) for file in healthy]
     with bar("calibrate") as show:
         made = fit_trajectory_monitor(
             load_diagnoser(model),  # refused there if it is no inversion
@@ -171,7 +179,7 @@ def _fit_trajectories(
 
 
 def _replay_trajectories(
-    monitor: Path, logs: Sequence[Path], case: str | None, max_bytes: int | None, as_json: bool
+    monitor: Path, logs: Sequence[Path], case: str | None, reading: Reading, as_json: bool
 ) -> None:
     """Watch recorded trajectories of one machine, file after file."""
     from retwin.monitor import TrajectoryMonitor
@@ -179,7 +187,7 @@ def _replay_trajectories(
     made, system, state = TrajectoryMonitor.load(monitor), case_named(case), None
     rows, found, texts = [], [], []
     for file in logs:
-        record = read(file, system, max_bytes=max_bytes)
+        record = reading(file, system)
         with bar("diagnose") as show:
             state, watched = made.watch(
                 record, state, progress=lambda share, name=file.name: show(name, share)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from retwin.checks import instance
-from retwin.cli.options import CaseArgument, Json, Model, Seed
+from retwin.cli.options import CaseArgument, Json, LogMapping, Model, Seed
 from retwin.cli.reading import case_named, read, updated_twin
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
@@ -32,6 +32,7 @@ def propose(
         float, typer.Option(metavar="X", help="Share by which bands may be too wide.")
     ] = 0.05,
     seed: Seed = 0,
+    mapping: LogMapping = None,
     as_json: Json = False,
 ) -> None:
     """Propose what to record next, and say whether there is enough."""
@@ -45,7 +46,7 @@ def propose(
     twin: Any = instance(
         "model", updated_twin(model), rt.CorrectedTwin, remedy="fit it without --dynamics"
     )
-    calibration = read(real, system)
+    calibration = read(real, system, mapping=mapping)
     with bar("next") as show:
         made = rt.next_experiments(
             twin,

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from retwin import catalog
 from retwin.cli.completion import complete_sources, one_of
-from retwin.cli.options import CaseArgument, Json, Seed
+from retwin.cli.options import CaseArgument, Json, LogMapping, Seed
 from retwin.cli.plans import Scheduler
 from retwin.cli.terminal import answer, bar, command_given, note, plain, resumable, table
 from retwin.errors import InputError
@@ -136,6 +136,7 @@ def study(
     seed: Seed = 0,
     processes: Processes = None,
     scheduler: Scheduler = None,
+    mapping: LogMapping = None,
     as_json: Json = False,
 ) -> None:
     """Compare updated twins with other sources on real trajectories."""
@@ -162,7 +163,7 @@ def study(
     )
     if sources == "all":
         plan = replace(plan, sources=possible_sources(system, plan))
-    given = StudyData(twin_data, calibration, test, real, data)
+    given = StudyData(twin_data, calibration, test, real, data, mapping)
     _run(system, plan, given, out, processes, scheduler, as_json=as_json)
 
 

@@ -58,11 +58,14 @@ class StudyData:
         set the case's emulator makes one, which is labelled "emulated" everywhere.
     records : Path, optional
         One file that the case itself splits into calibration and test set.
+    mapping : Path, optional
+        The mapping.toml of real sets that are logs; see `rt.load`.
 
     Raises
     ------
     InputError
-        If the real data are given in two ways, or a calibration set without a test set.
+        If the real data are given in two ways, or a calibration set without a test set; or a
+        mapping without a set that it is for.
 
     """
 
@@ -71,9 +74,19 @@ class StudyData:
     test: Path | None = None
     real: Path | None = None
     records: Path | None = None
+    mapping: Path | None = None
 
     def __post_init__(self) -> None:
         given = {name for name, file in vars(self).items() if file is not None} - {"twin"}
+        mapped = given & {"calibration", "test", "real"}
+        require(
+            self.mapping is None or mapped,
+            "mapping",
+            expected="real sets that are logs",
+            got=", ".join(sorted(given - {"mapping"})) or "none",
+            remedy="give --real LOG, or --calibration LOG --test LOG; or leave the mapping out",
+        )
+        given -= {"mapping"}
         require(
             given in ({"calibration", "test"}, {"real"}, {"records"}, set()),
             "real data",
@@ -364,7 +377,12 @@ def _real(
     """The real trajectories and their roles."""
 
     def read(path: Path) -> Trajectories:
-        found = load(path, case=case, progress=lambda share: report(path.name, share))
+        found = load(
+            path,
+            case=case,
+            progress=lambda share: report(path.name, share),
+            mapping=data.mapping,
+        )
         return _labelled(found, case, path.name)
 
     if data.records is not None:
