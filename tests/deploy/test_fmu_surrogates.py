@@ -17,9 +17,11 @@ import torch
 from scipy.special import ndtr, ndtri
 
 import retwin as rt
+from retwin.deploy.actuator.draws import drawn
 from retwin.deploy.fmu.export import export_fmu
+from retwin.deploy.fmu.segments import DRAWS, ENSEMBLE
 from retwin.errors import InputError
-from retwin.nets.mixtures import Blocks
+from retwin.nets.mixtures import BernoulliHead, Blocks
 from retwin.twins.command_range import CommandRange
 from retwin.twins.compiled.kernel import compilers
 from retwin.update.corrections import Chain, SampledSensor
@@ -31,6 +33,8 @@ fmpy = pytest.importorskip("fmpy")
 build_platform_binary = pytest.importorskip("fmpy.build").build_platform_binary
 
 STEPS, RATE, SEED = 40, 10.0, 5
+BEFORE = 12
+"""Samples of a segment that ends before an FMU begins."""
 COMMANDS = np.random.default_rng(1).normal(size=(STEPS, 2))
 NETWORKS = {
     "mlp": rt.MLP((8, 5)),
@@ -90,10 +94,10 @@ def corrected(
     return rt.CorrectedTwin(of, made.eval())
 
 
-def uniform(count: int) -> np.ndarray:
+def uniform(count: int, seed: int = SEED) -> np.ndarray:
     """The first numbers of the FMU's generator."""
     with np.errstate(over="ignore"):
-        x = np.uint64(SEED) * np.uint64(0xD1342543DE82EF95)
+        x = np.uint64(seed) * np.uint64(0xD1342543DE82EF95)
         x = x + np.arange(1, count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
         x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -271,15 +275,17 @@ def test_it_reports_commands_outside_the_training_range(version: str, tmp_path: 
 def test_what_depends_on_the_future_is_refused(tmp_path: Path) -> None:
     of, out = surrogate(NETWORKS["mlp"]), tmp_path / "twin.fmu"
     channels = {"inputs": of.inputs, "outputs": of.outputs}
-    for correction in (
-        rt.DelayOffset(),
-        rt.CommandSpace(),
-        Chain(rt.DelayOffset(), SampledSensor()),
+    for correction in (rt.DelayOffset(), rt.CommandSpace()):
+        name = type(correction).__name__
+        with pytest.raises(InputError, match=f"(?s)commands.*{name}.*known only after it"):
+            export_fmu(per_segment(correction), out)
+    for correction, how, reason in (
+        (rt.CommandSpace(), {"segmentation": "path"}, "known only at the end"),
+        (Chain(rt.DelayOffset(), rt.CommandSpace()), {}, "a Chain of operators"),
     ):
-        per_segment = ResidualModel(correction, rt.Mixture(), **channels)
-        name = "Chain" if isinstance(correction, Chain) else type(correction).__name__
-        with pytest.raises(InputError, match=f"(?s){name}.*known only after it"):
-            export_fmu(rt.CorrectedTwin(of, per_segment), out)
+        residual = ResidualModel(correction, rt.Mixture(), **channels, **how)
+        with pytest.raises(InputError, match=reason):
+            export_fmu(rt.CorrectedTwin(of, residual.eval()), out, commands=ramps(3, 4, 0))
     for period, reason in ((5, "depends on the next one"), (1, "errors .* have no C text")):
         sensor = Chain(rt.Additive(), SampledSensor(period=period / RATE))
         with pytest.raises(InputError, match=reason):
@@ -299,11 +305,15 @@ def test_the_command_line_exports_a_saved_corrected_twin(call: Any, tmp_path: Pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("version", ["2.0", "3.0"])
-@pytest.mark.parametrize("name", [*NETWORKS, "corrected"])
+@pytest.mark.parametrize("name", [*NETWORKS, "corrected", "segments"])
 def test_the_source_code_is_clean(name: str, version: str, tmp_path: Path) -> None:
     twin: Any = surrogate(NETWORKS.get(name), 1, 1) if name in NETWORKS else None
+    commands = None
+    if name == "segments":
+        twin, commands = per_segment(rt.CommandSpace(), channels=(1, 1)), ramps(9, 4, 0)[..., :1]
     twin = twin or corrected(NETWORKS["tcn"], CAUSAL, channels=(1, 1))
-    path = export_fmu(twin, tmp_path / "twin.fmu", version=version, compiled=False).path
+    out = tmp_path / "twin.fmu"
+    path = export_fmu(twin, out, version=version, compiled=False, commands=commands).path
     with zipfile.ZipFile(path) as archive:
         archive.extractall(tmp_path)
     strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-fsanitize=address,undefined")
@@ -340,3 +350,87 @@ def test_fmpy_compiles_the_source_code(
         return
     found = [fmpy.simulate_fmu(str(each), stop_time=1.0) for each in (folder, path)]
     np.testing.assert_allclose(found[0]["y1.q95"], found[1]["y1.q95"], atol=1e-9)
+
+
+def ramps(count: int, motion: int, seed: int) -> np.ndarray:
+    """Commands (n, T, 2) with three motions of so many steps, at rest between them."""
+    at = np.array([0, *(12 * m + 3 + e for m in range(3) for e in (0, motion)), STEPS])
+    levels = np.random.default_rng(seed).uniform(-2, 2, (count, 2, 4)).repeat(2, axis=2)
+    made = [[np.interp(np.arange(STEPS), at, row) for row in rows] for rows in levels]
+    return np.moveaxis(np.array(made), 1, 2).astype(np.float32)
+
+
+def per_segment(
+    correction: Any, missed: float = -9.0, channels: tuple[int, int] = (2, 3)
+) -> rt.CorrectedTwin:
+    """One with delays and offsets that depend on the commands, and log odds of a missed segment."""
+    of = surrogate(NETWORKS["mlp"], *channels)
+    residual = ResidualModel(
+        correction, rt.Mixture(components=2, hidden=(6,)), inputs=of.inputs, outputs=of.outputs
+    )
+    residual.shift[0], residual.scale[0], residual.scale[1:] = 2.2, 0.4, 0.1
+    residual.bounds.copy_(residual.shift.abs() + 5 * residual.scale)
+    for head in residual.heads:
+        if isinstance(head, BernoulliHead):
+            torch.nn.init.constant_(head.linear.bias, missed)
+    return rt.CorrectedTwin(of, residual.eval())
+
+
+@pytest.mark.parametrize(
+    ("correction", "motion"),
+    [
+        (rt.CommandSpace(), 1),
+        (rt.CommandSpace(), 4),
+        (Chain(rt.CommandSpace(), SampledSensor(period=0.2)), 4),
+        (rt.DelayOffset(), 4),
+    ],
+)
+def test_delays_and_offsets_are_those_of_the_twin_for_the_same_z(
+    correction: Any, motion: int, tmp_path: Path
+) -> None:
+    twin = per_segment(correction, -1.0 if motion == 1 else -20.0)
+    # Within the targets of `given`: beyond them the error stays that at their end.
+    given, commands = ramps(30, motion, 3), np.float32(0.7) * ramps(1, motion, 4)
+    made = export_fmu(twin, tmp_path / "twin.fmu", commands=given)
+    assert made.omitted == (("SampledSensor",) if isinstance(correction, Chain) else ())
+    outputs, mean, low, high = simulated(made.path, commands[0].astype(float))
+    found = drawn(twin, given, DRAWS, 0, any_outputs=True)
+    rows = [int(DRAWS * uniform(1)[0]), *range(ENSEMBLE)]
+    seeds = [SEED, *(2**64 - 1 - m for m in range(ENSEMBLE))]
+    both = zip(rows, seeds, strict=True)
+    expected = np.stack([replayed(twin, found, commands, *each) for each in both])
+    spread = expected[0].std(axis=0)
+    quantiles = np.quantile(expected[1:], [0.05, 0.95], axis=0)
+    pairs = ((outputs, expected[0]), (mean, expected[1:].mean(0)), (low, quantiles[0]))
+    for here, there in (*pairs, (high, quantiles[1])):
+        # Nominal outputs of the twin are in single precision.
+        np.testing.assert_allclose(here / spread, there / spread, rtol=1.2e-7, atol=1e-5)
+    assert (high > low).all()
+
+
+@torch.no_grad()
+def replayed(twin: Any, found: Any, commands: np.ndarray, row: int, seed: int) -> np.ndarray:
+    """Outputs (T, d_y) of the twin's operator with the draw of an instance.
+
+    The twin begins without an error, an FMU with that of its draw: a segment comes before.
+    """
+    operator = twin.residual.correction
+    operator = operator.first if isinstance(operator, Chain) else operator
+    twin.surrogate.double()
+    before = np.repeat(commands[:, :1], BEFORE, axis=1)
+    before[:, :2] *= 0.9
+    longer = np.concatenate([before, commands], axis=1, dtype=np.float64)
+    context = twin.residual.context(twin.surrogate, longer)
+    onsets = np.flatnonzero(np.diff(commands[0], axis=0).any(axis=1)) + 1
+    onsets = onsets[np.diff(onsets, prepend=-9) > 1]
+    count = 1 + len(onsets)
+    z = [(found.delay[row] * RATE).expand(1, count, 1), found.offset[row].repeat(1, count, 1)]
+    if isinstance(operator, rt.CommandSpace):
+        settle = torch.as_tensor(context.segments.settle).round().long()[0]
+        target = torch.as_tensor(longer)[:, settle].clamp(found.low, found.high)
+        z[1] = z[1] + found.gain * (target - found.centre)
+        numbers = uniform(1 + STEPS * 2, seed)[1 + 2 * onsets[:, None] + np.arange(2)]
+        missed = torch.as_tensor(numbers < found.probability[row].numpy())
+        z.append(torch.nn.functional.pad(missed, (0, 0, 1, 0))[None])
+    made = operator.apply(context, torch.cat([each.double() for each in z], dim=2))
+    return made[0, BEFORE:].numpy()

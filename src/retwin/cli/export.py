@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -13,6 +13,9 @@ from retwin.cli.options import Json, OtherCase, Seed
 from retwin.cli.reading import updated_twin
 from retwin.cli.terminal import answer, bar, example, note
 from retwin.serialisation.places import check_place
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = ["app"]
 
@@ -39,23 +42,37 @@ def fmu(
         bool,
         typer.Option("--source-only", help="Write no binary for this machine."),
     ] = False,
+    case: OtherCase = None,
     as_json: Json = False,
 ) -> None:
     """Write an updated twin as an FMU with C source code inside."""
     from retwin.deploy.fmu.export import export_fmu
+    from retwin.update.residual import ResidualModel
 
     check_place(out)
     twin = updated_twin(model)
+    commands = None
+    if isinstance(getattr(twin, "residual", None), ResidualModel):
+        commands = _sampled(twin, model, case, 0)
     with bar("export") as show:
         show("compile", 0.0)
-        made = export_fmu(twin, out, version=version, compiled=not source_only)
+        made = export_fmu(twin, out, version=version, compiled=not source_only, commands=commands)
+    drawn = "Delays and offsets are drawn once for each simulation."
+    omitted = f"Its outputs are those of the system: {', '.join(made.omitted)} is left out."
     delayed = (
         f"Its outputs are {made.delay:g} s behind, since the command at the end of a step is not "
         "known when the step begins."
     )
     answer(
-        {"saved": str(out), "variables": list(made.variables), "delay": made.delay},
+        {
+            "saved": str(out),
+            "variables": list(made.variables),
+            "delay": made.delay,
+            "omitted": list(made.omitted),
+        },
         *([delayed] if made.delay else []),
+        *([drawn] if commands is not None else []),
+        *([omitted] if made.omitted else []),
         as_json=as_json,
     )
     note(f"Saved {out}")
@@ -80,23 +97,12 @@ def actuator(
     as_json: Json = False,
 ) -> None:
     """Write what the actuators execute, for many simulated robots at once."""
-    import numpy as np
-
-    from retwin import cases
     from retwin.deploy.actuator.draws import causal_part
     from retwin.deploy.actuator.export import export_actuator
 
     check_place(out, folder=True)
     twin, _ = causal_part(updated_twin(model))
-    require(
-        case or twin.case,
-        "case",
-        expected="the name of a case, whose commands are sampled",
-        got=f"none, and {model} was saved without one",
-        remedy="give --case",
-    )
-    sampler = cases.get(case or twin.case).sampler
-    commands = sampler.sample(TRAJECTORIES, rng=np.random.default_rng(seed))
+    commands = _sampled(twin, model, case, seed)
     with bar("export") as show:
         show("compile", 0.0)
         made = export_actuator(
@@ -129,3 +135,20 @@ def actuator(
         as_json=as_json,
     )
     note(f"Saved {out}")
+
+
+def _sampled(twin: Any, model: Path, case: str | None, seed: int) -> NDArray:
+    """Commands of the sampler of the case, at whose segments z is drawn."""
+    import numpy as np
+
+    from retwin import cases
+
+    require(
+        case or twin.case,
+        "case",
+        expected="the name of a case, whose commands are sampled",
+        got=f"none, and {model} was saved without one",
+        remedy="give --case",
+    )
+    sampler = cases.get(case or twin.case).sampler
+    return sampler.sample(TRAJECTORIES, rng=np.random.default_rng(seed))

@@ -16,10 +16,12 @@ from retwin.update.corrections.warp import gather_samples
 from retwin.update.residual import ResidualModel
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["Draws", "causal_part", "drawn"]
+__all__ = ["Draws", "causal_part", "drawn", "still_and_fastest"]
 
 MAX_EARLY = 0.5
 """Share of draws at most whose delay is before the command; they get none."""
+NO_CHANGE = 1e-6
+"""Largest change of a command, relative to its range, that counts as none, as in `Segments`."""
 STILL = 1e-9
 """Spread of targets, relative to their size, below which no gain can be estimated."""
 
@@ -53,8 +55,24 @@ class Draws:
     early: float
 
 
-def causal_part(twin: object) -> tuple[CorrectedTwin, CommandSpace | DelayOffset]:
+def still_and_fastest(commands: NDArray) -> tuple[NDArray, NDArray]:
+    """The largest changes by one sample (d_u,) that count as none, and that are in `commands`."""
+    low, high = commands.min(axis=(0, 1)), commands.max(axis=(0, 1))
+    change: NDArray = np.abs(np.diff(commands, axis=1)).max(axis=(0, 1))
+    return NO_CHANGE * np.where(high > low, high - low, 1), change
+
+
+def causal_part(
+    twin: object, *, any_outputs: bool = False
+) -> tuple[CorrectedTwin, CommandSpace | DelayOffset]:
     """The twin and its operator, if that can be an actuator, step by step.
+
+    Parameters
+    ----------
+    twin : object
+        What is to be exported.
+    any_outputs : bool
+        Whether `DelayOffset` may correct outputs that are not those of actuators.
 
     Raises
     ------
@@ -90,7 +108,7 @@ def causal_part(twin: object) -> tuple[CorrectedTwin, CommandSpace | DelayOffset
         "fit it with the segments of the commands",
     )
     assert isinstance(operator, CommandSpace | DelayOffset)
-    if isinstance(operator, DelayOffset):
+    if isinstance(operator, DelayOffset) and not any_outputs:
         _check_outputs(twin)
     return twin, operator
 
@@ -122,13 +140,16 @@ def _refuse(wrong: bool, got: str, remedy: str) -> None:
 
 
 @torch.no_grad()
-def drawn(twin: CorrectedTwin, commands: NDArray, count: int, seed: int) -> Draws:
+def drawn(
+    twin: CorrectedTwin, commands: NDArray, count: int, seed: int, *, any_outputs: bool = False
+) -> Draws:
     """Draws of z at the segments of commands (n, T, d_u).
 
     Each draw is that of the twin for one segment, at random. Of the offsets the part that is
     proportional to the actuator's own target becomes the gain: the slope of their conditional mean.
     """
-    residual, operator = causal_part(twin)[0].residual, causal_part(twin)[1]
+    operator = causal_part(twin, any_outputs=any_outputs)[1]
+    residual = twin.residual
     assert isinstance(residual, ResidualModel)
     context = residual.context(twin.surrogate, commands)
     valid = torch.as_tensor(context.segments.valid)

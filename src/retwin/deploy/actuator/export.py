@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from retwin.checks import needs_extra, positive, require, whole
 from retwin.data.trajectories import Channels
-from retwin.deploy.actuator.draws import Draws, causal_part, drawn
+from retwin.deploy.actuator.draws import Draws, causal_part, drawn, still_and_fastest
 from retwin.deploy.actuator.module import AT_REST, Actuators, ActuatorStep
 from retwin.nets.networks import Standardise
 from retwin.serialisation.models import write_model
@@ -31,8 +31,6 @@ __all__ = ["ExportedActuator", "export_actuator"]
 
 PARITY = 1e-5
 """Greatest difference between a written file and torch, relative to the range of each output."""
-STILL = 1e-6
-"""Largest change of a command, relative to its range, that counts as none, as in `Segments`."""
 MAX_DRAWS = 10_000_000
 """Draws of z at most: more would not fit in memory beside a simulation."""
 DATE = (1980, 1, 1, 0, 0, 0)
@@ -184,9 +182,7 @@ def _actuators(
     twin: CorrectedTwin, commands: NDArray, found: Draws, period: float, at_outputs: bool
 ) -> Actuators:
     """The module, with the draws in steps."""
-    low, high = commands.min(axis=(0, 1)), commands.max(axis=(0, 1))
-    extent = np.where(high > low, high - low, 1)
-    change = np.abs(np.diff(commands, axis=1)).max(axis=(0, 1))
+    still, change = still_and_fastest(commands)
     plant: nn.Module = nn.Identity()
     if at_outputs:
         assert isinstance(twin.surrogate, Surrogate)
@@ -199,7 +195,7 @@ def _actuators(
         centre=found.centre,
         low=found.low,
         high=found.high,
-        tolerance=torch.as_tensor(STILL * extent, dtype=torch.float32),
+        tolerance=torch.as_tensor(still, dtype=torch.float32),
         speed=torch.as_tensor(change * twin.rate * period, dtype=torch.float32),
         # A motion of the twin ends when a sample equals the one before.
         rest=float(max(1, round(1 / (twin.rate * period)))),

@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from numpy.typing import NDArray
+
 from retwin.checks import needs_extra, one_of, require
 from retwin.deploy.fmu.description import build_description, description, token_of
 from retwin.deploy.fmu.states import states_text
@@ -54,6 +56,8 @@ class ExportedFMU:
         when the step begins.
     compiled : bool
         Whether it has a binary for this machine, beside its source code.
+    omitted : tuple of str
+        Operators of the correction that it lacks: a sensor behind delays and offsets.
 
     """
 
@@ -61,6 +65,7 @@ class ExportedFMU:
     variables: tuple[str, ...]
     delay: float
     compiled: bool
+    omitted: tuple[str, ...] = ()
 
 
 def export_fmu(
@@ -69,6 +74,7 @@ def export_fmu(
     *,
     version: str = "2.0",
     compiled: bool = True,
+    commands: NDArray | None = None,
 ) -> ExportedFMU:
     """Write a twin as an FMU for co-simulation.
 
@@ -81,8 +87,9 @@ def export_fmu(
     Parameters
     ----------
     twin : StateTwin, DynamicsTwin, Surrogate or CorrectedTwin
-        A twin with state equations, corrected dynamics, or a surrogate, alone or with a residual
-        at each sample (`Additive`).
+        A twin with state equations, corrected dynamics, or a surrogate, alone, with a residual at
+        each sample (`Additive`), or with delays and offsets (`CommandSpace`, `DelayOffset`), of
+        which one z is drawn for a whole simulation.
     path : path
         The file, *.fmu.
     version : str
@@ -90,13 +97,16 @@ def export_fmu(
     compiled : bool
         Whether it also has a binary for this machine. Others are compiled from its source code, as
         by `fmpy compile`.
+    commands : NDArray, optional
+        (n, T, d_u), commands like those of the task, at the rate of the twin: with delays and
+        offsets z is drawn at the poses of their segments.
 
     Raises
     ------
     InputError
         Another twin; one whose outputs depend on later samples, as with commands that are splines
-        between samples, a residual per segment, or a sensor that is sampled; a file of another
-        kind, or no C compiler that succeeds.
+        between samples, segments that are found in the path, or a sensor that is sampled; a file of
+        another kind, or no C compiler that succeeds.
 
     """
     fmpy = needs_extra("fmpy", "fmu", "holds the headers of FMI")
@@ -109,7 +119,7 @@ def export_fmu(
         got=str(path),
         remedy="give a name that ends with .fmu",
     )
-    text = _text(twin)
+    text = _text(twin, commands)
     identifier = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"twin_{identifier}"
     token = token_of(text.source + version)
@@ -138,15 +148,15 @@ def export_fmu(
             entry.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(entry, data)
     names = tuple(each.name for each in text.variables)
-    return ExportedFMU(path, names, text.delay, compiled)
+    return ExportedFMU(path, names, text.delay, compiled, text.omitted)
 
 
-def _text(twin: object) -> Text:
+def _text(twin: object, commands: NDArray | None) -> Text:
     """The C text of a twin of any kind that has one."""
     if isinstance(twin, StateTwin | DynamicsTwin):
         return states_text(twin)
     if isinstance(twin, Surrogate | CorrectedTwin):
-        return surrogate_text(twin)
+        return surrogate_text(twin, commands)
     raise InputError(
         "twin",
         expected="a twin with state equations, corrected dynamics, or a surrogate",

@@ -10,6 +10,7 @@ static double uniform(uint64_t seed, uint64_t counter)
     return ((double)(x >> 11) + 0.5) / 9007199254740992.0;
 }
 
+#ifndef DRAWS
 static double polynomial(const double *c, double x)
 {
     double sum = c[7];
@@ -49,3 +50,4 @@ static double gaussian(double p)
                            : polynomial(e, r - 5.0) / polynomial(f, r - 5.0);
     return q < 0.0 ? -made : made;
 }
+#endif

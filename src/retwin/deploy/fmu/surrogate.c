@@ -1,5 +1,5 @@
-/* A surrogate with an additive residual of its own at each sample, as an FMU. Above this text stand
- * the networks, the variables and the random numbers, and
+/* A surrogate with a residual as an FMU: additive at each sample, or delays and offsets by actuators.c.
+ * Above this text stand the networks, the variables and the random numbers, and
  *
  *   SURROGATE(w, in, memory, first, out)  the network of the surrogate, which remembers REMEMBERED
  *   SURROGATE_WEIGHTS, PERIOD, FIRST[NU]  its weights, sample period in s, commands before any given
@@ -19,7 +19,9 @@
  *                                         command is outside of them
  */
 
-#ifdef MEMBERS
+#ifdef DRAWS
+#define MEMORY ((1 + ENSEMBLE) * MEMBER)
+#elif defined MEMBERS
 #define MEMORY (2 * REMEMBERED + MEMBERS * ENCODED + 1 + NY)
 #else
 #define MEMORY (REMEMBERED + 1)
@@ -46,6 +48,54 @@ static void respond(const double *u, double *memory, int first, double *y)
     for (int i = 0; i < NY; i++)
         y[i] = AFTER_MEAN[i] + AFTER_SCALE[i] * y[i];
 }
+
+#ifdef DRAWS
+/* Outputs y[NY] for commands u[NU], with one of the draws. */
+static void corrected(const Twin *twin, int row, uint64_t seed, const double *u, double *memory,
+                      double *y)
+{
+    double *state = memory + REMEMBERED, *history = state + 3 * NU + 1;
+    int first = twin->samples == 0;
+#ifdef AT_OUTPUTS
+    respond(u, memory, first, y);
+    delay(row, y, history, first);
+#else
+    double commands[NU + 1];
+    memcpy(commands, u, NU * sizeof *u);
+    follow(row, seed, (uint64_t)twin->samples, commands, state, first);
+    delay(row, commands, history, first);
+    respond(commands, memory, first, y);
+#endif
+    (void)seed;
+}
+
+static int ascending(const void *a, const void *b)
+{
+    double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+
+/* Drawn outputs, and mean and quantiles of those of the first draws. */
+static void distribution(Twin *twin, const double *u, double *drawn, double *mean, double *low,
+                         double *high)
+{
+    double all[ENSEMBLE][NY], sorted[ENSEMBLE];
+    uint64_t seed = (uint64_t)(uint32_t)twin->seed;
+    corrected(twin, (int)(DRAWS * uniform(seed, 0)), seed, u, twin->after, drawn);
+    for (int m = 0; m < ENSEMBLE; m++)
+        corrected(twin, m, ~(uint64_t)m, u, twin->after + (1 + m) * MEMBER, all[m]);
+    for (int i = 0; i < NY; i++) {
+        mean[i] = 0.0;
+        for (int m = 0; m < ENSEMBLE; m++)
+            mean[i] += (sorted[m] = all[m][i]) / ENSEMBLE;
+        qsort(sorted, ENSEMBLE, sizeof *sorted, ascending);
+        double place = 0.05 * (ENSEMBLE - 1);
+        int k = (int)place, top = ENSEMBLE - 1;
+        low[i] = sorted[k] + (place - k) * (sorted[k + 1] - sorted[k]);
+        high[i] = sorted[top - k] + (place - k) * (sorted[top - k - 1] - sorted[top - k]);
+    }
+}
+#endif
 
 #ifdef MEMBERS
 /* A mixture of Gaussians. */
@@ -207,13 +257,18 @@ static int outside(const Twin *twin)
 /* Outputs at the present sample, for the present commands. */
 static void evaluate(Twin *twin)
 {
-    double executed[NU + 1], path[NY], z[NY] = {0}, mean[NY] = {0}, low[NY] = {0}, high[NY] = {0};
+    double executed[NU + 1], path[NY] = {0}, z[NY] = {0};
+    double mean[NY] = {0}, low[NY] = {0}, high[NY] = {0};
     if (twin->ready)
         return;
     memcpy(twin->after, twin->before, sizeof twin->after);
     for (int i = 0; i < NU; i++)
         executed[i] = twin->v[COMMAND + i] * (1.0 + twin->v[GAIN + i]);
+#ifdef DRAWS
+    distribution(twin, executed, z, mean, low, high);
+#else
     respond(executed, twin->after, twin->samples == 0, path);
+#endif
 #ifdef MEMBERS
     /* Faults act on the commands; the residual is that of the commands without them. */
     double nominal[NY];

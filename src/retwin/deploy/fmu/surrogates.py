@@ -10,19 +10,27 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.deploy.fmu.description import variables_of
 from retwin.deploy.fmu.networks import CNetwork, c_network, dense_weights, flat, weights_of
+from retwin.deploy.fmu.segments import segment_parts
 from retwin.deploy.fmu.text import Text, constants, written_beside
 from retwin.nets.mixtures import FLOOR
 from retwin.nets.networks import Network
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive, Chain, SampledSensor
-from retwin.update.residual import Residual, SequenceResidual
+from retwin.update.residual import Residual, ResidualModel, SequenceResidual
 from retwin.update.surrogate import Surrogate
 
 __all__ = ["surrogate_text"]
 
 
-def surrogate_text(twin: Surrogate | CorrectedTwin) -> Text:
+def surrogate_text(twin: Surrogate | CorrectedTwin, commands: NDArray | None = None) -> Text:
     """A surrogate, with its residual model where it has one, as C text.
+
+    Parameters
+    ----------
+    twin : Surrogate or CorrectedTwin
+        What is exported.
+    commands : NDArray, optional
+        (n, T, d_u), for a residual with one z per segment, see `segment_parts`.
 
     Raises
     ------
@@ -30,7 +38,6 @@ def surrogate_text(twin: Surrogate | CorrectedTwin) -> Text:
         A part that depends on later samples, or that does not exist in C.
 
     """
-    residual = None if isinstance(twin, Surrogate) else _per_sample(twin.residual, twin.rate)
     surrogate = twin if isinstance(twin, Surrogate) else twin.surrogate
     _refuse(
         not isinstance(surrogate, Surrogate),
@@ -49,8 +56,13 @@ def surrogate_text(twin: Surrogate | CorrectedTwin) -> Text:
         *_units(BEFORE=surrogate.before, AFTER=surrogate.after),
         *ranged,
     ]
-    if residual is not None:
-        encoder, texts = _residual_parts(residual)
+    before, omitted = [], ()
+    if isinstance(twin, CorrectedTwin) and isinstance(twin.residual, ResidualModel):
+        before, omitted = segment_parts(twin, commands)
+        before.append(f"#define REMEMBERED {network.memory}\n")
+        parts += [written_beside("actuators.c")]
+    elif isinstance(twin, CorrectedTwin):
+        encoder, texts = _residual_parts(_per_sample(twin.residual, twin.rate))
         networks.append(encoder)
         parts += texts
     kinds = sorted({each.kind.upper() for each in networks})
@@ -58,14 +70,16 @@ def surrogate_text(twin: Surrogate | CorrectedTwin) -> Text:
     sizes |= {"WIDEST": max(each.widest for each in networks)}
     defined = "".join(f"#define {name} {size}\n" for name, size in sizes.items())
     defined += "".join(f"#define USES_{kind}\n" for kind in kinds)
-    shared = ["variables.c", "networks.c", *(["random.c"] if residual is not None else [])]
-    source = [defined, *map(written_beside, shared), *parts, written_beside("surrogate.c")]
+    shared = ["variables.c", "networks.c", *(["random.c"] if twin is not surrogate else [])]
+    source = [defined, *before, *map(written_beside, shared), *parts]
+    source.append(written_beside("surrogate.c"))
     channels = (surrogate.inputs, surrogate.outputs)
     return Text(
         "\n".join(source),
         variables_of(*channels, first, (), (), limits=limits, ranged=bool(ranged)),
         surrogate.rate,
         "" if isinstance(twin, Surrogate) else twin.case,
+        omitted=omitted,
     )
 
 
@@ -100,12 +114,6 @@ def _per_sample(residual: Residual, rate: float) -> SequenceResidual:
     """The residual model, which must have one z per sample that is added."""
     other = "fit Additive with a SequenceMixture, or the state equations (retwin fit --dynamics)"
     correction = residual.correction
-    _refuse(
-        not isinstance(residual, SequenceResidual),
-        f"{_named(correction)} with one z per segment: it depends on where the segment ends and "
-        "how long it rests then, which is known only after it",
-        other,
-    )
     assert isinstance(residual, SequenceResidual)
     if isinstance(correction, Chain) and isinstance(correction.second, SampledSensor):
         every = 0 if correction.second.period is None else correction.second.timing(rate)[0]

@@ -33,6 +33,8 @@ class Text:
         What the twin is; may be "".
     delay : float
         By how much its outputs are behind, in s.
+    omitted : tuple of str
+        Operators of the correction that it lacks.
 
     """
 
@@ -41,6 +43,7 @@ class Text:
     rate: float
     about: str
     delay: float = 0.0
+    omitted: tuple[str, ...] = ()
 
 
 def constants(name: str, values: ArrayLike, kind: str = "double") -> str:
