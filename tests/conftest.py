@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,26 @@ import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC
 from retwin.nets.mixtures import FLOOR
 from retwin.nets.training import Training
+
+FIRST = (
+    "study/test_study.py",
+    "study/test_whole_studies.py",
+    "test_docs.py",
+    "study/test_simulating.py",
+    "update/state_surrogate/test_state_surrogate.py",
+    "diagnosis/test_state_inversion.py",
+    "long/test_odd_arguments.py",
+    "foreign/test_duffing.py",
+    "foreign/test_six_joints.py",
+    "testing/test_whole_chain.py",
+    "deploy/simulations/test_simulations.py",
+)
+"""Files that take longest. They start first: a worker that got one last would end alone."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    places = {Path(__file__).parent / name: place for place, name in enumerate(FIRST)}
+    items.sort(key=lambda item: places.get(item.path, len(FIRST)))
 
 
 @pytest.hookimpl(hookwrapper=True)

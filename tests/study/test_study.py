@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import small
+from small import PLAN, small_case
 
 import retwin as rt
 from retwin.scores.classification import METRICS
@@ -22,8 +24,11 @@ from retwin.study.trial import SEES, Trial
 from retwin.study.work import Work
 
 pytestmark = pytest.mark.slow
-PLAN = rt.StudyPlan(runs=2, per_class=10, folds=2, seed=3)
-COMMAND = "study armpi --runs 2 --per-class 10 --folds 2 --seed 3 --processes 2 --out".split()  # noqa: SIM905
+
+
+@pytest.fixture(scope="module")
+def case() -> rt.Case:
+    return small_case()
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +124,7 @@ def test_killed_and_called_again_it_ends_the_same(
     finished: tuple[dict, Path], tmp_path: Path, sign_of_progress: str
 ) -> None:
     out = tmp_path / "killed"
-    call = [sys.executable, "-m", "retwin", *COMMAND, str(out)]
+    call = [sys.executable, small.__file__, str(out)]
     process = subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 240
     while not (out / sign_of_progress).exists() and time.monotonic() < deadline:
