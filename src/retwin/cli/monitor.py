@@ -195,20 +195,21 @@ def _replay_trajectories(
         rows += [
             (file.name, each.trajectory, str(each.number), each.name) for each in watched.alarms
         ]
-        void, outside = int(watched.void.sum()), int(watched.outside.sum())
+        void = int(watched.void.sum())
+        kinds = ("outside", "unmeasured", "unranked", "implausible")
         found.append(
             {
                 "file": str(file),
                 "alarms": [vars(each) for each in watched.alarms],
                 "trajectories": len(record),
                 "void": void,
-                "outside": outside,
+                **{kind: int(getattr(watched, kind).sum()) for kind in kinds},
             }
         )
         texts.append(
             f"{file.name}: {len(watched.alarms)} alarms in {len(record)} trajectories"
             + (f"; the promise is VOID in {void}: calibrate again" if void else "")
-            + (f"; the twin extrapolates in {outside}" if outside else "")
+            + "".join(f"; {each}" for each in watched.remarks)
             + "."
         )
     answer(

@@ -1,4 +1,4 @@
-"""`Estimate`: a severity with its interval."""
+"""`Estimate`: a severity with its interval; and what no diagnosis can be made of."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 from numpy.typing import NDArray
 
-__all__ = ["UNKNOWN", "Estimate"]
+from retwin.errors import InputError
+
+__all__ = ["UNKNOWN", "Estimate", "ImplausibleError"]
 
 UNKNOWN = "unknown"
 """Name of what is none of the classes."""
@@ -19,3 +21,7 @@ class Estimate:
     value: NDArray
     low: NDArray
     high: NDArray
+
+
+class ImplausibleError(InputError):
+    """Measured values that no state of the system can have produced, whatever its noise."""

@@ -78,6 +78,10 @@ class Diagnosis:
         (n,) bool, whether the commands are outside the training range of the surrogate.
     unknown : NDArray
         (n,), the probability that none of the classes is the true one.
+    offset : NDArray
+        (n, M, d_u), the most probable offset of each actuator in each segment, from the mean of its
+        prior and in its command's unit, if the machine is healthy (if several classes are, as the
+        first of them); NaN where there is no such segment, or none was executed.
 
     """
 
@@ -89,6 +93,7 @@ class Diagnosis:
     bias: Estimate
     outside: NDArray
     unknown: NDArray
+    offset: NDArray
 
     @property
     def labels(self) -> NDArray:
@@ -222,13 +227,18 @@ class InversionDiagnoser:
         given = given.with_error(self.surrogate_variance)
         faults = tuple(self.faults.values())
         parts = []
+        healthy = faults.index(None) if None in faults else -1
         for begin in range(0, len(trajectories), TRAJECTORIES_PER_BATCH):
             part = given[begin : begin + TRAJECTORIES_PER_BATCH]
             rows = Hypotheses.of(faults, self.residual, *part)
-            parts.append(_severities(rows, invert(rows, self.noise), len(faults)))
+            found = invert(rows, self.noise)
+            offset = _offsets(rows, found, len(faults), healthy)
+            parts.append((*_severities(rows, found, len(faults)), offset))
             if progress is not None:
                 progress(min(1.0, (begin + TRAJECTORIES_PER_BATCH) / len(trajectories)))
-        evidence, level, onset, bias = (np.concatenate(each) for each in zip(*parts, strict=True))
+        evidence, level, onset, bias, offset = (
+            np.concatenate(each) for each in zip(*parts, strict=True)
+        )
         share = np.exp(evidence - evidence.max(axis=1, keepdims=True))
         measured = given.mask.any(dim=2).sum(dim=1).clamp_min(1).numpy()
         severities = (level, onset / trajectories.rate, bias)
@@ -242,6 +252,7 @@ class InversionDiagnoser:
             offsets,
             outside_training(self.surrogate, trajectories),
             expit(self.bound * measured - logsumexp(evidence, axis=1)),
+            offset,
         )
 
     def save(self, folder: str | Path) -> None:
@@ -401,6 +412,16 @@ def lower_bound(values: NDArray) -> float:
         return -np.inf
     spread = np.std(values, ddof=1) * np.sqrt(1 + 1 / count)
     return float(np.mean(values) - student.ppf(0.99, count - 1) * spread)
+
+
+def _offsets(rows: Hypotheses, found: Inversion, classes: int, healthy: int) -> NDArray:
+    """Offsets (n, M, d_u) if the machine is healthy, NaN where none is inferred or none is."""
+    problem = rows.problem
+    away = problem.per_segment(found.fit.x - rows.prior.gaussian.mean)[..., 1:]
+    absent = ~problem.valid[..., None] | (found.fit.missed > 0.5)
+    every = away.masked_fill(absent, torch.nan).unflatten(0, (-1, classes))
+    chosen = every[:, healthy] if healthy >= 0 else torch.full_like(every[:, 0], torch.nan)
+    return chosen.numpy()
 
 
 def _severities(rows: Hypotheses, found: Inversion, classes: int) -> tuple[NDArray, ...]:

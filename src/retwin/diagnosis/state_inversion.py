@@ -19,7 +19,7 @@ from scipy.special import logsumexp
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.adaptive_grid import Integral
-from retwin.diagnosis.estimate import UNKNOWN, Estimate
+from retwin.diagnosis.estimate import UNKNOWN, Estimate, ImplausibleError
 from retwin.diagnosis.fault_evidence import NOTHING, FaultEvidence
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
@@ -157,7 +157,8 @@ class StateInversionDiagnoser:
         ------
         InputError
             The channels or the sample rate are not those of the twin, or a trajectory is shorter
-            than the earliest onset of a fault.
+            than the earliest onset of a fault; an `ImplausibleError` for readings that are no
+            measurements.
 
         """
         check_channels(self.twin, trajectories, "trajectories")
@@ -173,13 +174,13 @@ class StateInversionDiagnoser:
         for i in range(len(trajectories)):
             record = FaultEvidence.of(self.twin, trajectories[i : i + 1], known_start)
             error = record.largest_error()
-            require(
-                error < IMPLAUSIBLE,
-                "trajectories",
-                expected="finite outputs that the twin's sensors could measure",
-                got=f"one {error:.1g} standard deviations away in {trajectories.ids[i]}",
-                remedy="check their units, and mask values that stand for missing ones",
-            )
+            if not error < IMPLAUSIBLE:
+                raise ImplausibleError(
+                    "trajectories",
+                    expected="finite outputs that the twin's sensors could measure",
+                    got=f"one {error:.1g} standard deviations away in {trajectories.ids[i]}",
+                    remedy="check their units, and mask values that stand for missing ones",
+                )
             row = [record.integral(fault) for fault in self.faults.values()]
             unknown = record.unknown(self.faults.values(), row)
             row = [record.tolerated(*each) for each in zip(self.faults.values(), row, strict=True)]
@@ -187,13 +188,13 @@ class StateInversionDiagnoser:
             if progress is not None:
                 progress((i + 1) / len(trajectories))
         evidence = np.array([[each.evidence for each in row] for row in found])
-        require(
-            np.isfinite(evidence).any(axis=1).all(),
-            "trajectories",
-            expected="outputs with which the filter stays finite",
-            got=f"{int((~np.isfinite(evidence).any(axis=1)).sum())} with which it does not",
-            remedy="check their units",
-        )
+        if not np.isfinite(evidence).any(axis=1).all():
+            raise ImplausibleError(
+                "trajectories",
+                expected="outputs with which the filter stays finite",
+                got=f"{int((~np.isfinite(evidence).any(axis=1)).sum())} with which it does not",
+                remedy="check their units",
+            )
         parts = np.array([[(e.mean, e.low, e.high) for e in row[:-1]] for row in found])
         size, onset, end = (Estimate(*np.moveaxis(parts[..., k], 2, 0)) for k in range(3))
         known = evidence[:, :-1]

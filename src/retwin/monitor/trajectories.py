@@ -7,7 +7,7 @@ machine, from a diagnosis by inversion.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,114 +16,48 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retwin.checks import finite, instance, require, whole
-from retwin.data.trajectories import Trajectories
+from retwin.checks import finite, instance, positive, require, whole
+from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis.diagnoser import load_diagnoser
 from retwin.diagnosis.estimate import UNKNOWN
-from retwin.diagnosis.inversion import InversionDiagnoser
-from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
-from retwin.monitor.detector import LARGEST, Detector, DetectorState
-from retwin.monitor.promise import duration, false_alarms
+from retwin.monitor.detector import LARGEST, Detector
+from retwin.monitor.offsets import OffsetModel, biases, fit_offsets, is_bias
+from retwin.monitor.promise import LEAST, MOST, duration, false_alarms
 from retwin.monitor.scores import ConformalScores, fit_scores, middle
 from retwin.monitor.slack import Slack
-from retwin.monitor.validity import Validity, ValidityState
+from retwin.monitor.trajectory_evidence import (
+    LARGEST_RATIO,
+    Compared,
+    Inversion,
+    alternatives,
+    checked,
+    compared,
+    factors,
+    twin_of,
+)
+from retwin.monitor.trajectory_state import TrajectoryState
+from retwin.monitor.validity import Validity
+from retwin.monitor.watched_trajectories import TrajectoryAlarm, WatchedTrajectories
 from retwin.progress import Progress
 from retwin.serialisation.models import read_model, refusing, write_model
 from retwin.twins.faults import Fault
 
-__all__ = [
-    "TrajectoryAlarm",
-    "TrajectoryMonitor",
-    "TrajectoryState",
-    "WatchedTrajectories",
-    "fit_trajectory_monitor",
-]
+__all__ = ["TrajectoryMonitor", "fit_trajectory_monitor"]
 
 KIND = "trajectory_monitor"
 """Kind of the saved model."""
 FEWEST = 8
 """Healthy trajectories of a calibration, at least."""
-LARGEST_RATIO = 300.0
-"""Logarithms of likelihood ratios count up to this, far more than any threshold; the largest of a
-trajectory is reduced to it, and the others by as much."""
 FACTORS = np.arange(1.0, 10.005, 0.01)
 """Factors of the errors of which the smallest is taken with which the calibration agrees."""
 CERTAIN = 1.645
 """Standard errors up to which the calibration may disagree: 95 %, one-sided."""
-
-Inversion = InversionDiagnoser | StateInversionDiagnoser
-"""Diagnosers whose evidence is that of a model."""
-
-
-@dataclass(frozen=True, eq=False)
-class TrajectoryState:
-    """What a monitor remembers of the trajectories of one machine.
-
-    Attributes
-    ----------
-    evidence : NDArray
-        (F,), that of each fault, and of `unknown` where the diagnoser has a model of it.
-    detector, validity
-        Of the errors that the healthy machine leaves unexplained.
-    count : int
-        Trajectories so far.
-
-    """
-
-    evidence: NDArray
-    detector: DetectorState
-    validity: ValidityState
-    count: int = 0
-
-
-@dataclass(frozen=True)
-class TrajectoryAlarm:
-    """A change that a monitor of trajectories has found.
-
-    Attributes
-    ----------
-    trajectory : str
-        The id of the trajectory after which the alarm was raised.
-    number : int
-        How many trajectories were watched before it.
-    name : str
-        The fault with most evidence since the last alarm, or "unknown": a change that no fault
-        explains.
-    evidence : float
-        At least the average run length of the promise.
-
-    """
-
-    trajectory: str
-    number: int
-    name: str
-    evidence: float
-
-
-@dataclass(frozen=True, eq=False)
-class WatchedTrajectories:
-    """What a monitor found in n trajectories.
-
-    Attributes
-    ----------
-    score : NDArray
-        (n,), of what the healthy machine leaves unexplained: standard Gaussian if it is healthy.
-    evidence : NDArray
-        (n,), that of a change; an alarm is raised from the average run length on.
-    void, outside : NDArray
-        (n,) bool, whether the promise does not apply any more, and whether the commands of the
-        trajectory leave their range in training, where the twin extrapolates.
-    alarms : list of TrajectoryAlarm
-        The alarms.
-
-    """
-
-    score: NDArray
-    evidence: NDArray
-    void: NDArray
-    outside: NDArray
-    alarms: list[TrajectoryAlarm]
+SHOWN = 0.01
+"""Smallest share of a cause that an alarm states."""
+COMPARABLE = 1.25
+"""Factor by which an output may have fewer or more measured values than in any trajectory of the
+calibration: the mean error of a trajectory then varies by an eighth more or less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +72,8 @@ class TrajectoryMonitor:
     is an e-detector: the expectation of the factor is 1 where errors are Gaussian and kappa times
     as large, and less where they are smaller. The mean over faults is averaged with the e-detector
     of the ranks of l_0 among those of the calibration, for changes that no fault explains
-    (`Detector`).
+    (`Detector`), and, where the diagnoser knows biases of actuators, with that of the offsets over
+    all trajectories (`OffsetModel`).
 
     Attributes
     ----------
@@ -154,8 +89,16 @@ class TrajectoryMonitor:
         Average number of trajectories to a false alarm, at least.
     duration : float
         Of a trajectory of the calibration, in s.
+    measured : NDArray
+        (2, d_y), the fewest and the most measured values of each output in a trajectory of the
+        calibration.
+    offsets : OffsetModel or None
+        Of the actuators; None where the diagnoser knows no bias of one.
     alpha : float
         Probability of declaring a promise void that applies.
+    used, given : int
+        Trajectories of the calibration that were used, and all of them: some may have nothing
+        measured, implausible readings, or commands outside their range in training.
 
     """
 
@@ -165,16 +108,35 @@ class TrajectoryMonitor:
     kappa: float
     arl: float
     duration: float
+    measured: NDArray
+    offsets: OffsetModel | None = None
     alpha: float = 0.01
+    used: int = 0
+    given: int = 0
 
     @property
     def promise(self) -> str:
         """What is promised, for which machines, in one sentence."""
+        offsets = ""
+        if self.offsets is not None:
+            wide = ", ".join(f"{each:.3g}" for each in self.offsets.kappa)
+            offsets = (
+                "the standard deviations of the actuators' offsets are at most "
+                f"{wide} times those of the calibration, "
+            )
+        unused = ""
+        if self.used < self.given:
+            unused = (
+                f" Of the {self.given} trajectories of the calibration {self.used} were used, since"
+                " in the others nothing was measured, readings are implausible or commands leave"
+                " their range in training."
+            )
         return (
             f"On average at least {self.arl:.6g} trajectories ({duration(self.arl * self.duration)}"
-            f" of {self.duration:.3g} s each) pass until a false alarm, as long as errors are at "
-            f"most {self.kappa:.3g} times those of the model, and {self.slack}. Where that is so, "
-            f"it is declared void with a probability of at most {self.alpha:g}."
+            f" of {self.duration:.3g} s each) pass until a false alarm, as long as commands stay "
+            f"in their range in training, errors are at most {self.kappa:.3g} times those of the "
+            f"model, {offsets}and {self.slack}. Where that is so, it is declared void with a "
+            f"probability of at most {self.alpha:g}.{unused}"
         )
 
     @cached_property
@@ -185,8 +147,12 @@ class TrajectoryMonitor:
     def start(self) -> TrajectoryState:
         """What is known of a machine before its first trajectory."""
         detector, validity = self._tests
-        count = len(_alternatives(self.diagnoser))
-        return TrajectoryState(np.zeros(count), detector.start(1), validity.start(1))
+        own = np.zeros(len(alternatives(self.diagnoser)))
+        pooled = np.zeros((0, 0))
+        if self.offsets is not None:
+            none = np.zeros((1, 0, len(self.offsets.mean)))
+            pooled = np.zeros_like(self.offsets.ratio(none, self.diagnoser.faults.values())[0])
+        return TrajectoryState(own, pooled, detector.start(1), validity.start(1))
 
     def watch(
         self,
@@ -197,10 +163,13 @@ class TrajectoryMonitor:
     ) -> tuple[TrajectoryState, WatchedTrajectories]:
         """Watch trajectories of one machine in the order of time.
 
+        Whatever a trajectory contains has one behaviour, which the result states. An empty set
+        changes nothing, and a trajectory that is given twice counts twice.
+
         Parameters
         ----------
         trajectories : Trajectories
-            n of them.
+            n of them, of any length, complete or not.
         state : TrajectoryState, optional
             After those before; by default these are the first ones.
         progress : callable, optional
@@ -209,37 +178,89 @@ class TrajectoryMonitor:
         Raises
         ------
         InputError
-            Other channels or another rate than those of the twin.
+            Other channels or another rate than those of the twin, trajectories shorter than the
+            earliest onset of a fault, or the state of another monitor.
 
         """
-        ratio, error, outside = _compared(self.diagnoser, trajectories, progress)
-        state = state or self.start()
-        detector, validity = self._tests
-        low, high = self.scores.score(error[None, :])
-        half = len(trajectories), 2
-        made, void, alarms = np.empty(half), np.zeros(half[0], dtype=bool), []
-        for t, factor in enumerate(_factor(ratio, self.kappa)):
-            own = np.minimum((state.evidence + 1) * factor, LARGEST)
-            ends = low[:, t], high[:, t]
-            detected, against = detector.step(state.detector, *ends)
-            made[t] = own.mean(), against[0]
-            alarm = made[t].mean() >= self.arl
-            tested, _ = validity.step(state.validity, [alarm], *ends)
-            void[t] = validity.void(tested)[0]
-            if alarm:
-                likely = _alternatives(self.diagnoser)[int(own.argmax())]
-                name = UNKNOWN if against[0] > own.max() else likely
-                alarms.append(
-                    TrajectoryAlarm(
-                        str(trajectories.ids[t]), state.count, name, float(made[t].mean())
-                    )
-                )
-                own = np.zeros_like(own)
-            detected = detector.reset(detected, np.array([alarm]))
-            state = TrajectoryState(own, detected, tested, state.count + 1)
+        first = self.start()
+        state = first if state is None else TrajectoryState.checked(state, first)
+        found = compared(self.diagnoser, trajectories, progress)
+        unranked = self._unranked(found)
+        low, high = self.scores.score(np.where(unranked, np.nan, found.error)[None, :])
+        evidence, void = np.empty(len(trajectories)), np.zeros(len(trajectories), dtype=bool)
+        alarms = []
+        for t, steps in enumerate(self._factors(found)):
+            state, evidence[t], shares = self._step(state, steps, low[:, t], high[:, t])
+            void[t] = self._tests[1].void(state.validity)[0]
+            if shares:
+                name, probability = next(iter(shares.items()))
+                about = str(trajectories.ids[t]), state.count - 1, name, float(evidence[t])
+                shown = {each: share for each, share in shares.items() if share >= SHOWN}
+                alarms.append(TrajectoryAlarm(*about, probability, shown, bool(found.outside[t])))
         return state, WatchedTrajectories(
-            middle(low, high)[0], made.mean(axis=1), void, outside, alarms
+            middle(low, high)[0],
+            evidence,
+            void,
+            found.outside,
+            found.unmeasured,
+            unranked,
+            found.implausible,
+            alarms,
         )
+
+    def _unranked(self, found: Compared) -> NDArray:
+        """Whether trajectories (n,) were measured otherwise than those of the calibration."""
+        fewest, most = self.measured
+        other = (found.measured * COMPARABLE < fewest) | (found.measured > COMPARABLE * most)
+        made: NDArray = other.any(axis=1) & ~found.unmeasured
+        return made
+
+    def _factors(self, found: Compared) -> Iterator[tuple[NDArray | None, NDArray | None]]:
+        """Per trajectory, factors of the evidence for faults and for biases; None for no news."""
+        own = factors(found.ratio, self.kappa)
+        used = ~(found.unmeasured | found.implausible)
+        estimated = used & np.isfinite(found.offset).any(axis=(1, 2))
+        pooled = np.ones((len(own), 0, 0))
+        if self.offsets is not None:
+            logs = self.offsets.ratio(found.offset, self.diagnoser.faults.values())
+            pooled = np.exp(np.minimum(logs, LARGEST_RATIO))
+        for t in range(len(own)):
+            yield own[t] if used[t] else None, pooled[t] if estimated[t] else None
+
+    def _step(
+        self,
+        state: TrajectoryState,
+        step: tuple[NDArray | None, NDArray | None],
+        low: NDArray,
+        high: NDArray,
+    ) -> tuple[TrajectoryState, float, dict[str, float]]:
+        """The state after a trajectory, the evidence, and at an alarm the shares of its causes."""
+        detector, validity = self._tests
+        own, pooled = (
+            before if factor is None else np.minimum((before + 1) * factor, LARGEST)
+            for before, factor in zip((state.evidence, state.pooled), step, strict=True)
+        )
+        detected, against = detector.step(state.detector, low, high)
+        parts = [own.mean(), against[0], *([pooled.mean()] if pooled.size else [])]
+        evidence = float(np.mean(parts))
+        alarm = evidence >= self.arl
+        tested, _ = validity.step(state.validity, [alarm], low, high)
+        shares = self._shares(own, pooled, against[0]) if alarm else {}
+        if alarm:
+            own, pooled = np.zeros_like(own), np.zeros_like(pooled)
+        detected = detector.reset(detected, np.array([alarm]))
+        return TrajectoryState(own, pooled, detected, tested, state.count + 1), evidence, shares
+
+    def _shares(self, own: NDArray, pooled: NDArray, against: float) -> dict[str, float]:
+        """The share of each cause in the evidence, the largest first."""
+        total = dict(zip(alternatives(self.diagnoser), own.tolist(), strict=True))
+        faults = {name: each for name, each in self.diagnoser.faults.items() if is_bias(each)}
+        for name, found in zip(faults, pooled, strict=False):  # none without a model of offsets
+            total[name] += float(found.mean())
+        total[UNKNOWN] = total.get(UNKNOWN, 0.0) + float(against)
+        every = sum(total.values())
+        ordered = sorted(total.items(), key=lambda each: -each[1])  # keeps the order of equal ones
+        return {name: value / every for name, value in ordered}
 
     def save(self, folder: str | Path) -> None:
         """Write the diagnoser, the calibration and the promise."""
@@ -248,7 +269,9 @@ class TrajectoryMonitor:
             "copies": self.scores.copies,
             **{name: getattr(self, name) for name in NUMBERS},
         }
-        arrays = self.scores.arrays()
+        arrays = {**self.scores.arrays(), "measured": self.measured}
+        if self.offsets is not None:
+            arrays |= self.offsets.arrays()
         tensors = {name: torch.tensor(np.ascontiguousarray(each)) for name, each in arrays.items()}
         with write_model(folder, KIND, about, tensors) as temporary:
             self.diagnoser.save(temporary / "diagnoser")
@@ -258,22 +281,38 @@ class TrajectoryMonitor:
         """Read what `save` wrote. Raises InputError if it is no such monitor or is damaged."""
         about, weights = read_model(folder, KIND)
         with refusing(folder, expected="a monitor of trajectories"):
-            diagnoser = _checked(load_diagnoser(Path(folder) / "diagnoser"))
+            diagnoser = checked(load_diagnoser(Path(folder) / "diagnoser"))
             arrays = {name: each.numpy() for name, each in weights.items()}
             scores = ConformalScores.of_arrays(arrays, about["copies"])
+            twin = twin_of(diagnoser)
+            # Development versions before 0.1.0 wrote neither: all trajectories are comparable.
+            measured = arrays.get("measured", ANY * np.ones(len(twin.outputs)))
             require(
-                len(scores.independent) == 1,
+                len(scores.independent) == 1 and measured.shape == (2, len(twin.outputs)),
                 "weights",
-                expected="the calibration of one stream",
-                got=len(scores.independent),
+                expected=f"the calibration of one stream with {len(twin.outputs)} outputs",
+                got=f"{len(scores.independent)}, {measured.shape}",
                 remedy="save the monitor again",
             )
-            numbers = {name: finite(name, about[name], least=0.0) for name in NUMBERS}
-            return cls(diagnoser, scores, Slack(*about["slack"]), **numbers)
+            return cls(
+                diagnoser,
+                scores,
+                Slack(*about["slack"]),
+                finite("kappa", about["kappa"], least=1.0),
+                finite("arl", about["arl"], least=LEAST, most=MOST),
+                positive("duration", about["duration"], unit="s"),
+                measured,
+                OffsetModel.of_arrays(arrays, len(twin.inputs)),
+                finite("alpha", about["alpha"], least=1e-12, most=0.5),
+                whole("used", about.get("used", 0), least=0),
+                whole("given", about.get("given", 0), least=0),
+            )
 
 
-NUMBERS = ("kappa", "arl", "duration", "alpha")
+NUMBERS = ("kappa", "arl", "duration", "alpha", "used", "given")
 """Attributes that are saved as numbers."""
+ANY = np.array([[0.0], [np.inf]])
+"""Limits of the number of measured values that contain any."""
 
 
 def fit_trajectory_monitor(
@@ -315,22 +354,46 @@ def fit_trajectory_monitor(
         by inversion, or trajectories that look faulty to it.
 
     """
-    diagnoser = _checked(diagnoser).with_faults(causes or {})
+    diagnoser = checked(checked(diagnoser).with_faults(causes or {}))
     instance("healthy", healthy, Trajectories, remedy="load recorded ones")
-    whole("healthy", len(healthy), least=FEWEST, remedy="record more healthy trajectories")
+    finite("alpha", alpha, least=1e-12, most=0.5)
+    _check_labels(diagnoser, healthy)
     length = healthy.steps / healthy.rate
     arl = false_alarms(false_alarms_at_most, 1 / length)
-    ratio, error, _ = _compared(diagnoser, healthy, progress)
-    scores = fit_scores(error[None, :])
+    found = compared(diagnoser, healthy, progress)
+    used = np.isfinite(found.error) & ~found.outside
+    require(
+        used.sum() >= FEWEST,
+        "healthy",
+        expected=f"at least {FEWEST} trajectories",
+        got=f"{len(healthy)}, of which {int(found.unmeasured.sum())} without measured samples, "
+        f"{int(found.implausible.sum())} with implausible readings and "
+        f"{int(found.outside.sum())} with commands outside their range in training",
+        remedy="record more healthy trajectories, with commands as those of the twin's training",
+    )
+    ratio, count = found.ratio[used], found.measured[used]
+    scores = fit_scores(found.error[None, used])
     (slack,) = scores.slack(1)
+    some = bool(biases(diagnoser.faults.values()))
+    offsets = fit_offsets(found.offset[used]) if some else None
     for kappa in FACTORS[slack.kappa <= FACTORS]:
-        factor = _factor(ratio, kappa).mean(axis=1)
+        factor = factors(ratio, kappa).mean(axis=1)
         bound = factor.mean() + CERTAIN * factor.std(ddof=1) / np.sqrt(len(factor))
         if bound <= 1:
             return TrajectoryMonitor(
-                diagnoser, scores, slack, float(kappa), arl, length, float(alpha)
+                diagnoser,
+                scores,
+                slack,
+                float(kappa),
+                arl,
+                length,
+                np.stack([count.min(axis=0), count.max(axis=0)]).astype(float),
+                offsets,
+                float(alpha),
+                int(used.sum()),
+                len(healthy),
             )
-    likely = _alternatives(diagnoser)[int(np.median(ratio, axis=0).argmax())]
+    likely = alternatives(diagnoser)[int(np.median(ratio, axis=0).argmax())]
     raise InputError(
         "healthy",
         expected="trajectories that the diagnoser takes for healthy ones",
@@ -339,53 +402,14 @@ def fit_trajectory_monitor(
     )
 
 
-def _checked(diagnoser: object) -> Inversion:
-    got = type(diagnoser).__name__
-    if isinstance(diagnoser, Inversion):
-        if None in diagnoser.faults.values():
-            return diagnoser
-        got = "one without a healthy class"
-    raise InputError(
-        "diagnoser",
-        expected="a diagnoser by inversion, with a healthy class",
-        got=got,
-        remedy="derive it from the twin by fit_inversion",
-    )
-
-
-def _factor(ratio: NDArray, kappa: float) -> NDArray:
-    """Likelihood ratios for errors that may be `kappa` times as large, from their logarithms."""
-    logs = ratio / kappa**2
-    logs = np.clip(logs, -np.inf, 1e300)  # differences of infinite ones would not be numbers
-    logs -= np.maximum(logs.max(axis=1, keepdims=True) - LARGEST_RATIO, 0.0)
-    made: NDArray = np.exp(logs)
-    return made
-
-
-def _healthy(diagnoser: Inversion) -> int:
-    """The index of the healthy class."""
-    return [each is None for each in diagnoser.faults.values()].index(True)
-
-
-def _alternatives(diagnoser: Inversion) -> list[str]:
-    """The names of all for which there is evidence, but the healthy machine."""
-    names = [name for name, fault in diagnoser.faults.items() if fault is not None]
-    return [*names, UNKNOWN] if isinstance(diagnoser, StateInversionDiagnoser) else names
-
-
-def _compared(
-    diagnoser: Inversion, trajectories: Trajectories, progress: Progress | None
-) -> tuple[NDArray, NDArray, NDArray]:
-    """Evidence for each fault against the healthy machine, (n, F); what that leaves; `outside`."""
-    found = diagnoser.diagnose(trajectories, progress=progress)
-    healthy = _healthy(diagnoser)
-    own = found.evidence[:, healthy]
-    measured = np.maximum(trajectories.mask.any(axis=2).sum(axis=1), 1)
-    with np.errstate(invalid="ignore"):
-        ratio = np.delete(found.evidence, healthy, axis=1) - own[:, None]
-    # Where neither explains the trajectory, it is no evidence for that fault.
-    return (
-        np.nan_to_num(ratio, nan=-np.inf, neginf=-np.inf, posinf=np.inf),
-        -own / measured,
-        found.outside,
+def _check_labels(diagnoser: Inversion, healthy: Trajectories) -> None:
+    """Refuse trajectories that are labelled as faulty ones."""
+    allowed = {HEALTHY, *(name for name, fault in diagnoser.faults.items() if fault is None)}
+    faulty = sorted(healthy.known_labels - allowed)
+    require(
+        not faulty,
+        "healthy",
+        expected=f"trajectories without labels, or labelled {' or '.join(sorted(allowed))}",
+        got=f"some labelled {', '.join(faulty[:3])}",
+        remedy="leave these out",
     )
