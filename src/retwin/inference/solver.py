@@ -3,8 +3,9 @@
 All rows of a problem are solved together. Robust noise is handled by iteratively reweighted least
 squares, damping follows Levenberg and Marquardt (Nocedal and Wright, Numerical Optimization, 2006,
 chapter 10), steps that converge linearly, as reweighting does, are extrapolated (Aitken, Proc. R.
-Soc. Edinburgh 46, 289, 1927), and the evidence is Laplace's (Tierney and Kadane, J. Am. Stat. Assoc. 81, 82, 1986):
-a normalised prior makes rows with more freedom pay for it (MacKay, Neural Comput. 4, 415, 1992).
+Soc. Edinburgh 46, 289, 1927), and the evidence is Laplace's (Tierney and Kadane, J. Am. Stat.
+Assoc. 81, 82, 1986): a normalised prior makes rows with more freedom pay for it (MacKay, Neural
+Comput. 4, 415, 1992).
 """
 
 from __future__ import annotations
