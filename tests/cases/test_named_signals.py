@@ -120,3 +120,14 @@ def test_a_hole_in_a_command_is_refused_and_a_row_of_another_unit_of_time_is_rea
     path = table(tmp_path / "b.csv", "n,valve,level", [each.replace(",,", ",0,") for each in rows])
     named = Columns(time=TimeSettings(column="n", unit="ms"))
     assert read_logs([path], TWIN, named).trajectories.steps == 30
+
+
+def test_channels_that_never_change_are_named_and_their_commands_can_be_drawn(
+    tmp_path: Path,
+) -> None:
+    path = table(tmp_path / "a.csv", "time,valve,level", [f"{k / 10},0.5,{k}" for k in range(30)])
+    found = read_logs([path], TWIN)
+    assert any(note.startswith("valve: constant in all logs") for note in found.notes)
+    sampler = rt.twins.sampler_from(found.trajectories.commands, 10.0)
+    drawn = sampler.sample(3, rng=np.random.default_rng(0))
+    assert np.isfinite(drawn).all()

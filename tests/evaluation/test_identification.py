@@ -115,10 +115,20 @@ def test_standard_errors_from_one_record_hold_for_autoregressive_noise() -> None
     assert binom.ppf(0.0005, count, 0.95) <= inside
 
 
+def test_records_that_begin_in_another_state_are_named() -> None:
+    data = measured(12, count=4, noise=0.01)
+    moved = data.observed + 3.0 * 0.9 ** np.arange(data.steps)[:, None]
+    for observed, named in ((data.observed, False), (moved, True)):
+        found = checked(data.replace(observed=observed), "gain")
+        assert (found.begin_errors["y"] > 2) == named
+        assert any("did not begin in the state" in each for each in findings(found)) == named
+
+
 def test_a_parameter_without_effect_is_an_open_direction() -> None:
     with pytest.warns(UserWarning, match="not identified: spare"):
         found = checked(measured(3), "gain", "spare")
     assert found.open_parameters == ("spare",)
+    assert found.parameters[1].value == 1.0, "it stays, whatever the starts of the search were"
     last = found.directions[-1]
     assert (last.open, list(last.components)) == (True, ["spare"])
     assert np.isinf(last.error)

@@ -281,6 +281,11 @@ class LogReader:
         if unseen.any():
             lacking = ", ".join(np.array(joined.outputs.names)[unseen])
             notes[f"No log holds {lacking}."] = []
+        constant = _constant(joined)
+        if constant:
+            notes[
+                f"{', '.join(constant)}: constant in all logs, so that they show no dynamics of it."
+            ] = []
         kept = Trajectories.concatenate(tests) if tests else None
         return Logs(joined, kept, tuple(_sentences(notes)))
 
@@ -381,6 +386,19 @@ def _check_size(found: Trajectories) -> None:
                 f"{sample / found.rate:g} s",
                 remedy="leave the cell empty, or write NaN, where a measurement is missing",
             )
+
+
+def _constant(found: Trajectories) -> list[str]:
+    """Channels that never change, among the commands and the outputs that were measured."""
+    values = np.where(found.mask, found.observed, np.nan)
+    some = [(found.inputs.names[i], found.commands[..., i]) for i in range(len(found.inputs))] + [
+        (found.outputs.names[i], values[..., i]) for i in range(len(found.outputs))
+    ]
+    return [
+        name
+        for name, each in some
+        if np.isfinite(each).any() and float(np.nanmax(each)) == float(np.nanmin(each))
+    ]
 
 
 def _settled(found: Trajectories, transient: float) -> Trajectories:

@@ -65,12 +65,12 @@ def sampler_from(
     power = spectra.mean(axis=0, dtype=np.float64)
     share = (power / np.maximum(power.sum(axis=0), 1e-300)).mean(axis=1)
     lowest = rate / steps
-    highest = min(BAND_MARGIN * max(contained.band), rate / 2)
+    highest = max(lowest, min(BAND_MARGIN * max(contained.band), rate / 2))  # of constants too
     corner = float(frequency[np.searchsorted(share.cumsum(), CORNER_SHARE * share.sum())])
     corner = min(max(corner, lowest), highest)
     full = share[frequency <= corner].mean()
     above = share[(frequency > corner) & (frequency <= highest)]
-    weak = float(np.sqrt(above.mean() / full)) if len(above) else 1.0
+    weak = float(np.sqrt(above.mean() / full)) if len(above) and full > 0 else 1.0
     mean = np.clip(values.mean(axis=(0, 1)), low, high)
     deviation = (1 + MARGIN) * values.std(axis=(0, 1))
     return MultisineSampler(

@@ -21,6 +21,9 @@ from retwin.update.identification.posterior import Posterior
 
 __all__ = ["Identification", "OutputError", "RMSError", "validate_identification"]
 
+BEGIN = 10
+"""The begin of a trajectory is its part by this number."""
+
 MAX_BLOCKS = 20
 """Blocks into which held-out records are divided for an interval, at most."""
 Part = Literal["identification", "validation"]
@@ -134,6 +137,25 @@ class Identification:
     def open_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that are not identified, those at a bound among them."""
         return tuple(each.name for each in self.parameters if not each.identified)
+
+    @property
+    def begin_errors(self) -> dict[str, float]:
+        """By output, the RMS error in the first tenth of each trajectory over that of the rest.
+
+        It is that of the twin after identification, on the measurements that were used; outputs
+        without errors in both parts are left out.
+        """
+        measured, _, after = self.simulated["identification"]
+        error, first = measured.observed - after, np.zeros(measured.mask.shape[:2], dtype=bool)
+        for row, length in enumerate(measured.lengths):
+            first[row, : max(1, length // BEGIN)] = True
+        made = {}
+        for i, name in enumerate(measured.outputs.names):
+            seen = measured.mask[..., i]
+            begin, rest = (error[..., i][seen & part] for part in (first, ~first))
+            if len(begin) and len(rest) and np.any(rest):
+                made[name] = float(np.sqrt(np.mean(begin**2) / np.mean(rest**2)))
+        return made
 
     @property
     def at_bound(self) -> tuple[str, ...]:

@@ -28,6 +28,8 @@ SMALL = 0.02
 """Ratio of errors below which a change in percent has decimals."""
 SMALL_SHARE = 0.01
 """Share of a range below which it is given with more digits."""
+ELSEWHERE = 2.0
+"""Ratio of the errors at the begin of trajectories and later, from which it is named."""
 STRONG = 0.95
 """Correlation of two estimates from which they are named."""
 MISFIT = 0.02
@@ -106,7 +108,8 @@ def percent(ratio: float) -> str:
 
 def findings(found: Identification) -> list[str]:
     """What a reader must know, in sentences, the most important first."""
-    return [*_errors(found), *_open(found), *_residuals(found), *_limits(found)]
+    parts = (_errors, _begins, _open, _residuals, _limits)
+    return [sentence for each in parts for sentence in each(found)]
 
 
 def _errors(found: Identification) -> Iterator[str]:
@@ -134,6 +137,18 @@ def _errors(found: Identification) -> Iterator[str]:
         yield (
             "Nothing was held out: these errors are of the measurements that the parameters were "
             "fitted to, and smaller than those of others."
+        )
+
+
+def _begins(found: Identification) -> Iterator[str]:
+    """Whether trajectories begin in another state than simulations."""
+    larger = {name: ratio for name, ratio in found.begin_errors.items() if ratio > ELSEWHERE}
+    if larger:
+        shown = ", ".join(f"{name} ({ratio:.1f} times)" for name, ratio in larger.items())
+        yield (
+            f"The error is larger in the first tenth of the trajectories than later: {shown}. "
+            "The system did not begin in the state in which the twin starts, as after a pause of "
+            "the log: leave that time out (--transient), or free the start of the state."
         )
 
 

@@ -75,6 +75,16 @@ class Identifiability:
     independent: float
 
     @property
+    def effects(self) -> NDArray:
+        """(k,), norms of the derivatives of the residuals by a parameter, over the largest; 0 for
+        one without effect.
+        """
+        norms = np.linalg.norm(self.singular_values[:, None] * self.directions, axis=0)
+        largest = float(norms.max(initial=0.0))
+        made: NDArray = np.where(norms > RANK_TOLERANCE * largest, norms, 0.0) / (largest or 1.0)
+        return made
+
+    @property
     def warning(self) -> str:
         """The parameters that are not identified or lie on a bound; "" if there are none."""
         parts = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import overload
 
 import numpy as np
@@ -213,6 +213,11 @@ def _fit(
         best, point = optima[0]
         residual = misfit.residuals(np.array([best.values]))[0]
         found, errors, agreeing = _identifiability(search, optima, point, residual)
+    # Starts draw all parameters; one without effect has no other value than the present one.
+    kept = np.where(found.effects > 0, best.values, twin.values)
+    if (kept != best.values).any():
+        best = replace(best, values=tuple(kept.tolist()))
+        optima = [(best, point), *optima[1:]]
     if found.warning:
         warnings.warn(found.warning, stacklevel=3)
     count = len(observed)

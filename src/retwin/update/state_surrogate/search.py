@@ -27,6 +27,8 @@ STRONGEST, WEAKEST, STEP = 0.1, 1e-8, 10.0
 one to the next: from a prior so strong that the network begins near 0 to nearly none."""
 STEPS = 15
 """Steps of the search with each variance at most."""
+FEW = 5
+"""The same on whole simulations, where the search ends as soon as the error is small enough."""
 MAX_PASSES = 16
 """Number of searches at most, those with the last variance included."""
 WORTH = 0.95
@@ -144,7 +146,8 @@ def searched(
     if steps < training.steps and np.isfinite(best.error):
         whole = _error_of(best.equations, held_out) if enough else np.inf
         if whole > enough:
-            best = fitted(training, held_out, best.equations, WEAKEST, enough)
+            steps = FEW if enough else STEPS
+            best = fitted(training, held_out, best.equations, WEAKEST, enough, steps)
         else:
             best = Found(best.equations, whole)
     return best, history
@@ -156,6 +159,7 @@ def fitted(
     equations: Equations,
     variance: float,
     enough: float = 0.0,
+    steps: int = STEPS,
 ) -> Found:
     """The equations whose search begins at some weights, with an assumed variance.
 
@@ -175,7 +179,7 @@ def fitted(
     for _ in range(MAX_PASSES):
         if not now.finite:
             break
-        now = replace(estimation, variance=variance * power).minimised(now, STEPS)
+        now = replace(estimation, variance=variance * power).minimised(now, steps)
         shared = now.point.shared
         residual = tested.residual(Point(shared, other))
         error = float(relative_error(residual, held_out.mask, equations.outputs.deviation).max())
