@@ -56,7 +56,8 @@ def surrogate_text(twin: Surrogate | CorrectedTwin, commands: NDArray | None = N
         *_units(BEFORE=surrogate.before, AFTER=surrogate.after),
         *ranged,
     ]
-    before, omitted = [], ()
+    before: list[str] = []
+    omitted: tuple[str, ...] = ()
     if isinstance(twin, CorrectedTwin) and isinstance(twin.residual, ResidualModel):
         before, omitted = segment_parts(twin, commands)
         before.append(f"#define REMEMBERED {network.memory}\n")
