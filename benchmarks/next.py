@@ -1,15 +1,19 @@
-"""Trajectories that are chosen by what they tell, against random ones, on the emulated arm.
+"""Trajectories that are chosen by their expected information, compared with random ones.
 
-Half of the mean square of the emulated offsets repeats with the pose and the direction of travel.
-The error is that of the predicted mean position at rest, against the same arm with the repeating
-part alone, at commands of the sampler. The ratio is the number of random trajectories with which
-the mean error is that of eight chosen ones, divided into eight: below 1, choosing pays. Intervals
-are those of a bootstrap over seeds.
+On the emulated arm half of the mean square of the offsets repeats with the pose and the direction
+of travel. The error is that of the predicted mean position at rest, compared with the same arm with
+the repeating part alone, at other commands of the sampler. The surrogate is exact, so that all of
+the error is that of the discrepancy; with a learned surrogate its own error, which no trajectory
+reduces, hides most of the learning curve. The ratio is the number of chosen trajectories per random
+one at the mean error of twelve chosen ones, those before the first choice included: below 1,
+choosing pays. The number of random trajectories is interpolated on their learning curve, both on
+logarithmic scales. Intervals (95 %) are those of a bootstrap over arms.
 
-Ways to choose: `chosen` from draws of the sampler by what they tell about predictions (that of
-`next_experiments`); `stretched` from these and the same with larger movements; `coefficients` by
-what they tell about the coefficients of the regression. Arguments are ways, `--seeds N` their
-number. Target: an interval that excludes 1.
+Ways to choose: `chosen` from draws of the sampler by the expected information about predictions
+(that of `next_experiments`); `stretched` from these and the same with larger movements;
+`coefficients` by the expected information about the coefficients of the regression. Arguments are
+ways; `--seeds N` is the number of arms, `--first` the first one, `--repeats` the number of
+sequences of random and of chosen trajectories of each arm. Target: an interval that excludes 1.
 """
 
 from __future__ import annotations
@@ -23,16 +27,27 @@ from multiprocessing import get_context
 
 import numpy as np
 import torch
+from command_space import ExactArm
 from record import record
 
 import retwin as rt
+from retwin.cases.armpi_fpv.twin import KINEMATIC
 from retwin.evaluation.experiments.actuators import ActuatorKnowledge
 from retwin.inference.design import Knowledge, chosen
-from retwin.nets.training import Training
+from retwin.update.residual import ResidualModel
 
-FIRST, BATCH, CHOSEN, RANDOM = 4, 2, 8, 12
+FIRST, BATCH, CHOSEN = 4, 2, 12
+RANDOM = (6, 8, 12, 16, 20)
+"""Numbers of random trajectories."""
 CANDIDATES, REFERENCES = 200, 60
+DRAWS = 5000
 WAYS = ("chosen", "stretched", "coefficients")
+
+
+class Arm(ExactArm):
+    """The exact surrogate with its channels."""
+
+    inputs, outputs, rate = KINEMATIC.inputs, KINEMATIC.outputs, KINEMATIC.rate
 
 
 def stretched(commands: np.ndarray) -> np.ndarray:
@@ -55,8 +70,6 @@ def best(
     known: ActuatorKnowledge, way: str, candidates: np.ndarray, references: np.ndarray
 ) -> np.ndarray:
     """The next trajectories."""
-    if way == "random":
-        return candidates[:BATCH]
     if way == "stretched":
         candidates = np.concatenate([candidates, stretched(candidates)])
     now, roots = known.knowledge(references), known.roots(candidates)
@@ -69,51 +82,63 @@ def best(
     return candidates[chosen(now, roots, BATCH)[0]]
 
 
-def error(known: ActuatorKnowledge, test: rt.Trajectories) -> float:
-    """Root mean square error of the mean position at rest, in mm."""
-    twin = known.twin
-    context = twin.residual.context(twin.surrogate, test.commands)
-    last = np.clip(np.ceil(context.segments.stop) - 5, 0, test.steps - 1).astype(int)
-    z = known.mean(test.commands).float()
-    made = known.operator.at(context, z, torch.as_tensor(last)).detach().numpy()
-    truth = test.observed[np.arange(len(test))[:, None], last]
-    return float(1e3 * np.sqrt(np.mean((made - truth) ** 2)))
+class Test:
+    """Positions at rest of an arm with the repeating part of its offsets alone."""
+
+    def __init__(self, commands: np.ndarray, machine: object, seed: int) -> None:
+        share = machine.offset * np.sqrt(machine.repeatable)
+        silent = {"bias": 0.0, "missed": 0.0, "noise": 0.0, "glitch": 0.0, "jitter": 0.0}
+        repeating = replace(machine, repeatable=1.0, offset=share, **silent)
+        hidden: dict[str, np.ndarray] = {}
+        made = repeating.simulate(commands, seed=seed, hidden=hidden)
+        stop = np.ceil(rt.Segments.from_commands(commands).stop)
+        self.commands = commands
+        self.last = np.clip(stop - 5, 0, made.steps - 1).astype(int)
+        reached = hidden["angles"][np.arange(len(commands))[:, None], self.last]
+        self.truth = KINEMATIC.position(reached)
+
+    def error(self, known: ActuatorKnowledge) -> float:
+        """Root mean square error of the mean position at rest, in mm."""
+        twin = known.twin
+        context = twin.residual.context(twin.surrogate, self.commands)
+        z = known.mean(self.commands).float()
+        made = known.operator.at(context, z, torch.as_tensor(self.last)).detach().numpy()
+        return float(1e3 * np.sqrt(np.mean((made - self.truth) ** 2)))
 
 
-def measured(seed: int, ways: tuple[str, ...]) -> dict[str, dict[int, float]]:
+def measured(seed: int, ways: tuple[str, ...], repeats: int) -> dict[str, dict[int, float]]:
     """Errors by way and number of trajectories, of one emulated machine."""
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     case = rt.cases.armpi()
-    simulated = rt.generate(case.twin, case, per_class=12, seed=7)
-    how = Training(max_epochs=6, batch_size=256, learning_rate=1e-2)
-    surrogate = rt.fit_surrogate(simulated, rt.MLP((64, 64)), seed=0, training=how)
     machine = replace(case.emulator, repeatable=0.5)
-    share = machine.offset * np.sqrt(machine.repeatable)
-    silent = {"bias": 0.0, "missed": 0.0, "noise": 0.0, "glitch": 0.0, "jitter": 0.0}
-    repeating = replace(machine, repeatable=1.0, offset=share, **silent)
     rng = np.random.default_rng([seed, 1])
-    test = repeating.simulate(case.sampler.sample(REFERENCES, rng=rng), seed=seed)
+    test = Test(case.sampler.sample(REFERENCES, rng=rng), machine, seed)
     references = case.sampler.sample(REFERENCES, rng=rng)
     first = machine.simulate(case.sampler.sample(FIRST, rng=rng), seed=100 * seed)
-    # Of the residual model the operator with its sensor and its range of delays is needed alone.
-    residual = rt.fit_residual(surrogate, first, case.correction, seed=0)
-    twin = rt.CorrectedTwin(surrogate, residual)
+    # Of the residual model only the operator with its sensor is needed.
+    channels = {"inputs": KINEMATIC.inputs, "outputs": KINEMATIC.outputs}
+    residual = ResidualModel(case.correction, rt.Mixture(), **channels).eval()
+    twin = rt.CorrectedTwin(Arm(), residual)
     start = ActuatorKnowledge.of(twin, first)
     found = {}
     for way in ("random", *ways):
-        have, known = first, start
-        errors = {FIRST: error(start, test)}
-        while len(have) < (RANDOM if way == "random" else CHOSEN):
-            part = np.random.default_rng([seed, len(have)])
-            candidates = case.sampler.sample(CANDIDATES, rng=part)
-            commands = best(known, way, candidates, references)
-            more = machine.simulate(commands, seed=100 * seed + len(have))
-            have = rt.Trajectories.concatenate([have, more])
-            known = ActuatorKnowledge.of(twin, have)
-            errors[len(have)] = error(known, test)
-        found[way] = errors
-        print(seed, way, {n: round(e, 3) for n, e in errors.items()}, flush=True)
+        counts = RANDOM if way == "random" else range(FIRST + BATCH, CHOSEN + 1, BATCH)
+        errors = {count: [] for count in counts}
+        for repeat in range(repeats):
+            have, known = first, start
+            for count in counts:
+                part = np.random.default_rng([seed, repeat, len(have)])
+                candidates = case.sampler.sample(CANDIDATES, rng=part)
+                more = candidates[: count - len(have)]
+                if way != "random":
+                    more = best(known, way, candidates, references)
+                own = 10_000 * seed + 100 * repeat + len(have)
+                have = rt.Trajectories.concatenate([have, machine.simulate(more, seed=own)])
+                known = ActuatorKnowledge.of(twin, have)
+                errors[count].append(test.error(known))
+        found[way] = {FIRST: test.error(start)} | {n: np.mean(e) for n, e in errors.items()}
+        print(seed, way, {n: round(float(e), 3) for n, e in found[way].items()}, flush=True)
     return found
 
 
@@ -123,8 +148,8 @@ def ratio(rows: list[dict[str, dict[int, float]]], way: str) -> float:
     counts = np.array(sorted(rows[0]["random"]))
     curve = np.array([np.mean([row["random"][n] for row in rows]) for n in counts])
     falling = np.minimum.accumulate(curve)
-    # Beyond the last point the ratio is at most that of the last point, before the first one 2.
-    needed = np.interp(-goal, -falling, counts)
+    # Beyond the last point the ratio is at most that of the last point.
+    needed = np.exp(np.interp(-np.log(goal), -np.log(falling), np.log(counts)))
     return float(CHOSEN / needed)
 
 
@@ -132,22 +157,28 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("ways", nargs="*", choices=WAYS, default=["chosen"])
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--processes", type=int, default=2)
     given = parser.parse_args()
     ways = tuple(given.ways)
+    seeds = range(given.first, given.first + given.seeds)
     with ProcessPoolExecutor(given.processes, get_context("spawn")) as pool:
-        rows = list(pool.map(partial(measured, ways=ways), range(1, 1 + given.seeds)))
+        rows = list(pool.map(partial(measured, ways=ways, repeats=given.repeats), seeds))
     rng = np.random.default_rng(0)
     table = {}
     for way in ways:
         draws = [
             ratio([rows[i] for i in rng.integers(len(rows), size=len(rows))], way)
-            for _ in range(2000)
+            for _ in range(DRAWS)
         ]
         low, high = np.quantile(draws, [0.025, 0.975])
         table[way] = {"ratio": ratio(rows, way), "low": float(low), "high": float(high)}
-        for count in (FIRST + BATCH, CHOSEN):
-            table[way][f"error at {count} (mm)"] = float(np.mean([r[way][count] for r in rows]))
+        for count in (FIRST + BATCH, FIRST + 2 * BATCH, CHOSEN):
+            errors = np.array([row[way][count] for row in rows])
+            table[way][f"error at {count} (mm)"] = float(errors.mean())
+        better = np.array([row[way][CHOSEN] - row["random"][CHOSEN] for row in rows])
+        table[way][f"less than random at {CHOSEN} (arms)"] = float((better < 0).sum())
     record("next", f"trajectories chosen per random one, {given.seeds} emulated arms", table)
     for count in sorted(rows[0]["random"]):
         print(f"random, {count}: {np.mean([r['random'][count] for r in rows]):.3f} mm")

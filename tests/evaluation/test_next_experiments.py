@@ -39,7 +39,7 @@ def test_information_is_that_of_gaussians_in_closed_form() -> None:
         assert float(gain) == pytest.approx(float(0.5 * (known.variance / left).log().mean()))
 
 
-def test_each_choice_counts_what_those_before_tell() -> None:
+def test_each_choice_accounts_for_those_before() -> None:
     known, roots = knowledge(), experiments(6)
     picked, after = chosen(known, roots, 6)
     assert sorted(picked) == list(range(6))
@@ -74,7 +74,7 @@ def test_the_regression_finds_a_known_mean_and_its_scatter() -> None:
     # The covariance of z given outputs is that of z's posterior: it adds to the spread of z*.
     expected = root @ root.mT + error[0]
     torch.testing.assert_close(scatter, expected, rtol=0.3, atol=0.02)
-    # A segment whose outputs do not determine z tells nothing.
+    # A segment whose outputs do not determine z gives no information.
     blind = scatter.expand(400, 2, 2)
     _, _, wide = _regression(design, measured, torch.cat([error[:200], blind[200:]]))
     assert float(wide.diagonal().mean()) > float(covariance.diagonal().mean())
