@@ -193,7 +193,8 @@ def check_no_segment(subject: CorrectionSubject) -> None:
         return
     corrected = subject.apply(subject.z).detach()
     mask = corrected == corrected
-    more = replace(subject.context, segments=_with_another(subject.context.segments))
+    bare = replace(subject.context, surrogate_variance=None)  # one per segment, of those that are
+    more = replace(bare, segments=_with_another(bare.segments))
     z = subject.z.new_zeros(len(more), more.segments.max_count, subject.z.shape[2])
     z[:, :-1] = subject.z
     message = "a segment that does not exist, z = 0, must change nothing"
@@ -201,7 +202,7 @@ def check_no_segment(subject: CorrectionSubject) -> None:
     found = subject.correction.infer(more, corrected, mask)
     quiet = not found.z[:, -1].any() and not found.identified[:, -1].any()
     require(quiet, "infer must give z = 0, not identified, for a segment that does not exist")
-    still = replace(subject.context, segments=_without_any(subject.context.segments))
+    still = replace(bare, segments=_without_any(bare.segments))
     none = subject.z[:, :0]
     message = "without any segment apply must return the path"
     require_alike(subject.apply(none, still), subject.context.path, message)
