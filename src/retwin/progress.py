@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-__all__ = ["FinishedStage", "Progress", "Report"]
+__all__ = ["FinishedStage", "Progress", "Report", "ResumedStage"]
 
 Progress = Callable[[float], None]
 """Called with the share of the work that is done, from 0 to 1."""
@@ -15,5 +15,11 @@ Report = Callable[[str, float], None]
 
 class FinishedStage(str):
     """The name of a stage that is done, in place of that of the present one."""
+
+    __slots__ = ()
+
+
+class ResumedStage(str):
+    """The name of a stage that goes on where it stopped: its share was done before."""
 
     __slots__ = ()

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
+from rich.progress import Progress
 from test_readme import check
 
 import retwin as rt
 from retwin.cli import command_tree
-from retwin.cli.terminal import answer, bar, be_quiet, note, show_warnings, table
+from retwin.cli.terminal import _TimeLeft, answer, bar, be_quiet, note, show_warnings, table
 from retwin.progress import FinishedStage
 
 WITHOUT_TABLES = {
@@ -167,6 +168,20 @@ def test_a_bar_shows_the_time_left(on_screen, capsys: pytest.CaptureFixture[str]
     assert "study: diagnosis" in time_left
     assert "left" in time_left
     assert max(len(line) for line in Console().render_str(time_left).plain.splitlines()) < 200
+
+
+def test_the_time_left_counts_a_standstill_and_not_what_was_done_before() -> None:
+    now = [0.0]
+    progress = Progress(_TimeLeft(), get_time=lambda: now[0])
+    place = progress.add_task("study", total=1.0, before=0.0)
+    task = progress.tasks[place]
+    progress.update(place, completed=0.1)
+    now[0] = 1.0
+    assert _TimeLeft().render(task).plain == "-:--:-- left", "too early to tell"
+    now[0] = 100.0  # nothing moved
+    assert _TimeLeft().render(task).plain == "0:15:00 left"
+    progress.update(place, completed=0.6, before=0.5)  # half was done before
+    assert _TimeLeft().render(task).plain == "0:06:40 left"
 
 
 def test_a_log_shows_the_progress_of_long_work_only(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from retwin.progress import FinishedStage
+from retwin.progress import FinishedStage, ResumedStage
 from retwin.study.files import Job
 from retwin.study.progress import Stages
 
@@ -55,3 +55,17 @@ def test_what_was_done_before_is_not_done_again() -> None:
     assert "surrogate" not in ended
     shares = [share for stage, share in reported(done=3) if stage.startswith("diagnoses")]
     assert shares[0] > 0.4
+    assert not any(isinstance(stage, ResumedStage) for stage, _ in reported())
+    (resumed,) = (share for stage, share in reported(done=3) if isinstance(stage, ResumedStage))
+    assert resumed == shares[0]
+
+
+def test_every_file_that_is_read_moves_the_share() -> None:
+    """The first one used to take all that the data have, and the bar stood still for the second."""
+    told: list[float] = []
+    stages = Stages(lambda stage, share: told.append(share))
+    for stage in ("real.mat", "twin data", "third"):
+        for share in (0.0, 0.5, 1.0):
+            stages.prepare(stage, share)
+    assert len(set(told)) == 7
+    assert told[-1] < 0.1

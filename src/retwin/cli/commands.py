@@ -62,11 +62,17 @@ class Commands(typer.Typer):
 
 
 def _without_types(params: list[Any]) -> list[Any]:
-    """The parameters; those that take no value are listed without "<bool>"."""
+    """The parameters; flags are listed without "<bool>", named arguments without their type."""
     for each in params:
         if getattr(each, "is_flag", False):
             each.metavar = ""
+        if each.param_type_name == "argument" and each.metavar:
+            each.display_type_rich = _nothing  # it would be "<str>" beside "CASE"
     return params
+
+
+def _nothing(ctx: Any) -> None:
+    """No type in the help."""
 
 
 def _naming(error: InputError, params: Iterable[Any], values: Mapping[str, Any]) -> str:

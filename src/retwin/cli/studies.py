@@ -21,6 +21,8 @@ from retwin.errors import InputError
 from retwin.progress import FinishedStage
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from retwin.results import Results
 
 __all__ = ["demo", "report", "study"]
@@ -291,23 +293,25 @@ def _title(results: Results) -> str:
     kind = "EMULATED data (no real measurements)" if results.emulated else results.title
     counted = f"{runs} run{'s' if runs > 1 else ''}"
     what = f"{n} test trajector{'ies' if n > 1 else 'y'}"
-    return ", ".join(filter(None, (f"{kind}: {what}", counted, results.classifier)))
+    classifier = (results.classifier or "").upper()
+    return ", ".join(filter(None, (f"{kind}: {what}", counted, classifier)))
 
 
 def _table(results: Results) -> Table:
+    from retwin.report.labels import source_name
+
     sources, shown = results.sources, _metrics(results)
     titles = [COLUMNS[metric] for metric in shown]
     made = table(
         ("training data" if results.classes else "source", *titles),
         [
-            (source.title, *(_over_runs(source.runs(metric)) for metric in shown))
-            for source in sources.values()
+            (source_name(name), *(_over_runs(source.runs(metric)) for metric in shown))
+            for name, source in sources.items()
         ],
         numbers=titles,
     )
     for name, figures in results.published.items():
-        title = sources[name].title if name in sources else name
-        cells = (f"  paper: {title}", *(figures.get(metric, "") for metric in shown))
+        cells = (f"  paper: {source_name(name)}", *(figures.get(metric, "") for metric in shown))
         made.add_row(*map(plain, cells), style="dim")
     return made
 
@@ -323,17 +327,40 @@ def _over_runs(values: list[float]) -> str:
     return mean_and_deviation(values) if np.isfinite(values).all() else "–"
 
 
-def _differences(results: Results) -> list[str]:
+def _differences(results: Results) -> list[RenderableType]:
     """The difference of each source from the plain twin, with its interval and verdict."""
-    from retwin.report.labels import digits, reason
+    from retwin.report.labels import (
+        digits,
+        reason,
+        sentence,
+        signed,
+        source_in_sentence,
+        source_name,
+        span,
+    )
     from retwin.report.verdict import outcome_of
 
     first, metric = next(iter(results.sources)), "macro_f1" if results.classes else "nrmse"
-    return [
-        f"{row.a} - {first}, {COLUMNS[metric]}: {row.mean_diff:+.{digits(row)}f} "
-        f"(95 % bootstrap interval {row.interval[0]:+.{digits(row)}f} "
-        f"to {row.interval[1]:+.{digits(row)}f}): "
-        f"{VERDICTS.get(outcome_of(row)) or 'no verdict, since ' + reason(row)}"
+    found = [
+        row
         for row in results.comparisons
         if row.b == first and row.metric == metric and row.interval is not None
+    ]
+    if not found:
+        return []
+    columns = ("source", "difference", "95 % interval", "verdict")
+    rows = [
+        (
+            source_name(row.a),
+            signed(row.mean_diff, digits(row)),
+            span(row.interval, digits(row), sign=True),
+            VERDICTS.get(outcome_of(row), "none"),
+        )
+        for row in found
+    ]
+    reasons = dict.fromkeys(reason(row) for row in found if not outcome_of(row))
+    return [
+        f"{sentence(COLUMNS[metric])} minus that of {source_in_sentence(first)}",
+        table(columns, rows, numbers=columns[1:3]),
+        *(f"No verdict: {each}." for each in reasons if each),
     ]

@@ -21,12 +21,12 @@ from typing import Any
 import typer
 from rich import box
 from rich.console import Console, JustifyMethod, RenderableType
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgressColumn, TextColumn
 from rich.table import Table
 from rich.text import Text
 
 from retwin.errors import place_of
-from retwin.progress import FinishedStage
+from retwin.progress import FinishedStage, ResumedStage
 
 __all__ = [
     "BAD_INPUT",
@@ -59,8 +59,8 @@ FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 LOG_DELAY = 2.0
 """Seconds before the first line of progress in a log; shorter work leaves none."""
-SPEED_WINDOW = 3600.0
-"""Seconds over which the speed is averaged, since the jobs of a study differ much in length."""
+LEFT_DELAY = 5.0
+"""Seconds before the first time left on a bar; the first steps tell little about the others."""
 CONTROL = {
     code: f"\\u{code:04x}"
     for code in (*range(32), *range(127, 160), *range(0x202A, 0x202F), *range(0x2066, 0x206A))
@@ -160,6 +160,19 @@ def note(text: str) -> None:
     _stderr().print(plain(text), soft_wrap=True)
 
 
+class _TimeLeft(ProgressColumn):
+    """The time left at the mean speed since the work began, so that a standstill counts too."""
+
+    def render(self, task: Task) -> Text:
+        elapsed, before = task.elapsed or 0.0, task.fields["before"]
+        done, left = task.completed - before, 1.0 - task.completed
+        if elapsed < LEFT_DELAY or done <= 0:
+            return Text("-:--:-- left", style="progress.remaining")
+        minutes, seconds = divmod(round(elapsed * left / done), 60)
+        hours, minutes = divmod(minutes, 60)
+        return Text(f"{hours}:{minutes:02d}:{seconds:02d} left", style="progress.remaining")
+
+
 @contextmanager
 def bar(what: str) -> Iterator[Callable[[str, float], None]]:
     """Show progress on stderr while the block runs.
@@ -176,7 +189,8 @@ def bar(what: str) -> Iterator[Callable[[str, float], None]]:
     callable
         Function of the current step's name and the share that is done. A share smaller than the
         one before starts a new part of the work, with its own remaining time. A `FinishedStage`
-        leaves a line with its name and the time since the work began.
+        leaves a line with its name and the time since the work began; what a `ResumedStage` adds
+        to the share does not count for the time left.
 
     """
     console = _stderr()
@@ -187,26 +201,21 @@ def bar(what: str) -> Iterator[Callable[[str, float], None]]:
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=20),
         TaskProgressColumn(),
-        TimeRemainingColumn(),
-        TextColumn("left"),
+        _TimeLeft(),
     )
-    with Progress(
-        *columns,
-        console=console,
-        transient=True,
-        speed_estimate_period=SPEED_WINDOW,
-        disable=_quiet,
-    ) as bars:
-        task = bars.add_task(what, total=1.0)
-
+    with Progress(*columns, console=console, transient=True, disable=_quiet) as bars:
+        task = bars.add_task(what, total=1.0, before=0.0)
         begun = time.monotonic()
 
         def show(text: str, share: float) -> None:
             if isinstance(text, FinishedStage):
                 bars.console.print(_finished(text, time.monotonic() - begun))
                 return
-            if share < bars.tasks[task].completed:
-                bars.reset(task, total=1.0)
+            done = bars.tasks[task].completed
+            if share < done:
+                bars.reset(task, total=1.0, before=0.0)
+            if isinstance(text, ResumedStage):
+                bars.update(task, before=bars.tasks[task].fields["before"] + share - done)
             described = plain(f"{what}: {text}" if text else what).plain
             bars.update(task, completed=share, description=described)
 
@@ -215,16 +224,19 @@ def bar(what: str) -> Iterator[Callable[[str, float], None]]:
 
 def _lines(console: Console, what: str) -> Callable[[str, float], None]:
     begun = since = time.monotonic()
-    first, tenth = 0.0, -1
+    first, last, tenth = 0.0, 0.0, -1
 
     def show(text: str, share: float) -> None:
-        nonlocal since, first, tenth
+        nonlocal since, first, last, tenth
         if isinstance(text, FinishedStage):
             console.print(_finished(text, time.monotonic() - begun), soft_wrap=True)
             return
         now, before, tenth = time.monotonic(), tenth, int(10 * share)
         if before < 0 or tenth < before:
             since, first = now, share
+        if isinstance(text, ResumedStage):
+            first += share - last
+        last = share
         if tenth == before or now - begun < LOG_DELAY:
             return
         left = (now - since) * (1 - share) / (share - first) if share > first else 0.0

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from retwin.catalog import SOURCES
-from retwin.progress import FinishedStage, Report
+from retwin.progress import FinishedStage, Report, ResumedStage
 from retwin.study.files import Job
 
 __all__ = ["Stages"]
@@ -46,7 +46,8 @@ class Stages:
     ----------
     report : callable
         Called with the name of the present stage and the share of all work that is done, which
-        never falls; and once with each `FinishedStage`.
+        never falls; once with each `FinishedStage`; and once with a `ResumedStage` if jobs were
+        done before.
 
     """
 
@@ -54,10 +55,15 @@ class Stages:
     _shares: dict[Job, float] = field(default_factory=dict)
     _highest: float = 0.0
     _finished: set[str] = field(default_factory=set)
+    _begun: dict[str, float] = field(default_factory=dict)
 
     def prepare(self, stage: str, share: float) -> None:
-        """A share of the data is read or simulated."""
-        self._share(stage, PREPARED * share)
+        """A share of the data is read or simulated.
+
+        How many stages there are is not known, so that each has half of what is left for them.
+        """
+        begun = self._begun.setdefault(stage, self._highest)
+        self._share(stage, begun + max(0.0, PREPARED - begun) / 2 * share)
         if share >= 1.0:
             self.finish(stage)
 
@@ -70,17 +76,23 @@ class Stages:
     def begin(self, shares: Mapping[Job, float]) -> None:
         """The jobs of the study, and which share of each is done already."""
         self._shares = dict(shares)
+        if any(shares.values()):
+            self._share(ResumedStage("jobs that were done before"), self._done())
 
     def work(self, job: Job, share: float) -> None:
         """A share of a job is done."""
         before, self._shares[job] = self._shares[job], max(self._shares[job], share)
-        whole = sum(SECONDS[each.kind] for each in self._shares)
-        done = sum(SECONDS[each.kind] * share for each, share in self._shares.items())
-        self._share(_named(job), PREPARED + (WORKED - PREPARED) * done / whole)
+        self._share(_named(job), self._done())
         if before < 1.0 and all(
             share >= 1.0 for each, share in self._shares.items() if _named(each) == _named(job)
         ):
             self.finish(_named(job))
+
+    def _done(self) -> float:
+        """The share of all work that the jobs make, which begin when the data are prepared."""
+        whole = sum(SECONDS[each.kind] for each in self._shares)
+        done = sum(SECONDS[each.kind] * share for each, share in self._shares.items())
+        return PREPARED + (WORKED - PREPARED) * done / whole
 
     def _share(self, stage: str, share: float) -> None:
         self._highest = max(self._highest, share)
