@@ -350,6 +350,7 @@ def test_the_page_needs_nothing_else_and_shows_names_as_text(place: Path, call) 
     assert "&lt;img src=x" in page
     assert not re.search(r"<script[^>]+src|<link|<iframe", page)
     assert {f'id="{each}"' in page for each in ("summary", "parameters", "open", "next")} == {True}
+    assert re.search(r"<b>Next:</b></p>\s*<ol>\s*<li>[A-Z]", page)
 
 
 def test_a_sensor_of_several_channels_keeps_its_name_in_the_case(place: Path) -> None:

@@ -14,6 +14,7 @@ __all__ = [
     "combination",
     "findings",
     "interval",
+    "next_steps",
     "percent",
     "significant",
     "state",
@@ -110,6 +111,24 @@ def findings(found: Identification) -> list[str]:
     """What a reader must know, in sentences, the most important first."""
     parts = (_errors, _begins, _open, _residuals, _limits)
     return [sentence for each in parts for sentence in each(found)]
+
+
+def next_steps(found: Identification) -> list[str]:
+    """What to do next, by names in the template: what is most worth the effort first."""
+    errors = found.errors(found.compared).values()
+    worse = any(each.ratio >= 1 or (each.interval or (0, 0))[1] >= 1 for each in errors)
+    lacks = any(
+        each.p_white < WHITE or any(test.p_value < WHITE for test in each.inputs)
+        for each in found.residuals
+    )
+    unsettled = bool(found.open_parameters) or any(each.at_bound for each in found.parameters)
+    needed = {
+        "settle": unsettled,
+        "hold_out": found.compared != "validation",
+        "correct": lacks,
+        "check": worse,
+    }
+    return [name for name, holds in needed.items() if holds] or ["use"]
 
 
 def _errors(found: Identification) -> Iterator[str]:
