@@ -119,6 +119,12 @@ def test_every_room_states_what_belongs_there() -> None:
             assert "Not here:" in words, folder
 
 
+def test_every_folder_is_in_the_picture_of_the_rooms() -> None:
+    page = ROOT.parents[1] / "docs" / "architecture.md"
+    listed = set(re.findall(r"^ +(\w+)/ ", page.read_text("utf-8"), re.MULTILINE))
+    assert {path.parent.name for path in FILES.values()} - {ROOT.name} <= listed
+
+
 def test_only_cases_know_a_robot() -> None:
     for module, path in FILES.items():
         if place_of(module) < ORDER["cases"] and module != "catalog":
