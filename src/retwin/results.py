@@ -34,8 +34,8 @@ __all__ = [
     "CurvePoint",
     "Data",
     "Dataset",
-    "Fidelity",
     "FidelityFigure",
+    "FidelityResults",
     "Interval",
     "Number",
     "OverlayInfo",
@@ -59,7 +59,7 @@ def _finite(interval: Interval | None) -> tuple[float, float] | None:
     return interval if known else None
 
 
-class Part(BaseModel):
+class ResultsPart(BaseModel):
     """What all parts of the file have in common."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -79,7 +79,7 @@ class Part(BaseModel):
         return {key: v for key, v in values.items() if v is not None or key in nullable}
 
 
-class Scored(Part):
+class Scored(ResultsPart):
     """A part whose scores stand beside its other keys in the file, by their names.
 
     Attributes
@@ -201,7 +201,7 @@ class CurvePoint(Scored):
         return _finite(self.intervals.get(metric))
 
 
-class Dataset(Part):
+class Dataset(ResultsPart):
     """A data set: its file, its number of trajectories, and which of them have a role.
 
     `rate` is the sample rate of the data in Hz; None in files of versions that did not state it.
@@ -221,7 +221,7 @@ class Dataset(Part):
         return self.n or len(self.labels)
 
 
-class Data(Part):
+class Data(ResultsPart):
     """The data in their three roles."""
 
     twin: Dataset = Dataset()
@@ -230,14 +230,14 @@ class Data(Part):
     protocol: str = ""
 
 
-class ChannelNames(Part):
+class ChannelNames(ResultsPart):
     """Names and units of the commands or of the outputs."""
 
     names: list[str] = []
     units: list[str] = []
 
 
-class Comparison(Part):
+class Comparison(ResultsPart):
     """A pair of sources on one metric: `mean_diff` is the mean of `a` minus that of `b`.
 
     Attributes
@@ -291,7 +291,7 @@ class Comparison(Part):
         return self.model_copy(update=opposite)
 
 
-class FidelityFigure(Part):
+class FidelityFigure(ResultsPart):
     """A figure with its interval over trajectories, and its p-value under a perfect generator."""
 
     value: Number = math.nan
@@ -304,7 +304,7 @@ class FidelityFigure(Part):
         return _finite(self.interval)
 
 
-class Fidelity(Part):
+class FidelityResults(ResultsPart):
     """How close the draws of one source's twin are to measured trajectories.
 
     Attributes
@@ -348,7 +348,7 @@ class Fidelity(Part):
         return {name: self.figures[key] for name, key in keys.items() if key in self.figures}
 
 
-class OverlayInfo(Part):
+class OverlayInfo(ResultsPart):
     """The source whose predictions stand beside the test trajectories, and its components of z."""
 
     source: str
@@ -356,7 +356,7 @@ class OverlayInfo(Part):
     latent_units: list[str] = Field([], alias="movement_units")
 
 
-class SurrogateError(Part):
+class SurrogateError(ResultsPart):
     """Error of the surrogate against the twin, per output; `unit` is that of the RMSE."""
 
     rmse: dict[str, float] = {}
@@ -364,7 +364,7 @@ class SurrogateError(Part):
     unit: str = ""
 
 
-class Results(Part):
+class Results(ResultsPart):
     """All that a study found, arrays apart.
 
     Attributes
@@ -395,7 +395,7 @@ class Results(Part):
     published: dict[str, dict[str, str]] = {}
     comparisons: list[Comparison] = []
     surrogate: SurrogateError = SurrogateError()
-    fidelity: dict[str, Fidelity] = {}
+    fidelity: dict[str, FidelityResults] = {}
     learning_curve: list[CurvePoint] | None = None
     timing: dict[str, Any] = {}
     provenance: dict[str, Any] = {}

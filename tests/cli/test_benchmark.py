@@ -12,18 +12,18 @@ import pytest
 
 import retwin as rt
 from retwin.cli import benchmark as bench
-from retwin.cli.benchmark import Benchmark, Timed, generating, median_seconds, memory_bandwidth
+from retwin.cli.benchmark import Benchmark, Timing, generating, median_seconds, memory_bandwidth
 from retwin.nets.training import Training
 
 BY_HAND = Benchmark(
     count=1000,
-    generation={"twin": Timed("twin", 50.0, 0.1), "corrected": Timed("corrected", 10.0)},
+    generation={"twin": Timing("twin", 50.0, 0.1), "corrected": Timing("corrected", 10.0)},
     learning={
-        "twin_data": Timed("data", 5.0),
-        "surrogate": Timed("surrogate", 20.0),
-        "residual": Timed("residual", 3.0),
-        "residual_command": Timed("another", 100.0),
-        "classifier": Timed("classifier", 100.0),
+        "twin_data": Timing("data", 5.0),
+        "surrogate": Timing("surrogate", 20.0),
+        "residual": Timing("residual", 3.0),
+        "residual_command": Timing("another", 100.0),
+        "classifier": Timing("classifier", 100.0),
     },
     machine={},
 )
@@ -34,7 +34,9 @@ def test_ratios_and_break_even_follow_from_the_times() -> None:
     assert BY_HAND.paper_ratio == pytest.approx(30600 / 270)
     # 28 s once, 40 ms gained with every trajectory.
     assert BY_HAND.pays_from == pytest.approx(700)
-    slow = Benchmark(1, {"twin": Timed("", 1.0), "corrected": Timed("", 2.0)}, BY_HAND.learning, {})
+    slow = Benchmark(
+        1, {"twin": Timing("", 1.0), "corrected": Timing("", 2.0)}, BY_HAND.learning, {}
+    )
     assert slow.pays_from == float("inf")
     figures = BY_HAND.about()
     assert figures["generation"]["twin"] == {

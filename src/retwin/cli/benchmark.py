@@ -38,7 +38,7 @@ from retwin.update.surrogate import fit_surrogate, surrogate_training
 
 __all__ = [
     "Benchmark",
-    "Timed",
+    "Timing",
     "generating",
     "machine",
     "median_seconds",
@@ -63,7 +63,7 @@ Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class Timed:
+class Timing:
     """The time that something takes.
 
     Attributes
@@ -93,9 +93,9 @@ class Benchmark:
     ----------
     count : int
         Trajectories that `generation` is given for.
-    generation : mapping of str to Timed
+    generation : mapping of str to Timing
         Times to generate labelled trajectories, by twin; ratios are to that of "corrected".
-    learning : mapping of str to Timed
+    learning : mapping of str to Timing
         Times to learn, once, what the corrected twin needs, and a classifier.
     machine : mapping
         Machine, versions and date.
@@ -103,8 +103,8 @@ class Benchmark:
     """
 
     count: int
-    generation: Mapping[str, Timed]
-    learning: Mapping[str, Timed]
+    generation: Mapping[str, Timing]
+    learning: Mapping[str, Timing]
     machine: Mapping[str, Any]
 
     def ratio(self, name: str) -> float:
@@ -181,9 +181,9 @@ def run_bench(
     for done, way in enumerate(_ways(case, corrected, in_commands)):
         show(way.what, 0.4 + 0.1 * done)
         seconds, share = generating(way.twin, case, count, share=way.share, repeats=repeats)
-        generation[way.name] = Timed(way.what, seconds, share, PAPER.get(way.name))
+        generation[way.name] = Timing(way.what, seconds, share, PAPER.get(way.name))
     size = count * _bytes_of_one(case)
-    generation["memory"] = Timed("writing as many bytes to memory", size / memory_bandwidth())
+    generation["memory"] = Timing("writing as many bytes to memory", size / memory_bandwidth())
     show("done", 1.0)
     return Benchmark(count, generation, learning, machine())
 
@@ -258,13 +258,13 @@ def _ways(case: Case, corrected: CorrectedTwin, in_commands: CorrectedTwin) -> l
     ]
 
 
-def _learned(case: Case) -> tuple[dict[str, Timed], CorrectedTwin, CorrectedTwin]:
+def _learned(case: Case) -> tuple[dict[str, Timing], CorrectedTwin, CorrectedTwin]:
     """Times to learn, and the twin corrected at its outputs and in command space."""
     assert case.emulator is not None
     n = case.per_class
     healthy = replace(case, faults={HEALTHY: None})
     seconds, simulated = timed(lambda: generate(case.twin, healthy, per_class=n, seed=0))
-    found = {"twin_data": Timed(f"simulating {n} trajectories to learn from", seconds)}
+    found = {"twin_data": Timing(f"simulating {n} trajectories to learn from", seconds)}
     surrogate, found["surrogate"] = _trained(
         lambda how: fit_surrogate(simulated, case.network, seed=0, training=how),
         case.training or surrogate_training(case.network),
@@ -279,11 +279,11 @@ def _learned(case: Case) -> tuple[dict[str, Timed], CorrectedTwin, CorrectedTwin
         seconds, residual = timed(partial(fit_residual, surrogate, measured, correction, seed=0))
         corrected.append(CorrectedTwin(surrogate, residual))
         where = "in command space" if name == "residual_command" else "at outputs"
-        found[name] = Timed(f"residual model {where}, of {len(measured)} trajectories", seconds)
+        found[name] = Timing(f"residual model {where}, of {len(measured)} trajectories", seconds)
     return found, corrected[0], corrected[1]
 
 
-def _classifier(twin: Twin, case: Case, count: int) -> Timed:
+def _classifier(twin: Twin, case: Case, count: int) -> Timing:
     """Time to train the CNN on `count` generated trajectories."""
     made = generate(twin, case, per_class=max(5, count // len(case.classes)), seed=2)
     return _trained(
@@ -295,7 +295,7 @@ def _classifier(twin: Twin, case: Case, count: int) -> Timed:
 
 def _trained(
     fit: Callable[[Training], Model], training: Training, what: str
-) -> tuple[Model, Timed]:
+) -> tuple[Model, Timing]:
     """A model fitted in three epochs, and the time that all epochs would take.
 
     The difference between one epoch and three is the time of an epoch; the rest occurs once.
@@ -306,7 +306,7 @@ def _trained(
     )
     slope = max(0.0, second - first) / (brief[1] - brief[0])
     share = min(1.0, brief[1] / training.max_epochs)
-    return model, Timed(what, first + (training.max_epochs - brief[0]) * slope, share)
+    return model, Timing(what, first + (training.max_epochs - brief[0]) * slope, share)
 
 
 def _bytes_of_one(case: Case) -> int:

@@ -28,7 +28,7 @@ from retwin.diagnosis.hypotheses import Hypotheses, checked
 from retwin.diagnosis.latent_prior import command_problem, command_space, healthy_prior
 from retwin.diagnosis.missed_segments import best_fit, fitted_noise
 from retwin.diagnosis.onsets import Onsets
-from retwin.diagnosis.samples import Samples
+from retwin.diagnosis.samples import DiagnosisInputs
 from retwin.diagnosis.severity import biases, stuck_level
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
@@ -38,7 +38,7 @@ from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.twin import Twin
-from retwin.update.corrections.missed_segments import Fit
+from retwin.update.corrections.missed_segments import CommandFit
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.exact import exact_surrogate
 from retwin.update.residual import Residual, ResidualModel
@@ -117,7 +117,7 @@ class Inversion:
         Of a stuck actuator.
     bias : Tensor
         (R, M, 3), mean and interval of the bias in every segment; NaN where there is none.
-    fit : Fit
+    fit : CommandFit
         The most probable z.
 
     """
@@ -127,7 +127,7 @@ class Inversion:
     level_deviation: Tensor
     onsets: Onsets
     bias: Tensor
-    fit: Fit
+    fit: CommandFit
 
 
 def invert(rows: Hypotheses, noise: Noise) -> Inversion:
@@ -223,7 +223,7 @@ class InversionDiagnoser:
             The channels or the sample rate are not those of the surrogate.
 
         """
-        given = Samples.of(self.surrogate, self.residual, trajectories)
+        given = DiagnosisInputs.of(self.surrogate, self.residual, trajectories)
         given = given.with_error(self.surrogate_variance)
         faults = tuple(self.faults.values())
         parts = []
@@ -381,7 +381,7 @@ def fit_inversion(
         remedy="label healthy trajectories",
     )
     surrogate = exact_surrogate(surrogate)
-    given = Samples.of(surrogate, residual, healthy)
+    given = DiagnosisInputs.of(surrogate, residual, healthy)
     segments = given.context.segments
     found = surrogate_variance(surrogate, twin, healthy.commands, segments)
     variance = (

@@ -18,9 +18,9 @@ from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.missed_segments import (
     MARGIN,
     SEARCHES,
-    Fit,
+    CommandFit,
     LatentPrior,
-    Search,
+    MissedSearch,
     searched,
 )
 
@@ -32,7 +32,7 @@ WORST = 2
 
 def best_fit(
     problem: CommandProblem, prior: LatentPrior, noise: Noise, start: Tensor, trajectory: Tensor
-) -> Search:
+) -> MissedSearch:
     """The most probable missed segments, from x (R, P) and none missed on.
 
     `trajectory` (R,) is the trajectory of each row. Each time the segments that are explained worst
@@ -40,10 +40,10 @@ def best_fit(
     their trajectory are left alone.
     """
 
-    def suspects(fit: Fit, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def suspects(fit: CommandFit, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return _suspects(problem, fit, prior, noise, trajectory, rows)
 
-    return searched(problem, prior, noise, Fit.of_prior(problem, prior, start), suspects)
+    return searched(problem, prior, noise, CommandFit.of_prior(problem, prior, start), suspects)
 
 
 def fitted_noise(problem: CommandProblem, prior: LatentPrior, *, rounds: int) -> Noise:
@@ -51,16 +51,16 @@ def fitted_noise(problem: CommandProblem, prior: LatentPrior, *, rounds: int) ->
     start = prior.gaussian.mean
     trajectory = torch.arange(len(start))
 
-    def infer(fit: Fit, noise: Noise) -> Fit:
+    def infer(fit: CommandFit, noise: Noise) -> CommandFit:
         return best_fit(problem, prior, noise, fit.x, trajectory).fit
 
-    def learn(fit: Fit, noise: Noise) -> Noise:
+    def learn(fit: CommandFit, noise: Noise) -> Noise:
         residual, jacobian = problem.with_missed(fit.missed).linearised(fit.x)
         variance = predicted_variance(jacobian, fit.solution.covariance)
         return problem.learned_noise(noise, residual, variance)
 
     _, noise = expectation_maximisation(
-        Fit.of_prior(problem, prior, start),
+        CommandFit.of_prior(problem, prior, start),
         Noise.from_median(problem, problem.residual(start), groups=2),
         infer=infer,
         learn=learn,
@@ -71,7 +71,7 @@ def fitted_noise(problem: CommandProblem, prior: LatentPrior, *, rounds: int) ->
 
 def _suspects(
     problem: CommandProblem,
-    fit: Fit,
+    fit: CommandFit,
     prior: LatentPrior,
     noise: Noise,
     trajectory: Tensor,

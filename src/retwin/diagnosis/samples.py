@@ -1,4 +1,4 @@
-"""`Samples`: what a diagnosis by inversion takes from trajectories."""
+"""`DiagnosisInputs`: what a diagnosis by inversion takes from trajectories."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from retwin.update.corrections import Context, sample_mask
 from retwin.update.residual import ResidualModel
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["Samples"]
+__all__ = ["DiagnosisInputs"]
 
 
 class Precise:
@@ -32,7 +32,7 @@ class Precise:
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class DiagnosisInputs:
     """The inputs of a diagnosis: the commands' context, and outputs where they were sampled."""
 
     context: Context
@@ -42,7 +42,7 @@ class Samples:
     @classmethod
     def of(
         cls, surrogate: Surrogate, residual: ResidualModel, trajectories: Trajectories
-    ) -> Samples:
+    ) -> DiagnosisInputs:
         """Those of `trajectories`, which must have the channels and the rate of the surrogate."""
         for name in ("inputs", "outputs", "rate"):
             expected, got = getattr(surrogate, name), getattr(trajectories, name)
@@ -66,7 +66,7 @@ class Samples:
             context = replace(context, surrogate=Precise(surrogate))
         return cls(context, observed, torch.cat(sampled))
 
-    def with_error(self, variance: Tensor) -> Samples:
+    def with_error(self, variance: Tensor) -> DiagnosisInputs:
         """The same for a surrogate whose error has this variance (d_y,) in every segment."""
         if not variance.any():
             return self

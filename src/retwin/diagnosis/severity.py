@@ -16,7 +16,7 @@ from torch import Tensor
 from retwin.diagnosis.hypotheses import Hypotheses
 from retwin.inference.noise import Noise
 from retwin.update.corrections.effective_commands import effective_commands
-from retwin.update.corrections.missed_segments import Fit
+from retwin.update.corrections.missed_segments import CommandFit
 
 __all__ = ["BiasDraws", "biases", "draw_biases", "stuck_level"]
 
@@ -26,7 +26,7 @@ SMALLEST = 1e-300
 """Probability below which an interval counts as empty."""
 
 
-def biases(rows: Hypotheses, fit: Fit, coverage: float) -> tuple[Tensor, Tensor]:
+def biases(rows: Hypotheses, fit: CommandFit, coverage: float) -> tuple[Tensor, Tensor]:
     """Mean and central interval of each segment's bias, and the log evidence that its limits add.
 
     Parameters
@@ -62,7 +62,9 @@ def biases(rows: Hypotheses, fit: Fit, coverage: float) -> tuple[Tensor, Tensor]
     return summary, gain
 
 
-def stuck_level(rows: Hypotheses, fit: Fit, onset: Tensor, noise: Noise) -> tuple[Tensor, Tensor]:
+def stuck_level(
+    rows: Hypotheses, fit: CommandFit, onset: Tensor, noise: Noise
+) -> tuple[Tensor, Tensor]:
     """Where the faulty actuator is in the end (R,), in its command's unit, and the deviation.
 
     Parameters

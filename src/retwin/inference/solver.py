@@ -19,7 +19,7 @@ from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior, inverse
 from retwin.inference.problem import Problem
 
-__all__ = ["Bounds", "Solution", "Step", "blocks", "gauss_newton_step", "solve"]
+__all__ = ["Bounds", "GaussNewtonStep", "Solution", "blocks", "gauss_newton_step", "solve"]
 
 TOLERANCE = 1e-4
 """Predicted decrease of the objective, in nats, below which a row has converged."""
@@ -110,7 +110,7 @@ def blocks(covariance: Tensor, count: int) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class GaussNewtonStep:
     """A damped Gauss-Newton step from x, and what the linearised problem predicts of it.
 
     Attributes
@@ -139,7 +139,7 @@ def gauss_newton_step(
     damping: Tensor | None = None,
     bounds: Bounds | None = None,
     reweightings: int = REWEIGHTINGS,
-) -> Step:
+) -> GaussNewtonStep:
     """The step from x (R, P) to the optimum of the linearised problem, samples being reweighted.
 
     Parameters
@@ -175,7 +175,7 @@ def gauss_newton_step(
         there = bounds.moved(x, move)
         left = _left(joined, there - x).view_as(residual)
     predicted = noise.misfit(problem, left).sum(dim=1) + prior.energy(there)
-    return Step(there, predicted, undamped)
+    return GaussNewtonStep(there, predicted, undamped)
 
 
 def solve(

@@ -20,7 +20,7 @@ from retwin.study.files import Job
 from retwin.study.work import Work
 from retwin.update.dynamics import DynamicsTwin, state_twin_of
 
-__all__ = ["Answers", "Diagnoses", "Simulations", "answers"]
+__all__ = ["Answers", "Diagnoses", "SimulatedRecords", "answers"]
 
 CURVES = 6
 """Curves of a discrepancy that the page has room for."""
@@ -72,7 +72,7 @@ class Answers(Protocol):
 
 def answers(work: Work) -> Answers:
     """The answers of a study: diagnoses, or simulations where the case has no classes."""
-    return Diagnoses(work) if work.case.diagnosed else Simulations(work)
+    return Diagnoses(work) if work.case.diagnosed else SimulatedRecords(work)
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class Diagnoses:
 
 
 @dataclass(frozen=True)
-class Simulations:
+class SimulatedRecords:
     """Test records simulated from their commands.
 
     `arrays.npz` holds, of the first run, `simulation/SOURCE/mean` (n, T, d) and `/bands`
@@ -239,7 +239,7 @@ class Simulations:
         return np.stack([low.max(axis=0), high.min(axis=0)]).astype(np.float32)
 
     def _curves(self) -> dict[str, NDArray]:
-        """See `Simulations`; those that vary most, over the usual derivative of their state."""
+        """See `SimulatedRecords`; those that vary most, over the usual derivative of a state."""
         twin = DynamicsTwin.load(self.work.files.path(Job("update", 0, 0, "dynamics")))
         base, _, values = state_twin_of(self.work.case.twin)  # type: ignore[arg-type]  # checked
         given = {each.name: values[each.name] for each in base.parameters}

@@ -281,7 +281,7 @@ class FMUTwin:
 
     def _workers(self, count: int) -> AbstractContextManager[IsolatedPool]:
         """Processes that have loaded the FMU, for `count` trajectories."""
-        job = fmu_worker.Job(
+        job = fmu_worker.RunSettings(
             inputs=self.inputs.names,
             outputs=self.outputs.names,
             rate=self.rate,
@@ -295,7 +295,7 @@ class FMUTwin:
         return worker_processes((version, job, workers), lambda: self._start(job, workers))
 
     @contextmanager
-    def _start(self, job: fmu_worker.Job, workers: int) -> Iterator[IsolatedPool]:
+    def _start(self, job: fmu_worker.RunSettings, workers: int) -> Iterator[IsolatedPool]:
         """Start the processes on an unpacked FMU, which is removed when they end."""
         begin, orphaned = fmu_worker.start, fmu_worker.orphaned
         with scratch_folder() as folder:

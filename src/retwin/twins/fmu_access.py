@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from retwin.twins.fmu_model import Scalar
 
-__all__ = ["Access", "Group"]
+__all__ = ["Access", "VariableGroup"]
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class VariableGroup:
     """Numbers of one type, which FMI sets and gets together.
 
     Parameters
@@ -67,11 +67,11 @@ class Access:
 
     def getters(
         self, outputs: Sequence[Scalar], count: int
-    ) -> list[tuple[Group, NDArray, Callable[[int], None]]]:
+    ) -> list[tuple[VariableGroup, NDArray, Callable[[int], None]]]:
         """For each type the outputs, an array for `count` samples, and what fills its row k."""
         return [self._getter(group, count) for group in self._groups(outputs)]
 
-    def _groups(self, scalars: Sequence[Scalar]) -> list[Group]:
+    def _groups(self, scalars: Sequence[Scalar]) -> list[VariableGroup]:
         """The numbers of each type: FMI has one function per type."""
         groups = []
         for kind in dict.fromkeys(each.variable.type for each in scalars):
@@ -82,11 +82,11 @@ class Access:
             places = [first[scalars[i].variable.name] + scalars[i].place for i in columns]
             name, element = self._type(kind)
             groups.append(
-                Group(name, element, list(variables.values()), columns, places, sum(sizes))
+                VariableGroup(name, element, list(variables.values()), columns, places, sum(sizes))
             )
         return groups
 
-    def _setter(self, group: Group, table: NDArray) -> Callable[[int], None]:
+    def _setter(self, group: VariableGroup, table: NDArray) -> Callable[[int], None]:
         """A function that sets the inputs of a group to row k of `table`.
 
         Elements of an array that are no channels keep their start values.
@@ -96,7 +96,9 @@ class Access:
         rows[:, group.places] = table[:, group.columns]
         return self._call("Set", group, _as_type(rows, group))
 
-    def _getter(self, group: Group, count: int) -> tuple[Group, NDArray, Callable[[int], None]]:
+    def _getter(
+        self, group: VariableGroup, count: int
+    ) -> tuple[VariableGroup, NDArray, Callable[[int], None]]:
         """A group, an array for its outputs at `count` samples, and a function that fills row k."""
         rows = np.zeros((count, group.count), group.element)
         return group, rows, self._call("Get", group, rows)
@@ -109,7 +111,7 @@ class Access:
             kind = "Integer" if self.version == 2 else "Int64"
         return kind, getattr(fmi2 if self.version == 2 else fmi3, f"fmi{self.version}{kind}")
 
-    def _call(self, verb: str, group: Group, rows: NDArray) -> Callable[[int], None]:
+    def _call(self, verb: str, group: VariableGroup, rows: NDArray) -> Callable[[int], None]:
         """FMI's function that gets or sets a group for row k of `rows`; twice as fast as FMPy's."""
         from fmpy.fmi1 import FMICallException
 
@@ -135,7 +137,7 @@ def _starts(variable: Any) -> NDArray:
     return np.resize(numbers, prod(variable.shape))
 
 
-def _as_type(values: NDArray, group: Group) -> NDArray:
+def _as_type(values: NDArray, group: VariableGroup) -> NDArray:
     """`values` as C type; whole numbers are rounded and clipped to the range of the type."""
     dtype = np.dtype(group.element)
     if dtype.kind != "f":

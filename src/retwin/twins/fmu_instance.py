@@ -17,7 +17,7 @@ from retwin.isolation import Retired, more_time
 from retwin.twins.fmu_access import Access
 from retwin.twins.fmu_model import find_scalars
 
-__all__ = ["Instance", "Job", "Outcome", "Start"]
+__all__ = ["Instance", "Outcome", "RunSettings", "Start"]
 
 MAX_INSTANCES = 500
 """Largest number of instances that one process makes. Some FMUs crash at about the thousandth."""
@@ -36,7 +36,7 @@ Start = Mapping[str, float | str]
 
 
 @dataclass(frozen=True)
-class Job:
+class RunSettings:
     """Settings that all runs share.
 
     Parameters
@@ -109,7 +109,7 @@ class Instance:
     """
 
     @_same_arithmetic()
-    def __init__(self, folder: str, job: Job) -> None:
+    def __init__(self, folder: str, job: RunSettings) -> None:
         from fmpy import read_model_description
         from fmpy.simulation import instantiate_fmu
 

@@ -11,23 +11,23 @@ import signal
 
 from numpy.typing import NDArray
 
-from retwin.twins.fmu_instance import Instance, Job, Outcome, Start
+from retwin.twins.fmu_instance import Instance, Outcome, RunSettings, Start
 
-__all__ = ["Job", "Outcome", "Start", "load", "orphaned", "run", "start"]
+__all__ = ["Outcome", "RunSettings", "Start", "load", "orphaned", "run", "start"]
 
 _folder: str
-_job: Job
+_job: RunSettings
 _instance: Instance | None = None
 
 
-def start(folder: str, job: Job) -> None:
+def start(folder: str, job: RunSettings) -> None:
     """Prepare this process for runs.
 
     Parameters
     ----------
     folder : str
         Where the FMU is unpacked.
-    job : Job
+    job : RunSettings
         Settings of the runs.
 
     """
@@ -41,7 +41,7 @@ def start(folder: str, job: Job) -> None:
     os.dup2(2, 1)
 
 
-def orphaned(folder: str, job: Job) -> None:
+def orphaned(folder: str, job: RunSettings) -> None:
     """Remove the unpacked FMU when the parent process, which would have done it, has died.
 
     Parameters

@@ -26,7 +26,7 @@ from retwin.twins.mujoco_model import (
     limits_of,
     output_channels,
 )
-from retwin.twins.mujoco_simulation import Simulation
+from retwin.twins.mujoco_simulation import MuJoCoSimulation
 from retwin.twins.parameter_values import values_per_simulation
 from retwin.twins.time_step import steps_per_sample
 from retwin.twins.twin import Chunk, checked_commands, nominal_outputs, simulate_in_chunks
@@ -289,9 +289,9 @@ class MuJoCoTwin:
         return result.positions
 
     @cached_property
-    def _simulation(self) -> Simulation:
+    def _simulation(self) -> MuJoCoSimulation:
         """The integration of the model."""
-        return Simulation(
+        return MuJoCoSimulation(
             self.model,
             self.inputs.names,
             self.sensors,

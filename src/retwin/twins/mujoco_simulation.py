@@ -1,4 +1,4 @@
-"""`Simulation`: batches of simulations of one MuJoCo model, from commands to sensor data."""
+"""`MuJoCoSimulation`: batches of simulations of one MuJoCo model, from commands to sensor data."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from retwin.errors import InputError
 from retwin.twins.mujoco_model import FILTERS, joint_of, resting
 from retwin.twins.mujoco_parameters import set_parameter
 
-__all__ = ["Response", "Simulation"]
+__all__ = ["MuJoCoSimulation", "Response"]
 
 LOCKED = 1e12
 """Damping in N m s/rad (N s/m) of a joint that is held. It is so high that the joint moves by less
@@ -49,7 +49,7 @@ class Response:
 
 
 @dataclass(frozen=True, eq=False)
-class Simulation:
+class MuJoCoSimulation:
     """How simulations of a model run.
 
     Parameters

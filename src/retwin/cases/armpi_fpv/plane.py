@@ -26,7 +26,7 @@ __all__ = [
     "TIE",
     "TURN",
     "Plane",
-    "Solution",
+    "PlaneSolution",
     "bends",
     "forward",
     "grid_chain",
@@ -108,7 +108,7 @@ class Plane(_Paths):
 
 
 @dataclass(frozen=True)
-class Solution(_Paths):
+class PlaneSolution(_Paths):
     """Postures and ramps that explain n paths of M movements.
 
     Attributes
@@ -129,22 +129,22 @@ class Solution(_Paths):
     cost: NDArray
     tied: NDArray
 
-    def join(self, other: Solution) -> Solution:
+    def join(self, other: PlaneSolution) -> PlaneSolution:
         """Concatenate the paths of two solutions.
 
         Parameters
         ----------
-        other : Solution
+        other : PlaneSolution
             Paths of as many movements.
 
         Returns
         -------
-        Solution
+        PlaneSolution
             These paths, then the other ones.
 
         """
         pairs = ((getattr(self, name), getattr(other, name)) for name in self.__dataclass_fields__)
-        return Solution(*(np.concatenate(pair) for pair in pairs))
+        return PlaneSolution(*(np.concatenate(pair) for pair in pairs))
 
 
 def forward(angles: NDArray, links: tuple[float, ...]) -> tuple[NDArray, NDArray]:
@@ -309,7 +309,7 @@ def _ramp_costs(
     return np.where(idle, np.inf, cost)
 
 
-def grid_chain(plane: Plane) -> tuple[NDArray, Solution]:
+def grid_chain(plane: Plane) -> tuple[NDArray, PlaneSolution]:
     """Find the chain of whole-step postures with the lowest cost.
 
     Parameters
@@ -321,7 +321,7 @@ def grid_chain(plane: Plane) -> tuple[NDArray, Solution]:
     -------
     on_grid : ndarray of bool, shape (n,)
         Paths that have a posture on whole steps for every rest.
-    solution : Solution
+    solution : PlaneSolution
         Their explanation.
 
     """
@@ -335,7 +335,7 @@ def grid_chain(plane: Plane) -> tuple[NDArray, Solution]:
     return on_grid, _cheapest(plane.rows(on_grid), rest, posture)
 
 
-def _cheapest(plane: Plane, rest: NDArray, posture: NDArray) -> Solution:
+def _cheapest(plane: Plane, rest: NDArray, posture: NDArray) -> PlaneSolution:
     """Chain of lowest cost through postures (c, 3) of `rest` (c,), at least one per rest."""
     count, moves = plane.noise.shape
     begin = np.searchsorted(rest, np.arange(count * (moves + 1) + 1))
@@ -360,7 +360,7 @@ def _cheapest(plane: Plane, rest: NDArray, posture: NDArray) -> Solution:
         at = move == moves - 1 - step
         np.minimum.at(behind, head[at], behind[tail[at]] + best[at])
     chain = ahead[head][:, None] + cost + behind[tail][:, None]
-    solution = Solution(
+    solution = PlaneSolution(
         np.zeros((count, moves + 1, 3)), np.zeros((count, moves, 3), dtype=int),
         np.zeros((count, moves)), np.zeros((count, moves), dtype=bool),
     )  # fmt: skip

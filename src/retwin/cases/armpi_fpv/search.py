@@ -21,7 +21,7 @@ from retwin.cases.armpi_fpv.plane import (
     TIE,
     TURN,
     Plane,
-    Solution,
+    PlaneSolution,
     bends,
     forward,
     grid_postures,
@@ -44,17 +44,17 @@ DURATIONS_USED = (COMBINATIONS[:, None] == np.arange(3)[:, None]).any(axis=2)
 
 @dataclass
 class _Guesses:
-    """Explanations that are kept: the path (g,) of each and its `Solution` so far."""
+    """Explanations that are kept: the path (g,) of each and its `PlaneSolution` so far."""
 
     path: NDArray
-    found: Solution
+    found: PlaneSolution
 
     def keep(self, rows: NDArray) -> _Guesses:
         """Select explanations."""
         return _Guesses(self.path[rows], self.found.rows(rows))
 
 
-def free_chain(plane: Plane, effort: int = 1) -> Solution:
+def free_chain(plane: Plane, effort: int = 1) -> PlaneSolution:
     """Find continuous postures, movement by movement and then for a whole path together.
 
     Parameters
@@ -72,7 +72,7 @@ def free_chain(plane: Plane, effort: int = 1) -> Solution:
     """
     count, moves = plane.noise.shape
     on_grid, postures = _starts(plane)
-    found = Solution(
+    found = PlaneSolution(
         np.repeat(postures[:, None], moves + 1, axis=1), np.zeros((count, moves, 3), dtype=int),
         np.zeros((count, moves)), np.zeros((count, moves), dtype=bool),
     )  # fmt: skip
@@ -124,7 +124,7 @@ def _best(plane: Plane, move: int, guesses: _Guesses, number: int, margin: float
     return guesses.keep(order[close & (np.arange(path.size) - begin < number)])
 
 
-def _decided(plane: Plane, guesses: _Guesses) -> Solution:
+def _decided(plane: Plane, guesses: _Guesses) -> PlaneSolution:
     """The best explanation of each path; movements that another one explains as well are tied."""
     found, path = guesses.found, guesses.path
     total = found.cost.sum(axis=1)

@@ -38,7 +38,7 @@ ISO = re.compile(r"\d{4}-\d\d?-\d\d?[T ]|\d\d?[./]\d\d?[./]\d{2,4}|\d\d?:\d\d")
 
 
 @dataclass(frozen=True)
-class Layout:
+class TextLayout:
     """How a text table is written.
 
     Attributes
@@ -110,7 +110,7 @@ def _opened(path: Path, encoding: str) -> TextIO:
     return path.open(encoding=encoding, newline="")
 
 
-def _blocks(path: Path, layout: Layout) -> Iterator[list[Sequence[str]]]:
+def _blocks(path: Path, layout: TextLayout) -> Iterator[list[Sequence[str]]]:
     """The rows of a table, block by block."""
     width = len(layout.names)
     with _opened(path, layout.encoding) as file:
@@ -166,7 +166,7 @@ def _rows(lines: Iterator[str], separator: str, path: Path) -> Iterator[Sequence
         ) from None
 
 
-def _layout(path: Path) -> Layout:
+def _layout(path: Path) -> TextLayout:
     encoding = _encoding(path)
     with _opened(path, encoding) as file:
         lines = list(islice(_lines(file, path), HEAD))
@@ -196,7 +196,7 @@ def _layout(path: Path) -> Layout:
     names, units = _titles(_head(rows[:first], width, path), width)
     cells = [cell.strip() for row in rows[first:] for cell in row]
     comma = separator != "," and any(re.fullmatch(r"[+-]?\d*,\d+(e[+-]?\d+)?", c) for c in cells)
-    return Layout(encoding, separator, first, names, units, comma)
+    return TextLayout(encoding, separator, first, names, units, comma)
 
 
 def _encoding(path: Path) -> str:

@@ -125,7 +125,7 @@ class Portable:
 
     """
 
-    graphs: Mapping[str, Graph]
+    graphs: Mapping[str, Session]
     facts: Facts
     inputs: Channels
     outputs: Channels
@@ -174,7 +174,7 @@ class Portable:
             files = {name: Path(folder) / f"{name}.onnx" for name in names}
             return cls(
                 graphs={
-                    name: Graph(
+                    name: Session(
                         runtime.InferenceSession(file, options, ["CPUExecutionProvider"]), file
                     )
                     for name, file in files.items()
@@ -338,7 +338,7 @@ class Portable:
         )
 
 
-class Graph:
+class Session:
     """A session of onnxruntime as a function of named arrays; others are ignored.
 
     Parameters

@@ -5,7 +5,7 @@ the search and the posterior (see `update.identification`).
 """
 
 from retwin.evaluation.identification.hold_out import hold_out
-from retwin.evaluation.identification.parameters import Direction, Estimate
+from retwin.evaluation.identification.parameters import Direction, ParameterEstimate
 from retwin.evaluation.identification.residual_tests import InputTest, ResidualTest
 from retwin.evaluation.identification.validation import (
     Identification,
@@ -16,10 +16,10 @@ from retwin.evaluation.identification.validation import (
 
 __all__ = [
     "Direction",
-    "Estimate",
     "Identification",
     "InputTest",
     "OutputError",
+    "ParameterEstimate",
     "RMSError",
     "ResidualTest",
     "hold_out",

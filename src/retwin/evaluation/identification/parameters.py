@@ -15,7 +15,15 @@ from retwin.update.identification.identifiability import UNIFORM
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.posterior import Posterior
 
-__all__ = ["WIDEST", "Basis", "Direction", "Estimate", "Uncertainty", "estimates", "uncertainty_of"]
+__all__ = [
+    "WIDEST",
+    "Basis",
+    "Direction",
+    "ParameterEstimate",
+    "Uncertainty",
+    "estimates",
+    "uncertainty_of",
+]
 
 NEAR = 0.01
 """Distance from a bound, in widths of the range, within which draws count as on it."""
@@ -35,7 +43,7 @@ as those of a first-order autoregression, or draws from the posterior."""
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ParameterEstimate:
     """A parameter before and after identification.
 
     Attributes
@@ -115,7 +123,7 @@ class Direction:
 class Uncertainty:
     """Estimates, their correlation (k, k), directions from best to least determined, and basis."""
 
-    parameters: tuple[Estimate, ...]
+    parameters: tuple[ParameterEstimate, ...]
     correlation: NDArray
     directions: tuple[Direction, ...]
     basis: Basis
@@ -190,7 +198,7 @@ def estimates(
     sides: Sequence[str],
     *,
     bounded: bool = False,
-) -> tuple[Estimate, ...]:
+) -> tuple[ParameterEstimate, ...]:
     """One estimate per parameter; at a bound a fit has no error, whose theory ends there.
 
     `agreed` states which may be identified by what is known beside their intervals.
@@ -199,7 +207,7 @@ def estimates(
     for i, each in enumerate(before.parameters):
         lost = (bool(sides[i]) and not bounded) or np.isnan(errors[i])
         known = not lost and np.isfinite(intervals[i]).all()
-        estimate = Estimate(
+        estimate = ParameterEstimate(
             each.name,
             each.unit,
             each.low,

@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
-from retwin.evaluation.identification.parameters import Basis, Direction, Estimate, uncertainty_of
+from retwin.evaluation.identification.parameters import (
+    Basis,
+    Direction,
+    ParameterEstimate,
+    uncertainty_of,
+)
 from retwin.evaluation.identification.residual_tests import ResidualTest, residual_tests
 from retwin.scores.intervals import MIN_GROUPS, jackknife_interval
 from retwin.scores.residuals import decorrelated_after
@@ -90,7 +95,7 @@ class Identification:
     ----------
     twin : ParametricTwin
         The twin with the identified values; of a posterior with its mean.
-    parameters : tuple of Estimate
+    parameters : tuple of ParameterEstimate
         The parameters before and after, with their uncertainty.
     correlation : NDArray
         (k, k), of the estimates; NaN where it is not defined.
@@ -113,7 +118,7 @@ class Identification:
     """
 
     twin: ParametricTwin
-    parameters: tuple[Estimate, ...]
+    parameters: tuple[ParameterEstimate, ...]
     correlation: NDArray
     directions: tuple[Direction, ...]
     basis: Basis

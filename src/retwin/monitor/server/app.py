@@ -24,7 +24,7 @@ from retwin.monitor.live import Live, Received
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import parse
 from retwin.monitor.server.comparison import Comparisons
-from retwin.monitor.server.guard import Guard
+from retwin.monitor.server.guard import RequestGuard
 from retwin.monitor.server.metrics import Metrics
 from retwin.monitor.server.views import Views
 from retwin.report.style import CHROME, PALETTE
@@ -87,7 +87,7 @@ def create_app(
     hosts: Collection[str] = (),
     sources: Mapping[str, Callable[[], bool]] | None = None,
     emulated: bool = False,
-) -> Guard:
+) -> RequestGuard:
     """The ASGI application of a live monitor.
 
     Parameters
@@ -130,7 +130,7 @@ def create_app(
     _add_reading(app, live, views, metrics, emulated=emulated)
     _add_writing(app, live, gate, metrics)
     _add_versions(app, live, views)
-    guard = Guard(app, token, hosts)
+    guard = RequestGuard(app, token, hosts)
     app.state.closing = guard.closing
     return guard
 

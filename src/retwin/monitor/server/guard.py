@@ -10,7 +10,7 @@ from collections.abc import Collection
 from typing import Any
 from urllib.parse import urlsplit
 
-__all__ = ["MAX_BODY", "Guard"]
+__all__ = ["MAX_BODY", "RequestGuard"]
 
 MAX_BODY = 2**22
 """Bytes of a request's body at most."""
@@ -29,7 +29,7 @@ HEADERS = {
 }
 
 
-class Guard:
+class RequestGuard:
     """Refuses foreign hosts, writes without the token and large bodies; adds headers.
 
     A page of another site that a browser shows cannot read from here, since its requests carry the

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 from retwin.checks import needs_extra
 from retwin.errors import InputError, brief
-from retwin.monitor.server.guard import Guard
+from retwin.monitor.server.guard import RequestGuard
 
 __all__ = ["PORT", "listening", "serving"]
 
@@ -44,7 +44,7 @@ def listening(host: str, port: int) -> socket.socket:
 
 
 @contextmanager
-def serving(app: Guard, bound: socket.socket) -> Iterator[None]:
+def serving(app: RequestGuard, bound: socket.socket) -> Iterator[None]:
     """Serve an application of `create_app` in a thread while the block runs.
 
     The socket is one of `listening`.

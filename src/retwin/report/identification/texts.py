@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from math import floor, isfinite, isnan, log10
 
-from retwin.evaluation.identification import Direction, Estimate, Identification, RMSError
+from retwin.evaluation.identification import Direction, Identification, ParameterEstimate, RMSError
 from retwin.evaluation.identification.parameters import WIDEST
 from retwin.update.identification.posterior import Posterior
 
@@ -49,14 +49,14 @@ def significant(number: float, like: float | None = None) -> str:
     return f"{number:.{max(decimals, 0)}f}".replace("-", "−")
 
 
-def value(each: Estimate) -> str:
+def value(each: ParameterEstimate) -> str:
     """`0.646 ± 0.012`; the value alone where there is no error."""
     if not isfinite(each.error) or each.error == 0:
         return significant(each.value)
     return f"{significant(each.value, each.error)} ± {significant(each.error, each.error)}"
 
 
-def interval(each: Estimate) -> str:
+def interval(each: ParameterEstimate) -> str:
     """`0.62 to 0.67`, or that it is wider than the range."""
     if each.interval is None:
         return "–"
@@ -66,7 +66,7 @@ def interval(each: Estimate) -> str:
     return f"{significant(low, high - low)} to {significant(high, high - low)}"
 
 
-def state(each: Estimate) -> str:
+def state(each: ParameterEstimate) -> str:
     """What is wrong with an estimate; "" if nothing is."""
     if each.at_bound:
         return "at its lower bound" if each.at_bound == "low" else "at its upper bound"
@@ -205,7 +205,7 @@ def _open(found: Identification) -> Iterator[str]:
         yield f"Estimates that are strongly correlated: {', '.join(strong[:SENTENCES])}."
 
 
-def _not_apart(each: Estimate) -> str:
+def _not_apart(each: ParameterEstimate) -> str:
     """From which end of its range a parameter is not shown to differ; "" if it is from both."""
     if each.interval is None or not each.leaves or each.covered == 1:
         return ""

@@ -24,7 +24,7 @@ from retwin.report.labels import number, order, quantity, source_name, span, wit
 from retwin.report.sections.discrepancy import detailed, figure_cell, suffixes, titled
 from retwin.report.study import Study
 from retwin.report.style import colour_of
-from retwin.results import Fidelity
+from retwin.results import FidelityResults
 
 __all__ = ["fidelity"]
 
@@ -67,10 +67,10 @@ def fidelity(study: Study) -> Section | None:
     names = [each["source"] for each in details]
     shown = [figure for name in names for figure in figures[name].values()]
     further = [f for name in known if name not in names for f in figures[name].values()]
-    return Section("fidelity", "Fidelity", values, shown, further)
+    return Section("fidelity", "FidelityResults", values, shown, further)
 
 
-def _lengths(each: Fidelity, energy: str) -> list[tuple[str, str, float, str]]:
+def _lengths(each: FidelityResults, energy: str) -> list[tuple[str, str, float, str]]:
     """Key, title, factor and unit of the CRPS of each output; `energy` is put behind them."""
     units = [*each.units, *[""] * len(each.outputs)]
     rows = [(f"crps/{n}", f"CRPS {n}", u) for n, u in zip(each.outputs, units, strict=False)]

@@ -38,7 +38,7 @@ OUTSIDE = Key("outside the range of the calibration", "grid", "bar")
 
 
 @dataclass(frozen=True)
-class Channel:
+class ChannelRecords:
     """A command or an output of all records: values (n, T), range in calibration."""
 
     name: str
@@ -83,7 +83,7 @@ def residuals(study: Study) -> Section | None:
     return Section("residuals", "Residual diagnostics", values, figures)
 
 
-def _channels(study: Study, kind: str) -> list[Channel]:
+def _channels(study: Study, kind: str) -> list[ChannelRecords]:
     """The channels of the records, in the units that are shown."""
     arrays = study.arrays[f"simulation/{kind}"].astype(float)
     about = study.results.inputs if kind == "commands" else study.results.outputs
@@ -96,12 +96,12 @@ def _channels(study: Study, kind: str) -> list[Channel]:
     else:
         ends = ends[:, :count] if kind == "commands" else ends[:, -count:]
     return [
-        Channel(names[i], unit, factor * arrays[..., i], *(factor * ends[:, i]).tolist())
+        ChannelRecords(names[i], unit, factor * arrays[..., i], *(factor * ends[:, i]).tolist())
         for i, (factor, unit) in enumerate(units)
     ]
 
 
-def _errors(study: Study, source: str, outputs: Sequence[Channel]) -> list[NDArray]:
+def _errors(study: Study, source: str, outputs: Sequence[ChannelRecords]) -> list[NDArray]:
     """Measured minus simulated values (n, T) of each output."""
     mean = study.arrays[f"simulation/{source}/mean"].astype(float)
     units = study.results.outputs.units or [""] * len(outputs)
@@ -110,8 +110,8 @@ def _errors(study: Study, source: str, outputs: Sequence[Channel]) -> list[NDArr
 
 def _table(
     errors: dict[str, list[NDArray]],
-    outputs: Sequence[Channel],
-    commands: Sequence[Channel],
+    outputs: Sequence[ChannelRecords],
+    commands: Sequence[ChannelRecords],
     rate: float,
 ) -> Table:
     heads = columns(
@@ -151,7 +151,7 @@ def _table(
     return Table(title if len(outputs) > 1 else with_unit(title, outputs[0].unit), heads, rows)
 
 
-def _outside(channels: Sequence[Channel]) -> NDArray:
+def _outside(channels: Sequence[ChannelRecords]) -> NDArray:
     """Whether any channel is outside its range in calibration (n, T)."""
     made: NDArray = np.any([each.outside for each in channels], axis=0)
     return made
@@ -179,7 +179,10 @@ def _at_lag(found: Correlogram, rate: float, command: str = "") -> tuple[str, st
 
 
 def _autocorrelations(
-    errors: dict[str, list[NDArray]], outputs: Sequence[Channel], rate: float, keys: list[Key]
+    errors: dict[str, list[NDArray]],
+    outputs: Sequence[ChannelRecords],
+    rate: float,
+    keys: list[Key],
 ) -> Figure:
     panels = []
     for i, output in enumerate(outputs[:OUTPUTS]):
@@ -205,8 +208,8 @@ def _autocorrelations(
 
 def _cross_correlations(
     errors: dict[str, list[NDArray]],
-    outputs: Sequence[Channel],
-    commands: Sequence[Channel],
+    outputs: Sequence[ChannelRecords],
+    commands: Sequence[ChannelRecords],
     rate: float,
     keys: list[Key],
 ) -> Figure:
@@ -239,7 +242,10 @@ def _cross_correlations(
 
 
 def _spectra(
-    errors: dict[str, list[NDArray]], outputs: Sequence[Channel], rate: float, keys: list[Key]
+    errors: dict[str, list[NDArray]],
+    outputs: Sequence[ChannelRecords],
+    rate: float,
+    keys: list[Key],
 ) -> Figure:
     panels = []
     for i, output in enumerate(outputs[:OUTPUTS]):
@@ -265,8 +271,8 @@ def _spectra(
 
 def _amplitudes(
     errors: dict[str, list[NDArray]],
-    outputs: Sequence[Channel],
-    commands: Sequence[Channel],
+    outputs: Sequence[ChannelRecords],
+    commands: Sequence[ChannelRecords],
     keys: list[Key],
 ) -> Figure:
     panels = []
@@ -301,8 +307,8 @@ def _amplitudes(
 
 def _times(
     errors: dict[str, list[NDArray]],
-    outputs: Sequence[Channel],
-    commands: Sequence[Channel],
+    outputs: Sequence[ChannelRecords],
+    commands: Sequence[ChannelRecords],
     rate: float,
     keys: list[Key],
 ) -> Figure:
@@ -336,7 +342,7 @@ def _runs(outside: NDArray, edges: NDArray, rate: float) -> Iterator[tuple[float
         yield float(edges[first]), float(edges[last])
 
 
-def _ranged(channels: Sequence[Channel]) -> bool:
+def _ranged(channels: Sequence[ChannelRecords]) -> bool:
     return any(np.isfinite([each.low, each.high]).any() for each in channels)
 
 

@@ -30,7 +30,7 @@ from retwin.twins.state import State
 from retwin.twins.state_twin import StateTwin
 from retwin.update.blackbox.estimate import (
     BlackBox,
-    Fit,
+    BlackBoxFit,
     best_order,
     check_records,
     cross_validated,
@@ -58,7 +58,9 @@ def fit_arx(observed: Trajectories, seed: int, progress: Progress | None) -> Bla
     return fit.model(linear.lags.order, began, names[: len(observed.outputs)])
 
 
-def best_linear(observed: Trajectories, progress: Progress | None = None) -> tuple[Linear, Fit]:
+def best_linear(
+    observed: Trajectories, progress: Progress | None = None
+) -> tuple[Linear, BlackBoxFit]:
     """The linear model of the best order, and its fit."""
     check_records(observed)
     order, fit = best_order(
@@ -153,11 +155,11 @@ class Linear:
             found.insert(0, later)
         return np.concatenate(found, axis=1)
 
-    def fit(self) -> Fit | None:
+    def fit(self) -> BlackBoxFit | None:
         """The model; None where samples are too few or a simulation diverges."""
         return cross_validated(self.lags.observed.mask, self.without) if self.lags.enough else None
 
-    def without(self, part: NDArray) -> Fit | None:
+    def without(self, part: NDArray) -> BlackBoxFit | None:
         """The model without a part (n, T) of the samples; None where its simulation diverges."""
         kept = self.lags.rows.without(part)
         theta = np.stack([least_squares(kept.values, y) for y in kept.outputs.T])

@@ -27,7 +27,7 @@ from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 
 __all__ = [
     "BlackBox",
-    "Fit",
+    "BlackBoxFit",
     "best_order",
     "check_records",
     "cross_validated",
@@ -86,7 +86,7 @@ class BlackBox:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class BlackBoxFit:
     """A model at its most probable parameters.
 
     Attributes
@@ -115,7 +115,7 @@ class Fit:
     def _tested(self) -> Estimation:
         return replace(self.estimation, seen=~np.isnan(self.errors))
 
-    def searched(self, variance: NDArray) -> Fit:
+    def searched(self, variance: NDArray) -> BlackBoxFit:
         """The most probable point nearby with another variance of the errors."""
         estimation = replace(self.estimation, variance=variance)
         found = estimation.minimised(estimation.linearised(self.point), SEARCH)
@@ -169,8 +169,8 @@ def check_records(observed: Trajectories) -> None:
 
 
 def best_order(
-    orders: Sequence[int], fit: Callable[[int], Fit | None], progress: Progress | None
-) -> tuple[int, Fit]:
+    orders: Sequence[int], fit: Callable[[int], BlackBoxFit | None], progress: Progress | None
+) -> tuple[int, BlackBoxFit]:
     """The order with the least error of held-out blocks in free simulation, and its fit.
 
     Raises
@@ -179,7 +179,7 @@ def best_order(
         No order can be fitted.
 
     """
-    best: tuple[int, Fit] | None = None
+    best: tuple[int, BlackBoxFit] | None = None
     for done, order in enumerate(orders, 1):
         found = fit(order)
         error = np.inf if found is None else found.held_out
@@ -213,7 +213,9 @@ def held_out_parts(seen: NDArray) -> list[NDArray]:
     return [(own == part) & (block > 0) for part in range(count)]
 
 
-def cross_validated(seen: NDArray, fitted: Callable[[NDArray], Fit | None]) -> Fit | None:
+def cross_validated(
+    seen: NDArray, fitted: Callable[[NDArray], BlackBoxFit | None]
+) -> BlackBoxFit | None:
     """The fit to all samples, with the errors of parts by fits without them.
 
     Parameters
@@ -232,7 +234,9 @@ def cross_validated(seen: NDArray, fitted: Callable[[NDArray], Fit | None]) -> F
     return replace(good[0], errors=held_out_errors(good[1:], parts, seen))
 
 
-def held_out_errors(fits: Sequence[Fit], parts: Sequence[NDArray], seen: NDArray) -> NDArray:
+def held_out_errors(
+    fits: Sequence[BlackBoxFit], parts: Sequence[NDArray], seen: NDArray
+) -> NDArray:
     """Errors (n, T, d_y) of each part by the fit without it, NaN of samples in no part."""
     errors = np.full(seen.shape, np.nan)
     for fit, part in zip(fits, parts, strict=True):
@@ -250,8 +254,8 @@ def estimation_of(twin: StateTwin, observed: Trajectories, part: NDArray) -> Est
 
 
 def with_best_prior(
-    start: Callable[[NDArray], Fit], seen: NDArray, report: Progress | None = None
-) -> Fit | None:
+    start: Callable[[NDArray], BlackBoxFit], seen: NDArray, report: Progress | None = None
+) -> BlackBoxFit | None:
     """The fit to all samples whose prior has the strength that predicts held-out parts best.
 
     The assumed error of the outputs begins large, which makes the prior strong, and falls from step
@@ -300,7 +304,7 @@ def observed_variance(estimation: Estimation, point: Point) -> NDArray:
     return estimation.power(residual) * correlation_time(residual)
 
 
-def followed(estimation: Estimation, point: Point) -> Fit | None:
+def followed(estimation: Estimation, point: Point) -> BlackBoxFit | None:
     """The fit whose assumed errors are those that are observed; None where the start diverges."""
     if not np.isfinite(estimation.residual(point)).all():
         return None
@@ -314,4 +318,4 @@ def followed(estimation: Estimation, point: Point) -> Fit | None:
         if not found.finite:
             return None
         point = estimation.minimised(found).point
-    return Fit(estimation, point, np.full(estimation.seen.shape, np.nan))
+    return BlackBoxFit(estimation, point, np.full(estimation.seen.shape, np.nan))

@@ -15,7 +15,7 @@ from retwin.update.dynamics.corrected import Domain
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.terms import Term
 
-__all__ = ["ROWS_PER_TERM", "Lags", "Rows", "Scales", "least_squares"]
+__all__ = ["ROWS_PER_TERM", "Lags", "MeasuredRows", "Scales", "least_squares"]
 
 ROWS_PER_TERM = 10
 """Least number of samples per term."""
@@ -51,7 +51,7 @@ class Scales:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class MeasuredRows:
     """The samples before which enough samples are measured.
 
     Attributes
@@ -73,10 +73,10 @@ class Rows:
     def __len__(self) -> int:
         return len(self.values)
 
-    def without(self, part: NDArray) -> Rows:
+    def without(self, part: NDArray) -> MeasuredRows:
         """The rows outside a part (n, T) of the samples."""
         kept = ~part[self.record, self.sample]
-        return Rows(*(each[kept] for each in vars(self).values()))
+        return MeasuredRows(*(each[kept] for each in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ class Lags:
         return [term.value(free if i <= last else held) for i, term in enumerate(self.terms)]
 
     @cached_property
-    def rows(self) -> Rows:
+    def rows(self) -> MeasuredRows:
         """The samples before which all `order` samples of all outputs are measured."""
         import torch
 
@@ -163,7 +163,7 @@ class Lags:
         ones = torch.ones(len(variables), dtype=torch.float64)
         columns = [each * ones for each in self.values(list(variables.unbind(1)))]
         outputs = (y[record, sample] - self.scales.outputs.centre) / self.scales.outputs.scale
-        return Rows(torch.stack(columns, 1).numpy(), outputs, record, sample)
+        return MeasuredRows(torch.stack(columns, 1).numpy(), outputs, record, sample)
 
     @cached_property
     def enough(self) -> bool:

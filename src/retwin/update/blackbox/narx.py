@@ -27,7 +27,7 @@ from retwin.twins.state import State
 from retwin.twins.state_twin import StateTwin
 from retwin.update.blackbox.estimate import (
     BlackBox,
-    Fit,
+    BlackBoxFit,
     best_order,
     check_records,
     estimation_of,
@@ -69,7 +69,7 @@ def fit_narx(observed: Trajectories, seed: int, progress: Progress | None) -> Bl
     began = time.perf_counter()
     check_records(observed)
 
-    def fit(order: int) -> Fit | None:
+    def fit(order: int) -> BlackBoxFit | None:
         return Polynomial(Lags(observed, order, DEGREE)).fit()
 
     order, found = best_order(range(1, MAX_ORDER + 1), fit, progress)
@@ -142,13 +142,13 @@ class Polynomial:
             )
         ]
 
-    def fit(self) -> Fit | None:
+    def fit(self) -> BlackBoxFit | None:
         """The model; None where samples are too few or the linear model diverges."""
         if not self.lags.enough:
             return None
         observed, chosen, linear = self.lags.observed, self.chosen(), self.linear
 
-        def start(part: NDArray) -> Fit:
+        def start(part: NDArray) -> BlackBoxFit:
             kept = self.lags.rows.without(part)
             coefficients = np.zeros((len(chosen), max(map(len, chosen))))
             coefficients[:, linear] = [
@@ -158,7 +158,9 @@ class Polynomial:
                 [own[: len(terms)] for own, terms in zip(coefficients, chosen, strict=True)]
             )
             estimation = estimation_of(self.twin(chosen, flat), observed, part)
-            return Fit(self._with_prior(estimation, chosen), Point(flat, self.starts), np.empty(0))
+            return BlackBoxFit(
+                self._with_prior(estimation, chosen), Point(flat, self.starts), np.empty(0)
+            )
 
         return with_best_prior(start, observed.mask)
 

@@ -34,7 +34,7 @@ from retwin.twins.state_twin import StateTwin
 from retwin.update.blackbox.arx import Linear, best_linear
 from retwin.update.blackbox.estimate import (
     BlackBox,
-    Fit,
+    BlackBoxFit,
     best_order,
     estimation_of,
     with_best_prior,
@@ -42,7 +42,7 @@ from retwin.update.blackbox.estimate import (
 from retwin.update.blackbox.lags import Lags
 from retwin.update.dynamics.estimation import Point
 
-__all__ = ["Network", "fit_neural_ss"]
+__all__ = ["NeuralModel", "fit_neural_ss"]
 
 SAMPLES_PER_WEIGHT = 10
 """Measured samples per number of the network at least."""
@@ -64,12 +64,12 @@ def fit_neural_ss(observed: Trajectories, seed: int, progress: Progress | None) 
     report = progress or (lambda _: None)
     linear, _ = best_linear(observed, lambda share: report(0.2 * share))
 
-    def fit(order: int) -> Fit | None:
+    def fit(order: int) -> BlackBoxFit | None:
         own = Linear(Lags(observed, order, 1))
         found = own.without(np.zeros(observed.mask.shape[:2], dtype=bool))
         if found is None:
             return None
-        network = Network.of(own, found, np.random.default_rng(seed))
+        network = NeuralModel.of(own, found, np.random.default_rng(seed))
         return with_best_prior(network.start, observed.mask)
 
     orders = range(linear.lags.order, linear.lags.order + 2)
@@ -79,7 +79,7 @@ def fit_neural_ss(observed: Trajectories, seed: int, progress: Progress | None) 
 
 
 @dataclass(frozen=True, eq=False)
-class Network:
+class NeuralModel:
     """The neural state-space model of some records, where it begins.
 
     Attributes
@@ -101,7 +101,7 @@ class Network:
     speed: NDArray
 
     @classmethod
-    def of(cls, linear: Linear, fit: Fit, rng: np.random.Generator) -> Network:
+    def of(cls, linear: Linear, fit: BlackBoxFit, rng: np.random.Generator) -> NeuralModel:
         """The linear model in coordinates in which its states are white, and a random network."""
         width, inputs, n = linear.sizes
         size = n * width
@@ -178,11 +178,11 @@ class Network:
             ],
         )
 
-    def start(self, part: NDArray) -> Fit:
+    def start(self, part: NDArray) -> BlackBoxFit:
         """The model where it begins, without a part (n, T) of the samples."""
         estimation = estimation_of(self.twin, self.linear.lags.observed, part)
         unknowns = estimation.unknowns
         unknowns = replace(unknowns, deviation=np.ones(unknowns.count))
-        return Fit(
+        return BlackBoxFit(
             replace(estimation, unknowns=unknowns), Point(unknowns.mean, self.starts), np.empty(0)
         )

@@ -23,7 +23,13 @@ from retwin.inference.solver import Solution, blocks
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.correction import Context, Discrepancy, block_diagonal
 from retwin.update.corrections.delays import at_bound, first_delays
-from retwin.update.corrections.missed_segments import Fit, LatentPrior, Search, fitted, searched
+from retwin.update.corrections.missed_segments import (
+    CommandFit,
+    LatentPrior,
+    MissedSearch,
+    fitted,
+    searched,
+)
 from retwin.update.corrections.offset_features import OffsetFeatures
 from retwin.update.corrections.sample_noise import SampleNoise
 
@@ -101,16 +107,16 @@ def infer_with_belief(
     problem.per_segment(start)[..., 0] = first_delays(problem, start, problem.delay_range)
     first = Belief.of(problem, start)
 
-    def infer(found: Search, belief: Belief) -> Search:
+    def infer(found: MissedSearch, belief: Belief) -> MissedSearch:
         white, prior, noise = belief.whitened(problem), belief.prior(problem), belief.noise
         return searched(white, prior, noise, found.fit, partial(_suspects, white, prior, noise))
 
-    def learn(found: Search, belief: Belief) -> Belief:
+    def learn(found: MissedSearch, belief: Belief) -> Belief:
         return belief.learned(problem.with_missed(found.fit.missed), found.fit.solution)
 
-    fit = Fit.of_prior(problem, first.prior(problem), start)
+    fit = CommandFit.of_prior(problem, first.prior(problem), start)
     found, belief = expectation_maximisation(
-        Search(fit, fit.missed, fit.evidence),
+        MissedSearch(fit, fit.missed, fit.evidence),
         first,
         infer=infer,
         learn=learn,
@@ -119,7 +125,7 @@ def infer_with_belief(
     )
     if uncertain.common is not None:
         problem = uncertain
-        found = infer(Search(fit, fit.missed, fit.evidence), belief)
+        found = infer(MissedSearch(fit, fit.missed, fit.evidence), belief)
     problem = belief.whitened(problem).with_missed(found.fit.missed)
     last = fitted(problem, belief.prior(problem), belief.noise, found.fit.x)
     made = _discrepancy(problem, last.solution, found.probability, belief, identified_below)
@@ -154,7 +160,7 @@ def _empty(problem: CommandProblem) -> Discrepancy:
 
 
 def _suspects(
-    problem: CommandProblem, prior: LatentPrior, noise: Noise, fit: Fit, rows: Tensor
+    problem: CommandProblem, prior: LatentPrior, noise: Noise, fit: CommandFit, rows: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Trajectory, segment and actuator of every flip worth a trial.
 

@@ -18,14 +18,14 @@ from retwin.inference.priors import GaussianPrior
 from retwin.inference.solver import Solution, solve
 from retwin.update.corrections.command_problem import CommandProblem
 
-__all__ = ["MARGIN", "SEARCHES", "Fit", "LatentPrior", "Search", "fitted", "searched"]
+__all__ = ["MARGIN", "SEARCHES", "CommandFit", "LatentPrior", "MissedSearch", "fitted", "searched"]
 
 SEARCHES = 3
 """Segments of a row at most of which one search may change whether they were missed."""
 MARGIN = 20.0
 """Log evidence behind a row's best at which a trial is given up."""
 
-Suspects = Callable[["Fit", Tensor], tuple[Tensor, Tensor, Tensor]]
+Suspects = Callable[["CommandFit", Tensor], tuple[Tensor, Tensor, Tensor]]
 """From a fit and some rows (k,) to row, segment and actuator (m,) of every flip worth a trial."""
 
 
@@ -68,7 +68,7 @@ class LatentPrior:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class CommandFit:
     """The most probable x of every row.
 
     Attributes
@@ -87,7 +87,7 @@ class Fit:
     evidence: Tensor
 
     @classmethod
-    def of_prior(cls, problem: CommandProblem, prior: LatentPrior, x: Tensor) -> Fit:
+    def of_prior(cls, problem: CommandProblem, prior: LatentPrior, x: Tensor) -> CommandFit:
         """At x (R, P), without any measured output."""
         solution = Solution.of_prior(prior.gaussian, x)
         return cls(solution, problem.missed, solution.evidence)
@@ -97,13 +97,13 @@ class Fit:
         """(R, P)."""
         return self.solution.x
 
-    def __getitem__(self, rows: Tensor) -> Fit:
+    def __getitem__(self, rows: Tensor) -> CommandFit:
         """The fit of some rows."""
-        return Fit(self.solution[rows], self.missed[rows], self.evidence[rows])
+        return CommandFit(self.solution[rows], self.missed[rows], self.evidence[rows])
 
-    def put(self, rows: Tensor, other: Fit) -> Fit:
+    def put(self, rows: Tensor, other: CommandFit) -> CommandFit:
         """The same with another fit in some rows."""
-        return Fit(
+        return CommandFit(
             self.solution.put(rows, other.solution),
             self.missed.index_copy(0, rows, other.missed),
             self.evidence.index_copy(0, rows, other.evidence),
@@ -111,12 +111,12 @@ class Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class MissedSearch:
     """What a search for missed segments found.
 
     Attributes
     ----------
-    fit : Fit
+    fit : CommandFit
         The best one of every row.
     probability : Tensor
         (R, M, d_u), that an actuator missed a segment, as far as that was tried; else 0 or 1.
@@ -125,7 +125,7 @@ class Search:
 
     """
 
-    fit: Fit
+    fit: CommandFit
     probability: Tensor
     evidence: Tensor
 
@@ -136,7 +136,7 @@ def fitted(
     noise: Noise,
     start: Tensor,
     minimum_evidence: Tensor | None = None,
-) -> Fit:
+) -> CommandFit:
     """The most probable x (R, P) if the problem's segments were missed, and no others.
 
     Rows that are not predicted to reach the log evidence `minimum_evidence` (R,) are given up.
@@ -151,12 +151,12 @@ def fitted(
         minimum_evidence=None if minimum_evidence is None else minimum_evidence - log_probability,
     )
     evidence = solution.evidence + log_probability - prior.excess(solution.x).sum(dim=1)
-    return Fit(solution, problem.missed, evidence)
+    return CommandFit(solution, problem.missed, evidence)
 
 
 def searched(
-    problem: CommandProblem, prior: LatentPrior, noise: Noise, start: Fit, suspects: Suspects
-) -> Search:
+    problem: CommandProblem, prior: LatentPrior, noise: Noise, start: CommandFit, suspects: Suspects
+) -> MissedSearch:
     """The most probable missed segments, from those of `start` on.
 
     Of each row the flip that gains most is kept, and rows in which one gained are searched again.
@@ -185,4 +185,4 @@ def searched(
         fit = fit.put(rows, tried[best])
         if not len(rows):
             break
-    return Search(fit, probability, total)
+    return MissedSearch(fit, probability, total)

@@ -15,7 +15,7 @@ from retwin.update.identification.mcmc import MCMC
 from retwin.update.identification.misfit import misfit_of
 from retwin.update.identification.npe import NPE
 from retwin.update.identification.posterior import Posterior, PosteriorTwin
-from retwin.update.identification.problem import Problem
+from retwin.update.identification.problem import BoxProblem
 from retwin.update.identification.summaries import Summaries, outlyingness
 
 __all__ = ["calibration_ranks", "infer_posterior"]
@@ -45,7 +45,7 @@ def infer_posterior(
     with misfit_of(twin, observed, seed=seed, rate=rate, processes=processes) as misfit:
         seeds = np.random.SeedSequence(seed).generate_state(4).tolist()
         for_method, for_check, for_kept, for_prior = seeds
-        problem = Problem(misfit, method.noise, for_prior)
+        problem = BoxProblem(misfit, method.noise, for_prior)
         points, figures, warning = method.sample(problem, seed=for_method, progress=progress)
         p_value = _prior_predictive(problem, np.random.default_rng(for_check))
         order = np.random.default_rng(for_kept).permutation(len(points))[:MAX_DRAWS]
@@ -83,7 +83,7 @@ def infer_posterior(
     )
 
 
-def _prior_predictive(problem: Problem, rng: np.random.Generator) -> float:
+def _prior_predictive(problem: BoxProblem, rng: np.random.Generator) -> float:
     """The prior predictive p-value of the measured data."""
     points, paths = problem.prior
     seen = problem.misfit.seen
@@ -133,7 +133,7 @@ def calibration_ranks(
     """
     blank = twin.simulate(commands, seed=0)
     with misfit_of(twin, blank, seed=0, rate=rate, processes=1) as misfit:
-        problem = Problem(misfit, method.noise, 0)
+        problem = BoxProblem(misfit, method.noise, 0)
     ranks = np.empty((count, len(twin.names)))
     for i, sequence in enumerate(np.random.SeedSequence(seed).spawn(count)):
         rng = np.random.default_rng(sequence)
@@ -150,12 +150,12 @@ def _posterior(
     twin: ParametricTwin,
     data: Trajectories,
     method: MCMC | NPE,
-    problem: Problem,
+    problem: BoxProblem,
     seed: int,
     rate: float | None,
 ) -> NDArray:
     """Draws (s, k) of the parameters."""
     with misfit_of(twin, data, seed=0, rate=rate, processes=1) as misfit:
-        own = Problem(misfit, problem.noise, seed)
+        own = BoxProblem(misfit, problem.noise, seed)
         points, _, _ = method.sample(own, seed=seed, progress=None)
     return own.physical(points)[0]

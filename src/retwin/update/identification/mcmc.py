@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from retwin.checks import needs_extra, require, whole
 from retwin.progress import Progress
 from retwin.update.identification.noise import Noise
-from retwin.update.identification.problem import Problem
+from retwin.update.identification.problem import BoxProblem
 from retwin.update.identification.search import LeastSquares, Search
 
 __all__ = ["MCMC"]
@@ -57,7 +57,7 @@ class MCMC:
             whole(name, getattr(self, name), least=1)
 
     def sample(
-        self, problem: Problem, *, seed: int, progress: Progress | None
+        self, problem: BoxProblem, *, seed: int, progress: Progress | None
     ) -> tuple[NDArray, dict[str, float], str]:
         """Points (s, k + q), figures, and a warning, or "" where there is none."""
         emcee = needs_extra("emcee", "bayes", "samples posteriors")
@@ -96,7 +96,7 @@ class MCMC:
         warning = "" if independent >= MIN_EFFECTIVE_SAMPLES else short
         return chain.reshape(-1, problem.size), figures, warning
 
-    def _begin(self, problem: Problem, rng: np.random.Generator) -> NDArray:
+    def _begin(self, problem: BoxProblem, rng: np.random.Generator) -> NDArray:
         """Initial points (walkers, k + q) about the best fit."""
         search = Search(problem.misfit, LeastSquares(self.starts, loss="soft_l1"), None)
         _, best = search.run(rng)[0]

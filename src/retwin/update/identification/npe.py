@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from retwin.checks import needs_extra, whole
 from retwin.progress import Progress
 from retwin.update.identification.noise import Noise
-from retwin.update.identification.problem import Problem
+from retwin.update.identification.problem import BoxProblem
 from retwin.update.identification.summaries import Summaries
 
 __all__ = ["NPE"]
@@ -82,7 +82,7 @@ class NPE:
         whole("max_epochs", self.max_epochs, least=1)
 
     def sample(
-        self, problem: Problem, *, seed: int, progress: Progress | None
+        self, problem: BoxProblem, *, seed: int, progress: Progress | None
     ) -> tuple[NDArray, dict[str, float], str]:
         """Points (s, k + q), figures, and a warning, which is empty."""
         rng = np.random.default_rng(seed)

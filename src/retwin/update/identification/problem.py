@@ -11,7 +11,7 @@ from retwin.update.identification.misfit import Misfit
 from retwin.update.identification.noise import Noise
 from retwin.update.identification.summaries import Summaries
 
-__all__ = ["Problem"]
+__all__ = ["BoxProblem"]
 
 PRIOR_DRAWS = 200
 """Draws from the prior whose simulations the measured data are compared with."""
@@ -21,7 +21,7 @@ VALUES_PER_BATCH = 64
 """Values of the parameters that are simulated in one batch, which bounds the memory."""
 
 
-class Problem:
+class BoxProblem:
     """Points are (k + q,): parameters and logarithms of scales, in widths of their bounds.
 
     The prior is uniform on the unit box: uniform in the parameters, log-uniform in the scales.

@@ -31,7 +31,7 @@ from retwin.twins.parametric import Parameter
 from retwin.twins.state import State
 from retwin.twins.state_twin import StateTwin
 
-__all__ = ["Equations", "Scale"]
+__all__ = ["ChannelScale", "Equations"]
 
 PAST = 10
 """Least number of past samples from which the first estimate of the states is made."""
@@ -44,7 +44,7 @@ WIDEST = 1e9
 
 
 @dataclass(frozen=True, eq=False)
-class Scale:
+class ChannelScale:
     """Means and standard deviations of channels.
 
     Attributes
@@ -58,7 +58,7 @@ class Scale:
     deviation: NDArray
 
     @classmethod
-    def of(cls, values: NDArray) -> Scale:
+    def of(cls, values: NDArray) -> ChannelScale:
         """The scale of values (n, T, d)."""
         mean, deviation = values.mean(axis=(0, 1)), values.std(axis=(0, 1))
         small = deviation <= 1e-9 * np.abs(mean)
@@ -94,8 +94,8 @@ class Equations:
 
     arrays: dict[str, NDArray]
     speed: NDArray
-    given: Scale
-    outputs: Scale
+    given: ChannelScale
+    outputs: ChannelScale
 
     @classmethod
     def begun(
@@ -107,7 +107,7 @@ class Equations:
         """
         whole = made[np.flatnonzero(made.mask.all(axis=(1, 2)))]
         v, y = (np.asarray(each, np.float64) for each in (whole.commands, whole.observed))
-        given, outputs = Scale.of(v), Scale.of(y)
+        given, outputs = ChannelScale.of(v), ChannelScale.of(y)
         v, y = given(v), outputs(y)
         a, b, c, out, direct, e = model = _linear(v, y, order)
         begin = _start(model, v, y)

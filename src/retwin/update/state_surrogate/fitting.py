@@ -21,7 +21,7 @@ from retwin.twins.samplers import CommandSampler
 from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import Twin, checked_seed
-from retwin.update.state_surrogate.equations import Scale
+from retwin.update.state_surrogate.equations import ChannelScale
 from retwin.update.state_surrogate.search import Found, relative_error, searched
 from retwin.update.state_surrogate.simulations import (
     MIN_SIMULATIONS,
@@ -329,7 +329,7 @@ def _enough(
         return 0.0
     seen = observed.mask & expected.mask
     used = training.mask.all(axis=2)
-    deviation = Scale.of(training.observed[used][None]).deviation
+    deviation = ChannelScale.of(training.observed[used][None]).deviation
     sizes = relative_error(observed.observed - expected.observed, seen, deviation)
     return share * float(sizes[seen.any(axis=(0, 1))].min(initial=np.inf))
 
