@@ -26,8 +26,9 @@ from retwin.study.work import Work
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def case() -> rt.Case:
+    """In place of the arm's default case; of the same scope, since sets of the session need it."""
     return small_case()
 
 
