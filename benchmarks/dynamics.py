@@ -27,6 +27,7 @@ import retwin as rt
 from retwin.cases.silver_box.twin import SILVERBOX
 from retwin.cases.styrofoam_incubator.case import WARM_UP, measurements
 from retwin.cases.styrofoam_incubator.twin import INCUBATOR
+from retwin.scores.distributions import quantiles
 from retwin.update import (
     Dynamics,
     FittedDynamics,
@@ -72,7 +73,7 @@ def free(fitted: FittedDynamics, test: rt.Trajectories) -> Row:
     """A record simulated from its commands alone."""
     mask = test.mask[0, :, 0]
     made = fitted.twin.simulate(np.repeat(test.commands, DRAWS, axis=0), seed=0)
-    low, high = np.quantile(made.observed[:, :, 0], [0.05, 0.95], axis=0)
+    low, high = quantiles(made.observed[:, :, 0], [0.05, 0.95])
     inside = (low <= test.observed[0, :, 0]) & (test.observed[0, :, 0] <= high)
     error = (made.nominal[0] - test.observed[0])[mask]
     share, *interval = covered(inside[mask])
