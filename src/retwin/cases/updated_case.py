@@ -28,7 +28,7 @@ STEP = 2
 """Samples within which a command that moves is a step, and no ramp."""
 SUFFICIENT = 0.1
 """Error of learned state equations, over the discrepancy of the twin, that is small beside it: the
-root mean square of both together is 0.1 % larger."""
+root mean square of both together is 0.5 % larger."""
 STATE_EQUATIONS = (
     "For retwin fit --dynamics: the state equations, which the twin does not show, are learned "
     "from simulations until their error is this share of the twin's discrepancy in the logs."

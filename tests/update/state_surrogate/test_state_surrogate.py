@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from retwin.update import (
     fit_state_surrogate,
     identify,
 )
+from retwin.update.dynamics.estimation import Estimation
 
 RATE = 10.0
 FORCE, POSITION = rt.Channels(("force",), ("N",)), rt.Channels(("position",), ("m",))
@@ -169,6 +172,32 @@ def test_an_error_beside_which_the_discrepancy_is_small_is_refused() -> None:
     near = near.replace(observed=near.observed + 1e-6)
     with pytest.raises(InputError, match=r"observed.*twin's discrepancy.*more simulations"):
         fit_state_surrogate(GAINS, SHORT, near, SMALL)
+
+
+def test_the_search_ends_where_its_error_is_small_beside_the_discrepancy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It takes fewer simulations with derivatives, and its error is the share that was wanted."""
+    runs = [0]
+
+    def counted(*given: Any) -> Any:
+        runs[-1] += 1
+        return linearised(*given)
+
+    linearised = Estimation.linearised
+    monkeypatch.setattr(Estimation, "linearised", counted)
+    commands = SHORT.sample(2, rng=np.random.default_rng(3))
+    far = GAINS.simulate(commands, seed=0)
+    far = far.replace(observed=1.5 * far.observed)
+    errors = []
+    for share in (0.0, 0.2):
+        runs.append(0)
+        found = fit_state_surrogate(GAINS, SHORT, far, replace(SMALL, sufficient=share))
+        errors.append(found.figures["own_position"] / found.figures["discrepancy_position"])
+    assert runs[2] < 0.6 * runs[1]
+    assert errors[0] < errors[1] < 0.4
+    with pytest.raises(InputError, match="sufficient"):
+        StateSurrogate(sufficient=0.9)
 
 
 def test_a_constant_output_and_another_rate_are_refused() -> None:

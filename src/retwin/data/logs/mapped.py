@@ -217,9 +217,11 @@ class Parts:
         if self.split:
             notes.append(f"{self.split} times a trajectory ends where a command is missing")
         if self.short:
-            notes.append(f"{self.short} parts were too short, or without all commands")
+            were = "part was" if self.short == 1 else "parts were"
+            notes.append(f"{self.short} {were} too short, or without all commands")
         if self.unmeasured:
-            notes.append(f"{self.unmeasured} parts had no measurement")
+            parts = "part" if self.unmeasured == 1 else "parts"
+            notes.append(f"{self.unmeasured} {parts} had no measurement")
         return notes
 
 

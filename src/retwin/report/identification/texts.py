@@ -166,8 +166,8 @@ def _begins(found: Identification) -> Iterator[str]:
         shown = ", ".join(f"{name} ({ratio:.1f} times)" for name, ratio in larger.items())
         yield (
             f"The error is larger in the first tenth of the trajectories than later: {shown}. "
-            "The system did not begin in the state in which the twin starts, as after a pause of "
-            "the log: leave that time out (--transient), or free the start of the state."
+            "Probably the system did not begin in the state in which the twin starts, as after a "
+            "pause of the log: leave that time out (--transient), or free the start of the state."
         )
 
 
