@@ -27,7 +27,7 @@ from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import DelayOffset
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["ExportedActuator", "export_actuator"]
+__all__ = ["ExportedActuator", "Standard", "export_actuator", "write_script"]
 
 PARITY = 1e-5
 """Greatest difference between a written file and torch, relative to the range of each output."""
@@ -188,7 +188,7 @@ def _actuators(
         assert isinstance(twin.surrogate, Surrogate)
         before, network, after = (getattr(twin.surrogate, each) for each in PARTS)
         network = copy.deepcopy(network).requires_grad_(False)
-        plant = nn.Sequential(_Standard(before, False), network, _Standard(after, True))
+        plant = nn.Sequential(Standard(before, False), network, Standard(after, True))
     step = ActuatorStep(
         plant,
         gain=found.gain,
@@ -205,7 +205,7 @@ def _actuators(
     return Actuators(step, delay, found.offset, found.probability, length).eval()
 
 
-class _Standard(nn.Module):
+class Standard(nn.Module):
     """To standard units of a standardisation, or back: torch.jit cannot read that of `nets`."""
 
     if TYPE_CHECKING:  # torch.jit reads no annotations of a class
@@ -219,6 +219,7 @@ class _Standard(nn.Module):
         self.register_buffer("scale", units.scale.clone())
 
     def forward(self, values: Tensor) -> Tensor:
+        """Values (..., d) in the other units."""
         return values * self.scale + self.mean if self.back else (values - self.mean) / self.scale
 
 
@@ -257,16 +258,21 @@ def _check(what: str, found: Tensor, expected: Tensor) -> None:
 def _write_script(actuators: Actuators, path: Path, commands: NDArray) -> None:
     """The TorchScript file, read again and compared."""
     expected = _expected(actuators, commands)
-    with warnings.catch_warnings():
-        # Isaac Lab and mjlab read TorchScript, which torch calls deprecated.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        torch.jit.save(torch.jit.script(actuators), str(path))
-        _without_sources(path)
-        again: Any = torch.jit.load(str(path))
+    again = write_script(actuators, path)
     rows, sent, uniform = _examples(actuators, commands)
     again.start(sent[0], rows)
     found = [again(u, noise) for u, noise in zip(sent, uniform, strict=True)]
     _check("TorchScript", torch.stack(found), expected)
+
+
+def write_script(module: nn.Module, path: Path) -> Any:
+    """Write a module as TorchScript, and read it again."""
+    with warnings.catch_warnings():
+        # Isaac Lab and mjlab read TorchScript, which torch calls deprecated.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.jit.save(torch.jit.script(module), str(path))
+        _without_sources(path)
+        return torch.jit.load(str(path))
 
 
 def _without_sources(path: Path) -> None:

@@ -1,0 +1,110 @@
+"""Actuator nets: torque by position error and velocity, called as Isaac Lab documents."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import retwin as rt
+from retwin.deploy import ExportedActuatorNet, Joint, export_actuator_net
+from retwin.errors import InputError
+from retwin.twins import Parameter, State, StateTwin
+
+STIFFNESS, DAMPING = 12.0, 0.8
+JOINTS = [Joint(f"target {i}", f"angle {i}", f"torque {i}", f"speed {i}") for i in (1, 2)]
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.:DeprecationWarning")
+
+
+def arm(positions: str = "rad") -> StateTwin:
+    """An emulated arm of two equal drives, whose torques are outputs."""
+    return StateTwin(
+        tuple(State(f"{what} {i}", "rad", 0.0) for i in (1, 2) for what in ("q", "v")),
+        lambda x, u, p: (
+            x[0], x[1], p.stiffness * (u[0] - x[0]) - DAMPING * x[1],
+            x[2], x[3], p.stiffness * (u[1] - x[2]) - DAMPING * x[3],
+        ),
+        rt.Channels(("target 1", "target 2"), ("rad", "rad")),
+        rt.Channels(
+            tuple(f"{what} {i}" for i in (1, 2) for what in ("angle", "speed", "torque")),
+            (positions, "rad/s", "N m") * 2,
+        ),
+        50.0,
+        derivative=lambda x, u, p: (
+            x[1], p.stiffness * (u[0] - x[0]) - 2 * x[1],
+            x[3], p.stiffness * (u[1] - x[2]) - 3 * x[3],
+        ),
+        parameters=(Parameter("stiffness", "N m/rad", 1.0, 50.0, STIFFNESS),),
+    )  # fmt: skip
+
+
+def held(count: int, seed: int) -> np.ndarray:
+    levels = np.random.default_rng(seed).uniform(-1, 1, (count, 8, 2))
+    return np.concatenate([np.zeros((count, 5, 2)), levels.repeat(15, axis=1)], axis=1)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> ExportedActuatorNet:
+    return export_actuator_net(
+        arm(), tmp_path_factory.mktemp("net") / "net.pt", joints=JOINTS, commands=held(12, 0),
+        seed=0, history=(0, 2), training=rt.Training(max_epochs=12, learning_rate=1e-2),
+    )  # fmt: skip
+
+
+class Drive:
+    """Stands in for `ActuatorNetMLP`, from its documentation: histories, scales, one network."""
+
+    def __init__(self, cfg: Any, robots: int, joints: int) -> None:
+        self.cfg, self.shape = cfg, (robots, joints)
+        self.network = torch.jit.load(str(cfg.network_file)).eval()
+        self.past = torch.zeros(2, max(cfg.input_idx) + 1, robots, joints)
+
+    def compute(self, target: torch.Tensor, position: torch.Tensor, velocity: torch.Tensor) -> Any:
+        now = torch.stack([target - position, velocity])
+        self.past = torch.cat([now[:, None], self.past[:, :-1]], dim=1)
+        rows = [self.past[:, i].flatten(1) for i in self.cfg.input_idx]
+        error, speed = torch.stack(rows, dim=-1)
+        parts = [error * self.cfg.pos_scale, speed * self.cfg.vel_scale]
+        order = (0, 1) if self.cfg.input_order == "pos_vel" else (1, 0)
+        made = self.network(torch.cat([parts[k] for k in order], dim=1))
+        return made.view(self.shape) * self.cfg.torque_scale
+
+
+@pytest.mark.slow
+def test_its_torques_are_those_of_the_twin(exported: ExportedActuatorNet) -> None:
+    assert (exported.input_idx, exported.period, exported.unit) == ((0, 2), 0.02, "N m")
+    robots = 6
+    made = arm().simulate(held(robots, 7), seed=0)
+    drive = Drive(exported, robots, 2)
+    series = made.observed.copy().reshape(robots, made.steps, 2, 3)
+    found = []
+    for k in range(made.steps):
+        position, speed = (torch.as_tensor(series[:, k, :, i]).float() for i in (0, 1))
+        target = torch.as_tensor(made.commands[:, k].copy()).float()
+        found.append(drive.compute(target, position, speed))
+    torques = torch.stack(found, dim=1).numpy()
+    truth = series[..., 2]
+    error = np.sqrt(np.mean((torques - truth) ** 2)) / truth.std()
+    assert error < 0.05
+    assert exported.error == pytest.approx(error, rel=0.6, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("joint", "unit", "message"),
+    [
+        (Joint("target 1", "angle 1", "current"), "rad", "current.*effective position targets"),
+        (Joint("angle 1", "angle 1", "torque 1"), "rad", "target among target 1, target 2"),
+        (Joint("target 1", "angle 1", "torque 1"), "deg", "unit of its target"),
+    ],
+)
+def test_without_torques_it_is_refused(
+    joint: Joint, unit: str, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=f"(?s){message}"):
+        export_actuator_net(
+            arm(unit), tmp_path / "net.pt", joints=[joint], commands=held(12, 0), seed=0
+        )
+    assert not list(tmp_path.iterdir())
