@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from retwin.checks import instance
 from retwin.cli.options import CaseArgument, Json, LogMapping, Model, Seed
 from retwin.cli.reading import case_named, read, updated_twin
 from retwin.cli.terminal import answer, bar, note, table
@@ -43,9 +42,7 @@ def propose(
     check_target(out)
     system = case_named(case)
     assert system is not None
-    twin: Any = instance(
-        "model", updated_twin(model), rt.CorrectedTwin, remedy="fit it without --dynamics"
-    )
+    twin = updated_twin(model)
     calibration = read(real, system, mapping=mapping)
     with bar("next") as show:
         made = rt.next_experiments(
@@ -58,7 +55,10 @@ def propose(
             tolerance=tolerance,
             progress=lambda share: show("", share),
         )
-    nominal = twin.surrogate.predict(made.commands)
+    if isinstance(twin, rt.CorrectedTwin):
+        nominal = twin.surrogate.predict(made.commands)
+    else:
+        nominal = twin.simulate(made.commands, seed=seed).nominal
     commands = rt.Trajectories(
         made.commands,
         nominal,
@@ -68,7 +68,8 @@ def propose(
         outputs=twin.outputs,
     )
     rt.save(commands, out)
-    answer(_values(made, out), _ahead(made), _curve(made), _verdict(made), as_json=as_json)
+    curve = [_curve(made)] if made.curve else []
+    answer(_values(made, out), _ahead(made), *curve, _verdict(made), as_json=as_json)
     note(f"Saved {len(made.commands)} trajectories of commands to {out}")
 
 

@@ -13,6 +13,7 @@ from scipy.stats import norm
 from retwin.checks import at_least, finite, instance, require, whole
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.evaluation.experiments.actuators import ActuatorKnowledge
+from retwin.evaluation.experiments.dynamics import DynamicsKnowledge
 from retwin.evaluation.experiments.segments import SegmentKnowledge
 from retwin.inference.design import Knowledge, chosen
 from retwin.nets.student import widening
@@ -21,6 +22,7 @@ from retwin.twins.samplers import CommandSampler
 from retwin.twins.twin import checked_seed
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Chain, CommandSpace, SampledSensor
+from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.residual import ResidualModel, infer_discrepancy
 
 __all__ = ["Expected", "Measured", "Proposal", "next_experiments"]
@@ -104,7 +106,7 @@ class Proposal:
     ahead_random : tuple of Expected
         The same for random commands, with the interval over their draws.
     curve : tuple of Measured
-        Learning curve on subsets of the calibration trajectories.
+        Learning curve on subsets of the calibration trajectories; none for corrected dynamics.
     needed, needed_random : int or None
         How many chosen or random trajectories are expected to be enough; None if more than 60.
     tolerance : float
@@ -129,7 +131,7 @@ class Proposal:
 
 
 def next_experiments(
-    twin: CorrectedTwin,
+    twin: CorrectedTwin | DynamicsTwin,
     calibration: Trajectories,
     sampler: CommandSampler,
     *,
@@ -143,15 +145,17 @@ def next_experiments(
 
     Candidates are commands of the sampler, within its limits. They are chosen one after the other
     by how much their outputs, given those before, would inform on the discrepancy at other
-    commands of the sampler: with `CommandSpace` by the posterior of its inference, otherwise by
-    that of a linear regression of z on features of the commands.
+    commands of the sampler: with `CommandSpace` by the posterior of its inference, with corrected
+    dynamics by that of their parameters, otherwise by that of a linear regression of z on features
+    of the commands.
 
     Parameters
     ----------
-    twin : CorrectedTwin
-        With one z per segment.
+    twin : CorrectedTwin or DynamicsTwin
+        With one z per segment, or with corrected dynamics.
     calibration : Trajectories
-        The healthy trajectories that it was calibrated on, at least three; others are left out.
+        The healthy trajectories that it was calibrated on; others are left out. At least three, of
+        corrected dynamics one.
     sampler : CommandSampler
         The distribution of the commands for which the twin is to predict.
     seed : int
@@ -183,7 +187,8 @@ def next_experiments(
     rng = np.random.default_rng(checked_seed(seed))
     healthy = calibration[np.flatnonzero(np.isin(calibration.labels, [HEALTHY, ""]))]
     remedy = "record any healthy ones first"
-    at_least("calibration", healthy, MIN_TRAJECTORIES, "healthy trajectories", remedy=remedy)
+    least = 1 if isinstance(twin, DynamicsTwin) else MIN_TRAJECTORIES
+    at_least("calibration", healthy, least, "healthy trajectories", remedy=remedy)
     references = sampler.sample(REFERENCES, rng=rng)
     known, curve = _known(twin, healthy, references, rng)
     show(0.6)
@@ -220,15 +225,16 @@ def next_experiments(
 def _check(twin: object, sampler: CommandSampler, count: int, candidates: int) -> None:
     whole("count", count, least=1, most=FURTHER)
     whole("candidates", candidates, least=count, most=100_000)
-    instance("twin", twin, CorrectedTwin, remedy="give a corrected twin with one z per segment")
-    assert isinstance(twin, CorrectedTwin)
-    require(
-        isinstance(twin.residual, ResidualModel) and not bool(twin.residual.events.all()),
-        "twin",
-        expected="a corrected twin with one z per segment",
-        got=f"{type(twin.residual.correction).__name__}, with one per sample",
-        remedy="fit it with CommandSpace or DelayOffset",
-    )
+    if not isinstance(twin, DynamicsTwin):
+        instance("twin", twin, CorrectedTwin, remedy="give a corrected twin with one z per segment")
+        assert isinstance(twin, CorrectedTwin)
+        require(
+            isinstance(twin.residual, ResidualModel) and not bool(twin.residual.events.all()),
+            "twin",
+            expected="a corrected twin with one z per segment, or corrected dynamics",
+            got=f"{type(twin.residual.correction).__name__}, with one per sample",
+            remedy="fit it with CommandSpace or DelayOffset",
+        )
     require(
         sampler.rate == twin.rate,
         "sampler",
@@ -238,8 +244,10 @@ def _check(twin: object, sampler: CommandSampler, count: int, candidates: int) -
     )
 
 
-def _widenings(twin: CorrectedTwin, trajectories: int, count: int) -> NDArray:
+def _widenings(twin: CorrectedTwin | DynamicsTwin, trajectories: int, count: int) -> NDArray:
     """(count,) factors of bands since the scatter is estimated, from so many trajectories on."""
+    if isinstance(twin, DynamicsTwin):
+        return np.ones(count)  # noise is estimated from every sample
     degrees = min(twin.residual.degrees)
     total = trajectories + np.arange(count)
     return np.array([widening(degrees * each / trajectories) for each in total])
@@ -278,9 +286,14 @@ def _recall(excess: float) -> float:
 
 
 def _known(
-    twin: CorrectedTwin, healthy: Trajectories, references: NDArray, rng: np.random.Generator
-) -> tuple[ActuatorKnowledge | SegmentKnowledge, tuple[Measured, ...]]:
+    twin: CorrectedTwin | DynamicsTwin,
+    healthy: Trajectories,
+    references: NDArray,
+    rng: np.random.Generator,
+) -> tuple[ActuatorKnowledge | DynamicsKnowledge | SegmentKnowledge, tuple[Measured, ...]]:
     """What is known, and the learning curve so far."""
+    if isinstance(twin, DynamicsTwin):
+        return DynamicsKnowledge.of(twin), ()
     correction = twin.residual.correction
     sensed = isinstance(correction, Chain) and isinstance(correction.second, SampledSensor)
     operator = correction.first if isinstance(correction, Chain) and sensed else correction
