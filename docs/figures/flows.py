@@ -15,7 +15,8 @@ from style import BLUE, GREEN, MUTED, ORANGE, blank, save
 
 STEP, ROW = 3.4, 1.15
 """Distances of boxes, in the units of the drawing."""
-FLOWS: dict[str, tuple[str, tuple[tuple[tuple[str, str], ...], ...]]] = {
+Columns = tuple[tuple[tuple[str, str], ...], ...]
+FLOWS: dict[str, tuple[str, Columns] | tuple[str, Columns, tuple[tuple[int, int, int], ...]]] = {
     "flow-own-data": (
         "From a log to a set",
         (
@@ -60,13 +61,74 @@ FLOWS: dict[str, tuple[str, tuple[tuple[tuple[str, str], ...], ...]]] = {
             (("one Zarr folder", GREEN),),
         ),
     ),
+    "flow-own-twin": (
+        "One file describes a system; every command and function takes it",
+        (
+            (("twin.py\nthe simulator", MUTED), ("data.csv\nmeasured", MUTED)),
+            (("case.toml\nchannels, units,\nparameters", BLUE),),
+            (("retwin fit", GREEN), ("retwin study", GREEN), ("retwin monitor", GREEN)),
+        ),
+    ),
+    "flow-function": (
+        "Two ways to a twin from Python: a function, or equations that are compiled",
+        (
+            (("function of\ncommands", MUTED), ("ẋ = f(x, u, p)", MUTED)),
+            (("FunctionTwin", BLUE), ("StateTwin\ncompiled", BLUE)),
+            (("simulate", GREEN), ("identify", GREEN), ("fit_dynamics,\nC code, FMU", GREEN)),
+        ),
+        ((0, 0, 0), (0, 1, 1), (1, 0, 0), (1, 0, 1), (1, 1, 0), (1, 1, 1), (1, 1, 2)),
+    ),
+    "flow-fmu": (
+        "The FMU runs in processes of its own: a crash ends one trajectory",
+        (
+            (("Simulink,\nDymola, …", MUTED),),
+            (("plant.fmu", MUTED),),
+            (("worker 1", BLUE), ("worker 2", BLUE), ("worker 3 …", BLUE)),
+            (("FMUTwin\nis a Twin", GREEN),),
+        ),
+    ),
+    "flow-data": (
+        "All files become one type, which checks itself and knows where it comes from",
+        (
+            (("MAT, NPZ, Zarr", MUTED), ("CSV folders", MUTED), ("logs, with\na mapping", MUTED)),
+            (("Trajectories\nn runs, one grid", BLUE),),
+            (("commands\n(n, T, inputs)", GREEN), ("nominal, observed\n(n, T, outputs)", GREEN)),
+        ),
+    ),
+    "flow-next": (
+        "Which experiment next: the one that narrows the predictions most",
+        (
+            (("CorrectedTwin", MUTED), ("healthy\ntrajectories", MUTED), ("sampler", MUTED)),
+            (("next_experiments", BLUE),),
+            (("commands to\nsend", GREEN), ("enough, or\nhow many more", GREEN)),
+        ),
+    ),
+    "flow-identify": (
+        "Part of the measurements is held out, so that the result can be judged",
+        (
+            (("twin with free\nparameters", MUTED), ("logs", MUTED)),
+            (("identify", BLUE), ("held out", ORANGE)),
+            (("report.html", GREEN), ("updated twin,\ncalibrated FMU", GREEN)),
+        ),
+        ((0, 0, 0), (0, 1, 0), (0, 1, 1), (1, 0, 0), (1, 1, 0), (1, 0, 1)),
+    ),
+    "flow-actuator": (
+        "What the actuators execute, learned from outputs, for training of robots",
+        (
+            (("CorrectedTwin", MUTED), ("commands of\nthe task", MUTED)),
+            (("export_actuator", BLUE),),
+            (("actuator.pt", GREEN), ("actuator.onnx", GREEN)),
+            (("simulation of\nmany robots", MUTED),),
+        ),
+    ),
 }
-"""Name to its caption and its columns of boxes from left to right, each with its colour."""
+"""Name to its caption, its columns of boxes from left to right, each with its colour, and its lines
+(column, row, row in the next one); by default all."""
 
 
 def main() -> None:
     """Draw all of them."""
-    for name, (caption, columns) in FLOWS.items():
+    for name, (caption, columns, *lines) in FLOWS.items():
         rows = max(map(len, columns))
         figure = blank(7.4, 0.72 * rows + 0.5)
         axes = figure.subplots()
@@ -74,9 +136,10 @@ def main() -> None:
         axes.set_xlim(-1.2, STEP * (len(columns) - 1) + 1.2)
         axes.set_ylim(-ROW * (rows - 1) / 2 - 0.55, ROW * (rows - 1) / 2 + 0.55)
         for place, (left, right) in enumerate(pairwise(columns)):
-            for begin in heights(left):
-                for end in heights(right):
-                    line(axes, (STEP * place, begin), (STEP * (place + 1), end))
+            for i, begin in enumerate(heights(left)):
+                for j, end in enumerate(heights(right)):
+                    if not lines or (place, i, j) in lines[0]:
+                        line(axes, (STEP * place, begin), (STEP * (place + 1), end))
         for place, column in enumerate(columns):
             for (text, colour), height in zip(column, heights(column), strict=True):
                 box(axes, text, STEP * place, height, colour)
