@@ -315,7 +315,7 @@ def test_the_summary_prints_on_one_sheet(sheet: Page) -> None:
 
 
 def test_the_first_screen_answers(browser: Browser, study_page: Path) -> None:
-    """Before anything is opened: the error, the uses, the lights, and what speaks against it."""
+    """Before anything is opened: the error, the uses, what is next, the lights, the objections."""
     with browser.new_context(offline=True, viewport=SCREEN) as context:
         page = context.new_page()
         page.set_default_timeout(PATIENCE)
@@ -325,7 +325,7 @@ def test_the_first_screen_answers(browser: Browser, study_page: Path) -> None:
         text = page.inner_text(".answer")
         assert re.search(r"Error on healthy runs: [\d.]+ → [\d.]+ mm\.", text)
         assert "Ready for:" in text
-        assert "record at least" in text
+        assert "Record at least" in text
         assert page.locator(".lights > div").count() == 4
         assert "emulated" in page.inner_text(".against")
         box = page.locator(".lights").bounding_box()
