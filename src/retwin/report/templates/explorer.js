@@ -237,7 +237,7 @@
       }).filter((group) => group.children.length));
     }
     sequence = Array.from(at("pick").options, (each) => Number(each.value));
-    if (!sequence.length) at("answer").textContent = "No trajectory is like this.";
+    if (!sequence.length) at("answer").textContent = "No trajectory matches these choices.";
     else if (!sequence.includes(picked)) pick(sequence[0]);
     else at("pick").value = String(picked);
   };
