@@ -73,7 +73,7 @@ class Compared:
     @property
     def unmeasured(self) -> NDArray:
         """Whether nothing was measured, (n,) bool."""
-        made: NDArray = ~self.measured.any(axis=1)
+        made: NDArray = np.asarray(~self.measured.any(axis=1))
         return made
 
 
