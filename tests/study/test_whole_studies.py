@@ -60,14 +60,14 @@ def test_every_source_is_made(
 @pytest.mark.skipif(
     "RETWIN_DATA" not in os.environ, reason="RETWIN_DATA names the folder of the real data"
 )
-def test_the_whole_job_runs_on_the_public_files(tmp_path: Path) -> None:
+def test_the_whole_job_runs_on_the_public_files(case: rt.Case, tmp_path: Path) -> None:
     """The published twin (a tenth of it) and the real robot, commands recovered, two folds."""
     arm = Path(os.environ["RETWIN_DATA"]) / "armpi"
     real = next(f for n in ("real_a.mat", "my_dataset_test.mat") if (f := arm / n).exists())
     rt.save(rt.load(arm / "sim.mat", rate=100.0)[::10], tmp_path / "sim.npz")
     plan = rt.StudyPlan(sources=("dt", "ibg_rg"), runs=1, folds=2, per_class=40)
     data = rt.StudyData(twin=tmp_path / "sim.npz", real=real)
-    results = rt.run_study(small_case(), plan, data, tmp_path / "out", processes=1)
+    results = rt.run_study(case, plan, data, tmp_path / "out", processes=1)
     assert results.emulated is False
     assert results.published["ibg_rg"]["healthy_recall"] == "0.62"
     assert results.sources["ibg_rg"].runs("auroc")[0] > 0.8
