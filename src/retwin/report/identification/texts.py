@@ -131,24 +131,6 @@ def next_steps(found: Identification) -> list[str]:
     return [name for name, holds in needed.items() if holds] or ["use"]
 
 
-def next_steps(found: Identification) -> list[str]:
-    """What to do next, by names in the template: what is most worth the effort first."""
-    errors = found.errors(found.compared).values()
-    worse = any(each.ratio >= 1 or (each.interval or (0, 0))[1] >= 1 for each in errors)
-    lacks = any(
-        each.p_white < WHITE or any(test.p_value < WHITE for test in each.inputs)
-        for each in found.residuals
-    )
-    unsettled = bool(found.open_parameters) or any(each.at_bound for each in found.parameters)
-    needed = {
-        "settle": unsettled,
-        "hold_out": found.compared != "validation",
-        "correct": lacks,
-        "check": worse,
-    }
-    return [name for name, holds in needed.items() if holds] or ["use"]
-
-
 def _errors(found: Identification) -> Iterator[str]:
     """The error before and after."""
     part = found.compared
