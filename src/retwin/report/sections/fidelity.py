@@ -67,7 +67,7 @@ def fidelity(study: Study) -> Section | None:
     names = [each["source"] for each in details]
     shown = [figure for name in names for figure in figures[name].values()]
     further = [f for name in known if name not in names for f in figures[name].values()]
-    return Section("fidelity", "FidelityResults", values, shown, further)
+    return Section("fidelity", "Fidelity", values, shown, further)
 
 
 def _lengths(each: FidelityResults, energy: str) -> list[tuple[str, str, float, str]]:
