@@ -33,6 +33,7 @@ from retwin.data.trajectories import Channels, Trajectories
 from retwin.serialisation.files import sha256, write_atomically
 from retwin.serialisation.places import check_place
 from retwin.times import sample_rate
+from retwin.twins import FILES
 
 if TYPE_CHECKING:
     from retwin.data.logs.proposal import Proposal
@@ -235,6 +236,8 @@ def _channels_of(
             remedy="give --case too, or leave them out",
         )
         return None
+    if Path(name).suffix.lower() not in FILES and ":" not in name and not any(names):
+        return data_case(name)
     from retwin.cases.twin_data import log_case
 
     return log_case(name, inputs=names[0], outputs=names[1], mapping=mapping)
