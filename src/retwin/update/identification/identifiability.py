@@ -79,7 +79,9 @@ class Identifiability:
         """(k,), norms of the derivatives of the residuals by a parameter, over the largest; 0 for
         one without effect.
         """
-        norms = np.linalg.norm(self.singular_values[:, None] * self.directions, axis=0)
+        # Of exact measurements, singular values over the noise are too large to be squared.
+        size = self.singular_values / (float(self.singular_values.max(initial=0.0)) or 1.0)
+        norms = np.linalg.norm(size[:, None] * self.directions, axis=0)
         largest = float(norms.max(initial=0.0))
         made: NDArray = np.where(norms > RANK_TOLERANCE * largest, norms, 0.0) / (largest or 1.0)
         return made
