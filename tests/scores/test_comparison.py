@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from statsmodels.stats.multitest import multipletests
 
 from retwin.scores.comparison import compare_runs, compliance, holm, no_verdict, outcome
 
@@ -41,6 +40,8 @@ def test_one_run_has_no_welch() -> None:
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=8))
 @settings(max_examples=25, deadline=None)
 def test_holm_is_statsmodels_s(p: list[float]) -> None:
+    from statsmodels.stats.multitest import multipletests  # here, since it takes seconds
+
     np.testing.assert_allclose(holm(p), multipletests(p, method="holm")[1], atol=1e-12)
 
 
