@@ -150,15 +150,31 @@ def factors(ratio: NDArray, kappa: float) -> NDArray:
 def _diagnosed(
     diagnoser: Inversion, trajectories: Trajectories, progress: Progress | None
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Evidence (n, F + 1) of classes, NaN where implausible; `outside`; and offsets."""
-    if isinstance(diagnoser, InversionDiagnoser):
-        found = diagnoser.diagnose(trajectories, progress=progress)
-        return found.evidence, found.outside, found.offset
-    evidence = np.full((len(trajectories), len(diagnoser.faults) + 1), np.nan)
+    """Evidence (n, F + 1) of classes, NaN where implausible; `outside`; and offsets.
+
+    Trajectories are diagnosed one by one: the last digits of a batch depend on what else is in it,
+    and a monitor that is continued later has to find the same bytes.
+    """
+    found = []
     for i in range(len(trajectories)):
-        with suppress(ImplausibleError):
-            evidence[i] = diagnoser.diagnose(trajectories[[i]]).evidence[0]
+        found.append(_one(diagnoser, trajectories[[i]]))
         if progress is not None:
             progress((i + 1) / len(trajectories))
-    none = np.zeros((len(trajectories), 0, len(trajectories.inputs)))
-    return evidence, diagnoser.twin.outside(trajectories.commands), none
+    evidence, outside = (np.concatenate([each[k] for each in found]) for k in range(2))
+    most = max(each[2].shape[1] for each in found)  # alone, each has the segments that it has
+    offset = np.full((len(found), most, len(trajectories.inputs)), np.nan)
+    for row, each in zip(offset, found, strict=True):
+        row[: each[2].shape[1]] = each[2][0]
+    return evidence, outside, offset
+
+
+def _one(diagnoser: Inversion, trajectory: Trajectories) -> tuple[NDArray, NDArray, NDArray]:
+    """Those of one trajectory."""
+    if isinstance(diagnoser, InversionDiagnoser):
+        found = diagnoser.diagnose(trajectory)
+        return found.evidence, found.outside, found.offset
+    evidence = np.full((1, len(diagnoser.faults) + 1), np.nan)
+    with suppress(ImplausibleError):
+        evidence = diagnoser.diagnose(trajectory).evidence
+    none = np.zeros((1, 0, len(trajectory.inputs)))
+    return evidence, diagnoser.twin.outside(trajectory.commands), none
