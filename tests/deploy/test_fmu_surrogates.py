@@ -403,8 +403,9 @@ def test_delays_and_offsets_are_those_of_the_twin_for_the_same_z(
     quantiles = np.quantile(expected[1:], [0.05, 0.95], axis=0)
     pairs = ((outputs, expected[0]), (mean, expected[1:].mean(0)), (low, quantiles[0]))
     for here, there in (*pairs, (high, quantiles[1])):
-        # Nominal outputs of the twin are in single precision.
-        np.testing.assert_allclose(here / spread, there / spread, rtol=1.2e-7, atol=1e-5)
+        # Paths of the twin are in single precision: nominal outputs, their interpolation, offsets.
+        rounding = 4 * float(np.finfo(np.float32).eps)
+        np.testing.assert_allclose(here / spread, there / spread, rtol=rounding, atol=1e-5)
     assert (high > low).all()
 
 
