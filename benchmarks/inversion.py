@@ -95,7 +95,7 @@ def severities(
 def left_out(found: Diagnosis, truth: np.ndarray) -> dict[str, float]:
     """How well a fault that is left out of the hypotheses is distinguished from all classes."""
     areas = [
-        roc_auc_score(truth == fault, -np.delete(found.evidence, fault, axis=1).max(axis=1))
+        roc_auc_score(truth == fault, -np.delete(found.explained, fault, axis=1).max(axis=1))
         for fault in range(1, len(found.classes))
     ]
     known = np.mean(found.unknown > 0.5)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scipy.stats import multivariate_normal
+from scipy.stats import entropy, multivariate_normal
 from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
@@ -141,6 +141,10 @@ def test_limits_of_a_bias_are_integrated(mean: tuple[float, float]) -> None:
     believed = np.exp(-0.5 * (grid / width) ** 2).prod(axis=-1) / (2 * np.pi * width**2)
     mass = multivariate_normal(mean, covariance).pdf(grid) / believed / (2 * (high - low)) ** 2
     np.testing.assert_allclose(drawn.gain[0], np.log(mass.sum() * 0.01), atol=0.03)
+    share, prior = mass / mass.sum(), (0.1 / (2 * (high - low))) ** 2
+    np.testing.assert_allclose(
+        drawn.information[0], -entropy(share, axis=None) - np.log(prior), atol=0.03
+    )
     average = (grid * mass[..., None]).sum(axis=(0, 1)) / mass.sum()
     summary = drawn.summary(0.9)[0]
     np.testing.assert_allclose(summary[:, 0], average, atol=0.5)
@@ -242,6 +246,16 @@ def test_a_biased_actuator_may_also_miss_segments(toy_diagnoser: InversionDiagno
     assert (found.probabilities[away, 2] > 0.9).all()
 
 
+def test_a_fault_of_any_size_is_not_unknown(toy_diagnoser: InversionDiagnoser) -> None:
+    """Wide limits cost evidence in every segment, and explain the outputs as well."""
+    made = toy(12, "Second biased", 19)[0]
+    wide = toy_diagnoser.with_faults({"Second biased": rt.ActuatorBias(1, size=(0.0, 50.0))})
+    found, other = toy_diagnoser.diagnose(made), wide.diagnose(made)
+    assert (found.evidence[:, 2] - other.evidence[:, 2] > 10).all()
+    assert np.median(np.abs(found.explained[:, 2] - other.explained[:, 2])) < 2
+    assert ((found.unknown < 0.5) & (other.unknown < 0.5)).sum() >= 10
+
+
 @pytest.fixture(scope="module")
 def inversion(exact, emulated: rt.Trajectories, case: rt.Case) -> InversionDiagnoser:
     """Calibrated on eight healthy trajectories of the emulated arm, with the twin itself.
@@ -287,7 +301,7 @@ def test_a_fault_that_is_left_out_is_unknown(
     areas = []
     assert np.mean(diagnosis.unknown < 0.5) >= 0.9
     for left in range(1, len(diagnosis.classes)):
-        kept = np.delete(diagnosis.evidence, left, axis=1)
+        kept = np.delete(diagnosis.explained, left, axis=1)
         own = arm[0].labels == diagnosis.classes[left]
         areas.append(roc_auc_score(own, -kept.max(axis=1)))
     assert np.mean(areas) >= 0.9

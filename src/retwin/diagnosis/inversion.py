@@ -17,7 +17,7 @@ from typing import overload
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import expit, logsumexp
+from scipy.special import expit
 from scipy.stats import t as student
 from torch import Tensor
 
@@ -68,6 +68,10 @@ class Diagnosis:
         (n, C), each row sums to one.
     evidence : NDArray
         (n, C), log marginal likelihood of the outputs, up to a constant of each trajectory.
+    explained : NDArray
+        (n, C), the evidence without what it has lost to the open onset and bias of a fault: on
+        average the log likelihood with their true values. It states how well a class explains the
+        outputs, whatever its freedom, and is compared with `InversionDiagnoser.bound`.
     level : Estimate
         (n, C), where a stuck actuator stands, in its command's unit.
     onset : Estimate
@@ -88,6 +92,7 @@ class Diagnosis:
     classes: tuple[str, ...]
     probabilities: NDArray
     evidence: NDArray
+    explained: NDArray
     level: Estimate
     onset: Estimate
     bias: Estimate
@@ -111,6 +116,8 @@ class Inversion:
     ----------
     evidence : Tensor
         (R,), log marginal likelihood, up to a constant of each trajectory.
+    information : Tensor
+        (R,), in nats, what the outputs have added to the prior of the fault's onset and bias.
     level, level_deviation : Tensor
         (R,), where the faulty actuator is in the end, in its command's unit.
     onsets : Onsets
@@ -123,6 +130,7 @@ class Inversion:
     """
 
     evidence: Tensor
+    information: Tensor
     level: Tensor
     level_deviation: Tensor
     onsets: Onsets
@@ -138,9 +146,11 @@ def invert(rows: Hypotheses, noise: Noise) -> Inversion:
     fit = found.fit
     # What is beyond the limits of a bias counted in the search; `biases` integrates over them.
     evidence = found.evidence + held.prior.excess(fit.x).sum(dim=1)
-    bias, gain = biases(held, fit, COVERAGE)
+    bias, gain, of_bias = biases(held, fit, COVERAGE)
     level, deviation = stuck_level(held, fit, onsets.best, noise)
-    return Inversion(evidence + onsets.gain + gain, level, deviation, onsets, bias, fit)
+    information = onsets.information + of_bias
+    evidence = evidence + onsets.gain + gain
+    return Inversion(evidence, information, level, deviation, onsets, bias, fit)
 
 
 class InversionDiagnoser:
@@ -236,7 +246,7 @@ class InversionDiagnoser:
             parts.append((*_severities(rows, found, len(faults)), offset))
             if progress is not None:
                 progress(min(1.0, (begin + TRAJECTORIES_PER_BATCH) / len(trajectories)))
-        evidence, level, onset, bias, offset = (
+        evidence, explained, level, onset, bias, offset = (
             np.concatenate(each) for each in zip(*parts, strict=True)
         )
         share = np.exp(evidence - evidence.max(axis=1, keepdims=True))
@@ -247,11 +257,12 @@ class InversionDiagnoser:
             self.classes,
             share / share.sum(axis=1, keepdims=True),
             evidence,
+            explained,
             levels,
             onsets,
             offsets,
             outside_training(self.surrogate, trajectories),
-            expit(self.bound * measured - logsumexp(evidence, axis=1)),
+            expit(self.bound * measured - explained.max(axis=1)),
             offset,
         )
 
@@ -425,7 +436,10 @@ def _offsets(rows: Hypotheses, found: Inversion, classes: int, healthy: int) -> 
 
 
 def _severities(rows: Hypotheses, found: Inversion, classes: int) -> tuple[NDArray, ...]:
-    """Evidence (n, C), and value, low and high of level, onset (n, C, 3) and bias (n, C, M, 3)."""
+    """Evidence and what is explained (n, C); value, low and high of level, onset and bias.
+
+    The latter are (n, C, 3) and (n, C, M, 3).
+    """
     half = NormalDist().inv_cdf(0.5 + COVERAGE / 2) * found.level_deviation
     level = torch.stack([found.level, found.level - half, found.level + half], dim=1)
     samples, probability = found.onsets.samples, found.onsets.probability
@@ -440,5 +454,5 @@ def _severities(rows: Hypotheses, found: Inversion, classes: int) -> tuple[NDArr
     onset = onset + delay.abs().mean(dim=1, keepdim=True) * torch.tensor([0.0, -1.0, 1.0])
     free = ~rows.stuck[:, None]
     level, onset = (each.masked_fill(free, torch.nan) for each in (level, onset))
-    every = (found.evidence, level, onset, found.bias)
+    every = (found.evidence, found.evidence + found.information, level, onset, found.bias)
     return tuple(each.unflatten(0, (-1, classes)).numpy() for each in every)

@@ -41,6 +41,8 @@ class Onsets:
         (R,), the most probable onset.
     gain : Tensor
         (R,), log evidence that all together have beyond that of the best.
+    information : Tensor
+        (R,), in nats, what the measurements have added to the prior of the onset.
 
     """
 
@@ -48,6 +50,7 @@ class Onsets:
     probability: Tensor
     best: Tensor
     gain: Tensor
+    information: Tensor
 
     @classmethod
     def of(cls, rows: Hypotheses, noise: Noise) -> Onsets:
@@ -60,10 +63,12 @@ class Onsets:
         probability = torch.zeros(samples.shape, dtype=torch.float64)
         probability[:, 0] = 1.0
         best, gain = first.clone(), torch.zeros(len(first), dtype=torch.float64)
+        information = torch.zeros_like(gain)
         if found is not None:
             samples[open_rows], probability[open_rows] = found.samples, found.probability
             best[open_rows], gain[open_rows] = found.best, found.gain
-        return cls(samples, probability, best, gain)
+            information[open_rows] = found.information
+        return cls(samples, probability, best, gain, information)
 
     @classmethod
     def _inferred(cls, rows: Hypotheses, noise: Noise) -> Onsets:
@@ -72,13 +77,19 @@ class Onsets:
         each = torch.arange(count).repeat_interleave(parts)
         samples, weight, best, evidence = _explained(rows[each], spans.flatten(0, 1), noise)
         first, last = rows.onsets.unbind(dim=1)
-        weight = weight - (last - first + 1).log()[each, None]
+        all_onsets = (last - first + 1).double()
+        weight = weight - all_onsets.log()[each, None]
+        prior = _cells(samples) / all_onsets[each, None]
         shape = (count, parts)
         at = evidence.unflatten(0, shape).argmax(dim=1, keepdim=True)
         own = evidence.unflatten(0, shape).gather(1, at)[:, 0]
         best = best.unflatten(0, shape).gather(1, at)[:, 0]
-        samples, weight = (each.unflatten(0, shape).flatten(1) for each in (samples, weight))
-        return cls(samples, weight.softmax(dim=1), best, weight.logsumexp(dim=1) - own)
+        samples, weight, prior = (
+            each.unflatten(0, shape).flatten(1) for each in (samples, weight, prior)
+        )
+        probability = weight.softmax(dim=1)
+        information = torch.special.xlogy(probability, probability / prior).sum(dim=1)
+        return cls(samples, probability, best, weight.logsumexp(dim=1) - own, information)
 
 
 def _spans(rows: Hypotheses) -> Tensor:

@@ -26,8 +26,8 @@ SMALLEST = 1e-300
 """Probability below which an interval counts as empty."""
 
 
-def biases(rows: Hypotheses, fit: CommandFit, coverage: float) -> tuple[Tensor, Tensor]:
-    """Mean and central interval of each segment's bias, and the log evidence that its limits add.
+def biases(rows: Hypotheses, fit: CommandFit, coverage: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean and central interval of each segment's bias, and what its limits add to the evidence.
 
     Parameters
     ----------
@@ -37,15 +37,17 @@ def biases(rows: Hypotheses, fit: CommandFit, coverage: float) -> tuple[Tensor, 
     Returns
     -------
     tuple of Tensor
-        (R, M, 3), NaN where there is no bias; and (R,).
+        (R, M, 3), NaN where there is no bias; (R,), log evidence that the limits add; and (R,), the
+        information about the bias, see `BiasDraws`.
 
     """
     place = rows.offset_index
     summary = torch.full((*place.shape, 3), torch.nan, dtype=torch.float64)
     gain = torch.zeros(len(place), dtype=torch.float64)
+    information = torch.zeros_like(gain)
     biased = (rows.width > 0).nonzero()[:, 0]
     if not len(biased):
-        return summary, gain
+        return summary, gain, information
     prior, width = rows.prior[biased].gaussian, rows.width[biased]
     square = width.square()[:, None, None]
     pick = torch.nn.functional.one_hot(place[biased], prior.mean.shape[1]).double()
@@ -59,7 +61,8 @@ def biases(rows: Hypotheses, fit: CommandFit, coverage: float) -> tuple[Tensor, 
         size=rows.size[biased],
     )
     summary[biased], gain[biased] = drawn.summary(coverage), drawn.gain
-    return summary, gain
+    information[biased] = drawn.information
+    return summary, gain, information
 
 
 def stuck_level(
@@ -104,12 +107,16 @@ class BiasDraws:
         (R, K), sum to one.
     gain : Tensor
         (R,), log evidence that the limits add to that of a Gaussian bias.
+    information : Tensor
+        (R,), in nats, what the measurements have added to the prior of the biases: the
+        Kullback-Leibler divergence of the posterior from it.
 
     """
 
     values: Tensor
     weights: Tensor
     gain: Tensor
+    information: Tensor
 
     def summary(self, coverage: float) -> Tensor:
         """Mean, and the ends of the central interval of that coverage, (R, M, 3)."""
@@ -162,7 +169,12 @@ def draw_biases(mean: Tensor, covariance: Tensor, *, width: Tensor, size: Tensor
     )
     log_weight = log_mass + (density - normal).sum(dim=-1)
     gain = log_weight.logsumexp(dim=1) - torch.log(torch.tensor(float(POINTS)))
-    return BiasDraws(values, log_weight.softmax(dim=1), gain)
+    weights = log_weight.softmax(dim=1)
+    # Posterior over prior: the Gaussian posterior over the Gaussian prior that `gain` is beyond.
+    spread = torch.log(factor.diagonal(dim1=1, dim2=2) * (2 * torch.pi) ** 0.5).sum(dim=1)
+    gaussian = -0.5 * noise.square().sum(dim=-1) - spread[:, None]
+    information = (weights * (gaussian - normal.sum(dim=-1))).sum(dim=1) - gain
+    return BiasDraws(values, weights, gain, information)
 
 
 def _inside(
