@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import textwrap
 from pathlib import Path
@@ -14,6 +13,7 @@ from retwin.cases.named_twin import FILES
 from retwin.cases.opened_twin import OpenedTwin
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Trajectories
+from retwin.serialisation.configs import toml_text
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.record_sampler import moves_and_rests
 from retwin.update.dynamics import state_names
@@ -71,21 +71,21 @@ def updated_case(
         base = opened.name
         if Path(base).suffix.lower() == ".toml":
             base = _relative(Path(base).resolve(), place)
-        lines.append(f"based_on = {_text(base)}")
+        lines.append(f"based_on = {toml_text(base)}")
     else:
         source = Path(opened.name)
         is_file = source.suffix.lower() in FILES
         home = (source.resolve().parent if is_file else Path.cwd()).resolve()
         stem = source.stem if is_file else opened.name.rpartition(":")[2]
         lines += [
-            f"name = {_text(stem)}",
-            f"title = {_text(f'{source.name}, identified')}",
-            f"folder = {_text(_relative(home, place))}",
-            f"twin = {_text(source.name if is_file else opened.name)}",
+            f"name = {toml_text(stem)}",
+            f"title = {toml_text(f'{source.name}, identified')}",
+            f"folder = {toml_text(_relative(home, place))}",
+            f"twin = {toml_text(source.name if is_file else opened.name)}",
             *_channels(opened, twin, is_file=is_file),
             "",
             "[commands]",
-            f"file = {_text(commands)}",
+            f"file = {toml_text(commands)}",
         ]
         if measured is not None:
             # Keys of the case come before its tables.
@@ -98,7 +98,7 @@ def updated_case(
     for each, value in zip(twin.parameters, twin.values, strict=True):
         start = min(max(value, each.low), each.high)
         settings = f"low = {each.low!r}, high = {each.high!r}, start = {start!r}"
-        lines.append(f"{_text(each.name)} = {{ unit = {_text(each.unit)}, {settings} }}")
+        lines.append(f"{toml_text(each.name)} = {{ unit = {toml_text(each.unit)}, {settings} }}")
     return "\n".join(lines) + "\n"
 
 
@@ -141,8 +141,8 @@ def _channels(opened: OpenedTwin, twin: ParametricTwin, *, is_file: bool) -> lis
     # A sensor of a robot model may have several channels.
     outputs = getattr(inner, "sensors", twin.outputs.names)
     for name, names in (("inputs", twin.inputs.names), ("outputs", outputs)):
-        listed = ", ".join(map(_text, names))
-        tables = ", ".join(f"{_text(each)} = {{}}" for each in names)
+        listed = ", ".join(map(toml_text, names))
+        tables = ", ".join(f"{toml_text(each)} = {{}}" for each in names)
         lines.append(f"{name} = " + (f"[{listed}]" if is_file else f"{{ {tables} }}"))
     return lines
 
@@ -153,8 +153,3 @@ def _relative(path: Path, start: Path) -> str:
         return Path(os.path.relpath(path, start)).as_posix()
     except ValueError:  # on another drive of Windows
         return path.as_posix()
-
-
-def _text(text: str) -> str:
-    """A string of TOML, whose escapes are those of JSON."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -7,6 +7,7 @@ a file names.
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,6 +44,7 @@ __all__ = [
     "plain_reason",
     "read_toml",
     "to_config",
+    "toml_text",
 ]
 
 T = TypeVar("T")
@@ -106,6 +108,11 @@ def read_toml(path: Path, *, expected: str, remedy: str) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         got = f"{type(error).__name__}: {error}"
         raise InputError(str(path), expected=expected, got=got, remedy=remedy) from None
+
+
+def toml_text(text: str) -> str:
+    """A string as TOML writes it, whose escapes are those of JSON."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def to_config(value: Any, kinds: Sequence[type]) -> dict[str, Any]:

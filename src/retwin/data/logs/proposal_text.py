@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,6 +9,7 @@ from retwin.data.io.assembly import DataCase
 from retwin.data.logs.mapping import ChannelMapping, Cut, TimeSettings
 from retwin.data.logs.signals import NO_STAMP, Log
 from retwin.data.logs.tables import TIMES
+from retwin.serialisation.configs import toml_text
 
 __all__ = ["Chosen", "Draft", "Fact", "mapping_text", "units_of"]
 
@@ -79,10 +79,6 @@ class Draft:
     tables: dict[str, dict[str, ChannelMapping]]
 
 
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
 def _comment(text: str) -> str:
     return "".join(c if c.isprintable() else " " for c in text)
 
@@ -130,11 +126,11 @@ def mapping_text(
     lines += [f"{key} = {_value(value)}" for key, value in given.items()]
     if delay is not None:
         lines.append(f"# messages were recorded {delay:.3g} s after their header stamps (median)")
-    lines += ["", "[cut]", f"by = {_quoted(cut.by)} # none, gap, trigger or length"]
+    lines += ["", "[cut]", f"by = {toml_text(cut.by)} # none, gap, trigger or length"]
     lines += [f"gap = {cut.gap!r} # s"] if cut.gap else []
     for table in chosen:
         for name, fact in chosen[table].items():
-            lines += ["", f"[{table}.{_quoted(name)}]"]
+            lines += ["", f"[{table}.{toml_text(name)}]"]
             if fact is None:
                 # The outputs that a mapping lacks are not compared by identify.
                 more = ", or delete this table" if _spare(case, table) else ""
@@ -142,18 +138,21 @@ def mapping_text(
                 lines += _units_wanted(name, "", case)
                 continue
             own = tables[table][name]
-            lines += [f"# {_seen(fact)}", f"signal = {_quoted(fact.name)}"]
+            lines += [f"# {_seen(fact)}", f"signal = {toml_text(fact.name)}"]
             lines += _units_wanted(name, fact.unit, case)
-            lines += [f"resample = {_quoted(own.resample or '')}", f"max_gap = {own.max_gap!r} # s"]
+            lines += [
+                f"resample = {toml_text(own.resample or '')}",
+                f"max_gap = {own.max_gap!r} # s",
+            ]
     used = {fact.name for table in chosen.values() for fact in table.values() if fact}
     rest = [each for each in facts if each.name not in used]
     if rest or log.skipped:
         lines += ["", "# Not mapped:"]
     for each in rest[:MAX_LISTED]:
         what = f"constant, {each.low:g}" if each.constant and each.count else _seen(each)
-        lines.append(f"#   {_comment(_quoted(each.name))}: {what}")
+        lines.append(f"#   {_comment(toml_text(each.name))}: {what}")
     others = [(n, why) for n, why in log.skipped.items() if why not in (TIMES, NO_STAMP)]
-    lines += [f"#   {_comment(_quoted(n))}: {_comment(why)}" for n, why in others[:MAX_LISTED]]
+    lines += [f"#   {_comment(toml_text(n))}: {_comment(why)}" for n, why in others[:MAX_LISTED]]
     left = max(0, len(rest) - MAX_LISTED) + max(0, len(others) - MAX_LISTED)
     lines += [f"#   and {left} more"] if left else []
     return "\n".join(lines) + "\n"
@@ -181,8 +180,8 @@ def _units_wanted(channel: str, stated: str, case: DataCase | None) -> list[str]
         return [f'# from_unit = "…" # {lack}: no conversion without', '# unit = "…" # both']
     asked = [f'# from_unit = "…" # the log states none: taken as {_comment(unit)}']
     # Written out, since the unit of a case is not known to a command without it.
-    return ([] if stated else asked) + [f"unit = {_quoted(unit)}"]
+    return ([] if stated else asked) + [f"unit = {toml_text(unit)}"]
 
 
 def _value(value: object) -> str:
-    return _quoted(value) if isinstance(value, str) else repr(value)
+    return toml_text(value) if isinstance(value, str) else repr(value)
