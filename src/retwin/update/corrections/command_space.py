@@ -16,7 +16,7 @@ from torch import Tensor
 from retwin.data.trajectories import Channels
 from retwin.update.corrections.command_inference import infer_commands
 from retwin.update.corrections.correction import Context, Discrepancy, Head
-from retwin.update.corrections.delay_range import checked_range, range_in_samples
+from retwin.update.corrections.delay_range import checked_range, range_in_samples, range_in_seconds
 from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.warp import gather_samples
 from retwin.update.kernels.generation import at_effective_commands
@@ -107,8 +107,8 @@ class CommandSpace:
 
     def completed(self, context: Context, observed: Tensor, mask: Tensor) -> CommandSpace:
         """The operator with the range of delays that measured outputs show, where none is given."""
-        low, high = range_in_samples(self.delay_range, context, observed, mask)
-        return replace(self, delay_range=(low / context.rate, high / context.rate))
+        found = range_in_seconds(self.delay_range, context, observed, mask)
+        return replace(self, delay_range=found)
 
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """z* and its covariance from outputs alone; see `command_inference`."""

@@ -21,7 +21,7 @@ from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
 from retwin.inference.solver import Solution, blocks, solve
 from retwin.update.corrections.correction import Context, Discrepancy, Head
-from retwin.update.corrections.delay_range import checked_range, range_in_samples
+from retwin.update.corrections.delay_range import checked_range, range_in_samples, range_in_seconds
 from retwin.update.corrections.delays import at_bound, first_delays
 from retwin.update.corrections.path_problem import PathProblem, path_at
 from retwin.update.kernels.generation import delayed_path
@@ -104,8 +104,8 @@ class DelayOffset:
 
     def completed(self, context: Context, observed: Tensor, mask: Tensor) -> DelayOffset:
         """The operator with the range of delays that measured outputs show, where none is given."""
-        low, high = range_in_samples(self.delay_range, context, observed, mask)
-        return replace(self, delay_range=(low / context.rate, high / context.rate))
+        found = range_in_seconds(self.delay_range, context, observed, mask)
+        return replace(self, delay_range=found)
 
     @torch.no_grad()
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:

@@ -19,7 +19,13 @@ from retwin.update.corrections.delays import common_delay, first_delays
 from retwin.update.corrections.path_problem import PathProblem
 from retwin.update.corrections.warp import within
 
-__all__ = ["bound_note", "checked_range", "plausible_delays", "range_in_samples"]
+__all__ = [
+    "bound_note",
+    "checked_range",
+    "plausible_delays",
+    "range_in_samples",
+    "range_in_seconds",
+]
 
 FEW = 0.05
 """Share of delays at a bound that needs no mention: a few segments are always missed."""
@@ -68,6 +74,14 @@ def range_in_samples(
     # 0.3 s times 100 Hz is a little more than 30 samples.
     low, high = (each * context.rate for each in delay_range)
     return float(math.floor(low + ROUNDING)), float(math.ceil(high - ROUNDING))
+
+
+def range_in_seconds(
+    delay_range: tuple[float, float] | None, context: Context, observed: Tensor, mask: Tensor
+) -> tuple[float, float]:
+    """`range_in_samples` in seconds, as operators hold it."""
+    low, high = range_in_samples(delay_range, context, observed, mask)
+    return low / context.rate, high / context.rate
 
 
 def bound_note(share: float) -> str:
