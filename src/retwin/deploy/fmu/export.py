@@ -16,10 +16,11 @@ from retwin.checks import needs_extra, one_of, require
 from retwin.deploy.fmu.description import build_description, description, token_of
 from retwin.deploy.fmu.states import states_text
 from retwin.deploy.fmu.surrogates import surrogate_text
-from retwin.deploy.fmu.text import Text, written_beside
+from retwin.deploy.fmu.text import Text
 from retwin.errors import InputError, brief
 from retwin.serialisation.files import write_atomically
 from retwin.twins.compiled.kernel import compilers
+from retwin.twins.compiled.source import c_source
 from retwin.twins.state_twin import StateTwin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.twin import DynamicsTwin
@@ -123,7 +124,7 @@ def export_fmu(
     identifier = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"twin_{identifier}"
     token = token_of(text.source + version)
-    interface = written_beside("fmi2.c" if version == "2.0" else "fmi3.c")
+    interface = c_source(__package__, "fmi2.c" if version == "2.0" else "fmi3.c")
     source = "\n".join([text.source, f'#define TOKEN "{token}"', interface])
     headers = Path(str(fmpy.__file__)).parent / "c-code"
     content: dict[str, bytes] = {

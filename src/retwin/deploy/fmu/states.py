@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from retwin.checks import require
 from retwin.deploy.fmu.description import Variable, variables_of
-from retwin.deploy.fmu.text import Text, constants, written_beside
+from retwin.deploy.fmu.text import Text, constants
+from retwin.twins.compiled.source import c_source
 from retwin.twins.state_twin import StateTwin
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.twin import DynamicsTwin
@@ -37,9 +38,9 @@ def states_text(twin: StateTwin | DynamicsTwin) -> Text:
         remedy='make the twin with interpolation="linear"',
     )
     variables, places = _variables(corrected, ranged)
-    parts = map(written_beside, ("variables.c", "random.c", "states.c"))
+    steps = c_source(__package__, "variables.c", "random.c", "states.c")
     return Text(
-        "\n".join([_model(corrected, places, ranged), *parts]),
+        "\n".join([_model(corrected, places, ranged), steps]),
         variables,
         corrected.rate,
         corrected.case,

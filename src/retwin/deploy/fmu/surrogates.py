@@ -11,9 +11,10 @@ from retwin.checks import require
 from retwin.deploy.fmu.description import variables_of
 from retwin.deploy.fmu.networks import CNetwork, c_network, dense_weights, flat, weights_of
 from retwin.deploy.fmu.segments import segment_parts
-from retwin.deploy.fmu.text import Text, constants, written_beside
+from retwin.deploy.fmu.text import Text, constants
 from retwin.nets.mixtures import FLOOR
 from retwin.nets.networks import Network
+from retwin.twins.compiled.source import c_source
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive, Chain, SampledSensor
 from retwin.update.residual import Residual, ResidualModel, SequenceResidual
@@ -61,7 +62,7 @@ def surrogate_text(twin: Surrogate | CorrectedTwin, commands: NDArray | None = N
     if isinstance(twin, CorrectedTwin) and isinstance(twin.residual, ResidualModel):
         before, omitted = segment_parts(twin, commands)
         before.append(f"#define REMEMBERED {network.memory}\n")
-        parts += [written_beside("actuators.c")]
+        parts += [c_source(__package__, "actuators.c")]
     elif isinstance(twin, CorrectedTwin):
         encoder, texts = _residual_parts(_per_sample(twin.residual, twin.rate))
         networks.append(encoder)
@@ -72,8 +73,8 @@ def surrogate_text(twin: Surrogate | CorrectedTwin, commands: NDArray | None = N
     defined = "".join(f"#define {name} {size}\n" for name, size in sizes.items())
     defined += "".join(f"#define USES_{kind}\n" for kind in kinds)
     shared = ["variables.c", "networks.c", *(["random.c"] if twin is not surrogate else [])]
-    source = [defined, *before, *map(written_beside, shared), *parts]
-    source.append(written_beside("surrogate.c"))
+    source = [defined, *before, c_source(__package__, *shared), *parts]
+    source.append(c_source(__package__, "surrogate.c"))
     channels = (surrogate.inputs, surrogate.outputs)
     return Text(
         "\n".join(source),

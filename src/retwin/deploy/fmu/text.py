@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from retwin.deploy.fmu.description import Variable
 
-__all__ = ["Text", "constants", "written_beside"]
+__all__ = ["Text", "constants"]
 
 DIGITS = {"double": (".17g", ""), "float": (".9g", "f"), "int": ("d", "")}
 """How all digits of a number are written, and the suffix of its type."""
@@ -59,8 +58,3 @@ def _number(value: float, kind: str) -> str:
     if text.lstrip("-") in ("inf", "nan"):
         return text.replace("inf", "INFINITY").replace("nan", "NAN")
     return text + ("" if kind == "int" or set(text) & set(".e") else ".0") + suffix
-
-
-def written_beside(name: str) -> str:
-    """The text of a C file of this package."""
-    return files(__package__).joinpath(name).read_text("utf-8")

@@ -9,12 +9,12 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from functools import lru_cache
-from importlib.resources import files
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.segments import Segments
+from retwin.twins.compiled.source import c_source
 
 __all__ = ["biased_references", "ramped"]
 
@@ -25,8 +25,7 @@ def library() -> ctypes.CDLL | None:
     # Imported here: a description of a twin needs no torch, which the kernel's threads need.
     from retwin.twins.compiled.kernel import compiled
 
-    source = files("retwin.twins.compiled").joinpath("commands.c").read_text("utf-8")
-    return compiled(source, quiet=True)
+    return compiled(c_source(__package__, "commands.c"), quiet=True)
 
 
 def ramped(

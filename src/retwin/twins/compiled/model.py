@@ -6,10 +6,10 @@ from collections import namedtuple
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from retwin.twins.compiled.program import OPERATIONS, Node, Program
+from retwin.twins.compiled.source import c_source
 from retwin.twins.compiled.trace import traced
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class Model:
         exported = (
             "#ifdef _WIN32\n#define EXPORT __declspec(dllexport)\n#else\n#define EXPORT\n#endif\n"
         )
-        return "\n".join([exported, self.steps_source, _written_beside("simulate.c")])
+        return "\n".join([exported, self.steps_source, c_source(__package__, "simulate.c")])
 
     @cached_property
     def steps_source(self) -> str:
@@ -100,7 +100,7 @@ class Model:
             "#include <math.h>\n",
             "".join(f"#define {name} {size}\n" for name, size in sizes.items()),
             *functions,
-            _written_beside("steps.c"),
+            c_source(__package__, "steps.c"),
         ]
         return "\n".join(parts)
 
@@ -119,11 +119,6 @@ class Model:
         for array, nodes in results:
             lines += [f"    {array}[{i}] = {_written(node)};" for i, node in enumerate(nodes)]
         return "\n".join([*lines, "}\n"])
-
-
-def _written_beside(name: str) -> str:
-    """The text of a C file of this package."""
-    return files(__package__).joinpath(name).read_text("utf-8")
 
 
 def _written(node: Node) -> str:

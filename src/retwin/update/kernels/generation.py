@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ctypes
 from functools import lru_cache
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from torch import Tensor, nn
 
 from retwin.data.segments import Segments
 from retwin.twins.compiled.kernel import call, compiled
+from retwin.twins.compiled.source import c_source
 from retwin.update.piecewise_linear import TOLERANCE
 
 __all__ = [
@@ -46,9 +46,7 @@ def library() -> ctypes.CDLL | None:
 
 @lru_cache(maxsize=1)
 def _library() -> ctypes.CDLL | None:
-    folder = files("retwin.update.kernels")
-    source = "".join((folder / name).read_text("utf-8") for name in SOURCES)
-    return compiled(source, contract=True, quiet=True)
+    return compiled(c_source(__package__, *SOURCES), contract=True, quiet=True)
 
 
 def along_pieces(surrogate: Any, commands: NDArray) -> NDArray | None:
