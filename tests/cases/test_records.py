@@ -101,7 +101,11 @@ def test_what_was_not_measured_is_missing(tmp_path: Path) -> None:
         ([0, 0.1, "nan", 0.3], {}, "3 times in 4 rows"),
         ([0, 0.1, 1.2, 1.3], {}, r"none at 0.2 s.*the rows before and after them as two"),
         ([0, 0.1, 0.2, 1e9], {}, r"an interval of 1e\+09 s before data row 3"),
-        ([0, 0.1, 0.2, 0.3], {"column": "when"}, "numbers in columns .* KeyError: 'when'"),
+        (
+            [0, 0.1, 0.2, 0.3],
+            {"column": "when"},
+            "a header with the columns in, a, b, when, got no column when",
+        ),
     ],
 )
 def test_times_that_cannot_be_meant_are_refused(
@@ -110,6 +114,25 @@ def test_times_that_cannot_be_meant_are_refused(
     write(tmp_path / "first.csv", times, [1, 2, 3, 4], [1, 2, 3, 4])
     with pytest.raises(rt.InputError, match=rf"first\.csv.*{message}"):
         read(tmp_path, **settings)
+
+
+def test_a_table_is_read_as_logs_are(tmp_path: Path) -> None:
+    """Separator, decimal commas and lines before the titles are found; an empty row is a sample."""
+    (tmp_path / "first.csv").write_text(
+        "recorded on a bench\n\ntime;in;a;b;\n0;0,5;1;1;\n0,1;0,5;;;\n0,2;1;3,5;3;\n"
+    )
+    made = read(tmp_path, max_gap=0.1)
+    np.testing.assert_allclose(made.commands[0, :, 0], [0.5, 0.5, 1])
+    assert made.mask[0, :, 0].tolist() == [True, False, True]
+    np.testing.assert_allclose(made.observed[0, [0, 2], 0], [1, 3.25])
+    rows = "in,a,b\n1,2,2\n,,\n3,4,4\n"
+    (tmp_path / "rows.csv").write_text(rows)
+    two = [Record(COLUMNS, rows=each) for each in ((2, 4), (0, 2))]
+    with pytest.raises(rt.InputError, match=r"rows\.csv: expected a number for every command"):
+        ColumnRecords(TWIN, *two)(tmp_path / "rows.csv")
+    (tmp_path / "rows.csv").write_text(rows + '5,6,"7\n')
+    with pytest.raises(rt.InputError, match="check quotation marks"):
+        ColumnRecords(TWIN, *two)(tmp_path / "rows.csv")
 
 
 def test_records_of_a_folder(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from glob import glob
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from retwin.cases.time_column import TimeColumn
 from retwin.checks import finite, require
+from retwin.data.logs.text_tables import read_cells
 from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError
 from retwin.serialisation.files import sha256
@@ -327,12 +327,14 @@ def number(cell: str) -> float:
 def read_columns(path: Path, cells: Mapping[str, Callable[[str], float]]) -> dict[str, NDArray]:
     """Columns of a CSV file, each by a function of its cells."""
     try:
-        with path.open(encoding="utf-8-sig", newline="") as lines:
-            rows = list(csv.DictReader(lines, strict=True))
+        table, comma = read_cells(path, tuple(cells))
         return {
-            name: np.array([number(row[name]) for row in rows]) for name, number in cells.items()
+            name: np.array([number(each.replace(",", ".") if comma else each) for each in own])
+            for (name, own), number in zip(table.items(), cells.values(), strict=True)
         }
-    except (OSError, KeyError, ValueError, TypeError, AttributeError, csv.Error) as error:
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
         raise InputError(
             str(path),
             expected=f"a CSV file with a header and numbers in columns {', '.join(cells)}",

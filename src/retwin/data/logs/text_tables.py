@@ -17,7 +17,7 @@ from retwin.data.logs.signals import Clock, Signal, Skipped, named_unit
 from retwin.data.logs.tables import MISSING, TRUTH, numbers, table_signals
 from retwin.errors import InputError, brief
 
-__all__ = ["read"]
+__all__ = ["read", "read_cells"]
 
 SEPARATORS = (";", "\t", ",", "|")
 """Separators in the order in which they are tried; blanks come last."""
@@ -32,6 +32,7 @@ BLOCK = 65_536
 TEXT_SHARE = 0.5
 """The share of cells that are no numbers from which a column is text."""
 NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf|nan", re.IGNORECASE)
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(e[+-]?\d+)?")
 STARTS = re.compile(r"[+-]?[.,]?\d")
 """How a number begins, and hardly a title."""
 ISO = re.compile(r"\d{4}-\d\d?-\d\d?[T ]|\d\d?[./]\d\d?[./]\d{2,4}|\d\d?:\d\d")
@@ -99,6 +100,63 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
     yield from table_signals(path.name, titles, column, cells, count, clock, wanted)
 
 
+def read_cells(path: Path, wanted: Sequence[str]) -> tuple[dict[str, list[str]], bool]:
+    """The cells of columns that are named by their titles, as they are written.
+
+    Rows of empty cells stay: each row may be a sample at a given rate.
+
+    Parameters
+    ----------
+    path : Path
+        A table whose titles stand in one of the first `HEAD` rows.
+    wanted : sequence of str
+        Titles of columns.
+
+    Returns
+    -------
+    cells : dict of str to list of str
+        By title, a cell for each row below the titles.
+    comma : bool
+        Whether decimals are after a comma.
+
+    Raises
+    ------
+    InputError
+        A column is missing, a row has another number of cells than the titles, or quotation marks
+        are not closed.
+
+    """
+    plain = {title.strip() for title in wanted}
+    encoding = _encoding(path)
+    with _opened(path, encoding) as file:
+        lines = list(islice(_lines(file, path), HEAD))
+    tables = [(each, list(_rows(iter(lines), each, path))) for each in SEPARATORS]
+    found = [
+        (separator, rows, place)
+        for separator, rows in tables
+        for place, row in enumerate(rows)
+        if {cell.strip() for cell in row}.issuperset(plain)
+    ]
+    if not found:
+        titles = max((rows[0] for _, rows in tables if rows), key=len, default=[])
+        raise InputError(
+            path.name,
+            expected=f"a header with the columns {', '.join(wanted)}",
+            got=f"no column {', '.join(sorted(plain - {each.strip() for each in titles}))}",
+            remedy="name the columns as the file does",
+        )
+    separator, rows, place = found[0]
+    names = tuple(cell.strip() for cell in rows[place])
+    comma = _decimal_comma(rows[place + 1 :], separator)
+    layout = TextLayout(encoding, separator, place + 1, names, ("",) * len(names), comma)
+    cells: dict[str, list[str]] = {name: [] for name in wanted}
+    for block in _blocks(path, layout, exact=True):
+        for name, own in cells.items():
+            at = names.index(name.strip())
+            own += [row[at] for row in block]
+    return cells, comma
+
+
 def _compact(cells: NDArray) -> NDArray:
     try:
         return cells.astype(float)
@@ -110,16 +168,22 @@ def _opened(path: Path, encoding: str) -> TextIO:
     return path.open(encoding=encoding, newline="")
 
 
-def _blocks(path: Path, layout: TextLayout) -> Iterator[list[Sequence[str]]]:
-    """The rows of a table, block by block."""
+def _blocks(
+    path: Path, layout: TextLayout, *, exact: bool = False
+) -> Iterator[list[Sequence[str]]]:
+    """The rows of a table, block by block.
+
+    If `exact`, rows of empty cells are kept, and quotation marks must be closed.
+    """
     width = len(layout.names)
     with _opened(path, layout.encoding) as file:
         lines = _lines(file, path)
         for _ in range(layout.first):
             next(lines)
         block: list[Sequence[str]] = []
-        for number, row in enumerate(_rows(lines, layout.separator, path), layout.first + 1):
-            if not row or not any(cell.strip() for cell in row):
+        rows = _rows(lines, layout.separator, path, strict=exact)
+        for number, row in enumerate(rows, layout.first + 1):
+            if not row or not (exact or any(cell.strip() for cell in row)):
                 continue
             if len(row) == width + 1 and not row[-1].strip():
                 row = row[:-1]  # a separator at the end of each line
@@ -151,12 +215,14 @@ def _lines(file: TextIO, path: Path) -> Iterator[str]:
         yield line
 
 
-def _rows(lines: Iterator[str], separator: str, path: Path) -> Iterator[Sequence[str]]:
+def _rows(
+    lines: Iterator[str], separator: str, path: Path, *, strict: bool = False
+) -> Iterator[Sequence[str]]:
     if not separator:
         yield from (line.split() for line in lines)
         return
     try:
-        yield from csv.reader(lines, delimiter=separator)
+        yield from csv.reader(lines, delimiter=separator, strict=strict)
     except csv.Error as error:
         raise InputError(
             path.name,
@@ -194,9 +260,14 @@ def _layout(path: Path) -> TextLayout:
     rows = list(_rows(iter(lines), separator, path))
     width = _width(rows, first)
     names, units = _titles(_head(rows[:first], width, path), width)
-    cells = [cell.strip() for row in rows[first:] for cell in row]
-    comma = separator != "," and any(re.fullmatch(r"[+-]?\d*,\d+(e[+-]?\d+)?", c) for c in cells)
+    comma = _decimal_comma(rows[first:], separator)
     return TextLayout(encoding, separator, first, names, units, comma)
+
+
+def _decimal_comma(rows: Sequence[Sequence[str]], separator: str) -> bool:
+    """Whether decimals are after a comma in some cell."""
+    cells = (cell.strip() for row in rows for cell in row)
+    return separator != "," and any(DECIMAL_COMMA.fullmatch(cell) for cell in cells)
 
 
 def _encoding(path: Path) -> str:
