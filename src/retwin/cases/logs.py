@@ -10,6 +10,7 @@ import numpy as np
 
 from retwin.cases.case import Case
 from retwin.cases.matching import matched
+from retwin.cases.measured import usable
 from retwin.cases.named_signals import (
     check_named,
     has_times,
@@ -25,16 +26,13 @@ from retwin.data.logs.mapped import mapped
 from retwin.data.logs.mapping import NO_NOMINAL, TimeSettings, read_mapping
 from retwin.data.logs.reading import is_log, read_log
 from retwin.data.logs.signals import Clock, Log
-from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
-from retwin.errors import InputError
+from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.serialisation.sizes import Budget
 from retwin.twins.twin import Twin
 
 __all__ = ["Columns", "LogReader", "Logs", "read_logs"]
 
-LARGEST = 1e30
-"""Magnitude from which a number is no measurement: programs write 3.4e38 for a missing one."""
 ROUNDED = 1e-3
 """Relative accuracy to which a rate is rounded that is computed from times."""
 
@@ -223,6 +221,21 @@ class LogReader:
             got="none",
             remedy="name the files with the measurements",
         )
+        self._check_columns(twin)
+        notes: dict[str, list[str]] = {}
+        sets, tests = [], []
+        for done, path in enumerate(map(Path, paths)):
+            own, test = self._of_log(path, twin, case, notes, rows_at_rate=rows_at_rate)
+            sets.append(own)
+            tests += test
+            if progress is not None:
+                progress((done + 1) / len(paths))
+        joined = usable(Trajectories.concatenate(sets), notes, self.columns.transient)
+        kept = Trajectories.concatenate(tests) if tests else None
+        return Logs(joined, kept, tuple(_sentences(notes)))
+
+    def _check_columns(self, twin: Twin) -> None:
+        """Refuse columns of channels that the twin does not have."""
         names = (*twin.inputs.names, *twin.outputs.names)
         for name in self.columns.names:
             require(
@@ -232,62 +245,32 @@ class LogReader:
                 got=repr(name),
                 remedy="write CHANNEL=COLUMN, the name in the twin first",
             )
-        notes: dict[str, list[str]] = {}
-        sets, tests = [], []
-        for done, path in enumerate(map(Path, paths)):
-            own = case is not None and case.records is not None and not self.columns.names
-            mapping = self.columns.mapping
-            if own and mapping is None and (_is_table(path) or path.is_dir()):
-                assert case is not None
-                assert case.records is not None
-                calibration, test = case.records(path)
-                sets.append(calibration)
-                tests.append(test)
-            elif mapping is not None:
-                rate = None if read_mapping(mapping).rate else twin.rate
-                found = load(path, rate=rate, max_bytes=self.max_bytes, mapping=mapping)
-                sets.append(
-                    matched(
-                        found,
-                        twin,
-                        self.columns.names,
-                        path.name,
-                        notes,
-                        mapped=mapping is not None,
-                    )
-                )
-                _add_notes(found, path.name, notes)
-            elif is_log(path):
-                sets.append(self._by_names(path, twin, notes, rows_at_rate=rows_at_rate))
-            else:
-                found = load(path, case=case, max_bytes=self.max_bytes)
-                sets.append(
-                    matched(
-                        found,
-                        twin,
-                        self.columns.names,
-                        path.name,
-                        notes,
-                        mapped=mapping is not None,
-                    )
-                )
-            if progress is not None:
-                progress((done + 1) / len(paths))
-        joined = _healthy(Trajectories.concatenate(sets), notes)
-        _check_size(joined)
-        if self.columns.transient:
-            joined = _settled(joined, self.columns.transient)
-        unseen = ~joined.mask.any(axis=(0, 1))
-        if unseen.any():
-            lacking = ", ".join(np.array(joined.outputs.names)[unseen])
-            notes[f"No log holds {lacking}."] = []
-        constant = _constant(joined)
-        if constant:
-            notes[
-                f"{', '.join(constant)}: constant in all logs, so that they show no dynamics of it."
-            ] = []
-        kept = Trajectories.concatenate(tests) if tests else None
-        return Logs(joined, kept, tuple(_sentences(notes)))
+
+    def _of_log(
+        self,
+        path: Path,
+        twin: Twin,
+        case: Case | None,
+        notes: dict[str, list[str]],
+        *,
+        rows_at_rate: bool,
+    ) -> tuple[Trajectories, list[Trajectories]]:
+        """The trajectories of one log, and those that the records of a case keep for the test."""
+        mapping, names = self.columns.mapping, self.columns.names
+        records = None if case is None or names or mapping is not None else case.records
+        if records is not None and (_is_table(path) or path.is_dir()):
+            calibration, test = records(path)
+            return calibration, [test]
+        if mapping is not None:
+            rate = None if read_mapping(mapping).rate else twin.rate
+            found = load(path, rate=rate, max_bytes=self.max_bytes, mapping=mapping)
+            made = matched(found, twin, names, path.name, notes, mapped=True)
+            _add_notes(found, path.name, notes)
+            return made, []
+        if is_log(path):
+            return self._by_names(path, twin, notes, rows_at_rate=rows_at_rate), []
+        found = load(path, case=case, max_bytes=self.max_bytes)
+        return matched(found, twin, names, path.name, notes), []
 
     def _by_names(
         self, path: Path, twin: Twin, notes: dict[str, list[str]], *, rows_at_rate: bool
@@ -355,61 +338,3 @@ def _is_table(path: Path) -> bool:
 def _is_text(path: Path) -> bool:
     """Whether it is a table of text, each row of which has all channels."""
     return path.suffix.lower() in LOGS and not LOGS[path.suffix.lower()].extra
-
-
-def _healthy(found: Trajectories, notes: dict[str, list[str]]) -> Trajectories:
-    """The healthy and the unlabelled trajectories; InputError if there is none."""
-    kept = np.isin(found.labels, (HEALTHY, UNLABELLED))
-    require(
-        kept.any(),
-        "logs",
-        expected=f"a trajectory without a label, or labelled {HEALTHY}",
-        got=f"labels {', '.join(sorted(found.known_labels))}",
-        remedy="identify the parameters of a healthy system",
-    )
-    if not kept.all():
-        notes[f"{int((~kept).sum())} trajectories of other classes are not used."] = []
-    return found[kept]
-
-
-def _check_size(found: Trajectories) -> None:
-    """Refuse numbers that stand for missing measurements."""
-    for name, values in (("observed", found.observed), ("commands", found.commands)):
-        large = np.argwhere(np.abs(values) >= LARGEST)
-        channels = found.outputs if name == "observed" else found.inputs
-        if len(large):
-            row, sample, channel = large[0]
-            raise InputError(
-                str(found.ids[row]),
-                expected=f"numbers below {LARGEST:g}",
-                got=f"{values[row, sample, channel]:g} for {channels.names[channel]} at "
-                f"{sample / found.rate:g} s",
-                remedy="leave the cell empty, or write NaN, where a measurement is missing",
-            )
-
-
-def _constant(found: Trajectories) -> list[str]:
-    """Channels that never change, among the commands and the outputs that were measured."""
-    values = np.where(found.mask, found.observed, np.nan)
-    some = [(found.inputs.names[i], found.commands[..., i]) for i in range(len(found.inputs))] + [
-        (found.outputs.names[i], values[..., i]) for i in range(len(found.outputs))
-    ]
-    return [
-        name
-        for name, each in some
-        if np.isfinite(each).any() and float(np.nanmax(each)) == float(np.nanmin(each))
-    ]
-
-
-def _settled(found: Trajectories, transient: float) -> Trajectories:
-    """The trajectories without their outputs in the first seconds."""
-    mask = found.mask.copy()
-    mask[:, : round(transient * found.rate)] = False
-    require(
-        mask.any(),
-        "transient",
-        expected=f"less than the {found.steps / found.rate:g} s of the longest trajectory",
-        got=f"{transient:g} s",
-        remedy="give a shorter transient",
-    )
-    return found.replace(mask=mask)
