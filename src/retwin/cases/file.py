@@ -128,23 +128,8 @@ def read_case(path: str | Path) -> Case:
     # A sampler is code; a file of commands is data, which lies beside this file.
     beside = folder if isinstance(keys.commands, str) else home
     sampler = _sampler(keys.commands, twin, records, beside, key(place, "commands"))
-    correction = keys.correction or ("delay_offset" if _has_segments(sampler) else "additive")
-    correction = _chosen(correction, catalog.CORRECTIONS, key(place, "correction"))
+    correction, density, at_outputs = _residual(keys, sampler, place)
     network = keys.network or ("mlp" if _is_static(twin, sampler) else "lstm")
-    stepwise = correction.resolution == "step"
-    density = keys.density or (SequenceMixture() if stepwise else Mixture())
-    density = _chosen(density, catalog.DENSITIES, key(place, "density"))
-    at_outputs = keys.output_correction or (correction if stepwise else DelayOffset())
-    at_outputs = _chosen(at_outputs, catalog.CORRECTIONS, key(place, "output_correction"))
-    check_density(correction, density, key(place, "density"))
-    require(
-        at_outputs.resolution == correction.resolution,
-        key(place, "output_correction"),
-        expected=f"a correction with one z per {'sample' if stepwise else 'segment'}, as that of "
-        "`correction`",
-        got=type(at_outputs).__name__,
-        remedy="leave it out, or choose another correction",
-    )
     sensor_rate = twin.rate if keys.sensor_rate is None else keys.sensor_rate
     faults = {HEALTHY: None, **_faults(keys.faults, twin, folder, key(place, "faults"))}
     causes = _faults(keys.causes, twin, folder, key(place, "causes"))
@@ -170,6 +155,32 @@ def read_case(path: str | Path) -> Case:
             state_surrogate=keys.state_surrogate,
             causes=causes,
         )
+
+
+def _residual(
+    keys: CaseFile, sampler: CommandSampler, place: str
+) -> tuple[Correction, Density | SequenceMixture, Correction]:
+    """The correction, its density, and the correction at the outputs; defaults by the commands."""
+    correction = _chosen(
+        keys.correction or ("delay_offset" if _has_segments(sampler) else "additive"),
+        catalog.CORRECTIONS,
+        key(place, "correction"),
+    )
+    stepwise = correction.resolution == "step"
+    density = keys.density or (SequenceMixture() if stepwise else Mixture())
+    density = _chosen(density, catalog.DENSITIES, key(place, "density"))
+    at_outputs = keys.output_correction or (correction if stepwise else DelayOffset())
+    at_outputs = _chosen(at_outputs, catalog.CORRECTIONS, key(place, "output_correction"))
+    check_density(correction, density, key(place, "density"))
+    require(
+        at_outputs.resolution == correction.resolution,
+        key(place, "output_correction"),
+        expected=f"a correction with one z per {'sample' if stepwise else 'segment'}, as that of "
+        "`correction`",
+        got=type(at_outputs).__name__,
+        remedy="leave it out, or choose another correction",
+    )
+    return correction, density, at_outputs
 
 
 def check_density(
