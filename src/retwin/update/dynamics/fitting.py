@@ -133,23 +133,8 @@ def fit_dynamics(
     base, free, values = state_twin_of(twin)
     checked_stride(base, observed, None, "observed")
     report = progress or (lambda share: None)
-    names = base.outputs.names
-    missing = [name for i, name in enumerate(names) if not observed.mask[..., i].any()]
-    require(
-        not missing,
-        "observed",
-        expected="measured samples of every output",
-        got=f"none of {', '.join(missing)}",
-        remedy="leave that output out of the twin and of the record, since its noise is unknown",
-    )
     unknowns = unknowns_of(base, free, values)
-    require(
-        observed.mask.sum() > unknowns.count + len(unknowns.free) + settings.folds,
-        "observed",
-        expected="more measured samples than parameters",
-        got=int(observed.mask.sum()),
-        remedy="give more or longer trajectories, or free fewer parameters",
-    )
+    _check_samples(observed, unknowns.count + len(unknowns.free) + settings.folds)
     parts = folds(observed.mask, settings.folds)
     alone, fitted, best = chosen(base, observed, unknowns, settings, parts, report)
     power = alone.variance
@@ -164,8 +149,7 @@ def fit_dynamics(
     notes = _notes(estimation, found.point, unknown)
     if notes:
         warnings.warn(notes, stacklevel=2)
-    k = unknowns.count
-    count = len(found.point.shared)
+    k, count = unknowns.count, len(found.point.shared)
     covariance = estimation.covariance(found)[:count, :count]
     deviation = np.sqrt(np.maximum(np.diag(covariance), held_out.variance))
     deviation[: len(unknown)][unknown] = np.inf
@@ -186,6 +170,26 @@ def fit_dynamics(
         form=equations.form,
         seconds=time.perf_counter() - began,
         reason=notes,
+    )
+
+
+def _check_samples(observed: Trajectories, parameters: int) -> None:
+    """Refuse an output that was never measured, and fewer samples than parameters."""
+    names = observed.outputs.names
+    missing = [name for i, name in enumerate(names) if not observed.mask[..., i].any()]
+    require(
+        not missing,
+        "observed",
+        expected="measured samples of every output",
+        got=f"none of {', '.join(missing)}",
+        remedy="leave that output out of the twin and of the record, since its noise is unknown",
+    )
+    require(
+        observed.mask.sum() > parameters,
+        "observed",
+        expected="more measured samples than parameters",
+        got=int(observed.mask.sum()),
+        remedy="give more or longer trajectories, or free fewer parameters",
     )
 
 
