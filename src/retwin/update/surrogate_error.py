@@ -10,12 +10,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retwin.data.segments import Segments
+from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.twins.twin import SimulationError, Twin
+from retwin.update.corrections import Context
 from retwin.update.corrections.warp import within
 from retwin.update.surrogate import Surrogate, known_samples
 
-__all__ = ["surrogate_variance"]
+__all__ = ["surrogate_variance", "warn_of_error"]
+
+LARGEST_SHARE = 0.5
+"""Share of the mean square of the residual above which the surrogate's error is warned of."""
 
 
 def surrogate_variance(
@@ -64,3 +69,26 @@ def surrogate_variance(
     count = inside.sum(dim=-1)[..., None]
     square = inside.double() @ error.square()
     return torch.where(count > 0, square / count.clamp_min(1), held_out)
+
+
+def warn_of_error(context: Context, used: Trajectories) -> None:
+    """Warn where the surrogate's own error is most of what outputs differ by."""
+    if context.surrogate_variance is None:
+        return
+    valid = torch.as_tensor(context.segments.valid)
+    error = context.surrogate_variance[valid].mean(dim=0).numpy()
+    difference = np.where(used.mask, used.observed - context.path.numpy(), 0.0)
+    square = np.square(difference, dtype=np.float64).sum(axis=(0, 1))
+    count = used.mask.sum(axis=(0, 1))
+    # Of an output that is never measured there is no difference.
+    share = np.divide(error * count, square, out=np.zeros(len(error)), where=square > 0)
+    worst = int(share.argmax())
+    if share[worst] > LARGEST_SHARE:
+        warnings.warn(
+            f"surrogate: its own error is {np.sqrt(error[worst]):.3g} "
+            f"{used.outputs.units[worst]} in {used.outputs.names[worst]} on these commands, "
+            f"{share[worst]:.0%} of the mean square by which measured outputs differ from it; "
+            "little can be inferred. Train it for longer or on other commands (fit_surrogate), or "
+            "use the twin in its place",
+            stacklevel=3,
+        )

@@ -16,7 +16,7 @@ from retwin.checks import instance, require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
-from retwin.nets.training import isolated
+from retwin.nets.training import Fit, isolated
 from retwin.progress import Progress
 from retwin.twins.faults import Fault, draw_faults, faulty_commands, frozen_from
 from retwin.twins.twin import Twin
@@ -39,19 +39,13 @@ from retwin.update.residual.sequence_fitting import fit_sequence
 from retwin.update.residual.settings import Density, Mixture
 from retwin.update.residual.targets import Targets
 from retwin.update.surrogate import Surrogate
-from retwin.update.surrogate_error import surrogate_variance
+from retwin.update.surrogate_error import surrogate_variance, warn_of_error
 from retwin.update.training_range import checked_once, training_checked
 
 __all__ = ["calibrating", "fit_residual", "infer_discrepancy"]
 
 R = TypeVar("R", bound=Residual)
 
-SMALLEST = 1e-12
-"""Smallest value taken for the largest |z*|: a millionth of it still has a square in float32."""
-LARGEST_SHARE = 0.5
-"""Share of the mean square of the residual above which the surrogate's error is warned of."""
-BOUND_MARGIN = 1.25
-"""Default bound b of Eq. 9, over the largest |z*|."""
 MAX_RATIO, MAX_VALUE = 1e6, 1e18
 """Largest measurement, over the largest ideal output and in any case: float32 has seven digits, and
 the squares of larger numbers are infinite."""
@@ -209,7 +203,7 @@ def fit_residual(
     with training_checked(surrogate, used.commands) as outside:
         context = _context(surrogate, used, parts, faults, twin)
         if twin is not None:
-            _warn_of_error(context, used)
+            warn_of_error(context, used)
         correction, found = fit_correction(correction, context, *_measured(used))
     require(
         found.identified.any(),
@@ -227,48 +221,43 @@ def fit_residual(
         model = ResidualModel(
             correction, density, inputs=used.inputs, outputs=used.outputs, segmentation=rule
         )
-    targets = Targets.of(model, context, found, seed=seed)
-    result, held_out = fit_segments(model, targets, bounds=bounds, seed=seed, progress=progress)
-    figures = {"trajectories": float(len(used)), "movements": float(parts.valid.sum())}
-    if found.at_bound is not None:
-        figures["delays_at_bound"] = share = float(found.at_bound.double()[parts.valid].mean())
-        result = replace(result, reason="; ".join(filter(None, [result.reason, bound_note(share)])))
-    if density.refinement is not None and len(held_out):
-        observed, mask = _measured(used)
-        sampled = sample_mask(correction, observed, mask, used.rate)
-        fitted = np.setdiff1d(np.arange(len(used)), held_out)
-        figures |= refine(
-            model, context, observed, sampled, fitted=torch.as_tensor(fitted), held_out=held_out,
-            how=density.refinement, seed=seed, progress=progress,
-        )  # fmt: skip
+    model.fitted = _fit_per_segment(
+        model, used, context, found, parts.valid, bounds=bounds, seed=seed, progress=progress
+    )
     model.emulated = used.emulated
     onsets = Segments.from_commands(calibration.commands)
     model.timing = np.where(onsets.valid, onsets.start, np.nan)
-    model.fitted = replace(result, figures=figures | result.figures)
     return _noted(model.eval(), outside)
 
 
-def _warn_of_error(context: Context, used: Trajectories) -> None:
-    """Warn where the surrogate's own error is most of what outputs differ by."""
-    if context.surrogate_variance is None:
-        return
-    valid = torch.as_tensor(context.segments.valid)
-    error = context.surrogate_variance[valid].mean(dim=0).numpy()
-    difference = np.where(used.mask, used.observed - context.path.numpy(), 0.0)
-    square = np.square(difference, dtype=np.float64).sum(axis=(0, 1))
-    count = used.mask.sum(axis=(0, 1))
-    # Of an output that is never measured there is no difference.
-    share = np.divide(error * count, square, out=np.zeros(len(error)), where=square > 0)
-    worst = int(share.argmax())
-    if share[worst] > LARGEST_SHARE:
-        warnings.warn(
-            f"surrogate: its own error is {np.sqrt(error[worst]):.3g} "
-            f"{used.outputs.units[worst]} in {used.outputs.names[worst]} on these commands, "
-            f"{share[worst]:.0%} of the mean square by which measured outputs differ from it; "
-            "little can be inferred. Train it for longer or on other commands (fit_surrogate), or "
-            "use the twin in its place",
-            stacklevel=3,
-        )
+def _fit_per_segment(
+    model: ResidualModel,
+    used: Trajectories,
+    context: Context,
+    found: Discrepancy,
+    valid: NDArray,
+    *,
+    bounds: NDArray | None,
+    seed: int,
+    progress: Progress | None,
+) -> Fit:
+    """Fit the distribution of one z per segment, (n, M) `valid`, and refine it if it is set so."""
+    targets = Targets.of(model, context, found, seed=seed)
+    result, held_out = fit_segments(model, targets, bounds=bounds, seed=seed, progress=progress)
+    figures = {"trajectories": float(len(used)), "movements": float(valid.sum())}
+    if found.at_bound is not None:
+        figures["delays_at_bound"] = share = float(found.at_bound.double()[valid].mean())
+        result = replace(result, reason="; ".join(filter(None, [result.reason, bound_note(share)])))
+    refinement = model.density.refinement
+    if refinement is not None and len(held_out):
+        observed, mask = _measured(used)
+        sampled = sample_mask(model.correction, observed, mask, used.rate)
+        fitted = np.setdiff1d(np.arange(len(used)), held_out)
+        figures |= refine(
+            model, context, observed, sampled, fitted=torch.as_tensor(fitted), held_out=held_out,
+            how=refinement, seed=seed, progress=progress,
+        )  # fmt: skip
+    return replace(result, figures=figures | result.figures)
 
 
 def _noted(model: R, outside: str) -> R:
