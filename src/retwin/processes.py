@@ -36,8 +36,6 @@ def worker_pool(
     workers: int,
     start: Callable[..., None] | None = None,
     arguments: tuple[Any, ...] = (),
-    *,
-    orphaned: Callable[..., None] | None = None,
 ) -> Iterator[ProcessPool]:
     """A pool of spawned processes.
 
@@ -53,15 +51,13 @@ def worker_pool(
     start : callable
         Called with `arguments` when a worker begins.
     arguments : tuple
-        Arguments of `start` and `orphaned`, which are pickled.
-    orphaned : callable
-        Called with `arguments` in a worker whose parent has ended, before the worker ends.
+        Arguments of `start`, which are pickled.
 
     """
     pool = ProcessPool(
         max_workers=workers,
         initializer=_begin_with_modules,
-        initargs=(known(), start, arguments, orphaned),
+        initargs=(known(), start, arguments),
         context=_Spawn(),
     )
     try:
@@ -115,9 +111,12 @@ def _begin_with_modules(modules: dict[str, str], *begin: Any) -> None:
 def begin_worker(
     start: Callable[..., None] | None,
     arguments: tuple[Any, ...],
-    orphaned: Callable[..., None] | None,
+    orphaned: Callable[..., None] | None = None,
 ) -> None:
-    """Begin a spawned process that ignores Ctrl-C and ends with its parent; see `worker_pool`."""
+    """Begin a spawned process that ignores Ctrl-C and ends with its parent; see `worker_pool`.
+
+    `orphaned` is called with `arguments` where the parent has ended, before the process ends.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if os.name == "posix":
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -37,10 +37,10 @@ def test_one_more_draw_is_below_a_quantile_with_its_probability() -> None:
 def test_the_central_bands_have_their_levels() -> None:
     bands = np.array(LEVELS)[None, :, None]
     for level in (50, 90):
-        low, high = central_band(bands, level, axis=1)
+        low, high = central_band(bands, level)
         assert high - low == pytest.approx(level / 100)
     with pytest.raises(InputError, match="level: expected one of 50, 90, got 80"):
-        central_band(bands, 80, axis=1)
+        central_band(bands, 80)
 
 
 def test_missing_values_are_neither_inside_nor_outside() -> None:

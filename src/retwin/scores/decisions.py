@@ -190,7 +190,7 @@ def certain_decision(
 
 
 def detection_difference(
-    a: NDArray, b: NDArray, truth: NDArray, classes: list[str], rate: float, *, seed: int = 0
+    a: NDArray, b: NDArray, truth: NDArray, classes: list[str], rate: float
 ) -> tuple[float, tuple[float, float]] | None:
     """What one model detects more than another at the same false-alarm rate.
 
@@ -200,8 +200,6 @@ def detection_difference(
         Predicted probabilities of the two models for the same trajectories.
     truth, classes, rate
         See `decide`.
-    seed : int
-        Seed of the bootstrap draws.
 
     Returns
     -------
@@ -224,7 +222,7 @@ def detection_difference(
         shares = (faulty[:, columns] > thresholds[:, None]).mean(axis=1)
         return float(shares[0] - shares[1])
 
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     rows, columns = (rng.integers(0, size, (DRAWS, size)) for size in (n, m))
     drawn = [difference(*each) for each in zip(rows, columns, strict=True)]
     low, high = np.quantile(drawn, [TAIL, 1 - TAIL])

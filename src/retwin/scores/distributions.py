@@ -44,17 +44,15 @@ def quantiles(draws: NDArray, levels: Sequence[float] = LEVELS) -> NDArray:
     return found
 
 
-def central_band(bands: NDArray, level: int, *, axis: int) -> tuple[NDArray, NDArray]:
+def central_band(bands: NDArray, level: int) -> tuple[NDArray, NDArray]:
     """Lower and upper bound of the central 50 or 90 % band.
 
     Parameters
     ----------
     bands : NDArray
-        Quantiles at `LEVELS` along `axis`.
+        (n, len(LEVELS), …), quantiles at `LEVELS`; the bounds lack that axis.
     level : int
         50 or 90.
-    axis : int
-        The axis of the quantiles; the bounds lack it.
 
     Raises
     ------
@@ -63,7 +61,7 @@ def central_band(bands: NDArray, level: int, *, axis: int) -> tuple[NDArray, NDA
 
     """
     low, high = BANDS[one_of("level", level, BANDS)]
-    return np.take(bands, low, axis=axis), np.take(bands, high, axis=axis)
+    return bands[:, low], bands[:, high]
 
 
 def inside(observed: NDArray, low: NDArray, high: NDArray) -> NDArray:

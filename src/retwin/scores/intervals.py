@@ -18,8 +18,8 @@ LEVEL = 0.95
 """Confidence of intervals, unless it is given."""
 
 
-def share_interval(count: float, n: int, level: float = LEVEL) -> tuple[float, float]:
-    """The exact interval of a binomial share.
+def share_interval(count: float, n: int) -> tuple[float, float]:
+    """The exact interval of a binomial share, with confidence `LEVEL`.
 
     Parameters
     ----------
@@ -27,8 +27,6 @@ def share_interval(count: float, n: int, level: float = LEVEL) -> tuple[float, f
         Successes, from 0 to `n`.
     n : int
         Trials, at least 1.
-    level : float
-        Confidence, in (0, 1).
 
     Returns
     -------
@@ -40,7 +38,7 @@ def share_interval(count: float, n: int, level: float = LEVEL) -> tuple[float, f
     Clopper and Pearson, The use of confidence or fiducial limits, Biometrika 1934.
 
     """
-    tail = (1 - level) / 2
+    tail = (1 - LEVEL) / 2
     low = float(betaincinv(count, n - count + 1, tail)) if count else 0.0
     high = float(betaincinv(count + 1, n - count, 1 - tail)) if count < n else 1.0
     return low, high

@@ -27,6 +27,8 @@ __all__ = [
 
 LEVEL = 0.95
 """Probability of the limits of correlations."""
+BINS = 12
+"""Bins of an amplitude, about."""
 PER_BIN = 20
 """Samples per bin of amplitudes, at least."""
 SHORTEST = 16
@@ -264,9 +266,10 @@ def error_by_amplitude(
     residual: NDArray,
     amplitude: NDArray,
     within: tuple[float, float] = (-np.inf, np.inf),
-    bins: int = 12,
 ) -> Binned:
-    """Errors in bins of equal counts of an amplitude, such as an output or a command.
+    """Errors in about `BINS` bins of equal counts of an amplitude, such as an output or a command.
+
+    An amplitude of so few different values has a bin for each.
 
     Parameters
     ----------
@@ -274,8 +277,6 @@ def error_by_amplitude(
         See the module.
     within : (float, float)
         The range of the amplitude in calibration, which no bin crosses.
-    bins : int
-        Number of bins, about; an amplitude of so few different values has a bin for each.
 
     """
     seen = np.isfinite(residual) & np.isfinite(amplitude)
@@ -287,8 +288,8 @@ def error_by_amplitude(
         if not len(own):
             continue
         different, inverse = np.unique(own, return_inverse=True)
-        if len(different) > bins:
-            number = max(1, min(round(bins * len(own) / len(value)), len(own) // PER_BIN))
+        if len(different) > BINS:
+            number = max(1, min(round(BINS * len(own) / len(value)), len(own) // PER_BIN))
             ends = np.unique(np.quantile(own, np.linspace(0, 1, number + 1)))
             inverse = np.searchsorted(ends[1:-1], own, side="right")
         place[part] = first + inverse

@@ -44,8 +44,6 @@ TRUTH = {"true": "1", "false": "0", "on": "1", "off": "0"}
 EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """The least times since 1970 in these units; smaller ones are in s."""
 
-Column = Callable[[str], NDArray]
-
 
 def time_column(names: Iterable[str]) -> str:
     """The name of the column that holds the times, "" if none has such a name.

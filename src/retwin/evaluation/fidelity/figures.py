@@ -34,6 +34,8 @@ __all__ = ["BINS", "Fidelity", "Figure"]
 
 BINS = 100
 """Bins of the PIT histograms, which are stored; pages show fewer."""
+SHOWN_BINS = 20
+"""Bins of a PIT histogram on a page, of which each joins several of the computed ones."""
 MIN_TRAJECTORIES = 8
 """Least number of trajectories for the classifier two-sample test: fewer do not train it."""
 MAX_PLACES = 512
@@ -199,7 +201,7 @@ class Fidelity:
 
     def inside(self, level: int, *, widened: bool = False) -> NDArray:
         """Share (n, d) of each trajectory's samples inside its central 50 or 90 % band."""
-        low, high = central_band(self.bands, level, axis=1)
+        low, high = central_band(self.bands, level)
         if widened:
             factor, middle = self.widening[:, None, None], self.bands[:, 2]
             low, high = middle + factor * (low - middle), middle + factor * (high - middle)
@@ -249,12 +251,14 @@ class Fidelity:
             },
         }
 
-    def pit_shares(self, bins: int = 20) -> NDArray:
-        """PIT histogram (3, bins) over all outputs: of the measured trajectories, and its 5 and
-        95 % quantiles for a perfect generator on as many trajectories.
+    def pit_shares(self) -> NDArray:
+        """PIT histogram (3, `SHOWN_BINS`) over all outputs.
+
+        That of the measured trajectories, and its 5 and 95 % quantiles for a perfect generator on
+        as many trajectories.
         """
         pooled = self.pit.mean(axis=(0, 2))
-        shares = pooled.reshape(len(pooled), bins, -1).sum(axis=2)
+        shares = pooled.reshape(len(pooled), SHOWN_BINS, -1).sum(axis=2)
         return np.stack([shares[0], *np.quantile(shares[1:], [0.05, 0.95], axis=0)])
 
     def _positive(self, values: NDArray) -> Figure:

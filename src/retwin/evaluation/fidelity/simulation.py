@@ -66,7 +66,7 @@ class Simulation:
 
         """
         error = np.square(self.mean - self.observed)
-        bounds = [central_band(self.bands, level, axis=1) for level in (50, 90)]
+        bounds = [central_band(self.bands, level) for level in (50, 90)]
         hits = [inside(self.observed, *each) for each in bounds]
         if not self.random:
             hits = [np.full_like(error, np.nan)] * 2

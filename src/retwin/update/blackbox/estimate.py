@@ -253,9 +253,7 @@ def estimation_of(twin: StateTwin, observed: Trajectories, part: NDArray) -> Est
     return Estimation(base, observed, unknowns, seen, np.ones(len(base.outputs)))
 
 
-def with_best_prior(
-    start: Callable[[NDArray], BlackBoxFit], seen: NDArray, report: Progress | None = None
-) -> BlackBoxFit | None:
+def with_best_prior(start: Callable[[NDArray], BlackBoxFit], seen: NDArray) -> BlackBoxFit | None:
     """The fit to all samples whose prior has the strength that predicts held-out parts best.
 
     The assumed error of the outputs begins large, which makes the prior strong, and falls from step
@@ -267,8 +265,6 @@ def with_best_prior(
         From a part (n, T) that is left out to the model where it begins, with its prior.
     seen : NDArray
         (n, T, d_y) bool, the measured samples.
-    report : callable, optional
-        Called with the share of the work that is done.
 
     Returns
     -------
@@ -282,14 +278,12 @@ def with_best_prior(
         return None
     variance = STRONGEST * observed_variance(fits[0].estimation, fits[0].point)
     best, least, since = fits[0], np.inf, 0
-    for strength in range(MAX_STRENGTHS):
+    for _ in range(MAX_STRENGTHS):
         fits = [each.searched(variance) for each in fits]
         found = replace(whole, errors=held_out_errors(fits, parts, seen))
         since += 1
         if found.held_out < least:
             whole, best, least, since = found, fits[0], found.held_out, 0
-        if report is not None:
-            report((strength + 1) / (MAX_STRENGTHS + 1))
         if since == PATIENCE:
             break
         variance = variance / STEP
