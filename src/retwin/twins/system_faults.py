@@ -207,7 +207,20 @@ class ActuatorGain(SizedFault):
 
 
 @dataclass(frozen=True)
-class SensorBias(SizedFault):
+class SensorError(SizedFault):
+    """What adds its size to the measurements of one output; see `SensorBias`, `SensorDrift`."""
+
+    output: int
+
+    def measured(self, outputs: NDArray, rate: float) -> NDArray:
+        """The outputs (T, d_y) with the error."""
+        made = outputs.copy()
+        made[:, self.output] += self.profile(len(outputs), rate)
+        return made
+
+
+@dataclass(frozen=True)
+class SensorBias(SensorError):
     """A sensor that measures too much or too little.
 
     Parameters
@@ -221,17 +234,9 @@ class SensorBias(SizedFault):
 
     """
 
-    output: int
-
-    def measured(self, outputs: NDArray, rate: float) -> NDArray:
-        """The outputs (T, d_y) with the bias."""
-        made = outputs.copy()
-        made[:, self.output] += self.profile(len(outputs), rate)
-        return made
-
 
 @dataclass(frozen=True)
-class SensorDrift(SizedFault):
+class SensorDrift(SensorError):
     """A sensor whose error grows from the onset on.
 
     Parameters
@@ -245,18 +250,10 @@ class SensorDrift(SizedFault):
 
     """
 
-    output: int
-
     def profile(self, steps: int, rate: float) -> NDArray:
         """The error at each sample, (T,), for a fault of which nothing is open; 0 elsewhere."""
         since = np.arange(steps) / rate - ends_of(self.onset)[0]
         return super().profile(steps, rate) * since
-
-    def measured(self, outputs: NDArray, rate: float) -> NDArray:
-        """The outputs (T, d_y) with the drift."""
-        made = outputs.copy()
-        made[:, self.output] += self.profile(len(outputs), rate)
-        return made
 
 
 @dataclass(frozen=True)
