@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from retwin.cases.recorded import RecordedCase
 from retwin.checks import one_of, require
-from retwin.data.trajectories import Channels, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.nets.networks import MLP, Network
 from retwin.nets.training import Training
 from retwin.progress import Progress
@@ -20,6 +20,7 @@ from retwin.twins.parametric import ParametricTwin
 from retwin.twins.samplers import CommandSampler
 from retwin.twins.system_faults import TimedFault
 from retwin.twins.twin import Twin
+from retwin.twins.wrapper import OfTwin
 from retwin.update.corrections import Correction
 from retwin.update.dynamics import Dynamics, state_names
 from retwin.update.residual import Density, Mixture, SequenceMixture
@@ -57,7 +58,7 @@ class Body(Protocol):
 
 
 @dataclass(frozen=True)
-class Case:
+class Case(OfTwin):
     """One system: all that the rest of retwin must know of it.
 
     Studies, the command line and reports take a case and hold nothing about a particular system.
@@ -182,21 +183,6 @@ class Case:
     def alarm_causes(self) -> dict[str, Fault | None]:
         """The faults and the further causes of alarms, by their names."""
         return {**self.faults, **self.causes}
-
-    @property
-    def inputs(self) -> Channels:
-        """Command channels."""
-        return self.twin.inputs
-
-    @property
-    def outputs(self) -> Channels:
-        """Output channels."""
-        return self.twin.outputs
-
-    @property
-    def rate(self) -> float:
-        """Sample rate of the data, in Hz."""
-        return self.twin.rate
 
     def with_random_onset(self) -> Case:
         """The same case with stuck actuators whose onset is uniform in the first 4/5 of a run."""

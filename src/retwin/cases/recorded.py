@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from retwin.data.trajectories import Channels, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.twin import Twin
+from retwin.twins.wrapper import OfTwin
 
 __all__ = ["RecordedCase"]
 
 
 @dataclass(frozen=True)
-class RecordedCase:
+class RecordedCase(OfTwin):
     """A `data.io.DataCase` of a built-in case, which is imported without torch.
 
     Parameters
@@ -30,21 +31,6 @@ class RecordedCase:
     classes: tuple[str, ...]
     twin: Twin
     recover: Callable[[Trajectories, Progress | None], Trajectories] | None = None
-
-    @property
-    def inputs(self) -> Channels:
-        """Command channels."""
-        return self.twin.inputs
-
-    @property
-    def outputs(self) -> Channels:
-        """Output channels."""
-        return self.twin.outputs
-
-    @property
-    def rate(self) -> float:
-        """Sample rate of the data, in Hz."""
-        return self.twin.rate
 
     def complete(
         self, trajectories: Trajectories, *, progress: Progress | None = None

@@ -14,19 +14,19 @@ from retwin.twins.limits import Limits
 from retwin.twins.system_faults import without_sensor_faults
 from retwin.twins.twin import Chunk, SimulationError, Twin
 
-__all__ = ["TwinWrapper", "chunk_generator", "simulate_chunk"]
+__all__ = ["OfTwin", "TwinWrapper", "chunk_generator", "simulate_chunk"]
 
 INNER_TWIN = 1
 """The purpose of random numbers that is reserved for the seeds of the wrapped twin."""
 
 
-class TwinWrapper:
-    """A twin with the channels, rate and limits of the twin that it wraps.
+class OfTwin:
+    """What has the channels and the sample rate of its twin.
 
     Attributes
     ----------
     twin : Twin
-        The wrapped twin, a field of the subclass.
+        A field of the subclass.
 
     """
 
@@ -34,7 +34,7 @@ class TwinWrapper:
 
         @property
         def twin(self) -> Twin:
-            """The wrapped twin."""
+            """The twin."""
 
     @property
     def inputs(self) -> Channels:
@@ -50,6 +50,10 @@ class TwinWrapper:
     def rate(self) -> float:
         """Sample rate in Hz."""
         return self.twin.rate
+
+
+class TwinWrapper(OfTwin):
+    """A twin with the channels, rate and limits of the twin that it wraps, its field `twin`."""
 
     @property
     def limits(self) -> Limits | None:
