@@ -25,17 +25,17 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.twins.parametric import Parameter
-from retwin.twins.state import State
 from retwin.twins.state_twin import StateTwin
 from retwin.update.blackbox.estimate import (
     BlackBox,
     BlackBoxFit,
     best_order,
     check_records,
+    coefficients_of,
     cross_validated,
     estimation_of,
     followed,
+    states_within,
 )
 from retwin.update.blackbox.lags import Lags, least_squares
 from retwin.update.dynamics.estimation import Point
@@ -44,8 +44,6 @@ __all__ = ["Linear", "best_linear", "fit_arx"]
 
 MAX_ORDER = 8
 """Largest number of past samples that is tried."""
-WIDEST = 1e9
-"""Bound of coefficients."""
 START = 10.0
 """Bound of the states at the first sample, over their largest value at rest."""
 
@@ -128,19 +126,13 @@ class Linear:
         terms = [each.name for each in self.lags.terms]
         names = [f"{own}: {term}" for own in observed.outputs.names for term in terms]
         return StateTwin(
-            [
-                State(f"x{i + 1}", "1", float(each), -bound, bound)
-                for i, each in enumerate(starts.mean(axis=0))
-            ],
+            states_within(starts, bound),
             output,
             observed.inputs,
             observed.outputs,
             observed.rate,
             step=step,
-            parameters=[
-                Parameter(name, "1", -WIDEST, WIDEST, float(value))
-                for name, value in zip(names, theta.ravel(), strict=True)
-            ],
+            parameters=coefficients_of(names, theta),
         )
 
     def starts(self, theta: NDArray) -> NDArray:

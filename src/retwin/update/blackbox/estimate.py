@@ -7,7 +7,7 @@ simulated, saved and used as a twin with corrected dynamics is.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,8 @@ from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.progress import Progress
+from retwin.twins.parametric import Parameter
+from retwin.twins.state import State
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
 from retwin.update.dynamics.estimation import Estimation, Point, correlation_time
@@ -30,11 +32,13 @@ __all__ = [
     "BlackBoxFit",
     "best_order",
     "check_records",
+    "coefficients_of",
     "cross_validated",
     "estimation_of",
     "followed",
     "held_out_errors",
     "held_out_parts",
+    "states_within",
     "with_best_prior",
 ]
 
@@ -60,6 +64,8 @@ MAX_PASSES = 6
 """Times that the error of the outputs is estimated anew."""
 SAME = 0.1
 """Logarithm of the ratio of two variances below which they agree."""
+WIDEST = 1e9
+"""Bound of coefficients, which their priors or the samples keep much smaller."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,6 +257,20 @@ def estimation_of(twin: StateTwin, observed: Trajectories, part: NDArray) -> Est
     base, free, values = state_twin_of(twin)
     unknowns, seen = unknowns_of(base, free, values), observed.mask & ~part[..., None]
     return Estimation(base, observed, unknowns, seen, np.ones(len(base.outputs)))
+
+
+def coefficients_of(names: Iterable[str], values: NDArray) -> list[Parameter]:
+    """The free parameters of a model, which have no unit and hardly a bound."""
+    return [
+        Parameter(name, "1", -WIDEST, WIDEST, value)
+        for name, value in zip(names, values.ravel().tolist(), strict=True)
+    ]
+
+
+def states_within(starts: NDArray, bound: float) -> list[State]:
+    """States (d_x,) without a unit, which begin at the mean of `starts` (records, d_x)."""
+    means = enumerate(starts.mean(axis=0).tolist(), 1)
+    return [State(f"x{i}", "1", mean, -bound, bound) for i, mean in means]
 
 
 def with_best_prior(start: Callable[[NDArray], BlackBoxFit], seen: NDArray) -> BlackBoxFit | None:

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.twins.parametric import Parameter
 from retwin.twins.state import State
 from retwin.twins.state_twin import StateTwin
 from retwin.update.blackbox.estimate import (
@@ -30,6 +29,7 @@ from retwin.update.blackbox.estimate import (
     BlackBoxFit,
     best_order,
     check_records,
+    coefficients_of,
     estimation_of,
     with_best_prior,
 )
@@ -47,8 +47,6 @@ WIDER = 4.0
 that diverges is held there, and the model warns that it leaves the range."""
 MARGIN = 1.0
 """How far samples before the first one may lie beyond the range of a channel, in widths of it."""
-WIDEST = 1e9
-"""Bound of coefficients."""
 MAX_TERMS = 40
 """Largest number of terms of an output that is tried."""
 SIGNIFICANT = 12.0
@@ -117,10 +115,9 @@ class Polynomial:
             observed.outputs,
             observed.rate,
             step=step,
-            parameters=[
-                Parameter(f"{observed.outputs.names[own]}: {names[i]}", "1", -WIDEST, WIDEST, value)
-                for (own, i), value in zip(places, coefficients.tolist(), strict=True)
-            ],
+            parameters=coefficients_of(
+                [f"{observed.outputs.names[own]}: {names[i]}" for own, i in places], coefficients
+            ),
         )
 
     @property

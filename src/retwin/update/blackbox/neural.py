@@ -28,15 +28,15 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
-from retwin.twins.parametric import Parameter
-from retwin.twins.state import State
 from retwin.twins.state_twin import StateTwin
 from retwin.update.blackbox.arx import Linear, best_linear
 from retwin.update.blackbox.estimate import (
     BlackBox,
     BlackBoxFit,
     best_order,
+    coefficients_of,
     estimation_of,
+    states_within,
     with_best_prior,
 )
 from retwin.update.blackbox.lags import Lags
@@ -50,8 +50,6 @@ WIDTHS = (2, 16)
 """Least and largest width of the hidden layer."""
 START = 3.0
 """Bound of the states at the first sample, over their largest value in the linear model."""
-WIDEST = 1e9
-"""Bound of the parameters, which their priors keep much smaller."""
 
 
 def fit_neural_ss(observed: Trajectories, seed: int, progress: Progress | None) -> BlackBox:
@@ -162,20 +160,16 @@ class NeuralModel:
 
         bound = START * max(1.0, float(np.abs(self.starts).max()))
         return StateTwin(
-            [
-                State(f"x{i + 1}", "1", float(each), -bound, bound)
-                for i, each in enumerate(self.starts.mean(axis=0))
-            ],
+            states_within(self.starts, bound),
             output,
             observed.inputs,
             observed.outputs,
             observed.rate,
             step=step,
-            parameters=[
-                Parameter(f"{name}{i + 1}", "1", -WIDEST, WIDEST, value)
-                for name, each in self.arrays.items()
-                for i, value in enumerate(each.ravel().tolist())
-            ],
+            parameters=coefficients_of(
+                [f"{name}{i + 1}" for name, each in self.arrays.items() for i in range(each.size)],
+                np.concatenate([each.ravel() for each in self.arrays.values()]),
+            ),
         )
 
     def start(self, part: NDArray) -> BlackBoxFit:
