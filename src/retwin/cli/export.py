@@ -17,6 +17,8 @@ from retwin.serialisation.places import check_place
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from retwin.deploy.actuator.export import ExportedActuator
+
 __all__ = ["app"]
 
 TRAJECTORIES = 256
@@ -114,6 +116,11 @@ def actuator(
             draws=draws,
             onnx=not torchscript_only,
         )
+    _print_actuator(made, out, as_json=as_json)
+
+
+def _print_actuator(made: ExportedActuator, out: Path, *, as_json: bool) -> None:
+    """The delays, and what a user of the files should know."""
     mean, greatest = made.delay
     shown = [f"Delays are {1000 * mean:.3g} ms on average and {1000 * greatest:.3g} ms at most."]
     if made.early:

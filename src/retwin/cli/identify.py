@@ -28,8 +28,9 @@ from retwin.serialisation.places import check_place
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from retwin.cases.logs import Columns, LogReader
+    from retwin.cases.logs import Columns, LogReader, Logs
     from retwin.cases.opened_twin import OpenedTwin
+    from retwin.data.trajectories import Trajectories
     from retwin.evaluation.identification import Identification
 
 __all__ = ["identify"]
@@ -125,7 +126,6 @@ def identify(
     from retwin.cases import LogReader
     from retwin.deploy.identified import HOLDS, save_identification
     from retwin.evaluation import identification as room
-    from retwin.evaluation.identification.hold_out import SHARE
     from retwin.twins import keep_workers
     from retwin.update.identification import identify as run
 
@@ -133,16 +133,7 @@ def identify(
     settings = _method(method, loss, starts)
     columns = replace(_columns(column, time, transient), mapping=mapping)
     names = [channel_names(each) for each in (inputs, outputs)]
-    given = rate is not None
-    for log in logs:
-        require(
-            log.exists(),
-            "LOG",
-            expected="an existing file or folder",
-            got=f"{log}, where there is none",
-            remedy="check the name",
-        )
-    any_rate = Path(twin).suffix.lower() in UNRATED
+    _check_there(logs)
     reader = LogReader(columns, max_bytes)
     opened, left_out = _opened(twin, logs, reader, free or (), names, rate)
     with keep_workers(), bar("identify") as show:
@@ -150,16 +141,13 @@ def identify(
             logs,
             opened.twin,
             case=opened.case,
-            rows_at_rate=given or not any_rate,
+            rows_at_rate=rate is not None or Path(twin).suffix.lower() not in UNRATED,
             progress=lambda share: show("read, 1 of 3", share),
         )
         if left_out:
             text = f"Outputs that no log holds are left out: {', '.join(left_out)}."
             read = replace(read, notes=(*read.notes, text))
-        used, held_out = read.trajectories, read.test
-        if held_out is None or hold_out is not None:
-            share = SHARE if hold_out is None else hold_out
-            used, held_out = room.hold_out(read.trajectories, share, seed=seed)
+        used, held_out = _separated(read, hold_out, seed)
         note(_plan(opened, used, method))
         found = run(
             opened.twin,
@@ -174,6 +162,29 @@ def identify(
         checked = room.validate_identification(found, opened.twin, used, held_out, seed=seed)
         values = save_identification(checked, opened, read, out, command=command_given())
     _print(checked, values, as_json=as_json)
+
+
+def _check_there(logs: Sequence[Path]) -> None:
+    for log in logs:
+        require(
+            log.exists(),
+            "LOG",
+            expected="an existing file or folder",
+            got=f"{log}, where there is none",
+            remedy="check the name",
+        )
+
+
+def _separated(
+    read: Logs, share: float | None, seed: int
+) -> tuple[Trajectories, Trajectories | None]:
+    """What is used and what is held out: the test of the case, unless a share is given."""
+    from retwin.evaluation.identification import hold_out
+    from retwin.evaluation.identification.hold_out import SHARE
+
+    if read.test is not None and share is None:
+        return read.trajectories, read.test
+    return hold_out(read.trajectories, SHARE if share is None else share, seed=seed)
 
 
 def _opened(

@@ -60,6 +60,33 @@ Servos = Annotated[
     list[str] | None,
     typer.Option("--servo", metavar="JOINT=K,D", help="A servo for a joint of a URDF; repeatable."),
 ]
+Count = Annotated[
+    int | None,
+    typer.Option("--n", metavar="N", help="Else one per row of --commands, or class."),
+]
+CommandCase = Annotated[
+    str | None,
+    typer.Option(
+        metavar="CASE",
+        help="Source of commands and faults; else its own.",
+        autocompletion=one_of(CASES),
+    ),
+]
+CommandFile = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Trajectories with the commands.")
+]
+FaultName = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        help="A class, or all (dealt in turn), or none.",
+        autocompletion=complete_faults,
+    ),
+]
+Duration = Annotated[
+    float | None,
+    typer.Option(metavar="SECONDS", help="Of commands that no case draws.", min=1e-9),
+]
 
 SHOWN = 100
 """Largest number of channels in a table: one of thousands takes minutes to lay out."""
@@ -147,34 +174,11 @@ def _ends(channel: dict[str, Any]) -> tuple[str, str]:
 def simulate(
     twin: TwinName,
     out: Annotated[Path, typer.Option(metavar="FILE", help="New *.npz, or *.zarr of any size.")],
-    n: Annotated[
-        int | None,
-        typer.Option("--n", metavar="N", help="Else one per row of --commands, or class."),
-    ] = None,
-    case: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CASE",
-            help="Source of commands and faults; else its own.",
-            autocompletion=one_of(CASES),
-        ),
-    ] = None,
-    commands: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Trajectories with the commands."),
-    ] = None,
-    fault: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="A class, or all (dealt in turn), or none.",
-            autocompletion=complete_faults,
-        ),
-    ] = "none",
-    duration: Annotated[
-        float | None,
-        typer.Option(metavar="SECONDS", help="Of commands that no case draws.", min=1e-9),
-    ] = None,
+    n: Count = None,
+    case: CommandCase = None,
+    commands: CommandFile = None,
+    fault: FaultName = "none",
+    duration: Duration = None,
     inputs: Inputs = "",
     outputs: Outputs = "",
     rate: Rate = None,
