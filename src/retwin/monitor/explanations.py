@@ -9,21 +9,18 @@ from collections.abc import Callable, Container, Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from retwin.checks import require
-from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.estimate import UNKNOWN
 from retwin.errors import InputError, brief
 from retwin.monitor.audit import Entry
 from retwin.monitor.cause import BEFORE, FEWEST, Cause, find_causes, possible_causes
-from retwin.monitor.gridded import gridded
+from retwin.monitor.gridded import gridded, record_of
 from retwin.monitor.live import Live
 from retwin.monitor.monitor import Alarm, Monitor
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import SECOND
 from retwin.twins.faults import Fault
-from retwin.update.dynamics.twin import DynamicsTwin
 
 __all__ = ["Explanations"]
 
@@ -160,26 +157,11 @@ class Explanations:
             got=len(times),
             remedy="store more of them: see max_samples",
         )
-        record = _record(monitor.twin, values)
+        record = record_of(monitor.twin, values)
         own = Alarm("", record.steps - 1, 0.0, alarm["output"], alarm["change"], alarm["evidence"])
         known = self.causes(twin, monitor)
         (cause,) = find_causes(monitor.twin, record, [own], known, known_start=False)
         return cause, int(times[0])
-
-
-def _record(twin: DynamicsTwin, values: NDArray) -> Trajectories:
-    """Samples (T, d_u + d_y) as a record."""
-    commands, measured = np.split(values, [len(twin.inputs)], axis=1)
-    return Trajectories(
-        commands=commands[None],
-        nominal=np.zeros_like(measured)[None],
-        observed=np.where(np.isfinite(measured), measured, 0.0)[None],
-        mask=np.isfinite(measured)[None],
-        rate=twin.rate,
-        ids=np.array([""]),
-        inputs=twin.inputs,
-        outputs=twin.outputs,
-    )
 
 
 def _data(entry: Entry, found: tuple[Cause, int]) -> dict[str, Any]:

@@ -1,16 +1,19 @@
-"""Stored samples of a machine at the sample rate of its twin."""
+"""Samples of a machine at the sample rate of its twin, and as a record."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.data.trajectories import Trajectories
 from retwin.monitor.samples import SECOND
 from retwin.monitor.store import Store
 from retwin.monitor.updates import LEAST
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["gridded"]
+__all__ = ["gridded", "record_of"]
 
 
 def gridded(
@@ -55,7 +58,30 @@ def gridded(
     inside = place <= (last - first) / period
     rows = np.full((int(place[inside][-1]) + 1, given.shape[1]), np.nan)
     rows[place[inside]] = given[chosen[inside]]
-    known = np.isfinite(rows[:, :commands])
-    index = np.maximum.accumulate(np.where(known, np.arange(len(rows))[:, None], 0), axis=0)
-    rows[:, :commands] = np.take_along_axis(rows[:, :commands], index, axis=0)
+    rows[:, :commands] = _held(rows[:, :commands])
     return found[0] + np.round(np.arange(len(rows)) * period).astype(np.int64), rows
+
+
+def record_of(twin: Any, values: NDArray) -> Trajectories:
+    """Samples (T, d_u + d_y) at the sample rate of a twin as one trajectory.
+
+    A command that is missing is the one before; the first ones must be there.
+    """
+    commands, measured = np.split(values, [len(twin.inputs)], axis=1)
+    return Trajectories(
+        commands=_held(commands)[None],
+        nominal=np.zeros_like(measured)[None],
+        observed=np.where(np.isfinite(measured), measured, 0.0)[None],
+        mask=np.isfinite(measured)[None],
+        rate=twin.rate,
+        ids=np.array([""]),
+        inputs=twin.inputs,
+        outputs=twin.outputs,
+    )
+
+
+def _held(commands: NDArray) -> NDArray:
+    """Commands (T, d_u) in which a missing one is the one before."""
+    known = np.isfinite(commands)
+    index = np.maximum.accumulate(np.where(known, np.arange(len(commands))[:, None], 0), axis=0)
+    return np.take_along_axis(commands, index, axis=0)
