@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -72,7 +73,15 @@ def stream(folder: Path, url: str, steps: int, begin: int, seed: int, acknowledg
             os.write(acknowledged, f"{k}\n".encode())
 
 
-def attempt(folder: Path, url: str, steps: int, begin: int, seed: int, seconds: float | None):
+def attempt(
+    folder: Path,
+    url: str,
+    steps: int,
+    begin: int,
+    seed: int,
+    seconds: float | None,
+    stream: Callable = stream,
+) -> int:
     """The number of samples of each machine that were acknowledged until the process was killed."""
     received, sent = os.pipe()
     process = os.fork()

@@ -152,7 +152,7 @@ def test_a_restart_continues_with_held_samples(store: Store, monitor: Monitor) -
     live = Live(store, wait=30.0)
     (again,) = live.submit([samples(made[90:120], 90)])
     assert vars(again.counts) == {
-        "used": 10, "repeated": 20, "late": 0, "ahead": 0, "extra": 0, "unknown": 0,
+        "used": 10, "repeated": 20, "late": 0, "ahead": 0, "extra": 0, "unknown": 0, "refused": 0,
     }  # fmt: skip
     live.submit([samples(made[120:], 120)])
     whole = monitor.watch(recorded(5, LEAK)).alarms

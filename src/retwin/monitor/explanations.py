@@ -100,7 +100,7 @@ class Explanations:
         """Queue alarms, each with the time of the alarm before it of the same machine."""
         for entry in alarms:
             asset = entry.data["asset"]
-            if entry.sequence not in explained:
+            if entry.sequence not in explained and "cause" not in entry.data:
                 self._queue.put((entry, self._before.get(asset, 0)))
             self._before[asset] = entry.data["time"]
             self._last = entry.sequence

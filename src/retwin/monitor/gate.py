@@ -9,8 +9,9 @@ from concurrent.futures import Future
 from typing import TypeAlias
 
 from retwin.errors import InputError
-from retwin.monitor.live import Live, Received
-from retwin.monitor.samples import Samples
+from retwin.monitor.live import Live
+from retwin.monitor.samples import Samples, Trajectory
+from retwin.monitor.status import Received
 
 __all__ = ["Gate"]
 
@@ -19,14 +20,15 @@ QUEUE = 10_000
 GROUP = 50_000
 """Samples of one commit at most, beside those of one producer."""
 
-_Waiting: TypeAlias = tuple[Samples, "Future[Received]"]
+_Waiting: TypeAlias = tuple[Samples | Trajectory, "Future[Received]"]
 
 
 class Gate:
     """The way of samples into a `Live`; a context manager that closes it.
 
     A thread takes all samples that wait and submits them in one commit, so that commits become
-    larger when there is more to do. Samples of one machine are used in the order of `send`.
+    larger when there is more to do; another one takes trajectories of machines that are watched so,
+    whose diagnosis would delay them. What one machine sends is used in the order of `send`.
 
     Parameters
     ----------
@@ -37,11 +39,15 @@ class Gate:
 
     def __init__(self, live: Live) -> None:
         self.live = live
-        self._queue: queue.Queue[_Waiting | None] = queue.Queue(QUEUE)
+        self._queues: list[queue.Queue[_Waiting | None]] = [queue.Queue(QUEUE) for _ in range(2)]
         self._lock = threading.Lock()
         self._closed = False
-        self._thread = threading.Thread(target=self._run, name="gate", daemon=True)
-        self._thread.start()
+        self._threads = [
+            threading.Thread(target=self._run, args=(own,), name="gate", daemon=True)
+            for own in self._queues
+        ]
+        for each in self._threads:
+            each.start()
 
     def __enter__(self) -> Gate:
         return self
@@ -49,8 +55,8 @@ class Gate:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def send(self, samples: Samples) -> Future[Received]:
-        """Hand samples over; the future has a result when they are durable.
+    def send(self, samples: Samples | Trajectory) -> Future[Received]:
+        """Hand samples or a trajectory over; the future has a result when they are durable.
 
         Its exception is an `InputError` if they were refused or could not be stored.
 
@@ -66,7 +72,7 @@ class Gate:
                 raise InputError(
                     "gate", expected="one that is open", got="a closed one", remedy="open another"
                 )
-            self._queue.put((samples, future))
+            self._queues[self.live.in_trajectories(samples.asset)].put((samples, future))
         return future
 
     def close(self) -> None:
@@ -74,22 +80,24 @@ class Gate:
         with self._lock:
             if not self._closed:
                 self._closed = True
-                self._queue.put(None)
-        self._thread.join()
+                for each in self._queues:
+                    each.put(None)
+        for thread in self._threads:
+            thread.join()
 
-    def _run(self) -> None:
+    def _run(self, own: queue.Queue[_Waiting | None]) -> None:
         open_ = True
         while open_:
             group: list[_Waiting] = []
-            waiting = self._queue.get()
+            waiting = own.get()
             count = 0
             while waiting is not None:
                 group.append(waiting)
-                count += len(waiting[0].times)
+                count += len(waiting[0].values)
                 if count >= GROUP:
                     break
                 try:
-                    waiting = self._queue.get_nowait()
+                    waiting = own.get_nowait()
                 except queue.Empty:
                     break
             open_ = waiting is not None

@@ -5,89 +5,38 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from retwin.checks import finite, instance, require, whole
 from retwin.errors import InputError
 from retwin.monitor.audit import Entry
+from retwin.monitor.kinds import AnyMonitor, load_monitor
 from retwin.monitor.machine import Counts, Layout, Machine, Recent, Work
-from retwin.monitor.monitor import Alarm, Monitor, Watched
 from retwin.monitor.registry import Registry
-from retwin.monitor.samples import SECOND, Samples
+from retwin.monitor.samples import SECOND, Samples, Trajectory
+from retwin.monitor.status import AssetStatus, Received
+from retwin.monitor.stepping import step
 from retwin.monitor.store import Store
+from retwin.monitor.trajectories import TrajectoryMonitor
+from retwin.monitor.trajectory_machine import Diagnosed, TrajectoryMachine
 from retwin.monitor.updates import MOST, Asset, Update, one_asset
 
-__all__ = ["AssetStatus", "Live", "Received"]
+__all__ = ["Live"]
 
 MOST_WAIT = 60.0
 """Seconds for which a place without a sample is waited for at most."""
-
-
-@dataclass(frozen=True)
-class Received:
-    """What became of samples of one machine; see docs/monitor.md.
-
-    Attributes
-    ----------
-    asset : str
-        Its name.
-    counts : Counts
-        Samples by what was done with them.
-    alarms : int
-        Alarms that were raised when they were used.
-
-    """
-
-    asset: str
-    counts: Counts
-    alarms: int
-
-
-@dataclass(frozen=True)
-class AssetStatus:
-    """How a machine is.
-
-    Attributes
-    ----------
-    asset, twin : str
-        Its name, and that of its twin.
-    version : int
-        The version of the twin that watches it.
-    time : int, optional
-        Time of its newest sample in nanoseconds; None before the first.
-    ratio : float
-        Evidence for a change, over the threshold of an alarm.
-    alarms : int
-        Alarms since the program was started.
-    last_alarm : int, optional
-        Time of the last one of these.
-    void, outside : bool
-        Whether the promise does not apply any more, and whether commands have left their range in
-        calibration.
-    rate : str
-        How the sample rate differs from the twin's; "" if it does not.
-    counts : dict of str to int
-        Samples since the program was started, by what was done with them.
-
-    """
-
-    asset: str
-    twin: str
-    version: int
-    time: int | None
-    ratio: float
-    alarms: int
-    last_alarm: int | None
-    void: bool
-    outside: bool
-    rate: str
-    counts: dict[str, int]
+WHY = {
+    "late": "it begins before the newest one ends",
+    "unknown": "a command of its first sample is missing",
+    "refused": "single samples are none; send arrays of values",
+}
+"""Why a trajectory is not used, where that is an event of the log."""
 
 
 class Live:
@@ -130,8 +79,11 @@ class Live:
         self._ahead = finite("ahead", ahead, least=0.0, most=MOST / SECOND, unit="s")
         self._clock = clock
         self._lock = threading.RLock()
-        self._monitors: dict[tuple[str, int], tuple[Monitor, Layout]] = {}
-        self._machines: dict[str, Machine] = {}
+        self._diagnosing = threading.Lock()
+        """Held while a trajectory is diagnosed, which takes long, taken before the other lock."""
+        self._monitors: dict[tuple[str, int], tuple[AnyMonitor, str]] = {}
+        self._layouts: dict[str, Layout] = {}
+        self._machines: dict[str, Machine | TrajectoryMachine] = {}
         self._unsure: set[str] = set()
         """Machines that must be read from the store again: a commit of theirs failed."""
         self._listeners: list[Callable[[list[Entry]], None]] = []
@@ -195,15 +147,20 @@ class Live:
         twin = self._one(asset).monitor.twin
         return (*twin.inputs.names, *twin.outputs.names)
 
-    def monitor(self, asset: str) -> Monitor:
+    def monitor(self, asset: str) -> AnyMonitor:
         """The monitor that watches a machine."""
         return self._one(asset).monitor
 
-    def submit(self, batch: Sequence[Samples]) -> list[Received]:
-        """Use samples of any machines, in their order; all is durable on return.
+    def in_trajectories(self, asset: str) -> bool:
+        """Whether a machine is watched trajectory by trajectory."""
+        return isinstance(self._machines.get(asset), TrajectoryMachine)
 
-        Samples, states and alarms are stored in one commit. What is found does not depend on how
-        samples and machines are grouped into calls.
+    def submit(self, batch: Sequence[Samples | Trajectory]) -> list[Received]:
+        """Use samples and trajectories of any machines, in their order; all is durable on return.
+
+        Samples, states and alarms are stored in one commit; those of a machine that is watched
+        trajectory by trajectory in one for each trajectory, which is diagnosed while other calls go
+        on. What is found does not depend on how they are grouped into calls.
 
         Raises
         ------
@@ -212,23 +169,22 @@ class Live:
             batch was acknowledged, and it may be sent again.
 
         """
-        with self._lock:
-            self._read_again()
-            for each in batch:
-                width = self._one(each.asset).asset.channels
-                require(
-                    each.values.shape[1] == width,
-                    f"samples of {each.asset}",
-                    expected=f"{width} channels",
-                    got=each.values.shape[1],
-                    remedy="give commands and then outputs, see Live.channels",
-                )
-            try:
-                return self._submitted(batch)
-            except BaseException:
-                # What the store holds is true, but it may not be in reach now.
-                self._unsure |= {each.asset for each in batch}
-                raise
+        for each in batch:
+            width = self._one(each.asset).asset.channels
+            require(
+                each.values.ndim == 2 and each.values.shape[1] == width,
+                f"samples of {each.asset}",
+                expected=f"{width} channels",
+                got=each.values.shape[-1],
+                remedy="give commands and then outputs, see Live.channels",
+            )
+        found: list[Received] = []
+        for whole_, group in groupby(batch, lambda each: self.in_trajectories(each.asset)):
+            if whole_:
+                found += [self._diagnosed(each) for each in group]
+            else:
+                found += self._sampled([self._samples(each) for each in group])
+        return found
 
     def status(self) -> list[AssetStatus]:
         """All machines, those with most evidence for a change first."""
@@ -291,19 +247,95 @@ class Live:
             self._machines[name] = self._machine(self._machines[name].asset)
             self._unsure.discard(name)
 
+    def _samples(self, given: Samples | Trajectory) -> Samples:
+        """A trajectory of a machine that is watched sample by sample is its samples."""
+        if isinstance(given, Samples):
+            return given
+        return given.samples(self._one(given.asset).monitor.twin.rate)
+
+    def _diagnosed(self, given: Samples | Trajectory) -> Received:
+        """Use one trajectory."""
+        with self._diagnosing:
+            while True:
+                with self._lock, self._rereading(given.asset):
+                    self._read_again()
+                    machine = self._one(given.asset)
+                    assert isinstance(machine, TrajectoryMachine)
+                    received = self._unused(machine, given)
+                if received is not None:
+                    return received
+                assert isinstance(given, Trajectory)
+                made = machine.diagnose(given)
+                with self._lock, self._rereading(given.asset):
+                    # Another version may watch since.
+                    if self._machines.get(given.asset) is machine:
+                        return self._stored(machine, made)
+
+    def _unused(self, machine: TrajectoryMachine, given: Samples | Trajectory) -> Received | None:
+        """What became of a trajectory that is not to be diagnosed; None for one that is."""
+        begin = given.begin if isinstance(given, Trajectory) else None
+        known = () if begin is None else self.store.present(given.asset, np.array([begin]))
+        what = machine.placed(given, self._limit(), set(np.array(known).tolist()))
+        if what == "used":
+            return None
+        if what in WHY:
+            self.log([machine.refusal(begin or self._clock(), WHY[what])])
+        return self._counted(machine, what, 0)
+
+    def _stored(self, machine: TrajectoryMachine, made: Diagnosed) -> Received:
+        if made.watched is None:
+            self.log([machine.refusal(int(made.samples.times[0]), made.refused)])
+            return self._counted(machine, "refused", 0)
+        update, entries = machine.update(made)
+        committed = self.store.commit([update], entries).entries
+        machine.take(made)
+        received = self._counted(machine, "used", len(made.watched.alarms))
+        self._announce(committed)
+        return received
+
+    def _counted(self, machine: TrajectoryMachine, what: str, alarms: int) -> Received:
+        counts = Counts(**{what: 1})
+        machine.counts.add(counts)
+        return Received(machine.asset.name, counts, alarms)
+
+    def _limit(self) -> int:
+        return self._clock() + round(self._ahead * SECOND)
+
+    @contextmanager
+    def _rereading(self, *assets: str) -> Iterator[None]:
+        """Machines are read from the store again after an exception in the block.
+
+        What the store holds is true, but it may not be in reach now.
+        """
+        try:
+            yield
+        except BaseException:
+            self._unsure |= set(assets)
+            raise
+
+    def _sampled(self, batch: Sequence[Samples]) -> list[Received]:
+        """Use samples of machines that are watched sample by sample, in one commit."""
+        with self._lock, self._rereading(*(each.asset for each in batch)):
+            self._read_again()
+            return self._submitted(batch)
+
+    def _streams(self, names: Iterable[str]) -> list[Machine]:
+        machines = [self._one(name) for name in names]
+        return [each for each in machines if isinstance(each, Machine)]
+
     def _submitted(self, batch: Sequence[Samples]) -> list[Received]:
-        limit = self._clock() + round(self._ahead * SECOND)
+        limit = self._limit()
         found, alarms = [], Counter[str]()
-        for each in batch:
-            machine, counts = self._machines[each.asset], Counts()
+        streams = self._streams(each.asset for each in batch)
+        for each, machine in zip(batch, streams, strict=True):
+            counts = Counts()
             known = set(self.store.present(each.asset, machine.unsure(each.times)).tolist())
             left = machine.accept(each, limit, known, counts)
             while len(left.times):
                 alarms += self._stepped([machine])
                 left = machine.accept(left, limit, known, counts)
             found.append(counts)
-        used = list(dict.fromkeys(each.asset for each in batch))
-        machines = [self._machines[name] for name in used]
+        machines = list(dict.fromkeys(streams))
         alarms += self._stepped(machines)
         updates, entries = [], []
         for machine in machines:
@@ -333,7 +365,7 @@ class Live:
             )
             for _, group in groupby(sorted(ready, key=key), key):
                 together = list(group)
-                alarms.update(_step(together))
+                alarms.update(step(together))
         return alarms
 
     def _announce(self, entries: list[Entry]) -> None:
@@ -341,19 +373,26 @@ class Live:
         for listener in self._listeners:
             listener(entries)
 
-    def _one(self, name: str) -> Machine:
+    def _one(self, name: str) -> Machine | TrajectoryMachine:
         found = self._machines.get(name)
         if found is None:
             one_asset(dict.fromkeys(self._machines, (0, 0)), name)
         assert found is not None
         return found
 
-    def _machine(self, asset: Asset) -> Machine:
+    def _machine(self, asset: Asset) -> Machine | TrajectoryMachine:
         """A machine as the store has it, with the samples that wait for others."""
         assert asset.version is not None
-        monitor = self._monitor(asset.settings["twin"], asset.version)
-        machine = Machine(asset, *monitor, self._wait)
+        monitor, digest = self._monitor(asset.settings["twin"], asset.version)
         stored = self.store.state(asset.name)
+        if isinstance(monitor, TrajectoryMonitor):
+            watched = TrajectoryMachine(asset, monitor, digest)
+            if stored is not None:
+                watched.restore(*stored)
+            return watched
+        if digest not in self._layouts:
+            self._layouts[digest] = Layout(monitor, digest)
+        machine = Machine(asset, monitor, self._layouts[digest], self._wait)
         if stored is not None and machine.restore(stored[1]):
             for times, values in self.store.samples(asset.name, machine.stepped_time):
                 machine.hold(times, values)
@@ -370,41 +409,15 @@ class Live:
             )
         return active.number
 
-    def _monitor(self, twin: str, version: int) -> tuple[Monitor, Layout]:
+    def _monitor(self, twin: str, version: int) -> tuple[AnyMonitor, str]:
+        """A version, and the hash of its files."""
         key = twin, version
         if key not in self._monitors:
             registry = Registry(self.store, twin)
-            monitor = Monitor.load(registry.folder(version))
             digest = {each.number: each.digest for each in registry.versions()}[version]
-            self._monitors[key] = monitor, Layout(monitor, digest)
+            self._monitors[key] = load_monitor(registry.folder(version)), digest
         return self._monitors[key]
 
 
 def _event(asset: Asset, moment: int, text: str) -> dict[str, Any]:
     return {"asset": asset.name, "time": moment, "what": "version", "text": text}
-
-
-def _step(together: Sequence[tuple[Machine, Work]]) -> dict[str, int]:
-    """Step machines of one monitor, each by as many samples; their numbers of alarms."""
-    machines = [each for each, _ in together]
-    monitor = machines[0].monitor
-    layout = machines[0].layout
-    before = layout.state(np.stack([machine.state_for(work) for machine, work in together]))
-    values = np.stack([work.values for _, work in together])
-    commands, measured = np.split(values, [len(monitor.twin.inputs)], axis=2)
-    names = [each.asset.name for each in machines]
-    after, watched = monitor.step(before, commands, measured, names)
-    states = layout.rows(after)
-    alarms: dict[str, list[Alarm]] = {name: [] for name in names}
-    for alarm in watched.alarms:
-        alarms[alarm.trajectory].append(alarm)
-    for i, (machine, work) in enumerate(together):
-        machine.stepped(work, states[i], _row(watched, i), alarms[machine.asset.name])
-    return {name: len(each) for name, each in alarms.items()}
-
-
-def _row(watched: Watched, i: int) -> dict[str, NDArray]:
-    return {
-        name: getattr(watched, name)[i]
-        for name in ("mean", "deviation", "evidence", "void", "outside")
-    }

@@ -56,6 +56,8 @@ class Counts:
         Not stored: their place has another sample.
     unknown : int
         Not stored: before the first sample of which all commands are known.
+    refused : int
+        Not stored: trajectories that their monitor cannot use, and samples outside of one.
 
     """
 
@@ -65,6 +67,7 @@ class Counts:
     ahead: int = 0
     extra: int = 0
     unknown: int = 0
+    refused: int = 0
 
     def add(self, other: Counts) -> None:
         """Add the counts of further samples."""
@@ -326,6 +329,8 @@ class Machine:
 
     def restore(self, arrays: Mapping[str, NDArray]) -> bool:
         """Continue where `arrays` was stored; False if another version or monitor watched."""
+        if "stream" not in arrays:  # of a monitor of trajectories
+            return False
         origin, done, self.newest, version, *window = arrays["stream"].tolist()
         other = not np.array_equal(arrays.get("digest", self.layout.digest), self.layout.digest)
         shape = arrays["monitor"].shape

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from functools import partial
@@ -13,12 +13,13 @@ from typing import Any
 
 from retwin import cases
 from retwin.cases.case import Case
+from retwin.checks import require
 from retwin.errors import InputError
 from retwin.monitor.audit import Entry
 from retwin.monitor.explanations import Explanations
 from retwin.monitor.gate import Gate
+from retwin.monitor.kinds import AnyMonitor, load_monitor
 from retwin.monitor.live import Live
-from retwin.monitor.monitor import Monitor
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import SECOND
 from retwin.monitor.server import create_app, listening, serving
@@ -73,7 +74,7 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
     with ExitStack() as opened:
         bound = settings.server and opened.enter_context(_bound(settings.server))
         for twin in settings.twins.values():
-            Monitor.load(twin.monitor)
+            load_monitor(twin.monitor)
         store = Store(settings.store, settings.url, max_samples=settings.max_samples)
         opened.enter_context(store)
         for name, twin in settings.twins.items():
@@ -131,6 +132,8 @@ def described(entry: Entry) -> str:
     if entry.kind not in texts:
         return ""
     text = texts[entry.kind].format(sequence=entry.sequence, **data)
+    if "cause" in data:
+        text += f", cause: {data['cause']['name']}, probability {data['cause']['probability']:.2f}"
     return f"{data['asset']}: {text} ({_moment(data['time'])})"
 
 
@@ -209,16 +212,30 @@ def _source(
             name: layout_of(settings, channels[name], systems[whole.assets[name].twin])
             for name in names
         }
+        _check_samples(live, names, settings.type)
         newest = {each.asset: each.time for each in live.status() if each.time is not None}
         return Folder(settings, layouts, newest, report)
+    _check_samples(live, settings.nodes, settings.type)
     rates = {name: live.monitor(name).twin.rate for name in whole.assets}
     return OpcUa(settings, channels, rates, report)
+
+
+def _check_samples(live: Live, names: Iterable[str], source: str) -> None:
+    """Refuse a source of single samples for machines that are watched in trajectories."""
+    for name in names:
+        require(
+            not live.in_trajectories(name),
+            "sources",
+            expected=f"one that gives complete trajectories, for {name}",
+            got=f"one of single samples, {source}",
+            remedy="send each trajectory by MQTT or HTTP, as arrays in values",
+        )
 
 
 def _faults(case: Case | None) -> dict[str, Fault | None] | None:
     return None if case is None else dict(case.alarm_causes)
 
 
-def _case(twin: TwinSettings, monitor: Monitor) -> Case | None:
-    name = twin.case or monitor.twin.case
+def _case(twin: TwinSettings, monitor: AnyMonitor) -> Case | None:
+    name = twin.case or getattr(monitor.twin, "case", None)
     return cases.get(name) if name else None

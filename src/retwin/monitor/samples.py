@@ -1,4 +1,4 @@
-"""`Samples` of a machine as they arrive, and the JSON in which they are sent."""
+"""`Samples` and whole trajectories of a machine, and the JSON in which they are sent."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from retwin.checks import require
 from retwin.errors import InputError, brief
 from retwin.monitor.updates import LEAST, MOST
 
-__all__ = ["SECOND", "Samples", "nanoseconds", "parse"]
+__all__ = ["SECOND", "Samples", "Trajectory", "nanoseconds", "parse"]
 
 SECOND = 10**9
 """Nanoseconds of a second."""
@@ -66,10 +66,36 @@ class Samples:
         object.__setattr__(self, "values", np.where(np.isfinite(values), values, np.nan))
 
 
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A complete trajectory of one machine, at the sample rate of its twin.
+
+    Parameters
+    ----------
+    asset : str
+        Its name.
+    begin : int
+        Time of the first sample, in nanoseconds since the epoch.
+    values : array (T, d_u + d_y)
+        Commands, then outputs; what is not finite is missing.
+
+    """
+
+    asset: str
+    begin: int
+    values: NDArray
+
+    def samples(self, rate: float) -> Samples:
+        """Its samples at that rate in Hz; times end before they are out of range."""
+        period = SECOND / rate
+        times = [min(self.begin + round(k * period), MOST) for k in range(len(self.values))]
+        return Samples(self.asset, np.array(times, dtype=np.int64), self.values)
+
+
 def parse(
     document: bytes | str, channels: Callable[[str], Sequence[str]], asset: str | None = None
-) -> list[Samples]:
-    """The samples of a JSON document, of one machine after the other.
+) -> list[Samples | Trajectory]:
+    """The samples of a JSON document, of one machine after the other, and then its trajectories.
 
     Parameters
     ----------
@@ -77,7 +103,9 @@ def parse(
         An object `{"asset": "line1", "time": 1700000000.25, "values": {"heater": 1, "T1": 21.3}}`,
         an array of such objects, or one on each line. `time` is in s since the epoch or ISO 8601
         with an offset; `time_ns` in its place is a whole number of nanoseconds. A channel that is
-        absent, null or not finite is missing.
+        absent, null or not finite is missing. Where `values` are arrays, the object is a
+        trajectory, `time` is that of its first sample, and the others follow at the sample rate of
+        the twin.
     channels : callable
         Gives the names of the channels of a machine, commands first; it raises an InputError for an
         unknown one (`Live.channels`).
@@ -93,11 +121,17 @@ def parse(
     times: dict[str, list[int]] = {}
     rows: dict[str, list[list[float]]] = {}
     known: dict[str, dict[str, int]] = {}
+    trajectories: list[Samples | Trajectory] = []
+    count = 0
     needed = {"values"} if asset is not None else {"asset", "values"}
     for number, each in enumerate(_objects(document)):
         place = f"sample {number}"
+        given = each.get("values") if isinstance(each, dict) else None
+        given = given if isinstance(given, dict) else {}
+        length = max(map(_length, given.values()), default=0)
+        count += max(1, length)
         require(
-            number < LONGEST,
+            count <= LONGEST,
             "samples",
             expected=f"at most {LONGEST} in a document",
             got="more",
@@ -120,10 +154,16 @@ def parse(
         )
         if name not in known:
             known[name] = {channel: i for i, channel in enumerate(channels(name))}
+        if length:
+            columns = _columns(given, length, place)
+            block = [_row(row, known[name], place) for row in columns]
+            trajectories.append(Trajectory(name, _time(each, place), np.array(block)))
+            continue
         times.setdefault(name, []).append(_time(each, place))
         rows.setdefault(name, []).append(_row(each["values"], known[name], place))
     return [
-        Samples(name, np.array(times[name], dtype=np.int64), np.array(rows[name])) for name in times
+        *(Samples(name, np.array(times[name], np.int64), np.array(rows[name])) for name in times),
+        *trajectories,
     ]
 
 
@@ -186,6 +226,24 @@ def _time(each: dict[str, Any], place: str) -> int:
         got=repr(given)[:60],
         remedy=REMEDY,
     )
+
+
+def _length(value: Any) -> int:
+    """Of an array; 0 for a number."""
+    return len(value) if isinstance(value, list) else 0
+
+
+def _columns(values: dict[str, Any], length: int, place: str) -> Iterator[dict[str, Any]]:
+    """The values of each sample of a trajectory, whose channels are arrays of one length."""
+    for name, value in values.items():
+        if _length(value) != length:
+            raise InputError(
+                f"{place}: {repr(name)[:60]}",
+                expected=f"an array of {length} numbers, as another channel has",
+                got=f"{_length(value)}" if isinstance(value, list) else repr(value)[:60],
+                remedy="send one value per sample of each channel, null where it is missing",
+            )
+    return (dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True))
 
 
 def _row(values: Any, places: dict[str, int], place: str) -> list[float]:

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -115,6 +116,11 @@ class TrajectoryMonitor:
     given: int = 0
 
     @property
+    def twin(self) -> Any:
+        """The twin or surrogate that the diagnoser inverts, with the machine's channels."""
+        return twin_of(self.diagnoser)
+
+    @property
     def promise(self) -> str:
         """What is promised, for which machines, in one sentence."""
         offsets = ""
@@ -138,6 +144,11 @@ class TrajectoryMonitor:
             f"model, {offsets}and {self.slack}. Where that is so, it is declared void with a "
             f"probability of at most {self.alpha:g}.{unused}"
         )
+
+    @property
+    def promises(self) -> dict[str, str]:
+        """The promise by what it is about, as other monitors have one for each output."""
+        return {"trajectories": self.promise}
 
     @cached_property
     def _tests(self) -> tuple[Detector, Validity]:

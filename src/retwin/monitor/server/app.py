@@ -6,7 +6,8 @@ import asyncio
 import json
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Collection, Mapping
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Mapping
 from dataclasses import asdict
 from importlib import resources
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -20,13 +21,14 @@ from retwin.errors import InputError
 from retwin.monitor.decision import Decision
 from retwin.monitor.explanations import Explanations
 from retwin.monitor.gate import Gate
-from retwin.monitor.live import Live, Received
+from retwin.monitor.live import Live
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import parse
 from retwin.monitor.server.comparison import Comparisons
 from retwin.monitor.server.guard import RequestGuard
 from retwin.monitor.server.metrics import Metrics
 from retwin.monitor.server.views import Views
+from retwin.monitor.status import Received
 from retwin.report.style import CHROME, PALETTE
 
 if TYPE_CHECKING:
@@ -274,13 +276,22 @@ def _add_writing(app: fastapi.FastAPI, live: Live, gate: Gate, metrics: Metrics)
             error = next(str(each) for each in made if not isinstance(each, Received))
             return JSON({"error": error}, 503)
         metrics.latency.observe(time.perf_counter() - began)
-        return JSON({each.asset: {**vars(each.counts), "alarms": each.alarms} for each in done})
+        return JSON(_counted(done))
 
     @app.post("/alarms/{sequence}/acknowledge")
     def acknowledge(sequence: Sequence, body: Acknowledgement) -> Any:
         """Record who has seen an alarm."""
         live.acknowledge(sequence, body.who, body.note)
         return JSON({"acknowledged": sequence})
+
+
+def _counted(done: Iterable[Received]) -> dict[str, Counter[str]]:
+    """What became of the samples and trajectories of each machine."""
+    made: dict[str, Counter[str]] = {}
+    for each in done:
+        own = made.setdefault(each.asset, Counter())
+        own.update({**vars(each.counts), "alarms": each.alarms})
+    return made
 
 
 BODY = {

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from retwin.data.trajectories import HEALTHY
-from retwin.monitor.monitor import Monitor
+from retwin.monitor.kinds import AnyMonitor
 from retwin.twins.system_faults import (
     ActuatorGain,
     ParameterShift,
@@ -17,7 +17,7 @@ from retwin.twins.system_faults import (
 
 __all__ = ["size_unit", "what_to_check"]
 
-SENTENCES: Mapping[type, Callable[[Any, Monitor], str]] = {
+SENTENCES: Mapping[type, Callable[[Any, AnyMonitor], str]] = {
     ParameterShift: lambda fault, monitor: (
         f"The parameter {fault.parameter} of the machine has changed. Look for what sets it: "
         "something that is open, leaks, is clogged, worn, loose or was replaced."
@@ -52,7 +52,7 @@ UNNAMED = (
 """Where the cause is of another kind."""
 
 
-def what_to_check(name: str, fault: object, monitor: Monitor) -> str:
+def what_to_check(name: str, fault: object, monitor: AnyMonitor) -> str:
     """A sentence or two on what to check first, for the fault that a cause names."""
     if name == HEALTHY:
         return NOTHING
@@ -60,7 +60,7 @@ def what_to_check(name: str, fault: object, monitor: Monitor) -> str:
     return found(fault, monitor) if found else UNNAMED
 
 
-def size_unit(fault: object, monitor: Monitor) -> str:
+def size_unit(fault: object, monitor: AnyMonitor) -> str:
     """The unit of a fault's size; "" where it has none."""
     units = monitor.twin.outputs.units
     if isinstance(fault, ParameterShift):
@@ -74,9 +74,9 @@ def size_unit(fault: object, monitor: Monitor) -> str:
     return units[fault.output] if isinstance(fault, SensorBias) else ""
 
 
-def _input(fault: ActuatorGain, monitor: Monitor) -> str:
+def _input(fault: ActuatorGain, monitor: AnyMonitor) -> str:
     return monitor.twin.inputs.names[fault.actuator]
 
 
-def _output(fault: SensorBias | SensorDrift | SensorFreeze, monitor: Monitor) -> str:
+def _output(fault: SensorBias | SensorDrift | SensorFreeze, monitor: AnyMonitor) -> str:
     return monitor.twin.outputs.names[fault.output]

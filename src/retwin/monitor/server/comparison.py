@@ -12,9 +12,11 @@ import scoringrules
 from numpy.typing import NDArray
 
 from retwin.checks import require
+from retwin.errors import InputError
 from retwin.monitor.cause import BEFORE
 from retwin.monitor.decision import MIN_SAMPLES, Decision, FalseAlarmTest, decide
 from retwin.monitor.gridded import gridded
+from retwin.monitor.kinds import load_monitor
 from retwin.monitor.monitor import Monitor
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import SECOND
@@ -61,7 +63,14 @@ def compare(store: Store, twin: str, number: int) -> Decision:
         remedy="promote the first version",
     )
     assert active is not None
-    old, new = (Monitor.load(registry.folder(each)) for each in (active.number, number))
+    old, new = (load_monitor(registry.folder(each)) for each in (active.number, number))
+    if not isinstance(old, Monitor) or not isinstance(new, Monitor):
+        raise InputError(
+            f"version {number}",
+            expected="two monitors that predict samples",
+            got="one of trajectories, whose evidence is of faults",
+            remedy="reject it, and watch its machine under the name of a new twin",
+        )
     require(
         (old.twin.inputs, old.twin.outputs, old.twin.rate)
         == (new.twin.inputs, new.twin.outputs, new.twin.rate),

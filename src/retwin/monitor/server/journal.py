@@ -105,6 +105,8 @@ class Journal:
             made = {**data, "kind": entry.kind, "sequence": entry.sequence}
             made["time"] = data["time"] / SECOND
             if entry.kind == "alarm":
-                made |= {"cause": None, "acknowledged": None}
+                made |= {"cause": data.get("cause"), "acknowledged": None}
+                if "begin" in data:  # of a trajectory
+                    made["begin"] = data["begin"] / SECOND
                 self._alarms[entry.sequence] = made
             self._events.setdefault(data["asset"], deque(maxlen=EVENTS)).append(made)

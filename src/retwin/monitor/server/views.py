@@ -16,13 +16,16 @@ from retwin.errors import InputError
 from retwin.monitor.cause import possible_causes
 from retwin.monitor.explanations import Explanations
 from retwin.monitor.gridded import gridded
-from retwin.monitor.live import AssetStatus, Live
+from retwin.monitor.kinds import AnyMonitor, load_monitor, pace
+from retwin.monitor.live import Live
 from retwin.monitor.machine import Recent
 from retwin.monitor.monitor import Monitor
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import SECOND
 from retwin.monitor.server.checks import size_unit, what_to_check
 from retwin.monitor.server.journal import Journal
+from retwin.monitor.status import AssetStatus
+from retwin.monitor.trajectories import TrajectoryMonitor
 
 __all__ = ["Views"]
 
@@ -54,12 +57,14 @@ class Views:
         self._newest: dict[str, tuple[float | None, float]] = {}
 
         @lru_cache(KEPT)
-        def loaded(twin: str, version: int) -> Monitor:
-            return Monitor.load(Registry(live.store, twin).folder(version))
+        def loaded(twin: str, version: int) -> AnyMonitor:
+            return load_monitor(Registry(live.store, twin).folder(version))
 
         @lru_cache(KEPT)
         def causes(twin: str, version: int) -> Mapping[str, Any]:
             monitor = loaded(twin, version)
+            if isinstance(monitor, TrajectoryMonitor):
+                return monitor.diagnoser.faults
             if explanations is None:
                 return possible_causes(monitor.twin)
             return explanations.causes(twin, monitor)
@@ -94,14 +99,15 @@ class Views:
         return {
             "status": self._status(found, self.journal.open(), twins),
             "arl": monitor.arl,
-            "rate": monitor.twin.rate,
+            "rate": pace(monitor),
+            "trajectories": isinstance(monitor, TrajectoryMonitor),
             "promise": {name: str(each) for name, each in monitor.promises.items()},
             "events": [
                 self._explained(each, twins) if each["kind"] == "alarm" else each
                 for each in self.journal.events(name)
             ],
             "evidence": recent.evidence[new].tolist(),
-            **_drawn(monitor, recent, new),
+            **_drawn(*_channels(monitor), recent, new),
         }
 
     def around(self, sequence: int) -> dict[str, Any]:
@@ -112,16 +118,21 @@ class Views:
         period = SECOND / monitor.twin.rate
         moment = round(alarm["time"] * SECOND)
         first, last = moment - round(LEARNED * period), moment + round(AFTER * period)
+        if "begin" in alarm:
+            first, last = round(alarm["begin"] * SECOND - period / 2), moment
         times, rows = gridded(self._live.store, asset.name, monitor.twin, first, last)
         commands, measured = np.split(rows, [len(monitor.twin.inputs)], axis=1)
-        if len(times):
+        if len(times) and isinstance(monitor, Monitor):
             watched = monitor.step(monitor.start(1), commands[None], measured[None])[1]
             mean, deviation = watched.mean[0], watched.deviation[0]
         else:
-            mean, deviation = measured, measured
+            mean, deviation = np.full((2, *measured.shape), np.nan)
         recent = Recent(times, commands, measured, mean, deviation, np.zeros(len(times)))
         shown = np.searchsorted(times, moment - round(SHOWN * period))
-        return _drawn(monitor, recent, slice(int(shown), None))
+        if "begin" in alarm:
+            shown = np.intp(0)
+        names = _named(monitor.twin.inputs), _named(monitor.twin.outputs)
+        return _drawn(*names, recent, slice(int(shown), None))
 
     def alarms(self, asset: str | None, before: int | None, limit: int) -> dict[str, Any]:
         """A page of alarms, the newest first."""
@@ -155,7 +166,7 @@ class Views:
         self._newest[status.asset] = status.time, since
         idle = now - since
         alarm = alarms.get(status.asset)
-        silent = max(SILENT_SECONDS, SILENT / self._live.monitor(status.asset).twin.rate)
+        silent = max(SILENT_SECONDS, SILENT / pace(self._live.monitor(status.asset)))
         states = {
             "alarm": alarm is not None,
             "void": status.void,
@@ -186,18 +197,29 @@ class Views:
             cause = dict(alarm["cause"])
             fault = self._causes(twin, alarm["version"]).get(cause["name"])
             cause["onset"] = [None if each is None else each / SECOND for each in cause["onset"]]
-            cause["unit"] = size_unit(fault, monitor)
+            cause["unit"] = "" if cause["size"][0] is None else size_unit(fault, monitor)
             cause["check"] = what_to_check(cause["name"], fault, monitor)
             made["cause"] = cause
         return made
 
 
-def _drawn(monitor: Monitor, recent: Recent, part: slice) -> dict[str, Any]:
+Named = list[tuple[str, str]]
+"""Names and units of channels."""
+
+
+def _channels(monitor: AnyMonitor) -> tuple[Named, Named]:
+    """The commands and outputs that are drawn; of trajectories their score alone."""
+    if isinstance(monitor, TrajectoryMonitor):
+        return [], [("score", "1")]
+    return _named(monitor.twin.inputs), _named(monitor.twin.outputs)
+
+
+def _drawn(inputs: Named, outputs: Named, recent: Recent, part: slice) -> dict[str, Any]:
     """What plots of samples need."""
     mean, half = recent.mean[part], BAND * recent.deviation[part]
     return {
-        "inputs": _named(monitor.twin.inputs),
-        "outputs": _named(monitor.twin.outputs),
+        "inputs": inputs,
+        "outputs": outputs,
         "times": (recent.times[part] / SECOND).tolist(),
         "commands": recent.commands[part].tolist(),
         "measured": recent.measured[part].tolist(),
@@ -211,5 +233,5 @@ ORDER = ("alarm", "void", "stopped", "rate", "outside", "ok")
 """The states of assets, the worst first."""
 
 
-def _named(channels: Channels) -> list[tuple[str, str]]:
+def _named(channels: Channels) -> Named:
     return list(zip(channels.names, channels.units, strict=True))

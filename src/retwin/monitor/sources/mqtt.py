@@ -14,7 +14,7 @@ from typing import Any
 from retwin.checks import needs_extra, one_of
 from retwin.errors import InputError, brief
 from retwin.monitor.gate import Gate
-from retwin.monitor.samples import Samples, parse
+from retwin.monitor.samples import Samples, Trajectory, parse
 from retwin.monitor.settings import MqttSource, secret
 from retwin.monitor.sources.source import Source
 
@@ -37,7 +37,7 @@ class _Message:
     connection: int
     number: int
     quality: int
-    parts: list[tuple[Samples, Future]]
+    parts: list[tuple[Samples | Trajectory, Future]]
 
 
 class Mqtt(Source):

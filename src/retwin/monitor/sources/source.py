@@ -11,7 +11,7 @@ from typing import Any
 
 from retwin.errors import InputError
 from retwin.monitor.gate import Gate
-from retwin.monitor.samples import Samples
+from retwin.monitor.samples import Samples, Trajectory
 
 __all__ = ["AGAIN", "Source"]
 
@@ -85,7 +85,11 @@ class Source(ABC):
             self._reported, self._unreported = now, 0
 
     def stored(
-        self, gate: Gate, samples: Samples, stop: threading.Event, first: Future | None = None
+        self,
+        gate: Gate,
+        samples: Samples | Trajectory,
+        stop: threading.Event,
+        first: Future | None = None,
     ) -> bool:
         """Whether samples are durable; False if `stop` was set and they are not.
 
@@ -95,8 +99,8 @@ class Source(ABC):
         ----------
         gate : Gate
             Where samples go.
-        samples : Samples
-            New samples of one machine.
+        samples : Samples or Trajectory
+            Those of one machine.
         stop : Event
             Ends the attempts.
         first : Future, optional

@@ -1,0 +1,70 @@
+"""What became of samples, and how machines are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from retwin.monitor.machine import Counts
+
+__all__ = ["AssetStatus", "Received"]
+
+
+@dataclass(frozen=True)
+class Received:
+    """What became of samples or of a trajectory of one machine; see docs/monitor.md.
+
+    Attributes
+    ----------
+    asset : str
+        Its name.
+    counts : Counts
+        Samples by what was done with them; a trajectory counts once.
+    alarms : int
+        Alarms that were raised when they were used.
+
+    """
+
+    asset: str
+    counts: Counts
+    alarms: int
+
+
+@dataclass(frozen=True)
+class AssetStatus:
+    """How a machine is.
+
+    Attributes
+    ----------
+    asset, twin : str
+        Its name, and that of its twin.
+    version : int
+        The version of the twin that watches it.
+    time : int, optional
+        Time of its newest sample in nanoseconds; None before the first.
+    ratio : float
+        Evidence for a change, over the threshold of an alarm.
+    alarms : int
+        Alarms since the program was started.
+    last_alarm : int, optional
+        Time of the last one of these.
+    void, outside : bool
+        Whether the promise does not apply any more, and whether commands have left their range in
+        calibration.
+    rate : str
+        How the sample rate differs from the twin's; "" if it does not.
+    counts : dict of str to int
+        Samples since the program was started, by what was done with them.
+
+    """
+
+    asset: str
+    twin: str
+    version: int
+    time: int | None
+    ratio: float
+    alarms: int
+    last_alarm: int | None
+    void: bool
+    outside: bool
+    rate: str
+    counts: dict[str, int]

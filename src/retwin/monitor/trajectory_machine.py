@@ -1,0 +1,188 @@
+"""`TrajectoryMachine`: one watched machine whose work is trajectories, each of which is complete.
+
+A trajectory is used as a whole: its samples, the state after it and its alarm are one commit.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.diagnosis.estimate import UNKNOWN
+from retwin.errors import InputError, brief
+from retwin.monitor.gridded import record_of
+from retwin.monitor.machine import Counts, Recent
+from retwin.monitor.samples import Samples, Trajectory
+from retwin.monitor.trajectories import TrajectoryMonitor
+from retwin.monitor.trajectory_state import TrajectoryState
+from retwin.monitor.updates import Asset, Update
+from retwin.monitor.watched_trajectories import WatchedTrajectories
+
+__all__ = ["Diagnosed", "TrajectoryMachine"]
+
+KEPT = 600
+"""Newest trajectories whose scores are kept for pages."""
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosed:
+    """What a trajectory changes, before it is stored: its samples, the state after it, and what was
+    found in it; or only why it was refused.
+    """
+
+    samples: Samples
+    state: TrajectoryState
+    watched: WatchedTrajectories | None
+    refused: str = ""
+
+
+class TrajectoryMachine:
+    """The trajectories of one asset. It changes in place; see `Live`.
+
+    Parameters
+    ----------
+    asset : Asset
+        The asset, with the version of its twin.
+    monitor : TrajectoryMonitor
+        That version.
+    digest : str
+        The hexadecimal hash of its files: its states are of no use to another one.
+
+    """
+
+    def __init__(self, asset: Asset, monitor: TrajectoryMonitor, digest: str = "") -> None:
+        self.asset = asset
+        self.monitor = monitor
+        self.counts = Counts()
+        self.newest: int | None = None
+        """The time of the last sample of the newest trajectory."""
+        self.evidence = 0.0
+        self.alarms = 0
+        self.last_alarm: int | None = None
+        self.void = self.outside = False
+        self.rate = ""
+        self._digest = np.frombuffer(bytes.fromhex(digest), dtype=np.uint8)
+        self._state = monitor.start()
+        self._recent: deque[tuple[int, float, float]] = deque(maxlen=KEPT)
+
+    def placed(self, given: object, limit: int, known: set[int]) -> str:
+        """What is done with a trajectory, as the name of a count: "used" if it is to be diagnosed.
+
+        Parameters
+        ----------
+        given : Trajectory
+            Of this machine; single samples are refused.
+        limit : int
+            The latest time at which one may begin.
+        known : set of int
+            Times of samples that the store has.
+
+        """
+        if not isinstance(given, Trajectory):
+            return "refused"
+        if given.begin > limit:
+            return "ahead"
+        if given.begin in known:
+            return "repeated"
+        if self.newest is not None and given.begin <= self.newest:
+            return "late"
+        first = given.values[:1, : len(self.monitor.twin.inputs)]
+        return "used" if np.isfinite(first).all() and len(first) else "unknown"
+
+    def diagnose(self, given: Trajectory) -> Diagnosed:
+        """What a trajectory changes; nothing is changed yet, so that no lock is needed."""
+        samples = given.samples(self.monitor.twin.rate)
+        try:
+            record = record_of(self.monitor.twin, given.values)
+            return Diagnosed(samples, *self.monitor.watch(record, self._state))
+        except Exception as error:  # Whatever fails, the next trajectory is diagnosed.
+            why = str(error) if isinstance(error, InputError) else f"not diagnosed: {brief(error)}"
+            return Diagnosed(samples, self._state, None, why)
+
+    def update(self, found: Diagnosed) -> tuple[Update, list[tuple[str, dict[str, Any]]]]:
+        """What a diagnosed trajectory stores: its samples with the state, and log entries."""
+        watched, samples = found.watched, found.samples
+        assert watched is not None
+        last = int(samples.times[-1])
+        entries = [
+            ("alarm", self._alarm(found, watched, number)) for number in range(len(watched.alarms))
+        ]
+        if watched.void[-1] and not self.void:
+            entries.append(("void", self._entry(last)))
+        arrays = {
+            **{f"trajectory.{name}": each for name, each in found.state.arrays().items()},
+            "version": np.array([self.asset.version], dtype=np.int64),
+            "status": np.array([watched.evidence[-1], watched.void[-1], watched.outside[-1]]) * 1.0,
+            "digest": self._digest,
+        }
+        return Update(samples.asset, samples.times, samples.values, arrays, last), entries
+
+    def take(self, found: Diagnosed) -> None:
+        """Continue after a trajectory that is stored."""
+        watched, last = found.watched, int(found.samples.times[-1])
+        assert watched is not None
+        self._state, self.newest = found.state, last
+        self.evidence = float(watched.evidence[-1])
+        self.void, self.outside = bool(watched.void[-1]), bool(watched.outside[-1])
+        self._recent.append((last, float(watched.score[-1]), self.evidence))
+        if watched.alarms:
+            self.alarms += len(watched.alarms)
+            self.last_alarm = last
+
+    def restore(self, time: int, arrays: Mapping[str, NDArray]) -> None:
+        """Continue where a state was stored, anew if it is that of another version or monitor."""
+        self.newest = time
+        same = np.array_equal(arrays.get("digest", ()), self._digest)
+        if not same or "version" not in arrays or arrays["version"][0] != self.asset.version:
+            return
+        own = {name.partition(".")[2]: each for name, each in arrays.items() if "." in name}
+        self._state = TrajectoryState.of_arrays(own).checked(self._state)
+        self.evidence, void, outside = arrays["status"].tolist()
+        self.void, self.outside = bool(void), bool(outside)
+
+    def recent(self) -> Recent:
+        """Scores of the newest trajectories, which are standard Gaussian for a healthy machine."""
+        times, score, evidence = np.array(self._recent, dtype=object).reshape(-1, 3).T
+        values = score.astype(float)[:, None]
+        return Recent(
+            times.astype(np.int64),
+            np.zeros((len(times), 0)),
+            values,
+            np.zeros_like(values),
+            np.ones_like(values),
+            evidence.astype(float),
+        )
+
+    def refusal(self, moment: int, why: str) -> tuple[str, dict[str, Any]]:
+        """The entry of the log about a trajectory that is not used."""
+        return "event", self._entry(moment, what="trajectory", text=f"trajectory not used: {why}")
+
+    def _alarm(self, found: Diagnosed, watched: WatchedTrajectories, number: int) -> dict[str, Any]:
+        """An alarm with its cause, which is known at once."""
+        alarm, times = watched.alarms[number], found.samples.times
+        cause = {
+            "name": alarm.name,
+            "probability": alarm.probability,
+            "unknown": alarm.shares.get(UNKNOWN, 0.0),
+            "size": [None] * 3,
+            "onset": [None] * 3,
+            "probabilities": alarm.shares,
+        }
+        return self._entry(
+            int(times[-1]),
+            sample=alarm.number,
+            begin=int(times[0]),
+            output=f"trajectory {alarm.number + 1}",
+            change="unlike the healthy machine" + ", with commands outside" * alarm.outside,
+            evidence=alarm.evidence,
+            cause=cause,
+        )
+
+    def _entry(self, moment: int, **data: Any) -> dict[str, Any]:
+        own = {"asset": self.asset.name, "version": self.asset.version, "time": moment}
+        return {**own, **data}
