@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -10,18 +11,23 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from time import sleep
 
 import httpx
 import numpy as np
 import pytest
+from collecting import running, wait
 from monitor.test_trajectory_monitor import TANK, runs
 
 import retwin as rt
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.monitor import Explanations, Gate, Live, Registry, Samples, Store, export_log, verify
+from retwin.monitor.machine import Counts
 from retwin.monitor.samples import SECOND, Trajectory, parse
 from retwin.monitor.server import create_app, listening, serving
+from retwin.monitor.settings import FolderSource
+from retwin.monitor.sources.trajectory_folder import Recorded, TrajectoryFolder
 from retwin.monitor.trajectories import TrajectoryMonitor, fit_trajectory_monitor
 from retwin.monitor.trajectory_machine import Diagnosed, TrajectoryMachine
 from retwin.twins import ParameterShift
@@ -234,6 +240,48 @@ def test_the_page_shows_trajectories_that_were_posted(
         assert refused.status_code == 400
         assert "an array of 2 numbers" in refused.json()["error"]
         assert "retwin_alarms_total" in client.get("/metrics").text
+
+
+def test_files_are_read_once_they_are_complete(
+    opened: Callable, monitor: TrajectoryMonitor, work: rt.Trajectories, tmp_path: Path
+) -> None:
+    (tmp_path / "logs").mkdir()
+    given = {"type": "folder", "files": str(tmp_path / "logs" / "*"), "asset": "a", "every": 0.02}
+    settings = FolderSource.model_validate(given | {"settle": 0.3})
+    lines: list[str] = []
+    first, second, *_ = trajectories(work)
+    table = "".join(
+        f"{BEGIN // SECOND + k / 10},{pump!r},{level!r}\n"
+        for k, (pump, level) in enumerate(first.values.tolist())
+    )
+    half = len(table) // 2
+    (tmp_path / "logs" / "b.csv").write_text("time,pump,level\n" + table[:half])
+    with opened() as live, Gate(live) as gate:
+        source = TrajectoryFolder(settings, {"a": Recorded(monitor)}, {}, lines.append)
+        with running(source, gate):
+            (tmp_path / "logs" / "bad.npz").write_bytes(b"PK")
+            sleep(0.1)
+            assert live.status()[0].time is None, "it is not complete"
+            with (tmp_path / "logs" / "b.csv").open("a") as file:
+                file.write(table[half:])
+            wait(lambda: live.status()[0].counts["used"] == 1, lines)
+            rt.save(work[[1, 3]], tmp_path / "part.npz")
+            os.utime(tmp_path / "part.npz", ns=(second.begin, second.begin))
+            (tmp_path / "part.npz").rename(tmp_path / "logs" / "a.npz")
+            wait(lambda: live.status()[0].counts["used"] == 3, lines)
+        files = stored(live.store)
+        again = TrajectoryFolder(
+            settings, {"a": Recorded(monitor)}, {"a": live.status()[0].time}, lines.append
+        )
+        with running(again, gate):
+            sleep(0.5)
+        assert live.status()[0].counts == {**dict.fromkeys(vars(Counts()), 0), "used": 3}
+        assert live.status()[0].alarms == 1
+    assert sum("refused" in line for line in lines) == 2, lines
+    with opened("other") as live:
+        leak = trajectories(work)[3]
+        live.submit([first, second, Trajectory("a", second.begin + LENGTH, leak.values)])
+        assert stored(live.store) == files
 
 
 def test_arrays_are_bounded_and_those_of_other_machines_are_samples() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from functools import partial
@@ -14,6 +14,7 @@ from typing import Any
 from retwin import cases
 from retwin.cases.case import Case
 from retwin.checks import require
+from retwin.data.logs.mapping import read_mapping
 from retwin.errors import InputError
 from retwin.monitor.audit import Entry
 from retwin.monitor.explanations import Explanations
@@ -35,8 +36,10 @@ from retwin.monitor.sources.folder import Folder
 from retwin.monitor.sources.mqtt import Mqtt
 from retwin.monitor.sources.opcua import OpcUa
 from retwin.monitor.sources.source import Source
-from retwin.monitor.sources.tables import layout_of
+from retwin.monitor.sources.tables import Layout, layout_of
+from retwin.monitor.sources.trajectory_folder import Recorded, TrajectoryFolder
 from retwin.monitor.store import Store
+from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.serialisation.files import sha256
 from retwin.twins.faults import Fault
 
@@ -89,7 +92,11 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
         explanations = Explanations(live, lambda twin: _faults(systems.get(twin)))
         opened.enter_context(explanations)
         gate = opened.enter_context(Gate(live))
-        sources = [_source(each, settings, live, systems, report) for each in settings.sources]
+        sources = [
+            source
+            for each in settings.sources
+            for source in _sources(each, settings, live, systems, report)
+        ]
         if settings.server and bound:
             app = create_app(
                 live,
@@ -195,41 +202,63 @@ def _token(server: ServerSettings) -> str | None:
     return secret("token", server.token_env, server.token_file)
 
 
-def _source(
+def _sources(
     settings: Any,
     whole: MonitorSettings,
     live: Live,
     systems: Mapping[str, Case | None],
     report: Callable[[str], None],
-) -> Source:
-    """What reads a source."""
+) -> list[Source]:
+    """What reads a source: of a folder, one for samples, one for trajectories, or both."""
     channels = {name: live.channels(name) for name in whole.assets}
     if isinstance(settings, MqttSource):
-        return Mqtt(settings, channels, report)
+        return [Mqtt(settings, channels, report)]
     if isinstance(settings, FolderSource):
-        names = [settings.asset] if settings.asset else list(whole.assets)
-        layouts = {
-            name: layout_of(settings, channels[name], systems[whole.assets[name].twin])
-            for name in names
-        }
-        _check_samples(live, names, settings.type)
-        newest = {each.asset: each.time for each in live.status() if each.time is not None}
-        return Folder(settings, layouts, newest, report)
-    _check_samples(live, settings.nodes, settings.type)
-    rates = {name: live.monitor(name).twin.rate for name in whole.assets}
-    return OpcUa(settings, channels, rates, report)
-
-
-def _check_samples(live: Live, names: Iterable[str], source: str) -> None:
-    """Refuse a source of single samples for machines that are watched in trajectories."""
-    for name in names:
+        return _folders(settings, whole, live, systems, report)
+    for name in settings.nodes:
         require(
             not live.in_trajectories(name),
             "sources",
             expected=f"one that gives complete trajectories, for {name}",
-            got=f"one of single samples, {source}",
-            remedy="send each trajectory by MQTT or HTTP, as arrays in values",
+            got=f"one of single samples, {settings.type}",
+            remedy="send trajectories by MQTT or HTTP, or write them to a folder",
         )
+    rates = {name: live.monitor(name).twin.rate for name in whole.assets}
+    return [OpcUa(settings, channels, rates, report)]
+
+
+def _folders(
+    settings: FolderSource,
+    whole: MonitorSettings,
+    live: Live,
+    systems: Mapping[str, Case | None],
+    report: Callable[[str], None],
+) -> list[Source]:
+    cases_ = {name: systems[asset.twin] for name, asset in whole.assets.items()}
+    newest = {each.asset: each.time for each in live.status() if each.time is not None}
+    layouts: dict[str, Layout] = {}
+    recorded: dict[str, Recorded] = {}
+    for name in [settings.asset] if settings.asset else whole.assets:
+        monitor = live.monitor(name)
+        if isinstance(monitor, TrajectoryMonitor):
+            recorded[name] = Recorded(monitor, cases_[name])
+        else:
+            require(
+                settings.files.endswith((".csv", ".parquet")),
+                "sources.files",
+                expected=f"files that end with .csv or .parquet, for {name}",
+                got=settings.files,
+                remedy="give tables of samples, since its monitor watches no whole trajectories",
+            )
+            layouts[name] = layout_of(settings, live.channels(name), cases_[name])
+    made: list[Source] = []
+    if layouts:
+        made.append(Folder(settings, layouts, newest, report))
+    if recorded:
+        if settings.mapping is not None:
+            read_mapping(settings.mapping)
+        made.append(TrajectoryFolder(settings, recorded, newest, report))
+    return made
 
 
 def _faults(case: Case | None) -> dict[str, Fault | None] | None:

@@ -64,7 +64,7 @@ class AssetSettings(Part):
 
 
 class FolderSource(Part):
-    """Tables in a folder, CSV or Parquet: files appear and grow."""
+    """Files in a folder: tables (CSV, Parquet) that appear and grow, or trajectories."""
 
     type: Literal["folder"]
     files: Annotated[str, AfterValidator(lambda files, info: str(_beside(files, info)))]
@@ -80,13 +80,15 @@ class FolderSource(Part):
     """Unit of the times, from 1970 on, or ISO 8601; by default that of the case, else "s"."""
     every: Seconds = 1.0
     """Interval in s at which the folder is read."""
+    settle: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 2.0
+    """Time in s without a change after which a file of trajectories is complete."""
+    mapping: Beside | None = None
+    """File mapping.toml by which logs become trajectories."""
 
     @model_validator(mode="after")
     def _names_one_asset(self) -> FolderSource:
         if ("{asset}" in self.files) == (self.asset is not None):
             raise ValueError("either {asset} in files, or an asset")
-        if not self.files.endswith((".csv", ".parquet")):
-            raise ValueError("files that end with .csv or .parquet")
         return self
 
 

@@ -17,7 +17,7 @@ from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.source import Source
 from retwin.monitor.sources.tables import Layout, Table, table_at
 
-__all__ = ["Folder"]
+__all__ = ["Folder", "base_of"]
 
 LATE = 60 * 10**9
 """Nanoseconds before the newest stored sample from which rows are sent again after a restart: what
@@ -61,7 +61,7 @@ class Folder(Source):
         while not stop.is_set():
             for asset, layout in self._layouts.items():
                 pattern = self._settings.files.replace("{asset}", glob.escape(asset))
-                base = _base(pattern)
+                base = base_of(pattern)
                 if base.is_dir():
                     self.back()
                     self._read(asset, self._changed(asset, pattern, layout), gate, stop)
@@ -111,7 +111,7 @@ class Folder(Source):
         self._report(f"{self.name}: {error}")
 
 
-def _base(pattern: str) -> Path:
+def base_of(pattern: str) -> Path:
     """The folder that a pattern begins with."""
     parts = Path(pattern).parts[:-1]
     fixed = itertools.takewhile(lambda part: not glob.has_magic(part), parts)
