@@ -231,9 +231,11 @@ def test_the_page_shows_trajectories_that_were_posted(
         assert "drain" in alarm["cause"]["check"]
         shown = client.get("/assets/a").json()
         assert (shown["outputs"], len(shown["evidence"])) == ([["score", "1"]], 2)
-        assert shown["trajectories"]
+        assert shown["kind"] == "scores"
         around = client.get(f"/alarms/{alarm['sequence']}/samples").json()
-        assert around["outputs"] == [["level", "m"]]
+        assert (around["outputs"], around["kind"]) == ([["level", "m"]], "trajectory")
+        fits = np.ravel(around["mean"]) - TANK.simulate(work.commands[[3]], seed=0).nominal.ravel()
+        assert 0 < np.abs(fits).max() < 0.5, "the twin of the healthy machine, of another drain"
         np.testing.assert_allclose(np.ravel(around["measured"]), work.observed[3, :, 0])
         uneven = {**rows[0], "values": {"pump": [1, 2], "level": [1]}}
         refused = client.post("/samples", json=uneven)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
@@ -100,7 +101,7 @@ class Views:
             "status": self._status(found, self.journal.open(), twins),
             "arl": monitor.arl,
             "rate": pace(monitor),
-            "trajectories": isinstance(monitor, TrajectoryMonitor),
+            "kind": "scores" if isinstance(monitor, TrajectoryMonitor) else "samples",
             "promise": {name: str(each) for name, each in monitor.promises.items()},
             "events": [
                 self._explained(each, twins) if each["kind"] == "alarm" else each
@@ -111,7 +112,10 @@ class Views:
         }
 
     def around(self, sequence: int) -> dict[str, Any]:
-        """The stored samples around an alarm, predicted anew; none if they were removed."""
+        """The stored samples around an alarm, or the trajectory of one, predicted anew.
+
+        None if they were removed. Of a trajectory it is what the twin does for its commands.
+        """
         alarm = self.journal.alarm(sequence)
         asset = next(each for each in self._live.store.assets() if each.name == alarm["asset"])
         monitor = self._monitor(asset.settings["twin"], alarm["version"])
@@ -122,17 +126,20 @@ class Views:
             first, last = round(alarm["begin"] * SECOND - period / 2), moment
         times, rows = gridded(self._live.store, asset.name, monitor.twin, first, last)
         commands, measured = np.split(rows, [len(monitor.twin.inputs)], axis=1)
+        mean, deviation = np.full((2, *measured.shape), np.nan)
+        whole = "begin" in alarm
         if len(times) and isinstance(monitor, Monitor):
             watched = monitor.step(monitor.start(1), commands[None], measured[None])[1]
             mean, deviation = watched.mean[0], watched.deviation[0]
-        else:
-            mean, deviation = np.full((2, *measured.shape), np.nan)
+        elif len(times):
+            with warnings.catch_warnings():  # commands outside their range are in the alarm
+                warnings.simplefilter("ignore")
+                mean = monitor.twin.simulate(commands[None], seed=0).nominal[0]
         recent = Recent(times, commands, measured, mean, deviation, np.zeros(len(times)))
-        shown = np.searchsorted(times, moment - round(SHOWN * period))
-        if "begin" in alarm:
-            shown = np.intp(0)
+        shown = 0 if whole else int(np.searchsorted(times, moment - round(SHOWN * period)))
         names = _named(monitor.twin.inputs), _named(monitor.twin.outputs)
-        return _drawn(*names, recent, slice(int(shown), None))
+        kind = "trajectory" if whole else "samples"
+        return {"kind": kind, **_drawn(*names, recent, slice(shown, None))}
 
     def alarms(self, asset: str | None, before: int | None, limit: int) -> dict[str, Any]:
         """A page of alarms, the newest first."""

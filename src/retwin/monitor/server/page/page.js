@@ -30,7 +30,7 @@
   const percent = (value) => {
     if (value == null) return "–";
     const text = value > 0 && value < 0.0001 ? "< 0.01" : String(Number((100 * value).toPrecision(2)));
-    return value >= 10 ? `${digits(value)} times` : `${text} %`;
+    return value >= 1e6 ? "over a million times" : value >= 10 ? `${digits(value)} times` : `${text} %`;
   };
   const pad = (value) => String(value).padStart(2, "0");
   const clock = (seconds) => {
@@ -212,7 +212,7 @@
         : { range: (u, low, high) => { const room = Math.max((high - low) * 0.08, 1e-9 + Math.abs(high) * 0.002); return [low - room, high + room]; } } },
       series: [{}, ...spec.series.map(line)],
       bands: spec.band ? [{ series: spec.band, fill: fade("c0") }] : [],
-      axes: [{ ...axis, space: 80, size: 32, values: (u, all) => all.map(clock) },
+      axes: [{ ...axis, space: 80, size: 32, values: (u, all) => all.map((each) => clock(each) + (all[1] - all[0] < 1 ? `.${Math.floor(10 * (each % 1))}` : "")) },
         { ...axis, size: 58, ...(spec.log ? powers(axis) : {}), values: (u, all) => all.map((each) => each == null ? "" : spec.log ? `1e${Math.round(Math.log10(each))}` : digits(each)) }],
       hooks: {
         draw: [(u) => marks(u, spec)],
@@ -272,21 +272,26 @@
   };
   const pictures = (place, first, alarms) => {
     const errors = (held, key, i) => held[key].map((row, k) => row[i] == null || held.mean[k][i] == null ? null : row[i] - held.mean[k][i]);
+    // Scores of trajectories have no other errors, and the prediction of a trajectory has no band.
+    const scores = first.kind === "scores";
+    const banded = first.kind !== "trajectory";
+    const band = (label) => ({ hidden: true, quiet: true, kind: "area", colour: 0, label: banded ? label : null });
     const outputs = first.outputs.flatMap((each, i) => [chart({
-      title: unit(each), height: 260, alarms, about: `${each[0]}: measured, and the 90 % band of what the twin predicted`, band: [2, 1],
+      title: scores ? "What the healthy machine leaves unexplained of each trajectory, as a standard score" : unit(each), height: 260, alarms,
+      about: `${each[0]}: measured, and ${banded ? "the 90 % band of " : ""}what the twin predicted`, band: banded && [2, 1],
       pick: (held) => [held.times, column(held.low, i), column(held.high, i), column(held.mean, i), column(held.measured, i)],
-      series: [{ hidden: true, quiet: true, kind: "area", colour: 0, label: "90 % band of the prediction" }, { hidden: true, quiet: true },
-        { colour: 0, width: 3, label: "predicted" }, { colour: "ink", width: 1, points: true, label: "measured" }],
-    }), chart({
-      title: `${each[0]}: measured minus predicted${each[1] === "1" ? "" : ` in ${each[1]}`}`, height: 180, alarms, about: `errors of the prediction of ${each[0]}, and their 90 % band`, band: [2, 1],
+      series: [band(scores ? "90 % of healthy trajectories" : "90 % band of the prediction"), { hidden: true, quiet: true },
+        { colour: 0, width: 3, label: scores ? "median of healthy ones" : "predicted" }, { colour: "ink", width: 1, points: banded, label: scores ? "score" : "measured" }],
+    }), ...(scores ? [] : [chart({
+      title: `${each[0]}: measured minus predicted${each[1] === "1" ? "" : ` in ${each[1]}`}`, height: 180, alarms, about: `errors of the prediction of ${each[0]}${banded ? ", and their 90 % band" : ""}`, band: banded && [2, 1],
       pick: (held) => [held.times, errors(held, "low", i), errors(held, "high", i), errors(held, "measured", i)],
-      series: [{ hidden: true, quiet: true, kind: "area", colour: 0, label: "90 % band" }, { hidden: true, quiet: true },
-        { colour: "ink", width: 1, points: true, label: "error" }],
-    })]);
+      series: [band("90 % band"), { hidden: true, quiet: true },
+        { colour: "ink", width: 1, points: banded, label: "error" }],
+    })])]);
     const evidence = !first.evidence ? [] : [chart({
       title: "Evidence for a change", height: 200, alarms, log: true, threshold: first.arl, about: "evidence for a change over time, logarithmic, and the threshold of an alarm",
-      pick: (held) => [held.times, held.evidence.map((each) => each == null ? null : Math.max(each, 0.1))],
-      series: [{ colour: 1, label: "evidence", width: 2 }],
+      pick: (held) => [held.times, held.evidence.map((each) => each == null ? null : Math.min(Math.max(each, 0.1), scores ? 1e6 * first.arl : Infinity))],
+      series: [{ colour: 1, label: scores ? "evidence, at most a million times the threshold" : "evidence", width: 2, points: scores }],
     })];
     const commands = first.inputs.map((each, i) => chart({
       title: `Command ${unit(each)}`, height: 130, alarms, about: `command ${each[0]} over time`,
@@ -381,14 +386,14 @@
       about.replaceChildren(h("h1", {}, found.asset, ": ", why ? why.name : "cause not known yet"),
         verdict("alarm", `Alarm at ${stamp(found.time)}; ${found.output}: ${found.change}. The twin of the healthy machine does not explain it.`,
           h("a", { href: to("asset", found.asset) }, "See the machine now")),
-        facts(["Began", why ? stamp(why.onset[0]) : "–", why && why.onset[1] != null && `90 % interval ${clock(why.onset[1])} to ${clock(why.onset[2])}`],
-          ["Size", ...(why ? interval(why.size, why.unit) : ["–"])],
+        facts(found.begin ? ["Trajectory", stamp(found.begin), `to ${clock(found.time)}`] : ["Began", why ? stamp(why.onset[0]) : "–", why && why.onset[1] != null && `90 % interval ${clock(why.onset[1])} to ${clock(why.onset[2])}`],
+          ...(found.begin ? [] : [["Size", ...(why ? interval(why.size, why.unit) : ["–"])]]),
           ["Evidence", digits(found.evidence), `alarm from ${digits(found.arl)} on`],
           ["Version of the twin", `${found.version}`]),
         h("h2", {}, "What to check"),
         h("div", { class: "check" }, h("p", {}, why ? why.check : "The cause is being inferred from the samples before the alarm."),
           why && why.unknown > 0.5 ? h("p", {}, `Something besides is probable (${percent(why.unknown)}): a fault that is not in the list, or one that does more than its equation.`) : null),
-        why ? probabilities(why) : "");
+        why ? probabilities(why, found.begin) : "");
       if (found.acknowledged) {
         answer.replaceChildren(h("h2", {}, "Acknowledged"), h("p", {}, "by ", found.acknowledged.who, found.acknowledged.note ? `: ${found.acknowledged.note}` : ""));
       } else if (!form) {
@@ -397,8 +402,8 @@
       }
     };
   };
-  const probabilities = (why) => h("div", {}, h("h2", {}, "Probable causes"), h("table", { class: "bars" },
-    h("caption", {}, `If one of these is the cause. Probability of something besides: ${percent(why.unknown)}.`),
+  const probabilities = (why, whole) => h("div", {}, h("h2", {}, "Probable causes"), h("table", { class: "bars" },
+    h("caption", {}, whole ? "The share of each in the evidence; unknown is a change that no fault explains." : `If one of these is the cause. Probability of something besides: ${percent(why.unknown)}.`),
     h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Cause"), h("th", { scope: "col", class: "number" }, "Probability"), h("td"))),
     h("tbody", {}, Object.entries(why.probabilities).sort((a, b) => b[1] - a[1]).map(([name, value]) => {
       const part = h("i");
@@ -415,8 +420,8 @@
     const held = await request(`/alarms/${found.sequence}/samples`).catch(() => null);
     if (!held?.times.length || !place.isConnected) return;
     const box = h("div");
-    place.replaceChildren(h("h2", {}, "Samples around the alarm"), box);
-    pictures(box, held, () => [found.time])(held);
+    place.replaceChildren(h("h2", {}, found.begin ? "The trajectory, beside the twin of the healthy machine" : "Samples around the alarm"), box);
+    pictures(box, held, () => found.begin ? [] : [found.time])(held);
   };
 
   // Versions of a twin.
