@@ -24,9 +24,10 @@ from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.monitor import Explanations, Gate, Live, Registry, Samples, Store, export_log, verify
 from retwin.monitor.machine import Counts
+from retwin.monitor.program import run
 from retwin.monitor.samples import SECOND, Trajectory, parse
 from retwin.monitor.server import create_app, listening, serving
-from retwin.monitor.settings import FolderSource
+from retwin.monitor.settings import FolderSource, read_settings
 from retwin.monitor.sources.trajectory_folder import Recorded, TrajectoryFolder
 from retwin.monitor.trajectories import TrajectoryMonitor, fit_trajectory_monitor
 from retwin.monitor.trajectory_machine import Diagnosed, TrajectoryMachine
@@ -303,3 +304,32 @@ def test_kills(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
     assert "4 kills" in done.stderr
+
+
+def test_the_program_watches_a_folder_and_refuses_sources_of_samples(
+    folder: Path, work: rt.Trajectories, tmp_path: Path
+) -> None:
+    (tmp_path / "logs" / "a").mkdir(parents=True)
+    for i in (2, 3):
+        rt.save(work[[i]], path := tmp_path / "logs" / "a" / f"{i}.npz")
+        begin = (BEGIN + APART * i) / SECOND
+        os.utime(path, (begin, begin))
+    config = f'store = "store"\n[twins.robot]\nmonitor = "{folder}"\n[assets.a]\ntwin = "robot"\n'
+    config += "[[sources]]\n"
+    (tmp_path / "opcua.toml").write_text(
+        config + 'type = "opcua"\nurl = "opc.tcp://h"\nnodes.a = { pump = "ns=2;s=p" }\n'
+    )
+    lines: list[str] = []
+    with pytest.raises(InputError, match="complete trajectories, for a"):
+        run(read_settings(tmp_path / "opcua.toml"), lines.append, threading.Event())
+    files = 'type = "folder"\nfiles = "logs/{asset}/*.npz"\nevery = 0.02\n'
+    (tmp_path / "folder.toml").write_text(config + files)
+    stop = threading.Event()
+
+    def report(line: str) -> None:
+        lines.append(line)
+        if "ALARM" in line:
+            stop.set()
+
+    run(read_settings(tmp_path / "folder.toml"), report, stop)
+    assert any("trajectory 2, unlike" in each and "cause: leak" in each for each in lines), lines
