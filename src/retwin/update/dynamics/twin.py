@@ -6,47 +6,30 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retwin.checks import finite, one_of, require
+from retwin.checks import require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
-from retwin.serialisation.models import read_model, refusing, write_model
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
-from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.twins.state_twin import SAMPLES_PER_CHUNK, StateTwin
 from retwin.twins.twin import Chunk, check_channels, checked_commands, simulate_in_chunks
 from retwin.twins.wrapper import chunk_generator
-from retwin.update.dynamics.corrected import correctable
 from retwin.update.dynamics.curves import Curve, axes_of, curve_of
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.estimation import Estimation, root
 from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.prediction import Prediction
+from retwin.update.dynamics.saved import read_fields, write_fields
 from retwin.update.dynamics.unknowns import unknowns_of
 from retwin.update.training_range import OutsideTrainingWarning
 
 __all__ = ["DynamicsTwin"]
 
-KIND = "dynamics"
-"""Kind of the saved model."""
-ARRAYS = (
-    "values",
-    "factor",
-    "start_deviation",
-    "process",
-    "proportional",
-    "free_process",
-    "noise",
-)
-"""Attributes that are saved as arrays."""
-DOMAIN = ("low", "high", "mean", "speed")
-"""Attributes of the domain."""
 STEP = 0.1
 """Differences of parameters, in posterior deviations, by which predictions are differentiated."""
 BEYOND = 0.05
@@ -519,17 +502,7 @@ class DynamicsTwin:
 
     def save(self, folder: str | Path) -> None:
         """Write the equations, as operations on numbers, with all values."""
-        about: dict[str, Any] = {
-            "equations": equations_of(self.equations),
-            "widening": self.widening,
-            "corrected": list(self.corrected),
-            "emulated": self.emulated,
-            "case": self.case,
-        }
-        arrays = {name: getattr(self, name) for name in ARRAYS}
-        arrays |= {f"domain_{name}": getattr(self.domain, name) for name in DOMAIN}
-        with write_model(folder, KIND, about, {k: torch.tensor(v) for k, v in arrays.items()}):
-            pass
+        write_fields(folder, vars(self))
 
     @classmethod
     def load(cls, folder: str | Path) -> DynamicsTwin:
@@ -537,48 +510,4 @@ class DynamicsTwin:
 
         Raises InputError if the folder holds no such model or is damaged.
         """
-        about, weights = read_model(folder, KIND)
-        with refusing(folder, expected="corrected dynamics"):
-            equations = equations_from(StateTwin, about["equations"])
-            corrected = correctable(equations, about["corrected"])
-            process = weights["process"]
-            weights = {"proportional": 0 * process, "free_process": process} | weights
-            arrays = {name: weights[name].double().numpy() for name in ARRAYS}
-            domain = Domain(*(weights[f"domain_{name}"].double().numpy() for name in DOMAIN))
-            traced = equations.model
-            count = (len(equations.parameters), len(traced.slope), len(traced.outputs))
-            shapes = [arrays[name].shape for name in ARRAYS]
-            both = count[0] + count[1]
-            wanted = [(both,), (both, shapes[1][-1]), *[(count[1],)] * 4, (count[2],)]
-            require(
-                shapes == wanted and all(np.isfinite(each).all() for each in arrays.values()),
-                "weights",
-                expected=f"finite arrays of the shapes {wanted}",
-                got=shapes,
-                remedy="save the model again",
-            )
-            variances = [arrays[name] for name in ARRAYS[2:]]
-            widening = finite("widening", about["widening"], least=0.0)
-            ends = np.stack([domain.low, domain.mean, domain.high])
-            require(
-                all((each >= 0).all() for each in variances)
-                and (arrays["noise"] > 0).all()
-                and ends.shape == (3, count[1] + len(equations.inputs))
-                and domain.speed.shape == (count[1],)
-                and np.isfinite(ends).all()
-                and np.isfinite(domain.speed).all()
-                and (np.diff(ends, axis=0) >= 0).all(),
-                "weights",
-                expected="variances above 0 and a domain of all states and commands",
-                got="others",
-                remedy="save the model again",
-            )
-            return cls(
-                equations,
-                **arrays,
-                widening=widening,
-                domain=domain,
-                corrected=corrected,
-                emulated=one_of("emulated", about["emulated"], (True, False)),
-                case=about["case"],
-            )
+        return cls(**read_fields(folder))
