@@ -23,23 +23,19 @@ from retwin.deploy.bundle.verdicts import (
     check_channels,
     no_diagnoser,
 )
-from retwin.errors import InputError
+from retwin.deploy.onnx.session import Session, bounded_options
 from retwin.progress import Progress
-from retwin.serialisation.files import refusing
-from retwin.serialisation.sizes import Budget
 from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, checked_seed, simulate_in_chunks
 
 if TYPE_CHECKING:
-    from onnxruntime import InferenceSession
+    pass
 
 __all__ = ["Portable", "padded_times", "settled_at"]
 
 GRAPHS = ("surrogate", "residual", "correction", "guard")
 """Names of the graphs that every export has."""
-EXPECTED = "a graph that retwin bundle export wrote"
-REMEDY = "make it anew with retwin bundle export, or give it less at once if memory is short"
 
 
 @dataclass(frozen=True)
@@ -161,7 +157,7 @@ class Portable:
 
         """
         runtime = needs_extra("onnxruntime", "onnx", "runs the graphs")
-        options = _bounded(runtime)
+        options = bounded_options(runtime)
         options.intra_op_num_threads = threads
         options.log_severity_level = 4  # errors are raised, and need not be printed too
         with open_sealed(folder, "portable") as about:
@@ -336,60 +332,6 @@ class Portable:
             got=f"{steps} samples, {segments} segments",
             remedy="cut them, or use the bundle with torch, which takes any length",
         )
-
-
-class Session:
-    """A session of onnxruntime as a function of named arrays; others are ignored.
-
-    Parameters
-    ----------
-    session : onnxruntime.InferenceSession
-        The session.
-    file : Path
-        File of the graph, for messages.
-
-    """
-
-    def __init__(self, session: InferenceSession, file: Path) -> None:
-        self.session = session
-        self.file = file
-        self.inputs = {each.name: each.shape for each in session.get_inputs()}
-
-    def __call__(self, **arrays: NDArray) -> NDArray:
-        """The output of the graph; InputError if it does not run."""
-        given = {name: array for name, array in arrays.items() if name in self.inputs}
-        with refusing(self.file, expected=EXPECTED, remedy=REMEDY):
-            result: NDArray = self.session.run(None, given)[0]
-        return result
-
-    def checked(self, shape: tuple[int, ...], **arrays: NDArray) -> NDArray:
-        """The output; InputError if it has another shape or is not finite."""
-        result = self(**arrays)
-        if result.shape != shape:
-            raise self.refused(f"an output of shape {result.shape} for {shape}")
-        if not np.isfinite(result).all():
-            raise self.refused("an output that is not finite")
-        return result
-
-    def refused(self, got: str) -> InputError:
-        """The error for an output that no graph of `export_onnx` has."""
-        return InputError(str(self.file), expected=EXPECTED, got=got, remedy=REMEDY)
-
-    def width(self, name: str) -> int:
-        """Size of the last axis of an input."""
-        return int(self.inputs[name][-1])
-
-
-def _bounded(runtime: Any) -> Any:
-    """Options of sessions that take a share of the free memory in all: a graph may expand."""
-    kind = runtime.OrtAllocatorType.ORT_ARENA_ALLOCATOR
-    memory = runtime.OrtMemoryInfo("Cpu", kind, 0, runtime.OrtMemType.DEFAULT)
-    # The other settings of an arena are the defaults. A further call replaces it for new sessions.
-    arena = runtime.OrtArenaCfg(Budget("graphs").left, -1, -1, -1)
-    runtime.create_and_register_allocator(memory, arena)
-    options = runtime.SessionOptions()
-    options.add_session_config_entry("session.use_env_allocators", "1")
-    return options
 
 
 def _outputs(trajectories: Trajectories) -> dict[str, NDArray]:
