@@ -21,7 +21,8 @@ import retwin as rt
 from retwin.cases.armpi_fpv.twin import UNIT
 from retwin.diagnosis import Diagnosis, Estimate, fit_inversion
 from retwin.scores.classification import score
-from retwin.twins.faults import ActuatorBias, Stuck, draw_faults
+from retwin.twins.applied_faults import draw_faults
+from retwin.twins.faults import ActuatorBias, Stuck
 
 HEALTHY = 6
 PER_CLASS = 6

@@ -23,7 +23,7 @@ from retwin.inference.priors import GaussianPrior
 from retwin.nets.training import Training
 from retwin.scores.classification import score
 from retwin.testing import DIAGNOSER_CHECKS, DiagnoserSubject
-from retwin.twins.faults import draw_faults, faulty_commands, frozen_from
+from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_from
 from retwin.twins.samplers import RampSampler
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import effective_commands

@@ -12,8 +12,9 @@ import torch
 
 import retwin as rt
 from retwin.nets.networks import MLP
+from retwin.twins.applied_faults import faulty_commands
 from retwin.twins.compiled import commands as compiled_commands
-from retwin.twins.faults import ActuatorBias, faulty_commands
+from retwin.twins.faults import ActuatorBias
 from retwin.twins.ramps import ramps_and_holds
 from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.path_problem import path_at

@@ -15,7 +15,8 @@ from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Provenance, Trajectories
 from retwin.progress import Progress
 from retwin.times import stride_of
-from retwin.twins.faults import Fault, draw_faults, faulty_commands, frozen_from, frozen_response
+from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_from, frozen_response
+from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.system_faults import check_faults, measured_with
 
