@@ -15,7 +15,7 @@ from torch import Tensor
 
 import retwin as rt
 from retwin.diagnosis import Diagnosis, InversionDiagnoser, fit_inversion
-from retwin.diagnosis.inversion import lower_bound
+from retwin.diagnosis.inversion_fitting import lower_bound
 from retwin.diagnosis.severity import draw_biases
 from retwin.inference.losses import StudentT
 from retwin.inference.noise import Noise

@@ -18,7 +18,8 @@ from retwin.diagnosis.estimate import Estimate
 from retwin.diagnosis.features import Features
 from retwin.diagnosis.fine_tuning import FineTune
 from retwin.diagnosis.fitting import Classifier, fit_diagnoser
-from retwin.diagnosis.inversion import Diagnosis, InversionDiagnoser, fit_inversion
+from retwin.diagnosis.inversion import Diagnosis, InversionDiagnoser
+from retwin.diagnosis.inversion_fitting import fit_inversion
 from retwin.diagnosis.network import NetworkDiagnoser
 from retwin.diagnosis.pooled import PooledDiagnoser
 from retwin.diagnosis.rocket import Rocket, RocketDiagnoser

@@ -12,26 +12,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import NormalDist
-from typing import overload
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.special import expit
-from scipy.stats import t as student
 from torch import Tensor
 
-from retwin.checks import instance, require
-from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.estimate import UNKNOWN, Estimate
 from retwin.diagnosis.hypotheses import Hypotheses, checked
-from retwin.diagnosis.latent_prior import command_problem, command_space, healthy_prior
-from retwin.diagnosis.missed_segments import best_fit, fitted_noise
+from retwin.diagnosis.latent_prior import command_space
+from retwin.diagnosis.missed_segments import best_fit
 from retwin.diagnosis.onsets import Onsets
 from retwin.diagnosis.samples import DiagnosisInputs
 from retwin.diagnosis.severity import biases, stuck_level
-from retwin.diagnosis.state_inversion import StateInversionDiagnoser
-from retwin.errors import InputError
 from retwin.inference.noise import Noise
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
@@ -39,19 +34,15 @@ from retwin.serialisation.models import read_model, write_model
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.twin import Twin
 from retwin.update.corrections.missed_segments import CommandFit
-from retwin.update.dynamics import DynamicsTwin
 from retwin.update.exact import exact_surrogate
-from retwin.update.residual import Residual, ResidualModel
+from retwin.update.residual import ResidualModel
 from retwin.update.surrogate import Surrogate
-from retwin.update.surrogate_error import surrogate_variance
 from retwin.update.training_range import outside_training
 
-__all__ = ["Diagnosis", "Inversion", "InversionDiagnoser", "fit_inversion", "invert"]
+__all__ = ["Diagnosis", "Inversion", "InversionDiagnoser", "invert"]
 
 TRAJECTORIES_PER_BATCH = 16
 """Trajectories inverted together, which bounds memory."""
-ROUNDS = 5
-"""Rounds of expectation-maximisation of the noise."""
 COVERAGE = 0.9
 """Coverage of all intervals."""
 
@@ -307,122 +298,6 @@ class InversionDiagnoser:
 
 FAULTS: tuple[type, ...] = (Stuck, ActuatorBias)
 """The faults that can be inverted, and that a model folder may name."""
-
-
-@overload
-def fit_inversion(
-    surrogate: DynamicsTwin,
-    residual: None,
-    calibration: Trajectories | None,
-    faults: Mapping[str, Fault | None],
-) -> StateInversionDiagnoser: ...
-
-
-@overload
-def fit_inversion(
-    surrogate: Surrogate | Twin,
-    residual: Residual,
-    calibration: Trajectories,
-    faults: Mapping[str, Fault | None],
-    *,
-    twin: Twin | None = None,
-) -> InversionDiagnoser: ...
-
-
-@torch.no_grad()
-def fit_inversion(
-    surrogate: Surrogate | Twin,
-    residual: Residual | None,
-    calibration: Trajectories | None,
-    faults: Mapping[str, Fault | None],
-    *,
-    twin: Twin | None = None,
-) -> InversionDiagnoser | StateInversionDiagnoser:
-    """A diagnoser by physics: at most its noise is learned, from healthy trajectories.
-
-    Parameters
-    ----------
-    surrogate : Surrogate or Twin
-        Of the updated twin, or a twin in its place (see `ExactSurrogate`), with which the diagnoser
-        cannot be saved. A `DynamicsTwin` is everything that its inversion needs.
-    residual : Residual or None
-        Of the updated twin, a `ResidualModel` with `CommandSpace`; None with a `DynamicsTwin`.
-    calibration : Trajectories or None
-        Those that the residual model was fitted to; the healthy ones are used. None with a
-        `DynamicsTwin`, which has learned its noise.
-    faults : mapping of str to Fault or None
-        Class name to fault, as a case has them: of actuators, or, with a `DynamicsTwin`, of
-        parameters, sensors and actuators (`retwin.twins.ParameterShift` and others).
-    twin : Twin, optional
-        The twin that the surrogate was trained on. It simulates the commands, and what the
-        surrogate errs there makes diagnoses less certain; without it, what the surrogate erred on
-        held-out simulations.
-
-    Raises
-    ------
-    InputError
-        There is no healthy trajectory, and whatever `InversionDiagnoser` or
-        `StateInversionDiagnoser` refuses.
-
-    """
-    if isinstance(surrogate, DynamicsTwin):
-        require(
-            residual is None,
-            "residual",
-            expected="None, since corrected dynamics have a distribution",
-            got=type(residual).__name__,
-            remedy="leave it out",
-        )
-        return StateInversionDiagnoser(surrogate, faults)
-    if not isinstance(residual, ResidualModel):
-        raise InputError(
-            "residual",
-            expected="a residual model with one z per segment",
-            got=type(residual).__name__,
-            remedy="fit it with CommandSpace",
-        )
-    remedy = "give those that the residual model was fitted to"
-    calibration = instance("calibration", calibration, Trajectories, remedy=remedy)
-    healthy = calibration.with_label(HEALTHY)
-    require(
-        len(healthy),
-        "calibration",
-        expected=f"at least one trajectory labelled {HEALTHY!r}",
-        got=f"labels {sorted(calibration.known_labels) or 'none'}",
-        remedy="label healthy trajectories",
-    )
-    surrogate = exact_surrogate(surrogate)
-    given = DiagnosisInputs.of(surrogate, residual, healthy)
-    segments = given.context.segments
-    found = surrogate_variance(surrogate, twin, healthy.commands, segments)
-    variance = (
-        torch.zeros(len(residual.outputs)) if found is None else found[segments.valid].mean(0)
-    )
-    context, observed, mask = given.with_error(variance)[:]
-    problem = command_problem(residual, context, observed, mask)
-    noise = fitted_noise(problem, healthy_prior(residual, context), rounds=ROUNDS)
-    known = invert(Hypotheses.of((None,), residual, context, observed, mask), noise)
-    each = known.evidence.numpy() / mask.any(dim=2).sum(dim=1).clamp_min(1).numpy()
-    return InversionDiagnoser(
-        surrogate,
-        residual,
-        faults,
-        noise=noise,
-        surrogate_variance=variance,
-        bound=lower_bound(each),
-    )
-
-
-def lower_bound(values: NDArray) -> float:
-    """What a further value exceeds with a probability of 0.99, from n normal ones.
-
-    Minus infinity for a single one, which has no spread.
-    """
-    count = len(values)
-    if count < 2:
-        return -np.inf
-    spread = np.std(values, ddof=1) * np.sqrt(1 + 1 / count)
-    return float(np.mean(values) - student.ppf(0.99, count - 1) * spread)
 
 
 def _offsets(rows: Hypotheses, found: Inversion, classes: int, healthy: int) -> NDArray:

@@ -1,0 +1,149 @@
+"""`fit_inversion`: what a diagnosis by physics learns from healthy trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import overload
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from retwin.checks import instance, require
+from retwin.data.trajectories import HEALTHY, Trajectories
+from retwin.diagnosis.hypotheses import Hypotheses
+from retwin.diagnosis.inversion import InversionDiagnoser, invert
+from retwin.diagnosis.latent_prior import command_problem, healthy_prior
+from retwin.diagnosis.missed_segments import fitted_noise
+from retwin.diagnosis.samples import DiagnosisInputs
+from retwin.diagnosis.state_inversion import StateInversionDiagnoser
+from retwin.errors import InputError
+from retwin.twins.faults import Fault
+from retwin.twins.twin import Twin
+from retwin.update.dynamics import DynamicsTwin
+from retwin.update.exact import exact_surrogate
+from retwin.update.residual import Residual, ResidualModel
+from retwin.update.surrogate import Surrogate
+from retwin.update.surrogate_error import surrogate_variance
+
+__all__ = ["fit_inversion", "lower_bound"]
+
+ROUNDS = 5
+"""Rounds of expectation-maximisation of the noise."""
+
+
+@overload
+def fit_inversion(
+    surrogate: DynamicsTwin,
+    residual: None,
+    calibration: Trajectories | None,
+    faults: Mapping[str, Fault | None],
+) -> StateInversionDiagnoser: ...
+
+
+@overload
+def fit_inversion(
+    surrogate: Surrogate | Twin,
+    residual: Residual,
+    calibration: Trajectories,
+    faults: Mapping[str, Fault | None],
+    *,
+    twin: Twin | None = None,
+) -> InversionDiagnoser: ...
+
+
+@torch.no_grad()
+def fit_inversion(
+    surrogate: Surrogate | Twin,
+    residual: Residual | None,
+    calibration: Trajectories | None,
+    faults: Mapping[str, Fault | None],
+    *,
+    twin: Twin | None = None,
+) -> InversionDiagnoser | StateInversionDiagnoser:
+    """A diagnoser by physics: at most its noise is learned, from healthy trajectories.
+
+    Parameters
+    ----------
+    surrogate : Surrogate or Twin
+        Of the updated twin, or a twin in its place (see `ExactSurrogate`), with which the diagnoser
+        cannot be saved. A `DynamicsTwin` is everything that its inversion needs.
+    residual : Residual or None
+        Of the updated twin, a `ResidualModel` with `CommandSpace`; None with a `DynamicsTwin`.
+    calibration : Trajectories or None
+        Those that the residual model was fitted to; the healthy ones are used. None with a
+        `DynamicsTwin`, which has learned its noise.
+    faults : mapping of str to Fault or None
+        Class name to fault, as a case has them: of actuators, or, with a `DynamicsTwin`, of
+        parameters, sensors and actuators (`retwin.twins.ParameterShift` and others).
+    twin : Twin, optional
+        The twin that the surrogate was trained on. It simulates the commands, and what the
+        surrogate errs there makes diagnoses less certain; without it, what the surrogate erred on
+        held-out simulations.
+
+    Raises
+    ------
+    InputError
+        There is no healthy trajectory, and whatever `InversionDiagnoser` or
+        `StateInversionDiagnoser` refuses.
+
+    """
+    if isinstance(surrogate, DynamicsTwin):
+        require(
+            residual is None,
+            "residual",
+            expected="None, since corrected dynamics have a distribution",
+            got=type(residual).__name__,
+            remedy="leave it out",
+        )
+        return StateInversionDiagnoser(surrogate, faults)
+    if not isinstance(residual, ResidualModel):
+        raise InputError(
+            "residual",
+            expected="a residual model with one z per segment",
+            got=type(residual).__name__,
+            remedy="fit it with CommandSpace",
+        )
+    remedy = "give those that the residual model was fitted to"
+    calibration = instance("calibration", calibration, Trajectories, remedy=remedy)
+    healthy = calibration.with_label(HEALTHY)
+    require(
+        len(healthy),
+        "calibration",
+        expected=f"at least one trajectory labelled {HEALTHY!r}",
+        got=f"labels {sorted(calibration.known_labels) or 'none'}",
+        remedy="label healthy trajectories",
+    )
+    surrogate = exact_surrogate(surrogate)
+    given = DiagnosisInputs.of(surrogate, residual, healthy)
+    segments = given.context.segments
+    found = surrogate_variance(surrogate, twin, healthy.commands, segments)
+    variance = (
+        torch.zeros(len(residual.outputs)) if found is None else found[segments.valid].mean(0)
+    )
+    context, observed, mask = given.with_error(variance)[:]
+    problem = command_problem(residual, context, observed, mask)
+    noise = fitted_noise(problem, healthy_prior(residual, context), rounds=ROUNDS)
+    known = invert(Hypotheses.of((None,), residual, context, observed, mask), noise)
+    each = known.evidence.numpy() / mask.any(dim=2).sum(dim=1).clamp_min(1).numpy()
+    return InversionDiagnoser(
+        surrogate,
+        residual,
+        faults,
+        noise=noise,
+        surrogate_variance=variance,
+        bound=lower_bound(each),
+    )
+
+
+def lower_bound(values: NDArray) -> float:
+    """What a further value exceeds with a probability of 0.99, from n normal ones.
+
+    Minus infinity for a single one, which has no spread.
+    """
+    count = len(values)
+    if count < 2:
+        return -np.inf
+    spread = np.std(values, ddof=1) * np.sqrt(1 + 1 / count)
+    return float(np.mean(values) - student.ppf(0.99, count - 1) * spread)
