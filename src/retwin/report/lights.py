@@ -175,18 +175,11 @@ def _simulated_change(
         return None
     unit = results.outputs.units[0] if results.outputs.units and metric == "rmse" else ""
     factor, shown = quantity(unit) if metric == "rmse" else (1.0, "σ")
-
-    def scaled(name: str) -> tuple[float, float] | None:
-        ends = results.sources[name].interval(metric)
-        return None if ends is None else (factor * ends[0], factor * ends[1])
-
     ends = compared.interval if compared else None
     ratio = None if ends is None else (1 + ends[0] / before, 1 + ends[1] / before)
     found = ErrorChange(
         before=factor * before,
-        before_interval=scaled(pair[1]),
         after=factor * after,
-        after_interval=scaled(pair[0]),
         ratio=after / before,
         ratio_interval=ratio,
         outputs_before=np.array([factor * before]),

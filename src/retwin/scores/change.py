@@ -27,12 +27,10 @@ class ErrorChange:
     ----------
     before, after : float
         Mean over all samples of all trajectories and over outputs.
-    before_interval, after_interval : (float, float) or None
-        Their 95 % intervals over trajectories; None for fewer than five.
     ratio : float
         After divided by before.
     ratio_interval : (float, float) or None
-        The paired 95 % interval of the ratio.
+        The paired 95 % interval of the ratio over trajectories; None for fewer than five.
     outputs_before, outputs_after : array (d,)
         The same for each output.
     trajectories : int
@@ -41,9 +39,7 @@ class ErrorChange:
     """
 
     before: float
-    before_interval: tuple[float, float] | None
     after: float
-    after_interval: tuple[float, float] | None
     ratio: float
     ratio_interval: tuple[float, float] | None
     outputs_before: NDArray
@@ -68,8 +64,8 @@ def error_change(
     Returns
     -------
     ErrorChange or None
-        None if nothing was measured. The intervals are those of the jackknife over trajectories,
-        on the scale of the logarithm.
+        None if nothing was measured. The interval is that of the jackknife over trajectories, on
+        the scale of the logarithm.
 
     """
     errors = [np.asarray(scale) * (np.asarray(each, float) - observed) for each in (before, after)]
@@ -94,9 +90,7 @@ def error_change(
         outputs = [each.sum(axis=0) / counts.sum(axis=0) for each in sums]
     return ErrorChange(
         float(mean(0, whole)[0]),
-        jackknife_interval(lambda weights: mean(0, weights), n, positive=True),
         float(mean(1, whole)[0]),
-        jackknife_interval(lambda weights: mean(1, weights), n, positive=True),
         float(ratio(whole)[0]),
         jackknife_interval(ratio, n, positive=True),
         outputs[0],
