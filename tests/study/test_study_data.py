@@ -9,7 +9,7 @@ import pytest
 
 import retwin as rt
 from retwin.errors import InputError
-from retwin.study import _real
+from retwin.study.data import real_data
 
 
 def test_real_sets_may_be_logs_with_a_mapping(tmp_path: Path) -> None:
@@ -27,10 +27,10 @@ def test_real_sets_may_be_logs_with_a_mapping(tmp_path: Path) -> None:
     ]
     (tmp_path / "log.csv").write_text("\n".join([",".join(("time", *names)), *rows]))
     given = rt.StudyData(real=tmp_path / "log.csv", mapping=tmp_path / "m.toml")
-    made, roles = _real(case, rt.StudyPlan(folds=2), given, lambda *_: None)
+    made, roles = real_data(case, rt.StudyPlan(folds=2), given, lambda *_: None)
     assert (len(made), made.steps, len(roles.folds)) == (4, 20, 2)
     np.testing.assert_allclose(made.observed[0, :5, -1], 1 + (np.arange(5) + len(names) - 1) % 5)
     with pytest.raises(InputError, match="make one: retwin data map"):
-        _real(case, rt.StudyPlan(), rt.StudyData(real=tmp_path / "log.csv"), lambda *_: None)
+        real_data(case, rt.StudyPlan(), rt.StudyData(real=tmp_path / "log.csv"), lambda *_: None)
     with pytest.raises(InputError, match="mapping: expected real sets that are logs"):
         rt.StudyData(records=tmp_path / "log.csv", mapping=tmp_path / "m.toml")

@@ -9,17 +9,15 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from retwin._version import __version__
 from retwin.cases.case import Case
 from retwin.catalog import CLASSIFIERS, SOURCES
 from retwin.checks import at_least, finite, require, whole
-from retwin.data.io import load, save
+from retwin.data.io import save
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
 from retwin.progress import Report
@@ -27,6 +25,7 @@ from retwin.results import Results
 from retwin.serialisation.files import sha256, write_atomically
 from retwin.serialisation.identity import identity
 from retwin.serialisation.places import in_use
+from retwin.study.data import StudyData, real_data, twin_data
 from retwin.study.files import Files, Roles
 from retwin.study.plan import StudyPlan
 from retwin.study.pool import run_jobs
@@ -34,66 +33,9 @@ from retwin.study.progress import Stages
 from retwin.study.results import write_results
 from retwin.study.sources import lacking, not_installed
 from retwin.study.work import Work
-from retwin.update.corrected import generate
 from retwin.update.surrogate import MIN_TRAJECTORIES
 
 __all__ = ["StudyData", "StudyPlan", "possible_sources", "run_study"]
-
-EMULATED_PER_CLASS = 10
-"""Emulated trajectories per class where there are no real ones: 90 for the arm, as measured."""
-
-
-@dataclass(frozen=True)
-class StudyData:
-    """The files of a study; see docs/theory.md, How a study scores.
-
-    Parameters
-    ----------
-    twin : Path, optional
-        Recorded or simulated trajectories; by default the case's twin simulates them.
-    calibration, test : Path, optional
-        Two real sets.
-    real : Path, optional
-        One real set, which is split into folds; every trajectory is tested once. Without any real
-        set the case's emulator makes one, which is labelled "emulated" everywhere.
-    records : Path, optional
-        One file that the case itself splits into calibration and test set.
-    mapping : Path, optional
-        The mapping.toml of real sets that are logs; see `rt.load`.
-
-    Raises
-    ------
-    InputError
-        If the real data are given in two ways, or a calibration set without a test set; or a
-        mapping without a set that it is for.
-
-    """
-
-    twin: Path | None = None
-    calibration: Path | None = None
-    test: Path | None = None
-    real: Path | None = None
-    records: Path | None = None
-    mapping: Path | None = None
-
-    def __post_init__(self) -> None:
-        given = {name for name, file in vars(self).items() if file is not None} - {"twin"}
-        mapped = given & {"calibration", "test", "real"}
-        require(
-            self.mapping is None or mapped,
-            "mapping",
-            expected="real sets that are logs",
-            got=", ".join(sorted(given - {"mapping"})) or "none",
-            remedy="give --real LOG, or --calibration LOG --test LOG; or leave the mapping out",
-        )
-        given -= {"mapping"}
-        require(
-            given in ({"calibration", "test"}, {"real"}, {"records"}, set()),
-            "real data",
-            expected="either calibration and test, or real alone, or records alone",
-            got=", ".join(sorted(given)),
-            remedy="give --calibration FILE --test FILE, or --real FILE --folds K, or --data FILE",
-        )
 
 
 def run_study(
@@ -295,9 +237,9 @@ def _prepare(
     Nothing is written before everything is checked. The roles are written last, so that their
     file marks the folder as complete.
     """
-    real, roles = _real(case, plan, data, report)
+    real, roles = real_data(case, plan, data, report)
     _check_healthy(plan, real, roles)
-    twin = _twin(case, plan, data, report)
+    twin = twin_data(case, plan, data, report)
     remedy = "give more of them, or a larger per_class"
     at_least("twin-data", twin, MIN_TRAJECTORIES, "trajectories of the twin", remedy=remedy)
     _check_classes(case, plan, twin)
@@ -357,83 +299,3 @@ def _check_classes(case: Case, plan: StudyPlan, twin: Trajectories) -> None:
         got=f"none of {', '.join(absent)}",
         remedy="add them, or leave these sources out: the others need healthy trajectories only",
     )
-
-
-def _twin(case: Case, plan: StudyPlan, data: StudyData, report: Report) -> Trajectories:
-    """The trajectories of the twin, read or simulated."""
-
-    def progress(share: float) -> None:
-        report("twin data", share)
-
-    if data.twin is not None:
-        return _labelled(load(data.twin, case=case, progress=progress), case, "twin-data")
-    seed = plan.seed_of("twin", 0)
-    return generate(case.twin, case, per_class=plan.generated(case), seed=seed, progress=progress)
-
-
-def _real(
-    case: Case, plan: StudyPlan, data: StudyData, report: Report
-) -> tuple[Trajectories, Roles]:
-    """The real trajectories and their roles."""
-
-    def read(path: Path) -> Trajectories:
-        found = load(
-            path,
-            case=case,
-            progress=lambda share: report(path.name, share),
-            mapping=data.mapping,
-        )
-        return _labelled(found, case, path.name)
-
-    if data.records is not None:
-        calibration, test = _records(case, data.records)
-        name = data.records.name
-        return _in_two(_labelled(calibration, case, name), _labelled(test, case, name))
-    if data.calibration is not None and data.test is not None:
-        return _in_two(read(data.calibration), read(data.test))
-    if data.real is not None:
-        real = read(data.real)
-    elif case.emulator is not None:
-        seed = plan.seed_of("emulated", 0)
-        real = generate(case.emulator, case, per_class=EMULATED_PER_CLASS, seed=seed)
-    else:
-        raise InputError(
-            "real data",
-            expected="measured trajectories",
-            got=f"none, and the case {case.name!r} has no emulator",
-            remedy="give --real FILE --folds K",
-        )
-    return real, Roles.of(real.folds(plan.folds, seed=plan.seed_of("folds", 0)))
-
-
-def _records(case: Case, path: Path) -> tuple[Trajectories, Trajectories]:
-    """Calibration and test set of a file that the case splits."""
-    if case.records is None:
-        raise InputError(
-            "records",
-            expected="a case that declares how its file is split",
-            got=f"the case {case.name!r}, which does not",
-            remedy="give --calibration FILE --test FILE, or --real FILE --folds K",
-        )
-    return case.records(path)
-
-
-def _in_two(calibration: Trajectories, test: Trajectories) -> tuple[Trajectories, Roles]:
-    """Both sets as one, with their roles."""
-    both = Trajectories.concatenate([calibration, test])
-    return both, Roles.of([(range(len(calibration)), range(len(calibration), len(both)))])
-
-
-def _labelled(trajectories: Trajectories, case: Case, name: str) -> Trajectories:
-    """The trajectories with labels of the case, where it has classes."""
-    if not case.diagnosed:
-        return trajectories.replace(labels=np.full(len(trajectories), case.classes[0]))
-    unknown = set(trajectories.labels.tolist()) - set(case.classes)
-    require(
-        not unknown,
-        name,
-        expected=f"trajectories labelled with the classes {', '.join(case.classes)}",
-        got=sorted(unknown),
-        remedy="label every trajectory: labels are needed to score a study",
-    )
-    return trajectories

@@ -1,0 +1,156 @@
+"""The data of a study: its files, read or simulated, with the roles of real trajectories."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from retwin.cases.case import Case
+from retwin.checks import require
+from retwin.data.io import load
+from retwin.data.trajectories import Trajectories
+from retwin.errors import InputError
+from retwin.progress import Report
+from retwin.study.files import Roles
+from retwin.study.plan import StudyPlan
+from retwin.update.corrected import generate
+
+__all__ = ["StudyData", "real_data", "twin_data"]
+
+EMULATED_PER_CLASS = 10
+"""Emulated trajectories per class where there are no real ones: 90 for the arm, as measured."""
+
+
+@dataclass(frozen=True)
+class StudyData:
+    """The files of a study; see docs/theory.md, How a study scores.
+
+    Parameters
+    ----------
+    twin : Path, optional
+        Recorded or simulated trajectories; by default the case's twin simulates them.
+    calibration, test : Path, optional
+        Two real sets.
+    real : Path, optional
+        One real set, which is split into folds; every trajectory is tested once. Without any real
+        set the case's emulator makes one, which is labelled "emulated" everywhere.
+    records : Path, optional
+        One file that the case itself splits into calibration and test set.
+    mapping : Path, optional
+        The mapping.toml of real sets that are logs; see `rt.load`.
+
+    Raises
+    ------
+    InputError
+        If the real data are given in two ways, or a calibration set without a test set; or a
+        mapping without a set that it is for.
+
+    """
+
+    twin: Path | None = None
+    calibration: Path | None = None
+    test: Path | None = None
+    real: Path | None = None
+    records: Path | None = None
+    mapping: Path | None = None
+
+    def __post_init__(self) -> None:
+        given = {name for name, file in vars(self).items() if file is not None} - {"twin"}
+        mapped = given & {"calibration", "test", "real"}
+        require(
+            self.mapping is None or mapped,
+            "mapping",
+            expected="real sets that are logs",
+            got=", ".join(sorted(given - {"mapping"})) or "none",
+            remedy="give --real LOG, or --calibration LOG --test LOG; or leave the mapping out",
+        )
+        given -= {"mapping"}
+        require(
+            given in ({"calibration", "test"}, {"real"}, {"records"}, set()),
+            "real data",
+            expected="either calibration and test, or real alone, or records alone",
+            got=", ".join(sorted(given)),
+            remedy="give --calibration FILE --test FILE, or --real FILE --folds K, or --data FILE",
+        )
+
+
+def twin_data(case: Case, plan: StudyPlan, data: StudyData, report: Report) -> Trajectories:
+    """The trajectories of the twin, read or simulated."""
+
+    def progress(share: float) -> None:
+        report("twin data", share)
+
+    if data.twin is not None:
+        return _labelled(load(data.twin, case=case, progress=progress), case, "twin-data")
+    seed = plan.seed_of("twin", 0)
+    return generate(case.twin, case, per_class=plan.generated(case), seed=seed, progress=progress)
+
+
+def real_data(
+    case: Case, plan: StudyPlan, data: StudyData, report: Report
+) -> tuple[Trajectories, Roles]:
+    """The real trajectories and their roles."""
+
+    def read(path: Path) -> Trajectories:
+        found = load(
+            path,
+            case=case,
+            progress=lambda share: report(path.name, share),
+            mapping=data.mapping,
+        )
+        return _labelled(found, case, path.name)
+
+    if data.records is not None:
+        calibration, test = _records(case, data.records)
+        name = data.records.name
+        return _in_two(_labelled(calibration, case, name), _labelled(test, case, name))
+    if data.calibration is not None and data.test is not None:
+        return _in_two(read(data.calibration), read(data.test))
+    if data.real is not None:
+        real = read(data.real)
+    elif case.emulator is not None:
+        seed = plan.seed_of("emulated", 0)
+        real = generate(case.emulator, case, per_class=EMULATED_PER_CLASS, seed=seed)
+    else:
+        raise InputError(
+            "real data",
+            expected="measured trajectories",
+            got=f"none, and the case {case.name!r} has no emulator",
+            remedy="give --real FILE --folds K",
+        )
+    return real, Roles.of(real.folds(plan.folds, seed=plan.seed_of("folds", 0)))
+
+
+def _records(case: Case, path: Path) -> tuple[Trajectories, Trajectories]:
+    """Calibration and test set of a file that the case splits."""
+    if case.records is None:
+        raise InputError(
+            "records",
+            expected="a case that declares how its file is split",
+            got=f"the case {case.name!r}, which does not",
+            remedy="give --calibration FILE --test FILE, or --real FILE --folds K",
+        )
+    return case.records(path)
+
+
+def _in_two(calibration: Trajectories, test: Trajectories) -> tuple[Trajectories, Roles]:
+    """Both sets as one, with their roles."""
+    both = Trajectories.concatenate([calibration, test])
+    return both, Roles.of([(range(len(calibration)), range(len(calibration), len(both)))])
+
+
+def _labelled(trajectories: Trajectories, case: Case, name: str) -> Trajectories:
+    """The trajectories with labels of the case, where it has classes."""
+    if not case.diagnosed:
+        return trajectories.replace(labels=np.full(len(trajectories), case.classes[0]))
+    unknown = set(trajectories.labels.tolist()) - set(case.classes)
+    require(
+        not unknown,
+        name,
+        expected=f"trajectories labelled with the classes {', '.join(case.classes)}",
+        got=sorted(unknown),
+        remedy="label every trajectory: labels are needed to score a study",
+    )
+    return trajectories
