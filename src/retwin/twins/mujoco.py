@@ -19,11 +19,11 @@ from retwin.progress import Progress
 from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
+from retwin.twins.mujoco_actuators import limits_of
 from retwin.twins.mujoco_model import (
     Servo,
     compiled,
     input_channels,
-    limits_of,
     output_channels,
 )
 from retwin.twins.mujoco_simulation import MuJoCoSimulation

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from itertools import chain, count
 from pathlib import Path
 
 import mujoco
-import numpy as np
-from numpy.typing import NDArray
 
 from retwin.checks import require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
+from retwin.twins.mujoco_actuators import HINGE, control_unit
 
 __all__ = [
-    "FILTERS",
     "Servo",
     "compiled",
     "input_channels",
-    "joint_of",
-    "limits_of",
     "output_channels",
-    "resting",
 ]
 
 
@@ -50,15 +45,6 @@ class Servo:
     damping: float
     armature: float = 0.005
 
-
-# As plain numbers: MuJoCo's enumerations do not equal the numbers that its arrays hold.
-HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
-DIRECT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-FIXED, AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
-FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
-"""Dynamics of actuators that follow their control with a lag."""
-FOLLOWING = (int(mujoco.mjtDyn.mjDYN_NONE), *FILTERS)
-"""Dynamics of actuators whose gain acts on their control, and not for instance on its integral."""
 
 PLACES = {
     "joint": ("joints", mujoco.mjtSensor.mjSENS_JOINTPOS),
@@ -239,7 +225,7 @@ def input_channels(model: mujoco.MjModel, names: Sequence[str]) -> Channels:
             got=f"{name} with {controls}",
             remedy="use an actuator for each of its controls",
         )
-    return Channels(tuple(chosen), tuple(_control_unit(model, name) for name in chosen))
+    return Channels(tuple(chosen), tuple(control_unit(model, name) for name in chosen))
 
 
 def output_channels(
@@ -294,85 +280,6 @@ def output_channels(
     return tuple(chosen), Channels(tuple(channels), tuple(units))
 
 
-def limits_of(model: mujoco.MjModel, names: Sequence[str]) -> tuple[NDArray, NDArray] | None:
-    """Control ranges of actuators.
-
-    Parameters
-    ----------
-    model : mujoco.MjModel
-        The model.
-    names : sequence of str
-        Actuators, d_u of them.
-
-    Returns
-    -------
-    (low, high) or None
-        Arrays (d_u,), infinite where an actuator is not limited; None when none is.
-
-    """
-    controls = np.array([model.actuator_ctrladr[model.actuator(name).id] for name in names])
-    limited = model.actuator_ctrllimited[controls].astype(bool)
-    if not limited.any():
-        return None
-    low, high = model.actuator_ctrlrange[controls].T
-    return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
-
-
-def resting(model: mujoco.MjModel, name: str) -> tuple[int, Callable[[NDArray], NDArray]] | None:
-    """Rest position of a position servo on a joint, as a function of its command.
-
-    Parameters
-    ----------
-    model : mujoco.MjModel
-        The model.
-    name : str
-        The actuator.
-
-    Returns
-    -------
-    (address, position) or None
-        The joint's address in qpos, and a function from commands to positions in rad or m. None
-        for other actuators, whose rest position does not follow from the command alone.
-
-    """
-    actuator = model.actuator(name)
-    joint = joint_of(model, name)
-    slope = actuator.biasprm[1]
-    plain = actuator.gaintype[0] == FIXED and actuator.biastype[0] == AFFINE
-    if joint is None or not plain or slope == 0 or actuator.dyntype[0] not in FOLLOWING:
-        return None
-    gear = actuator.gear[0]
-    low, high = limits_of(model, [name]) or (np.array([-np.inf]), np.array([np.inf]))
-
-    def position(commands: NDArray) -> NDArray:
-        controls = np.clip(commands, low[0], high[0])
-        return -(actuator.gainprm[0] * controls + actuator.biasprm[0]) / (slope * gear)
-
-    return int(model.jnt_qposadr[joint]), position
-
-
-def joint_of(model: mujoco.MjModel, name: str) -> int | None:
-    """The joint that an actuator drives.
-
-    Parameters
-    ----------
-    model : mujoco.MjModel
-        The model.
-    name : str
-        The actuator.
-
-    Returns
-    -------
-    int or None
-        Index of the hinge or slide joint; None when the actuator drives something else.
-
-    """
-    actuator = model.actuator(name)
-    joint = int(actuator.trnid[0])
-    direct = actuator.trntype[0] in DIRECT and model.jnt_type[joint] in (HINGE, SLIDE)
-    return joint if direct else None
-
-
 def _name(argument: str, name: str, existing: Sequence[str], also: Sequence[str] = ()) -> str:
     """`name`, if the model has it; the message proposes names of `also`, or else of `existing`."""
     known = also or existing
@@ -388,20 +295,6 @@ def _name(argument: str, name: str, existing: Sequence[str], also: Sequence[str]
         remedy=f"did you mean {close[0]!r}?" if close else "check the spelling",
     )
     return name
-
-
-def _control_unit(model: mujoco.MjModel, name: str) -> str:
-    """Unit of the control of a position servo or motor of gear 1; "1" for other actuators."""
-    joint = joint_of(model, name)
-    actuator = model.actuator(name)
-    if joint is None or actuator.gear[0] != 1 or actuator.dyntype[0] not in FOLLOWING:
-        return "1"
-    hinge = model.jnt_type[joint] == HINGE
-    if actuator.biastype[0] != AFFINE and actuator.gainprm[0] == 1:
-        return "N m" if hinge else "N"
-    if actuator.gainprm[0] == -actuator.biasprm[1] != 0:
-        return "rad" if hinge else "m"
-    return "1"
 
 
 UNITS = {

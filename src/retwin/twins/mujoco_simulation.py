@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import require
 from retwin.errors import InputError
-from retwin.twins.mujoco_model import FILTERS, joint_of, resting
+from retwin.twins.mujoco_actuators import FILTERS, joint_of, resting
 from retwin.twins.mujoco_parameters import set_parameter
 
 __all__ = ["MuJoCoSimulation", "Response"]
