@@ -156,6 +156,21 @@ def test_text_tables_of_any_kind(
     assert signal.values[-1] == last or (last is None and np.isnan(signal.values[-1]))
 
 
+@pytest.mark.parametrize("clock", [Clock(rate=10.0), Clock(otherwise=10.0)])
+def test_a_row_of_empty_cells_is_a_sample_where_rows_come_at_a_rate(
+    clock: Clock, tmp_path: Path
+) -> None:
+    (tmp_path / "a.csv").write_text("u,y\n1,5\n,\n3,7\n")
+    signals = [
+        each
+        for each in text_tables.read(tmp_path / "a.csv", None, clock)
+        if isinstance(each, Signal)
+    ]
+    for each, values in zip(signals, ([1, np.nan, 3], [5, np.nan, 7]), strict=True):
+        np.testing.assert_array_equal(each.values, values)
+        assert len(each.times) == 3
+
+
 def test_a_gap_is_missing_and_never_bridged() -> None:
     at = np.arange(0, 10, 0.01)
     kept = (at < 4) | (at > 4.5)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.data.logs.signals import Clock, Signal, Skipped, named_unit
-from retwin.data.logs.tables import MISSING, TRUTH, numbers, table_signals
+from retwin.data.logs.tables import MISSING, TRUTH, numbers, table_signals, time_column
 from retwin.errors import InputError, brief
 
 __all__ = ["read", "read_cells"]
@@ -81,7 +81,9 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
         kept = set(titles) if not clock.column else kept
     parts: dict[str, list[NDArray]] = {name: [] for name in titles if name in kept}
     count = 0
-    for block in _blocks(path, layout):
+    # At a rate, a row without values is a sample too: without it, later ones would come earlier.
+    even = bool(clock.rate or (clock.otherwise and not (clock.column or time_column(titles))))
+    for block in _blocks(path, layout, empty=even):
         count += len(block)
         columns = list(zip(*block, strict=True))
         for place, name in enumerate(layout.names):
@@ -150,7 +152,7 @@ def read_cells(path: Path, wanted: Sequence[str]) -> tuple[dict[str, list[str]],
     comma = _decimal_comma(rows[place + 1 :], separator)
     layout = TextLayout(encoding, separator, place + 1, names, ("",) * len(names), comma)
     cells: dict[str, list[str]] = {name: [] for name in wanted}
-    for block in _blocks(path, layout, exact=True):
+    for block in _blocks(path, layout, empty=True, strict=True):
         for name, own in cells.items():
             at = names.index(name.strip())
             own += [row[at] for row in block]
@@ -169,11 +171,11 @@ def _opened(path: Path, encoding: str) -> TextIO:
 
 
 def _blocks(
-    path: Path, layout: TextLayout, *, exact: bool = False
+    path: Path, layout: TextLayout, *, empty: bool, strict: bool = False
 ) -> Iterator[list[Sequence[str]]]:
     """The rows of a table, block by block.
 
-    If `exact`, rows of empty cells are kept, and quotation marks must be closed.
+    With `empty`, rows of empty cells are kept; if `strict`, quotation marks must be closed.
     """
     width = len(layout.names)
     with _opened(path, layout.encoding) as file:
@@ -181,9 +183,9 @@ def _blocks(
         for _ in range(layout.first):
             next(lines)
         block: list[Sequence[str]] = []
-        rows = _rows(lines, layout.separator, path, strict=exact)
+        rows = _rows(lines, layout.separator, path, strict=strict)
         for number, row in enumerate(rows, layout.first + 1):
-            if not row or not (exact or any(cell.strip() for cell in row)):
+            if not row or not (empty or any(cell.strip() for cell in row)):
                 continue
             if len(row) == width + 1 and not row[-1].strip():
                 row = row[:-1]  # a separator at the end of each line
@@ -331,10 +333,11 @@ def _first_row(rows: Sequence[Sequence[str]], *, comma: bool) -> int | None:
         return values + stamps > 0 and 2 * (values + stamps) >= sum(bool(c.strip()) for c in row)
 
     for place, row in enumerate(rows):
-        following = [each for each in rows[place : place + AGREEING] if each]
+        following = [each for each in rows[place : place + AGREEING] if any(map(str.strip, each))]
         # The last line may be cut off; the rows below say so when they are read.
         same = following[: max(1, len(following) - 1)]
-        if row and all(len(each) == len(row) and holds_numbers(each) for each in same):
+        filled = any(map(str.strip, row))
+        if filled and all(len(each) == len(row) and holds_numbers(each) for each in same):
             return place
     return None
 
