@@ -124,7 +124,9 @@ def test_what_cannot_calibrate_is_refused(diagnoser: StateInversionDiagnoser) ->
     with pytest.raises(InputError, match=r"healthy: expected .*at least 8"):
         fit_trajectory_monitor(diagnoser, runs(7, 1))
     leaking = runs(10, 1, ParameterShift("drain", size=0.5))
-    with pytest.raises(InputError, match="look like leak"):
+    with pytest.raises(InputError, match="some labelled Fault"):
         fit_trajectory_monitor(diagnoser, leaking)
+    with pytest.raises(InputError, match="look like leak"):
+        fit_trajectory_monitor(diagnoser, leaking.replace(labels=None))
     with pytest.raises(InputError, match="diagnoser by inversion"):
         fit_trajectory_monitor(diagnoser.twin, runs(10, 1))  # type: ignore[arg-type]
