@@ -22,7 +22,7 @@ def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -
     found : Trajectories
         Those of all logs.
     notes : dict of str to list of str
-        Takes what is to be said of all logs together.
+        Takes notes about all logs together.
     transient : float
         Duration in s.
 

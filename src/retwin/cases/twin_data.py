@@ -114,7 +114,7 @@ def log_case(
 
 
 def _object(name: str) -> Any:
-    """What a name `module:object` stands for; None if there is none, which `get` then says."""
+    """What a name `module:object` stands for; None if there is none, which `get` refuses."""
     try:
         return catalog.resolve(name)
     except (ImportError, AttributeError, ValueError):

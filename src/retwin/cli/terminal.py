@@ -60,7 +60,7 @@ FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 LOG_DELAY = 2.0
 """Seconds before the first line of progress in a log; shorter work leaves none."""
 LEFT_DELAY = 5.0
-"""Seconds before the first time left on a bar; the first steps tell little about the others."""
+"""Seconds before the first time left on a bar; the first steps are no sample of the others."""
 CONTROL = {
     code: f"\\u{code:04x}"
     for code in (*range(32), *range(127, 160), *range(0x202A, 0x202F), *range(0x2066, 0x206A))

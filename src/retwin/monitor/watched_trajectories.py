@@ -25,7 +25,7 @@ class TrajectoryAlarm:
     evidence : float
         At least the average run length of the promise.
     probability : float
-        The share of that name in the evidence for all causes, which says whether others have as
+        The share of that name in the evidence for all causes, which states whether others have as
         much; see `shares`.
     shares : dict of str to float
         The share of each cause of at least 0.01, the largest first.

@@ -49,8 +49,8 @@ def next_steps(
     lights = {each.key: each for each in found}
     steps = []
     if not results.classes and rival is not None:
-        ours, theirs = (results.sources[name].mean(rival.metric) for name in (rival.b, rival.a))
-        values = {"source": rival.a, "metric": rival.metric, "ours": ours, "theirs": theirs}
+        own, theirs = (results.sources[name].mean(rival.metric) for name in (rival.b, rival.a))
+        values = {"source": rival.a, "metric": rival.metric, "own": own, "theirs": theirs}
         steps.append(Step("other", values))
     elif results.classes and alternatives:
         best = alternatives[0]
