@@ -124,7 +124,7 @@ def export_fmu(
     identifier = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"twin_{identifier}"
     token = token_of(text.source + version)
-    interface = c_source(__package__, "fmi2.c" if version == "2.0" else "fmi3.c")
+    interface = c_source(__package__, "interface.c", f"fmi{version[0]}.c")
     source = "\n".join([text.source, f'#define TOKEN "{token}"', interface])
     headers = Path(str(fmpy.__file__)).parent / "c-code"
     content: dict[str, bytes] = {

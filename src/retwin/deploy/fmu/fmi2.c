@@ -3,25 +3,6 @@
 #include <stdlib.h>
 #include "fmi2Functions.h"
 
-#define LEFT                                                                                        \
-    "commands or states are outside the training range; the outputs there are extrapolated"
-
-/* The value of a Boolean variable, -1 if there is no such variable. */
-static int flag(Twin *twin, uint32_t reference)
-{
-    if (reference == NOISY)
-        return twin->noisy != 0;
-#ifdef RANGED
-    if (reference == OUTSIDE) {
-        if (!twin->begun)
-            begin(twin), twin->begun = 0;
-        evaluate(twin);
-        return twin->outside;
-    }
-#endif
-    return -1;
-}
-
 typedef struct {
     Twin twin;
     fmi2CallbackFunctions callbacks;
