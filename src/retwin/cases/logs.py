@@ -140,7 +140,7 @@ def read_logs(
 
 @dataclass(frozen=True, eq=False)
 class LogReader:
-    """Reads logs once for all that is asked of them.
+    """Reads each log once, and answers every question about it from what was read.
 
     Attributes
     ----------
