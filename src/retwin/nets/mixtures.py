@@ -29,6 +29,8 @@ __all__ = [
 FLOOR = 0.05
 """Smallest standard deviation of a component, in standard units. It keeps a component from
 collapsing onto a single example, where its likelihood has no bound."""
+STARTED_FROM = 2000
+"""Examples, drawn at random from more, to which the initial mixture of a network is fitted."""
 PIT_RANGE = (1e-4, 1 - 1e-4)
 """Range to which a PIT is clipped before it becomes a normal score, which is then finite, within
 3.7 standard deviations."""
@@ -293,25 +295,37 @@ class MixtureHead(nn.Module):
 
     @torch.no_grad()
     def initialise(self, values: NDArray, seed: int) -> None:
-        """Start at the clusters (k-means) of z (n, D) in standard units, nearly without context.
+        """Start at a mixture of independent components of z (n, D) in standard units.
 
-        The variance of a cluster is shrunk towards that of all examples, which counts as two
-        examples: that of a few is no estimate.
+        It is the best of several runs of expectation maximisation, and nearly without context.
+        Clusters would be no start: groups of outliers take most of them, and the component that is
+        left for all other examples is too wide. The variance of a component is shrunk towards that
+        of all examples, which counts as two examples: that of a few is no estimate.
         """
-        from sklearn.cluster import KMeans
+        from sklearn.mixture import GaussianMixture as MixtureByEM
 
+        if len(values) > STARTED_FROM:
+            values = np.random.default_rng(seed).choice(values, STARTED_FROM, replace=False)
         count = min(self.components, len(np.unique(values, axis=0)))
-        clusters = KMeans(count, n_init=5, random_state=seed).fit(values)
-        variance = values.var(axis=0)
+        fitted = MixtureByEM(
+            count,
+            covariance_type="diag",
+            init_params="random_from_data",
+            n_init=10,
+            max_iter=1000,
+            reg_covar=(2 * FLOOR) ** 2,
+            random_state=seed,
+            # The library refuses a single example, which may be all there is.
+        ).fit(np.resize(values, (max(2, len(values)), self.width)))
+        examples = fitted.weights_[:, None] * len(values)
+        shrunk = (examples * fitted.covariances_ + 2 * values.var(axis=0)) / (examples + 2)
+        deviations = torch.as_tensor(np.sqrt(shrunk).clip(2 * FLOOR) - FLOOR)
         bias = torch.zeros(self.components, 1 + self.width + self.lower)
         diagonal = [i * (i + 1) // 2 + i for i in range(self.width)]
         for k in range(self.components):
-            members = values[clusters.labels_ == k % count]
-            shrunk = (len(members) * members.var(axis=0) + 2 * variance) / (len(members) + 2)
-            deviation = torch.as_tensor(np.sqrt(shrunk).clip(2 * FLOOR) - FLOOR)
-            bias[k, 0] = np.log(len(members) / len(values))
-            bias[k, 1 : 1 + self.width] = torch.as_tensor(clusters.cluster_centers_[k % count])
-            bias[k, 1 + self.width :][diagonal] = torch.log(torch.expm1(deviation)).float()
+            bias[k, 0] = np.log(max(fitted.weights_[k % count], 1 / len(values)))
+            bias[k, 1 : 1 + self.width] = torch.as_tensor(fitted.means_[k % count])
+            bias[k, 1 + self.width :][diagonal] = deviations[k % count].expm1().log().float()
         self.linear.bias.copy_(bias.flatten())
         self.linear.weight.mul_(0.1)
 

@@ -13,7 +13,7 @@ from scipy import stats
 
 import retwin as rt
 from retwin.nets.flows import FlowHead
-from retwin.nets.mixtures import Blocks, GaussianMixture
+from retwin.nets.mixtures import Blocks, GaussianMixture, MixtureHead
 from retwin.nets.student import Student
 from retwin.nets.training import Training, isolated
 from retwin.scores.energy import energy_score
@@ -179,6 +179,45 @@ def test_a_flow_recovers_the_distribution_too(
     torch.testing.assert_close(drawn, value, atol=1e-3, rtol=0)
     weights, means, _ = true_mixture(height)
     assert np.abs(mean - (weights * means).sum(axis=-1)).mean() < 0.04
+
+
+@pytest.mark.parametrize("outliers", [0, 2, 12])
+def test_a_mixture_starts_with_one_component_as_wide_as_most_examples(outliers: int) -> None:
+    """Clusters would give components to the outliers, and the rest would share the last one."""
+    values = np.random.default_rng(0).normal(size=(300, 3)) * [0.5, 1.0, 1.0] + [0.0, 0.0, 1.0]
+    values[:outliers] *= 10
+    with isolated(0):
+        head = MixtureHead(4, 3, 3)
+    head.initialise(values, seed=0)
+    start = head(torch.zeros(4), torch.zeros(3), torch.ones(3))
+    drawn = start.sample((20_000,)).numpy()
+    levels = [0.1, 0.25, 0.5, 0.75, 0.9]
+    found, expected = (np.quantile(each, levels, axis=0) for each in (drawn, values))
+    assert np.abs(found - expected).max() < 0.25
+
+
+def test_a_mixture_starts_at_groups_that_lie_apart() -> None:
+    values = np.random.default_rng(0).normal(size=(300, 2)) + 4 * np.sign(
+        np.arange(300)[:, None] % 3 - 1
+    )
+    with isolated(0):
+        head = MixtureHead(4, 2, 3)
+    head.initialise(values, seed=0)
+    start = head(torch.zeros(4), torch.zeros(2), torch.ones(2))
+    at = torch.as_tensor([[-4.0, -4.0], [0.0, 0.0], [4.0, 4.0], [2.0, 2.0]])
+    expected = np.log(
+        np.mean([stats.multivariate_normal([m, m]).pdf(at) for m in (-4, 0, 4)], axis=0)
+    )
+    np.testing.assert_allclose(start.log_prob(at).detach().numpy(), expected, atol=0.5)
+
+
+def test_a_mixture_starts_from_a_single_example() -> None:
+    with isolated(0):
+        head = MixtureHead(4, 2, 3)
+    head.initialise(np.array([[0.5, -1.0]]), seed=0)
+    start = head(torch.zeros(4), torch.zeros(2), torch.ones(2))
+    torch.testing.assert_close(start.mean.detach(), torch.tensor([0.5, -1.0]), atol=1e-3, rtol=0)
+    assert bool((start.variance > 0).all())
 
 
 def test_a_flow_starts_as_a_normal_distribution_in_any_unit() -> None:

@@ -212,7 +212,7 @@ def _prepare(model: SequenceResidual, data: _Records, bounds: NDArray | None, se
 
 @torch.no_grad()
 def _initialise(model: SequenceResidual, data: _Records, seed: int) -> None:
-    """Start every head at the clusters of z."""
+    """Start every head at the mixture of all z."""
     standard = ((data.z[data.identified] - model.shift) / model.scale).double()
     for k, member in enumerate(model.members):
         heads: Any = member.heads
