@@ -24,9 +24,11 @@ from retwin.monitor import (
     fit_monitor,
     verify,
 )
-from retwin.monitor.machine import PLACES, Counts, Layout, Machine
+from retwin.monitor.layout import Layout
+from retwin.monitor.machine import Counts
 from retwin.monitor.program import _offer
 from retwin.monitor.settings import TwinSettings
+from retwin.monitor.stream_machine import PLACES, StreamMachine
 from retwin.monitor.updates import Asset, Update
 from retwin.twins import Parameter, ParameterShift, State, StateTwin
 from retwin.update import Dynamics, Library, fit_dynamics
@@ -334,7 +336,7 @@ def test_the_earliest_and_the_latest_time_are_restarted_from(store: Store) -> No
 
 def test_samples_with_many_holes_are_taken_in_parts(store: Store, monitor: Monitor) -> None:
     asset = Asset("a", 2, {"twin": "tank"}, 1)
-    machine, counts = Machine(asset, monitor, Layout(monitor), None), Counts()
+    machine, counts = StreamMachine(asset, monitor, Layout(monitor), None), Counts()
     left = Samples("a", BEGIN + 3500 * SECOND * np.arange(50), np.ones((50, 2)))
     while len(left.times):
         left, places = machine.accept(left, BEGIN + 10**18, set(), counts), 0

@@ -277,10 +277,9 @@ def test_files_are_read_once_they_are_complete(
             settings, {"a": Recorded(monitor)}, {"a": live.status()[0].time}, lines.append
         )
         with running(again, gate):
-            sleep(0.5)
+            wait(lambda: sum("refused" in line for line in lines) == 2, lines)
         assert live.status()[0].counts == {**dict.fromkeys(vars(Counts()), 0), "used": 3}
         assert live.status()[0].alarms == 1
-    assert sum("refused" in line for line in lines) == 2, lines
     with opened("other") as live:
         leak = trajectories(work)[3]
         live.submit([first, second, Trajectory("a", second.begin + LENGTH, leak.values)])

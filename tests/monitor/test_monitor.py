@@ -12,9 +12,12 @@ import retwin as rt
 from retwin.errors import InputError
 from retwin.monitor.cause import find_causes, possible_causes
 from retwin.monitor.detector import Detector
-from retwin.monitor.monitor import Monitor, MonitorState, Watched, fit_monitor
+from retwin.monitor.fitting import fit_monitor
+from retwin.monitor.monitor import Monitor
+from retwin.monitor.monitor_state import MonitorState
 from retwin.monitor.predictors import SLOWER, agreeing
 from retwin.monitor.slack import Slack
+from retwin.monitor.watched import Watched
 from retwin.twins import (
     ActuatorGain,
     Parameter,
@@ -261,9 +264,9 @@ def test_evidence_is_the_mean_of_two_models(
     assert len(monitor.slack) == 2 * len(twin.outputs)
     assert [each.process for each in monitor.predictors] == [1.0, SLOWER]
     assert "slower" in str(monitor.promises["pressure"])
-    monkeypatch.setattr("retwin.monitor.monitor.SLOWER", 1.0)  # the same model twice
+    monkeypatch.setattr("retwin.monitor.fitting.SLOWER", 1.0)  # the same model twice
     twice = fit_monitor(twin, record(2, 1), "1 per hour")
-    monkeypatch.setattr("retwin.monitor.monitor._slower", lambda *_: [])
+    monkeypatch.setattr("retwin.monitor.fitting._slower", lambda *_: [])
     once = fit_monitor(twin, record(2, 1), "1 per hour")
     found = [each.watch(leaking()) for each in (once, twice)]
     np.testing.assert_allclose(found[1].evidence, found[0].evidence, rtol=1e-9)
@@ -274,7 +277,7 @@ def test_evidence_is_the_mean_of_two_models(
 def test_a_monitor_that_was_saved_with_one_model_opens(
     twin: DynamicsTwin, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("retwin.monitor.monitor._slower", lambda *_: [])
+    monkeypatch.setattr("retwin.monitor.fitting._slower", lambda *_: [])
     made = fit_monitor(twin, record(2, 1), "1 per hour")
     made.save(tmp_path / "monitor")
     (file,) = (tmp_path / "monitor").glob("*.json")

@@ -10,7 +10,7 @@ from __future__ import annotations
 from retwin._lazy import names
 
 _HOME = {
-    "Alarm": "monitor",
+    "Alarm": "watched",
     "Asset": "updates",
     "AssetStatus": "status",
     "Audit": "audit",
@@ -31,7 +31,7 @@ _HOME = {
     "Live": "live",
     "Location": "bets",
     "Monitor": "monitor",
-    "MonitorState": "monitor",
+    "MonitorState": "monitor_state",
     "Promise": "promise",
     "Received": "status",
     "Recent": "machine",
@@ -49,7 +49,7 @@ _HOME = {
     "Validity": "validity",
     "ValidityState": "validity",
     "Version": "registry",
-    "Watched": "monitor",
+    "Watched": "watched",
     "WatchedTrajectories": "watched_trajectories",
     "decide": "decision",
     "effective_samples": "slack",
@@ -57,7 +57,7 @@ _HOME = {
     "false_alarms": "promise",
     "find_causes": "cause",
     "fit_disturbance": "disturbance",
-    "fit_monitor": "monitor",
+    "fit_monitor": "fitting",
     "fit_scores": "scores",
     "fit_trajectory_monitor": "trajectories",
     "possible_causes": "cause",

@@ -42,6 +42,10 @@ MASS = np.diff(ndtr(EDGES))
 class Alternative(Protocol):
     """What a bet is on. Scores come divided or multiplied by the slack of the scale."""
 
+    @property
+    def change(self) -> str:
+        """What it is a change of, for people."""
+
     def log_bet(self, score: NDArray, previous: float, kappa: float) -> NDArray:
         """The logarithm of g, given the score before and the slack of the scale."""
 
@@ -51,6 +55,11 @@ class Location:
     """A shift of the mean by `size` standard deviations, up or down by its sign."""
 
     size: float
+
+    @property
+    def change(self) -> str:
+        """See `Alternative.change`."""
+        return "higher than predicted" if self.size > 0 else "lower than predicted"
 
     def log_bet(self, score: NDArray, previous: float, kappa: float) -> NDArray:
         """Likelihood ratio of Gaussian distributions, but for a constant."""
@@ -62,6 +71,11 @@ class Scale:
     """A standard deviation `ratio` times as large; a sensor that is stuck is a small ratio."""
 
     ratio: float
+
+    @property
+    def change(self) -> str:
+        """See `Alternative.change`."""
+        return "larger errors" if self.ratio > 1 else "smaller errors"
 
     def log_bet(self, score: NDArray, previous: float, kappa: float) -> NDArray:
         """Likelihood ratio of Gaussian distributions, but for a constant."""
@@ -76,6 +90,11 @@ class Tails:
     share: float
     ratio: float
 
+    @property
+    def change(self) -> str:
+        """See `Alternative.change`."""
+        return "single large errors"
+
     def log_bet(self, score: NDArray, previous: float, kappa: float) -> NDArray:
         """Likelihood ratio of the contaminated Gaussian distribution."""
         wide = np.exp((1 - self.ratio**-2) / 2 * (score / kappa) ** 2) / self.ratio
@@ -88,6 +107,11 @@ class Dependence:
     """A `correlation` of each score with the one before."""
 
     correlation: float
+
+    @property
+    def change(self) -> str:
+        """See `Alternative.change`."""
+        return "errors that depend on each other"
 
     def log_bet(self, score: NDArray, previous: float, kappa: float) -> NDArray:
         """A shift of the mean in proportion to the score before."""

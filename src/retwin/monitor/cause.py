@@ -11,7 +11,7 @@ from retwin.checks import require, whole
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.diagnosis.estimate import Estimate
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
-from retwin.monitor.monitor import Alarm
+from retwin.monitor.watched import Alarm
 from retwin.twins.faults import Fault
 from retwin.twins.system_faults import (
     ActuatorGain,

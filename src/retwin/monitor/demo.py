@@ -19,9 +19,10 @@ from retwin.cases import get
 from retwin.cases.styrofoam_incubator.twin import INCUBATOR
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.explanations import Explanations
+from retwin.monitor.fitting import fit_monitor
 from retwin.monitor.gate import Gate
 from retwin.monitor.live import Live
-from retwin.monitor.monitor import Monitor, fit_monitor
+from retwin.monitor.monitor import Monitor
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import Samples
 from retwin.monitor.store import Store

@@ -113,6 +113,10 @@ class Detector:
         evidence = np.where(where[:, None], 0.0, state.evidence)
         return DetectorState(evidence, np.where(where, 0.0, state.previous))
 
+    def change(self, number: int) -> str:
+        """What an alternative, by its number of J, is a change of."""
+        return [each for family in self.alternatives for each in family][number].change
+
     def step(
         self, state: DetectorState, score: ArrayLike, high: ArrayLike | None = None
     ) -> tuple[DetectorState, NDArray]:

@@ -17,9 +17,10 @@ from retwin.monitor.audit import Entry
 from retwin.monitor.cause import BEFORE, FEWEST, Cause, find_causes, possible_causes
 from retwin.monitor.gridded import gridded, record_of
 from retwin.monitor.live import Live
-from retwin.monitor.monitor import Alarm, Monitor
+from retwin.monitor.monitor import Monitor
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import SECOND
+from retwin.monitor.watched import Alarm
 from retwin.twins.faults import Fault
 
 __all__ = ["Explanations"]

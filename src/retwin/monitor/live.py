@@ -17,12 +17,14 @@ from retwin.checks import finite, instance, require, whole
 from retwin.errors import InputError
 from retwin.monitor.audit import Entry
 from retwin.monitor.kinds import AnyMonitor, load_monitor
-from retwin.monitor.machine import Counts, Layout, Machine, Recent, Work
+from retwin.monitor.layout import Layout
+from retwin.monitor.machine import Counts, Recent
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import SECOND, Samples, Trajectory
 from retwin.monitor.status import AssetStatus, Received
 from retwin.monitor.stepping import step
 from retwin.monitor.store import Store
+from retwin.monitor.stream_machine import StreamMachine, Work
 from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.monitor.trajectory_machine import Diagnosed, TrajectoryMachine
 from retwin.monitor.updates import MOST, Asset, Update, one_asset
@@ -83,7 +85,7 @@ class Live:
         """Held while a trajectory is diagnosed, which takes long, taken before the other lock."""
         self._monitors: dict[tuple[str, int], tuple[AnyMonitor, str]] = {}
         self._layouts: dict[str, Layout] = {}
-        self._machines: dict[str, Machine | TrajectoryMachine] = {}
+        self._machines: dict[str, StreamMachine | TrajectoryMachine] = {}
         self._unsure: set[str] = set()
         """Machines that must be read from the store again: a commit of theirs failed."""
         self._listeners: list[Callable[[list[Entry]], None]] = []
@@ -319,9 +321,9 @@ class Live:
             self._read_again()
             return self._submitted(batch)
 
-    def _streams(self, names: Iterable[str]) -> list[Machine]:
+    def _streams(self, names: Iterable[str]) -> list[StreamMachine]:
         machines = [self._one(name) for name in names]
-        return [each for each in machines if isinstance(each, Machine)]
+        return [each for each in machines if isinstance(each, StreamMachine)]
 
     def _submitted(self, batch: Sequence[Samples]) -> list[Received]:
         limit = self._limit()
@@ -355,11 +357,11 @@ class Live:
             for i, (each, counts) in enumerate(zip(batch, found, strict=True))
         ]
 
-    def _stepped(self, machines: Sequence[Machine]) -> Counter[str]:
+    def _stepped(self, machines: Sequence[StreamMachine]) -> Counter[str]:
         """Step the monitors of machines through what is complete; alarms by machine."""
         alarms = Counter[str]()
         while ready := [(each, work) for each in machines if (work := each.next_work())]:
-            key: Callable[[tuple[Machine, Work]], tuple] = lambda each: (  # noqa: E731
+            key: Callable[[tuple[StreamMachine, Work]], tuple] = lambda each: (  # noqa: E731
                 id(each[0].monitor),
                 len(each[1].values),
             )
@@ -373,14 +375,14 @@ class Live:
         for listener in self._listeners:
             listener(entries)
 
-    def _one(self, name: str) -> Machine | TrajectoryMachine:
+    def _one(self, name: str) -> StreamMachine | TrajectoryMachine:
         found = self._machines.get(name)
         if found is None:
             one_asset(dict.fromkeys(self._machines, (0, 0)), name)
         assert found is not None
         return found
 
-    def _machine(self, asset: Asset) -> Machine | TrajectoryMachine:
+    def _machine(self, asset: Asset) -> StreamMachine | TrajectoryMachine:
         """A machine as the store has it, with the samples that wait for others."""
         assert asset.version is not None
         monitor, digest = self._monitor(asset.settings["twin"], asset.version)
@@ -392,7 +394,7 @@ class Live:
             return watched
         if digest not in self._layouts:
             self._layouts[digest] = Layout(monitor, digest)
-        machine = Machine(asset, monitor, self._layouts[digest], self._wait)
+        machine = StreamMachine(asset, monitor, self._layouts[digest], self._wait)
         if stored is not None and machine.restore(stored[1]):
             for times, values in self.store.samples(asset.name, machine.stepped_time):
                 machine.hold(times, values)

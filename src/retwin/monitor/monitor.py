@@ -2,164 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import count, takewhile
 from pathlib import Path
-from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import finite, instance, require
+from retwin.checks import finite, require
 from retwin.data.trajectories import Trajectories
-from retwin.monitor.bets import Dependence, Location, Scale
-from retwin.monitor.detector import Detector, DetectorState
-from retwin.monitor.disturbance import Disturbance, DisturbanceState, fit_disturbance
-from retwin.monitor.predictors import SLOWER, Predictor, agreeing, settled, standardised
-from retwin.monitor.promise import Promise, false_alarms
-from retwin.monitor.scores import ConformalScores, fit_scores, middle, resolution
+from retwin.monitor.detector import Detector
+from retwin.monitor.disturbance import Disturbance
+from retwin.monitor.monitor_state import MonitorState
+from retwin.monitor.predictors import Predictor, standardised
+from retwin.monitor.promise import Promise
+from retwin.monitor.scores import ConformalScores, middle
 from retwin.monitor.slack import Slack
-from retwin.monitor.validity import Validity, ValidityState
+from retwin.monitor.validity import Validity
+from retwin.monitor.watched import Alarm, Watched
 from retwin.serialisation.models import read_model, refusing, write_model
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics.online import FilterState, OnlineFilter
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["Alarm", "Monitor", "MonitorState", "Watched", "fit_monitor"]
+__all__ = ["Monitor"]
 
 KIND = "monitor"
 """Kind of the saved model."""
-APART = 200
-"""Missing samples that are put between two calibration records, so that neither predicts the
-other."""
-PARTS = {
-    "disturbance": DisturbanceState,
-    "detector": DetectorState,
-    "validity": ValidityState,
-}
-"""What the state of a monitor consists of, beside the filters."""
-
-
-@dataclass(frozen=True, eq=False)
-class MonitorState:
-    """What a monitor remembers of n machines with d_y outputs each; all of it.
-
-    Attributes
-    ----------
-    filters : tuple of FilterState
-        Of the n machines, one for each predictive model.
-    disturbance, detector, validity
-        Of n * M * d_y streams: those of the first machine first, and of these the d_y outputs of
-        the first of M predictive models.
-    samples, blank : NDArray
-        (n,), samples since the start, and samples for which no alarm is raised any more.
-    void : NDArray
-        (n,) bool, whether the promise does not apply to the machine.
-
-    """
-
-    filters: tuple[FilterState, ...]
-    disturbance: DisturbanceState
-    detector: DetectorState
-    validity: ValidityState
-    samples: NDArray
-    blank: NDArray
-    void: NDArray
-
-    def arrays(self) -> dict[str, NDArray]:
-        """All arrays by name, whose first axis is that of machines."""
-        found = {
-            f"{_filter(number)}.{each.name}": getattr(own, each.name)
-            for number, own in enumerate(self.filters)
-            for each in fields(own)
-        }
-        for name in PARTS:
-            value = getattr(self, name)
-            for each in fields(value):
-                array = getattr(value, each.name)
-                array = array.reshape(len(self.void), -1, *array.shape[1:])
-                found[f"{name}.{each.name}"] = array
-        return found | {name: getattr(self, name) for name in ("samples", "blank", "void")}
-
-    @classmethod
-    def of_arrays(cls, arrays: dict[str, NDArray]) -> MonitorState:
-        """The state of what `arrays` gave, of some machines or of several joined."""
-
-        def part(name: str, kind: Any) -> Any:
-            own = {each.name: arrays[f"{name}.{each.name}"] for each in fields(kind)}
-            if kind is not FilterState:
-                own = {key: each.reshape(-1, *each.shape[2:]) for key, each in own.items()}
-            return kind(**own)
-
-        filters = takewhile(lambda name: f"{name}.states" in arrays, map(_filter, count()))
-        return cls(
-            tuple(part(name, FilterState) for name in filters),
-            *(part(name, kind) for name, kind in PARTS.items()),
-            *(arrays[name] for name in ("samples", "blank", "void")),
-        )
-
-
-@dataclass(frozen=True)
-class Alarm:
-    """A change that a monitor has found.
-
-    Attributes
-    ----------
-    trajectory : str
-        The id of the record or machine.
-    sample : int
-        Number of the sample at which the alarm was raised.
-    time : float
-        Its time in s from the first sample.
-    output : str
-        The output with most evidence.
-    change : str
-        The change of that output's errors for which there is most evidence.
-    evidence : float
-        At least the average run length of the promise.
-
-    """
-
-    trajectory: str
-    sample: int
-    time: float
-    output: str
-    change: str
-    evidence: float
-
-
-@dataclass(frozen=True, eq=False)
-class Watched:
-    """What a monitor found in T samples of n machines.
-
-    Attributes
-    ----------
-    mean, deviation : NDArray
-        (n, T, d_y), one-step predictions of the twin.
-    score : NDArray
-        (n, T, d_y), of the errors: standard Gaussian for a healthy machine; NaN for samples that
-        do not count.
-    evidence : NDArray
-        (n, T), that of a change; an alarm is raised from the average run length on.
-    alarm, void : NDArray
-        (n, T) bool, whether an alarm was raised, and whether the promise does not apply.
-    outside : NDArray
-        (n,) bool, whether commands leave the range that they had when the twin was calibrated.
-    alarms : list of Alarm
-        The alarms.
-
-    """
-
-    mean: NDArray
-    deviation: NDArray
-    score: NDArray
-    evidence: NDArray
-    alarm: NDArray
-    void: NDArray
-    outside: NDArray
-    alarms: list[Alarm]
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,7 +244,7 @@ class Monitor:
                         sample,
                         sample / self.twin.rate,
                         self.twin.outputs.names[output % len(self.twin.outputs)],
-                        _described(streams.detector, chosen),
+                        streams.detector.change(chosen),
                         float(total[machine, last - 1]),
                     )
                 )
@@ -504,111 +374,6 @@ class _Streams:
         )
 
 
-def fit_monitor(
-    twin: DynamicsTwin,
-    healthy: Trajectories,
-    false_alarms_at_most: str | float = "1 per month",
-    *,
-    blanking: float = 60.0,
-    alpha: float = 0.01,
-) -> Monitor:
-    """Calibrate a monitor on records of the healthy machine.
-
-    Parameters
-    ----------
-    twin : DynamicsTwin
-        The corrected twin, of `fit_dynamics`.
-    healthy : Trajectories
-        Healthy records, best of several days, that the twin was not fitted to: the errors of those
-        are smaller than of others, and the promise is that of these errors.
-    false_alarms_at_most : str or float
-        See `false_alarms`.
-    blanking : float
-        Time in s after an alarm in which no other is raised.
-    alpha : float
-        Probability of declaring the promise void although it applies.
-
-    Returns
-    -------
-    Monitor
-        With its promise.
-
-    Raises
-    ------
-    InputError
-        Other channels or another rate than those of the twin, or too few samples.
-
-    """
-    instance("twin", twin, DynamicsTwin, remedy="fit it by fit_dynamics")
-    check_channels(twin, healthy, "healthy")
-    arl = false_alarms(false_alarms_at_most, twin.rate)
-    finite("blanking", blanking, least=0.0, unit="s")
-    measured = np.where(healthy.mask, healthy.observed, np.nan).astype(float)
-    steps = resolution(np.moveaxis(measured, 2, 0).reshape(measured.shape[2], -1))
-    first = _calibrated(twin, Predictor(), healthy, measured, steps)
-    require(
-        first is not None,
-        "healthy",
-        expected="records with which the filter of the twin stays finite",
-        got="others",
-        remedy="leave them out, or give the twin more substeps",
-    )
-    found = [each for each in (first, *_slower(twin, healthy, measured, steps)) if each]
-    error, width = (np.concatenate(each) for each in list(zip(*found, strict=True))[1:])
-    disturbance = fit_disturbance(error)
-    width = width / disturbance.deviation
-    scores = fit_scores(disturbance.held_out, width)
-    slack = scores.slack(disturbance.parameters)
-    slack = agreeing(slack, *scores.score(disturbance.held_out, width))
-    predictors = tuple(each[0] for each in found)
-    return Monitor(twin, disturbance, scores, slack, steps, arl, blanking, float(alpha), predictors)
-
-
-_Calibrated: TypeAlias = tuple[Predictor, NDArray, NDArray]
-"""A model with its settled errors and widths of their rounding intervals, (d_y, n * T)."""
-
-
-def _slower(
-    twin: DynamicsTwin, healthy: Trajectories, measured: NDArray, steps: NDArray
-) -> list[_Calibrated]:
-    """The model that follows slowly, where it is another one and settles within the records."""
-    if not (twin.process.any() or twin.proportional.any()):
-        return []
-    found = _calibrated(twin, Predictor(SLOWER), healthy, measured, steps)
-    if found is None or found[0].warm_up * twin.rate >= healthy.steps // 2:
-        return []
-    return [found]
-
-
-def _calibrated(
-    twin: DynamicsTwin,
-    predictor: Predictor,
-    healthy: Trajectories,
-    measured: NDArray,
-    steps: NDArray,
-) -> _Calibrated | None:
-    """A model with its warm-up and errors on healthy records; None if it does not stay finite."""
-    online = predictor.filter(twin)
-    start, given = online.start(len(healthy)), (healthy.commands.astype(float), measured)
-    _, mean, covariance = online.step(start, *given, healthy.mask)
-    if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
-        return None
-    warm_up = settled(online, start, (*given, healthy.mask), covariance)
-    late = (np.arange(healthy.steps) >= warm_up)[None, :, None]
-    error, width = (
-        np.pad(each, [(0, 0), (0, APART), (0, 0)], constant_values=np.nan)
-        .reshape(-1, measured.shape[2])
-        .T
-        for each in standardised(measured - mean, covariance, healthy.mask & late, steps)
-    )
-    return replace(predictor, warm_up=warm_up / twin.rate), error, width
-
-
-def _filter(number: int) -> str:
-    """The name of a filter among the arrays of a state."""
-    return f"filter{number or ''}"
-
-
 def _finite(online: OnlineFilter, state: FilterState) -> FilterState:
     """The state of a filter, begun anew where it is not finite."""
     kept = np.isfinite(state.states).all(axis=1) & np.isfinite(state.spread).all(axis=(1, 2))
@@ -616,18 +381,6 @@ def _finite(online: OnlineFilter, state: FilterState) -> FilterState:
     if not len(lost):
         return state
     return state.merged(lost, replace(online.start(len(lost)), commands=state.commands[lost]))
-
-
-def _described(detector: Detector, number: int) -> str:
-    """What an alternative is a change of."""
-    chosen = [each for family in detector.alternatives for each in family][number]
-    if isinstance(chosen, Location):
-        return "higher than predicted" if chosen.size > 0 else "lower than predicted"
-    if isinstance(chosen, Scale):
-        return "larger errors" if chosen.ratio > 1 else "smaller errors"
-    if isinstance(chosen, Dependence):
-        return "errors that depend on each other"
-    return "single large errors"
 
 
 def _by_stream(values: NDArray) -> NDArray:

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.monitor.machine import Machine, Work
-from retwin.monitor.monitor import Alarm, Watched
+from retwin.monitor.stream_machine import StreamMachine, Work
+from retwin.monitor.watched import Alarm, Watched
 
 __all__ = ["step"]
 
 
-def step(together: Sequence[tuple[Machine, Work]]) -> dict[str, int]:
+def step(together: Sequence[tuple[StreamMachine, Work]]) -> dict[str, int]:
     """Step machines of one monitor, each by as many samples; their numbers of alarms."""
     machines = [each for each, _ in together]
     monitor = machines[0].monitor

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from retwin.diagnosis.estimate import UNKNOWN
 from retwin.errors import InputError, brief
 from retwin.monitor.gridded import record_of
-from retwin.monitor.machine import Counts, Recent
+from retwin.monitor.machine import KEPT, Machine, Recent
 from retwin.monitor.samples import Samples, Trajectory
 from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.monitor.trajectory_state import TrajectoryState
@@ -24,9 +24,6 @@ from retwin.monitor.updates import Asset, Update
 from retwin.monitor.watched_trajectories import WatchedTrajectories
 
 __all__ = ["Diagnosed", "TrajectoryMachine"]
-
-KEPT = 600
-"""Newest trajectories whose scores are kept for pages."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +38,7 @@ class Diagnosed:
     refused: str = ""
 
 
-class TrajectoryMachine:
+class TrajectoryMachine(Machine[TrajectoryMonitor]):
     """The trajectories of one asset. It changes in place; see `Live`.
 
     Parameters
@@ -56,16 +53,7 @@ class TrajectoryMachine:
     """
 
     def __init__(self, asset: Asset, monitor: TrajectoryMonitor, digest: str = "") -> None:
-        self.asset = asset
-        self.monitor = monitor
-        self.counts = Counts()
-        self.newest: int | None = None
-        """The time of the last sample of the newest trajectory."""
-        self.evidence = 0.0
-        self.alarms = 0
-        self.last_alarm: int | None = None
-        self.void = self.outside = False
-        self.rate = ""
+        super().__init__(asset, monitor)
         self._digest = np.frombuffer(bytes.fromhex(digest), dtype=np.uint8)
         self._state = monitor.start()
         self._recent: deque[tuple[int, float, float]] = deque(maxlen=KEPT)
@@ -113,7 +101,7 @@ class TrajectoryMachine:
             ("alarm", self._alarm(found, watched, number)) for number in range(len(watched.alarms))
         ]
         if watched.void[-1] and not self.void:
-            entries.append(("void", self._entry(last)))
+            entries.append(("void", self.entry(last)))
         arrays = {
             **{f"trajectory.{name}": each for name, each in found.state.arrays().items()},
             "version": np.array([self.asset.version], dtype=np.int64),
@@ -160,7 +148,7 @@ class TrajectoryMachine:
 
     def refusal(self, moment: int, why: str) -> tuple[str, dict[str, Any]]:
         """The entry of the log about a trajectory that is not used."""
-        return "event", self._entry(moment, what="trajectory", text=f"trajectory not used: {why}")
+        return "event", self.entry(moment, what="trajectory", text=f"trajectory not used: {why}")
 
     def _alarm(self, found: Diagnosed, watched: WatchedTrajectories, number: int) -> dict[str, Any]:
         """An alarm with its cause, which is known at once."""
@@ -173,7 +161,7 @@ class TrajectoryMachine:
             "onset": [None] * 3,
             "probabilities": alarm.shares,
         }
-        return self._entry(
+        return self.entry(
             int(times[-1]),
             sample=alarm.number,
             begin=int(times[0]),
@@ -182,7 +170,3 @@ class TrajectoryMachine:
             evidence=alarm.evidence,
             cause=cause,
         )
-
-    def _entry(self, moment: int, **data: Any) -> dict[str, Any]:
-        own = {"asset": self.asset.name, "version": self.asset.version, "time": moment}
-        return {**own, **data}
