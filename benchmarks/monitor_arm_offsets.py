@@ -9,7 +9,7 @@ alarms of the monitor come no later.
 from __future__ import annotations
 
 import numpy as np
-from monitor_arm import BIASED, CALIBRATED, FITTED, HEALTHY, MACHINES, TRAJECTORIES, TWICE, made
+from monitor_arm import CALIBRATED, FITTED, HEALTHY, MACHINES, TRAJECTORIES, TWICE, made
 from numpy.typing import NDArray
 from record import record
 
@@ -44,7 +44,7 @@ def main() -> None:
             ),
         }
     }
-    for motor in range(len(BIASED)):
+    for motor in range(4):
         biased = ActuatorBias(motor, (TWICE - 0.1, TWICE + 0.1))
         numbers = []
         for machine in range(MACHINES):
