@@ -250,7 +250,7 @@ def test_files_are_read_once_they_are_complete(
 ) -> None:
     (tmp_path / "logs").mkdir()
     given = {"type": "folder", "files": str(tmp_path / "logs" / "*"), "asset": "a", "every": 0.02}
-    settings = FolderSource.model_validate(given | {"settle": 0.3})
+    settings = FolderSource.model_validate(given | {"settle": 1.5})
     lines: list[str] = []
     first, second, *_ = trajectories(work)
     table = "".join(
@@ -272,6 +272,7 @@ def test_files_are_read_once_they_are_complete(
             os.utime(tmp_path / "part.npz", ns=(second.begin, second.begin))
             (tmp_path / "part.npz").rename(tmp_path / "logs" / "a.npz")
             wait(lambda: live.status()[0].counts["used"] == 3, lines)
+            wait(lambda: sum("refused" in line for line in lines) == 1, lines)
         files = stored(live.store)
         again = TrajectoryFolder(
             settings, {"a": Recorded(monitor)}, {"a": live.status()[0].time}, lines.append
