@@ -51,6 +51,7 @@ _HOME = {
     "Version": "registry",
     "Watched": "watched",
     "WatchedTrajectories": "watched_trajectories",
+    "compare": "comparison",
     "decide": "decision",
     "effective_samples": "slack",
     "export_log": "audit",

@@ -31,17 +31,20 @@ class FalseAlarmTest:
         Healthy samples on which they were.
     run_length : float
         The promised mean number of samples between false alarms.
+    unit : str
+        What is counted: "samples", or "trajectories".
 
     """
 
     alarms: int
     samples: int
     run_length: float
+    unit: str = "samples"
 
     def __post_init__(self) -> None:
         whole("alarms", self.alarms)
         whole("samples", self.samples, least=1)
-        positive("run_length", self.run_length, unit="samples")
+        positive("run_length", self.run_length, unit=self.unit)
 
     @property
     def p(self) -> float:
@@ -92,7 +95,7 @@ class Decision:
         return (
             f"CRPS {self.old_crps:.4g} - {self.new_crps:.4g} = {self.difference:.3g} "
             f"(95 % interval {self.low:.3g} to {self.high:.3g}), and {test.alarms} alarms in "
-            f"{test.samples} samples where {test.samples / test.run_length:.3g} are promised "
+            f"{test.samples} {test.unit} where {test.samples / test.run_length:.3g} are promised "
             f"(p = {test.p:.2g}, at least {SIGNIFICANCE} needed)"
         )
 
@@ -116,7 +119,7 @@ def decide(
     ------
     InputError
         The shapes differ, the versions were not compared on the same samples, a value is infinite,
-        or a record has fewer than 160 samples.
+        or there are fewer than 8 records and one of them has fewer than 160 samples.
 
     Notes
     -----
@@ -144,10 +147,11 @@ def decide(
         remedy="find out which samples have such predictions",
     )
     fewest = int(present.sum(axis=1).min(initial=old.shape[1])) if len(old) else 0
+    least = MIN_SAMPLES if len(old) < MIN_RECORDS else 1
     require(
-        fewest >= MIN_SAMPLES,
+        fewest >= least,
         "crps",
-        expected=f"at least {MIN_SAMPLES} samples of each record",
+        expected=f"at least {least} samples of each record",
         got=fewest,
         remedy="collect more samples",
     )

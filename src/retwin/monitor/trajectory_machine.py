@@ -25,6 +25,9 @@ from retwin.monitor.watched_trajectories import WatchedTrajectories
 
 __all__ = ["Diagnosed", "TrajectoryMachine"]
 
+REMEMBERED = 1000
+"""Newest trajectories of which the store knows where they begin, for comparisons of versions."""
+
 
 @dataclass(frozen=True, eq=False)
 class Diagnosed:
@@ -56,6 +59,8 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         super().__init__(asset, monitor)
         self._digest = np.frombuffer(bytes.fromhex(digest), dtype=np.uint8)
         self._state = monitor.start()
+        self._known = np.zeros((0, 3), dtype=np.int64)
+        """Begin, end and number of samples of the newest trajectories."""
         self._recent: deque[tuple[int, float, float]] = deque(maxlen=KEPT)
 
     def placed(self, given: object, limit: int, known: set[int]) -> str:
@@ -107,6 +112,7 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
             "version": np.array([self.asset.version], dtype=np.int64),
             "status": np.array([watched.evidence[-1], watched.void[-1], watched.outside[-1]]) * 1.0,
             "digest": self._digest,
+            "trajectories": self._with(samples),
         }
         return Update(samples.asset, samples.times, samples.values, arrays, last), entries
 
@@ -115,6 +121,7 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         watched, last = found.watched, int(found.samples.times[-1])
         assert watched is not None
         self._state, self.newest = found.state, last
+        self._known = self._with(found.samples)
         self.evidence = float(watched.evidence[-1])
         self.void, self.outside = bool(watched.void[-1]), bool(watched.outside[-1])
         self._recent.append((last, float(watched.score[-1]), self.evidence))
@@ -125,6 +132,7 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
     def restore(self, time: int, arrays: Mapping[str, NDArray]) -> None:
         """Continue where a state was stored, anew if it is that of another version or monitor."""
         self.newest = time
+        self._known = arrays.get("trajectories", self._known)
         same = np.array_equal(arrays.get("digest", ()), self._digest)
         if not same or "version" not in arrays or arrays["version"][0] != self.asset.version:
             return
@@ -149,6 +157,12 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
     def refusal(self, moment: int, why: str) -> tuple[str, dict[str, Any]]:
         """The entry of the log about a trajectory that is not used."""
         return "event", self.entry(moment, what="trajectory", text=f"trajectory not used: {why}")
+
+    def _with(self, samples: Samples) -> NDArray:
+        """The newest trajectories, with one more."""
+        new = np.array([[*samples.times[[0, -1]], len(samples.times)]], dtype=np.int64)
+        made: NDArray = np.concatenate([self._known, new])[-REMEMBERED:]
+        return made
 
     def _alarm(self, found: Diagnosed, watched: WatchedTrajectories, number: int) -> dict[str, Any]:
         """An alarm with its cause, which is known at once."""

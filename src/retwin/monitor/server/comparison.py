@@ -1,146 +1,40 @@
-"""A version in the shadow compared with the active one, on samples that are stored."""
+"""Comparisons of versions beside the server, which take seconds to minutes."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-
-import numpy as np
-import scoringrules
-from numpy.typing import NDArray
+from dataclasses import dataclass, field
 
 from retwin.checks import require
-from retwin.errors import InputError
-from retwin.monitor.cause import BEFORE
-from retwin.monitor.decision import MIN_SAMPLES, Decision, FalseAlarmTest, decide
-from retwin.monitor.gridded import gridded
-from retwin.monitor.kinds import load_monitor
-from retwin.monitor.monitor import Monitor
-from retwin.monitor.registry import Registry
-from retwin.monitor.samples import SECOND
+from retwin.monitor.comparison import compare
+from retwin.monitor.decision import Decision
 from retwin.monitor.store import Store
 
-__all__ = ["Comparisons", "compare"]
+__all__ = ["Comparisons"]
 
-FRESH, QUEUE = 60.0, 16
-"""Seconds for which a comparison is kept, and comparisons that may be made or kept."""
-MOST = 20_000
-"""Newest samples of each asset that are compared, which bounds time and memory."""
-
-
-def compare(store: Store, twin: str, number: int) -> Decision:
-    """Compare a version with the active one on the stored samples of all assets of the twin.
-
-    Healthy samples are needed. Those of an asset are the longest part of its newest samples without
-    an alarm of the active version, without the samples before the next alarm in which its cause may
-    already act. An asset is left out where that version, begun anew, raises an alarm in that part.
-
-    Parameters
-    ----------
-    store : Store
-        The store.
-    twin : str
-        The name of the twin.
-    number : int
-        The version.
-
-    Raises
-    ------
-    InputError
-        No version is active, there is no such version, its channels or rate differ, or too few
-        samples are stored.
-
-    """
-    registry = Registry(store, twin)
-    active = registry.active
-    require(
-        active is not None,
-        "versions",
-        expected="an active version",
-        got="none",
-        remedy="promote the first version",
-    )
-    assert active is not None
-    old, new = (load_monitor(registry.folder(each)) for each in (active.number, number))
-    if not isinstance(old, Monitor) or not isinstance(new, Monitor):
-        raise InputError(
-            f"version {number}",
-            expected="two monitors that predict samples",
-            got="one of trajectories, whose evidence is of faults",
-            remedy="reject it, and watch its machine under the name of a new twin",
-        )
-    require(
-        (old.twin.inputs, old.twin.outputs, old.twin.rate)
-        == (new.twin.inputs, new.twin.outputs, new.twin.rate),
-        f"version {number}",
-        expected=f"the channels and the rate of version {active.number}",
-        got="others",
-        remedy="fit it to records of the same machine",
-    )
-    scores, alarms = [], 0
-    for part in _healthy(store, twin, old):
-        if len(part) < 2 * MIN_SAMPLES:
-            continue
-        commands, measured = np.split(part[None], [len(old.twin.inputs)], axis=2)
-        seen = [each.step(each.start(1), commands, measured)[1] for each in (old, new)]
-        if seen[0].alarms:  # an alarm that was not raised when the samples came, after another one
-            continue
-        known = np.where(np.isfinite(seen[0].score) & np.isfinite(seen[1].score), measured, np.nan)
-        unit = np.nanstd(measured, axis=1, keepdims=True)
-        unit = np.where(unit > 0, unit, 1.0)
-        found = [scoringrules.crps_normal(known, each.mean, each.deviation) for each in seen]
-        scores.append([_mean((each / unit)[0]) for each in found])
-        alarms += len(seen[1].alarms)
-    require(
-        scores,
-        "samples",
-        expected=f"at least {2 * MIN_SAMPLES} without an alarm, of one asset",
-        got="fewer",
-        remedy="compare the versions later",
-    )
-    steps = max(len(pair[0]) for pair in scores)
-    padded = np.array(
-        [
-            [np.pad(each, (0, steps - len(each)), constant_values=np.nan) for each in pair]
-            for pair in scores
-        ]
-    )
-    samples = int(np.isfinite(padded[:, 1]).sum())
-    test = FalseAlarmTest(alarms, max(samples, 1), new.arl)
-    return decide(padded[:, 0], padded[:, 1], test)
+FRESH, PATIENCE, QUEUE = 60.0, 20.0, 16
+"""A comparison is kept for so many seconds, or for so many times as long as it took, whichever is
+longer; and comparisons that may be made or kept."""
 
 
-def _mean(scores: NDArray) -> NDArray:
-    """The mean over outputs (T, d_y) of those that are measured; NaN where none is."""
-    seen = np.isfinite(scores)
-    count = seen.sum(axis=1)
-    total = np.where(seen, scores, 0.0).sum(axis=1)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+@dataclass(eq=False)
+class _Made:
+    """A comparison, and until when it is kept once it is done."""
 
+    future: Future[Decision]
+    begun: float = field(default_factory=time.monotonic)
+    until: float = float("inf")
 
-def _healthy(store: Store, twin: str, monitor: Monitor) -> Iterator[NDArray]:
-    """The healthy samples (T, d_u + d_y) of each asset of a twin."""
-    alarms: dict[str, list[int]] = {}
-    for entry in store.log("alarm"):
-        alarms.setdefault(entry.data["asset"], []).append(entry.data["time"])
-    for asset in store.assets():
-        newest = store.state(asset.name)
-        if asset.settings.get("twin") == twin and newest is not None:
-            period = SECOND / monitor.twin.rate
-            first = newest[0] - round(MOST * period)
-            times, rows = gridded(store, asset.name, monitor.twin, first, newest[0])
-            ends = np.searchsorted(times, sorted(alarms.get(asset.name, [])))
-            ends = np.unique(np.concatenate([[0], ends[ends > 0], [len(times) + BEFORE]]))
-            first = int(np.argmax(np.diff(ends))) if len(ends) > 1 else 0
-            part = rows[ends[first] : ends[first + 1] - BEFORE]
-            known = np.isfinite(part[:, : len(monitor.twin.inputs)]).all(axis=1)
-            yield part[int(np.argmax(known)) :] if known.any() else part[:0]
+    def done(self, _: object) -> None:
+        """Note that it is done."""
+        now = time.monotonic()
+        self.until = now + max(FRESH, PATIENCE * (now - self.begun))
 
 
 class Comparisons:
-    """Comparisons in a thread of their own, one after the other, each kept for a minute.
+    """Comparisons in a thread of their own, one after the other, each kept for a while.
 
     Parameters
     ----------
@@ -152,18 +46,14 @@ class Comparisons:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._worker = ThreadPoolExecutor(1, "comparison")
-        self._made: dict[tuple[str, int], tuple[float, Future[Decision]]] = {}
+        self._made: dict[tuple[str, int], _Made] = {}
         self._lock = threading.Lock()
 
     def of(self, twin: str, number: int) -> Future[Decision]:
         """The comparison of a version with the active one."""
         key, now = (twin, number), time.monotonic()
         with self._lock:
-            self._made = {
-                each: (since, made)
-                for each, (since, made) in self._made.items()
-                if not made.done() or now - since < FRESH
-            }
+            self._made = {each: made for each, made in self._made.items() if now < made.until}
             if key not in self._made:
                 require(
                     len(self._made) < QUEUE,
@@ -172,5 +62,7 @@ class Comparisons:
                     got="more",
                     remedy="wait for a minute",
                 )
-                self._made[key] = now, self._worker.submit(compare, self._store, twin, number)
-            return self._made[key][1]
+                made = _Made(self._worker.submit(compare, self._store, twin, number))
+                self._made[key] = made
+                made.future.add_done_callback(made.done)
+            return self._made[key].future

@@ -448,7 +448,7 @@
     if (each.state === "proposed") buttons.append(...step("shadow", "Make it the shadow", { first: true }), ...step("reject", "Reject"));
     if (each.state === "active" && retired) buttons.append(...action("Roll back to the version before", `${path}/rollback`, { reason: "on the page" }));
     if (each.state === "shadow") {
-      compared.append(h("p", { class: "quiet" }, "Comparing both on the stored samples …"));
+      compared.append(h("p", { class: "quiet" }, "Comparing both on what is stored …"));
       request(`${path}/${each.number}/comparison`).then((found) => {
         compared.replaceChildren(...comparison(found));
         buttons.prepend(...step("promote", "Promote", { first: true, disabled: !found.better }));
@@ -474,7 +474,7 @@
     return [h("p", {}, found.low > 0 ? "It predicts better than the active version." : found.high < 0 ? "It predicts worse than the active version." : "Whether it predicts better is undecided."),
       h("span", { class: `forest ${kind}`, "aria-hidden": "true" }, zero, bar, dot, label),
       h("p", {}, `CRPS is lower by ${digits(found.difference)} (95 % interval ${digits(found.low)} to ${digits(found.high)}): ${digits(found.old_crps)} before, ${digits(found.new_crps)} with this version.`),
-      h("p", {}, `It raised ${counted(found.alarms, "alarm")} in ${found.samples} healthy samples, where ${digits(found.promised)} are promised at most: ${found.passed ? "that agrees with the promise" : "too many for the promise"}.`)];
+      h("p", {}, `It raised ${counted(found.alarms, "alarm")} in ${found.samples} healthy ${found.unit}, where ${digits(found.promised)} are promised at most: ${found.passed ? "that agrees with the promise" : "too many for the promise"}.`)];
   };
 
   // The address selects the page; the server's events, and at least every ten seconds, renew it.

@@ -1,0 +1,148 @@
+"""A version of a twin compared with the active one, on samples that are stored."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import scoringrules
+from numpy.typing import NDArray
+
+from retwin.checks import require
+from retwin.monitor.cause import BEFORE
+from retwin.monitor.decision import MIN_SAMPLES, Decision, FalseAlarmTest, decide
+from retwin.monitor.gridded import gridded
+from retwin.monitor.kinds import load_monitor
+from retwin.monitor.monitor import Monitor
+from retwin.monitor.registry import Registry
+from retwin.monitor.samples import SECOND
+from retwin.monitor.store import Store
+from retwin.monitor.trajectories import TrajectoryMonitor
+from retwin.monitor.trajectory_comparison import compared_trajectories
+
+__all__ = ["compare"]
+
+MOST = 20_000
+"""Newest samples of each asset that are compared, which bounds time and memory."""
+KINDS: Mapping[type, str] = {Monitor: "samples", TrajectoryMonitor: "trajectories"}
+
+
+def compare(store: Store, twin: str, number: int) -> Decision:
+    """Compare a version with the active one on the stored samples of all assets of the twin.
+
+    Healthy samples or trajectories are needed. Those of an asset are the longest part of its newest
+    ones without an alarm of the active version, without those before the next alarm in which its
+    cause may already act. Of streams, the CRPS is that of one-step predictions; an asset is left
+    out where the active version, begun anew, raises an alarm in that part. Of trajectories, it is
+    that of simulations from their commands alone, see `retwin.evaluation.fidelity`: the evidence of
+    two diagnosers is no score by which they could be compared, since it is divided by the
+    autocorrelation that each has learned.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+    twin : str
+        The name of the twin.
+    number : int
+        The version.
+
+    Raises
+    ------
+    InputError
+        No version is active, there is no such version, it is a monitor of another kind, its
+        channels or rate differ, or too few healthy samples or trajectories are stored.
+
+    """
+    registry = Registry(store, twin)
+    active = registry.active
+    require(
+        active is not None,
+        "versions",
+        expected="an active version",
+        got="none",
+        remedy="promote the first version",
+    )
+    assert active is not None
+    old, new = (load_monitor(registry.folder(each)) for each in (active.number, number))
+    require(
+        type(old) is type(new),
+        f"version {number}",
+        expected=f"a monitor of {KINDS[type(old)]}, as version {active.number} is",
+        got=f"one of {KINDS[type(new)]}",
+        remedy="reject it, and watch its machine under the name of a new twin",
+    )
+    require(
+        (old.twin.inputs, old.twin.outputs, old.twin.rate)
+        == (new.twin.inputs, new.twin.outputs, new.twin.rate),
+        f"version {number}",
+        expected=f"the channels and the rate of version {active.number}",
+        got="others",
+        remedy="fit it to records of the same machine",
+    )
+    if isinstance(old, TrajectoryMonitor) and isinstance(new, TrajectoryMonitor):
+        return compared_trajectories(store, twin, old, new)
+    assert isinstance(old, Monitor)
+    assert isinstance(new, Monitor)
+    return _compared_streams(store, twin, old, new)
+
+
+def _compared_streams(store: Store, twin: str, old: Monitor, new: Monitor) -> Decision:
+    scores, alarms = [], 0
+    for part in _healthy(store, twin, old):
+        if len(part) < 2 * MIN_SAMPLES:
+            continue
+        commands, measured = np.split(part[None], [len(old.twin.inputs)], axis=2)
+        seen = [each.step(each.start(1), commands, measured)[1] for each in (old, new)]
+        if seen[0].alarms:  # an alarm that was not raised when the samples came, after another one
+            continue
+        known = np.where(np.isfinite(seen[0].score) & np.isfinite(seen[1].score), measured, np.nan)
+        unit = np.nanstd(measured, axis=1, keepdims=True)
+        unit = np.where(unit > 0, unit, 1.0)
+        found = [scoringrules.crps_normal(known, each.mean, each.deviation) for each in seen]
+        scores.append([_mean((each / unit)[0]) for each in found])
+        alarms += len(seen[1].alarms)
+    require(
+        scores,
+        "samples",
+        expected=f"at least {2 * MIN_SAMPLES} without an alarm, of one asset",
+        got="fewer",
+        remedy="compare the versions later",
+    )
+    steps = max(len(pair[0]) for pair in scores)
+    padded = np.array(
+        [
+            [np.pad(each, (0, steps - len(each)), constant_values=np.nan) for each in pair]
+            for pair in scores
+        ]
+    )
+    samples = int(np.isfinite(padded[:, 1]).sum())
+    test = FalseAlarmTest(alarms, max(samples, 1), new.arl)
+    return decide(padded[:, 0], padded[:, 1], test)
+
+
+def _mean(scores: NDArray) -> NDArray:
+    """The mean over outputs (T, d_y) of those that are measured; NaN where none is."""
+    seen = np.isfinite(scores)
+    count = seen.sum(axis=1)
+    total = np.where(seen, scores, 0.0).sum(axis=1)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _healthy(store: Store, twin: str, monitor: Monitor) -> Iterator[NDArray]:
+    """The healthy samples (T, d_u + d_y) of each asset of a twin."""
+    alarms: dict[str, list[int]] = {}
+    for entry in store.log("alarm"):
+        alarms.setdefault(entry.data["asset"], []).append(entry.data["time"])
+    for asset in store.assets():
+        newest = store.state(asset.name)
+        if asset.settings.get("twin") == twin and newest is not None:
+            period = SECOND / monitor.twin.rate
+            first = newest[0] - round(MOST * period)
+            times, rows = gridded(store, asset.name, monitor.twin, first, newest[0])
+            ends = np.searchsorted(times, sorted(alarms.get(asset.name, [])))
+            ends = np.unique(np.concatenate([[0], ends[ends > 0], [len(times) + BEFORE]]))
+            first = int(np.argmax(np.diff(ends))) if len(ends) > 1 else 0
+            part = rows[ends[first] : ends[first + 1] - BEFORE]
+            known = np.isfinite(part[:, : len(monitor.twin.inputs)]).all(axis=1)
+            yield part[int(np.argmax(known)) :] if known.any() else part[:0]
