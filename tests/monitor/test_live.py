@@ -20,7 +20,9 @@ from retwin.monitor import (
     Registry,
     Samples,
     Store,
+    compare,
     decide,
+    export_log,
     fit_monitor,
     verify,
 )
@@ -416,3 +418,60 @@ def test_an_alarm_whose_samples_were_removed_says_so(folder: Path, tmp_path: Pat
         first = next(store.log("cause")).data
         assert first["name"] == "unknown"
         assert "max_samples" in first["note"]
+
+
+def test_a_stored_stream_gives_the_same_alarms_again(
+    store: Store, folder: Path, tmp_path: Path
+) -> None:
+    """Though it came with holes, out of order, repeated, late, at another rate and in two runs."""
+    values = rows(recorded(5, LEAK))
+    values[50:60, 1] = np.nan
+    rng = np.random.default_rng(0)
+    given = samples(values)
+    order = np.argsort(np.arange(STEPS) + rng.uniform(0, 1.5, STEPS))
+    order = order[~np.isin(order, rng.choice(STEPS, 40, replace=False))]
+    times = given.times[order] + rng.integers(-(10**8), 10**8, len(order))
+    for part in np.array_split(np.arange(len(order)), 3):
+        live = opened(store)
+        for i in np.concatenate([part, part[::7], part[3:8] - 3]):  # some are repeated or late
+            live.submit([Samples("a", times[[i]], given.values[order[[i]]])])
+    counts = live.status()[0].counts
+    assert counts["repeated"], counts
+    assert alarms(store)
+    files = [tmp_path / "one.jsonl", tmp_path / "two.jsonl"]
+    export_log(store.log(), files[0], kind="alarm", order=("time", "asset"))
+    with Store(tmp_path / "again") as again:
+        registry = Registry(again, "tank")
+        registry.promote(registry.propose(folder, "first").number)
+        live = opened(again)
+        for part_times, part_values in store.samples("a"):
+            live.submit([Samples("a", part_times, part_values)])
+        export_log(again.log(), files[1], kind="alarm", order=("time", "asset"))
+    assert files[0].read_bytes() == files[1].read_bytes()
+
+
+@pytest.mark.slow
+def test_the_reference_shows_what_an_update_has_learned(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fault that grew slowly: the second version takes it for healthy, the first one does not."""
+    grown = ParameterShift("drain", size=0.05)
+
+    def changed(seed: int, count: int = 1) -> rt.Trajectories:
+        return recorded(seed, grown, count).replace(labels=None)
+
+    twin = fit_dynamics(TANK, changed(0), Dynamics(Library(0, (), False))).twin
+    fit_monitor(twin, changed(1, 2), "1 per day").save(tmp_path / "newer")
+    registry = Registry(store, "tank")
+    for _ in range(2):
+        registry.shadow(registry.propose(tmp_path / "newer", "newer").number)
+    worse = np.random.default_rng(0).gamma(9.0, size=1000)
+    registry.promote(2, decide(worse, worse - 1, FalseAlarmTest(0, 1000, 86_400)))
+    registry.shadow(3)
+    opened(store).submit([samples(rows(changed(6)))])
+    assert not alarms(store)
+    found = compare(store, "tank", 3)
+    assert (found.difference, found.false_alarms.alarms) == (0, 0)
+    assert found.reference is not None
+    assert found.reference.alarms
+    assert "alarms of the first active version in the same samples" in found.summary

@@ -38,6 +38,9 @@ def compare(store: Store, twin: str, number: int) -> Decision:
     two diagnosers is no score by which they could be compared, since it is divided by the
     autocorrelation that each has learned.
 
+    The reference, the first version that was active, watches the same samples if it is neither of
+    the two: its alarms are part of the decision, so that no update absorbs a slow fault unseen.
+
     Parameters
     ----------
     store : Store
@@ -80,15 +83,20 @@ def compare(store: Store, twin: str, number: int) -> Decision:
         got="others",
         remedy="fit it to records of the same machine",
     )
-    if isinstance(old, TrajectoryMonitor) and isinstance(new, TrajectoryMonitor):
-        return compared_trajectories(store, twin, old, new)
-    assert isinstance(old, Monitor)
-    assert isinstance(new, Monitor)
-    return _compared_streams(store, twin, old, new)
+    first = registry.reference
+    others = [first.number] if first and first.number not in (active.number, number) else []
+    watching = [old, new, *(load_monitor(registry.folder(each)) for each in others)]
+    if isinstance(old, TrajectoryMonitor):
+        return compared_trajectories(
+            store, twin, *(each for each in watching if isinstance(each, TrajectoryMonitor))
+        )
+    return _compared_streams(store, twin, *(each for each in watching if isinstance(each, Monitor)))
 
 
-def _compared_streams(store: Store, twin: str, old: Monitor, new: Monitor) -> Decision:
-    scores, alarms = [], 0
+def _compared_streams(
+    store: Store, twin: str, old: Monitor, new: Monitor, reference: Monitor | None = None
+) -> Decision:
+    scores, alarms, of_reference = [], 0, 0
     for part in _healthy(store, twin, old):
         if len(part) < 2 * MIN_SAMPLES:
             continue
@@ -102,6 +110,9 @@ def _compared_streams(store: Store, twin: str, old: Monitor, new: Monitor) -> De
         found = [scoringrules.crps_normal(known, each.mean, each.deviation) for each in seen]
         scores.append([_mean((each / unit)[0]) for each in found])
         alarms += len(seen[1].alarms)
+        if reference is not None:
+            seen = [reference.step(reference.start(1), commands, measured)[1]]
+            of_reference += len(seen[0].alarms)
     require(
         scores,
         "samples",
@@ -118,7 +129,10 @@ def _compared_streams(store: Store, twin: str, old: Monitor, new: Monitor) -> De
     )
     samples = int(np.isfinite(padded[:, 1]).sum())
     test = FalseAlarmTest(alarms, max(samples, 1), new.arl)
-    return decide(padded[:, 0], padded[:, 1], test)
+    beside = None
+    if reference is not None:
+        beside = FalseAlarmTest(of_reference, max(samples, 1), reference.arl)
+    return decide(padded[:, 0], padded[:, 1], test, reference=beside)
 
 
 def _mean(scores: NDArray) -> NDArray:

@@ -73,6 +73,10 @@ class Decision:
         The 95 % interval of the difference.
     false_alarms : FalseAlarmTest
         The test of the new version.
+    reference : FalseAlarmTest or None
+        That of the first active version, which is never changed, on the same samples: alarms of it
+        show a slow change of the machine that the versions since have learned. None where it was
+        not tested, or is itself one of the two.
 
     """
 
@@ -82,6 +86,7 @@ class Decision:
     low: float
     high: float
     false_alarms: FalseAlarmTest
+    reference: FalseAlarmTest | None = None
 
     @property
     def better(self) -> bool:
@@ -90,18 +95,32 @@ class Decision:
 
     @property
     def summary(self) -> str:
-        """Both numbers: the difference with its interval, and the false alarms."""
-        test = self.false_alarms
+        """Both numbers, the difference with its interval and the false alarms; and the reference's
+        alarms, if it raised any.
+        """
+        test, first = self.false_alarms, self.reference
+        slow = ""
+        if first is not None and first.alarms:
+            slow = (
+                f"; {first.alarms} alarms of the first active version in the same {first.unit}: "
+                "the machine differs from the one that it was calibrated on, check whether that is "
+                "a fault that grows slowly"
+            )
         return (
             f"CRPS {self.old_crps:.4g} - {self.new_crps:.4g} = {self.difference:.3g} "
             f"(95 % interval {self.low:.3g} to {self.high:.3g}), and {test.alarms} alarms in "
             f"{test.samples} {test.unit} where {test.samples / test.run_length:.3g} are promised "
-            f"(p = {test.p:.2g}, at least {SIGNIFICANCE} needed)"
+            f"(p = {test.p:.2g}, at least {SIGNIFICANCE} needed){slow}"
         )
 
 
 def decide(
-    old_crps: ArrayLike, new_crps: ArrayLike, false_alarm_test: FalseAlarmTest, *, seed: int = 0
+    old_crps: ArrayLike,
+    new_crps: ArrayLike,
+    false_alarm_test: FalseAlarmTest,
+    *,
+    reference: FalseAlarmTest | None = None,
+    seed: int = 0,
 ) -> Decision:
     """Compare two versions on the same samples.
 
@@ -112,6 +131,8 @@ def decide(
         is missing.
     false_alarm_test : FalseAlarmTest
         The alarms of the new version on healthy samples.
+    reference : FalseAlarmTest, optional
+        Those of the first active version, see `Decision`.
     seed : int
         Seed of the bootstrap.
 
@@ -171,4 +192,5 @@ def decide(
         mean - width,
         mean + width,
         false_alarm_test,
+        reference,
     )

@@ -32,13 +32,18 @@ DRAWS = 200
 
 
 def compared_trajectories(
-    store: Store, twin: str, old: TrajectoryMonitor, new: TrajectoryMonitor
+    store: Store,
+    twin: str,
+    old: TrajectoryMonitor,
+    new: TrajectoryMonitor,
+    reference: TrajectoryMonitor | None = None,
 ) -> Decision:
     """Compare two monitors on the stored healthy trajectories of all assets of a twin.
 
     Every trajectory has one score, the mean CRPS over its samples and outputs, each output in the
     unit of its standard deviation. What is resampled are 16 blocks or more of consecutive
     trajectories of one asset, since those of a machine that changes slowly resemble each other.
+    With a reference, its alarms on the same trajectories are part of the decision.
 
     Raises
     ------
@@ -59,20 +64,27 @@ def compared_trajectories(
     twins = [_predicting(each) for each in (old, new)]
     length = len(every) // BLOCKS
     scores: list[NDArray] = []
-    alarms = watched = 0
     for part in machines:
-        state = new.start()
-        for each in part:
-            state, found = new.watch(each, state)
-            alarms += len(found.alarms)
-            watched += int((~found.unmeasured).sum())
         pairs = np.array([[_crps(own, each, unit) for each in part] for own in twins])
         scores += np.array_split(pairs, max(1, len(part) // length), axis=1)
     longest = max(each.shape[1] for each in scores)
     old_crps, new_crps = np.full((2, len(scores), longest), np.nan)
     for block, pairs in enumerate(scores):
         old_crps[block, : pairs.shape[1]], new_crps[block, : pairs.shape[1]] = pairs
-    return decide(old_crps, new_crps, FalseAlarmTest(alarms, watched, new.arl, "trajectories"))
+    beside = None if reference is None else _tested(reference, machines)
+    return decide(old_crps, new_crps, _tested(new, machines), reference=beside)
+
+
+def _tested(monitor: TrajectoryMonitor, machines: list[list[Trajectories]]) -> FalseAlarmTest:
+    """The alarms of a monitor on healthy trajectories, those of each machine in their order."""
+    alarms = count = 0
+    for part in machines:
+        state = monitor.start()
+        for each in part:
+            state, found = monitor.watch(each, state)
+            alarms += len(found.alarms)
+            count += int((~found.unmeasured).sum())
+    return FalseAlarmTest(alarms, count, monitor.arl, "trajectories")
 
 
 def _healthy(store: Store, twin: str, monitor: TrajectoryMonitor) -> Iterator[list[NDArray]]:

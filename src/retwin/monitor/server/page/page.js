@@ -474,7 +474,8 @@
     return [h("p", {}, found.low > 0 ? "It predicts better than the active version." : found.high < 0 ? "It predicts worse than the active version." : "Whether it predicts better is undecided."),
       h("span", { class: `forest ${kind}`, "aria-hidden": "true" }, zero, bar, dot, label),
       h("p", {}, `CRPS is lower by ${digits(found.difference)} (95 % interval ${digits(found.low)} to ${digits(found.high)}): ${digits(found.old_crps)} before, ${digits(found.new_crps)} with this version.`),
-      h("p", {}, `It raised ${counted(found.alarms, "alarm")} in ${found.samples} healthy ${found.unit}, where ${digits(found.promised)} are promised at most: ${found.passed ? "that agrees with the promise" : "too many for the promise"}.`)];
+      h("p", {}, `It raised ${counted(found.alarms, "alarm")} in ${found.samples} healthy ${found.unit}, where ${digits(found.promised)} are promised at most: ${found.passed ? "that agrees with the promise" : "too many for the promise"}.`),
+      found.reference?.alarms ? h("p", { class: "error" }, `The first active version, which is never changed, raised ${counted(found.reference.alarms, "alarm")} in the same ${found.unit}: the machine differs from the one that it was calibrated on. Check whether that is a fault that grows slowly, which this version would learn.`) : ""];
   };
 
   // The address selects the page; the server's events, and at least every ten seconds, renew it.
