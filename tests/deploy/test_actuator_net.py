@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -108,3 +109,56 @@ def test_without_torques_it_is_refused(
             arm(unit), tmp_path / "net.pt", joints=[joint], commands=held(12, 0), seed=0
         )
     assert not list(tmp_path.iterdir())
+
+
+SERVO = """
+import numpy as np
+
+
+def servo(targets):
+    reached = 0.5 * targets
+    return np.concatenate([reached, 4 * (targets - reached)], axis=-1)
+"""
+CASE = """
+name = "servo"
+twin = "own_servo:servo"
+rate = 20
+inputs = { target = { unit = "rad", low = -1, high = 1 } }
+outputs = { angle = { unit = "rad" }, torque = { unit = "N m" } }
+commands = { duration = 4, segments = 2, ramp_durations = [0.8, 1.0] }
+network = { kind = "MLP", hidden = [8] }
+training = { max_epochs = 5, batch = 64, rate = 1e-2 }
+density = { kind = "Mixture", training = { max_epochs = 2, decay = "step" } }
+"""
+
+
+@pytest.mark.slow
+def test_the_command_line_writes_it_from_a_fitted_model(tmp_path: Path, call) -> None:
+    (tmp_path / "own_servo.py").write_text(SERVO)
+    (tmp_path / "case.toml").write_text(CASE)
+    case = rt.cases.get(str(tmp_path / "case.toml"))
+    made = case.twin.simulate(case.sampler.sample(12, rng=np.random.default_rng(0)), seed=0)
+    real = made.replace(observed=made.observed + np.float32(0.02))
+    rt.save(real, tmp_path / "real.npz")
+    model = tmp_path / "model"
+    given = (tmp_path / "case.toml", "--real", tmp_path / "real.npz", "--simulations", 40)
+    code, _, err = call("fit", *given, "--out", model)
+    assert code == 0, err
+    net = tmp_path / "net.pt"
+    words = ("export", "actuator-net", model, "--history", "0,2", "--json", "--out", net)
+    code, out, err = call(*words, "--joint", "target,angle,torque")
+    assert code == 0, err
+    printed = json.loads(out)
+    assert (printed["input_idx"], printed["period"], printed["unit"]) == ([0, 2], 0.05, "N m")
+    assert printed["error"] < 0.2
+    assert torch.jit.load(str(net))(torch.zeros(7, 4)).shape == (7, 1)
+    net.unlink()
+    for joint, part in (
+        ("target,angle,current", "effective position targets"),
+        ("target,angle", "TARGET,POSITION,TORQUE,VELOCITY"),
+        ("target,angle,torque,", "TARGET,POSITION,TORQUE,VELOCITY"),
+    ):
+        code, _, err = call(*words, "--joint", joint)
+        assert (code, part in err, net.exists()) == (2, True, False), err
+    code, _, err = call(*words, "--joint", "target,angle,torque", "--history", "0,x")
+    assert (code, "--history" in err) == (2, True), err

@@ -41,9 +41,15 @@ POSSIBLE = {
     "1e-300": {"rate", "seconds", "hold_out"},
 }
 """Options for which an odd number may be accepted."""
-LONG_WORK = ("bench", "data fetch", "demo", "diagnose fit", "fit", "monitor demo", "study")
+LONG_WORK = (
+    *("bench", "data fetch", "demo", "diagnose fit", "export actuator-net", "fit"),
+    *("monitor demo", "study"),
+)
 """Commands that work for a long time, or download, on what they accept; it is not tried."""
-NOT_RUN = ("bench", "bundle export", "data fetch", "demo", "doctor", "monitor demo", "study")
+NOT_RUN = (
+    *("bench", "bundle export", "data fetch", "demo", "doctor", "export actuator-net"),
+    *("monitor demo", "study"),
+)
 """Commands of which only the reading of words is tried with mutated ones: they work for a long
 time, or need a network."""
 ODD_WORDS = ("", "-", "--", "-1", "nan", HUGE, "x" * 300, "none", "..", "set", "study", "--seed")
@@ -71,6 +77,7 @@ BASE = {
     "fit": "reach.toml --real real.npz --simulations 20",
     "generate": "model --case reach.toml --per-class 1",
     "export actuator": "model --torchscript-only",
+    "export actuator-net": "model --joint second,far,high",
     "export fmu": "model",
     "identify": "own_of_mutations:reach real.npz --inputs first,second --outputs far,high --rate 10"
     " --free length=0.5:2",
@@ -119,9 +126,9 @@ def suffix(name: str, target: Any) -> str:
     """The suffix that a command wants of that name."""
     if target.metavar == "FOLDER":
         return ""
-    return {"bench": ".json", "data map": ".toml", "twin animate": ".gif"}.get(
-        name, ".csv" if "predict" in name else ".npz"
-    )
+    own = {"bench": ".json", "data map": ".toml", "export actuator-net": ".pt"}
+    own["twin animate"] = ".gif"
+    return own.get(name, ".csv" if "predict" in name else ".npz")
 
 
 def cases() -> Iterator[tuple[str, list[str], bool]]:

@@ -42,7 +42,7 @@ CASE = """
 name = "reach"
 twin = "own_of_mutations:reach"
 rate = 10
-inputs = { first = { unit = "rad", low = -1, high = 1 }, second = { low = -1, high = 1 } }
+inputs = { first = { low = -1, high = 1 }, second = { unit = "m", low = -1, high = 1 } }
 outputs = { far = { unit = "m" }, high = { unit = "m" } }
 commands = { duration = 6, segments = 2, ramp_durations = [0.8, 1.0] }
 network = { kind = "MLP", hidden = [8] }

@@ -9,20 +9,22 @@ import typer
 
 from retwin.checks import require
 from retwin.cli.commands import Commands
-from retwin.cli.options import Json, OtherCase, Seed
+from retwin.cli.options import Json, OtherCase, Seed, channel_names
 from retwin.cli.reading import updated_twin
-from retwin.cli.terminal import answer, bar, example, note
+from retwin.cli.terminal import answer, bar, example, note, table
+from retwin.errors import InputError
 from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from retwin.deploy.actuator.export import ExportedActuator
+    from retwin.deploy.actuator.torque_net import Joint
 
 __all__ = ["app"]
 
 TRAJECTORIES = 256
-"""Trajectories of the case's sampler at whose segments z is drawn."""
+"""Trajectories of the case's sampler at whose segments z is drawn, or whose torques are learned."""
 
 app = Commands(
     help="Take an updated twin to other tools.",
@@ -117,6 +119,92 @@ def actuator(
             onnx=not torchscript_only,
         )
     _print_actuator(made, out, as_json=as_json)
+
+
+@app.command(epilog=example("retwin export actuator-net model --joint u,angle,torque --out net.pt"))
+def actuator_net(
+    model: Annotated[
+        Path, typer.Argument(metavar="MODEL", help="Folder of an updated twin, of retwin fit.")
+    ],
+    joint: Annotated[
+        list[str],
+        typer.Option(
+            metavar="NAMES",
+            help="Channels TARGET,POSITION,TORQUE[,VELOCITY]. Repeat it for equal actuators.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The network to write, *.pt.")],
+    history: Annotated[
+        str, typer.Option(metavar="STEPS", help="Into the past, joined by commas.")
+    ] = "0,1,2",
+    case: OtherCase = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Write the torque by position errors and velocities, where torque is an output."""
+    from retwin.deploy.actuator.torque_net import export_actuator_net
+
+    joints = [_joint(each) for each in joint]
+    steps = _steps(history)
+    check_place(out)
+    twin = updated_twin(model)
+    commands = _sampled(twin, model, case, seed)
+    with bar("export") as show:
+        made = export_actuator_net(
+            twin,
+            out,
+            joints=joints,
+            commands=commands,
+            seed=seed,
+            history=steps,
+            progress=lambda share: show("train", share),
+        )
+    settings = {
+        "network_file": str(made.network_file),
+        "input_order": made.input_order,
+        "input_idx": list(made.input_idx),
+        "pos_scale": made.pos_scale,
+        "vel_scale": made.vel_scale,
+        "torque_scale": made.torque_scale,
+    }
+    answer(
+        {**settings, "period": made.period, "unit": made.unit, "error": made.error},
+        table(("of ActuatorNetMLPCfg", "value"), list(settings.items())),
+        f"The simulation must call it every {made.period:g} s. Torques are in {made.unit}; their "
+        f"error on held-out simulations of the twin, noise included, is {made.error:.2g} of their "
+        "standard deviation.",
+        as_json=as_json,
+    )
+    note(f"Saved {made.network_file}")
+
+
+def _joint(text: str) -> Joint:
+    """The channels in a value of --joint."""
+    from retwin.deploy.actuator.torque_net import Joint
+
+    names = channel_names(text)
+    require(
+        len(names) in (3, 4) and len(names) == text.count(",") + 1,
+        "--joint",
+        expected="TARGET,POSITION,TORQUE or TARGET,POSITION,TORQUE,VELOCITY",
+        got=repr(text),
+        remedy="name a command and two or three outputs of the twin; `retwin data info` of its "
+        "calibration data lists them",
+    )
+    return Joint(*names)
+
+
+def _steps(text: str) -> tuple[int, ...]:
+    """The steps into the past in the value of --history."""
+    try:
+        return tuple(int(each) for each in text.split(","))
+    except ValueError:
+        raise InputError(
+            "--history",
+            expected="whole numbers of steps, joined by commas",
+            got=repr(text),
+            remedy="give --history 0,1,2",
+        ) from None
 
 
 def _print_actuator(made: ExportedActuator, out: Path, *, as_json: bool) -> None:

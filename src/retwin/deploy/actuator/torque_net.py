@@ -23,6 +23,7 @@ from retwin.deploy.actuator.export import PARITY, PARTS, Standard, write_script
 from retwin.errors import InputError
 from retwin.nets.networks import MLP
 from retwin.nets.training import Training
+from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.places import check_place
 from retwin.twins.twin import Twin, checked_commands, checked_seed
@@ -98,6 +99,7 @@ def export_actuator_net(
     seed: int,
     history: Sequence[int] = (0, 1, 2),
     training: Training | None = None,
+    progress: Progress | None = None,
 ) -> ExportedActuatorNet:
     """Write the torque of joints by the history of their position errors and velocities.
 
@@ -117,6 +119,8 @@ def export_actuator_net(
         Steps into the past that the network is given, each once.
     training : Training, optional
         Settings of the training.
+    progress : callable, optional
+        Called with the share of the training that is done.
 
     Raises
     ------
@@ -146,7 +150,9 @@ def export_actuator_net(
     simulated = Trajectories(
         inputs, torque, torque, twin.rate, inputs=channels, outputs=Channels(("torque",), ("1",))
     )
-    network = fit_surrogate(simulated, MLP((32, 32)), seed=seed, training=training)
+    network = fit_surrogate(
+        simulated, MLP((32, 32)), seed=seed, training=training, progress=progress
+    )
     assert network.fitted is not None
     _write(network, path, torch.as_tensor(inputs.reshape(-1, inputs.shape[2])))
     error = float(network.fitted.figures["nrmse_torque"])
