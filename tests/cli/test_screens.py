@@ -214,6 +214,18 @@ def test_finished_stages_stay(on_screen, capsys: pytest.CaptureFixture[str]) -> 
     assert "✓ 0:00  diagnoses" not in shown
 
 
+def test_a_warning_has_a_line_of_its_own_while_a_bar_is_shown(
+    on_screen, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with show_warnings(), bar("study") as show:
+        show("data", 0.4)
+        warnings.warn("some commands are not certain", stacklevel=1)
+        show("data", 0.5)
+    printed = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().err)
+    assert "warning: some commands are not certain" in printed
+    assert not re.search(r"left *warning", printed), "the bar is erased before it"
+
+
 def test_quiet_leaves_out_bars_and_notes(on_screen, capsys: pytest.CaptureFixture[str]) -> None:
     be_quiet(True)
     try:

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from retwin.catalog import SOURCES
-from retwin.report.labels import class_name, digits, duration, number, p_value, signed, span
+from retwin.report.labels import (
+    class_name,
+    difference,
+    duration,
+    number,
+    p_value,
+    percents,
+    scored,
+    signed,
+    span,
+)
 from retwin.report.style import CHROME, PALETTE, colour_index, dash, symbol
 from retwin.results import Comparison
 
@@ -63,7 +73,20 @@ def test_digits_show_the_difference() -> None:
     assert (number(0.0106), number(0.0114), number(0.45)) == ("0.0106", "0.0114", "0.450")
     assert span((0.00098, 0.00102)) == "0.00098 to 0.00102"
     small = Comparison(a="a", b="b", metric="rmse", mean_diff=-4e-5, bootstrap_ci95=(-6e-5, -1e-6))
-    assert signed(small.mean_diff, digits(small)) == "−0.0000400"
-    assert span(small.interval, digits(small), sign=True) == "−0.0000600 to −0.0000010"
+    assert difference(small, []) == ("−0.0000400", "−0.0000600 to −0.0000010")
     wide = Comparison(a="a", b="b", metric="rmse", mean_diff=-4e-5, bootstrap_ci95=(-0.2, 0.1))
-    assert signed(wide.mean_diff, digits(wide)) == "0.000"
+    assert difference(wide, [])[0] == "0.000"
+
+
+def test_scores_have_the_unit_of_the_outputs() -> None:
+    small = Comparison(a="a", b="b", metric="rmse", mean_diff=-4e-5, bootstrap_ci95=(-6e-5, -1e-6))
+    assert difference(small, ["m", "m"]) == ("−0.0400 mm", "−0.0600 to −0.0010 mm")
+    assert difference(small, ["V"]) == ("−0.0000400 V", "−0.0000600 to −0.0000010 V")
+    assert scored(0.0049, "crps", ["m"]) == "4.900 mm"
+    assert scored(0.892, "macro_f1", ["m"]) == "0.892"
+
+
+def test_ends_of_wide_intervals_are_rounded_outwards() -> None:
+    assert percents((0.0002, 0.9998)) == "0 to 100 %"
+    assert percents((0.004, 0.46)) == "0.4 to 46 %"
+    assert percents((0.9992, 0.9998)) == "99.9 to 99.98 %"

@@ -184,9 +184,9 @@ def test_the_paper_item_by_item(study: Study, write: Write) -> None:
     reader = read(write(study))
     for given in (
         "Table 1: macro-F1",
-        "Figure 2: segments, delay (TDe), offset (TPE)",
         "Figure 5: delay, KS distance – – – 0.11 (p 0.41)",
         "Section 5: 3600 trajectories in 8.5 h 4–5 min",
+        "figure 2, of one segment with its delay and offset, is repeated in the section",
     ):
         assert given in reader.text, given
     inside = [each[1:] for each in reader.addresses if each.startswith("#") and "=" not in each]

@@ -330,13 +330,11 @@ def _over_runs(values: list[float]) -> str:
 def _differences(results: Results) -> list[RenderableType]:
     """The difference of each source from the plain twin, with its interval and verdict."""
     from retwin.report.labels import (
-        digits,
+        difference,
         reason,
         sentence,
-        signed,
         source_in_sentence,
         source_name,
-        span,
     )
     from retwin.report.verdict import outcome_of
 
@@ -352,8 +350,7 @@ def _differences(results: Results) -> list[RenderableType]:
     rows = [
         (
             source_name(row.a),
-            signed(row.mean_diff, digits(row)),
-            span(row.interval, digits(row), sign=True),
+            *difference(row, results.outputs.units),
             VERDICTS.get(outcome_of(row), "none"),
         )
         for row in found

@@ -69,6 +69,8 @@ CONTROL = {
 """Characters by which a name could steer a terminal or reverse a line, and what is printed."""
 
 _quiet = False
+_live: Console | None = None
+"""The console of the bar that is on the screen; what else is printed must pass through it."""
 
 
 def be_quiet(quiet: bool) -> None:
@@ -194,7 +196,7 @@ def bar(what: str) -> Iterator[Callable[[str, float], None]]:
 
     """
     console = _stderr()
-    if not console.is_terminal:
+    if _quiet or not console.is_terminal:
         yield _lines(console, what)
         return
     columns = (
@@ -203,7 +205,7 @@ def bar(what: str) -> Iterator[Callable[[str, float], None]]:
         TaskProgressColumn(),
         _TimeLeft(),
     )
-    with Progress(*columns, console=console, transient=True, disable=_quiet) as bars:
+    with _shown(console), Progress(*columns, console=console, transient=True) as bars:
         task = bars.add_task(what, total=1.0, before=0.0)
         begun = time.monotonic()
 
@@ -220,6 +222,17 @@ def bar(what: str) -> Iterator[Callable[[str, float], None]]:
             bars.update(task, completed=share, description=described)
 
         yield show
+
+
+@contextmanager
+def _shown(console: Console) -> Iterator[None]:
+    """The block has a bar on this console."""
+    global _live
+    before, _live = _live, console
+    try:
+        yield
+    finally:
+        _live = before
 
 
 def _lines(console: Console, what: str) -> Callable[[str, float], None]:
@@ -266,7 +279,7 @@ def complain(text: str) -> None:
 
 def _mark(kind: str, colour: str, text: str) -> None:
     line = Text.assemble((f"{kind}:", colour), " ", plain(text))
-    Console(stderr=True, soft_wrap=True).print(line)
+    (_live or Console(stderr=True)).print(line, soft_wrap=True)
 
 
 def complain_of_usage(error: Any) -> None:

@@ -31,7 +31,10 @@ class Link:
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell: text, a smaller line below it, emphasis, and the source whose colour it has."""
+    """A cell: text, a smaller line below it, emphasis, and the source whose colour it has.
+
+    `paper` is the paper's figure, in another small line.
+    """
 
     text: str
     below: str = ""
@@ -40,6 +43,7 @@ class Cell:
     links: Sequence[Link] = ()
     forest: Forest | None = None
     tone: str = ""
+    paper: str = ""
 
 
 @dataclass(frozen=True)

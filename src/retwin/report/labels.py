@@ -19,10 +19,11 @@ __all__ = [
     "MAIN",
     "MANY",
     "SELECTED",
+    "behind",
     "class_name",
     "counted",
     "decimals",
-    "digits",
+    "difference",
     "distinct",
     "duration",
     "in_sentence",
@@ -30,6 +31,7 @@ __all__ = [
     "learned_name",
     "mean_and_deviation",
     "metric_name",
+    "metric_quantity",
     "number",
     "order",
     "p_value",
@@ -39,6 +41,7 @@ __all__ = [
     "quantity",
     "real_data",
     "reason",
+    "scored",
     "sentence",
     "signed",
     "source_in_sentence",
@@ -169,6 +172,8 @@ def reason(comparison: Comparison) -> str:
     return NO_VERDICT.get(comparison.no_verdict, "")
 
 
+WIDE, NEAR = 0.01, 0.001
+"""The width of an interval beyond which shares so near to 0 and 1 need no more digits."""
 SMALL = 0.1
 """Values below this are shown with more decimals."""
 
@@ -213,16 +218,13 @@ def percent(share: float | None, digits: int = 0) -> str:
 
 
 def percents(interval: Sequence[float] | None) -> str:
-    """`58 to 91 %`."""
+    """`58 to 91 %`; the ends of a wide one are rounded outwards within 0.1 % of 0 and 100 %."""
     if interval is None:
         return "–"
-    low, high = (percent(end).removesuffix(" %") for end in interval)
-    return f"{low} to {high} %"
-
-
-def digits(each: Comparison) -> int:
-    """Decimals of a difference and of its interval."""
-    return decimals(each.mean_diff, *(each.interval or ()))
+    low, high = interval
+    if high - low > WIDE:
+        low, high = (0.0 if low < NEAR else low), (1.0 if high > 1 - NEAR else high)
+    return f"{percent(low).removesuffix(' %')} to {percent(high)}"
 
 
 def signed(value: float, digits: int | None = None) -> str:
@@ -279,6 +281,38 @@ def quantity(unit: str) -> tuple[float, str]:
         return 1000.0, "mm"
     counts = re.fullmatch(r"(\d*\.?\d+) (.+)", unit)
     return (float(counts[1]), counts[2]) if counts else (1.0, unit)
+
+
+def metric_quantity(metric: str, units: Sequence[str]) -> tuple[float, str]:
+    """Factor and unit in which a score is shown, of a study whose outputs have these units.
+
+    Scores in the unit of the outputs exist only where all outputs have the same.
+    """
+    known = METRICS.get(metric)
+    return quantity(units[0]) if known and known.unit == "output" and units else (1.0, "")
+
+
+def scored(value: float, metric: str, units: Sequence[str]) -> str:
+    """`0.892`, or `4.90 mm` of a score that has a unit."""
+    factor, unit = metric_quantity(metric, units)
+    return behind(number(factor * value), unit)
+
+
+def difference(each: Comparison, units: Sequence[str]) -> tuple[str, str]:
+    """The difference of a comparison and its interval, with the unit that they have."""
+    factor, unit = metric_quantity(each.metric, units)
+    ends = None if each.interval is None else [factor * end for end in each.interval]
+    shown = decimals(factor * each.mean_diff, *(ends or ()))
+    interval = span(ends, shown, sign=True)
+    return (
+        behind(signed(factor * each.mean_diff, shown), unit),
+        interval if ends is None else behind(interval, unit),
+    )
+
+
+def behind(text: str, unit: str) -> str:
+    """The text with the unit behind it."""
+    return text if unit in ("", "1") else f"{text} {unit}"
 
 
 def with_unit(title: str, unit: str) -> str:

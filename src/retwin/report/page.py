@@ -63,7 +63,6 @@ DOCS = f"{PAGES}report.html"
 FILTERS = {
     "class_name": labels.class_name,
     "counted": labels.counted,
-    "digits": labels.digits,
     "duration": labels.duration,
     "in_sentence": labels.in_sentence,
     "mean_and_deviation": labels.mean_and_deviation,
@@ -136,7 +135,12 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= FILTERS
+    units = study.results.outputs.units
+    environment.filters |= FILTERS | {
+        "scored": lambda value, metric: labels.scored(value, metric, units),
+        "difference": lambda each: labels.difference(each, units)[0],
+        "interval": lambda each: labels.difference(each, units)[1],
+    }
     environment.globals |= {
         "results": study.results,
         "word": study.word,

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from retwin.report.blocks import Cell, Column, Table
 from retwin.report.figure import Axis, Bars, Figure, Key, Line, Mark, Panel, Row, draw_bands
 from retwin.report.labels import (
+    in_sentence,
+    latent_names,
     learned_name,
     number,
     percent,
@@ -23,6 +25,7 @@ from retwin.report.labels import (
 )
 from retwin.report.lights import (
     Alarms,
+    Light,
     alarms,
     better_alternatives,
     change_of,
@@ -30,6 +33,7 @@ from retwin.report.lights import (
     uses,
     worst,
 )
+from retwin.report.sections.card import unlike
 from retwin.report.steps import next_steps
 from retwin.report.study import Study
 from retwin.report.style import colour_of
@@ -66,8 +70,21 @@ def summary(study: Study) -> dict[str, Any] | None:
         "alternatives": others,
         "steps": next_steps(study, found, ready, others, best["rival"] if best else None),
         "learned": learned(study),
+        "unlike": _unlike(study, pair[0], found),
+        "warnings": len(study.results.sources[pair[0]].notes),
         "figure": picture(study),
     }
+
+
+def _unlike(study: Study, source: str, found: list[Light]) -> list[str]:
+    """Components of z whose generated values differ, without noise that is missing altogether."""
+    missing = {
+        latent_names(f"noise_{name}")[0]
+        for light in found
+        if light.key == "realism"
+        for name in light.values["noiseless"]
+    }
+    return [in_sentence(name) for name, _ in unlike(study, source) if name not in missing]
 
 
 def learned(study: Study) -> Table | None:
@@ -180,11 +197,15 @@ def picture(study: Study) -> Figure | None:
     if not panels:
         return None
     colour = colour_of(pair[0])
-    keys = [
+    before, after = f"before: {source_name(pair[1])}", f"after: {source_name(pair[0])}"
+    lines = [
         Key("measured", "ink"),
-        Key(f"before: {source_name(pair[1])}", "muted", "dot"),
-        Key(f"after: {source_name(pair[0])}, 90 % and 50 % bands", colour, "bar"),
+        Key(before, "muted", "dot"),
+        Key(f"{after}, 90 % and 50 % bands", colour, "bar"),
     ]
+    titles = ("error before", "error after") if shown else (before, after)
+    errors = [Key(titles[0], "muted", "bar"), Key(titles[1], colour, "bar")]
+    keys = [*(lines if shown else []), *(errors if bars else [])]
     return Figure("summary", panels, keys, columns=2)
 
 

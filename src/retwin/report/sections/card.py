@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -11,10 +12,10 @@ from retwin.report.blocks import Cell, Column, Link, Section, Table
 from retwin.report.labels import class_name, counted, latent_names, quantity, real_data, source_name
 from retwin.report.study import Study
 from retwin.report.verdict import headline
-from retwin.results import ChannelNames, Dataset, Results
+from retwin.results import ChannelNames, Dataset, FidelityFigure, Results
 from retwin.scores.classification import row_shares
 
-__all__ = ["card"]
+__all__ = ["card", "unlike"]
 
 SIGNIFICANT = 0.05
 """The p-value at or below which generated and observed values count as different."""
@@ -28,18 +29,13 @@ def card(study: Study) -> Section:
     pair = headline(results)
     source = pair[0] if pair else next(iter(results.sources))
     each = results.sources[source]
-    fidelity = results.fidelity.get(source)
     values: dict[str, Any] = {
         "source": source,
         "scope": _scope(study, source),
         "protocol_known": each.fault_protocol_known,
         "confused": _confused(study, source),
         "missed": _missed(study, source),
-        "unlike": [
-            (latent_names(name)[0], figure)
-            for name, figure in (fidelity.agreement if fidelity else {}).items()
-            if figure.p is not None and figure.p <= SIGNIFICANT
-        ],
+        "unlike": unlike(study, source),
         "notes": _notes(results),
         "data": _data(study),
         "protocol": results.data.protocol.rstrip("."),
@@ -49,6 +45,16 @@ def card(study: Study) -> Section:
         "command": results.provenance.get("command"),
     }
     return Section("card", "Model card", values)
+
+
+def unlike(study: Study, source: str) -> list[tuple[str, FidelityFigure]]:
+    """The components of z whose generated and observed values differ, with their KS distance."""
+    fidelity = study.results.fidelity.get(source)
+    return [
+        (latent_names(name)[0], figure)
+        for name, figure in (fidelity.agreement if fidelity else {}).items()
+        if figure.p is not None and figure.p <= SIGNIFICANT
+    ]
 
 
 def _notes(results: Results) -> dict[str, str]:
@@ -144,10 +150,18 @@ def _setup(study: Study) -> dict[str, str]:
     setup = {"preset": results.preset, "classifier": results.classifier, "runs": results.runs}
     facts = {**setup, **results.provenance}
     return {
-        key.replace("_", " "): str(value)
+        key.replace("_", " "): _readable(key, str(value))
         for key, value in facts.items()
         if key != "command" and value not in (None, "")
     }
+
+
+def _readable(key: str, text: str) -> str:
+    """A time stamp to the minute, the name of a classifier in capitals, and others as they are."""
+    if key == "classifier":
+        return text.upper()
+    stamp = re.fullmatch(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d):[\d.]+\+00:00", text)
+    return f"{stamp[1]} {stamp[2]} UTC" if stamp else text
 
 
 def _data(study: Study) -> Table | None:

@@ -12,16 +12,17 @@ from retwin.report.labels import (
     MANY,
     SELECTED,
     decimals,
-    digits,
+    difference,
     in_sentence,
     metric_name,
+    metric_quantity,
     number,
     order,
     p_value,
     reason,
     signed,
     source_name,
-    span,
+    with_unit,
 )
 from retwin.report.study import Study
 from retwin.report.verdict import headline, outcome_of
@@ -45,9 +46,10 @@ def comparisons(study: Study) -> Section | None:
     values = {
         "matrix": matrix,
         "metric": metric_name(metric),
-        "pairs": _pairs(found),
+        "pairs": _pairs(study, found),
         "many": many,
-        "hundredths": _factor(metric) > 1,
+        "several": len(_axes(study, found)) > 1,
+        "hundredths": not METRICS[metric].simulated,
         "reasons": sorted({reason(each) for each in found} - {""}),
     }
     return Section("comparisons", "Comparisons", values)
@@ -55,26 +57,38 @@ def comparisons(study: Study) -> Section | None:
 
 def _matrix(study: Study, found: Sequence[Comparison], metric: str) -> Table:
     """The difference of each row's source from each column's, with its outcome."""
-    factor = _factor(metric)
+    factor, unit = metric_quantity(metric, study.results.outputs.units)
     own = [e for e in found if e.metric == metric]
-    shown = 0 if factor > 1 else decimals(*(e.mean_diff for e in own))
+    if METRICS[metric].simulated:
+        shown = decimals(*(factor * e.mean_diff for e in own))
+    else:  # scores of diagnoses are shown in hundredths
+        factor, shown = 100.0, 0
     rows = []
     for place, source in enumerate(study.sources):
         pairs = [e.with_first(source) for e in own if source in (e.a, e.b)]
-        cells = {e.b: Cell(signed(factor * e.mean_diff, shown), tone=outcome_of(e)) for e in pairs}
+        cells = {
+            e.b: Cell(signed(factor * e.mean_diff, shown), tone=outcome_of(e) or "open")
+            for e in pairs
+        }
         name = Cell(f"{place + 1}. {source_name(source)}", source=source)
         rows.append([name, *(cells.get(other, Cell("")) for other in study.sources)])
     others = [Column(str(place + 1), group="minus") for place in range(len(study.sources))]
-    title = f"Pairwise differences in {in_sentence(metric_name(metric))}"
+    title = with_unit(f"Pairwise differences in {in_sentence(metric_name(metric))}", unit)
     return Table(title, [Column("Source", numeric=False), *others], rows)
 
 
-def _factor(metric: str) -> float:
-    """Scores of diagnoses are shown in hundredths; those of simulations have a unit."""
-    return 1.0 if METRICS[metric].simulated else 100.0
+def _axes(study: Study, found: Sequence[Comparison]) -> dict[str, tuple[float, float]]:
+    """The ends of the axis of the bars, one per unit; each contains zero."""
+    ends: dict[str, tuple[float, float]] = {}
+    for each in found:
+        if each.interval is not None:
+            unit = metric_quantity(each.metric, study.results.outputs.units)[1]
+            low, high = ends.get(unit, (0.0, 0.0))
+            ends[unit] = min(low, each.interval[0]), max(high, each.interval[1])
+    return ends
 
 
-def _pairs(found: Sequence[Comparison]) -> Table:
+def _pairs(study: Study, found: Sequence[Comparison]) -> Table:
     columns = [
         Column("Score", numeric=False),
         Column("Outcome", numeric=False),
@@ -86,15 +100,17 @@ def _pairs(found: Sequence[Comparison]) -> Table:
         Column("p", group="Welch’s test over runs"),
         Column("p, Holm", group="Welch’s test over runs"),
     ]
-    shown = [each.interval for each in found if each.interval is not None]
-    low, high = min([0.0, *(lo for lo, _ in shown)]), max([0.0, *(hi for _, hi in shown)])
+    units = study.results.outputs.units
     rows: list[list[Cell]] = []
     last: tuple[str, str] | None = None
-    for each in _sorted(found):
+    oriented = _sorted(found)
+    axes = _axes(study, oriented)
+    for each in oriented:
         if (each.a, each.b) != last:
             rows.append([Cell(f"{source_name(each.a)} minus {source_name(each.b)}")])
         last = each.a, each.b
-        rows.append(_row(each, low, high))
+        axis = axes.get(metric_quantity(each.metric, units)[1], (0.0, 0.0))
+        rows.append(_row(each, units, axis))
     return Table("Differences, pair by pair", columns, rows)
 
 
@@ -108,8 +124,8 @@ def _sorted(found: Sequence[Comparison]) -> list[Comparison]:
     )
 
 
-def _row(each: Comparison, low: float, high: float) -> list[Cell]:
-    forest = None
+def _row(each: Comparison, units: Sequence[str], axis: tuple[float, float]) -> list[Cell]:
+    forest, (low, high) = None, axis
     if each.interval is not None and np.isfinite(each.mean_diff) and high > low:
         lower, at, upper, zero = (
             100 * (value - low) / (high - low)
@@ -117,13 +133,14 @@ def _row(each: Comparison, low: float, high: float) -> list[Cell]:
         )
         forest = Forest(lower, min(max(at, 0), 100), upper, zero)
     result = outcome_of(each)
+    mean, interval = difference(each, units)
     # Draws that are all equal show no uncertainty, which does not mean that there is none.
     wide = each.interval is not None and each.interval[0] < each.interval[1]
     return [
         Cell(metric_name(each.metric)),
         Cell({"open": "undecided", "": "no verdict"}.get(result, result), tone=result),
-        Cell(signed(each.mean_diff, digits(each))),
-        Cell(span(each.interval, digits(each), sign=True) if wide else "–"),
+        Cell(mean),
+        Cell(interval if wide else "–"),
         Cell("", forest=forest, source=each.a),
         Cell(p_value(each.p_verdict)),
         Cell(f"{number(each.t, 2)} ({number(each.df, 1)})" if each.t is not None else "–"),

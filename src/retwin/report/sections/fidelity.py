@@ -57,8 +57,13 @@ def fidelity(study: Study) -> Section | None:
     ]
     if not details and len(scored) < 2:
         return None
+    overview = _overview(study, scored) if len(scored) > 1 else None
+    for each in details:  # without simpler generators it would repeat a row of the overview
+        if overview is not None and not each["fidelity"].rivals:
+            each["scores"] = None
     values: dict[str, Any] = {
-        "overview": _overview(study, scored) if len(scored) > 1 else None,
+        "overview": overview,
+        "explained": next((each["source"] for each in details if each["scores"]), ""),
         "partial": set(scored) > set(detailed(study)),
         "details": details,
         "several": len(known) > 1,

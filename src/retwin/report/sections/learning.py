@@ -7,7 +7,7 @@ import math
 from retwin.catalog import METRICS
 from retwin.report.blocks import Section
 from retwin.report.figure import Axis, Figure, Key, Panel, Points, Row
-from retwin.report.labels import in_sentence, metric_name, order, source_name
+from retwin.report.labels import in_sentence, metric_name, metric_quantity, order, source_name
 from retwin.report.study import Study
 from retwin.report.style import colour_index, colour_of, dash, symbol
 from retwin.results import CurvePoint
@@ -24,7 +24,7 @@ def learning(study: Study) -> Section | None:
         return None
     first = next(iter(curves.values()))
     keys = [Key(source_name(name), colour_of(name), dash(name)) for name in first]
-    panels = [_panel(metric, found) for metric, found in curves.items()]
+    panels = [_panel(study, metric, found) for metric, found in curves.items()]
     figure = Figure("learning", panels, keys)
     return Section("learning", "Learning curve", {"figure": figure}, [figure])
 
@@ -37,25 +37,31 @@ def _curves(study: Study, metric: str) -> Curves:
     return {name: [point for point in known if point.source == name] for name in names}
 
 
-def _panel(metric: str, curves: Curves) -> Panel:
+def _panel(study: Study, metric: str, curves: Curves) -> Panel:
+    factor, unit = metric_quantity(metric, study.results.outputs.units)
     counts = sorted({point.healthy for points in curves.values() for point in points})
     title = in_sentence(metric_name(metric))
     if METRICS[metric].unit == "output":
-        y = Axis(title, from_zero=True)
+        y = Axis(title, unit, from_zero=True)
     else:
         y = Axis(title, limits=(-0.02, 1.02), kind="share", step=0.2)
+    marks = [_points(metric, name, points, factor) for name, points in curves.items()]
     return Panel(
         Axis("healthy trajectories", kind="log", ticks={count: str(count) for count in counts}),
-        [Row(y, [_points(metric, name, points) for name, points in curves.items()])],
+        [Row(y, marks)],
         f"{title} against calibration trajectories",
         title,
         height=320,
     )
 
 
-def _points(metric: str, source: str, points: list[CurvePoint]) -> Points:
-    means = [point.mean(metric) for point in points]
-    ends = [point.interval(metric) or (m, m) for point, m in zip(points, means, strict=True)]
+def _points(metric: str, source: str, points: list[CurvePoint], factor: float) -> Points:
+    means = [factor * point.mean(metric) for point in points]
+    known = [point.interval(metric) for point in points]
+    ends = [
+        (m, m) if each is None else (factor * each[0], factor * each[1])
+        for each, m in zip(known, means, strict=True)
+    ]
     # Sources stand side by side, so that intervals do not cover each other.
     shift = 1.02 ** (colour_index(source) - 3)
     return Points(

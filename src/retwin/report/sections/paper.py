@@ -26,7 +26,7 @@ PAPER, HERE = "the paper", "this study"
 
 
 def paper(study: Study) -> Section | None:
-    """Table 1, figures 2 to 6 and the times: the paper's, this study's, and links to them."""
+    """Table 1, figures 3 to 6 and the times: the paper's, this study's, and links to them."""
     known = [name for name in order(study.results.published) if name in study.sources]
     if not known:
         return None
@@ -48,12 +48,6 @@ def paper(study: Study) -> Section | None:
             for metric in TABLE1
         ),
         _row(
-            "Figure 2: segments, delay (TDe), offset (TPE)",
-            dashes,
-            dashes,
-            Link("Discrepancy", "discrepancy"),
-        ),
-        _row(
             "Figure 3: confusions, accuracy",
             dashes,
             _means(study, known, "accuracy"),
@@ -73,7 +67,7 @@ def paper(study: Study) -> Section | None:
             Link("Time", "time"),
         ),
     ]
-    table = Table("Table 1 and figures 2 to 6", columns, rows)
+    table = Table("Table 1, figures 3 to 6 and times", columns, rows)
     return Section("paper", "The paper and this study", {"table": table})
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from retwin.report.labels import (
     duration,
     mean_and_deviation,
     metric_name,
+    metric_quantity,
     number,
     real_data,
     source_name,
@@ -82,23 +84,23 @@ def _table_values(
     results = study.results
     paper = any(_in_paper(results, name) for name in metrics)
     columns = [Column("Training data" if results.classes else "Source", numeric=False)]
-    for name in metrics:
-        columns += _columns(results, name, paper)
+    shown = {name: metric_quantity(name, results.outputs.units) for name in metrics}
+    columns += [Column(with_unit(metric_name(name), unit)) for name, (_, unit) in shown.items()]
     if floors:
-        columns.append(Column("ECE floor", group="ECE floor" if columns[-1].group else ""))
+        columns.append(Column("ECE floor"))
     best = {name: _best(results, name) for name in metrics}
     rows = []
     for name, source in study.sources.items():
         used = f"{study.word} data: {real_data(source.real_data)}"
         known = ["fault protocol known"] if source.fault_protocol_known else []
         row = [Cell(source_name(name), "; ".join([name, used, *known]), source=name)]
-        for metric in metrics:
-            interval = source.interval(metric)
-            text = mean_and_deviation(source.runs(metric))
-            below = f"[{span(interval, decimals(source.mean(metric)))}]" if interval else ""
-            row.append(Cell(text, below, best=name in best[metric]))
-            if _in_paper(results, metric):
-                row.append(Cell(results.published.get(name, {}).get(metric, "–")))
+        for metric, (factor, _) in shown.items():
+            values, interval = factor * np.asarray(source.runs(metric)), source.interval(metric)
+            ends = [factor * end for end in interval or ()]
+            below = f"[{span(ends, decimals(factor * source.mean(metric)))}]" if ends else ""
+            published = results.published.get(name, {}).get(metric, "")
+            cell = Cell(mean_and_deviation(values), below, best=name in best[metric])
+            row.append(replace(cell, paper=published))
         rows.append([*row, Cell(number(floors[name]))] if floors else row)
     return {
         "table": Table(title, columns, rows),
@@ -106,17 +108,6 @@ def _table_values(
         "intervals": any(source.intervals for source in study.sources.values()),
         "protocol_known": any(source.fault_protocol_known for source in study.sources.values()),
     }
-
-
-def _columns(results: Results, metric: str, paper: bool) -> list[Column]:
-    """One column, or two under the metric's name where the paper has it too."""
-    unit = (results.outputs.units or [""])[0] if METRICS[metric].unit == "output" else ""
-    title = with_unit(metric_name(metric), unit)
-    if not paper:
-        return [Column(title)]
-    here = Column("this study", group=title)
-    published = Column("paper", group=title, paper=True)
-    return [here, published] if _in_paper(results, metric) else [here]
 
 
 def _in_paper(results: Results, metric: str) -> bool:

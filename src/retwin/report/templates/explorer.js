@@ -159,9 +159,12 @@
     if (!latent) return;
     const head = ["Segment", ...latent.names.map((name, k) => titled(name, latent.units[k]))];
     const there = data.times[picked].map((each, m) => [each, m]).filter(([each]) => each[0] !== null);
-    fill(at("z"), head, there.map(([each, m]) => row([
+    const texts = there.map(([, m]) => latent.z[picked][m].map((value, k) => rounded(value, latent.deviation[picked][m][k])));
+    const known = latent.names.map((_, k) => texts.some((each) => each[k] !== "–"));
+    const kept = (cells) => cells.filter((_, k) => known[k]);
+    fill(at("z"), [head[0], ...kept(head.slice(1))], there.map(([each, m], i) => row([
       cell("th", `${m + 1}: from ${each[0].toFixed(1)} s`, { scope: "row" }),
-      ...latent.z[picked][m].map((value, k) => cell("td", rounded(value, latent.deviation[picked][m][k]))),
+      ...kept(texts[i]).map((text) => cell("td", text)),
     ])));
   };
   const answer = () => {
