@@ -88,5 +88,6 @@ def test_scores_have_the_unit_of_the_outputs() -> None:
 
 def test_ends_of_wide_intervals_are_rounded_outwards() -> None:
     assert percents((0.0002, 0.9998)) == "0 to 100 %"
+    assert percents((0.57, 1.004)) == "57 to 100.4 %", "a ratio may exceed 1"
     assert percents((0.004, 0.46)) == "0.4 to 46 %"
     assert percents((0.9992, 0.9998)) == "99.9 to 99.98 %"

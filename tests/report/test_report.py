@@ -215,8 +215,8 @@ def test_the_model_card_knows_what_went_wrong(study: Study, write: Write) -> Non
         "Healthy diagnosed as M1 stuck real_a/003",
         "M4 bias recognised in 40%",
         "Noise x: generated and observed distributions differ KS distance 0.98, p 0.05",
-        "one chain did not mix reported while computing: Original twin; Updated twin (outputs)",
-        "a command outside reported while computing: Original twin",
+        "Original twin; Updated twin (outputs): one chain did not mix",
+        "Original twin: a command outside",
         "which would not be known in the field",
     ):
         assert given in reader.text, given

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import count, pairwise
 
 from retwin.progress import FinishedStage, ResumedStage
 from retwin.study.files import Job
@@ -20,7 +20,10 @@ JOBS = [
 def reported(*, done: int = 0) -> list[tuple[str, float]]:
     """What a study reports whose first jobs are done already."""
     told: list[tuple[str, float]] = []
-    stages = Stages(lambda stage, share: told.append((stage, share)))
+    ticks = count()
+    stages = Stages(
+        lambda stage, share: told.append((stage, share)), clock=lambda: float(next(ticks))
+    )
     for share in (0.0, 0.5, 1.0):
         stages.prepare("twin data", share)
     stages.prepare("real data", 0.2)
@@ -61,11 +64,24 @@ def test_what_was_done_before_is_not_done_again() -> None:
 
 
 def test_every_file_that_is_read_moves_the_share() -> None:
-    """The first one used to take all that the data have, and the bar stood still for the second."""
     told: list[float] = []
-    stages = Stages(lambda stage, share: told.append(share))
+    ticks = count()
+    stages = Stages(lambda stage, share: told.append(share), 100.0, clock=lambda: next(ticks))
     for stage in ("real.mat", "twin data", "third"):
         for share in (0.0, 0.5, 1.0):
             stages.prepare(stage, share)
     assert len(set(told)) == 7
     assert told[-1] < 0.1
+
+
+def test_the_time_left_is_known_while_data_are_read() -> None:
+    """Data that take 40 s before jobs that take 20 s: at half of the data, a third is done."""
+    told: list[float] = []
+    now = [0.0]
+    stages = Stages(lambda stage, share: told.append(share), 20.0, clock=lambda: now[0])
+    stages.prepare("twin data", 0.0)
+    for share in (0.25, 0.5, 1.0):
+        now[0] = 40 * share
+        stages.prepare("twin data", share)
+        left = now[0] * (1 - told[-1]) / told[-1]
+        assert 60 - now[0] <= left < 1.1 * (62 - now[0])

@@ -162,8 +162,10 @@ def times(count: int) -> str:
     return {1: "once", 2: "twice"}.get(count, f"{count} times")
 
 
-def real_data(text: str | None) -> str:
-    """The real data that a source learns from."""
+def real_data(text: str | None, *, classes: bool = True) -> str:
+    """The real data that a source learns from; a study without `classes` has no healthy ones."""
+    if text == "healthy" and not classes:
+        return "calibration records"
     return "not stated" if text is None else REAL_DATA.get(text, text)
 
 
@@ -212,7 +214,7 @@ def percent(share: float | None, digits: int = 0) -> str:
     if share is None or not math.isfinite(share):
         return "–"
     text = number(100 * share, digits)
-    if (share < 1 and text == number(100, digits)) or (share > 0 and text == number(0, digits)):
+    if (share != 1 and text == number(100, digits)) or (share != 0 and text == number(0, digits)):
         return percent(share, digits + 1) if digits < 3 else text + " %"
     return f"{text} %"
 
@@ -223,7 +225,7 @@ def percents(interval: Sequence[float] | None) -> str:
         return "–"
     low, high = interval
     if high - low > WIDE:
-        low, high = (0.0 if low < NEAR else low), (1.0 if high > 1 - NEAR else high)
+        low, high = (0.0 if 0 < low < NEAR else low), (1.0 if 1 - NEAR < high < 1 else high)
     return f"{percent(low).removesuffix(' %')} to {percent(high)}"
 
 

@@ -245,7 +245,7 @@ def _record(study: Study, pair: tuple[str, str]) -> Panel | None:
     outputs = study.results.outputs
     time = np.arange(len(observed)) / float(study.arrays["simulation/rate"])
     output = (outputs.names or ["output"])[0], (outputs.units or [""])[0]
-    record = f"test record {study.arrays['simulation/ids'][0]}"
+    record = f"test record “{study.arrays['simulation/ids'][0]}”"
     return _panel(output, record, time, (before, observed, drawn), colour_of(pair[0]))
 
 

@@ -29,7 +29,7 @@ from retwin.study.data import StudyData, real_data, twin_data
 from retwin.study.files import Files, Roles
 from retwin.study.plan import StudyPlan
 from retwin.study.pool import run_jobs
-from retwin.study.progress import Stages
+from retwin.study.progress import Stages, expected_seconds
 from retwin.study.results import write_results
 from retwin.study.sources import lacking, not_installed
 from retwin.study.work import Work
@@ -102,7 +102,7 @@ def run_study(
         _check_free(out, found)
         _check_possible(case, plan)
         work_folder = out / "work"
-        stages = Stages(report)
+        stages = Stages(report, expected_seconds(plan, workers), workers)
         if not (work_folder / "roles.json").exists():
             _prepare(case, plan, data, out, found, stages.prepare)
         roles = Roles.of(json.loads((work_folder / "roles.json").read_text("utf-8")))

@@ -75,7 +75,9 @@ def _scope(study: Study, source: str) -> dict[str, str]:
     facts = {
         "system": results.title or results.case,
         "updated twin": source_name(source),
-        f"{word} data used": real_data(results.sources[source].real_data),
+        f"{word} data used": real_data(
+            results.sources[source].real_data, classes=bool(results.classes)
+        ),
         "commands": _channels(results.inputs),
         "outputs": _channels(results.outputs),
         "classes": ", ".join(map(class_name, results.classes)),

@@ -8,10 +8,10 @@ from retwin.report.blocks import Cell, Column, Section, Table, columns
 from retwin.report.labels import duration, real_data, source_name, stage_name
 from retwin.report.study import Study
 
-__all__ = ["BULK", "time"]
+__all__ = ["PUBLISHED_BULK", "time"]
 
-BULK = 3600
-"""The number of trajectories to which generation times refer, as in the paper."""
+PUBLISHED_BULK, BULK = 3600, 1000
+"""The number of trajectories to which generation times refer: in the paper, and elsewhere."""
 
 
 def time(study: Study) -> Section | None:
@@ -39,13 +39,14 @@ def _stages(study: Study) -> Table | None:
 
 
 def _costs(study: Study) -> Table | None:
-    bulk = f"{BULK} trajectories"
+    count = PUBLISHED_BULK if study.results.published else BULK
+    bulk = f"{count} trajectories"
     shown = {
         "Twin runs": [
             "–" if s.twin_runs is None else str(s.twin_runs) for s in study.sources.values()
         ],
         "Update": [duration(s.update_s) for s in study.sources.values()],
-        bulk: [duration(s.generation_seconds(BULK)) for s in study.sources.values()],
+        bulk: [duration(s.generation_seconds(count)) for s in study.sources.values()],
         "Training": [duration(s.train_s) for s in study.sources.values()],
         "One diagnosis": [duration(s.predict_s) for s in study.sources.values()],
     }
@@ -65,7 +66,8 @@ def _costs(study: Study) -> Table | None:
             heads.append(Column(name))
     rows = []
     for place, (source, each) in enumerate(study.sources.items()):
-        row = [Cell(source_name(source), source=source), Cell(real_data(each.real_data))]
+        used = real_data(each.real_data, classes=bool(study.results.classes))
+        row = [Cell(source_name(source), source=source), Cell(used)]
         for name, texts in kept.items():
             row.append(Cell(texts[place]))
             if paper and name == bulk:

@@ -15,7 +15,7 @@ from retwin.report.labels import (
     order,
     source_name,
 )
-from retwin.report.sections.costs import BULK
+from retwin.report.sections.costs import PUBLISHED_BULK
 from retwin.report.study import Study
 
 __all__ = ["paper"]
@@ -61,9 +61,9 @@ def paper(study: Study) -> Section | None:
         ),
         *_distributions(study, known),
         _row(
-            f"Section 5: {BULK} trajectories in",
+            f"Section 5: {PUBLISHED_BULK} trajectories in",
             _published(study, known, "generate"),
-            [duration(study.sources[name].generation_seconds(BULK)) for name in known],
+            [duration(study.sources[name].generation_seconds(PUBLISHED_BULK)) for name in known],
             Link("Time", "time"),
         ),
     ]

@@ -91,7 +91,7 @@ def _table_values(
     best = {name: _best(results, name) for name in metrics}
     rows = []
     for name, source in study.sources.items():
-        used = f"{study.word} data: {real_data(source.real_data)}"
+        used = f"{study.word} data: {real_data(source.real_data, classes=bool(results.classes))}"
         known = ["fault protocol known"] if source.fault_protocol_known else []
         row = [Cell(source_name(name), "; ".join([name, used, *known]), source=name)]
         for metric, (factor, _) in shown.items():
