@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 from test_readme import ROOT, blocks
 
-HERE = ("data", "errors")
+HERE = ("data", "errors", "nets", "scores")
 """Pages that run here; all run when the site is built (`test_docs.py`), where an error is one."""
 
 

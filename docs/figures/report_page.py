@@ -31,7 +31,7 @@ MARKED = (
     "What speaks against it",
 )
 """What is marked, from 1 on, by the text with which it begins or that it holds."""
-SIZE = {"width": 1300, "height": 1720}
+SIZE = {"width": 1300, "height": 1850}
 MARK = """(element, [number, colour]) => {
   const box = element.getBoundingClientRect(), mark = document.createElement("div");
   mark.textContent = number;

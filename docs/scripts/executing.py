@@ -30,11 +30,13 @@ def executed(markdown: str, session: str) -> str:
     markdown : str
         The page.
     session : str
-        Its own name: blocks of a page share their variables.
+        The name of a session: its blocks share their variables and their folder, on several pages
+        too, in the order of the pages.
 
     """
-    folder = tempfile.TemporaryDirectory(prefix="docs-", ignore_cleanup_errors=True)
-    _FOLDERS.append(folder)
+    if session not in _FOLDERS:
+        _FOLDERS[session] = tempfile.TemporaryDirectory(prefix="docs-", ignore_cleanup_errors=True)
+    folder = _FOLDERS[session]
 
     def marked(found: re.Match[str]) -> str:
         code = found[1]
@@ -51,5 +53,5 @@ def executed(markdown: str, session: str) -> str:
     return PYTHON.sub(marked, markdown)
 
 
-_FOLDERS: list[tempfile.TemporaryDirectory[str]] = []
-"""Folders of the pages, which are removed when the build ends."""
+_FOLDERS: dict[str, tempfile.TemporaryDirectory[str]] = {}
+"""Folders of the sessions, which are removed when the build ends."""

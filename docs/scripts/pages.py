@@ -33,6 +33,8 @@ OUTSIDE = {
 """Files and folders outside of docs/ that the site has too, and their names there."""
 EXECUTED = ("tutorial.md",)
 """Pages whose Python runs when the site is built; the examples of the API do, too."""
+CONTINUED = {"api/report.md": "api/study.md"}
+"""Pages whose Python goes on where that of another page, which stands before it, has ended."""
 FOLDED = ("results.md",)
 """Pages whose tables are folded."""
 TABLE = re.compile(r"^\|.*\n(?:\|.*\n?){3,}", re.MULTILINE)
@@ -77,7 +79,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         markdown = re.sub(r"\]\(docs/", "](", markdown)
     name = page.file.src_uri
     if name in EXECUTED or name.startswith("api/"):
-        markdown = executed(markdown, re.sub(r"\W", "_", name))
+        markdown = executed(markdown, re.sub(r"\W", "_", CONTINUED.get(name, name)))
     return folded(markdown) if name in FOLDED else markdown
 
 
