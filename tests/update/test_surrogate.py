@@ -37,6 +37,27 @@ def test_the_fast_path_is_the_plain_one(ibg: rt.Surrogate, twin_set: rt.Trajecto
     np.testing.assert_allclose(ibg.predict(commands), plain, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "network", [rt.MLP((8,)), rt.LSTM(4), rt.TCN(4, levels=2), rt.StateSpace(2, 4)], ids=repr
+)
+def test_an_output_that_never_changes_is_exact_in_any_unit(network: rt.LSTM | rt.TCN) -> None:
+    """With a scale of 1 for a constant output the network's error was 1e4 times a value of 1 µm."""
+
+    def function(commands: np.ndarray) -> np.ndarray:
+        ones = np.ones_like(commands)
+        return np.concatenate([commands, 1e-6 * ones, 101325 * ones], axis=2)
+
+    outputs = rt.Channels(("y", "gap", "pressure"), ("1", "m", "Pa"))
+    twin = rt.FunctionTwin(function, rt.Channels(("u",), ("V",)), outputs, rate=10.0)
+    commands = np.random.default_rng(0).uniform(-1, 1, size=(12, 20, 1))
+    brief = Training(max_epochs=1)
+    surrogate = rt.fit_surrogate(twin.simulate(commands, seed=0), network, seed=0, training=brief)
+    found = surrogate.predict(commands)
+    np.testing.assert_array_equal(found[..., 1], np.float32(1e-6))
+    np.testing.assert_array_equal(found[..., 2], np.float32(101325))
+    assert np.ptp(found[..., 0]) > 0, "outputs that change are learned as before"
+
+
 def test_same_seed_same_bytes(twin_set: rt.Trajectories, tmp_path: Path) -> None:
     brief = Training(max_epochs=1)
     for name in ("a", "b"):

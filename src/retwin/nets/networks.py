@@ -28,6 +28,7 @@ __all__ = [
     "Network",
     "Standardise",
     "StateSpace",
+    "last_layers",
 ]
 
 ROWS_PER_BLOCK = 2**22
@@ -91,6 +92,17 @@ class Standardise(nn.Module):
         return values * self.scale + self.mean
 
 
+def last_layers(network: nn.Module) -> tuple[nn.Module, ...]:
+    """The layers whose sum is the output of a network; none if it does not name them.
+
+    A network has them as the attribute `last_layers`, or is a sequence that ends with a layer.
+    """
+    if isinstance(network, nn.Sequential):
+        return (network[-1],)
+    named: tuple[nn.Module, ...] = getattr(network, "last_layers", ())
+    return named
+
+
 @dataclass(frozen=True)
 class MLP:
     """A multilayer perceptron, applied to every sample: for twins without memory.
@@ -148,6 +160,10 @@ class _Recurrent(nn.Module):
         remembered, _ = self.memory(values)
         return self.readout(torch.cat([remembered, self.direct(values)], dim=-1))
 
+    @property
+    def last_layers(self) -> tuple[nn.Module, ...]:
+        return last_layers(self.readout)
+
 
 @dataclass(frozen=True)
 class TCN:
@@ -195,6 +211,10 @@ class _Convolutional(nn.Module):
             past = functional.pad(state, (padding, 0), mode="replicate")
             state = state + mix(functional.silu(convolution(past)))
         return self.leave(functional.silu(state)).transpose(1, 2)
+
+    @property
+    def last_layers(self) -> tuple[nn.Module, ...]:
+        return (self.leave,)
 
 
 @dataclass(frozen=True)

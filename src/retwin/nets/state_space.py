@@ -67,3 +67,7 @@ class _States(nn.Module):
             state = state + inverse_times * (linear + self.move(torch.tanh(inside)))
         trajectory = torch.stack(states, dim=1)
         return self.skip(trajectory) + self.readout(trajectory)
+
+    @property
+    def last_layers(self) -> tuple[nn.Module, ...]:
+        return self.readout[-1], self.skip

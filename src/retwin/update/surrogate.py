@@ -16,7 +16,7 @@ from retwin.arrays import row_blocks
 from retwin.catalog import NETWORKS, classes
 from retwin.checks import instance, one_per, require
 from retwin.data.trajectories import Channels, Trajectories
-from retwin.nets.networks import MLP, Network, Standardise
+from retwin.nets.networks import MLP, Network, Standardise, last_layers
 from retwin.nets.training import Fit, Training, isolated, train
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
@@ -293,9 +293,24 @@ def fit_surrogate(
         seed=seed,
         progress=progress,
     )
+    _hold_constant(surrogate, nominal[valid_samples])
     surrogate.trained = CommandRange.of(twin.commands, twin.rate)
     surrogate.fitted = replace(result, figures=_errors(surrogate, twin, test))
     return surrogate
+
+
+@torch.no_grad()
+def _hold_constant(surrogate: Surrogate, nominal: Tensor) -> None:
+    """Make outputs that never change in training exactly constant.
+
+    Their scale is 1, whatever their unit is, so that a small error of the network in standard units
+    can be a thousand times their value.
+    """
+    constant = nominal.amax(dim=0) == nominal.amin(dim=0)
+    for layer in last_layers(surrogate.network):
+        for weights in layer.parameters():
+            weights[constant] = 0.0
+    surrogate.after.mean[constant] = nominal[0, constant]
 
 
 def _errors(surrogate: Surrogate, twin: Trajectories, test: NDArray) -> dict[str, float]:
