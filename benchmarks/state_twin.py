@@ -26,8 +26,8 @@ import torch
 from record import record
 
 import retwin as rt
+from retwin.compiler import compiled
 from retwin.twins import Parameter, State, StateTwin
-from retwin.twins.compiled.kernel import compiled
 
 SAMPLES = 40_000
 RATE = 610.35

@@ -26,6 +26,7 @@ ROOMS = (
         "progress",
         "arrays",
         "modules",
+        "compiler",
         "processes",
         "isolation",
         "jobs",

@@ -13,10 +13,10 @@ import pytest
 from scipy.special import ndtri
 
 import retwin as rt
+from retwin.compiler import compilers
 from retwin.deploy.fmu.export import export_fmu
 from retwin.errors import InputError
 from retwin.twins import Parameter, ParameterShift, State, StateTwin
-from retwin.twins.compiled.kernel import compilers
 from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
 
 fmpy = pytest.importorskip("fmpy")

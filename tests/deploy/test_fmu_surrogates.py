@@ -17,13 +17,13 @@ import torch
 from scipy.special import ndtr, ndtri
 
 import retwin as rt
+from retwin.compiler import compilers
 from retwin.deploy.actuator.draws import drawn
 from retwin.deploy.fmu.export import export_fmu
 from retwin.deploy.fmu.segments import DRAWS, ENSEMBLE
 from retwin.errors import InputError
 from retwin.nets.mixtures import BernoulliHead, Blocks
 from retwin.twins.command_range import CommandRange
-from retwin.twins.compiled.kernel import compilers
 from retwin.update.corrections import Chain, SampledSensor
 from retwin.update.residual import SequenceMixture, SequenceResidual
 from retwin.update.residual.model import ResidualModel

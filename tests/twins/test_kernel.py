@@ -10,8 +10,8 @@ import pytest
 import torch
 
 import retwin as rt
+from retwin import compiler
 from retwin.twins import State, StateTwin
-from retwin.twins.compiled import kernel
 
 LAG = StateTwin(
     (State("level", "V"),),
@@ -37,8 +37,8 @@ def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.Monk
     measured = rng.normal(size=(5, 40, 1)), rng.random((5, 40, 1)) < 0.8
     theta, spread = rng.normal(size=(5, 1)), np.ones((5, 1, 1))
     variances = np.ones(1), np.ones(1)
-    pool = kernel.ThreadPoolExecutor
-    monkeypatch.setattr(kernel, "ThreadPoolExecutor", lambda n: (used.append(n), pool(n))[1])
+    pool = compiler.ThreadPoolExecutor
+    monkeypatch.setattr(compiler, "ThreadPoolExecutor", lambda n: (used.append(n), pool(n))[1])
 
     def made(count: int) -> list[bytes]:
         torch.set_num_threads(count)
@@ -57,9 +57,9 @@ def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.Monk
 def test_a_compiler_that_does_not_know_the_processor_is_used(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(kernel, "NATIVE", "-march=unheard-of")
-    kernel.compiled.cache_clear()
+    monkeypatch.setattr(compiler, "NATIVE", "-march=unheard-of")
+    compiler.compiled.cache_clear()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert kernel.compiled(LAG.model.source) is not None
-    kernel.compiled.cache_clear()
+        assert compiler.compiled(LAG.model.source) is not None
+    compiler.compiled.cache_clear()

@@ -11,10 +11,10 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 import retwin as rt
+from retwin import compiler
 from retwin.evaluation.fidelity.simulation import simulate_records
 from retwin.testing import TWIN_CHECKS, TwinSubject
 from retwin.twins import Parameter, ParametricTwin, State, StateTwin
-from retwin.twins.compiled import kernel
 from retwin.twins.interpolation import INTERPOLATIONS, cubic_coefficients
 from retwin.update.identification import LeastSquares, identify
 
@@ -152,21 +152,21 @@ def test_sensitivities_are_those_of_torch_and_of_differences(twin: StateTwin) ->
 def test_without_a_compiler_torch_gives_the_same(monkeypatch) -> None:
     twin, commands = duffing(substeps=2), noise(2, 30)
     wanted, derivatives = twin.sensitivities(commands)
-    monkeypatch.setattr(kernel, "compilers", list)
-    kernel.compiled.cache_clear()
+    monkeypatch.setattr(compiler, "compilers", list)
+    compiler.compiled.cache_clear()
     with pytest.warns(UserWarning, match="no C compiler .none is installed.*retwin.compiled"):
         made = duffing(substeps=2).simulate(commands, seed=0).observed
     np.testing.assert_allclose(made, wanted, rtol=1e-9, atol=1e-12)
     found = twin.sensitivities(commands)[1]
     np.testing.assert_allclose(found, derivatives, rtol=1e-9, atol=1e-12)
-    kernel.compiled.cache_clear()
+    compiler.compiled.cache_clear()
 
 
 def test_the_source_is_strict_c99(tmp_path) -> None:
     for number, twin in enumerate((duffing(), of_all(), lag())):
         file = tmp_path / f"{number}.c"
         file.write_text(twin.model.source)
-        (command, *_) = kernel.compilers()
+        (command, *_) = compiler.compilers()
         strict = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-c")
         subprocess.run([*command, *strict, file, "-o", tmp_path / "o"], check=True)
 

@@ -181,17 +181,17 @@ def test_results_do_not_depend_on_threads(surrogate: Surrogate, threads: int) ->
 def test_kept_libraries_of_others_are_not_loaded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Any
 ) -> None:
-    from retwin.twins.compiled import kernel
+    from retwin import compiler
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     source = "int answer(void) { return 42; }\n"
     for content in (None, b"damaged", b"damaged and open to others"):
-        kernel.compiled.cache_clear()
+        compiler.compiled.cache_clear()
         for kept in tmp_path.rglob("*.so"):
             kept.write_bytes(content or b"")
             kept.chmod(0o666 if content and b"others" in content else 0o600)
-        library = kernel.compiled(source)
+        library = compiler.compiled(source)
         assert library is not None
         assert library.answer() == 42
         assert len(list(tmp_path.rglob("*.so"))) == 1
-    kernel.compiled.cache_clear()
+    compiler.compiled.cache_clear()

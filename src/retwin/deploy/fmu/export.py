@@ -13,14 +13,13 @@ from pathlib import Path
 from numpy.typing import NDArray
 
 from retwin.checks import needs_extra, one_of, require
+from retwin.compiler import c_source, compilers
 from retwin.deploy.fmu.description import build_description, description, token_of
 from retwin.deploy.fmu.states import states_text
 from retwin.deploy.fmu.surrogates import surrogate_text
 from retwin.deploy.fmu.text import Text
 from retwin.errors import InputError, brief
 from retwin.serialisation.files import write_atomically
-from retwin.twins.compiled.kernel import compilers
-from retwin.twins.compiled.source import c_source
 from retwin.twins.state_twin import StateTwin
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.twin import DynamicsTwin

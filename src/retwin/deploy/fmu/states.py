@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import require
+from retwin.compiler import c_source
 from retwin.deploy.fmu.description import Variable, variables_of
 from retwin.deploy.fmu.text import Text, constants
-from retwin.twins.compiled.source import c_source
 from retwin.twins.state_twin import StateTwin
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.twin import DynamicsTwin

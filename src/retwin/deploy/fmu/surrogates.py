@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import require
+from retwin.compiler import c_source
 from retwin.deploy.fmu.description import variables_of
 from retwin.deploy.fmu.networks import CNetwork, c_network, dense_weights, flat, weights_of
 from retwin.deploy.fmu.segments import segment_parts
 from retwin.deploy.fmu.text import Text, constants
 from retwin.nets.mixtures import FLOOR
 from retwin.nets.networks import Network
-from retwin.twins.compiled.source import c_source
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Additive, Chain, SampledSensor
 from retwin.update.residual import Residual, ResidualModel, SequenceResidual

@@ -13,8 +13,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.compiler import c_source, call, compiled
 from retwin.data.segments import Segments
-from retwin.twins.compiled.source import c_source
 
 __all__ = ["biased_references", "ramped"]
 
@@ -22,9 +22,6 @@ __all__ = ["biased_references", "ramped"]
 @lru_cache(maxsize=1)
 def library() -> ctypes.CDLL | None:
     """The compiled functions; None without a C compiler."""
-    # Imported here: a description of a twin needs no torch, which the kernel's threads need.
-    from retwin.twins.compiled.kernel import compiled
-
     return compiled(c_source(__package__, "commands.c"), quiet=True)
 
 
@@ -38,8 +35,6 @@ def ramped(
     kernel = library()
     if kernel is None or not levels.size:
         return None
-    from retwin.twins.compiled.kernel import call
-
     n, segments, width = levels.shape
     out, done = np.empty((n, steps, width), np.float32), np.empty(n, np.uint8)
     given = (np.ascontiguousarray(each, np.float64) for each in (start, levels, spans, onsets))
@@ -71,8 +66,6 @@ def biased_references(
     kernel = library()
     if kernel is None or commands.dtype != np.float32 or not commands.size:
         return False
-    from retwin.twins.compiled.kernel import call
-
     levels = np.zeros(segments.start.shape)
     for row, bias in enumerate(biases):
         levels[row, : len(bias)] = bias

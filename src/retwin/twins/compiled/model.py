@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+from retwin.compiler import c_source
 from retwin.twins.compiled.program import OPERATIONS, Node, Program
-from retwin.twins.compiled.source import c_source
 from retwin.twins.compiled.trace import traced
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from retwin.twins.compiled.kernel import call, compiled
+from retwin.compiler import call, compiled
 from retwin.twins.compiled.model import Model
 from retwin.twins.interpolation import cubic_coefficients
 

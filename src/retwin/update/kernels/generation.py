@@ -16,9 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from retwin.compiler import c_source, call, compiled
 from retwin.data.segments import Segments
-from retwin.twins.compiled.kernel import call, compiled
-from retwin.twins.compiled.source import c_source
 from retwin.update.piecewise_linear import TOLERANCE
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""The C compiler: a model's C99 source as a function of arrays."""
+"""The C compiler: C99 source as functions of arrays."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import lru_cache
+from importlib.resources import files
 from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 
-import torch
 from numpy.typing import NDArray
 
-__all__ = ["call", "compiled", "compilers"]
+__all__ = ["c_source", "call", "compiled", "compilers"]
 
 FLAGS = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """Without contraction and reassociation, results are those of torch up to single roundings."""
@@ -32,6 +32,12 @@ COMPILED = 64
 """Number of models whose compiled form is kept in this process."""
 TIMEOUT = 120
 """Longest time in s that a compiler may take; the first run of zig builds its own library."""
+
+
+def c_source(package: str, *names: str) -> str:
+    """The text of C files that lie beside the modules of a package, one after the other."""
+    folder = files(package)
+    return "\n".join((folder / name).read_text("utf-8") for name in names)
 
 
 def compilers() -> Iterator[list[str]]:
@@ -173,6 +179,8 @@ def call(
         Those with a first axis of n; None is NULL.
 
     """
+    import torch  # the ground loads without it
+
     function = getattr(library, name)
     function.restype = None
     count = max(1, min(sizes[0], torch.get_num_threads()))
