@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from retwin.twins.applied_faults import faulty_commands
 from retwin.twins.compiled import commands as compiled_commands
 from retwin.twins.faults import ActuatorBias
 from retwin.twins.ramps import ramps_and_holds
+from retwin.update.corrections import Context
+from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.path_problem import path_at
 from retwin.update.corrections.sampled_sensor import SampledSensor
@@ -127,6 +130,39 @@ def test_effective_commands_are_the_same(monkeypatch: pytest.MonkeyPatch) -> Non
     with slowly(monkeypatch):
         slow = effective_commands(reference, segments, z, times, frozen)
     assert float((fast - slow).abs().max()) < 1e-9 * 650
+
+
+@pytest.mark.parametrize("own_delays", [False, True])
+@torch.no_grad()
+def test_linearised_outputs_are_the_same(
+    surrogate: Surrogate, monkeypatch: pytest.MonkeyPatch, own_delays: bool
+) -> None:
+    rng = np.random.default_rng(7)
+    commands = ramped(rng)
+    mask = rng.random((len(commands), STEPS, 1)) < 0.6
+    context = Context.of(
+        surrogate,
+        commands,
+        rt.Segments.from_commands(commands),
+        rate=100.0,
+        frozen=rng.choice([STEPS, 30, 90, 0], size=(len(commands), INPUTS)),
+    )
+    problem = CommandProblem.of(
+        context,
+        context.nominal + 0.01,
+        torch.from_numpy(mask).expand(-1, -1, OUTPUTS),
+        delay_range=(-5.0, 30.0),
+        max_samples=60,
+    )
+    missed = torch.from_numpy(rng.random(problem.missed.shape) < 0.3).double()
+    problem = replace(problem, own_delays=own_delays).with_missed(missed)
+    x = torch.from_numpy(rng.normal(size=problem.zero.shape))
+    problem.per_segment(x)[..., 0] *= 12.0
+    fast = problem.linearised(x)
+    with slowly(monkeypatch):
+        slow = problem.linearised(x)
+    for found, expected in zip(fast, slow, strict=True):
+        assert float((found - expected).abs().max() / expected.abs().max()) < 1e-5
 
 
 @torch.no_grad()

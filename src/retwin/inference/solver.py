@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from retwin.inference.noise import Noise
+from retwin.inference.normal import compiled_step
 from retwin.inference.priors import GaussianPrior, inverse
 from retwin.inference.problem import Problem
 
@@ -154,6 +155,11 @@ def gauss_newton_step(
         Times that samples are weighted anew, at least 1.
 
     """
+    free = x.new_full((x.shape[1],), torch.inf)
+    limits = (-free, free, free) if bounds is None else (bounds.lower, bounds.upper, bounds.step)
+    made = compiled_step(problem, prior, noise, x, linearised, damping, limits, reweightings)
+    if made is not None:
+        return GaussNewtonStep(*made)
     residual, jacobian = linearised
     # Curvature and slope in one product: what takes time here is to pass through the Jacobian.
     joined = torch.cat([jacobian, residual[..., None]], dim=-1).flatten(1, 2)

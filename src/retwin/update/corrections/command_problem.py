@@ -17,7 +17,7 @@ from retwin.update.corrections.correction import Context, DifferentiableTwin
 from retwin.update.corrections.delays import delay_bounds
 from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.warp import gather_samples, interpolate, within
-from retwin.update.kernels.generation import jacobians
+from retwin.update.kernels.generation import jacobians, linearised_outputs
 from retwin.update.piecewise_linear import distinct
 
 __all__ = ["CommandProblem"]
@@ -289,6 +289,9 @@ class CommandProblem:
     @torch.no_grad()
     def linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residual, and the Jacobian (n, S, d_y, P) of the predicted outputs."""
+        made = self._compiled(x)
+        if made is not None:
+            return self._white(made[0]), self._white(made[1])
         parts = [map(part._white, part._linearised(some)) for part, some in self._batches(x)]
         residual, jacobian = zip(*parts, strict=True)
         return torch.cat(residual), torch.cat(jacobian)
@@ -363,6 +366,27 @@ class CommandProblem:
         if self.own_delays:
             parts.append(torch.einsum("nsyu,nmsu->nsymu", by_command, delay))
         return residual, torch.cat(parts, dim=-1).flatten(3)
+
+    def _compiled(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
+        """As `_linearised`, by a compiled kernel; None where that does not apply."""
+        if self.memory:
+            return None
+        made = linearised_outputs(
+            self.surrogate,
+            self.reference,
+            self.segments,
+            x,
+            self.missed,
+            self.sample,
+            self.frozen,
+            unit=self.unit,
+            step=COMMAND_STEP,
+        )
+        if made is None:
+            return None
+        different, place, jacobian = made
+        outputs = self.surrogate(different[None])[0, place].double()
+        return self.observed - outputs / self.unit, jacobian
 
     def _by_command(self, commands: Tensor) -> tuple[Tensor, Tensor]:
         """The residual (n, S, d_y), and the surrogate's Jacobian (n, S, d_y, d_u)."""

@@ -75,20 +75,18 @@ def _one_by_one(
 
     No actuator's command depends on another's: each is computed as a system of one actuator.
     """
-    n, _, width = own_delays.shape
-    index = torch.arange(n).view(len(reference), 1, -1), torch.arange(width)[:, None]
-    row, actuator = (each.flatten() for each in torch.broadcast_tensors(*index))
+    width = own_delays.shape[-1]
     delay, offset, missed = z.split([1, width, width], dim=-1)
-    parts = delay + own_delays, offset, missed
-    commands = effective_commands(
-        reference.mT.flatten(0, 1)[..., None],
-        segments[row.numpy()],
-        torch.stack([each[row, :, actuator] for each in parts], dim=-1),
-        times[row],
-        None if frozen is None else frozen[row, actuator][:, None],
-    )
-    separate = commands.view(len(reference), width, n // len(reference), times.shape[1])
-    return separate.permute(0, 2, 3, 1).flatten(0, 1)
+    columns = []
+    for one in (slice(i, i + 1) for i in range(width)):
+        parts = delay + own_delays[..., one], offset[..., one], missed[..., one]
+        since = None if frozen is None else frozen[:, one]
+        columns.append(
+            effective_commands(
+                reference[..., one], segments, torch.cat(parts, dim=-1), times, since
+            )
+        )
+    return torch.cat(columns, dim=-1)
 
 
 def _moving(reference: Tensor, segments: Segments, z: Tensor, times: Tensor) -> Tensor:

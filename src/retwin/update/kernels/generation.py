@@ -28,9 +28,10 @@ __all__ = [
     "jacobians",
     "joined_samples",
     "library",
+    "linearised_outputs",
 ]
 
-SOURCES = ("network.c", "pieces.c", "warp.c")
+SOURCES = ("network.c", "pieces.c", "warp.c", "linearised.c")
 OUTPUTS = 6
 """Outputs of a layer that are computed together, as in `network.c`."""
 DENSITY = 3.0
@@ -122,6 +123,61 @@ def effective_commands_at(
     return torch.from_numpy(out)
 
 
+def linearised_outputs(
+    surrogate: Any,
+    reference: Tensor,
+    segments: Segments,
+    x: Tensor,
+    missed: Tensor,
+    times: Tensor,
+    frozen: Tensor,
+    *,
+    unit: Tensor,
+    step: float,
+) -> tuple[Tensor, Tensor, Tensor] | None:
+    """The effective commands of `CommandProblem`, and the Jacobian of the outputs by x.
+
+    See there for the arguments; finite differences of the commands have the step `step`.
+
+    Returns
+    -------
+    Tensor
+        (k, d_u), single precision, the commands that differ from the sample before.
+    Tensor
+        (n, S), the row of it that each sample's commands are.
+    Tensor
+        (n, S, d_y, P), the derivatives of the outputs in `unit`.
+
+    """
+    kernel, packed = library(), _packed(getattr(surrogate, "single", surrogate))
+    if kernel is None or packed is None or x.dtype != torch.float64 or not x.numel():
+        return None
+    (n, samples), (steps, width), outputs = times.shape, reference.shape[1:], len(packed[2])
+    if not samples:
+        return None
+    count, own = segments.max_count, x.shape[1] > segments.max_count * (1 + width)
+    points = np.empty((n, samples, width), np.float32)
+    kept, place = np.empty(n, np.int64), np.empty((n, samples), np.int64)
+    jacobian = np.empty((n, samples, outputs, x.shape[1]))
+    size = reference.abs().amax(dim=0).amax(dim=0).clamp_min(1e-12)
+    given = (
+        _doubles(reference),
+        *_times(segments),
+        *map(_doubles, (x, missed, frozen, times)),
+    )
+    call(
+        kernel,
+        "linearised",
+        (n, steps, count, samples, int(own)),
+        step,
+        (*packed[:2], _doubles(size), _doubles(unit)),
+        (*given, points, kept, place, jacobian),
+    )
+    different = points[np.arange(samples) < kept[:, None]]
+    place += (kept.cumsum() - kept)[:, None]
+    return torch.from_numpy(different), torch.from_numpy(place), torch.from_numpy(jacobian)
+
+
 def delayed_path(segments: Segments, path: Tensor, z: Tensor) -> Tensor | None:
     """The path (n, T, d_y), delayed and offset by z (n, M, 1 + d_y); see `path_at`."""
     kernel = library()
@@ -165,15 +221,22 @@ def _packed(surrogate: Any) -> tuple[NDArray, NDArray, NDArray] | None:
     )
     if not suits or not _plain(*(each.weight.detach() for each in dense)):
         return None
-    mean, scale = surrogate.after.mean, surrogate.after.scale
-    numbers = [surrogate.before.mean, surrogate.before.scale, mean, scale]
-    for each in dense:
-        rows = torch.cat([each.weight.detach(), each.bias.detach()[:, None]], dim=1)
-        rows = nn.functional.pad(rows, (0, 0, 0, -len(rows) % OUTPUTS))
-        numbers.append(rows.unflatten(0, (-1, OUTPUTS)).mT.flatten())
+    before, after = surrogate.before, surrogate.after
+    mean, scale = after.mean.numpy(), after.scale.numpy()
+    numbers = [before.mean.numpy(), before.scale.numpy(), mean, scale, *map(_grouped, dense)]
     widths = [len(dense), dense[0].in_features, *(each.out_features for each in dense)]
-    packed = torch.cat(numbers).numpy().astype(np.float32)
-    return np.array(widths, np.int64), packed, _floats(TOLERANCE * scale)
+    packed = np.concatenate(numbers, dtype=np.float32)
+    return np.array(widths, np.int64), packed, (TOLERANCE * scale).astype(np.float32)
+
+
+def _grouped(dense: nn.Linear) -> NDArray:
+    """The weights of a layer and then its biases, for so many outputs at a time."""
+    weights = dense.weight.detach().numpy()
+    groups = -(-dense.out_features // OUTPUTS)
+    rows = np.zeros((groups * OUTPUTS, dense.in_features + 1), np.float32)
+    rows[: len(weights), :-1] = weights
+    rows[: len(weights), -1] = dense.bias.detach().numpy()
+    return rows.reshape(groups, OUTPUTS, -1).transpose(0, 2, 1).ravel()
 
 
 def _times(segments: Segments) -> tuple[NDArray, NDArray, NDArray]:

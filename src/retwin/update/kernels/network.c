@@ -130,15 +130,16 @@ static void activated(i64 out, i64 d, i64 widest, float *x, float *t)
     }
 }
 
-/* Outputs (m, d_y) of commands (m, d_u), and their Jacobians (m, d_y, d_u), in forward mode. */
-EXPORT void slopes(i64 m, double unused, const i64 *widths, const float *numbers, const float *u,
-                   float *y, float *jacobian)
+static size_t sloped_bytes(network net)
 {
-    network net = unpacked(widths, numbers);
+    return 2 * (1 + net.widths[0]) * net.widest * BLOCK * sizeof(float) + 64;
+}
+
+/* Outputs (m, d_y) of commands (m, d_u), and their Jacobians (m, d_y, d_u), in forward mode. */
+static void sloped(network net, i64 m, const float *u, float *y, float *jacobian, void *scratch)
+{
     i64 d = net.widths[0], outputs = net.widths[net.layers], size = net.widest * BLOCK;
-    void *scratch = malloc(2 * (1 + d) * size * sizeof(float) + 64);
     float *a = (float *)(((size_t)scratch + 63) & ~(size_t)63), *b = a + (1 + d) * size;
-    (void)unused;
     for (i64 begin = 0; begin < m; begin += BLOCK) {
         i64 count = m - begin < BLOCK ? m - begin : BLOCK;
         standardised(net, count, u + begin * d, a);
@@ -165,5 +166,14 @@ EXPORT void slopes(i64 m, double unused, const i64 *widths, const float *numbers
                     jacobian[at * d + c] = a[(1 + c) * size + o * BLOCK + k] * net.out_scale[o];
             }
     }
+}
+
+EXPORT void slopes(i64 m, double unused, const i64 *widths, const float *numbers, const float *u,
+                   float *y, float *jacobian)
+{
+    network net = unpacked(widths, numbers);
+    void *scratch = malloc(sloped_bytes(net));
+    (void)unused;
+    sloped(net, m, u, y, jacobian, scratch);
     free(scratch);
 }
