@@ -57,6 +57,12 @@ def test_crps_is_that_of_the_gaussian_for_small_ensembles_too() -> None:
     assert np.isnan(crps(np.array([np.nan]), draws[:, 0, :1])).all()
 
 
+def test_crps_is_that_of_scoringrules() -> None:
+    observed, draws = RNG.normal(size=(7, 3)), RNG.normal(size=(40, 7, 3))
+    wanted = scoringrules.crps_ensemble(observed, draws, m_axis=0, estimator="pwm")
+    np.testing.assert_allclose(crps(observed, draws), wanted, rtol=1e-12)
+
+
 def test_the_pit_of_exchangeable_members_is_uniform_with_ties_too() -> None:
     """Rounded values tie often; the histogram stays flat."""
     ensemble = RNG.normal(size=(40, 2000, 2)).round(1)
