@@ -93,7 +93,7 @@ def crps(observed: NDArray, draws: NDArray) -> NDArray:
     moments.
 
     """
-    # To import `scoringrules`, which compiles all of its scores, takes 3 s where numba is installed.
+    # To import `scoringrules` takes 3 s where numba is installed: it compiles all of its scores.
     count = len(draws)
     rank = np.arange(count).reshape(-1, *[1] * (draws.ndim - 1))
     spread = (rank * np.sort(draws, axis=0)).sum(axis=0) / (count * (count - 1.0))
