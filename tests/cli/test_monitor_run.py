@@ -122,6 +122,41 @@ def test_alarms_and_causes_are_lines_and_a_changed_monitor_is_proposed(
 
 
 @pytest.mark.slow
+def test_a_growing_table_is_read_by_the_mapping_that_data_map_wrote(
+    watched: Path, place: Path, watching, call
+) -> None:
+    healthy, begin = rt.load(watched / "healthy.npz"), round(time.time()) - 1000
+    valve, level = healthy.commands[0, :, 0], healthy.observed[0, :, 0]
+    lines = [
+        f"{begin + k};{u};{100 * y:.17g}\n"
+        for k, (u, y) in enumerate(zip(valve, level, strict=True))
+    ]
+    log = place / "logs" / "tank1.csv"
+    log.write_text("# line 7\ntime;valve;level [cm]\n" + "".join(lines[:300]).replace(".", ","))
+    mapping = place / "mapping.toml"
+    code, _, err = call("data", "map", log, "--case", watched / "case.toml", "--out", mapping)
+    assert code == 0, err
+    settings = SETTINGS.replace("case.toml", str(watched / "case.toml"))
+    source = FOLDER + 'mapping = "mapping.toml"\n'
+    (place / "monitor.toml").write_text(settings + source)
+    running = watching(place)
+    running.wait(lambda: "watching" in running.out())
+    with log.open("a") as file:
+        file.write("".join(lines[300:350]).replace(".", ","))
+    with Store(place / "store", read_only=True) as store:
+
+        def stored() -> np.ndarray:
+            return np.concatenate([np.empty((0, 2)), *(each for _, each in store.samples("tank1"))])
+
+        running.wait(lambda: len(stored()) == 350)
+        np.testing.assert_allclose(stored(), np.stack([valve, level], 1)[:350], rtol=1e-12)
+    stopped(running)
+    mapping.write_text(mapping.read_text().replace("rate = 1.0", "rate = 2.0"))
+    code, _, err = call("monitor", "run", "--config", place / "monitor.toml")
+    assert (code, err.count("\n"), "that of the twin, 1 Hz" in err) == (2, 1, True), err
+
+
+@pytest.mark.slow
 def test_nothing_published_is_lost_by_a_kill(watched: Path, place: Path, watching) -> None:
     broker = Broker(place / "broker").start()
     client = paho.Client(paho.CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)

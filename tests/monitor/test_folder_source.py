@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +14,11 @@ from collecting import CollectingGate, running, wait
 from pyarrow import parquet
 
 import retwin as rt
+from retwin.data.logs.mapping import Mapping
 from retwin.errors import InputError
 from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.folder import Folder
+from retwin.monitor.sources.mapped_tables import mapped_layout
 from retwin.monitor.sources.tables import CHUNK, Layout, layout_of
 
 SECOND = 10**9
@@ -193,3 +197,170 @@ def test_columns_are_those_of_the_case_unless_they_are_given() -> None:
 )
 def test_times_are_read_exactly(unit: str, cell: str, expected: int) -> None:
     assert Layout("time", unit, ()).nanoseconds(cell) == expected
+
+
+TWIN = {
+    "inputs": rt.Channels(("heater",), ("1",)),
+    "outputs": rt.Channels(("T1", "flow"), ("K", "m^3/s")),
+    "rate": 1.0,
+    "case": None,
+}
+MAPPING = {
+    "rate": 1.0,
+    "time": {"column": "Zeit"},
+    "cut": {"by": "gap", "gap": 60.0},
+    "commands": {
+        "heater": {"signal": "on", "resample": "hold", "max_gap": 2.5, "clock_offset": -0.5}
+    },
+    "outputs": {
+        "T1": {"signal": ["upper", "lower"], "clock_offset": -0.5},
+        "flow": {"signal": "Q", "from_unit": "l/min", "clock_offset": -0.5, "max_gap": 3.0},
+    },
+}
+"""As `retwin data map` writes it, completed for a table of other units and another clock."""
+TABLE = """Export of plant 7
+on;Zeit;upper [°C];lower [°C];Q;note
+1;2023-11-14 22:13:20,5;20;21,0;60;a
+0;2023-11-14 22:13:21,5;20,5;21,5;30;b
+"""
+BEGIN = 1_700_000_000
+
+
+def changed(place: str, value: object) -> dict:
+    """The mapping with another value at a place such as time.rate."""
+    *tables, name = place.split(".")
+    made = copy.deepcopy(MAPPING)
+    own = made
+    for each in tables:
+        own = own[each]
+    own[name] = value
+    return made
+
+
+def mapped(pattern: object, lines: list[str]) -> Folder:
+    own = settings(pattern, asset="line1")
+    layout = mapped_layout(Mapping.model_validate(MAPPING), **TWIN)
+    return Folder(own, {"line1": layout}, {}, lines.append)
+
+
+def test_a_mapping_renames_converts_and_shifts_rows_as_they_appear(tmp_path: Path) -> None:
+    lines: list[str] = []
+    gate = CollectingGate()
+    file = tmp_path / "a.csv"
+    title, *rows = TABLE.splitlines(keepends=True)
+    file.write_text(title + rows[0], encoding="latin-1")
+    own = mapped(tmp_path / "*.csv", lines)
+    with running(own, gate):
+        for text in (rows[1], rows[2][:20], rows[2][20:], "x;2023-11-14 22:13:22,5;;1;0,6;c\n"):
+            with file.open("a", encoding="latin-1") as out:
+                out.write(text)
+            time.sleep(0.05)
+        more = [";2023-11-14 22:13:23,5;20;20;0;", "1;yesterday;1;1;1;d", "1;2"]
+        more += [";2023-11-14 22:13:25,5;20;20;0;", "1;2023-11-14 22:13:26,5;20;20;0;"]
+        with file.open("a") as out:
+            out.write("\n".join(more) + "\n")
+        wait(lambda: len(seconds(gate)) == 6, lines)
+    assert seconds(gate) == [BEGIN + k for k in (0, 1, 2, 3, 5, 6)]
+    flow, nan = 1e-3 / 60, np.nan
+    expected = [
+        [1, 293.65, 60 * flow],
+        [0, 294.15, 30 * flow],
+        [nan, nan, 0.6 * flow],
+        [nan, 293.15, 0],
+        [nan, nan, nan],  # the command is missing for longer than max_gap
+        [1, 293.15, 0],
+    ]
+    np.testing.assert_allclose(gate.values("line1"), expected)
+    assert own.refused == 3, "a cell, a time, and a row"
+    log = tmp_path / "log.csv"
+    log.write_text(TABLE, encoding="utf-8")
+    whole = rt.load(log, mapping=Mapping.model_validate(MAPPING), case=Channelled())
+    stream = np.concatenate([whole.commands, whole.observed], axis=2)[0]
+    np.testing.assert_allclose(gate.values("line1")[:2], stream, rtol=1e-6)
+
+
+class Channelled:
+    """What reading a log needs of a case."""
+
+    inputs, outputs, rate = TWIN["inputs"], TWIN["outputs"], TWIN["rate"]
+    classes: tuple[str, ...] = ()
+
+
+def test_a_mapping_reads_parquet_files_that_are_written_anew(tmp_path: Path) -> None:
+    lines: list[str] = []
+    gate = CollectingGate()
+
+    def write(count: int) -> None:
+        stamps = [(BEGIN * 1000 + 500) * 10**6 + k * 10**9 for k in range(count)]
+        columns = {
+            "Zeit": pyarrow.array(stamps, pyarrow.timestamp("ns")),
+            "on": [1.0] * count,
+            "upper [°C]": [20.0 + k for k in range(count)],
+            "lower [°C]": [20.0] * count,
+            "Q": [60.0] * count,
+        }
+        parquet.write_table(pyarrow.table(columns), tmp_path / "part")
+        os.replace(tmp_path / "part", tmp_path / "x.parquet")
+
+    write(2)
+    (tmp_path / "broken.parquet").write_bytes(b"PAR1")
+    with running(mapped(tmp_path / "*.parquet", lines), gate):
+        wait(lambda: len(seconds(gate)) == 2, lines)
+        write(3)
+        wait(lambda: len(seconds(gate)) == 3, lines)
+    assert seconds(gate) == [BEGIN, BEGIN + 1, BEGIN + 2]
+    np.testing.assert_allclose(gate.values("line1")[:, 1], [293.15, 293.65, 294.15])
+    assert any("broken.parquet" in line for line in lines)
+
+
+def test_tables_that_a_mapping_does_not_fit_are_reported_by_name(tmp_path: Path) -> None:
+    lines: list[str] = []
+    gate = CollectingGate()
+    hostile = {
+        "other": TABLE.replace("lower", "lowest"),
+        "units": TABLE.replace("lower [°C]", "lower [K]"),
+        "quantity": TABLE.replace("°C", "m"),
+        "clock": TABLE.replace("Zeit", "when"),
+        "text": "nothing at all\n" * 3,
+        "zero": "\0" * 500 + "\n",
+    }
+    for name, text in hostile.items():
+        (tmp_path / f"{name}.csv").write_text(text)
+    (tmp_path / "wide.csv").write_text(TABLE, encoding="utf-16")
+    own = mapped(tmp_path / "*.csv", lines)
+    with running(own, gate):
+        wait(lambda: own.refused == len(hostile) + 1, lines)
+    assert not seconds(gate)
+    for name in (*hostile, "wide"):
+        assert any(f"{name}.csv" in line for line in lines), name
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "reason"),
+    [
+        ("rate", 2.0, "that of the twin, 1 Hz"),
+        ("time.rate", 1.0, "a column of times"),
+        ("cut", {"by": "length", "length": 5.0}, "all rows of a stream"),
+        ("cut", {"by": "trigger", "signal": "on"}, "all rows of a stream"),
+        ("cut.min_length", 5.0, "all rows of a stream"),
+        ("commands.heater.resample", "linear", "held until the next row"),
+        ("outputs.T1.resample", "hold", "what was not measured is missing"),
+        ("outputs.T1.clock_offset", 0.0, "a row of a stream has one time"),
+        ("outputs", {"T1": {"signal": "upper"}}, "T1, flow"),
+    ],
+)
+def test_what_a_stream_cannot_do_is_refused_with_the_reason(
+    place: str, value: object, reason: str
+) -> None:
+    with pytest.raises(InputError, match=reason):
+        mapped_layout(Mapping.model_validate(changed(place, value)), **TWIN)
+
+
+def test_a_unit_that_neither_the_twin_nor_the_mapping_states_is_refused(tmp_path: Path) -> None:
+    outputs = rt.Channels(("T1", "flow"), ("1", "m^3/s"))
+    layout = mapped_layout(Mapping.model_validate(MAPPING), **(TWIN | {"outputs": outputs}))
+    (tmp_path / "a.csv").write_text(TABLE)
+    with pytest.raises(InputError, match=r"write unit = … for T1"):
+        list(layout.table(tmp_path / "a.csv").rows())
+    with pytest.raises(ValueError, match="either a mapping, or columns, time and unit"):
+        settings("a.csv", asset="line1", mapping="m.toml", time="Zeit")

@@ -33,6 +33,7 @@ from retwin.monitor.settings import (
     secret,
 )
 from retwin.monitor.sources.folder import Folder
+from retwin.monitor.sources.mapped_tables import MappedLayout, mapped_layout
 from retwin.monitor.sources.mqtt import Mqtt
 from retwin.monitor.sources.opcua import OpcUa
 from retwin.monitor.sources.source import Source
@@ -236,7 +237,8 @@ def _folders(
 ) -> list[Source]:
     cases_ = {name: systems[asset.twin] for name, asset in whole.assets.items()}
     newest = {each.asset: each.time for each in live.status() if each.time is not None}
-    layouts: dict[str, Layout] = {}
+    mapping = None if settings.mapping is None else read_mapping(settings.mapping)
+    layouts: dict[str, Layout | MappedLayout] = {}
     recorded: dict[str, Recorded] = {}
     for name in [settings.asset] if settings.asset else whole.assets:
         monitor = live.monitor(name)
@@ -250,13 +252,16 @@ def _folders(
                 got=settings.files,
                 remedy="give tables of samples, since its monitor watches no whole trajectories",
             )
-            layouts[name] = layout_of(settings, live.channels(name), cases_[name])
+            if mapping is None:
+                layouts[name] = layout_of(settings, live.channels(name), cases_[name])
+            else:
+                twin = monitor.twin
+                channels = (twin.inputs, twin.outputs, twin.rate)
+                layouts[name] = mapped_layout(mapping, *channels, cases_[name])
     made: list[Source] = []
     if layouts:
         made.append(Folder(settings, layouts, newest, report))
     if recorded:
-        if settings.mapping is not None:
-            read_mapping(settings.mapping)
         made.append(TrajectoryFolder(settings, recorded, newest, report))
     return made
 

@@ -83,12 +83,15 @@ class FolderSource(Part):
     settle: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 2.0
     """Time in s without a change after which a file of trajectories is complete."""
     mapping: Beside | None = None
-    """File mapping.toml by which logs become trajectories."""
+    """File mapping.toml of `retwin data map`: which columns are which channels, with their units
+    and clock, instead of `columns`, `time` and `unit`; and how logs become trajectories."""
 
     @model_validator(mode="after")
     def _names_one_asset(self) -> FolderSource:
         if ("{asset}" in self.files) == (self.asset is not None):
             raise ValueError("either {asset} in files, or an asset")
+        if self.mapping is not None and (self.columns or self.time or self.unit):
+            raise ValueError("either a mapping, or columns, time and unit")
         return self
 
 

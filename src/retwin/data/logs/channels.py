@@ -18,7 +18,7 @@ from retwin.data.resampling import Resampling, longest_bridge, resampled
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 
-__all__ = ["Channel", "channels_of", "in_order", "signal_of", "table_of"]
+__all__ = ["Channel", "channels_of", "in_order", "in_unit", "signal_of", "table_of"]
 
 DISORDER = 10.0
 """Longest step back in time, in median intervals, that is a matter of order: messages of several
@@ -151,26 +151,56 @@ def _channel(
         signal.name == each or signal.name.startswith((f"{each}.", f"{each}[")) for each in topics
     ):
         notes.append("no header stamps, time of recording")
-    values = signal.values
+    values, target, done = in_unit(
+        signal.values, own, signal.unit, unit, f"{log.name}, {signal.name}"
+    )
+    notes += done
+    if own.clock_offset:
+        notes.append(f"clock {own.clock_offset:+g} s")
+    made = replace(signal, times=signal.times + own.clock_offset, values=values, unit=target)
+    known = made.times[np.isfinite(made.values)]
+    longest = own.max_gap or longest_bridge(known, period)
+    return Channel(name, target, made, own.resample or default, longest, tuple(notes))
+
+
+def in_unit(
+    values: NDArray, own: ChannelMapping, stated: str, unit: str | None, where: str
+) -> tuple[NDArray, str, list[str]]:
+    """Values (n,) of a signal as those of its channel, their unit, and what was done to them.
+
+    Parameters
+    ----------
+    values : NDArray
+        Values of the signal.
+    own : ChannelMapping
+        The channel in the mapping.
+    stated : str
+        The unit that the log states, "" for none.
+    unit : str or None
+        The unit that the case has.
+    where : str
+        Log and signal, for messages.
+
+    Raises
+    ------
+    InputError
+        A unit is not known, or is not converted to the other.
+
+    """
+    notes = []
     if own.scale != 1 or own.shift != 0:
         values = values * own.scale + own.shift
         notes.append(f"times {own.scale:g} plus {own.shift:g}")
         source = own.from_unit or own.unit or unit or "1"
     else:
-        source = own.from_unit or signal.unit or own.unit or unit or "1"
-        if not (own.from_unit or signal.unit or own.unit) and unit and unit != "1":
+        source = own.from_unit or stated or own.unit or unit or "1"
+        if not (own.from_unit or stated or own.unit) and unit and unit != "1":
             notes.append(f"no unit in the log, taken as {unit}")
     target = unit or own.unit or source
     if not same_unit(source, target):
-        values = converted(values, source, target, f"{log.name}, {signal.name}")
+        values = converted(values, source, target, where)
         notes.append(f"{source} to {target}")
-    if own.clock_offset:
-        notes.append(f"clock {own.clock_offset:+g} s")
-    values = np.where(np.isfinite(values), values, np.nan)
-    made = replace(signal, times=signal.times + own.clock_offset, values=values, unit=target)
-    known = made.times[np.isfinite(made.values)]
-    longest = own.max_gap or longest_bridge(known, period)
-    return Channel(name, target, made, own.resample or default, longest, tuple(notes))
+    return np.where(np.isfinite(values), values, np.nan), target, notes
 
 
 def _mean_of(log: Log, names: Sequence[str]) -> Signal:

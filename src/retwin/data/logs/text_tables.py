@@ -17,7 +17,16 @@ from retwin.data.logs.signals import Clock, Signal, Skipped, named_unit
 from retwin.data.logs.tables import MISSING, TRUTH, numbers, table_signals, time_column
 from retwin.errors import InputError, brief
 
-__all__ = ["read", "read_cells"]
+__all__ = [
+    "AGREEING",
+    "HEAD",
+    "SEPARATORS",
+    "TextLayout",
+    "decimal_comma",
+    "read",
+    "read_cells",
+    "text_layout",
+]
 
 SEPARATORS = (";", "\t", ",", "|")
 """Separators in the order in which they are tried; blanks come last."""
@@ -63,6 +72,19 @@ class TextLayout:
     names: tuple[str, ...]
     units: tuple[str, ...]
     comma: bool
+
+    def cells(self, line: str) -> Sequence[str]:
+        """The cells of a row; ValueError or csv.Error if it has more or less than the table."""
+        if self.separator:
+            (row,) = csv.reader([line], delimiter=self.separator, strict=True)
+        else:
+            row = line.split()
+        width = len(self.names)
+        if len(row) == width + 1 and not row[-1].strip():
+            row = row[:-1]  # a separator at the end of each line
+        if len(row) != width:
+            raise ValueError(f"{len(row)} of {width} cells")
+        return row
 
 
 def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Signal | Skipped]:
@@ -149,7 +171,7 @@ def read_cells(path: Path, wanted: Sequence[str]) -> tuple[dict[str, list[str]],
         )
     separator, rows, place = found[0]
     names = tuple(cell.strip() for cell in rows[place])
-    comma = _decimal_comma(rows[place + 1 :], separator)
+    comma = decimal_comma(rows[place + 1 :], separator)
     layout = TextLayout(encoding, separator, place + 1, names, ("",) * len(names), comma)
     cells: dict[str, list[str]] = {name: [] for name in wanted}
     for block in _blocks(path, layout, empty=True, strict=True):
@@ -238,6 +260,18 @@ def _layout(path: Path) -> TextLayout:
     encoding = _encoding(path)
     with _opened(path, encoding) as file:
         lines = list(islice(_lines(file, path), HEAD))
+    return text_layout(lines, encoding, path)
+
+
+def text_layout(lines: Sequence[str], encoding: str, path: Path) -> TextLayout:
+    """How a table is written of which these are the first lines, `HEAD` at most.
+
+    Raises
+    ------
+    InputError
+        They hold no row of numbers.
+
+    """
     best: tuple[int, int, str] | None = None
     for separator in (*SEPARATORS, ""):
         rows = list(_rows(iter(lines), separator, path))
@@ -262,11 +296,11 @@ def _layout(path: Path) -> TextLayout:
     rows = list(_rows(iter(lines), separator, path))
     width = _width(rows, first)
     names, units = _titles(_head(rows[:first], width, path), width)
-    comma = _decimal_comma(rows[first:], separator)
+    comma = decimal_comma(rows[first:], separator)
     return TextLayout(encoding, separator, first, names, units, comma)
 
 
-def _decimal_comma(rows: Sequence[Sequence[str]], separator: str) -> bool:
+def decimal_comma(rows: Sequence[Sequence[str]], separator: str) -> bool:
     """Whether decimals are after a comma in some cell."""
     cells = (cell.strip() for row in rows for cell in row)
     return separator != "," and any(DECIMAL_COMMA.fullmatch(cell) for cell in cells)

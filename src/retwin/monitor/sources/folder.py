@@ -14,8 +14,9 @@ from retwin.errors import InputError
 from retwin.monitor.gate import Gate
 from retwin.monitor.samples import Samples
 from retwin.monitor.settings import FolderSource
+from retwin.monitor.sources.mapped_tables import MappedLayout
 from retwin.monitor.sources.source import Source
-from retwin.monitor.sources.tables import Layout, Table, table_at
+from retwin.monitor.sources.tables import Layout, Table
 
 __all__ = ["Folder", "base_of"]
 
@@ -34,7 +35,7 @@ class Folder(Source):
     ----------
     settings : FolderSource
         Its pattern is absolute.
-    layouts : mapping of str to Layout
+    layouts : mapping of str to Layout or MappedLayout
         The columns of each machine's files.
     newest : mapping of str to int
         Time of the newest stored sample of each machine that has any, in ns.
@@ -46,7 +47,7 @@ class Folder(Source):
     def __init__(
         self,
         settings: FolderSource,
-        layouts: Mapping[str, Layout],
+        layouts: Mapping[str, Layout | MappedLayout],
         newest: Mapping[str, int],
         report: Callable[[str], None],
     ) -> None:
@@ -69,14 +70,14 @@ class Folder(Source):
                     self.lost(f"there is no folder {base}")
             stop.wait(self._settings.every)
 
-    def _changed(self, asset: str, pattern: str, layout: Layout) -> list[Table]:
+    def _changed(self, asset: str, pattern: str, layout: Layout | MappedLayout) -> list[Table]:
         """The files of a machine that were written to, in the order of their new rows."""
         paths = glob.glob(pattern, recursive=True)
         for key in [key for key in self._tables if key[0] == asset and key[1] not in paths]:
             del self._tables[key]
         found = []
         for path in sorted(paths):
-            table = self._tables.setdefault((asset, path), table_at(Path(path), layout))
+            table = self._tables.setdefault((asset, path), layout.table(Path(path)))
             try:
                 if table.changed():
                     first = next((rows.times[0] for rows in table.rows() if len(rows.times)), None)

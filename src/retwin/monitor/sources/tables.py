@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from retwin.errors import InputError, brief
 from retwin.monitor.samples import nanoseconds
 from retwin.monitor.settings import FolderSource
 
-__all__ = ["Layout", "Rows", "Table", "layout_of", "table_at"]
+__all__ = ["Layout", "Rows", "Table", "TextTable", "layout_of"]
 
 CHUNK = 2**16
 """Bytes of a CSV file, and of one of its rows, that are read at once."""
@@ -61,6 +61,10 @@ class Layout:
         found = [np.mean([cells[each] for each in own], axis=0) for own in self.columns]
         made = np.array(found, dtype=float).reshape(len(self.columns), -1).T
         return np.where(np.isfinite(made), made, np.nan)
+
+    def table(self, path: Path) -> Table:
+        """What reads that file, by its suffix."""
+        return (Parquet if path.suffix == ".parquet" else Csv)(path, self)
 
 
 @dataclass(frozen=True)
@@ -104,9 +108,12 @@ def layout_of(settings: FolderSource, channels: Sequence[str], case: Case | None
     return Layout(time, unit, tuple((e,) if isinstance(e, str) else tuple(e) for e in several))
 
 
-def table_at(path: Path, layout: Layout) -> Table:
-    """What reads that file, by its suffix."""
-    return (Parquet if path.suffix == ".parquet" else Csv)(path, layout)
+class Columns(Protocol):
+    """What a table must have."""
+
+    @property
+    def wanted(self) -> list[str]:
+        """The columns that are read."""
 
 
 class Table(ABC):
@@ -116,12 +123,14 @@ class Table(ABC):
     ----------
     path : Path
         The file.
-    layout : Layout
+    layout : Columns
         Its columns.
 
     """
 
-    def __init__(self, path: Path, layout: Layout) -> None:
+    layout: Columns
+
+    def __init__(self, path: Path, layout: Columns) -> None:
         self.path = path
         self.layout = layout
         self.place: Any = None
@@ -162,10 +171,18 @@ class _Place:
     header: tuple[str, ...]
 
 
-class Csv(Table):
-    """A CSV file with a header. An incomplete last row waits for its end."""
+class TextTable(Table):
+    """Rows of text. An incomplete last one waits for its end.
+
+    A place has the bytes that were read, `offset`, and those before, `tail`.
+    """
+
+    @abstractmethod
+    def _parsed(self, text: bytes, place: Any) -> Rows:
+        """Complete lines from a place on; the end is None if they hold no row yet."""
 
     def rows(self) -> Iterator[Rows]:
+        """New rows part by part; see `Table`."""
         try:
             with self.path.open("rb") as file:
                 place = self._kept(file)
@@ -180,18 +197,26 @@ class Csv(Table):
                     made = self._parsed(text, place)
                     yield made
                     place = made.end
+                    if place is None:
+                        return
         except (OSError, ValueError, csv.Error) as error:
             if isinstance(error, InputError):
                 raise
             raise self.refusing(error) from None
 
-    def _kept(self, file: Any) -> _Place | None:
+    def _kept(self, file: Any) -> Any:
         """How far the file was read, if it still is the same up to there."""
-        place: _Place | None = self.place
+        place = self.place
         if place is None:
             return None
         file.seek(place.offset - len(place.tail))
         return place if file.read(len(place.tail)) == place.tail else None
+
+
+class Csv(TextTable):
+    """A CSV file with a header."""
+
+    layout: Layout
 
     def _parsed(self, text: bytes, place: _Place | None) -> Rows:
         tail = ((place.tail if place else b"") + text)[-TAIL:]
@@ -230,6 +255,8 @@ class Csv(Table):
 
 class Parquet(Table):
     """A Parquet file, which is written anew when it grows."""
+
+    layout: Layout
 
     def rows(self) -> Iterator[Rows]:
         parquet = needs_extra("pyarrow.parquet", "parquet", "reads Parquet files")

@@ -21,7 +21,7 @@ from retwin.monitor.samples import LONGEST, SECOND, Trajectory
 from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.folder import base_of
 from retwin.monitor.sources.source import Source
-from retwin.monitor.sources.tables import layout_of, table_at
+from retwin.monitor.sources.tables import layout_of
 from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.twins.twin import check_channels
 
@@ -143,7 +143,7 @@ class TrajectoryFolder(Source):
         own, twin = self._machines[asset], self._machines[asset].monitor.twin
         channels = (*twin.inputs.names, *twin.outputs.names)
         times, rows = [], []
-        for part in table_at(path, layout_of(self._settings, channels, own.case)).rows():
+        for part in layout_of(self._settings, channels, own.case).table(path).rows():
             for reason in part.bad:
                 self.refuse(reason)
             times.append(part.times)
