@@ -13,6 +13,7 @@ import retwin as rt
 from retwin.twins import Parameter, State, StateTwin
 from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
 from retwin.update.dynamics.noise import fit_noise, folds
+from retwin.update.dynamics.noise_search import Search
 from retwin.update.dynamics.online import OnlineFilter
 
 LAG = StateTwin(
@@ -59,6 +60,24 @@ def test_it_is_left_out_where_noise_is_constant(twin: DynamicsTwin) -> None:
     found = fit_noise(twin, constant, [0], parts, np.zeros((10, len(twin.values))))
     assert found.proportional == pytest.approx([0.0])
     assert np.sqrt(found.process) == pytest.approx([CONSTANT], rel=0.3)
+
+
+def test_the_search_finds_what_a_grid_finds_with_few_calls(twin: DynamicsTwin) -> None:
+    made = record(PROPORTIONAL)
+    search = Search(twin, made, np.array([0]), folds(made.mask, 10), np.zeros((10, 2)))
+    found = search.visited(search.visited().best)
+    best = found.scores.sum(axis=1).max()
+    assert len(found.points) < 300
+    axis = np.linspace(np.log(1e-6), 0, 9)
+    grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    around = found.best + np.random.default_rng(0).normal(0, 0.2, size=(200, 3))
+    assert max(search.predicted(each)[1].sum() for each in (*grid, *around)) <= best + 0.01
+    # Without each part, no visited point is better for the others than the step of scoring.
+    more = found.points[:, None] + np.random.default_rng(1).normal(0, 0.02, size=(3, 3))
+    scores = np.array([search.predicted(each)[1] for each in more[-40:].reshape(-1, 3)])
+    others = found.scores.sum(axis=1)[:, None] - found.scores
+    near = (scores.sum(axis=1)[:, None] - scores).max(axis=0)
+    assert (near <= others.max(axis=0) + 0.02).all()
 
 
 def test_intervals_hold_what_they_promise_after_a_switch_and_between(twin: DynamicsTwin) -> None:
