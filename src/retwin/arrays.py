@@ -15,6 +15,7 @@ __all__ = [
     "check_shapes",
     "floating",
     "floats",
+    "held",
     "interpolated",
     "is_finite",
     "measured",
@@ -224,6 +225,14 @@ def interpolated(values: NDArray, at: ArrayLike, stride: int = 1) -> NDArray:
             np.take_along_axis(values, index[..., None], axis=-2) for index in (before, after)
         )
     return (1 - fraction) * left + fraction * right
+
+
+def held(values: NDArray, axis: int) -> NDArray:
+    """Values in which one that is not finite is the one before along an axis, if there is any."""
+    moved = np.moveaxis(values, axis, 0)
+    places = np.arange(len(moved)).reshape(-1, *(1,) * (moved.ndim - 1))
+    index = np.maximum.accumulate(np.where(np.isfinite(moved), places, 0), axis=0)
+    return np.moveaxis(np.take_along_axis(moved, index, axis=0), 0, axis)
 
 
 def is_finite(values: NDArray) -> bool:

@@ -160,6 +160,32 @@ def test_a_missing_command_is_the_one_before(monitor: Monitor) -> None:
         monitor.step(state, commands, whole.observed)
 
 
+@pytest.mark.parametrize("wrong", [1e6, -1e12, 3.4e38, 1e308, np.inf])
+def test_a_command_that_cannot_be_one_is_the_one_before(monitor: Monitor, wrong: float) -> None:
+    whole = record(1, 3)
+    commands, measured = whole.commands.astype(float), whole.observed
+    commands[0, 301] = wrong
+    held = commands.copy()
+    held[0, 301] = held[0, 300]
+    expected = monitor.step(monitor.start(1), held, measured)[1]
+    state, first = monitor.step(monitor.start(1), commands[:, :302], measured[:, :302])
+    found = monitor.step(state, commands[:, 302:], measured[:, 302:])[1]
+    joined = np.concatenate([first.evidence, found.evidence], axis=1)
+    assert joined.tobytes() == expected.evidence.tobytes()
+    assert first.outside[0] == np.isfinite(wrong)
+    assert not found.outside[0]
+    assert not expected.alarms
+
+
+def test_a_first_command_that_cannot_be_one_is_taken_as_it_is(monitor: Monitor) -> None:
+    whole = record(1, 3, steps=200)
+    commands = whole.commands.astype(float)
+    commands[0, 0] = 1e9
+    found = monitor.step(monitor.start(1), commands, whole.observed)[1]
+    assert found.outside[0]
+    assert np.isfinite(found.evidence).all()
+
+
 @pytest.mark.parametrize("value", [1e300, -1e300, np.inf, np.nan])
 def test_hostile_outputs_leave_the_monitor_usable(monitor: Monitor, value: float) -> None:
     whole = record(1, 3)
@@ -247,7 +273,7 @@ def test_causes_are_any_change_where_no_faults_are_known(
 def test_a_filter_that_diverges_voids_the_promise_and_begins_anew(monitor: Monitor) -> None:
     whole = record(2, 3)
     commands = whole.commands.astype(float).copy()
-    commands[0, 300] = 1e308
+    commands[0, 0] = 1e308  # no plausible one is before it
     state, found = monitor.step(monitor.start(2), commands, whole.observed)
     assert found.outside.tolist() == [True, False]
     assert found.void[:, -1].tolist() == [True, False]

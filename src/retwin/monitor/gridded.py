@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.arrays import held
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.samples import SECOND
 from retwin.monitor.store import Store
@@ -58,7 +59,7 @@ def gridded(
     inside = place <= (last - first) / period
     rows = np.full((int(place[inside][-1]) + 1, given.shape[1]), np.nan)
     rows[place[inside]] = given[chosen[inside]]
-    rows[:, :commands] = _held(rows[:, :commands])
+    rows[:, :commands] = held(rows[:, :commands], 0)
     return found[0] + np.round(np.arange(len(rows)) * period).astype(np.int64), rows
 
 
@@ -69,7 +70,7 @@ def record_of(twin: Any, values: NDArray) -> Trajectories:
     """
     commands, measured = np.split(values, [len(twin.inputs)], axis=1)
     return Trajectories(
-        commands=_held(commands)[None],
+        commands=held(commands, 0)[None],
         nominal=np.zeros_like(measured)[None],
         observed=np.where(np.isfinite(measured), measured, 0.0)[None],
         mask=np.isfinite(measured)[None],
@@ -78,10 +79,3 @@ def record_of(twin: Any, values: NDArray) -> Trajectories:
         inputs=twin.inputs,
         outputs=twin.outputs,
     )
-
-
-def _held(commands: NDArray) -> NDArray:
-    """Commands (T, d_u) in which a missing one is the one before."""
-    known = np.isfinite(commands)
-    index = np.maximum.accumulate(np.where(known, np.arange(len(commands))[:, None], 0), axis=0)
-    return np.take_along_axis(commands, index, axis=0)

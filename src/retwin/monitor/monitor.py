@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from retwin.arrays import held
 from retwin.checks import finite, require
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.detector import Detector
@@ -30,6 +31,10 @@ __all__ = ["Monitor"]
 
 KIND = "monitor"
 """Kind of the saved model."""
+IMPLAUSIBLE = 100.0
+"""Ranges of a command in calibration by which it may leave that range. What is farther away stands
+for a missing one, such as 1e9 or 3.4e38; a filter that took it for real would predict nothing until
+the states have decayed from there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +128,8 @@ class Monitor:
         state : MonitorState
             After the samples before. It is not changed.
         commands : array_like, shape (n, T, d_u)
-            A command that is not finite is the one before it; the first must be finite.
+            A command that is not finite, or is 100 times its range in calibration away from that,
+            is the one before it; the first must be finite.
         measured : array_like, shape (n, T, d_y)
             Outputs; those that are not finite are missing.
         ids : sequence of str, optional
@@ -181,7 +187,7 @@ class Monitor:
         deviation = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
         shape = (count, len(self.slack), samples)
         score = np.moveaxis(middle(low, high).reshape(shape)[:, :outputs], 1, 2)
-        outside = self.twin.outside(known)
+        outside = self.twin.outside(known) | self._implausible(commands).any(axis=(1, 2))
         return state, Watched(mean, deviation, score, evidence, alarm, void, outside, alarms)
 
     def watch(self, record: Trajectories) -> Watched:
@@ -259,19 +265,28 @@ class Monitor:
         return state, (evidence, alarm, void, alarms)
 
     def _held(self, state: MonitorState, commands: NDArray) -> NDArray:
-        """Commands (n, T, d_u), where those that are not finite are as before."""
-        known = np.concatenate([state.filters[0].commands[:, -1:], commands], axis=1)
-        index = np.where(np.isfinite(known), np.arange(known.shape[1])[:, None], 0)
-        index = np.maximum.accumulate(index, axis=1)
-        held = np.take_along_axis(known, index, axis=1)[:, 1:]
+        """Commands (n, T, d_u), where those that are missing or implausible are as before."""
+        given = np.concatenate([state.filters[0].commands[:, -1:], commands], axis=1)
+        known = held(np.where(self._implausible(given), np.nan, given), 1)
+        # Without a plausible one before, an implausible one is all that is known.
+        known = np.where(np.isfinite(known), known, held(given, 1))[:, 1:]
         require(
-            np.isfinite(held).all(),
+            np.isfinite(known).all(),
             "commands",
             expected="finite commands at the first sample of each machine",
             got="others",
             remedy="begin at the first sample whose commands are known",
         )
-        return held
+        return known
+
+    def _implausible(self, commands: NDArray) -> NDArray:
+        """Whether commands (n, T, d_u) are so far from those of the calibration."""
+        domain, states = self.twin.domain, len(self.twin.process)
+        low, high = domain.low[states:], domain.high[states:]
+        largest = np.maximum(high - low, np.maximum(np.abs(low), np.abs(high)))
+        far = IMPLAUSIBLE * np.where(largest > 0, largest, np.inf)
+        made: NDArray = np.isfinite(commands) & ((commands < low - far) | (commands > high + far))
+        return made
 
     @cached_property
     def _filters(self) -> tuple[OnlineFilter, ...]:
