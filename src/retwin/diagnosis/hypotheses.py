@@ -195,7 +195,8 @@ def _actuator_and_size(fault: Fault | None) -> tuple[int, tuple[float, float]]:
         "faults",
         expected="None, Stuck, or ActuatorBias with its bias open",
         got=repr(fault),
-        remedy="leave out what cannot be inverted, or train a diagnoser",
+        remedy="leave out what cannot be inverted, train a diagnoser, or correct the dynamics "
+        "(fit_dynamics, retwin fit --dynamics), by which every kind of fault is inverted",
     )
 
 

@@ -12,7 +12,7 @@ from scipy.stats import t as student
 
 from retwin.checks import instance, require
 from retwin.data.trajectories import HEALTHY, Trajectories
-from retwin.diagnosis.hypotheses import Hypotheses
+from retwin.diagnosis.hypotheses import Hypotheses, checked
 from retwin.diagnosis.inversion import InversionDiagnoser, invert
 from retwin.diagnosis.latent_prior import command_problem, healthy_prior
 from retwin.diagnosis.missed_segments import fitted_noise
@@ -105,6 +105,7 @@ def fit_inversion(
             got=type(residual).__name__,
             remedy="fit it with CommandSpace",
         )
+    faults = checked(faults)  # before the noise is fitted, which takes a minute
     remedy = "give those that the residual model was fitted to"
     calibration = instance("calibration", calibration, Trajectories, remedy=remedy)
     healthy = calibration.with_label(HEALTHY)

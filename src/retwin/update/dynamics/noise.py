@@ -149,7 +149,11 @@ def edges(states: NDArray, commands: NDArray, count: int) -> list[NDArray]:
 
 
 def widening(twin: DynamicsTwin, estimation: Estimation, held_out: HeldOut) -> float:
-    """Factor of deviations, with which bands hold as many held-out samples as they should."""
+    """Factor of deviations, with which bands hold as many held-out samples as they should.
+
+    None makes bands narrower: what is held out lies between samples that were used, and its errors
+    are smaller than those of a further trajectory.
+    """
     deviation = np.sqrt(held_out.variances + twin.noise_variance(estimation.commands))
     ratio = (np.abs(held_out.errors) / deviation)[estimation.seen]
-    return max(float(np.quantile(ratio, LEVEL) / ndtri((1 + LEVEL) / 2)), SMALLEST)
+    return max(float(np.quantile(ratio, LEVEL) / ndtri((1 + LEVEL) / 2)), 1.0)
