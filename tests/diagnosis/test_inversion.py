@@ -25,6 +25,7 @@ from retwin.scores.classification import score
 from retwin.testing import DIAGNOSER_CHECKS, DiagnoserSubject
 from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_from
 from retwin.twins.samplers import RampSampler
+from retwin.twins.system_faults import ActuatorGain
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.missed_segments import LatentPrior, fitted
@@ -409,6 +410,10 @@ def test_what_cannot_be_inverted_is_refused(
     faulty = emulated.with_label("Motor_1_Stuck")
     with pytest.raises(rt.InputError, match="at least one trajectory labelled 'Healthy'"):
         fit_inversion(*parts, faulty, inversion.faults)
+    # Of an unlabelled set there is nothing to fit: the faults are refused before.
+    weak = {"Healthy": None, "weak": ActuatorGain(0, size=-0.5)}
+    with pytest.raises(rt.InputError, match="fit_dynamics"):
+        fit_inversion(*parts, faulty, weak)
     fewer = emulated[:2].replace(inputs=rt.Channels.numbered("u", 4))
     with pytest.raises(rt.InputError, match=r"trajectories.inputs"):
         inversion.predict_proba(fewer)
