@@ -300,7 +300,13 @@ def _residual_line(rg: ResidualModel | SequenceResidual) -> str:
     emulated = "EMULATED " if rg.emulated else ""
     if isinstance(rg, ResidualModel):
         counted = f"{figures['movements']:.0f} segments of {figures['trajectories']:.0f} "
-        return f"Residual model: {counted}{emulated}trajectories; {reason}."
+        shares = [
+            f"{figures[f'coverage90_{name}']:.0%} of {name}"
+            for name in rg.outputs.names
+            if f"coverage90_{name}" in figures
+        ]
+        bands = f" Bands of 90 % hold {', '.join(shares)} in the calibration." if shares else ""
+        return f"Residual model: {counted}{emulated}trajectories; {reason}.{bands}"
     latent = zip(rg.latent.names, rg.latent.units, strict=True)
     errors = ", ".join(f"{name} {figures[f'rmse_{name}']:.3g} {unit}" for name, unit in latent)
     return (

@@ -249,10 +249,26 @@ def test_draws_follow_the_distribution_and_the_bounds(
         scores = offset.normal_scores(drawn[..., 1:])[:, 0, 0].numpy()
     assert stats.kstest(scores, "norm").pvalue > 1e-6
     brief, bounds = rt.Mixture(training=Training(max_epochs=3)), np.array([1.0, 0.1])
-    tight = rt.fit_residual(identity, toy(60, seed=5)[0], density=brief, seed=0, bounds=bounds)
+    with pytest.warns(UserWarning, match="bands of 90 % hold"):
+        tight = rt.fit_residual(identity, toy(60, seed=5)[0], density=brief, seed=0, bounds=bounds)
     assert tight.sample(context, generator=generator).abs().amax((0, 1)).tolist() == pytest.approx(
         [1.0, 0.1]
     )
+
+
+def test_a_correction_that_cannot_express_the_discrepancy_is_named(identity: rt.Surrogate) -> None:
+    """Noise of each sample is no delay and no offset: bands of 90 % hold a third of the samples."""
+    real, _ = toy(12, seed=6)
+    rng = np.random.default_rng(0)
+    noisy = real.replace(observed=real.observed + 0.5 * rng.normal(size=real.observed.shape))
+    brief = rt.Mixture(training=Training(max_epochs=3))
+    with pytest.warns(UserWarning, match="DelayOffset cannot express.*SampledSensor"):
+        model = rt.fit_residual(identity, noisy, density=brief, seed=0)
+    assert model.fitted.figures["coverage90_y1"] < 0.7
+
+
+def test_bands_hold_what_the_correction_expresses(fitted: dict[int, rt.ResidualModel]) -> None:
+    assert fitted[3].fitted.figures["coverage90_y1"] > 0.75, "without noise, an eighth is exact"
 
 
 def test_a_density_integrates_to_one() -> None:

@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 from retwin.update.corrections.additive import Additive
-from retwin.update.corrections.chain import Chain, fit_correction, measured_outputs, sample_mask
+from retwin.update.corrections.chain import (
+    Chain,
+    fit_correction,
+    measured_outputs,
+    sample_mask,
+    sensor_of,
+)
 from retwin.update.corrections.command_space import CommandSpace
 from retwin.update.corrections.correction import Context, Correction, Discrepancy, Head
 from retwin.update.corrections.delay_offset import DelayOffset
@@ -23,6 +29,7 @@ __all__ = [
     "fit_correction",
     "measured_outputs",
     "sample_mask",
+    "sensor_of",
 ]
 
 

@@ -19,7 +19,7 @@ from retwin.update.corrections.correction import (
 )
 from retwin.update.corrections.sampled_sensor import SampledSensor
 
-__all__ = ["Chain", "fit_correction", "measured_outputs", "sample_mask"]
+__all__ = ["Chain", "fit_correction", "measured_outputs", "sample_mask", "sensor_of"]
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Chain:
     second: Correction | SampledSensor
 
     def __post_init__(self) -> None:
-        if isinstance(self.first, SampledSensor) or _sensor(self.first) is not None:
+        if isinstance(self.first, SampledSensor) or sensor_of(self.first) is not None:
             raise InputError(
                 "first",
                 expected="an operator that acts on the system, the sensor being last",
@@ -165,7 +165,7 @@ def _either(one: Tensor | None, other: Tensor | None) -> Tensor | None:
     return one if other is None else other if one is None else one | other
 
 
-def _sensor(correction: Correction) -> SampledSensor | None:
+def sensor_of(correction: Correction) -> SampledSensor | None:
     """The sensor at the end of a chain, if there is one."""
     last = correction.second if isinstance(correction, Chain) else None
     return last if isinstance(last, SampledSensor) else None
@@ -175,7 +175,7 @@ def fit_correction(
     correction: Correction, context: Context, observed: Tensor, mask: Tensor
 ) -> tuple[Correction, Discrepancy]:
     """The operator with all settings fitted to measured outputs (n, T, d_y), and their z*."""
-    sensor = _sensor(correction)
+    sensor = sensor_of(correction)
     if sensor is None or not isinstance(correction, Chain):
         operator = completed(correction, context, observed, mask)
         return operator, operator.infer(context, observed, mask)
@@ -193,7 +193,7 @@ def sample_mask(correction: Correction, observed: Tensor, mask: Tensor, rate: fl
 
     `rate` is that of the record, in Hz.
     """
-    sensor = _sensor(correction)
+    sensor = sensor_of(correction)
     if sensor is None:
         return mask
     return sensor.timed(observed, mask, rate).sample_mask(observed, mask, rate)
@@ -206,7 +206,7 @@ def measured_outputs(
 
     Outputs that are not sampled are not computed, if the operator has `at`.
     """
-    sensor = _sensor(correction)
+    sensor = sensor_of(correction)
     if sensor is None or not isinstance(correction, Chain):
         return correction.apply(context, z)
     at, rate = getattr(correction.first, "at", None), context.rate

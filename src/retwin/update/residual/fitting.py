@@ -31,6 +31,7 @@ from retwin.update.corrections import (
 )
 from retwin.update.corrections.delay_range import bound_note
 from retwin.update.exact import exact_surrogate
+from retwin.update.residual.bands import coverage_figures
 from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.refining import refine
 from retwin.update.residual.residual import Residual, segment
@@ -258,6 +259,15 @@ def _fit_per_segment(
             model, context, observed, sampled, fitted=torch.as_tensor(fitted), held_out=held_out,
             how=refinement, seed=seed, progress=progress,
         )  # fmt: skip
+    healthy = (context.faulty_commands == context.commands).flatten(1).all(dim=1)
+    rows = (healthy & (context.frozen >= context.commands.shape[1]).all(dim=1)).nonzero().flatten()
+    if len(rows):
+        observed, mask = _measured(used)
+        sampled = sample_mask(model.correction, observed, mask, used.rate)
+        model.eval()
+        figures |= coverage_figures(
+            model, context[rows.numpy()], observed[rows], sampled[rows], seed=seed
+        )
     return replace(result, figures=figures | result.figures)
 
 
