@@ -9,7 +9,7 @@ import tempfile
 import threading
 import webbrowser
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -235,12 +235,14 @@ def demo(
 
     They run 60 times as fast as real ones. Everything is removed at the end.
     """
-    from retwin.monitor.demo import demonstration
+    from retwin.monitor.demo import announced, demonstration
     from retwin.monitor.server import create_app, listening, serving
 
     if seconds is not None:
         finite("seconds", positive("seconds", seconds, unit="s"), most=threading.TIMEOUT_MAX)
     token = secrets.token_urlsafe()
+    for line in announced():
+        note(line)
     with (
         listening("127.0.0.1", port) as bound,
         tempfile.TemporaryDirectory(prefix="retwin-") as folder,
@@ -258,9 +260,12 @@ def demo(
             f"Token, for changes on the page: {token}",
             as_json=as_json,
         )
+        note(f"It ends {'' if seconds is None else f'after {seconds:g} s, or '}with Ctrl-C.")
         if open_page:
             webbrowser.open(address)
-        threading.Event().wait(seconds)
+        with suppress(KeyboardInterrupt):
+            threading.Event().wait(seconds)
+    note("The demonstration has ended; nothing of it is kept.")
 
 
 @app.command(epilog=example("retwin monitor run --config monitor.toml"))

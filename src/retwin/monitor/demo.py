@@ -31,7 +31,7 @@ from retwin.twins.samplers import HoldSampler
 from retwin.twins.system_faults import ActuatorGain, ParameterShift, SensorBias
 from retwin.update import Dynamics, Library, fit_dynamics
 
-__all__ = ["MACHINES", "demonstration", "emulated", "fitted"]
+__all__ = ["MACHINES", "announced", "demonstration", "emulated", "fitted"]
 
 CASE = "incubator"
 SPEED = 60.0
@@ -48,20 +48,37 @@ DURATION = 86_400.0
 """Time in s by which the streams begin in the past, so that they are never ahead of the clock."""
 PAUSE, SHADOW = 0.1, 15.0
 """Seconds between two batches of samples, and until a second version of the twin is fitted."""
-BLANKING = 600.0
-"""Time in s after an alarm without another one: faults last a little longer."""
+BLANKING = 2700.0
+"""Time in s after an alarm without another one: faults last 900 s, and the prediction of a machine
+that was disturbed so much needs another half an hour, in which alarms would have no cause."""
 LENGTH = 2 * DURATION
 """Time in s that is emulated: with the clock it takes a day after the streams have caught up."""
+OPEN, OFFSET, WEAK, LASTING = 2400.0, 9000.0, 15600.0, 900.0
+"""Times in s from which the lid is open, the sensor is offset and the heater is weak, and how long
+each of them lasts."""
 MACHINES: Mapping[str, Fault | None] = {
     "incubator 1": None,
-    "incubator 2": ParameterShift("g_box", size=5.0, onset=2400.0, end=3300.0),
-    "incubator 3": SensorBias(0, size=1.5, onset=9000.0, end=9900.0),
-    "incubator 4": ActuatorGain(0, size=-0.7, onset=15600.0, end=16500.0),
+    "incubator 2": ParameterShift("g_box", size=5.0, onset=OPEN, end=OPEN + LASTING),
+    "incubator 3": SensorBias(0, size=1.5, onset=OFFSET, end=OFFSET + LASTING),
+    "incubator 4": ActuatorGain(0, size=-0.7, onset=WEAK, end=WEAK + LASTING),
 }
-"""The machines and their faults: a lid is open for 15 s of the demonstration from 40 s on, a
-sensor is offset from 150 s on, and a heater is weak from 260 s on."""
+"""The machines and their faults."""
 HOURS = (1.0, 6.0)
 """Hours of the healthy record to which each version of the twin is fitted."""
+
+
+def announced() -> list[str]:
+    """What will be seen, and when, line by line."""
+    faults = {"lid is open": OPEN, "sensor is offset": OFFSET, "heater is weak": WEAK}
+    healthy, *faulty = MACHINES
+    return [
+        f"Emulated incubators run {SPEED:.0f} times as fast as real ones; once the page is there:",
+        f"  {healthy}: healthy",
+        *(
+            f"  {name}: the {text} from {onset / SPEED:.0f} to {(onset + LASTING) / SPEED:.0f} s"
+            for name, (text, onset) in zip(faulty, faults.items(), strict=True)
+        ),
+    ]
 
 
 def emulated(

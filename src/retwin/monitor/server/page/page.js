@@ -111,7 +111,9 @@
   const facts = (...rows) => h("dl", { class: "facts" }, rows.map(([name, value, more]) =>
     h("div", {}, h("dt", {}, name), h("dd", {}, value, more && h("small", {}, more)))));
   const cause = (alarm) => !alarm.cause ? "cause not known yet"
-    : `${alarm.cause.name} (${percent(alarm.cause.probability)})`;
+    : `${fault(alarm.cause.name)} (${percent(alarm.cause.probability)})`;
+  // An alarm whose samples a healthy machine explains best has no known cause.
+  const fault = (name) => name === "Healthy" ? "no known fault" : name;
   const interval = ([value, low, high], unit = "") => value == null ? ["–"]
     : [`${digits(value)} ${unit}`, `90 % interval ${digits(low)} to ${digits(high)}`];
 
@@ -206,7 +208,7 @@
       points: each.points ? { size: 4 } : { show: false }, spanGaps: false, paths: each.steps ? uPlot.paths.stepped({ align: 1 }) : undefined });
     const fade = (name) => { const hex = colour(name); return hex + "40"; };
     return {
-      width, height: spec.height, legend: { show: false }, padding: [8, 10, 0, 0],
+      width, height: spec.height, legend: { show: false }, padding: [8, 34, 0, 0],
       cursor: { sync: { key: "time" }, drag: { x: false, y: false }, points: { size: 7 } },
       scales: { x: { time: true }, y: spec.log ? { distr: 3, log: 10, range: (u, low, high) => [0.1, Math.max(10 * spec.threshold, 10 * (high || 1))] }
         : { range: (u, low, high) => { const room = Math.max((high - low) * 0.08, 1e-9 + Math.abs(high) * 0.002); return [low - room, high + room]; } } },
@@ -383,10 +385,10 @@
       if (!shown) around(place, found);
       shown = text;
       const why = found.cause;
-      about.replaceChildren(h("h1", {}, found.asset, ": ", why ? why.name : "cause not known yet"),
+      about.replaceChildren(h("h1", {}, found.asset, ": ", why ? fault(why.name) : "cause not known yet"),
         verdict("alarm", `Alarm at ${stamp(found.time)}; ${found.output}: ${found.change}. The twin of the healthy machine does not explain it.`,
           h("a", { href: to("asset", found.asset) }, "See the machine now")),
-        facts(found.begin ? ["Trajectory", stamp(found.begin), `to ${clock(found.time)}`] : ["Began", why ? stamp(why.onset[0]) : "–", why && why.onset[1] != null && `90 % interval ${clock(why.onset[1])} to ${clock(why.onset[2])}`],
+        facts(found.begin ? ["Trajectory", stamp(found.begin), `to ${clock(found.time)}`] : ["Began", why && why.onset[0] != null ? stamp(why.onset[0]) : "–", why && why.onset[1] != null && `90 % interval ${clock(why.onset[1])} to ${clock(why.onset[2])}`],
           ...(found.begin ? [] : [["Size", ...(why ? interval(why.size, why.unit) : ["–"])]]),
           ["Evidence", digits(found.evidence), `alarm from ${digits(found.arl)} on`],
           ["Version of the twin", `${found.version}`]),
@@ -408,7 +410,7 @@
     h("tbody", {}, Object.entries(why.probabilities).sort((a, b) => b[1] - a[1]).map(([name, value]) => {
       const part = h("i");
       fill(part, value);
-      return h("tr", {}, h("th", { scope: "row" }, name), h("td", { class: "number" }, percent(value)), h("td", { "aria-hidden": "true" }, h("span", { class: "meter" }, part)));
+      return h("tr", {}, h("th", { scope: "row" }, fault(name)), h("td", { class: "number" }, percent(value)), h("td", { "aria-hidden": "true" }, h("span", { class: "meter" }, part)));
     }))));
   const acknowledge = (found) => {
     const who = h("input", { autocomplete: "name", maxlength: 200 });
