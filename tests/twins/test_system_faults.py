@@ -14,6 +14,7 @@ from retwin.twins import (
     FunctionTwin,
     NoisyTwin,
     Parameter,
+    ParameterDrift,
     ParameterShift,
     SensorBias,
     SensorDrift,
@@ -61,6 +62,12 @@ def test_a_parameter_shift_is_that_of_the_equations() -> None:
 def test_the_nominal_output_has_no_fault() -> None:
     made = LAG.simulate(COMMANDS, faults=[ParameterShift("loss", size=1.0)], seed=0)
     np.testing.assert_allclose(made.nominal[0, :, 0], 1.0, atol=1e-9)
+
+
+def test_a_drifting_parameter_moves_away_and_comes_back() -> None:
+    changes = LAG.changes([ParameterDrift("loss", size=0.3, onset=2.0, end=5.0)], STEPS)
+    expected = np.where((TIME >= 2) & (TIME < 5), 0.3 * (TIME - 2), 0.0)
+    np.testing.assert_allclose(changes[0, :, 0], expected, atol=1e-12)
 
 
 def test_shifted_parameters_are_the_same_without_a_compiler(monkeypatch) -> None:

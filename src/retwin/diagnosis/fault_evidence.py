@@ -19,7 +19,7 @@ from retwin.diagnosis.adaptive_grid import Integral, integrated
 from retwin.twins.faults import ends_of
 from retwin.twins.system_faults import (
     ActuatorGain,
-    ParameterShift,
+    ParameterFault,
     SensorBias,
     SensorDrift,
     SensorFreeze,
@@ -184,7 +184,7 @@ class FaultEvidence:
         commands, measured = np.tile(self.commands, shape), np.tile(self.measured, shape)
         seen, gain, changes = np.tile(self.seen, shape), np.zeros(len(points)), None
         made = [_fixed(fault, point, rate) for point in points] if fault is not None else []
-        if isinstance(fault, ParameterShift):
+        if isinstance(fault, ParameterFault):
             changes = parameter_changes(made, self.twin.shiftable, steps, rate)
         for i, each in enumerate(made):
             match each:

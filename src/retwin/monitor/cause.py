@@ -15,6 +15,7 @@ from retwin.monitor.watched import Alarm
 from retwin.twins.faults import Fault
 from retwin.twins.system_faults import (
     ActuatorGain,
+    ParameterDrift,
     ParameterShift,
     SensorBias,
     SensorDrift,
@@ -71,9 +72,9 @@ def possible_causes(
 ) -> dict[str, TimedFault | None]:
     """What may cause an alarm: the faults that are known, or else any change of the system.
 
-    Without known faults these are a shift of each parameter of the twin within its bounds, another
-    gain of each command, and an offset, a drift and a freeze of each sensor, by up to the range
-    that the output has in calibration.
+    Without known faults these are a shift and a drift of each parameter of the twin within its
+    bounds, another gain of each command, and an offset, a drift and a freeze of each sensor, by up
+    to the range that the output has in calibration.
 
     Parameters
     ----------
@@ -101,6 +102,8 @@ def _any_change(twin: DynamicsTwin) -> dict[str, TimedFault]:
             value = min(max(present[each.name], each.low), each.high)
             size = (each.low - value, each.high - value)
             made[f"{each.name} changed"] = ParameterShift(parameter=each.name, size=size)
+            slow = (size[0] * twin.rate / BEFORE, size[1] * twin.rate / BEFORE)
+            made[f"{each.name} drifting"] = ParameterDrift(parameter=each.name, size=slow)
     states = len(twin.process)
     moved = twin.domain.high[states:] > twin.domain.low[states:]
     for i in np.flatnonzero(moved).tolist():

@@ -35,6 +35,7 @@ _HOME = {
     "MultisineSampler": "samplers",
     "NoisyTwin": "noisy",
     "Parameter": "parametric",
+    "ParameterDrift": "system_faults",
     "ParameterShift": "system_faults",
     "ParametricTwin": "parametric",
     "RampSampler": "samplers",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,8 @@ from retwin.twins.faults import (
 __all__ = [
     "FAULTS",
     "ActuatorGain",
+    "ParameterDrift",
+    "ParameterFault",
     "ParameterShift",
     "SensorBias",
     "SensorDrift",
@@ -140,6 +142,8 @@ class SizedFault(TimedFault):
 
     """
 
+    grows: ClassVar[bool] = False
+    """Whether the size is that per second since the onset."""
     size: float | tuple[float, float]
 
     def __post_init__(self) -> None:
@@ -160,12 +164,21 @@ class SizedFault(TimedFault):
         return replace(made, size=size)
 
     def profile(self, steps: int, rate: float) -> NDArray:
-        """The size at each sample, (T,), for a fault of which nothing is open; 0 elsewhere."""
-        return ends_of(self.size)[0] * self.active(steps, rate)
+        """The effect at each sample, (T,), for a fault of which nothing is open; 0 elsewhere."""
+        made = ends_of(self.size)[0] * self.active(steps, rate)
+        since = np.arange(steps) / rate - ends_of(self.onset)[0]
+        return made * since if self.grows else made
 
 
 @dataclass(frozen=True)
-class ParameterShift(SizedFault):
+class ParameterFault(SizedFault):
+    """The base of faults of a parameter; see `ParameterShift` and `ParameterDrift`."""
+
+    parameter: str
+
+
+@dataclass(frozen=True)
+class ParameterShift(ParameterFault):
     """A parameter of the twin differs by a constant: a leak, a clogged valve, a worn bearing.
 
     Parameters
@@ -179,7 +192,23 @@ class ParameterShift(SizedFault):
 
     """
 
-    parameter: str
+
+@dataclass(frozen=True)
+class ParameterDrift(ParameterFault):
+    """A parameter of the twin that moves away from its value: wear, fouling, ageing.
+
+    Parameters
+    ----------
+    parameter : str
+        Name of a parameter of a `StateTwin`.
+    size : float or (float, float)
+        What is added to it per second, in its unit.
+    onset, end, label
+        See `TimedFault`; at its end the parameter is as before.
+
+    """
+
+    grows: ClassVar[bool] = True
 
 
 @dataclass(frozen=True)
@@ -250,10 +279,7 @@ class SensorDrift(SensorError):
 
     """
 
-    def profile(self, steps: int, rate: float) -> NDArray:
-        """The error at each sample, (T,), for a fault of which nothing is open; 0 elsewhere."""
-        since = np.arange(steps) / rate - ends_of(self.onset)[0]
-        return super().profile(steps, rate) * since
+    grows: ClassVar[bool] = True
 
 
 @dataclass(frozen=True)
@@ -284,6 +310,7 @@ FAULTS: tuple[type, ...] = (
     ActuatorBias,
     ActuatorGain,
     ParameterShift,
+    ParameterDrift,
     SensorBias,
     SensorDrift,
     SensorFreeze,
@@ -314,7 +341,7 @@ def parameter_changes(
     """What faults add to the parameters `names` at each sample, (n, T, q)."""
     made = np.zeros((len(faults), steps, len(names)))
     for i, fault in enumerate(faults):
-        if isinstance(fault, ParameterShift):
+        if isinstance(fault, ParameterFault):
             made[i, :, names.index(fault.parameter)] = fault.profile(steps, rate)
     return made
 
@@ -348,7 +375,7 @@ def check_faults(
                 got=fault,
                 remedy=f"count the {'command' if name == 'actuator' else name} channels from 0",
             )
-        if isinstance(fault, ParameterShift):
+        if isinstance(fault, ParameterFault):
             require(
                 fault.parameter in shiftable,
                 "faults",

@@ -9,6 +9,8 @@ from retwin.data.trajectories import HEALTHY
 from retwin.monitor.kinds import AnyMonitor
 from retwin.twins.system_faults import (
     ActuatorGain,
+    ParameterDrift,
+    ParameterFault,
     ParameterShift,
     SensorBias,
     SensorDrift,
@@ -21,6 +23,10 @@ SENTENCES: Mapping[type, Callable[[Any, AnyMonitor], str]] = {
     ParameterShift: lambda fault, monitor: (
         f"The parameter {fault.parameter} of the machine has changed. Look for what sets it: "
         "something that is open, leaks, is clogged, worn, loose or was replaced."
+    ),
+    ParameterDrift: lambda fault, monitor: (
+        f"The parameter {fault.parameter} of the machine moves away from its value. Look for what "
+        "wears, fouls, ages, heats up or loosens slowly, and compare it with earlier records."
     ),
     ActuatorGain: lambda fault, monitor: (
         f"The machine does not do what the command {_input(fault, monitor)} demands. Check the "
@@ -63,10 +69,10 @@ def what_to_check(name: str, fault: object, monitor: AnyMonitor) -> str:
 def size_unit(fault: object, monitor: AnyMonitor) -> str:
     """The unit of a fault's size; "" where it has none."""
     units = monitor.twin.outputs.units
-    if isinstance(fault, ParameterShift):
+    if isinstance(fault, ParameterFault):
         parameters = monitor.twin.equations.parameters
         own = [each.unit for each in parameters if each.name == fault.parameter]
-        return own[0] if own else ""
+        return f"{own[0]}{' per second' * fault.grows}" if own else ""
     if isinstance(fault, ActuatorGain):
         return "of the command"
     if isinstance(fault, SensorDrift):
