@@ -297,13 +297,16 @@ def test_arrays_are_bounded_and_those_of_other_machines_are_samples() -> None:
         parse(json.dumps({"asset": "b", "time": 2, "values": {"u": [0] * 100_001}}), lambda _: "uy")
 
 
-@pytest.mark.slow
-def test_kills(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "kills",
+    [pytest.param(5, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.long)],
+)
+def test_kills(kills: int, tmp_path: Path) -> None:
     script = Path(__file__).with_name("killing_trajectories.py")
-    command = [sys.executable, str(script), str(tmp_path), "4", "0"]
+    command = [sys.executable, str(script), str(tmp_path), str(kills), "0"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
-    assert "4 kills" in done.stderr
+    assert f"{kills} kills" in done.stderr
 
 
 def test_the_program_watches_a_folder_and_refuses_sources_of_samples(
