@@ -155,6 +155,24 @@ def test_each_trajectory_has_one_behaviour(opened: Callable, work: rt.Trajectori
         assert found.counts.used == 1
 
 
+def test_trajectories_that_are_not_used_as_usual_are_events_once(
+    opened: Callable, work: rt.Trajectories
+) -> None:
+    given = trajectories(rt.Trajectories.concatenate([work[:3], work[:2]]))
+    for k, wrong in ((1, -1e300), (2, -1e300), (3, np.nan)):
+        given[k].values[:, 1] = wrong
+    for each in given:  # a restart before each
+        with opened() as live:
+            assert live.submit([each])[0].counts.used == 1
+    with opened() as live:
+        texts = [entry.data["text"] for entry in live.store.log("event")]
+    assert texts == [
+        "trajectory with readings that no healthy machine can have caused",
+        "trajectory without measured samples, which are no evidence",
+        "trajectory measured as those of the calibration again",
+    ]
+
+
 def test_a_commit_that_fails_is_repeated_with_the_same_result(
     opened: Callable, work: rt.Trajectories, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,10 +21,13 @@ from retwin.monitor.samples import Samples, Trajectory
 from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.monitor.trajectory_state import TrajectoryState
 from retwin.monitor.updates import Asset, Update
-from retwin.monitor.watched_trajectories import WatchedTrajectories
+from retwin.monitor.watched_trajectories import REMARKS, WatchedTrajectories
 
 __all__ = ["Diagnosed", "TrajectoryMachine"]
 
+UNUSUAL = ("unmeasured", "unranked", "implausible")
+"""What trajectories may be that is an event of the log when it begins and when it ends. Commands
+outside their range are a status of the machine."""
 REMEMBERED = 1000
 """Newest trajectories of which the store knows where they begin, for comparisons of versions."""
 
@@ -61,6 +64,8 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         self._state = monitor.start()
         self._known = np.zeros((0, 3), dtype=np.int64)
         """Begin, end and number of samples of the newest trajectories."""
+        self._remark = 0
+        """Why the newest trajectory was not used as usual, as a place in UNUSUAL from 1; or 0."""
         self._recent: deque[tuple[int, float, float]] = deque(maxlen=KEPT)
 
     def placed(self, given: object, limit: int, known: set[int]) -> str:
@@ -107,10 +112,16 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         ]
         if watched.void[-1] and not self.void:
             entries.append(("void", self.entry(last)))
+        remark = self._remarked(watched)
+        if remark != self._remark:
+            again = "measured as those of the calibration again"
+            text = f"trajectory {REMARKS[UNUSUAL[remark - 1]] if remark else again}"
+            entries.append(("event", self.entry(last, what="trajectory", text=text)))
+        status = watched.evidence[-1], watched.void[-1], watched.outside[-1], remark
         arrays = {
             **{f"trajectory.{name}": each for name, each in found.state.arrays().items()},
             "version": np.array([self.asset.version], dtype=np.int64),
-            "status": np.array([watched.evidence[-1], watched.void[-1], watched.outside[-1]]) * 1.0,
+            "status": np.array(status, dtype=float),
             "digest": self._digest,
             "trajectories": self._with(samples),
         }
@@ -124,6 +135,7 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
         self._known = self._with(found.samples)
         self.evidence = float(watched.evidence[-1])
         self.void, self.outside = bool(watched.void[-1]), bool(watched.outside[-1])
+        self._remark = self._remarked(watched)
         self._recent.append((last, float(watched.score[-1]), self.evidence))
         if watched.alarms:
             self.alarms += len(watched.alarms)
@@ -138,7 +150,8 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
             return
         own = {name.partition(".")[2]: each for name, each in arrays.items() if "." in name}
         self._state = TrajectoryState.of_arrays(own).checked(self._state)
-        self.evidence, void, outside = arrays["status"].tolist()
+        self.evidence, void, outside, *remark = arrays["status"].tolist()
+        self._remark = int(remark[0]) if remark else 0  # not in states of development versions
         self.void, self.outside = bool(void), bool(outside)
 
     def recent(self) -> Recent:
@@ -157,6 +170,11 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
     def refusal(self, moment: int, why: str) -> tuple[str, dict[str, Any]]:
         """The entry of the log about a trajectory that is not used."""
         return "event", self.entry(moment, what="trajectory", text=f"trajectory not used: {why}")
+
+    def _remarked(self, watched: WatchedTrajectories) -> int:
+        """Why the newest trajectory was not used as usual, as `_remark`."""
+        found = (i for i, name in enumerate(UNUSUAL, 1) if getattr(watched, name)[-1])
+        return next(found, 0)
 
     def _with(self, samples: Samples) -> NDArray:
         """The newest trajectories, with one more."""

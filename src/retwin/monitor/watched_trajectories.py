@@ -6,7 +6,16 @@ from dataclasses import dataclass
 
 from numpy.typing import NDArray
 
-__all__ = ["TrajectoryAlarm", "WatchedTrajectories"]
+__all__ = ["REMARKS", "TrajectoryAlarm", "WatchedTrajectories"]
+
+REMARKS = {
+    "unmeasured": "without measured samples, which are no evidence",
+    "unranked": "measured otherwise than in the calibration, in which only faults of the diagnoser "
+    "would be found",
+    "implausible": "with readings that no healthy machine can have caused",
+    "outside": "with commands outside their range in training, where the twin extrapolates",
+}
+"""What a trajectory is that is not used as usual, by the attribute that states it."""
 
 
 @dataclass(frozen=True)
@@ -85,12 +94,5 @@ class WatchedTrajectories:
     @property
     def remarks(self) -> list[str]:
         """How many trajectories were not used as usual, and why; none if all were."""
-        texts = {
-            "unmeasured": "without measured samples, which are no evidence",
-            "unranked": "measured otherwise than in the calibration, in which only faults of the "
-            "diagnoser would be found",
-            "implausible": "with readings that no healthy machine can have caused",
-            "outside": "with commands outside their range in training, where the twin extrapolates",
-        }
-        counts = {name: int(getattr(self, name).sum()) for name in texts}
-        return [f"{each} {texts[name]}" for name, each in counts.items() if each]
+        counts = {name: int(getattr(self, name).sum()) for name in REMARKS}
+        return [f"{each} {REMARKS[name]}" for name, each in counts.items() if each]
