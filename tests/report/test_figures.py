@@ -133,3 +133,17 @@ def test_very_many_samples_are_drawn_as_their_envelope() -> None:
     short = Line(x[:100], y[:100], "measured", "ink")
     few = panel_spec(Panel(Axis("time"), [Row(Axis("output"), [short])], "short"))["data"][0]
     assert len(few["y"]) == 100
+
+
+def test_gaps_neither_join_a_band_nor_empty_the_envelope_of_a_line() -> None:
+    """A sensor that samples every tenth time still has a line; a gap divides a band in two."""
+    x, low = np.arange(6.0), np.array([0.0, 1.0, np.nan, np.nan, 4.0, 5.0])
+    marks = [Band(x, low, low + 1, "band", "c0")]
+    (band,) = panel_spec(Panel(Axis("time"), [Row(Axis("output"), marks)], "gap"))["data"]
+    assert band["x"] == [0, 1, 1, 0, None, 4, 5, 5, 4]
+    assert band["y"] == [1, 2, 1, 0, None, 5, 6, 5, 4]
+    y = np.full(40_000, np.nan)
+    y[::10] = 1.0
+    slow = [Line(np.arange(40_000.0), y, "measured", "ink")]
+    (line,) = panel_spec(Panel(Axis("time"), [Row(Axis("output"), slow)], "slow"))["data"]
+    assert set(line["y"]) == {1.0}

@@ -43,3 +43,13 @@ def test_the_median_is_taken_over_complete_trajectories() -> None:
     nominal = np.zeros((5, 21, 1))
     assert median_error_trajectory(nominal, observed, times, candidates) == 2
     assert median_error_trajectory(nominal, observed, times, np.zeros(5, dtype=bool)) is None
+
+
+def test_a_trajectory_with_gaps_may_be_typical_if_it_is_asked_for() -> None:
+    nominal = np.zeros((3, 10, 1))
+    observed = nominal + np.array([0.1, 0.2, 0.3])[:, None, None]
+    observed[:, 4] = np.nan
+    observed[2, :8] = np.nan
+    times, every = np.zeros((3, 1, 3)), np.ones(3, dtype=bool)
+    assert median_error_trajectory(nominal, observed, times, every) is None
+    assert median_error_trajectory(nominal, observed, times, every, least=0.5) == 0

@@ -57,7 +57,8 @@ def panel_spec(panel: Panel) -> dict[str, Any]:
 
 
 def _axis(axis: Axis) -> dict[str, Any]:
-    made: dict[str, Any] = {"title": {"text": _escaped(axis.title)}}
+    # 5000 rather than 5k.
+    made: dict[str, Any] = {"title": {"text": _escaped(axis.title)}, "minexponent": 5}
     if axis.limits is not None:
         made["range"] = _numbers(axis.limits)
     if axis.kind == "log":
@@ -90,16 +91,31 @@ def _reduced(mark: Mark) -> Mark:
     x = np.asarray(mark.x, dtype=float)
     starts = np.linspace(0, len(x), MANY // 2 + 1).astype(int)[:-1]
     if isinstance(mark, Band):
-        low = np.minimum.reduceat(np.asarray(mark.low, dtype=float), starts)
-        high = np.maximum.reduceat(np.asarray(mark.high, dtype=float), starts)
+        low = np.fmin.reduceat(np.asarray(mark.low, dtype=float), starts)
+        high = np.fmax.reduceat(np.asarray(mark.high, dtype=float), starts)
         return replace(mark, x=x[starts], low=low, high=high)
     y = np.asarray(mark.y, dtype=float)
-    ends = [each.reduceat(y, starts) for each in (np.minimum, np.maximum)]
+    ends = [each.reduceat(y, starts) for each in (np.fmin, np.fmax)]
     return replace(mark, x=np.repeat(x[starts], 2), y=np.stack(ends, axis=1).ravel())
 
 
 def _breaks(mark: Line | Band) -> bool:
     return isinstance(mark, Line) and (mark.step or bool(np.any(np.diff(np.asarray(mark.x)) < 0)))
+
+
+def _outline(band: Band) -> tuple[list[float | None], list[float | None]]:
+    """The outline of each part of a band, with None between parts: a gap where it has no value."""
+    x, low, high = (np.asarray(each, dtype=float) for each in (band.x, band.low, band.high))
+    known = np.flatnonzero(np.isfinite(low) & np.isfinite(high))
+    parts = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1)
+    x_of: list[float | None] = []
+    y_of: list[float | None] = []
+    for part in parts:
+        if len(part):
+            between: list[float | None] = [None] if x_of else []
+            x_of += [*between, *_numbers(x[part]), *_numbers(x[part[::-1]])]
+            y_of += [*between, *_numbers(high[part]), *_numbers(low[part[::-1]])]
+    return x_of, y_of
 
 
 def _trace(mark: Mark, x: Axis, y: Axis) -> dict[str, Any] | None:
@@ -114,12 +130,12 @@ def _trace(mark: Mark, x: Axis, y: Axis) -> dict[str, Any] | None:
             hover = _hover(mark.name, where) if mark.hover else {"hoverinfo": "skip"}
             return _scatter(mark.name, "lines", **points, line={**line, **shape}, **hover)
         case Band():
-            along, low, high = map(_numbers, (mark.x, mark.low, mark.high))
+            x_of, y_of = _outline(mark)
             return _scatter(
                 mark.name,
                 "lines",
-                x=along + along[::-1],
-                y=high + low[::-1],
+                x=x_of,
+                y=y_of,
                 fill="toself",
                 fillcolor=f"@{mark.colour}/{mark.alpha}",
                 line={"width": 0},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,8 @@ MANY_OUTPUTS = 6
 """Number of outputs beyond which one pair of bars stands for all of them."""
 SEGMENTS = 10
 """Number of segments below which no range of them is shown."""
+MOSTLY = 0.5
+"""The share of a trajectory that was measured, at least, if none was measured completely."""
 BAR = 0.38
 """Width of a bar; groups of bars are 1 apart."""
 
@@ -217,12 +220,16 @@ def _trajectory(study: Study, pair: tuple[str, str]) -> Panel | None:
     nominal, observed, times, bands = (
         study.arrays[f"portrait/{name}"] for name in ("nominal", "observed", "times", "bands")
     )
-    place = median_error_trajectory(nominal, observed, times, study.healthy)
+    chosen = partial(median_error_trajectory, nominal, observed, times, study.healthy)
+    # Where no healthy trajectory is complete, one of which most was measured.
+    place = chosen() if chosen() is not None else chosen(least=MOSTLY)
     if place is None:
         return None
     outputs = study.results.outputs
-    spread = np.nanstd(observed[study.healthy].astype(float), axis=(0, 1))
-    error = np.sqrt(np.nanmean(np.square(observed[place] - nominal[place]), axis=0))
+    # Masked, since an output may lack any measured value.
+    measured = np.ma.masked_invalid(observed.astype(float))
+    spread = measured[study.healthy].std(axis=(0, 1)).filled(0.0)
+    error = np.sqrt(np.square(measured[place] - nominal[place]).mean(axis=0).filled(0.0))
     column = int(np.argmax(error / np.where(spread > 0, spread, np.inf)))
     time = np.arange(nominal.shape[1]) / float(study.arrays["portrait/rate"])
     return _panel(

@@ -46,9 +46,14 @@ class SegmentError:
 
 
 def median_error_trajectory(
-    nominal: NDArray, observed: NDArray, times: NDArray, candidates: NDArray
+    nominal: NDArray,
+    observed: NDArray,
+    times: NDArray,
+    candidates: NDArray,
+    *,
+    least: float = 1.0,
 ) -> int | None:
-    """The completely observed candidate with the median RMS error.
+    """The candidate with the median RMS error, of those that were observed completely.
 
     Parameters
     ----------
@@ -58,6 +63,8 @@ def median_error_trajectory(
         Onset, start of the steady part and end of every segment in s; NaN for no segment.
     candidates : array (n,)
         Whether each trajectory may be chosen.
+    least : float
+        The share of its values from 0 to 1 that must have been observed.
 
     Returns
     -------
@@ -65,8 +72,11 @@ def median_error_trajectory(
         Its index; None if there is no such trajectory.
 
     """
-    error = np.sqrt(np.nanmean(np.square(observed - nominal), axis=(1, 2)))
-    known = np.isfinite(observed).all(axis=(1, 2)) & np.isfinite(times).any(axis=(1, 2))
+    seen = np.isfinite(observed)
+    squares = np.where(seen, np.square(observed - nominal), 0.0).sum(axis=(1, 2))
+    error = np.sqrt(squares / np.maximum(seen.sum(axis=(1, 2)), 1))
+    known = (seen.mean(axis=(1, 2)) >= least) & np.isfinite(times).any(axis=(1, 2))
+    known &= seen.any(axis=(1, 2))
     usable = np.flatnonzero(known & candidates)
     if not len(usable):
         return None

@@ -172,7 +172,8 @@ def _excess(found: Correlogram) -> float:
 def _at_lag(found: Correlogram, rate: float, command: str = "") -> tuple[str, str]:
     """The largest correlation, and below it where it is and its limit."""
     i = found.largest
-    where = f"{abs(found.lags[i]) / rate:.3g} s"
+    seconds = abs(found.lags[i]) / rate
+    where = f"{seconds:.0f} s" if seconds >= 1000 else f"{seconds:.3g} s"
     if command:
         where = f"{command}, {where} {'later' if found.lags[i] < 0 else 'earlier'}"
     return number(found.values[i], 2), f"{where}; limit {number(found.limits[i], 2)}"
