@@ -26,6 +26,7 @@ ROOMS = (
         "progress",
         "arrays",
         "modules",
+        "threads",
         "compiler",
         "processes",
         "isolation",

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import require
 from retwin.errors import InputError
+from retwin.threads import in_threads
 
 __all__ = [
     "check_finite",
@@ -106,8 +107,10 @@ def check_finite(name: str, array: NDArray) -> None:
         One is NaN or infinite; the message names the first one.
 
     """
-    for rows in row_blocks(array):
-        if is_finite(array[rows]):
+    blocks = list(row_blocks(array))
+    checked = in_threads(lambda rows: is_finite(array[rows]), blocks)
+    for rows, finite in zip(blocks, checked, strict=True):
+        if finite:
             continue
         bad = ~np.isfinite(array[rows])
         if bad.any():
@@ -151,10 +154,12 @@ def measured(observed: NDArray, mask: ArrayLike | None) -> tuple[NDArray, NDArra
         remedy="give one flag per measurement",
     )
     masked = zeroed = True
-    for rows in row_blocks(observed):
-        values, present = observed[rows], flags[rows]
-        if present.all() and is_finite(values):
+    blocks = list(row_blocks(observed))
+    plain = in_threads(lambda rows: flags[rows].all() and is_finite(observed[rows]), blocks)
+    for rows, unchanged in zip(blocks, plain, strict=True):
+        if unchanged:
             continue
+        values, present = observed[rows], flags[rows]
         infinite = np.isinf(values)
         if infinite.any():
             raise InputError(

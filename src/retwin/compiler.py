@@ -12,15 +12,16 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import lru_cache
 from importlib.resources import files
 from importlib.util import find_spec
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 
 from numpy.typing import NDArray
+
+from retwin.threads import available, in_threads
 
 __all__ = ["c_source", "call", "compiled", "compilers"]
 
@@ -179,11 +180,9 @@ def call(
         Those with a first axis of n; None is NULL.
 
     """
-    import torch  # the ground loads without it
-
     function = getattr(library, name)
     function.restype = None
-    count = max(1, min(sizes[0], torch.get_num_threads()))
+    count = max(1, min(sizes[0], available()))
     ends = [sizes[0] * i // count for i in range(count + 1)]
 
     def part(first: int, last: int) -> None:
@@ -194,8 +193,5 @@ def call(
             *(ctypes.c_void_p(None if a is None else a.ctypes.data) for a in (*common, *own)),
         )
 
-    if count == 1:
-        part(0, sizes[0])
-        return
-    with ThreadPoolExecutor(count) as pool:
-        list(pool.map(part, ends[:-1], ends[1:]))
+    for _ in in_threads(lambda ends: part(*ends), list(pairwise(ends))):
+        pass

@@ -11,6 +11,7 @@ import torch
 
 import retwin as rt
 from retwin import compiler
+from retwin import threads as divided
 from retwin.twins import State, StateTwin
 
 LAG = StateTwin(
@@ -37,8 +38,9 @@ def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.Monk
     measured = rng.normal(size=(5, 40, 1)), rng.random((5, 40, 1)) < 0.8
     theta, spread = rng.normal(size=(5, 1)), np.ones((5, 1, 1))
     variances = np.ones(1), np.ones(1)
-    pool = compiler.ThreadPoolExecutor
-    monkeypatch.setattr(compiler, "ThreadPoolExecutor", lambda n: (used.append(n), pool(n))[1])
+    pool = divided.ThreadPoolExecutor
+    made_by = lambda n, **options: (used.append(n), pool(n, **options))[1]  # noqa: E731
+    monkeypatch.setattr(divided, "ThreadPoolExecutor", made_by)
 
     def made(count: int) -> list[bytes]:
         torch.set_num_threads(count)

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import require
 from retwin.errors import InputError
+from retwin.threads import in_threads
 from retwin.times import sample_rate
 
 __all__ = ["Segments"]
@@ -150,17 +151,30 @@ class Segments:
             of that command.
 
         """
-        # One axis after the other, so that numpy's inner loop is over a whole trajectory.
-        highest, lowest = commands.max(axis=0).max(axis=0), commands.min(axis=0).min(axis=0)
-        extent = highest - lowest
+        blocks = [
+            slice(begin, begin + TRAJECTORIES_PER_BLOCK)
+            for begin in range(0, len(commands), TRAJECTORIES_PER_BLOCK)
+        ]
+
+        def ends(rows: slice) -> tuple[NDArray, NDArray]:
+            # One axis after the other, so that numpy's inner loop is over a whole trajectory.
+            some = commands[rows]
+            return some.max(axis=0).max(axis=0), some.min(axis=0).min(axis=0)
+
+        highest, lowest = zip(*in_threads(ends, blocks), strict=True)
+        extent = np.max(highest, axis=0) - np.min(lowest, axis=0)
         smallest = (tolerance * np.where(extent > 0, extent, 1)).astype(commands.dtype)
         moving = np.empty((len(commands), commands.shape[1] - 1), dtype=bool)
-        for begin in range(0, len(commands), TRAJECTORIES_PER_BLOCK):
-            some = commands[begin : begin + TRAJECTORIES_PER_BLOCK]
+
+        def mark(rows: slice) -> None:
+            some = commands[rows]
             change = np.abs(some[:, 1:] - some[:, :-1]) > smallest
             still = np.zeros(change.shape[:2], dtype=bool)  # a twin may have no inputs
             channels = np.moveaxis(change, 2, 0)
-            moving[begin : begin + TRAJECTORIES_PER_BLOCK] = reduce(np.logical_or, channels, still)
+            moving[rows] = reduce(np.logical_or, channels, still)
+
+        for _ in in_threads(mark, blocks):
+            pass
 
         def speed(row: NDArray, step: NDArray) -> NDArray:
             after, before = (commands[row, step + i].astype(np.float64) for i in (1, 0))

@@ -15,6 +15,7 @@ from scipy.signal import windows
 from retwin.arrays import floats, row_blocks
 from retwin.checks import one_per
 from retwin.data.trajectories import Channels
+from retwin.threads import in_threads
 
 __all__ = ["TOLERANCE", "CommandRange", "excess", "extremes", "power_spectra"]
 
@@ -80,7 +81,7 @@ class CommandRange:
     @classmethod
     def of(cls, commands: NDArray, rate: float) -> CommandRange:
         """Of commands (n, T, d_u) at `rate` Hz."""
-        ends = [extremes(commands[rows]) for rows in row_blocks(commands)]
+        ends = in_threads(lambda rows: extremes(commands[rows]), list(row_blocks(commands)))
         least, greatest, steps = (np.concatenate(each) for each in zip(*ends, strict=True))
         low, high = least.min(axis=0), greatest.max(axis=0)
         change = rate * steps.max(axis=0)
@@ -126,8 +127,9 @@ class CommandRange:
         found = np.zeros((len(commands), 3, len(low)))
         still = high <= low
         tolerated = TOLERANCE / (TOLERANCE + self.chance)
-        for rows in row_blocks(commands):
-            least, greatest, steps = extremes(commands[rows])
+        blocks = list(row_blocks(commands))
+        ends = in_threads(lambda rows: extremes(commands[rows]), blocks)
+        for rows, (least, greatest, steps) in zip(blocks, ends, strict=True):
             # The training of a constant channel does not contain any other value.
             changed = np.maximum(low - least, greatest - low) > ROUNDING * np.abs(low)
             beyond = excess(least, greatest, low, high)
@@ -255,11 +257,14 @@ def _blocks(commands: NDArray, rate: float) -> Iterator[NDArray]:
     chosen = _chosen(len(commands))
     window = windows.hann(commands.shape[1] + 2)[1:-1, None].astype(np.float32)
     scale = 2 / len(window) / np.sum(window**2)
-    for rows in row_blocks(commands, len(chosen)):
+
+    def spectra_of(rows: slice) -> NDArray:
         values = np.asarray(commands[chosen[rows]], np.float32)
         values = (values - values.mean(axis=1, keepdims=True)) * window
         spectra = np.abs(fft.rfft(np.ascontiguousarray(np.moveaxis(values, 1, 2)), axis=2)) ** 2
-        yield np.moveaxis(spectra, 2, 1) * scale
+        return np.moveaxis(spectra, 2, 1) * scale
+
+    return in_threads(spectra_of, list(row_blocks(commands, len(chosen))))
 
 
 def _above(frequency: NDArray, spectra: NDArray, limit: NDArray, power: NDArray) -> NDArray:

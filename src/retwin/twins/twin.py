@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -14,6 +15,7 @@ from retwin.checks import instance, require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Provenance, Trajectories
 from retwin.progress import Progress
+from retwin.threads import Turns, in_threads
 from retwin.times import stride_of
 from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_from, frozen_response
 from retwin.twins.faults import Fault
@@ -300,6 +302,9 @@ class Chunk:
     known : dict of int to int
         Filled in by the simulation: the trajectories of this chunk whose simulation ended early,
         and the number of their samples that are known. Later ones are masked.
+    turn : context manager
+        A block that the simulations of all chunks enter in order, for what draws from a generator
+        that they share, or changes other things in common.
 
     """
 
@@ -311,6 +316,7 @@ class Chunk:
     rate: float
     failed: dict[int, str] = field(default_factory=dict)
     known: dict[int, int] = field(default_factory=dict)
+    turn: AbstractContextManager[None] = field(default_factory=nullcontext)
 
     @property
     def frozen(self) -> NDArray:
@@ -337,6 +343,7 @@ def simulate_in_chunks(
     progress: Progress | None,
     size: int = 128,
     emulated: bool = False,
+    threaded: bool = False,
 ) -> Trajectories:
     """Simulate by a function of chunks: the steps that the `simulate` of all twins shares.
 
@@ -356,6 +363,8 @@ def simulate_in_chunks(
         Trajectories per chunk, at most.
     emulated : bool, default False
         Whether the result stands in for measurements.
+    threaded : bool, default False
+        Whether `run` may be called in several threads at a time, and then uses `Chunk.turn`.
 
     Returns
     -------
@@ -380,16 +389,28 @@ def simulate_in_chunks(
     drawn = draw_faults(faults, segments, seed, rate=twin.rate)
     nominal = np.empty((*commands.shape[:2], len(twin.outputs)), dtype=commands.dtype)
     observed = np.empty_like(nominal)
-    failed: dict[int, str] = {}
-    known = np.full(len(commands), commands.shape[1])
-    for begin in range(0, len(commands), size):
+    turns = Turns()
+
+    def run_chunk(begin: int) -> tuple[Chunk, dict[int, str]]:
         index = slice(begin, begin + size)
         own_commands, own_faults, own_segments = commands[index], drawn[index], segments[index]
         effective = faulty_commands(own_commands, own_faults, own_segments, rate=twin.rate)
-        chunk = Chunk(index, own_commands, effective, own_faults, own_segments, twin.rate)
-        nominal[index], healthy = run(chunk)
+        turn = turns.turn(begin // size)
+        chunk = Chunk(
+            index, own_commands, effective, own_faults, own_segments, twin.rate, turn=turn
+        )
+        try:
+            nominal[index], healthy = run(chunk)
+        finally:
+            turns.over(begin // size)
         observed[index] = measured_with(healthy, own_faults, twin.rate)
-        reasons = _not_finite(twin, nominal[index], observed[index]) | chunk.failed
+        return chunk, _not_finite(twin, nominal[index], observed[index]) | chunk.failed
+
+    failed: dict[int, str] = {}
+    known = np.full(len(commands), commands.shape[1])
+    begins = range(0, len(commands), size)
+    for chunk, reasons in (in_threads if threaded else map)(run_chunk, begins):
+        begin = chunk.index.start
         failed |= {begin + i: reason for i, reason in sorted(reasons.items())}
         for i, samples in chunk.known.items():
             known[begin + i] = samples

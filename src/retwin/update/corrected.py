@@ -24,7 +24,7 @@ from retwin.twins.twin import (
     checked_seed,
     simulate_in_chunks,
 )
-from retwin.update.corrections import measured_outputs
+from retwin.update.corrections import measuring
 from retwin.update.exact import exact_surrogate
 from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
@@ -114,8 +114,11 @@ class CorrectedTwin:
                 frozen=chunk.frozen,
             )
             if self.random:
-                z = self.residual.sample(context, generator=generator)
-                outputs = measured_outputs(correction, context, z, generator)
+                sampler = self.residual.sampler(context)
+                with chunk.turn:  # the same noise, however many threads there are
+                    z = sampler(generator)
+                    measured = measuring(correction, context, generator)
+                outputs = measured(z)
             else:
                 outputs = correction.apply(context, self.residual.mean(context))
             return context.nominal.numpy(), outputs.numpy()
@@ -129,6 +132,7 @@ class CorrectedTwin:
                 seed=seed,
                 progress=progress,
                 emulated=self.residual.emulated,
+                threaded=isinstance(self.surrogate, Surrogate),
             )
 
     def save(self, folder: str | Path) -> None:

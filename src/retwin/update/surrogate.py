@@ -172,7 +172,9 @@ class Surrogate(nn.Module):
 
         checked = checked_commands(commands, self.inputs).astype(np.float32, copy=False)
         with training_checked(self, checked):
-            return simulate_in_chunks(self, run, checked, faults, seed=seed, progress=progress)
+            return simulate_in_chunks(
+                self, run, checked, faults, seed=seed, progress=progress, threaded=True
+            )
 
     def save(self, folder: str | Path) -> None:
         """Write the weights and the description; see `read_model` for the layout."""

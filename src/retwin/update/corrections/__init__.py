@@ -7,6 +7,7 @@ from retwin.update.corrections.chain import (
     Chain,
     fit_correction,
     measured_outputs,
+    measuring,
     sample_mask,
     sensor_of,
 )
@@ -28,6 +29,7 @@ __all__ = [
     "command_space",
     "fit_correction",
     "measured_outputs",
+    "measuring",
     "sample_mask",
     "sensor_of",
 ]

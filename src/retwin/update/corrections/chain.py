@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -18,8 +20,16 @@ from retwin.update.corrections.correction import (
     block_diagonal,
 )
 from retwin.update.corrections.sampled_sensor import SampledSensor
+from retwin.update.corrections.warp import gather_samples
 
-__all__ = ["Chain", "fit_correction", "measured_outputs", "sample_mask", "sensor_of"]
+__all__ = [
+    "Chain",
+    "fit_correction",
+    "measured_outputs",
+    "measuring",
+    "sample_mask",
+    "sensor_of",
+]
 
 
 @dataclass(frozen=True)
@@ -206,12 +216,23 @@ def measured_outputs(
 
     Outputs that are not sampled are not computed, if the operator has `at`.
     """
+    return measuring(correction, context, generator)(z)
+
+
+def measuring(
+    correction: Correction, context: Context, generator: torch.Generator
+) -> Callable[[Tensor], Tensor]:
+    """`measured_outputs` as a function of z: what is random of the sensor is drawn here."""
     sensor = sensor_of(correction)
-    if sensor is None or not isinstance(correction, Chain):
-        return correction.apply(context, z)
-    at, rate = getattr(correction.first, "at", None), context.rate
-    if at is None or sensor.period is None:
-        return sensor.read(correction.apply(context, z), generator, rate)
-    steps = context.commands.shape[1]
-    when = sensor.polls(len(context), steps, generator, rate)
-    return sensor.record(at(context, z, when), when, steps, generator, rate)
+    if sensor is None or sensor.period is None or not isinstance(correction, Chain):
+        return partial(correction.apply, context)
+    (count, steps, width), rate = context.nominal.shape, context.rate
+    at, apply = getattr(correction.first, "at", None), correction.apply
+    when = sensor.polls(count, steps, generator, rate)
+    errors = sensor.errors((*when.shape, width), context.nominal.dtype, generator)
+
+    def measured(z: Tensor) -> Tensor:
+        values = gather_samples(apply(context, z), when) if at is None else at(context, z, when)
+        return sensor.record(values + errors.to(values), when, steps, rate)
+
+    return measured

@@ -181,7 +181,8 @@ class SampledSensor:
             return outputs
         steps = outputs.shape[1]
         when = self.polls(len(outputs), steps, generator, rate)
-        return self.record(gather_samples(outputs, when), when, steps, generator, rate)
+        errors = self.errors((*when.shape, outputs.shape[2]), outputs.dtype, generator)
+        return self.record(gather_samples(outputs, when) + errors, when, steps, rate)
 
     def polls(self, count: int, steps: int, generator: torch.Generator, rate: float) -> Tensor:
         """Time steps (count, R) at which records of that length are sampled, within the record."""
@@ -191,11 +192,8 @@ class SampledSensor:
         samples = -(-steps // every)
         return (phase[:, None] + every * torch.arange(samples)).clamp_max(steps - 1)
 
-    def record(
-        self, values: Tensor, when: Tensor, steps: int, generator: torch.Generator, rate: float
-    ) -> Tensor:
-        """The record (n, steps, d_y) of outputs (n, R, d_y) at their `polls` (n, R)."""
-        values = values + self._errors(values, generator)
+    def record(self, values: Tensor, when: Tensor, steps: int, rate: float) -> Tensor:
+        """The record (n, steps, d_y) of outputs (n, R, d_y), errors included, at `polls` (n, R)."""
         if self.steps is not None and any(self.steps):
             step = values.new_tensor(self.steps)
             whole = torch.where(step > 0, step * (values / step.clamp_min(1e-30)).round(), values)
@@ -215,20 +213,22 @@ class SampledSensor:
         lines = torch.einsum("ek,knrd->nred", join, ends).flatten(1, 2)
         return gather_samples(lines, (torch.arange(steps) - phase).clamp_min(0))
 
-    def _errors(self, like: Tensor, generator: torch.Generator) -> Tensor:
-        """Errors of sampled values (n, R, d_y)."""
-        error = torch.zeros_like(like)
+    def errors(
+        self, shape: tuple[int, ...], dtype: torch.dtype, generator: torch.Generator
+    ) -> Tensor:
+        """Errors of sampled values (n, R, d_y), which is the shape."""
+        error = torch.zeros(shape, dtype=dtype)
         if self.noise is not None:
-            level = torch.rand(like.shape, generator=generator, dtype=torch.float64)
+            level = torch.rand(shape, generator=generator, dtype=torch.float64)
             for j, quantiles in enumerate(self.noise):
                 quantile = level.new_tensor(quantiles)
                 place = level[..., j] * (len(quantile) - 1)
                 left = place.long().clamp_max(len(quantile) - 2)
                 error[..., j] = torch.lerp(quantile[left], quantile[left + 1], place - left)
         if self.glitch_probability and self.glitch_size is not None:
-            hit = torch.rand(like.shape[:2], generator=generator) < self.glitch_probability
-            size = torch.randn(like.shape, generator=generator).to(like)
-            error = error + hit[..., None] * like.new_tensor(self.glitch_size) * size
+            hit = torch.rand(shape[:2], generator=generator) < self.glitch_probability
+            size = torch.randn(shape, generator=generator).to(dtype)
+            error = error + hit[..., None] * error.new_tensor(self.glitch_size) * size
         return error
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -128,6 +128,11 @@ class ResidualModel(Residual):
     def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:
         """Draws of z (n, M, d_z), see `drawn`."""
         return self.drawn(self(context), generator=generator)
+
+    def sampler(self, context: Context) -> Callable[[torch.Generator], Tensor]:
+        """`sample` as a function of the generator: the distribution is not random."""
+        distribution = self(context)
+        return lambda generator: self.drawn(distribution, generator=generator)
 
     def drawn(self, distribution: Blocks, *, generator: torch.Generator) -> Tensor:
         """Draws of z (n, M, d_z), clipped at b, since the penalty on z̄ does not bound samples.

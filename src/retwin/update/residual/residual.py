@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -131,6 +132,10 @@ class Residual(nn.Module, ABC):
     @abstractmethod
     def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:
         """Draws of z (n, M, d_z), clipped at b."""
+
+    def sampler(self, context: Context) -> Callable[[torch.Generator], Tensor]:
+        """`sample` as a function of the generator, after what is not random."""
+        return lambda generator: self.sample(context, generator=generator)
 
     def save(self, folder: str | Path) -> None:
         """Write the weights and the description, see `retwin.serialisation.models`."""
