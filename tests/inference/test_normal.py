@@ -81,6 +81,16 @@ def test_steps_are_those_in_torch(
         assert torch.allclose(found, expected, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("common", [False, True])
+def test_objectives_are_those_in_torch(shared: bool, common: bool) -> None:
+    problem, prior, noise, x, (residual, _) = posed(shared=shared, common=common)
+    found = normal.compiled_objective(problem, prior, noise, x, residual)
+    assert found is not None
+    expected = noise.misfit(problem, residual).sum(dim=1) + prior.energy(x)
+    assert torch.allclose(found, expected, rtol=1e-12)
+
+
 def test_what_the_kernel_cannot_do_is_left_to_torch() -> None:
     problem, prior, noise, x, linearised = posed(shared=True, common=False)
     free = torch.full((SIZE,), torch.inf, dtype=torch.float64)

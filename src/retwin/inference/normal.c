@@ -90,9 +90,9 @@ static void accumulated(row r, const double *residual, const double *jacobian, c
     }
 }
 
-/* The solution of a x = b, of which the upper triangle is given, scaled to a unit diagonal; 0 if a
-   is not positive definite. It is written over b, and a is overwritten by its Cholesky factor. */
-static int solved(i64 size, double *a, double *b, double *unit)
+/* The Cholesky factor of a, of which the upper triangle is given and overwritten, after it is scaled
+   to a unit diagonal by `unit` (P,); 0 if a is not positive definite. */
+static int factorised(i64 size, double *a, double *unit)
 {
     for (i64 i = 0; i < size; i++) unit[i] = sqrt(a[i * size + i]);
     for (i64 i = 0; i < size; i++)
@@ -105,6 +105,12 @@ static int solved(i64 size, double *a, double *b, double *unit)
         for (i64 k = i + 1; k < size; k++)
             for (i64 j = k; j < size; j++) a[k * size + j] -= own[k] * own[j];
     }
+    return 1;
+}
+
+/* The solution of a x = b, written over b, from the factor of a; 0 if it is not finite. */
+static int solved(i64 size, const double *a, double *b, const double *unit)
+{
     for (i64 i = 0; i < size; i++) {
         b[i] = b[i] / unit[i] / a[i * size + i];
         for (i64 j = i + 1; j < size; j++) b[j] -= a[i * size + j] * b[i] * unit[j];
@@ -116,6 +122,13 @@ static int solved(i64 size, double *a, double *b, double *unit)
     }
     for (i64 i = 0; i < size; i++) b[i] /= unit[i];
     return 1;
+}
+
+static double log_determinant_of(i64 size, const double *a, const double *unit)
+{
+    double sum = 0.0;
+    for (i64 i = 0; i < size; i++) sum += 2.0 * log(a[i * size + i] * unit[i]);
+    return sum;
 }
 
 /* What is left of the residual after a move (P,). */
@@ -131,13 +144,48 @@ static void after(row r, const double *residual, const double *jacobian, const d
         }
 }
 
+/* Minus the log posterior, up to the density of noise and prior at 0. */
+static double objective_of(row r, const double *left, const double *x, const double *mean,
+                           const double *precision)
+{
+    double total = 0.0, both = r.freedom + r.outputs;
+    for (i64 k = 0; k < r.samples; k++)
+        if (r.count[k] != 0.0)
+            total += 0.5 * both * log1p(square_of(r, k, left) / r.freedom) * r.count[k];
+    for (i64 i = 0; i < r.size; i++) {
+        double slope = 0.0;
+        for (i64 j = 0; j < r.size; j++) slope += precision[i * r.size + j] * (x[j] - mean[j]);
+        total += 0.5 * slope * (x[i] - mean[i]);
+    }
+    return total;
+}
+
+/* Objectives (n,) at x (n, P), with the residuals (n, K, d) there. */
+EXPORT void objectives(i64 n, i64 samples, i64 outputs, i64 size, i64 scales, double freedom,
+                       const double *scale, const double *thinning, const i64 *group,
+                       const double *measured, const double *common, const double *block,
+                       const double *residual, const double *x, const double *mean,
+                       const double *precision, double *objective)
+{
+    i64 all = samples * outputs;
+    double *room = malloc((all + samples) * sizeof(double));
+    row r = {samples, outputs, size, freedom, room, room + all, 0, 0};
+    for (i64 m = 0; m < n; m++) {
+        measured_once(r, scales, scale, thinning, group + m * samples, measured + m * samples,
+                      common ? common + m * all : 0, block ? block + m * samples : 0);
+        objective[m] = objective_of(r, residual + m * all, x + m * size, mean + m * size,
+                                    precision + m * size * size);
+    }
+    free(room);
+}
+
 static double bounded(double value, double low, double high)
 {
     return value < low ? low : value > high ? high : value;
 }
 
-/* Steps from x (n, P) on: where they end, the objective that is predicted there, and the curvature
-   before the step; `done` is 0 for a row whose equations could not be solved. */
+/* Steps from x (n, P) on: where they end, the objective that is predicted there, the curvature before
+   the step and the logarithm of its determinant; `done` is 0 for a row whose equations could not be solved. */
 EXPORT void gauss_newton(i64 n, i64 samples, i64 outputs, i64 size, i64 scales, i64 rounds,
                          double freedom, const double *scale, const double *thinning,
                          const double *lower, const double *upper, const double *largest,
@@ -145,7 +193,7 @@ EXPORT void gauss_newton(i64 n, i64 samples, i64 outputs, i64 size, i64 scales, 
                          const double *block, const double *residual, const double *jacobian,
                          const double *x, const double *mean, const double *precision,
                          const double *damping, double *there, double *objective,
-                         double *curvature, unsigned char *done)
+                         double *curvature, double *determinant, unsigned char *done)
 {
     i64 all = samples * outputs, square = size * size;
     double *room = malloc((2 * all + samples + square + 3 * size) * sizeof(double));
@@ -166,13 +214,17 @@ EXPORT void gauss_newton(i64 n, i64 samples, i64 outputs, i64 size, i64 scales, 
             memcpy(a, precision, square * sizeof(double));
             for (i64 i = 0; i < size; i++) b[i] = -gradient[i];
             accumulated(r, residual, jacobian, left, a, b);
-            if (!round)
+            if (!round) {
                 for (i64 i = 0; i < size; i++)
                     for (i64 j = i; j < size; j++)
                         curvature[i * size + j] = curvature[j * size + i] = a[i * size + j];
+                if (!(done[m] = (unsigned char)factorised(size, a, unit))) break;
+                determinant[m] = log_determinant_of(size, a, unit);
+                memcpy(a, curvature, square * sizeof(double));
+            }
             if (damping)
                 for (i64 i = 0; i < size; i++) a[i * size + i] *= 1.0 + damping[m];
-            done[m] = (unsigned char)solved(size, a, b, unit);
+            done[m] = factorised(size, a, unit) && solved(size, a, b, unit);
             after(r, residual, jacobian, b, left);
         }
         for (i64 i = 0; i < size; i++) {
@@ -181,16 +233,7 @@ EXPORT void gauss_newton(i64 n, i64 samples, i64 outputs, i64 size, i64 scales, 
             b[i] = there[i] - x[i];
         }
         after(r, residual, jacobian, b, left);
-        double total = 0.0;
-        for (i64 k = 0; k < samples; k++)
-            total += 0.5 * (freedom + outputs) * log1p(square_of(r, k, left) / freedom) * r.count[k];
-        for (i64 i = 0; i < size; i++) {
-            double slope = 0.0;
-            for (i64 j = 0; j < size; j++)
-                slope += precision[i * size + j] * (there[j] - mean[j]);
-            total += 0.5 * slope * (there[i] - mean[i]);
-        }
-        objective[m] = total;
+        objective[m] = objective_of(r, left, there, mean, precision);
         group += samples;
         measured += samples;
         common = common ? common + all : common;

@@ -23,7 +23,7 @@ from retwin.inference.problem import Problem
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["compiled_step", "library"]
+__all__ = ["compiled_objective", "compiled_step", "library"]
 
 
 def library() -> ctypes.CDLL | None:
@@ -45,28 +45,23 @@ def compiled_step(
     damping: Tensor | None,
     limits: Sequence[Tensor],
     reweightings: int,
-) -> tuple[Tensor, Tensor, Tensor] | None:
-    """The end (R, P) of each step, the objective (R,) predicted there, the curvature (R, P, P).
+) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
+    """The numbers of a `GaussNewtonStep`.
 
     See `gauss_newton_step` for the arguments. `limits` are the lower and upper limits of x and the
     largest change of a step, (P,) each. None where the kernel does not apply, or equations have no
     solution.
     """
-    kernel, loss, common = library(), noise.loss, problem.common
-    tensors = (*linearised, x, prior.mean, prior.precision, noise.scale)
-    suits = all(each.dtype == torch.float64 and each.device.type == "cpu" for each in tensors)
-    graded = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
-    if kernel is None or not isinstance(loss, StudentT) or not suits or graded or not x.numel():
+    kernel, loss = library(), noise.loss
+    if kernel is None or not isinstance(loss, StudentT) or not _suits(prior, noise, x, *linearised):
         return None
     residual, jacobian = linearised
     rows, samples, outputs, size = jacobian.shape
     there, objective = np.empty((rows, size)), np.empty(rows)
-    curvature, done = np.empty((rows, size, size)), np.empty(rows, np.uint8)
+    curvature, determinant = np.empty((rows, size, size)), np.empty(rows)
+    done = np.empty(rows, np.uint8)
     given = (
-        np.ascontiguousarray(problem.group.numpy(), np.int64),
-        _doubles(problem.measured),
-        None if common is None else _doubles(common.variance),
-        None if common is None else _doubles(common.block),
+        *_samples(problem),
         *map(_doubles, (residual, jacobian, x, prior.mean, prior.precision)),
         None if damping is None else _doubles(damping),
     )
@@ -76,11 +71,55 @@ def compiled_step(
         (rows, samples, outputs, size, noise.scale.shape[1], reweightings),
         loss.freedom,
         [*map(_doubles, (noise.scale, noise.thinning, *limits))],
-        (*given, there, objective, curvature, done),
+        (*given, there, objective, curvature, determinant, done),
     )
     if not done.all():
         return None
-    return torch.from_numpy(there), torch.from_numpy(objective), torch.from_numpy(curvature)
+    made = map(torch.from_numpy, (there, objective, curvature, determinant))
+    return tuple(made)  # type: ignore[return-value]
+
+
+def compiled_objective(
+    problem: Problem, prior: GaussianPrior, noise: Noise, x: Tensor, residual: Tensor
+) -> Tensor | None:
+    """The objective (R,) at x (R, P), with the residual (R, K, d) there; see `Solution`.
+
+    None where the kernel does not apply.
+    """
+    kernel, loss = library(), noise.loss
+    if kernel is None or not isinstance(loss, StudentT) or not _suits(prior, noise, x, residual):
+        return None
+    rows, samples, outputs = residual.shape
+    objective = np.empty(rows)
+    given = map(_doubles, (residual, x, prior.mean, prior.precision))
+    call(
+        kernel,
+        "objectives",
+        (rows, samples, outputs, x.shape[1], noise.scale.shape[1]),
+        loss.freedom,
+        [_doubles(noise.scale), _doubles(noise.thinning)],
+        (*_samples(problem), *given, objective),
+    )
+    return torch.from_numpy(objective)
+
+
+def _suits(prior: GaussianPrior, noise: Noise, x: Tensor, *others: Tensor) -> bool:
+    """Whether all numbers are in double precision on the processor, and no gradient is wanted."""
+    tensors = (*others, x, prior.mean, prior.precision, noise.scale)
+    graded = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
+    doubles = all(each.dtype == torch.float64 and each.device.type == "cpu" for each in tensors)
+    return doubles and not graded and x.numel() > 0
+
+
+def _samples(problem: Problem) -> tuple[NDArray | None, ...]:
+    """Group and share of every sample, and what is known of its error."""
+    common = problem.common
+    return (
+        np.ascontiguousarray(problem.group.numpy(), np.int64),
+        _doubles(problem.measured),
+        None if common is None else _doubles(common.variance),
+        None if common is None else _doubles(common.block),
+    )
 
 
 def _doubles(values: Tensor) -> NDArray:

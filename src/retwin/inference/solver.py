@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from retwin.inference.noise import Noise
-from retwin.inference.normal import compiled_step
+from retwin.inference.normal import compiled_objective, compiled_step
 from retwin.inference.priors import GaussianPrior, inverse
 from retwin.inference.problem import Problem
 
@@ -122,12 +122,15 @@ class GaussNewtonStep:
         (R,), predicted there.
     curvature : Tensor
         (R, P, P), of the objective before the step, without damping.
+    log_determinant : Tensor
+        (R,), of the curvature.
 
     """
 
     x: Tensor
     objective: Tensor
     curvature: Tensor
+    log_determinant: Tensor
 
 
 def gauss_newton_step(
@@ -181,7 +184,7 @@ def gauss_newton_step(
         there = bounds.moved(x, move)
         left = _left(joined, there - x).view_as(residual)
     predicted = noise.misfit(problem, left).sum(dim=1) + prior.energy(there)
-    return GaussNewtonStep(there, predicted, undamped)
+    return GaussNewtonStep(there, predicted, undamped, torch.linalg.slogdet(undamped)[1])
 
 
 def solve(
@@ -216,7 +219,7 @@ def solve(
 
     """
     x, linearised = start, problem.linearised(start)
-    energy = noise.misfit(problem, linearised[0]).sum(dim=1) + prior.energy(x)
+    energy = _objective(problem, prior, noise, x, linearised[0])
     size = x.shape[1]
     found = Solution(
         x, energy, x.new_full((len(x), size, size), torch.nan), torch.full_like(energy, -torch.inf)
@@ -234,7 +237,7 @@ def solve(
             bounds=bounds,
             reweightings=reweightings,
         )
-        occam = 0.5 * (prior.log_determinant - torch.linalg.slogdet(step.curvature)[1])
+        occam = 0.5 * (prior.log_determinant - step.log_determinant)
         done = (energy - step.objective < TOLERANCE) | (count == MAX_STEPS)
         if minimum_evidence is not None and count:
             hopeless = (occam - step.objective <= minimum_evidence[rows]) & (damping <= DAMPING)
@@ -247,17 +250,19 @@ def solve(
         going = (~done & ~hopeless).nonzero()[:, 0]
         if not len(going):
             break
+        end, curvature = step.x, step.curvature
         if len(going) < len(rows):
+            end, curvature = end[going], curvature[going]
             problem, prior, rows = problem[going], prior[going], rows[going]
             x, energy, damping, before = x[going], energy[going], damping[going], before[going]
             linearised = linearised[0][going], linearised[1][going]
-        move = step.x[going] - x
-        factor = _extrapolation(move, before, step.curvature[going])
+        move = end - x
+        factor = _extrapolation(move, before, curvature)
         trial = x + factor[:, None] * move
         if bounds is not None:
             trial = bounds.moved(x, trial - x)
         tried = problem.linearised(trial)
-        there = noise.misfit(problem, tried[0]).sum(dim=1) + prior.energy(trial)
+        there = _objective(problem, prior, noise, trial, tried[0])
         better = there <= energy
         x = torch.where(better[:, None], trial, x)
         energy = torch.where(better, there, energy)
@@ -267,6 +272,16 @@ def solve(
         damping = torch.where(better, (damping / 4).clamp_min(1e-9), raised)
         before = torch.where(better[:, None], move, 0.0)
     return found
+
+
+def _objective(
+    problem: Problem, prior: GaussianPrior, noise: Noise, x: Tensor, residual: Tensor
+) -> Tensor:
+    """Minus the log posterior (R,) at x (R, P), see `Solution`."""
+    made = compiled_objective(problem, prior, noise, x, residual)
+    if made is not None:
+        return made
+    return noise.misfit(problem, residual).sum(dim=1) + prior.energy(x)
 
 
 def _extrapolation(move: Tensor, before: Tensor, metric: Tensor) -> Tensor:
