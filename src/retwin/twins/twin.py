@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.arrays import check_finite, is_finite
 from retwin.checks import instance, require, whole
+from retwin.data.measured import check_magnitude
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Provenance, Trajectories
 from retwin.progress import Progress
@@ -182,8 +183,9 @@ def checked_stride(
     Raises
     ------
     InputError
-        There is no trajectory, one has a fault, channels or rate are not the twin's, or `rate` does
-        not divide that of the trajectories.
+        There is no trajectory, one has a fault, channels or rate are not the twin's, `rate` does
+        not divide that of the trajectories, or a value stands for a missing measurement
+        (`check_magnitude`).
 
     """
     instance(argument, trajectories, Trajectories, remedy="load recorded ones, or simulate a twin")
@@ -196,6 +198,7 @@ def checked_stride(
         remedy=f"take {argument}.with_label({HEALTHY!r})",
     )
     check_channels(twin, trajectories, argument)
+    check_magnitude(argument, trajectories)
     return stride_of(
         trajectories.rate, rate, steps=trajectories.steps, remedy="give the sensor's true rate"
     )

@@ -395,6 +395,10 @@ def test_what_cannot_be_corrected_is_refused() -> None:
         fit_dynamics(LINEAR, short)
     with pytest.raises(InputError, match="rate"):
         fit_dynamics(LINEAR, observed.replace(rate=10.0))
+    spoilt = observed.observed.copy()
+    spoilt[0, 100] = 1e9
+    with pytest.raises(InputError, match="by NaN"):
+        fit_dynamics(LINEAR, observed.replace(observed=spoilt))
     unstable = replace(OSCILLATOR, substeps=1, parameters=(
         Parameter("stiffness", "N/m", 10.0, 1e9, 1e8), DAMPING, CUBIC))  # fmt: skip
     with pytest.raises(InputError, match="finite"):

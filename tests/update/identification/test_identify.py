@@ -114,6 +114,31 @@ def test_two_trajectories_give_no_standard_errors() -> None:
     assert np.isfinite(updated.identifiability.errors).all()
 
 
+def test_trajectories_without_a_measurement_are_named_and_are_no_evidence() -> None:
+    """Counted among twelve, three measured ones had intervals half as wide as alone."""
+    three, every = persistent(3, 0, "segment"), persistent(12, 0, "segment")
+    observed = every.observed.copy()
+    observed[:3], observed[3:] = three.observed, np.nan
+    commands = every.commands.copy()
+    commands[:3] = three.commands
+    method = LeastSquares(1)
+    alone = identify(AFFINE, three, seed=0, method=method)
+    padded = every.replace(observed=observed, mask=np.isfinite(observed), commands=commands)
+    with pytest.warns(UserWarning, match="nothing was measured in 00003, 00004"):
+        updated = identify(AFFINE, padded, seed=0, method=method)
+    assert updated.errors == pytest.approx(alone.errors)
+    assert updated.intervals["a"] == pytest.approx(alone.intervals["a"])
+    assert "nothing was measured in 00003" in updated.reason
+
+
+def test_a_value_that_stands_for_a_missing_measurement_is_refused() -> None:
+    observed = measured(LAG, 0.05, seed=1, gain=GAIN, share=SHARE)
+    spoilt = observed.observed.copy()
+    spoilt[0, 30] = 1e9
+    with pytest.raises(rt.InputError, match=r"got 1e\+09 of .* by NaN"):
+        identify(LAG, observed.replace(observed=spoilt), seed=0)
+
+
 def test_a_product_of_two_parameters_is_not_identified() -> None:
     observed = measured(PRODUCT, 0.05, seed=3, a=1.2, b=0.9)
     with pytest.warns(UserWarning, match="not identified: a, b"):

@@ -336,6 +336,16 @@ def test_nothing_to_calibrate_on_is_refused(ibg: rt.Surrogate, emulated: rt.Traj
         rt.fit_residual(ibg, still, seed=0)
 
 
+def test_trajectories_without_a_measurement_are_named(identity: rt.Surrogate) -> None:
+    real, _ = toy(12, seed=6)
+    mask = np.ones_like(real.mask)
+    mask[3] = False
+    brief = rt.Mixture(training=Training(max_epochs=3))
+    with pytest.warns(UserWarning, match="nothing was measured in 00003"):
+        model = rt.fit_residual(identity, real.replace(mask=mask), density=brief, seed=0)
+    assert "nothing was measured in 00003" in model.fitted.reason
+
+
 @pytest.mark.parametrize("value", [3.4e38, 1e19, -1e12])
 def test_a_sentinel_is_refused_by_name(
     value: float, ibg: rt.Surrogate, emulated: rt.Trajectories

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from retwin.checks import require
+from retwin.data.measured import unmeasured
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
@@ -146,7 +147,9 @@ def fit_dynamics(
     made = replace(made, widening=widening(made, estimation, held_out))
     report(1.0)
     unknown = estimation.undetermined(found)[: unknowns.count]
-    notes = _notes(estimation, found.point, unknown)
+    notes = "; ".join(
+        filter(None, [_notes(estimation, found.point, unknown), unmeasured(observed)])
+    )
     if notes:
         warnings.warn(notes, stacklevel=2)
     k, count = unknowns.count, len(found.point.shared)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from retwin.checks import require
+from retwin.data.measured import measured_only, unmeasured
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
@@ -206,6 +207,8 @@ def _fit(
 ) -> Updated:
     """The parameters that fit best; arguments are those of `identify`."""
     began = time.perf_counter()
+    missing = unmeasured(observed) if isinstance(observed, Trajectories) else ""
+    observed = measured_only(observed) if missing else observed
     with misfit_of(twin, observed, seed=seed, rate=rate, processes=processes) as misfit:
         search = Search(misfit, method, progress)
         before = misfit.rms
@@ -218,8 +221,8 @@ def _fit(
     if (kept != best.values).any():
         best = replace(best, values=tuple(kept.tolist()))
         optima = [(best, point), *optima[1:]]
-    if found.warning:
-        warnings.warn(found.warning, stacklevel=3)
+    for note in filter(None, [found.warning, missing]):
+        warnings.warn(note, stacklevel=3)
     count = len(observed)
     half = stats.t.ppf(0.975, max(count - 1, 1)) * errors
     values = np.array(best.values)
@@ -246,7 +249,7 @@ def _fit(
             "independent": found.independent,
             "starts_agreeing": float(agreeing),
         },
-        reason="; ".join(filter(None, [best.reason, found.warning, unknown])),
+        reason="; ".join(filter(None, [best.reason, found.warning, missing, unknown])),
         loss=search.loss,
         scale=search.scale,
     )

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from retwin.checks import one_of, whole
+from retwin.data.measured import measured_only
 from retwin.data.trajectories import Trajectories
 from retwin.update.identification.identifiability import CHI2_95, noise_of
 from retwin.update.identification.identify import Updated
@@ -100,7 +101,7 @@ def profile(
     names = updated.twin.names
     one_of("name", name, names)
     whole("points", points, least=3)
-    which = names.index(name)
+    which, observed = names.index(name), measured_only(observed)
     error, limit, ratio = updated.identifiability.errors[which], CHI2_95, 1.0
     if np.isfinite(updated.errors[name]):
         error, ratio = updated.errors[name], (updated.errors[name] / error) ** 2

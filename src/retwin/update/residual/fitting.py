@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retwin.checks import instance, require
+from retwin.data.measured import check_magnitude, unmeasured
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
 from retwin.errors import InputError
@@ -47,10 +48,6 @@ from retwin.update.training_range import checked_once, training_checked
 __all__ = ["calibrating", "fit_residual", "infer_discrepancy"]
 
 R = TypeVar("R", bound=Residual)
-
-MAX_RATIO, MAX_VALUE = 1e6, 1e18
-"""Largest measurement, over the largest ideal output and in any case: float32 has seven digits, and
-the squares of larger numbers are infinite."""
 
 
 @checked_once
@@ -191,6 +188,9 @@ def fit_residual(
         calibration, calibrate_on, getattr(correction, "severities", False), 1 if stepwise else 3
     )
     used = calibration[keep]
+    missing = unmeasured(used)
+    if missing:
+        warnings.warn(f"calibration: {missing}", stacklevel=2)
     if isinstance(segments, str):
         rule, parts = segments, segment(used.commands, used.nominal, segments)
     else:
@@ -218,7 +218,7 @@ def fit_residual(
         sequence = fit_sequence(
             used, correction, density, context, found, seed=seed, bounds=bounds, progress=progress
         )
-        return _noted(sequence, outside)
+        return _noted(sequence, outside, missing)
     with isolated(seed):
         model = ResidualModel(
             correction, density, inputs=used.inputs, outputs=used.outputs, segmentation=rule
@@ -229,7 +229,7 @@ def fit_residual(
     model.emulated = used.emulated
     onsets = Segments.from_commands(calibration.commands)
     model.timing = np.where(onsets.valid, onsets.start, np.nan)
-    return _noted(model.eval(), outside)
+    return _noted(model.eval(), outside, missing)
 
 
 def _fit_per_segment(
@@ -271,10 +271,14 @@ def _fit_per_segment(
     return replace(result, figures=figures | result.figures)
 
 
-def _noted(model: R, outside: str) -> R:
-    """The model; its record states the commands that the surrogate was not trained on."""
-    if outside and model.fitted is not None:
-        reason = f"{model.fitted.reason}; commands outside the surrogate's training: {outside}"
+def _noted(model: R, outside: str, missing: str) -> R:
+    """The model; its record states the commands that the surrogate was not trained on.
+
+    It also states in which trajectories nothing was measured.
+    """
+    notes = [f"commands outside the surrogate's training: {outside}" if outside else "", missing]
+    if model.fitted is not None:
+        reason = "; ".join(filter(None, [model.fitted.reason, *notes]))
         model.fitted = replace(model.fitted, reason=reason)
     return model
 
@@ -307,20 +311,7 @@ def _measured(trajectories: Trajectories) -> tuple[Tensor, Tensor]:
 
     Raises InputError for a value that no sensor gives, beside which the others would be lost.
     """
-    scale = np.abs(trajectories.nominal).max(axis=(0, 1)).astype(float)
-    limit = np.where(scale > 0, MAX_RATIO * scale, np.inf).clip(max=MAX_VALUE)
-    i, _, k = np.argwhere(np.abs(trajectories.observed) > limit)[:1].T
-    require(
-        not len(i),
-        "calibration.observed",
-        expected=f"measurements below {MAX_RATIO:g} times the largest ideal output",
-        got=", ".join(
-            f"{np.abs(trajectories.observed[each, :, at]).max():.3g} of "
-            f"{trajectories.outputs.names[at]} in {trajectories.ids[each]}"
-            for each, at in zip(i, k, strict=True)
-        ),
-        remedy="replace the values that stand for a missing measurement by NaN",
-    )
+    check_magnitude("calibration", trajectories, ideal=True)
     return torch.tensor(trajectories.observed), torch.tensor(trajectories.mask)
 
 
