@@ -53,6 +53,21 @@ def test_iso_times_with_a_zone_and_pauses_between_three_runs(tmp_path: Path) -> 
     assert any("No log holds level" in note for note in found.notes)
 
 
+def test_rows_that_are_left_out_are_no_pause(tmp_path: Path) -> None:
+    """A row in five lost: the record was cut into eight, each from the twin's start on."""
+    keep = np.sort(np.random.default_rng(0).permutation(400)[:320])
+    rows = [f"{k / 10:.1f},{k // 50},{k}" for k in keep]
+    found = read_logs([table(tmp_path / "a.csv", "time,valve,speed", rows)], TWIN)
+    made = found.trajectories
+    assert made.ids.tolist() == ["a"]
+    kept = np.isin(np.arange(keep[0], keep[-1] + 1), keep)
+    np.testing.assert_allclose(made.commands[0, kept[: made.steps], 0], keep // 50)
+    longest = np.diff(keep).max() / 10
+    assert longest > 0.25, "more than one lost row"
+    assert any(f"for {longest:.2g} s at most" in note for note in found.notes)
+    assert not made.mask[0, :, 0].all(), "measurements are not joined over as long"
+
+
 def test_a_last_column_with_empty_cells_keeps_its_title_and_its_first_rows(tmp_path: Path) -> None:
     rows = [f"{k / 10},{k % 4},{'' if k in (1, 3, 4) else k}" for k in range(25)]
     made = read_logs([table(tmp_path / "a.csv", "time,valve,level", rows)], TWIN).trajectories

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 
 import numpy as np
@@ -9,9 +10,10 @@ import numpy as np
 from retwin.checks import require
 from retwin.data.logs.mapping import ChannelMapping, Cut, TimeSettings
 from retwin.data.logs.mapping import Mapping as LogMapping
-from retwin.data.logs.proposal import channel_mapping, cut_at_pauses
+from retwin.data.logs.proposal import channel_mapping, cut_at_pauses, shortest_pause
 from retwin.data.logs.signals import UNWANTED, Log, named_unit
 from retwin.data.logs.tables import EVEN, TIMES
+from retwin.data.resampling import longest_bridge
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 from retwin.twins.twin import Twin
@@ -142,8 +144,8 @@ def mapping_by_names(log: Log, twin: Twin, named: Mapping[str, str], *, table: b
     """The mapping of the signals that have the names of a twin's channels, at its rate.
 
     A pause separates trajectories, as in the mapping that `retwin data map` proposes. Commands are
-    held: in a table no longer than values of outputs are joined, since an empty cell is a missing
-    value; in another log until they are sent again.
+    held until they are sent again; in a table, where an empty cell is refused, over rows that are
+    left out, up to the shortest pause.
     """
     found = signals_of(log, (*twin.inputs.names, *twin.outputs.names), named)
     signals = [log.signals[each] for each in found.values()]
@@ -156,10 +158,16 @@ def mapping_by_names(log: Log, twin: Twin, named: Mapping[str, str], *, table: b
                 continue
             signal = log.signals[found[name]]
             wanted = unit if unit != "1" else None
-            if table:
+            proposed = channel_mapping(signal, kind, twin.rate, cut)
+            if table and kind == "commands":
+                held = min(proposed.max_gap or math.inf, shortest_pause(1 / twin.rate))
+                usual = longest_bridge(signal.times, 1 / twin.rate)
+                made[name] = ChannelMapping(
+                    signal=signal.name, unit=wanted, max_gap=max(held, usual)
+                )
+            elif table:
                 made[name] = ChannelMapping(signal=signal.name, unit=wanted)
             else:
-                proposed = channel_mapping(signal, kind, twin.rate, cut)
                 made[name] = proposed.model_copy(update={"unit": wanted})
         return made
 
@@ -202,14 +210,20 @@ def resampling_of(log: Log, mapping: LogMapping, rate: float) -> str:
     """How the values of a log come to the sample rate."""
     place = next((name for name, why in log.skipped.items() if why == TIMES), "")
     where = f"times in column {place}, " if place else ""
-    own = []
+    own, held = [], 0.0
+    commands = {each for channel in mapping.commands.values() for each in channel.signals}
     for name in mapping.signals:
         at = log.signals[name].times
         steps = np.diff(at)
+        if name in commands and place and len(steps):
+            usual = longest_bridge(at, 1 / rate)
+            bridged = steps[(steps > usual) & (steps <= max(usual, shortest_pause(1 / rate)))]
+            held = max(held, float(bridged.max(initial=0.0)))
         if len(steps) and not np.allclose((at - at[0]) * rate, np.arange(len(at)), atol=1e-3):
             own.append(1 / float(np.median(steps)) if np.median(steps) > 0 else 0.0)
     if not own:
         return f"{where}a row per sample at {rate:g} Hz"
     low, high = min(own), max(own)
     shown = f"{low:.4g}" if high < (1 + ROUNDED) * low else f"{low:.4g} to {high:.4g}"
-    return f"{where}values at {shown} Hz (median) are brought to {rate:g} Hz"
+    rows = f", commands are held where rows are left out, for {held:.2g} s at most" if held else ""
+    return f"{where}values at {shown} Hz (median) are brought to {rate:g} Hz{rows}"

@@ -70,4 +70,4 @@ def measured_only(trajectories: Trajectories) -> Trajectories:
     All are left if it is none: what needs measurements then refuses them.
     """
     some = trajectories.mask.any(axis=(1, 2))
-    return trajectories if some.all() or not some.any() else trajectories[some]
+    return trajectories if some.all() or not some.any() else trajectories[np.flatnonzero(some)]

@@ -71,8 +71,8 @@ def resampled(
     before = np.searchsorted(at, grid + margin, side="right") - 1
     after = np.searchsorted(at, grid - margin)
     bridged = (before >= 0) & (after < len(at))
-    bridged[bridged] = (at[after[bridged]] - at[before[bridged]]) <= longest
-    if how == "hold" and end is not None and end - at[-1] <= longest:
+    bridged[bridged] = (at[after[bridged]] - at[before[bridged]]) <= longest + margin
+    if how == "hold" and end is not None and end - at[-1] <= longest + margin:
         bridged |= (before == len(at) - 1) & (grid <= end + margin)
     found = _means(at, own, grid, period) if how == "hold" else np.interp(grid, at, own)
     made[bridged] = found[bridged]

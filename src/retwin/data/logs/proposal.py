@@ -33,6 +33,7 @@ __all__ = [
     "facts_of",
     "propose_mapping",
     "proposed",
+    "shortest_pause",
 ]
 
 COMMAND = re.compile(
@@ -346,14 +347,19 @@ def _alike(name: str, unit: str, fact: Fact, *, command: bool) -> float:
     return score
 
 
+def shortest_pause(period: float) -> float:
+    """The longest interval in s without a value that is no pause, at a sample period in s."""
+    return max(PAUSE, PAUSE_PERIODS * period)
+
+
 def cut_at_pauses(signals: Sequence[Signal], period: float) -> Cut:
     """A cut at the pauses of a log, if there are any."""
     steps = np.diff(union_of_times(signals))
-    longer = steps[steps > max(PAUSE, PAUSE_PERIODS * period)]
+    least = shortest_pause(period)
+    longer = steps[steps > least]
     # A slow log has no pauses: its intervals are all alike.
     if not len(longer) or len(longer) > 0.05 * len(steps):
         return Cut()
-    least = max(PAUSE, PAUSE_PERIODS * period)
     return Cut(by="gap", gap=_round(max(least, float(longer.min()) / 2)))
 
 
