@@ -48,7 +48,8 @@ def steps_per_sample(rate: float, step: float) -> int:
         "step",
         expected=f"a step that divides the sample period, {1.0 / rate:g} s",
         got=f"{step:g} s",
-        remedy=f"give for instance step={1.0 / (rate * max(count, 1)):g}",
+        remedy=f"give for instance step={1.0 / (rate * max(count, 1)):g}, or another sample rate "
+        f"(--rate), {1.0 / (step * max(count, 1)):g} Hz",
     )
     return count
 
