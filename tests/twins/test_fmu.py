@@ -417,6 +417,19 @@ def test_an_fmu_that_does_not_load_is_refused_once(tmp_path: Path, load: int, wh
         twin.simulate(np.zeros((3, 10, 1)), seed=0)
 
 
+def test_a_script_without_a_guard_is_advised(lag: Path, tmp_path: Path) -> None:
+    text = SCRIPT.split("if __name__")[0] + (
+        f"twin = FMUTwin.from_file({str(lag)!r}, 100.0, ['u'], ['x'], workers=1)\n"
+        "twin.simulate(np.zeros((1, 10, 1)), seed=0)\n"
+    )
+    (tmp_path / "main.py").write_text(text)
+    ran = subprocess.run(
+        [sys.executable, tmp_path / "main.py"], capture_output=True, text=True, timeout=120
+    )
+    assert ran.returncode == 1
+    assert "in a script simulate under `if __name__ == '__main__':`" in ran.stderr
+
+
 def test_members_stay_in_the_folder(
     lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -362,18 +362,21 @@ class FMUTwin:
 
     def _check_loads(self, pool: IsolatedPool) -> None:
         """Refuse an FMU that cannot be loaded, once instead of in every run."""
+        remedy = "export it for this system; see that what it needs is installed"
         try:
             reason = pool.schedule(fmu_worker.load, timeout=self.timeout, size=0).result()
         except TimeoutError:
             reason = f"it hung for more than {self.timeout:g} s"
         except ProcessEnded as error:
             reason = str(error)
+            # A process that imports a script without this line simulates in its turn, and ends.
+            remedy += "; in a script simulate under `if __name__ == '__main__':`"
         require(
             not reason,
             "path",
             expected="an FMU that loads on this machine",
             got=f"{self.path.name}: {reason}",
-            remedy="export it for this system; see that what it needs is installed",
+            remedy=remedy,
         )
 
     def _start_values(
