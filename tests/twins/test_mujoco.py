@@ -82,6 +82,24 @@ def test_parameters_differ_from_simulation_to_simulation(make) -> None:
     assert abs(heavy.observed[1, -1, 0] - 0.1) < abs(heavy.observed[0, -1, 0] - 0.1) / 2
 
 
+def test_parameters_of_a_tendon_differ_like_those_of_a_joint(make) -> None:
+    """A tendon along one joint, with its stiffness, is a spring of that joint."""
+    tendon = '<tendon><fixed name="spring"><joint joint="hinge" coef="1"/></fixed></tendon>'
+    model = PENDULUM.format(actuator=MOTOR, joint="")
+    path = make().path.with_name("with_a_tendon.xml")
+    path.write_text(model.replace("<actuator>", f"{tendon}<actuator>"), encoding="utf-8")
+    twin = MuJoCoTwin.from_file(path, keyframe="raised")
+    values, free = [3.0, 40.0], np.zeros((2, 100, 1))
+    by_tendon, by_joint = (
+        twin.simulate(free, seed=0, parameters={f"{place}.stiffness": values}).observed
+        for place in ("tendon.spring", "joint.hinge")
+    )
+    np.testing.assert_allclose(by_tendon, by_joint, atol=1e-4)
+    assert not np.allclose(by_tendon[0], by_tendon[1], atol=0.01)
+    with pytest.raises(rt.InputError, match=r"tendon\.spring\.nothing"):
+        twin.simulate(free, seed=0, parameters={"tendon.spring.nothing": values})
+
+
 def test_a_servo_starts_at_rest_at_its_first_command(make) -> None:
     twin = make(SERVO)
     made = twin.simulate(np.full((2, 50, 1), [[[0.0]], [[0.5]]]), seed=0)

@@ -85,8 +85,13 @@ def parameter_value(model: mujoco.MjModel, name: str) -> float:
         index = int(parts["index"] or parts["at"] or 0)
         if parts["option"]:
             return float(np.ravel(getattr(model.opt, parts["option"]))[index])
-        place = getattr(model, parts["kind"])(parts["name"])
-        return float(np.ravel(getattr(place, parts["field"]))[index])
+        kind, field = parts["kind"], parts["field"]
+        place = getattr(model, kind)(parts["name"])
+        # MuJoCo 4 hides the fields of tendons behind other names, those of its arrays are public.
+        values = getattr(place, field, None)
+        if values is None:
+            values = getattr(model, f"{kind}_{field}")[place.id]
+        return float(np.ravel(values)[index])
     except (KeyError, AttributeError, ValueError, IndexError, TypeError) as error:
         raise _no_such_field(name, error) from None
 
@@ -136,6 +141,10 @@ def set_parameter(batch: mujoco_batch.Batch, name: str, values: NDArray) -> None
             field.reshape(len(values), -1)[:, index] = values
             return
         place = getattr(batch, parts["kind"])(parts["name"])
+        if not hasattr(place, parts["field"]):  # a field of a tendon
+            every = batch.expand(f"{parts['kind']}_{parts['field']}")
+            every.reshape(len(values), len(every[0]), -1)[:, place.id, index] = values
+            return
         field = np.array(getattr(place, parts["field"]))
         field.reshape(len(values), -1)[:, index] = values
         setattr(place, parts["field"], field)
