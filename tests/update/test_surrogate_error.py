@@ -90,13 +90,14 @@ def test_within_the_training_held_out_simulations_stand_for_the_twin(
     assert covered(found, z) >= 0.8
 
 
-def test_a_surrogate_that_errs_more_than_the_machine_is_warned_of() -> None:
+@pytest.mark.parametrize("twin", [TWIN, None])
+def test_a_surrogate_that_errs_more_than_the_machine_is_warned_of(twin: rt.Twin | None) -> None:
     how = Training(max_epochs=2, batch_size=256, learning_rate=5e-3)
     simulated = TWIN.simulate(commands(20, 1.0, 0), seed=0)
     poor = rt.fit_surrogate(simulated, rt.MLP((8,)), seed=0, training=how)
     density = rt.Mixture(components=1, hidden=(4,), training=Training(max_epochs=1))
     with pytest.warns(UserWarning, match=r"its own error is .* mm in .*; little can be inferred"):
-        rt.fit_residual(poor, measured(0.9)[0][:6], rt.DelayOffset(), density, seed=0, twin=TWIN)
+        rt.fit_residual(poor, measured(0.9)[0][:6], rt.DelayOffset(), density, seed=0, twin=twin)
 
 
 def test_the_error_is_that_on_the_commands(surrogate: rt.Surrogate) -> None:

@@ -204,8 +204,7 @@ def fit_residual(
     )
     with training_checked(surrogate, used.commands) as outside:
         context = _context(surrogate, used, parts, faults, twin)
-        if twin is not None:
-            warn_of_error(context, used)
+        warn_of_error(context, used)
         correction, found = fit_correction(correction, context, *_measured(used))
     require(
         found.identified.any(),
