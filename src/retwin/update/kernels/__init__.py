@@ -1,4 +1,4 @@
-"""Compiled kernels of generation: the surrogate, effective commands, delays and records.
+"""Compiled kernels: the surrogate and its Jacobian, effective commands, delays and records.
 
 Each does in one pass over a trajectory, in C and on all threads of torch, what the same function of
 `retwin.update` does in torch with many passes over a set. The functions in torch stay: they give
