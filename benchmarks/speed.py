@@ -14,8 +14,9 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+import psutil
 import torch
-from record import record
+from record import peak_memory_gb, record
 
 import retwin as rt
 from retwin.cases.armpi_fpv.twin import KINEMATIC
@@ -37,12 +38,22 @@ def both(make: Callable[[], object], repeats: int = REPEATS) -> dict[str, float]
     return {"processor (s)": processor, "clock (s)": wall}
 
 
+def memory(twin: rt.CorrectedTwin, case: rt.Case, each: int) -> dict[str, float]:
+    """Memory in GB that the first generation of this process takes beyond its result."""
+    rt.generate(twin, case, per_class=4, seed=0)
+    before = psutil.Process().memory_info().rss / 1024**3
+    made = rt.generate(twin, case, per_class=each, seed=2)
+    size = sum(getattr(made, name).nbytes for name in ("commands", "nominal", "observed"))
+    return {"set": size / 1024**3, "beyond it": peak_memory_gb() - before - size / 1024**3}
+
+
 def main(folders: list[str]) -> None:
     case = rt.cases.armpi()
     loaded = [rt.CorrectedTwin.load(each) for each in folders]
     twin = loaded[0]
     ways = {type(each.residual.correction).__name__: each for each in loaded}
     each = COUNT // len(case.classes)
+    record("speed_memory", f"GB for {COUNT} trajectories", memory(twin, case, each))
     rows = {}
     for name, way in {**ways, "surrogate": twin.surrogate, "closed form": KINEMATIC}.items():
         rt.generate(way, case, per_class=4, seed=0)
