@@ -114,7 +114,8 @@ def test_a_twin_is_inverted_and_its_diagnoser_is_not_saved(
 
 def test_a_twin_in_place_of_a_surrogate_has_no_onnx_graph(measured: rt.Trajectories) -> None:
     export = pytest.importorskip("retwin.deploy.onnx.export")
-    residual = rt.fit_residual(TWIN, measured, rt.DelayOffset(), BRIEF, seed=0)
+    with pytest.warns(UserWarning, match="DelayOffset cannot express what was measured"):
+        residual = rt.fit_residual(TWIN, measured, rt.DelayOffset(), BRIEF, seed=0)
     bundle = SimpleNamespace(twin=rt.CorrectedTwin(TWIN, residual), diagnoser=None)
     with pytest.raises(rt.InputError, match="a twin in place of a surrogate: it is no network"):
         export._check_exportable(bundle)

@@ -31,14 +31,16 @@ def commands(count: int, scale: float = 1.0) -> np.ndarray:
 @pytest.fixture(scope="module")
 def surrogate() -> rt.Surrogate:
     drawn = SAMPLER.sample(100, rng=np.random.default_rng(0))
-    training = Training(max_epochs=15, batch_size=256, learning_rate=5e-3)
+    training = Training(max_epochs=40, batch_size=256, learning_rate=5e-3)
     return rt.fit_surrogate(TWIN.simulate(drawn, seed=0), rt.MLP((32,)), seed=0, training=training)
 
 
 def measured(scale: float = 1.0) -> rt.Trajectories:
-    made = TWIN.simulate(commands(6, scale), seed=0)
-    noise = np.random.default_rng(1).normal(size=made.observed.shape)
-    return made.replace(observed=(made.nominal + 0.01 + 0.001 * noise).astype(np.float32))
+    """Six trajectories, in each of which the commands are executed with other errors."""
+    offset = np.random.default_rng(1).normal(0, 10, size=(6, 1, 2))
+    sent = commands(6, scale)
+    made = TWIN.simulate(sent + offset, seed=0)
+    return made.replace(commands=sent, nominal=TWIN.simulate(sent, seed=0).nominal)
 
 
 @pytest.fixture(scope="module")
