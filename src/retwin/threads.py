@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from threadpoolctl import ThreadpoolController
 
-__all__ = ["Turns", "available", "in_threads"]
+__all__ = ["Turns", "available", "in_threads", "one_thread"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -31,6 +31,19 @@ def available() -> int:
     """
     torch = sys.modules.get("torch")
     return 1 if torch is None or getattr(_own, "divided", False) else torch.get_num_threads()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One thread of torch, as many as before afterwards: for steps that are too small to divide."""
+    import torch
+
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
 
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:

@@ -31,6 +31,7 @@ from retwin.inference.noise import Noise
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
+from retwin.threads import one_thread
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 from retwin.twins.twin import Twin
 from retwin.update.corrections.missed_segments import CommandFit
@@ -213,6 +214,7 @@ class InversionDiagnoser:
         return self.diagnose(trajectories).probabilities
 
     @torch.no_grad()
+    @one_thread()
     def diagnose(
         self, trajectories: Trajectories, *, progress: Progress | None = None
     ) -> Diagnosis:

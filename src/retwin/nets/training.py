@@ -23,6 +23,7 @@ from torch.utils.data import (
 
 from retwin.checks import finite, one_of, positive, whole
 from retwin.progress import Progress
+from retwin.threads import one_thread
 
 __all__ = ["Fit", "Loss", "Training", "isolated", "train"]
 
@@ -118,14 +119,9 @@ def isolated(seed: int) -> Iterator[None]:
     Networks this small are slower on several threads, and their last digits would depend on the
     number of threads.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            yield
-    finally:
-        torch.set_num_threads(threads)
+    with one_thread(), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        yield
 
 
 def train(

@@ -20,6 +20,7 @@ from retwin.inference.em import expectation_maximisation
 from retwin.inference.hierarchy import Hierarchy
 from retwin.inference.noise import Noise
 from retwin.inference.solver import Solution, blocks
+from retwin.threads import one_thread
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.correction import Context, Discrepancy, block_diagonal
 from retwin.update.corrections.delays import at_bound, first_delays
@@ -85,6 +86,7 @@ def infer_commands(
     )[0]
 
 
+@one_thread()
 def infer_with_belief(
     context: Context,
     observed: Tensor,
