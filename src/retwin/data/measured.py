@@ -59,9 +59,16 @@ def check_magnitude(argument: str, trajectories: Trajectories, *, ideal: bool = 
 
 
 def unmeasured(trajectories: Trajectories) -> str:
-    """A note that names trajectories in which nothing was measured; empty if there is none."""
-    names = trajectories.ids[~trajectories.mask.any(axis=(1, 2))].tolist()
-    return f"nothing was measured in {', '.join(names)}, which are not used" if names else ""
+    """A note that names trajectories in which nothing was measured.
+
+    It is empty if there is none, and if there is no other: what needs measurements refuses them.
+    """
+    none = ~trajectories.mask.any(axis=(1, 2))
+    if none.all() or not none.any():
+        return ""
+    return (
+        f"nothing was measured in {', '.join(trajectories.ids[none].tolist())}, which are not used"
+    )
 
 
 def measured_only(trajectories: Trajectories) -> Trajectories:
