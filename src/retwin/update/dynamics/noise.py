@@ -16,8 +16,10 @@ from retwin.update.dynamics.noise_search import CHANCE, SMALLEST, Search, noisy
 from retwin.update.dynamics.prediction import Prediction
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["edges", "fit_noise", "folds", "widening"]
+__all__ = ["edges", "fit_noise", "folds", "needed_factor", "widening"]
 
+CERTAIN = 1.645
+"""Standard errors between a quantile of held-out samples and its upper 95 % limit."""
 LEVEL = 0.9
 """Probability of the intervals that are calibrated."""
 ENOUGH = 10_000
@@ -149,11 +151,24 @@ def edges(states: NDArray, commands: NDArray, count: int) -> list[NDArray]:
 
 
 def widening(twin: DynamicsTwin, estimation: Estimation, held_out: HeldOut) -> float:
-    """Factor of deviations, with which bands hold as many held-out samples as they should.
-
-    None makes bands narrower: what is held out lies between samples that were used, and its errors
-    are smaller than those of a further trajectory.
-    """
+    """Factor of deviations, with which bands hold as many held-out samples as they should."""
     deviation = np.sqrt(held_out.variances + twin.noise_variance(estimation.commands))
-    ratio = (np.abs(held_out.errors) / deviation)[estimation.seen]
-    return max(float(np.quantile(ratio, LEVEL) / ndtri((1 + LEVEL) / 2)), 1.0)
+    return needed_factor(np.abs(held_out.errors) / deviation, estimation.seen)
+
+
+def needed_factor(ratio: NDArray, seen: NDArray) -> float:
+    """Factor of deviations to which errors (n, T, d_y), in deviations, belong where they are seen.
+
+    Bands become narrower only as far as errors show it beyond chance, which correlated ones do
+    little: below 1 it is the upper limit of the factor, from as many independent samples as the
+    hits of the band are worth.
+    """
+    usual = ndtri((1 + LEVEL) / 2)
+    factor = float(np.quantile(ratio[seen], LEVEL) / usual)
+    if factor >= 1:
+        return factor
+    missed = ratio > factor * usual
+    correlated = correlation_time(np.where(seen, missed - missed[seen].mean(), 0.0))
+    number = seen.any(axis=2).sum() / correlated
+    level = LEVEL + CERTAIN * np.sqrt(LEVEL * (1 - LEVEL) / number)
+    return float(min(np.quantile(ratio[seen], min(level, 1.0)) / usual, 1.0))
