@@ -53,7 +53,7 @@ def test_turns_follow_the_items_and_a_failure_ends_the_work() -> None:
 @pytest.mark.slow
 def test_a_corrected_twin_gives_the_same_bytes_with_any_number_of_threads() -> None:
     case, before = rt.cases.armpi(), torch.get_num_threads()
-    brief = rt.Training(max_epochs=1)
+    brief = rt.Training(max_epochs=5)
     simulated = rt.generate(case.emulator, case, per_class=10, seed=0)
     ibg = rt.fit_surrogate(simulated, seed=0, training=brief)
     twin = rt.CorrectedTwin(ibg, rt.fit_residual(ibg, simulated, seed=0))

@@ -208,7 +208,7 @@ def test_sections_that_need_labels_disappear(folder: Path) -> None:
         assert f'<section id="{section}">' not in page
     for section in ("scores", "simulation", "fidelity", "time"):
         assert f'<section id="{section}">' in page
-    assert ">RMSE</abbr>, m</th>" in page
+    assert ">RMSE</abbr>, mm</th>" in page
     assert "No verdict, since a verdict over records needs at least 8 of them" in page
     assert "other stretches of the same test records" in page
     assert (folder / "figures" / "simulation.png").exists()

@@ -448,6 +448,7 @@ def drawn_discrepancy(
         ("a millionth and a million", IN_COMMANDS),
     ],
 )
+@pytest.mark.filterwarnings("ignore:correction. bands of 90 %")
 def test_the_units_of_outputs_do_not_matter(name: str, correction: rt.Correction) -> None:
     """The same discrepancy is found in other units."""
     scale, offset = ODD[name]
