@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 
 import retwin as rt
-from retwin.threads import Turns, available, in_threads
+from retwin.threads import Turns, available, in_threads, one_thread
 
 
 @pytest.fixture(params=[1, 3])
@@ -27,6 +28,32 @@ def test_results_are_in_order_and_each_part_has_one_thread(count: int) -> None:
 
     assert list(in_threads(part, range(9))) == [(number, 1, 1) for number in range(9)]
     assert torch.get_num_threads() == available() == count
+
+
+@pytest.mark.usefixtures("count")
+def test_blocks_of_one_thread_that_overlap_restore_the_number() -> None:
+    before, inside, found = torch.get_num_threads(), threading.Event(), []
+
+    def first() -> None:
+        with one_thread():
+            inside.set()
+            time.sleep(0.1)
+
+    def second() -> None:
+        inside.wait()
+        with one_thread():
+            time.sleep(0.2)
+
+    def third() -> None:  # begins when both have ended
+        found.append(torch.get_num_threads())
+
+    for group in ((first, second), (third,)):
+        threads = [threading.Thread(target=each) for each in group]
+        for each in threads:
+            each.start()
+        for each in threads:
+            each.join()
+    assert found == [before] == [torch.get_num_threads()]
 
 
 @pytest.mark.usefixtures("count")

@@ -22,6 +22,9 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _own = threading.local()
+_lock = threading.Lock()
+_blocks: list[int] = []
+"""Of each block of `one_thread` that is entered, the number of threads outside of all of them."""
 
 
 def available() -> int:
@@ -38,12 +41,17 @@ def one_thread() -> Iterator[None]:
     """One thread of torch, as many as before afterwards: for steps that are too small to divide."""
     import torch
 
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
+    with _lock:
+        # Blocks of several threads overlap: what the first one found is restored by each.
+        count = _blocks[0] if _blocks else torch.get_num_threads()
+        _blocks.append(count)
+        torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(count)
+        with _lock:
+            _blocks.pop()
+            torch.set_num_threads(count)
 
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
