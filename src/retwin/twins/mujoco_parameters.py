@@ -87,11 +87,10 @@ def parameter_value(model: mujoco.MjModel, name: str) -> float:
             return float(np.ravel(getattr(model.opt, parts["option"]))[index])
         kind, field = parts["kind"], parts["field"]
         place = getattr(model, kind)(parts["name"])
-        # MuJoCo 4 hides the fields of tendons behind other names, those of its arrays are public.
-        values = getattr(place, field, None)
-        if values is None:
-            values = getattr(model, f"{kind}_{field}")[place.id]
-        return float(np.ravel(values)[index])
+        if hasattr(place, field):
+            return float(np.ravel(getattr(place, field))[index])
+        # MuJoCo 4 hides the fields of tendons behind other names, but not the arrays of them all.
+        return float(np.ravel(getattr(model, f"{kind}_{field}")[place.id])[index])
     except (KeyError, AttributeError, ValueError, IndexError, TypeError) as error:
         raise _no_such_field(name, error) from None
 
