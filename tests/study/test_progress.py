@@ -19,10 +19,10 @@ JOBS = [
 
 def reported(*, done: int = 0) -> list[tuple[str, float]]:
     """What a study reports whose first jobs are done already."""
-    told: list[tuple[str, float]] = []
+    shares: list[tuple[str, float]] = []
     ticks = count()
     stages = Stages(
-        lambda stage, share: told.append((stage, share)), clock=lambda: float(next(ticks))
+        lambda stage, share: shares.append((stage, share)), clock=lambda: float(next(ticks))
     )
     for share in (0.0, 0.5, 1.0):
         stages.prepare("twin data", share)
@@ -33,7 +33,7 @@ def reported(*, done: int = 0) -> list[tuple[str, float]]:
             stages.work(job, share)
     stages.prepare("scores", 0.0)
     stages.finish("scores")
-    return told
+    return shares
 
 
 def test_the_share_never_falls_and_jobs_are_almost_all_of_it() -> None:
@@ -64,24 +64,24 @@ def test_what_was_done_before_is_not_done_again() -> None:
 
 
 def test_every_file_that_is_read_moves_the_share() -> None:
-    told: list[float] = []
+    shares: list[float] = []
     ticks = count()
-    stages = Stages(lambda stage, share: told.append(share), 100.0, clock=lambda: next(ticks))
+    stages = Stages(lambda stage, share: shares.append(share), 100.0, clock=lambda: next(ticks))
     for stage in ("real.mat", "twin data", "third"):
         for share in (0.0, 0.5, 1.0):
             stages.prepare(stage, share)
-    assert len(set(told)) == 7
-    assert told[-1] < 0.1
+    assert len(set(shares)) == 7
+    assert shares[-1] < 0.1
 
 
 def test_the_time_left_is_known_while_data_are_read() -> None:
     """Data that take 40 s before jobs that take 20 s: at half of the data, a third is done."""
-    told: list[float] = []
+    shares: list[float] = []
     now = [0.0]
-    stages = Stages(lambda stage, share: told.append(share), 20.0, clock=lambda: now[0])
+    stages = Stages(lambda stage, share: shares.append(share), 20.0, clock=lambda: now[0])
     stages.prepare("twin data", 0.0)
     for share in (0.25, 0.5, 1.0):
         now[0] = 40 * share
         stages.prepare("twin data", share)
-        left = now[0] * (1 - told[-1]) / told[-1]
+        left = now[0] * (1 - shares[-1]) / shares[-1]
         assert 60 - now[0] <= left < 1.1 * (62 - now[0])

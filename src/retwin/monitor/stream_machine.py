@@ -32,7 +32,7 @@ PART = 4096
 """Samples that are stepped at once at most."""
 PLACES = 4 * PART
 """Places, most of them perhaps without a sample, from which on they are stepped before others are
-taken: that bounds the memory, whatever times samples have."""
+taken: that bounds the memory for any times of the samples."""
 WINDOW, TOLERATED = 100, 20
 """Places of a check of the sample rate, and how many may be missing or have further samples."""
 BEHIND = 10

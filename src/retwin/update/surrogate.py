@@ -305,7 +305,7 @@ def fit_surrogate(
 def _hold_constant(surrogate: Surrogate, nominal: Tensor) -> None:
     """Make outputs that never change in training exactly constant.
 
-    Their scale is 1, whatever their unit is, so that a small error of the network in standard units
+    Their scale is 1 in any unit, so that a small error of the network in standard units
     can be a thousand times their value.
     """
     constant = nominal.amax(dim=0) == nominal.amin(dim=0)
