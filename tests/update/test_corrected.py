@@ -39,7 +39,8 @@ def test_sources_share_commands_and_faults(
 def test_healthy_ones_are_distributed_like_the_robot_s(ibg: rt.Surrogate, case: rt.Case) -> None:
     """Median distance from nominal, in steady parts and in motion, within a factor of 1.6.
 
-    Sixty trajectories calibrate; over four robots drawn at random the ratio was 0.9 to 1.15.
+    Sixty trajectories calibrate. The ratio was 1.02 in steady parts and 0.92 in motion here, and
+    1.05 to 1.15 for three other sets; with a start at clusters it was 1.2 to 2.4 in steady parts.
     """
     commands = case.sampler.sample(60, rng=np.random.default_rng(5))
     real = case.emulator.simulate(commands, seed=9)
