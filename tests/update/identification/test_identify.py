@@ -157,6 +157,29 @@ def test_a_best_value_on_a_bound_is_reported() -> None:
     assert updated.values["gain"] == pytest.approx(1.0, abs=1e-2)
 
 
+def test_values_that_depend_on_a_bound_are_not_identified() -> None:
+    """The gain is 1.3 where the range ends at 1: the share of the lag is wrong by it."""
+    narrow = parametric(lag, gain=(0.1, 1.0), share=(0.1, 0.98))
+    observed = measured(LAG, 0.01, seed=4, gain=1.3, share=SHARE)
+    with pytest.warns(UserWarning, match="values that depend on this bound: share"):
+        found = identify(narrow, observed, seed=0, method=LeastSquares(starts=2))
+    assert abs(found.values["share"] - SHARE) > 0.04
+    assert found.identifiability.depends.tolist() == [False, True]
+    assert not found.identifiability.identified[1]
+
+
+def test_a_true_value_on_a_bound_leaves_the_others_identified() -> None:
+    narrow = parametric(lag, gain=(0.1, 1.0), share=(0.1, 0.98))
+    depends = []
+    for seed in range(30):
+        observed = measured(LAG, 0.05, seed=seed, gain=1.0, share=SHARE)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = identify(narrow, observed, seed=0, method=LeastSquares(starts=1))
+        depends.append(found.identifiability.depends[1])
+    assert sum(depends) <= 4  # at most 5 % are expected; five of 30 have a probability of 1.6 %
+
+
 def test_a_robust_loss_forgives_outliers_and_a_mask_hides_them() -> None:
     clean = measured(LAG, 0.02, seed=5, gain=GAIN, share=SHARE)
     spoilt = clean.observed.copy()

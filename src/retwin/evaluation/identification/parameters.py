@@ -61,10 +61,14 @@ class ParameterEstimate:
         The 95 % interval, None where there is no error.
     identified : bool
         Whether the measurements determine it: its 95 % interval lies within its range, of which it
-        covers half at most, it is not at a bound, and starts that fit equally well agree. A range
-        of positive values ends at 0 or above, so that the interval then excludes 0.
+        covers half at most, it neither is at a bound nor depends on one, and starts that fit
+        equally well agree. A range of positive values ends at 0 or above, so that the interval then
+        excludes 0.
     at_bound : "low", "high" or ""
         The bound on which it lies; the true value may be beyond it.
+    depends : bool
+        Whether its value depends on the bound of another parameter: without bounds it would move by
+        more than half of its 95 % interval.
 
     """
 
@@ -78,6 +82,7 @@ class ParameterEstimate:
     interval: tuple[float, float] | None
     identified: bool
     at_bound: Literal["low", "high", ""]
+    depends: bool = False
 
     @property
     def covered(self) -> float | None:
@@ -154,7 +159,14 @@ def _of_fit(before: ParametricTwin, found: Updated) -> Uncertainty:
     # A search leaves a parameter without effect where it began, which may be a bound.
     bound = local.at_bound & np.isfinite(local.errors)
     sides = [end if at else "" for end, at in zip(ends, bound, strict=True)]
-    made = estimates(before, values, errors, intervals, local.identified, sides)
+    made = tuple(
+        replace(each, depends=bool(depends))
+        for each, depends in zip(
+            estimates(before, values, errors, intervals, local.identified, sides),
+            local.depends,
+            strict=True,
+        )
+    )
     return Uncertainty(made, local.correlation, directions, basis)
 
 

@@ -72,6 +72,8 @@ def state(each: ParameterEstimate) -> str:
         return "at its lower bound" if each.at_bound == "low" else "at its upper bound"
     if each.identified:
         return ""
+    if each.depends:
+        return "depends on the bound of another parameter"
     if each.covered is None:
         return "not identified"
     if each.covered <= WIDEST and not each.leaves:
@@ -173,7 +175,9 @@ def _begins(found: Identification) -> Iterator[str]:
 
 def _open(found: Identification) -> Iterator[str]:
     """What the measurements leave open."""
-    unknown = [each for each in found.parameters if not each.identified and not each.at_bound]
+    unknown = [
+        each for each in found.parameters if not (each.identified or each.at_bound or each.depends)
+    ]
     if unknown:
         last = found.directions[-1]
         combined = (
@@ -194,6 +198,12 @@ def _open(found: Identification) -> Iterator[str]:
                 else f"The posterior of {each.name} has its mass at its "
                 f"{'lower' if each.at_bound == 'low' else 'upper'} bound, {significant(bound)}."
             )
+    depending = [each.name for each in found.parameters if each.depends]
+    if depending:
+        yield (
+            f"The values of {', '.join(depending)} depend on that bound, beyond which others "
+            "fit better: they are right only if the bound is the true value."
+        )
     names = [each.name for each in found.parameters]
     strong = [
         f"{names[j]} and {names[i]} ({found.correlation[i, j]:+.2f})".replace("-", "−")

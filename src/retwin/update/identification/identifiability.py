@@ -20,6 +20,8 @@ RANK_TOLERANCE = 1e-5
 """Singular values below this share of the largest count as 0: finite differences are no better."""
 CHI2_95 = 3.84
 """95 % quantile of the chi-square distribution with one degree of freedom."""
+NORMAL_95 = 1.96
+"""Standard errors from an estimate to an end of its 95 % interval."""
 UNIFORM = 12**-0.5
 """Standard deviation of a uniform distribution between the bounds, in widths of the bounds."""
 AGREEMENT = 0.05
@@ -57,9 +59,12 @@ class Identifiability:
         (k, k), row i belongs to `singular_values[i]`; the last is the least identified.
     at_bound : NDArray
         (k,) bool, the optimum lies on a bound, and the true value may lie beyond it.
+    depends : NDArray
+        (k,) bool, the estimate depends on the bound of another parameter: without bounds it would
+        move, to first order, by more than half of its 95 % interval there.
     identified : NDArray
         (k,) bool, the standard error is below that of a uniform distribution between the bounds,
-        and starts that fit equally well agree.
+        starts that fit equally well agree, and the estimate depends on no bound.
     independent : float
         Effective sample size of the residuals, which are autocorrelated.
 
@@ -71,6 +76,7 @@ class Identifiability:
     singular_values: NDArray
     directions: NDArray
     at_bound: NDArray
+    depends: NDArray
     identified: NDArray
     independent: float
 
@@ -91,11 +97,13 @@ class Identifiability:
         """The parameters that are not identified or lie on a bound; "" if there are none."""
         parts = []
         names = np.array(self.names)
-        if not self.identified.all():
-            open_ = ", ".join(names[~self.identified])
-            parts.append(f"not identified: {open_} ({self.least_identified})")
+        open_ = ~self.identified & ~self.depends
+        if open_.any():
+            parts.append(f"not identified: {', '.join(names[open_])} ({self.least_identified})")
         if self.at_bound.any():
             parts.append(f"at a bound: {', '.join(names[self.at_bound])}")
+        if self.depends.any():
+            parts.append(f"values that depend on this bound: {', '.join(names[self.depends])}")
         return "; ".join(parts)
 
     @property
@@ -143,7 +151,7 @@ def identifiability(
     """
     flat = jacobian.reshape(-1, jacobian.shape[-1])
     noise = np.sqrt(noise_of(residual, measured, len(names)))
-    _, singular, directions = np.linalg.svd(flat, full_matrices=False)
+    left, singular, directions = np.linalg.svd(flat, full_matrices=False)
     nonzero = singular > RANK_TOLERANCE * singular.max(initial=0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         uncertainty = np.where(nonzero, noise / singular, np.inf)
@@ -161,6 +169,12 @@ def identifiability(
     determined = within < UNIFORM
     errors = np.where(determined, within, errors)
     agree = distance <= np.maximum(4 * errors, AGREEMENT)
+    # Where a bound holds the optimum, a step of least squares without bounds leaves it.
+    known = uncertainty < 1
+    step = -(left[:, known].T @ residual.ravel() / singular[known]) @ directions[known]
+    rest = np.sqrt(noise_of(residual + jacobian @ step, measured, len(names)))
+    moved = np.abs(step) * noise > NORMAL_95 * errors * rest
+    depends = at_bound.any() & ~at_bound & moved
     return Identifiability(
         names=names,
         errors=errors * width,
@@ -168,7 +182,8 @@ def identifiability(
         singular_values=singular / max(noise, 1e-300),
         directions=directions,
         at_bound=at_bound,
-        identified=determined & agree,
+        depends=depends,
+        identified=determined & agree & ~depends,
         independent=measured / correlation_time(residual),
     )
 
