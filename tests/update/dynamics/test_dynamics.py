@@ -166,11 +166,11 @@ def test_bands_of_free_simulation_hold_what_they_promise(noisy: FittedDynamics) 
 def test_few_or_correlated_errors_do_not_make_bands_narrower(deviation: float) -> None:
     """Many errors show that bands are too wide; few, which are correlated, do so by chance."""
     rng = np.random.default_rng(0)
-    many = np.abs(rng.normal(0, deviation, (8, 4000, 1)))
+    many = np.abs(rng.normal(0, deviation, (8, 4000)))
     assert needed_factor(many, many > 0) == pytest.approx(deviation, rel=0.05)
     found = []
     for _ in range(50):
-        few = lfilter([(1 - 0.97**2) ** 0.5], [1, -0.97], rng.normal(0, deviation, (4, 600, 1)), 1)
+        few = lfilter([(1 - 0.97**2) ** 0.5], [1, -0.97], rng.normal(0, deviation, (4, 600)))
         few = np.abs(few[:, 200:])
         found.append(needed_factor(few, few >= 0))
     assert np.mean(np.array(found) >= 0.9 * deviation) > 0.85

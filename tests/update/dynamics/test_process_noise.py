@@ -101,7 +101,7 @@ def test_a_measured_deviation_makes_no_larger_one_probable(twin: DynamicsTwin) -
 
 
 def test_simulations_spread_as_the_filter_predicts(twin: DynamicsTwin) -> None:
-    sure = replace(twin, factor=0 * twin.factor, start_deviation=np.zeros(1), widening=1.0)
+    sure = replace(twin, factor=0 * twin.factor, start_deviation=np.zeros(1), widening=np.ones(1))
     commands = record(PROPORTIONAL, count=1).commands
     made = sure.simulate(np.repeat(commands, 1000, axis=0), seed=0).observed
     spread = sure.noise_variance(commands.astype(float))[0]

@@ -40,7 +40,7 @@ def lag(derivative, *parameters: Parameter, start: State = STATE) -> StateTwin:
 
 def is_finite(twin: DynamicsTwin) -> bool:
     simulated = twin.simulate(COMMANDS, seed=0)
-    return bool(np.isfinite(twin.widening) and np.isfinite(simulated.observed).all())
+    return bool(np.isfinite(twin.widening).all() and np.isfinite(simulated.observed).all())
 
 
 def test_a_twin_without_free_parameters_is_corrected() -> None:
@@ -138,6 +138,8 @@ def test_predictions_that_are_not_finite_are_refused() -> None:
         ("noise", -1.0),
         ("noise", 0.0),
         ("process", -1.0),
+        ("widening", -1.0),
+        ("widening", np.nan),
         ("start_deviation", -1.0),
         ("domain_low", np.nan),
         ("domain_low", 1e9),
@@ -157,12 +159,51 @@ def test_forged_weights_are_refused(fitted: DynamicsTwin, tmp_path, name: str, v
 
 
 @pytest.mark.parametrize("widening", [float("nan"), -1.0, "1"])
-def test_a_forged_widening_is_refused(fitted: DynamicsTwin, tmp_path, widening) -> None:
+def test_a_forged_factor_of_all_outputs_is_refused(
+    fitted: DynamicsTwin, tmp_path, widening
+) -> None:
     fitted.save(tmp_path / "model")
     file = tmp_path / "model" / "model.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "widening": widening}))
     with pytest.raises(rt.InputError):
         DynamicsTwin.load(tmp_path / "model")
+
+
+def test_a_model_with_one_factor_of_all_outputs_is_read(fitted: DynamicsTwin, tmp_path) -> None:
+    fitted.save(tmp_path / "model")
+    about, weights = tmp_path / "model" / "model.json", tmp_path / "model" / "weights.safetensors"
+    kept = load_file(weights)
+    factor = kept.pop("widening")
+    save_file(kept, weights)
+    about.write_text(json.dumps({**json.loads(about.read_text()), "widening": factor.item()}))
+    found = DynamicsTwin.load(tmp_path / "model")
+    np.testing.assert_array_equal(found.widening, fitted.widening)
+
+
+def test_bands_are_scaled_for_each_output() -> None:
+    """Noise of one output has far outliers: with its variance, bands would be too wide there."""
+    twin = StateTwin(
+        (State("x", "m"), State("z", "m")),
+        lambda x, u: (x.x, x.z),
+        INPUT,
+        rt.Channels(("x", "z"), ("m", "m")),
+        20.0,
+        derivative=lambda x, u, p: (u.u - p.rate * x.x, u.u - 2 * x.z),
+        parameters=(Parameter("rate", "1/s", 0.1, 9.0, 2.0),),
+    )
+    rng = np.random.default_rng(3)
+    commands = np.clip(np.cumsum(rng.normal(size=(12, 300, 1)), axis=1) / 3, -1, 1)
+    outliers = rng.standard_t(2.5, size=(12, 300))
+    noise = 1e-3 * np.stack([rng.normal(size=(12, 300)), outliers], axis=2)
+    made = twin.simulate(commands, seed=0)
+    real = made.replace(observed=made.observed + noise)
+    found = fit_dynamics(twin, real[np.arange(6)], QUICK)
+    names = ("widening_x", "widening_z")
+    np.testing.assert_array_equal([found.figures[name] for name in names], found.twin.widening)
+    draws = found.twin.simulate(np.repeat(commands[6:], 200, axis=0), seed=0).observed
+    low, high = np.quantile(draws.reshape(6, 200, 300, 2), [0.05, 0.95], axis=1)
+    inside = (low <= real.observed[6:]) & (real.observed[6:] <= high)
+    np.testing.assert_allclose(inside.mean(axis=(0, 1)), 0.9, atol=0.03)
 
 
 @pytest.mark.parametrize(

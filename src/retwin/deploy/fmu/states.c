@@ -5,11 +5,11 @@
  *   NV                    real variables, by value reference
  *   SUBSTEPS, PERIOD      steps of the integration per sample, sample period in s
  *   LINEAR                1 if commands are straight lines between samples, 0 if they are held
- *   WIDENING              factor of the deviations from the mean
  *   VALUES[NQ], PLACE[NQ] parameters and start values, and their value references, -1 for none
  *   FACTOR[NQ][NR]        of the covariance of these, FACTOR FACTOR^T
  *   START[NX]             deviations by which starts differ between instances
  *   PROCESS[NX], NOISE[NY] variances of process and measurement noise
+ *   WIDENING[NY]          factors of the deviations from the mean
  *
  * and, where there was a calibration, RANGED and
  *
@@ -176,9 +176,9 @@ static void evaluate(Twin *twin)
             for (int k = 0; k < NX; k++)
                 variance += hx[i * NX + j] * twin->P[j * NX + k] * hx[i * NX + k];
         }
-        double half = QUANTILE * WIDENING * sqrt(variance), drawn = 0.0;
+        double half = QUANTILE * WIDENING[i] * sqrt(variance), drawn = 0.0;
         if (twin->noisy)
-            drawn = WIDENING * (kicked[i] + twin->error[i] - mean[i] + moved);
+            drawn = WIDENING[i] * (kicked[i] + twin->error[i] - mean[i] + moved);
         twin->v[MEAN + i] = mean[i];
         twin->v[LOW + i] = mean[i] - half;
         twin->v[HIGH + i] = mean[i] + half;

@@ -77,7 +77,7 @@ def _as_corrected(twin: StateTwin) -> DynamicsTwin:
         nothing,
         nothing,
         np.zeros(len(twin.outputs)),
-        1.0,
+        np.ones(len(twin.outputs)),
         domain,
         (),
     )
@@ -123,13 +123,14 @@ def _model(twin: DynamicsTwin, places: Sequence[int], ranged: bool) -> str:
         "SUBSTEPS": twin.equations.substeps,
         "LINEAR": int(twin.equations.interpolation == "linear"),
     }
-    numbers = {"PERIOD": 1 / twin.rate, "WIDENING": twin.widening}
+    numbers = {"PERIOD": 1 / twin.rate}
     arrays: Mapping[str, NDArray] = {
         "VALUES": twin.values,
         "FACTOR": twin.factor.ravel(),
         "START": twin.start_deviation,
         "PROCESS": twin.free_process,
         "NOISE": twin.noise,
+        "WIDENING": twin.widening,
         "FIRST": twin.domain.mean[states:],
     }
     if ranged:

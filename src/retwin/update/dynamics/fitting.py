@@ -60,8 +60,8 @@ class FittedDynamics:
         `rms_before` and `rms_after` of free simulation over the calibration record, in output units
         (relative to each output's standard deviation where units differ), `held_out`, that of
         blocks left out in time, `held_out_edges`, that of the ends of the range of each state and
-        command if they are left out, `widening`, of the bands, and `strength`, the assumed variance
-        of errors over that of the twin.
+        command if they are left out, `widening_NAME`, of the bands of each output, and `strength`,
+        the assumed variance of errors over that of the twin.
     form : Library or TanhNetwork
         The chosen form of the discrepancy.
     seconds : float
@@ -167,7 +167,10 @@ def fit_dynamics(
             "rms_after": estimation.rms(found.residual),
             "held_out": estimation.rms(held_out.errors),
             "held_out_edges": float(np.sqrt(np.mean(best.squares[1]))),
-            "widening": made.widening,
+            **{
+                f"widening_{name}": float(factor)
+                for name, factor in zip(base.outputs.names, made.widening, strict=True)
+            },
             "strength": float(np.mean(estimation.variance / power)),
         },
         form=equations.form,
@@ -239,7 +242,7 @@ def assembled(
         np.zeros(len(start)),
         np.zeros(len(start)),
         estimation.power(found.residual),
-        1.0,
+        np.ones(len(estimation.twin.outputs)),
         Domain.visited(states, estimation.commands, speed),
         corrected,
         estimation.observed.emulated,

@@ -150,14 +150,18 @@ def edges(states: NDArray, commands: NDArray, count: int) -> list[NDArray]:
     return parts
 
 
-def widening(twin: DynamicsTwin, estimation: Estimation, held_out: HeldOut) -> float:
-    """Factor of deviations, with which bands hold as many held-out samples as they should."""
+def widening(twin: DynamicsTwin, estimation: Estimation, held_out: HeldOut) -> NDArray:
+    """Factors (d_y,) of deviations, with which the bands of each output hold the share they should.
+
+    The share is that of held-out samples.
+    """
     deviation = np.sqrt(held_out.variances + twin.noise_variance(estimation.commands))
-    return needed_factor(np.abs(held_out.errors) / deviation, estimation.seen)
+    ratio, seen = np.abs(held_out.errors) / deviation, estimation.seen
+    return np.array([needed_factor(ratio[..., i], seen[..., i]) for i in range(seen.shape[2])])
 
 
 def needed_factor(ratio: NDArray, seen: NDArray) -> float:
-    """Factor of deviations to which errors (n, T, d_y), in deviations, belong where they are seen.
+    """Factor of deviations to which errors (n, T), in deviations, belong where they are seen.
 
     Bands become narrower only as far as errors show it beyond chance, which correlated ones do
     little: below 1 it is the upper limit of the factor, from as many independent samples as the
@@ -168,7 +172,7 @@ def needed_factor(ratio: NDArray, seen: NDArray) -> float:
     if factor >= 1:
         return factor
     missed = ratio > factor * usual
-    correlated = correlation_time(np.where(seen, missed - missed[seen].mean(), 0.0))
-    number = seen.any(axis=2).sum() / correlated
+    around = np.where(seen, missed - missed[seen].mean(), 0.0)
+    number = seen.sum() / correlation_time(around[..., None])
     level = LEVEL + CERTAIN * np.sqrt(LEVEL * (1 - LEVEL) / number)
     return float(min(np.quantile(ratio[seen], min(level, 1.0)) / usual, 1.0))

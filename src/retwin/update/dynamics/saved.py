@@ -29,6 +29,7 @@ ARRAYS = (
     "proportional",
     "free_process",
     "noise",
+    "widening",
 )
 """Attributes that are saved as arrays."""
 DOMAIN = ("low", "high", "mean", "speed")
@@ -39,7 +40,6 @@ def write_fields(folder: str | Path, fields: Mapping[str, Any]) -> None:
     """Write the fields of a `DynamicsTwin`, its equations as operations on numbers."""
     about: dict[str, Any] = {
         "equations": equations_of(fields["equations"]),
-        "widening": fields["widening"],
         "corrected": list(fields["corrected"]),
         "emulated": fields["emulated"],
         "case": fields["case"],
@@ -59,15 +59,18 @@ def read_fields(folder: str | Path) -> dict[str, Any]:
     with refusing(folder, expected="corrected dynamics"):
         equations = equations_from(StateTwin, about["equations"])
         process = weights["process"]
-        # Models of earlier versions had process noise of one kind.
-        weights = {"proportional": 0 * process, "free_process": process} | weights
+        # Models of earlier versions had process noise of one kind, and one factor for all outputs.
+        earlier = {"proportional": 0 * process, "free_process": process}
+        if "widening" in about:
+            factor = finite("widening", about["widening"], least=0.0)
+            earlier["widening"] = torch.full_like(weights["noise"], factor)
+        weights = earlier | weights
         arrays = {name: weights[name].double().numpy() for name in ARRAYS}
         domain = Domain(*(weights[f"domain_{name}"].double().numpy() for name in DOMAIN))
         _check(equations, arrays, domain)
         return {
             "equations": equations,
             **arrays,
-            "widening": finite("widening", about["widening"], least=0.0),
             "domain": domain,
             "corrected": correctable(equations, about["corrected"]),
             "emulated": one_of("emulated", about["emulated"], (True, False)),
@@ -81,7 +84,7 @@ def _check(equations: StateTwin, arrays: Mapping[str, NDArray], domain: Domain) 
     parameters, states = len(equations.parameters), len(traced.slope)
     shapes = [arrays[name].shape for name in ARRAYS]
     both = parameters + states
-    wanted = [(both,), (both, shapes[1][-1]), *[(states,)] * 4, (len(traced.outputs),)]
+    wanted = [(both,), (both, shapes[1][-1]), *[(states,)] * 4, *[(len(traced.outputs),)] * 2]
     require(
         shapes == wanted and all(np.isfinite(each).all() for each in arrays.values()),
         "weights",

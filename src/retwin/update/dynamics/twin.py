@@ -63,8 +63,8 @@ class DynamicsTwin:
     free_process : NDArray
         (d_x,), the variance of w in free simulation, which is constant: errors that are new in each
         sample, as those after a switch seem to be, cancel each other over many.
-    widening : float
-        Factor of the deviations from the most probable outputs, from held-out blocks.
+    widening : NDArray
+        (d_y,), factors of the deviations from the most probable outputs, from held-out blocks.
     domain : Domain
         The range of states and commands in calibration.
     corrected : tuple of str
@@ -84,7 +84,7 @@ class DynamicsTwin:
     proportional: NDArray
     free_process: NDArray
     noise: NDArray
-    widening: float
+    widening: NDArray
     domain: Domain
     corrected: tuple[str, ...]
     emulated: bool = False
