@@ -4,8 +4,9 @@ Target: at most 2 GB for parent and workers together, whatever the number of tra
 is the closed-form arm, 1000 samples, all nine classes. The uses of the data are timed too: features
 for a classifier, and the samples from which a surrogate learns (it trains for one epoch, which
 takes the same time for any number of trajectories). For docs/scaling.md, several twins are timed on
-one core in processor time, which excludes other work of the machine. The argument is the number of
-trajectories; 0 skips the first part.
+one core in processor time, which excludes other work of the machine. The arguments are the number
+of trajectories, where 0 skips the first part, and folders that `CorrectedTwin.save` wrote for the
+arm, in whose place the closed-form arm is not written; then the second part is skipped.
 """
 
 from __future__ import annotations
@@ -59,9 +60,8 @@ class PeakMemory:
         self._watcher.join()
 
 
-def whole(case: rt.Case, n: int) -> None:
+def whole(case: rt.Case, n: int, name: str, twin: rt.Twin) -> None:
     workers = os.cpu_count() or 1
-    twin = twins.get("armpi-kinematic")
     plan = SimulationPlan(twin, case.sampler, seed=0, n=n, faults=case.faults)
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "made.zarr"
@@ -87,7 +87,7 @@ def whole(case: rt.Case, n: int) -> None:
         "a million, extrapolated (min)": MILLION / n * took / 60,
         "a million on disk, extrapolated (GB)": MILLION / n * size / 1e9,
     }
-    record("scale", "Closed-form arm to Zarr, 1000 samples", rows)
+    record(f"scale_{name.split()[0].lower()}", f"{name} to Zarr, 1000 samples", rows)
 
 
 def per_core(case: rt.Case) -> None:
@@ -126,9 +126,14 @@ def per_core(case: rt.Case) -> None:
 def main() -> None:
     n = int(sys.argv[1]) if len(sys.argv) > 1 else 20_000
     case = rt.cases.armpi()
-    if n:
-        whole(case, n)
-    per_core(case)
+    corrected = [rt.CorrectedTwin.load(each) for each in sys.argv[2:]]
+    for twin in corrected:
+        name = type(twin.residual.correction).__name__
+        whole(case, n, f"Corrected arm ({name})", twin)
+    if n and not corrected:
+        whole(case, n, "Closed-form arm", twins.get("armpi-kinematic"))
+    if not corrected:
+        per_core(case)
 
 
 if __name__ == "__main__":
