@@ -212,9 +212,9 @@ class Segments:
         """
         n, steps = moving.shape[0], moving.shape[1] + 1
         padded = np.pad(moving, ((0, 0), (1, 1)))
-        # padded[:, i] is True if step i - 1 -> i moves: edges are the first and last such steps.
-        row, first = np.nonzero(padded[:, 1:] & ~padded[:, :-1])
-        _, last = np.nonzero(padded[:, :-1] & ~padded[:, 1:])
+        # padded[:, i] is True if step i - 1 -> i moves: such steps begin and end in turn.
+        row, edge = np.nonzero(padded[:, 1:] != padded[:, :-1])
+        row, first, last = row[::2], edge[::2], edge[1::2]
         order = np.arange(len(row)) - np.searchsorted(row, row)
         count = int(order.max(initial=-1)) + 1
         start = np.full((n, count), float(steps))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from math import inf
 from typing import Any
@@ -85,14 +85,14 @@ class CommandRange:
         least, greatest, steps = (np.concatenate(each) for each in zip(*ends, strict=True))
         low, high = least.min(axis=0), greatest.max(axis=0)
         change = rate * steps.max(axis=0)
-        mean = np.add.reduce([each.sum(axis=0) for each in _blocks(commands, rate)])
+        mean = np.add.reduce(list(_of_spectra(lambda each: each.sum(axis=0), commands, rate)))
         frequency = _frequencies(commands, rate)
         below = mean.cumsum(axis=0) / len(_chosen(len(commands)))
         index = (below < BAND_SHARE * below[-1]).sum(axis=0)
         band, power, resolution = frequency[index], below[-1], rate / commands.shape[1]
         limit = band + LEAKAGE * resolution
-        above = [_above(frequency, each, limit, power) for each in _blocks(commands, rate)]
-        share = np.concatenate(above).max(axis=0)
+        above = _of_spectra(lambda each: _above(frequency, each, limit, power), commands, rate)
+        share = np.concatenate(list(above)).max(axis=0)
         numbers = dict(zip(ARRAYS, (low, high, change, band, share, power), strict=True))
         return cls(
             **{k: floats(v) for k, v in numbers.items()},
@@ -161,8 +161,8 @@ class CommandRange:
         frequency = _frequencies(commands, rate)
         limit = np.array(self.band) + LEAKAGE * max(self.resolution, rate / commands.shape[1])
         power = np.array(self.power)
-        above = [_above(frequency, each, limit, power) for each in _blocks(commands, rate)]
-        return np.concatenate(above)
+        above = _of_spectra(lambda each: _above(frequency, each, limit, power), commands, rate)
+        return np.concatenate(list(above))
 
     def outside(self, commands: NDArray, rate: float, inputs: Channels) -> str:
         """What of the commands is outside the range, by channel, in words; "" if nothing is."""
@@ -245,26 +245,30 @@ def power_spectra(commands: NDArray, rate: float) -> tuple[NDArray, NDArray]:
 
     The window is Hann's. Of more than a thousand trajectories that many are taken.
     """
-    return _frequencies(commands, rate), np.concatenate(list(_blocks(commands, rate)))
+    return _frequencies(commands, rate), np.concatenate(
+        list(_of_spectra(np.asarray, commands, rate))
+    )
 
 
 def _frequencies(commands: NDArray, rate: float) -> NDArray:
     return fft.rfftfreq(commands.shape[1], 1 / rate)
 
 
-def _blocks(commands: NDArray, rate: float) -> Iterator[NDArray]:
-    """The power spectra (n, F, d_u) of the chosen trajectories, block by block."""
+def _of_spectra(
+    function: Callable[[NDArray], NDArray], commands: NDArray, rate: float
+) -> Iterator[NDArray]:
+    """A function of the power spectra (n, F, d_u) of the chosen trajectories, block by block."""
     chosen = _chosen(len(commands))
     window = windows.hann(commands.shape[1] + 2)[1:-1, None].astype(np.float32)
     scale = 2 / len(window) / np.sum(window**2)
 
-    def spectra_of(rows: slice) -> NDArray:
+    def of_block(rows: slice) -> NDArray:
         values = np.asarray(commands[chosen[rows]], np.float32)
         values = (values - values.mean(axis=1, keepdims=True)) * window
         spectra = np.abs(fft.rfft(np.ascontiguousarray(np.moveaxis(values, 1, 2)), axis=2)) ** 2
-        return np.moveaxis(spectra, 2, 1) * scale
+        return function(np.moveaxis(spectra, 2, 1) * scale)
 
-    return in_threads(spectra_of, list(row_blocks(commands, len(chosen))))
+    return in_threads(of_block, list(row_blocks(commands, len(chosen))))
 
 
 def _above(frequency: NDArray, spectra: NDArray, limit: NDArray, power: NDArray) -> NDArray:

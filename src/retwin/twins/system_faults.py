@@ -366,7 +366,7 @@ def check_faults(
         See above.
 
     """
-    for fault in faults:
+    for fault in {id(fault): fault for fault in faults}.values():  # thousands are the same object
         for name, count in (("actuator", inputs), ("output", outputs)):
             require(
                 0 <= getattr(fault, name, 0) < count or not hasattr(fault, name),
