@@ -43,8 +43,7 @@ def instance(argument: str, value: Any, kind: type[T], *, remedy: str) -> T:
     """`value`, if it is an object of a class; another one is an `InputError`."""
     got = type(value).__name__
     require(isinstance(value, kind), argument, expected=kind.__name__, got=got, remedy=remedy)
-    made: T = value
-    return made
+    return value
 
 
 def one_of(argument: str, value: T, choices: Iterable[T], *, remedy: str = "") -> T:

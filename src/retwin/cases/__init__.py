@@ -81,6 +81,5 @@ def data_case(name: str) -> DataCase:
     Raises as `get` does.
     """
     if name in catalog.CASES:
-        found: DataCase = catalog.resolve(catalog.CASES[name].recorded)
-        return found
+        return catalog.resolve(catalog.CASES[name].recorded)
     return get(name)

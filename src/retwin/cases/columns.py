@@ -195,8 +195,7 @@ class ColumnRecords:
         return self._records("calibration") + self._records("test")
 
     def _records(self, name: str) -> tuple[Record, ...]:
-        records: tuple[Record, ...] = getattr(self, name)
-        return records
+        return getattr(self, name)
 
     def _check_separate(self, calibration: Sequence[Record], test: Sequence[Record]) -> None:
         """Refuse measurements that are in both sets."""

@@ -274,8 +274,7 @@ def _sampler(
 ) -> CommandSampler:
     """The distribution of commands: like those of a `file`, of a kind, or of the user's own."""
     if isinstance(value, str):
-        own: CommandSampler = _own(value, folder, place, CommandSampler)
-        return own
+        return _own(value, folder, place, CommandSampler)
     require(
         value,
         place,
@@ -299,8 +298,7 @@ def _sampler(
             return RecordedSampler(commands, **own_settings)
     if limits is not None:
         settings = {"low": limits.low, "high": limits.high, **settings}
-    made: CommandSampler = from_config(settings, SAMPLERS, place=place, rate=twin.rate)
-    return made
+    return from_config(settings, SAMPLERS, place=place, rate=twin.rate)
 
 
 def _recorded(

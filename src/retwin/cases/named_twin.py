@@ -204,10 +204,9 @@ def _of_file(
     if rate is not None:
         settings["rate"] = rate
     with at(own):
-        made: Twin = kind.from_file(
+        return kind.from_file(
             file, inputs=tuple(inputs), outputs=tuple(outputs), outside=making.outside, **settings
         )
-        return made
 
 
 def _making(options: dict[str, Any], place: str, *names: str) -> _Making:

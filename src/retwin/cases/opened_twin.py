@@ -152,8 +152,7 @@ def _case(name: str) -> Case | None:
         return read_case(name)
     if name not in catalog.CASES:
         return None
-    made: Case = catalog.resolve(catalog.CASES[name].target)()
-    return made
+    return catalog.resolve(catalog.CASES[name].target)()
 
 
 def _known(twin: Twin) -> Iterator[Known]:

@@ -86,14 +86,12 @@ def integrated(
     def centre_of(of: NDArray) -> NDArray:
         """Points (..., K) in the middle of cells (..., K, 2)."""
         middle = of.mean(axis=-1)
-        made: NDArray = np.where(whole, np.round(middle), middle)
-        return made
+        return np.where(whole, np.round(middle), middle)
 
     def volume(of: NDArray) -> NDArray:
         """Log shares (J,) of the box that cells (J, K, 2) fill."""
         share = np.where(is_open, of[..., 1] - of[..., 0], 1.0) / np.where(is_open, sides, 1.0)
-        made: NDArray = np.log(share).sum(axis=1)
-        return made
+        return np.log(share).sum(axis=1)
 
     def log_mass(of: NDArray) -> NDArray:
         """The log integrals (J,) over cells (J, K, 2)."""

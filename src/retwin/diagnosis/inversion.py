@@ -96,8 +96,7 @@ class Diagnosis:
     def labels(self) -> NDArray:
         """The most probable class of each trajectory (n,), or "unknown"."""
         names = np.array(self.classes)[self.probabilities.argmax(axis=1)]
-        made: NDArray = np.where(self.unknown > 0.5, UNKNOWN, names)
-        return made
+        return np.where(self.unknown > 0.5, UNKNOWN, names)
 
 
 @dataclass(frozen=True, eq=False)

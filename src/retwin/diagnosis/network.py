@@ -103,8 +103,7 @@ class NetworkDiagnoser(nn.Module):
 
 def training_for(network: Network) -> Training:
     """The training that suits a network: its `default_training`, if it has one."""
-    training: Training = getattr(network, "default_training", Training())
-    return training
+    return getattr(network, "default_training", Training())
 
 
 def fit_network(

@@ -113,8 +113,7 @@ class Hierarchy:
         """(R, F, F) the information of each row about the coefficients, with x integrated out."""
         weighted = design.features / self._variances(design)[..., None]
         left = design.features - solution.covariance @ weighted
-        made: Tensor = weighted.mT @ left
-        return made
+        return weighted.mT @ left
 
     def scatter(self, design: Design) -> Tensor:
         """(R, P) variances of x when the coefficients are known."""

@@ -99,8 +99,7 @@ def last_layers(network: nn.Module) -> tuple[nn.Module, ...]:
     """
     if isinstance(network, nn.Sequential):
         return (network[-1],)
-    named: tuple[nn.Module, ...] = getattr(network, "last_layers", ())
-    return named
+    return getattr(network, "last_layers", ())
 
 
 @dataclass(frozen=True)

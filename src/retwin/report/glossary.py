@@ -22,8 +22,7 @@ UNTOUCHED = ("abbr", "button", "code", "h1", "h2", "h3", "option", "pre", "scrip
 @cache
 def _terms() -> dict[str, str]:
     folder = resources.files(__package__).joinpath("templates")
-    found: dict[str, str] = json.loads(folder.joinpath("glossary.json").read_text(encoding="utf-8"))
-    return found
+    return json.loads(folder.joinpath("glossary.json").read_text(encoding="utf-8"))
 
 
 @cache

@@ -166,8 +166,7 @@ class Study:
         if HEALTHY not in labels:
             test = self.results.data.test
             return np.ones(len(test.ids) or test.size, dtype=bool)
-        healthy: NDArray = labels == HEALTHY
-        return healthy
+        return labels == HEALTHY
 
     @property
     def output_units(self) -> list[str]:

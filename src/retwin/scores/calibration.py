@@ -69,8 +69,7 @@ def _shared_frequency(happened: NDArray, probability: NDArray) -> NDArray:
     """Mean (..., n) of what happened (..., n) over the events of equal, sorted probability (n,)."""
     _, begins, counts = np.unique(probability, return_index=True, return_counts=True)
     sums = np.add.reduceat(np.asarray(happened, dtype=float), begins, axis=-1)
-    shares: NDArray = np.repeat(sums / counts, counts, axis=-1)
-    return shares
+    return np.repeat(sums / counts, counts, axis=-1)
 
 
 def _binned_error(frequency: NDArray, probability: NDArray) -> NDArray:

@@ -78,8 +78,7 @@ def error_change(
     counts, n = counts[used], int(used.sum())
 
     def mean(which: int, weights: NDArray) -> NDArray:
-        total: NDArray = weights @ sums[which].sum(axis=1) / (weights @ counts.sum(axis=1))
-        return total
+        return weights @ sums[which].sum(axis=1) / (weights @ counts.sum(axis=1))
 
     def ratio(weights: NDArray) -> NDArray:
         with np.errstate(invalid="ignore", divide="ignore"):

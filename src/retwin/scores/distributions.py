@@ -40,8 +40,7 @@ def quantiles(draws: NDArray, levels: Sequence[float] = LEVELS) -> NDArray:
     One more independent draw is below each of them with exactly the probability `level` (the
     "weibull" definition), however small m is.
     """
-    found: NDArray = np.quantile(draws, levels, axis=0, method="weibull")
-    return found
+    return np.quantile(draws, levels, axis=0, method="weibull")
 
 
 def central_band(bands: NDArray, level: int) -> tuple[NDArray, NDArray]:
@@ -97,8 +96,7 @@ def crps(observed: NDArray, draws: NDArray) -> NDArray:
     count = len(draws)
     rank = np.arange(count).reshape(-1, *[1] * (draws.ndim - 1))
     spread = (rank * np.sort(draws, axis=0)).sum(axis=0) / (count * (count - 1.0))
-    found: NDArray = np.abs(draws - observed).mean(axis=0) + draws.mean(axis=0) - 2 * spread
-    return found
+    return np.abs(draws - observed).mean(axis=0) + draws.mean(axis=0) - 2 * spread
 
 
 def log_score(observed: NDArray, draws: NDArray) -> NDArray:
@@ -242,8 +240,7 @@ def ks_distance(below: NDArray, count: NDArray, weights: NDArray, member: int) -
     with np.errstate(invalid="ignore", divide="ignore"):
         one = (weights @ below[:, member]) / (weights @ count[:, member])
         rest = (weights @ below[:, others].sum(1)) / (weights @ count[:, others].sum(1))
-    distance: NDArray = np.abs(one - rest).max(axis=1)
-    return distance
+    return np.abs(one - rest).max(axis=1)
 
 
 def share_as_far(distances: NDArray) -> float:

@@ -60,8 +60,7 @@ class Correlogram:
     @property
     def outside(self) -> NDArray:
         """Whether each correlation is beyond its limits (K,); False for NaN."""
-        made: NDArray = np.abs(self.values) > self.limits
-        return made
+        return np.abs(self.values) > self.limits
 
     @property
     def largest(self) -> int:
@@ -339,8 +338,7 @@ def _lagged(later: NDArray, earlier: NDArray) -> NDArray:
     samples = later.shape[1]
     parts = (np.fft.rfft(each, 2 * samples, axis=1) for each in (later, earlier))
     spectrum = next(parts) * next(parts).conj()
-    made: NDArray = np.fft.irfft(spectrum.sum(axis=0), 2 * samples)[:samples]
-    return made
+    return np.fft.irfft(spectrum.sum(axis=0), 2 * samples)[:samples]
 
 
 def _pairs(later: NDArray, earlier: NDArray) -> NDArray:

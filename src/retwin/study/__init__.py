@@ -136,8 +136,7 @@ def _identity(case: Case, plan: StudyPlan, digests: Mapping[str, Any]) -> dict[s
     fixed = {key: value for key, value in asdict(plan).items() if key not in additive}
     system = {"name": case.name, "sha256": identity(case)}
     values = {"case": system, "plan": fixed, "data": digests}
-    plain: dict[str, Any] = json.loads(json.dumps(values))
-    return plain
+    return json.loads(json.dumps(values))
 
 
 def _check_free(out: Path, expected: Mapping[str, Any]) -> None:

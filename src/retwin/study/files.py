@@ -107,8 +107,7 @@ class Files:
     def costs(self, job: Job) -> dict[str, Any]:
         """What a job cost, see `Work.do`; empty if it was interrupted before it was recorded."""
         file = self._costs(job)
-        found: dict[str, Any] = json.loads(file.read_text("utf-8")) if file.exists() else {}
-        return found
+        return json.loads(file.read_text("utf-8")) if file.exists() else {}
 
     def keep_costs(self, job: Job, costs: Mapping[str, Any]) -> None:
         """Write the costs of a job beside its result."""

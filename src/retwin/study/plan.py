@@ -127,8 +127,7 @@ class StudyPlan:
 
     @property
     def _preset(self) -> Preset:
-        preset: Preset = resolve(PRESETS[self.preset].target)
-        return preset
+        return resolve(PRESETS[self.preset].target)
 
     @property
     def number_of_runs(self) -> int:
@@ -143,8 +142,7 @@ class StudyPlan:
     @property
     def classifier_config(self) -> Network | Rocket:
         """The config of the classifier."""
-        config: Network | Rocket = make(CLASSIFIERS, self.classifier_name, "classifier")
-        return config
+        return make(CLASSIFIERS, self.classifier_name, "classifier")
 
     @property
     def training(self) -> Training | None:

@@ -236,8 +236,7 @@ def excess(least: NDArray, greatest: NDArray, low: NDArray, high: NDArray) -> ND
     """How far (n, d) extremes (n, d) leave their ranges, in tolerated shares of their widths."""
     width = high - low
     over = np.maximum(low - least, greatest - high) / np.where(width > 0, width, 1.0)
-    found: NDArray = np.maximum(over, 0.0) / TOLERANCE
-    return found
+    return np.maximum(over, 0.0) / TOLERANCE
 
 
 def power_spectra(commands: NDArray, rate: float) -> tuple[NDArray, NDArray]:

@@ -354,8 +354,7 @@ class ParametricTwin(TwinWrapper):
         for column, each in enumerate(self.parameters):
             for place, factor in each.places.items():
                 mixed[self.twin.names.index(place), column] = factor  # type: ignore[attr-defined]
-        made: NDArray = every @ mixed
-        return made
+        return every @ mixed
 
     def inner(self, now: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
         """Values of the wrapped twin's parameters, for those of the free ones."""

@@ -110,8 +110,7 @@ class TimedFault:
         """Whether it acts at each sample, (T,) bool, for a fault of which nothing is open."""
         onset, end = self.onset_range(steps, rate)[0], self.end_range(steps, rate)[0]
         index = np.arange(steps)
-        made: NDArray = (index >= onset) & (index < end)
-        return made
+        return (index >= onset) & (index < end)
 
     def command(self, commands: NDArray, segments: Segments, rate: float) -> NDArray:
         """The commands unchanged, unless the fault is one of an actuator; see `Fault.command`."""

@@ -67,8 +67,7 @@ class ExactSurrogate:
         """The same for a tensor; with gradient if the twin can be called with one."""
         differentiated = torch.is_grad_enabled() and commands.requires_grad
         if isinstance(self.twin, nn.Module) or (differentiated and callable(self.twin)):
-            found: Tensor = self.twin(commands)
-            return found
+            return self.twin(commands)
         require(
             not differentiated,
             "surrogate",

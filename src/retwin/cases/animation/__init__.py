@@ -156,8 +156,7 @@ def _tips(body: Body, one: Trajectories, drawn: NDArray, fps: float) -> NDArray:
         inputs=one.inputs,
         outputs=one.outputs,
     )
-    tips: NDArray = body.skeleton(body.poses(several)[1][:, _samples(one, fps)])[..., -1, :]
-    return tips
+    return body.skeleton(body.poses(several)[1][:, _samples(one, fps)])[..., -1, :]
 
 
 def _chart(one: Trajectories, drawn: NDArray) -> Chart:

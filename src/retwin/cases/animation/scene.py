@@ -187,8 +187,7 @@ def _schedule(pool: ProcessPool, stage: Stage, shots: Shots, first: int) -> Futu
     joints = np.stack([shots.nominal[first:end], shots.observed[first:end]])
     tips = np.stack([shots.nominal_points[:end, -1], shots.observed_points[:end, -1]])
     trails = [shots.trails(frame) for frame in range(first, end)]
-    task: Future[NDArray] = pool.schedule(_draw, (stage, joints, tips, trails), timeout=TIMEOUT)
-    return task
+    return pool.schedule(_draw, (stage, joints, tips, trails), timeout=TIMEOUT)
 
 
 def _collect(pool: ProcessPool, stage: Stage, shots: Shots, task: Future[NDArray]) -> Pictures:
@@ -348,8 +347,7 @@ class Scene:
         for trail in trails:
             self._line(trail, UPDATED, 1.0)
             self._ball(trail[-1], UPDATED, 0.010)
-        picture: NDArray = self._renderer.render()
-        return picture
+        return self._renderer.render()
 
     def _line(self, points: NDArray, colour: Sequence[float], width: float) -> None:
         """Draw a line through the points; `width` in pixels of a picture 480 high."""

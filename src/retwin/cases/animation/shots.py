@@ -59,14 +59,12 @@ class Shots:
     def trails(self, frame: int) -> NDArray:
         """The paths (draws, frames, 3) of the draws that lead to a frame."""
         past = np.searchsorted(self.seconds, self.seconds[frame] - TRAIL - 1e-9)
-        trails: NDArray = self.drawn[:, past : frame + 1]
-        return trails
+        return self.drawn[:, past : frame + 1]
 
     @property
     def root(self) -> NDArray:
         """Position (3,) of the base of the chain in m."""
-        root: NDArray = self.nominal_points[0, 0]
-        return root
+        return self.nominal_points[0, 0]
 
     @property
     def reach(self) -> float:

@@ -177,10 +177,8 @@ def _applied(correction: Any, context: Context, z: Tensor, times: Tensor) -> Ten
     operator = correction.first if chained else correction
     at = getattr(operator, "at", None)
     if at is None:
-        made: Tensor = operator.apply(context, z)[:, times]
-        return made
-    found: Tensor = at(context, z, times.expand(len(context), -1))
-    return found
+        return operator.apply(context, z)[:, times]
+    return at(context, z, times.expand(len(context), -1))
 
 
 def _stride(correction: Any, rate: float) -> int:

@@ -206,8 +206,7 @@ class Fidelity:
             factor, middle = self.widening[:, None, None], self.bands[:, 2]
             low, high = middle + factor * (low - middle), middle + factor * (high - middle)
         hit = (low <= self.observed) & (self.observed <= high) & self.seen[..., None]
-        share: NDArray = hit.sum(axis=1) / self.seen.sum(axis=1)[:, None]
-        return share
+        return hit.sum(axis=1) / self.seen.sum(axis=1)[:, None]
 
     @cached_property
     def figures(self) -> dict[str, Figure]:

@@ -245,8 +245,7 @@ class _Ensemble:
     def values(self) -> NDArray:
         """Measured samples of all members (1 + draws, P, d), in double precision."""
         seen = self.members.observed[:, :: self.stride][:, self.seen]
-        values: NDArray = seen.astype(np.float64)
-        return values
+        return seen.astype(np.float64)
 
     def scores(self, rng: np.random.Generator) -> dict[str, Any]:
         """The fields of `Fidelity` for one trajectory, except those per segment."""

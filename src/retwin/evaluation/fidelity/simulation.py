@@ -154,8 +154,7 @@ def record_means(values: NDArray) -> NDArray:
     seen = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         each = np.where(seen, values, 0.0).sum(axis=1) / seen.sum(axis=1)
-    mean: NDArray = each.mean(axis=0)
-    return mean
+    return each.mean(axis=0)
 
 
 def simulation_scores(means: NDArray, records: Trajectories) -> dict[str, NDArray]:

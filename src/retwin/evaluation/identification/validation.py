@@ -297,8 +297,7 @@ def _rms(before: NDArray, after: NDArray) -> RMSError:
     filled = np.bincount(groups[seen], minlength=count) > 0
 
     def ratio(weights: NDArray) -> NDArray:
-        made: NDArray = np.sqrt((weights @ sums[1][filled]) / (weights @ sums[0][filled]))
-        return made
+        return np.sqrt((weights @ sums[1][filled]) / (weights @ sums[0][filled]))
 
     number = int(filled.sum())
     interval = None
@@ -323,5 +322,4 @@ def _groups(residual: NDArray) -> NDArray:
     blocks = np.maximum(seen.sum(axis=1) // length, 1)
     starts = np.concatenate([[0], np.cumsum(blocks)[:-1]])
     within = np.minimum(np.maximum(place, 0) // length, blocks[:, None] - 1)
-    made: NDArray = starts[:, None] + within
-    return made
+    return starts[:, None] + within

@@ -55,8 +55,7 @@ def _estimates(found: Identification) -> Figure:
     width = np.array([each.high for each in found.parameters]) - low
 
     def shares(values: list[float]) -> NDArray:
-        made: NDArray = (np.array(values) - low) / width
-        return made
+        return (np.array(values) - low) / width
 
     value = shares([each.value for each in found.parameters])
     ends = [

@@ -50,8 +50,7 @@ class ChannelRecords:
     @property
     def outside(self) -> NDArray:
         """Whether a value is outside that range (n, T)."""
-        made: NDArray = (self.values < self.low) | (self.values > self.high)
-        return made
+        return (self.values < self.low) | (self.values > self.high)
 
 
 def residuals(study: Study) -> Section | None:
@@ -153,8 +152,7 @@ def _table(
 
 def _outside(channels: Sequence[ChannelRecords]) -> NDArray:
     """Whether any channel is outside its range in calibration (n, T)."""
-    made: NDArray = np.any([each.outside for each in channels], axis=0)
-    return made
+    return np.any([each.outside for each in channels], axis=0)
 
 
 def _moments(error: NDArray) -> tuple[float, float]:

@@ -182,5 +182,4 @@ class Lags:
 
 def least_squares(columns: NDArray, target: NDArray) -> NDArray:
     """Coefficients of the columns, those of the smallest norm where several are equally good."""
-    made: NDArray = np.linalg.lstsq(columns, target, rcond=None)[0]
-    return made
+    return np.linalg.lstsq(columns, target, rcond=None)[0]

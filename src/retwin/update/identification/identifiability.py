@@ -89,8 +89,7 @@ class Identifiability:
         size = self.singular_values / (float(self.singular_values.max(initial=0.0)) or 1.0)
         norms = np.linalg.norm(size[:, None] * self.directions, axis=0)
         largest = float(norms.max(initial=0.0))
-        made: NDArray = np.where(norms > RANK_TOLERANCE * largest, norms, 0.0) / (largest or 1.0)
-        return made
+        return np.where(norms > RANK_TOLERANCE * largest, norms, 0.0) / (largest or 1.0)
 
     @property
     def warning(self) -> str:

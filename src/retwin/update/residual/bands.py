@@ -55,8 +55,7 @@ def coverage(
         rank += (drawn < observed) | ((drawn == observed) & above)
     inside = (rank >= OUTER) & (rank <= DRAWS - OUTER) & mask
     count = mask.sum(dim=1)
-    found: NDArray = torch.where(count > 0, inside.sum(dim=1).double() / count, torch.nan).numpy()
-    return found
+    return torch.where(count > 0, inside.sum(dim=1).double() / count, torch.nan).numpy()
 
 
 def coverage_figures(

@@ -42,8 +42,7 @@ def read_correction(about: Mapping[str, Any], rate: float | None) -> Correction:
         rate = None
     else:
         config = _in_seconds(config, rate)
-    made: Correction = from_config(config, classes(CORRECTIONS), rate=rate)
-    return made
+    return from_config(config, classes(CORRECTIONS), rate=rate)
 
 
 def _in_seconds(config: Mapping[str, Any], rate: float | None) -> dict[str, Any]:

@@ -221,8 +221,7 @@ class SequenceResidual(Residual):
     def predict(self, member: nn.Module, features: Tensor) -> list[GaussianMixture]:
         """The distribution of each block that one member predicts, before calibration."""
         units = self.shift.split(self.sizes), self.scale.split(self.sizes)
-        blocks: list[GaussianMixture] = member(self.before(features), *units)
-        return blocks
+        return member(self.before(features), *units)
 
     @torch.no_grad()
     def sample(self, context: Context, *, generator: torch.Generator) -> Tensor:

@@ -265,8 +265,7 @@ def _start(model: Linear, v: NDArray, y: NDArray) -> NDArray:
         effects.append(out @ power)
         power = power @ a
     target = (y - alone).mean(axis=0).ravel()
-    made: NDArray = np.linalg.lstsq(np.concatenate(effects), target, rcond=1e-8)[0]
-    return made
+    return np.linalg.lstsq(np.concatenate(effects), target, rcond=1e-8)[0]
 
 
 def _simulated(model: Linear, begin: NDArray, v: NDArray) -> tuple[NDArray, NDArray]:

@@ -75,8 +75,7 @@ def relative_error(error: NDArray, seen: NDArray, deviation: NDArray) -> NDArray
     count = np.maximum(seen.sum(axis=(0, 1)), 1)
     with np.errstate(over="ignore", invalid="ignore"):
         rms = np.sqrt(np.sum(counted**2, axis=(0, 1)) / count)
-    made: NDArray = np.nan_to_num(rms, nan=np.inf) / deviation
-    return made
+    return np.nan_to_num(rms, nan=np.inf) / deviation
 
 
 def searched(
