@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 from retwin.errors import InputError
 
 __all__ = [
+    "agree",
     "at_least",
     "finite",
     "instance",
@@ -169,6 +170,30 @@ def one_per(argument: str, values: Sized, count: int, what: str, *, remedy: str 
         got=str(len(values)),
         remedy=remedy or f"give one for each {what}",
     )
+
+
+def agree(
+    argument: str,
+    given: object,
+    model: object,
+    whose: str,
+    *,
+    names: Iterable[str] = ("inputs", "outputs", "rate"),
+    remedy: str,
+) -> None:
+    """Require an object to have the channels and the rate of a model, or other attributes of it.
+
+    `whose` describes those of the model in the message: "that of the twin".
+    """
+    for name in names:
+        expected, got = getattr(model, name), getattr(given, name)
+        require(
+            got == expected,
+            f"{argument}.{name}",
+            expected=f"{whose}, {expected}",
+            got=got,
+            remedy=remedy,
+        )
 
 
 def needs_extra(module: str, extra: str, purpose: str) -> ModuleType:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retwin.arrays import row_blocks
-from retwin.checks import require, whole
+from retwin.checks import agree, require, whole
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.times import sample_rate, stride_of
@@ -150,7 +150,9 @@ class Features:
 
     def _sampled(self, trajectories: Trajectories, time: NDArray) -> Tensor:
         """Features at the samples `time`, (n, len(time), 2 d_y), computed block by block."""
-        self._check(trajectories)
+        remedy = "resample or rename, or train on data like these"
+        whose = "what the diagnoser was trained on"
+        agree("trajectories", trajectories, self, whose, names=("outputs", "rate"), remedy=remedy)
         settled = self._settled(trajectories) if self.hide_start else None
         found = np.empty((len(trajectories), len(time), self.width), np.float32)
         for rows in row_blocks(trajectories.nominal):
@@ -181,17 +183,6 @@ class Features:
             return np.full(len(trajectories), trajectories.steps - 1)
         end = np.ceil(segments.settle[:, 0]).astype(int) + SETTLED * self.stride
         return np.minimum(end, trajectories.steps - 1)
-
-    def _check(self, trajectories: Trajectories) -> None:
-        for name in ("outputs", "rate"):
-            expected, given = getattr(self, name), getattr(trajectories, name)
-            require(
-                given == expected,
-                f"trajectories.{name}",
-                expected=f"what the diagnoser was trained on, {expected}",
-                got=given,
-                remedy="resample or rename, or train on data like these",
-            )
 
 
 def random_phase(phases: Tensor, generator: torch.Generator) -> Tensor:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from retwin.checks import require
+from retwin.checks import agree
 from retwin.data.trajectories import Trajectories
 from retwin.update.corrections import Context, sample_mask
 from retwin.update.residual import ResidualModel
@@ -44,15 +44,9 @@ class DiagnosisInputs:
         cls, surrogate: Surrogate, residual: ResidualModel, trajectories: Trajectories
     ) -> DiagnosisInputs:
         """Those of `trajectories`, which must have the channels and the rate of the surrogate."""
-        for name in ("inputs", "outputs", "rate"):
-            expected, got = getattr(surrogate, name), getattr(trajectories, name)
-            require(
-                expected == got,
-                f"trajectories.{name}",
-                expected=f"what the surrogate was trained on, {expected}",
-                got=got,
-                remedy="resample or rename, or load the file with its case",
-            )
+        remedy = "resample or rename, or load the file with its case"
+        whose = "what the surrogate was trained on"
+        agree("trajectories", trajectories, surrogate, whose, remedy=remedy)
         context = residual.context(surrogate, np.ascontiguousarray(trajectories.commands))
         observed = torch.as_tensor(trajectories.observed.astype(np.float64))
         mask = torch.as_tensor(trajectories.mask.copy())

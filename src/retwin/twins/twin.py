@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from retwin.arrays import check_finite, is_finite
-from retwin.checks import instance, require, whole
+from retwin.checks import agree, instance, require, whole
 from retwin.data.measured import check_magnitude
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Provenance, Trajectories
@@ -210,15 +210,8 @@ def check_channels(twin: Twin, trajectories: Trajectories, argument: str) -> Non
     Raises InputError, in which the trajectories have the name `argument`.
     """
     instance(argument, trajectories, Trajectories, remedy="load recorded ones, or simulate a twin")
-    for name in ("inputs", "outputs", "rate"):
-        expected, given = getattr(twin, name), getattr(trajectories, name)
-        require(
-            given == expected,
-            f"{argument}.{name}",
-            expected=f"that of the twin, {expected}",
-            got=given,
-            remedy="load the file with its case, or convert it",
-        )
+    remedy = "load the file with its case, or convert it"
+    agree(argument, trajectories, twin, "that of the twin", remedy=remedy)
 
 
 def checked_seed(seed: int) -> int:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.arrays import floats
-from retwin.checks import require
+from retwin.checks import agree, require
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.twins.command_range import TOLERANCE, excess, extremes
@@ -326,15 +326,8 @@ def no_diagnoser() -> InputError:
 
 def check_channels(trajectories: Trajectories, model: Twin) -> None:
     """Raise InputError unless inputs, outputs and rate of the trajectories are the model's."""
-    for name in ("inputs", "outputs", "rate"):
-        expected, got = getattr(model, name), getattr(trajectories, name)
-        require(
-            expected == got,
-            f"trajectories.{name}",
-            expected=f"what the bundle was made for, {expected}",
-            got=got,
-            remedy="resample or rename, and read files with their case, which recovers commands",
-        )
+    remedy = "resample or rename, and read files with their case, which recovers commands"
+    agree("trajectories", trajectories, model, "what the bundle was made for", remedy=remedy)
 
 
 def _subset(trajectories: Trajectories, rows: NDArray) -> Trajectories:

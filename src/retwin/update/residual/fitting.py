@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from retwin.checks import instance, require
+from retwin.checks import agree, instance, require
 from retwin.data.measured import check_magnitude, unmeasured
 from retwin.data.segments import Segments
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -182,7 +182,8 @@ def fit_residual(
     instance(
         "calibration", calibration, Trajectories, remedy="load recorded ones, or simulate a twin"
     )
-    _check_match(surrogate, calibration)
+    remedy = "load the file with its case, or convert it"
+    agree("calibration", calibration, surrogate, "that of the surrogate", remedy=remedy)
     stepwise = correction.resolution == "step" or isinstance(density, SequenceMixture)
     keep, faults = _chosen(
         calibration, calibrate_on, getattr(correction, "severities", False), 1 if stepwise else 3
@@ -312,19 +313,6 @@ def _measured(trajectories: Trajectories) -> tuple[Tensor, Tensor]:
     """
     check_magnitude("calibration", trajectories, ideal=True)
     return torch.tensor(trajectories.observed), torch.tensor(trajectories.mask)
-
-
-def _check_match(surrogate: Surrogate, calibration: Trajectories) -> None:
-    """Require the calibration data to have the surrogate's channels and rate."""
-    for name in ("inputs", "outputs", "rate"):
-        expected, got = getattr(surrogate, name), getattr(calibration, name)
-        require(
-            expected == got,
-            f"calibration.{name}",
-            expected=f"that of the surrogate, {expected}",
-            got=got,
-            remedy="load the file with its case, or convert it",
-        )
 
 
 def calibrating(
