@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from retwin.threads import available, in_threads
 
-__all__ = ["c_source", "call", "compiled", "compilers"]
+__all__ = ["c_source", "call", "compiled", "compiled_files", "compilers"]
 
 FLAGS = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """Without contraction and reassociation, results are those of torch up to single roundings."""
@@ -49,6 +49,16 @@ def compilers() -> Iterator[list[str]]:
             yield [found]
     if find_spec("ziglang"):
         yield [sys.executable, "-m", "ziglang", "cc"]
+
+
+@lru_cache(maxsize=COMPILED)
+def compiled_files(package: str, *names: str, contract: bool = False) -> ctypes.CDLL | None:
+    """The functions of C files in a package, compiled together; None without a C compiler.
+
+    The files need no declarations: `kernel.h` stands above them. `contract` is that of `compiled`.
+    """
+    source = c_source("retwin", "kernel.h") + c_source(package, *names)
+    return compiled(source, contract=contract, quiet=True)
 
 
 @lru_cache(maxsize=COMPILED)

@@ -1,17 +1,6 @@
 /* A damped Gauss-Newton step of many rows, in double precision; see `gauss_newton_step` in
    `solver.py` and `Noise` in `noise.py`, which are the same in torch and explain it. Columns of the
    Jacobian that are zero at a sample are passed over: outputs depend on few segments at a time. */
-#include <math.h>
-#include <stdlib.h>
-#include <string.h>
-
-#ifdef _WIN32
-#define EXPORT __declspec(dllexport)
-#else
-#define EXPORT
-#endif
-
-typedef long long i64;
 
 typedef struct {
     i64 samples, outputs, size;

@@ -6,7 +6,6 @@ What takes time in torch is to pass through the Jacobian, of which most is zero,
 from __future__ import annotations
 
 import ctypes
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from retwin.compiler import c_source, call, compiled
+from retwin.compiler import call, compiled_files
 from retwin.inference.losses import StudentT
 from retwin.inference.noise import Noise
 from retwin.inference.priors import GaussianPrior
@@ -28,12 +27,7 @@ __all__ = ["compiled_objective", "compiled_step", "library"]
 
 def library() -> ctypes.CDLL | None:
     """The compiled kernel; None without a C compiler."""
-    return _library()
-
-
-@lru_cache(maxsize=1)
-def _library() -> ctypes.CDLL | None:
-    return compiled(c_source(__package__, "normal.c"), contract=True, quiet=True)
+    return compiled_files(__package__, "normal.c", contract=True)
 
 
 def compiled_step(

@@ -1,14 +1,5 @@
 /* Ramps and holds, and biased references; `ramps.py` and `faults.py` in `retwin.twins` are the same
    in numpy, to the last digit, and explain them. */
-#include <math.h>
-
-#ifdef _WIN32
-#define EXPORT __declspec(dllexport)
-#else
-#define EXPORT
-#endif
-
-typedef long long i64;
 
 static i64 bounded(double t, i64 low, i64 high)
 {

@@ -8,21 +8,19 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.compiler import c_source, call, compiled
+from retwin.compiler import call, compiled_files
 from retwin.data.segments import Segments
 
 __all__ = ["biased_references", "ramped"]
 
 
-@lru_cache(maxsize=1)
 def library() -> ctypes.CDLL | None:
     """The compiled functions; None without a C compiler."""
-    return compiled(c_source(__package__, "commands.c"), quiet=True)
+    return compiled_files(__package__, "commands.c")
 
 
 def ramped(

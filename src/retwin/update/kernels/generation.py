@@ -8,7 +8,6 @@ by the rounding of single precision.
 from __future__ import annotations
 
 import ctypes
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retwin.compiler import c_source, call, compiled
+from retwin.compiler import call, compiled_files
 from retwin.data.segments import Segments
 from retwin.update.piecewise_linear import TOLERANCE
 
@@ -41,12 +40,8 @@ found out, and cost a second evaluation. With 3 the default network of the arm t
 
 def library() -> ctypes.CDLL | None:
     """The compiled kernels; None without a C compiler, and where torch traces a graph."""
-    return None if torch.compiler.is_compiling() or torch.jit.is_tracing() else _library()
-
-
-@lru_cache(maxsize=1)
-def _library() -> ctypes.CDLL | None:
-    return compiled(c_source(__package__, *SOURCES), contract=True, quiet=True)
+    graph = torch.compiler.is_compiling() or torch.jit.is_tracing()
+    return None if graph else compiled_files(__package__, *SOURCES, contract=True)
 
 
 def along_pieces(surrogate: Any, commands: NDArray) -> NDArray | None:

@@ -1,14 +1,5 @@
 /* A dense network with SiLU activations, in single precision: BLOCK inputs at a time, so that their
    activations stay in the processor's nearest cache. `network.py` packs its weights. */
-#include <math.h>
-#include <stdlib.h>
-#include <string.h>
-
-#ifdef _WIN32
-#define EXPORT __declspec(dllexport)
-#else
-#define EXPORT
-#endif
 
 #define LANES 16
 #define VECTORS 2
@@ -17,7 +8,6 @@
 
 typedef float vector __attribute__((vector_size(4 * LANES)));
 typedef int whole __attribute__((vector_size(4 * LANES)));
-typedef long long i64;
 
 typedef struct {
     i64 layers;
