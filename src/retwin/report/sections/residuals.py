@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ POINTS = 241
 """Lags that a figure shows, at most."""
 BLOCKS = 40
 """Blocks of the error over time."""
-OUTSIDE = Key("outside the range of the calibration", "grid", "bar")
+WHITE = Key("95 % limits of white noise", "muted", "bar")
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,23 @@ class ChannelRecords:
         return (self.values < self.low) | (self.values > self.high)
 
 
+@dataclass(frozen=True)
+class OutputErrors:
+    """An output, and by source what was measured minus what was simulated (n, T)."""
+
+    output: ChannelRecords
+    by_source: Mapping[str, NDArray]
+
+    def of(self, sources: Iterable[str]) -> OutputErrors:
+        """The errors of some sources alone."""
+        return OutputErrors(self.output, {name: self.by_source[name] for name in sources})
+
+    @cached_property
+    def lags(self) -> int:
+        """Lags up to which correlations are shown, by the first source."""
+        return decorrelated_after(next(iter(self.by_source.values())))
+
+
 def residuals(study: Study) -> Section | None:
     """A table of all sources; figures of the plain twin, the best other one, and `dynamics`."""
     known = [name for name in study.sources if f"simulation/{name}/mean" in study.arrays]
@@ -60,26 +78,47 @@ def residuals(study: Study) -> Section | None:
         return None
     best = sorted(known[1:], key=lambda name: study.sources[name].mean("nrmse"))[:1]
     shown = list(dict.fromkeys([known[0], *best, *(name for name in known if name == "dynamics")]))
-    outputs, commands = _channels(study, "observed"), _channels(study, "commands")
-    errors = {name: _errors(study, name, outputs) for name in known}
-    drawn = {name: errors[name] for name in shown}
-    keys = [Key(source_name(name), colour_of(name), dash(name)) for name in shown]
-    rate = float(study.arrays["simulation/rate"])
-    figures = [
-        _autocorrelations(drawn, outputs, rate, keys),
-        _cross_correlations(drawn, outputs, commands, rate, keys),
-        _spectra(drawn, outputs, rate, keys),
-        _amplitudes(drawn, outputs, commands, keys),
-        _times(drawn, outputs, commands, rate, keys),
-    ]
+    commands, errors = _channels(study, "commands"), _errors(study, known)
+    channels = [*(each.output for each in errors), *commands]
+    outside = np.any([each.outside for each in channels], axis=0)
+    figures = _figures(study, [each.of(shown) for each in errors], commands, outside)
     figures = [each for each in figures if each.panels]
     values = {
-        "table": _table(errors, outputs, commands, rate),
+        "table": _table(study, errors, commands, outside),
         "figures": {each.name: each for each in figures},
-        "limited": len(outputs) > OUTPUTS or len(commands) > COMMANDS,
+        "limited": len(errors) > OUTPUTS or len(commands) > COMMANDS,
         "ranged": "simulation/range" in study.arrays,
     }
     return Section("residuals", "Residual diagnostics", values, figures)
+
+
+def _figures(
+    study: Study, errors: list[OutputErrors], commands: list[ChannelRecords], outside: NDArray
+) -> list[Figure]:
+    """All figures, of the first outputs and commands."""
+    ranged = any(np.isfinite([each.output.low, each.output.high]).any() for each in errors)
+    rate, errors, drawn = _rate(study), errors[:OUTPUTS], commands[:COMMANDS]
+    keys = [Key(source_name(name), colour_of(name), dash(name)) for name in errors[0].by_source]
+    limits = [Key(f"95 % limits, {key.text}", key.colour, "bar") for key in keys]
+    correlated = [_cross_correlation(each, of, rate) for each in errors for of in drawn]
+    densities = [_spectrum(each, rate) for each in errors]
+    amplitudes = [_amplitudes(each, of) for each in errors for of in (each.output, *drawn)]
+    beyond, late = (
+        [Key("outside the range of the calibration", "grid", "bar")] * bool(known)
+        for known in (ranged, outside.any())
+    )
+    over_time = [_over_time(each, np.any(outside, axis=0), rate) for each in errors]
+    return [
+        Figure("autocorrelation", [_autocorrelation(e, rate) for e in errors], [*keys, WHITE]),
+        Figure("crosscorrelation", correlated, [*keys, *limits]),
+        Figure("spectra", [e for e in densities if e], [Key("measured output", "ink"), *keys]),
+        Figure("amplitude", [e for e in amplitudes if e], [*keys, *beyond]),
+        Figure("overtime", over_time, [*keys, *late], columns=1),
+    ]
+
+
+def _rate(study: Study) -> float:
+    return float(study.arrays["simulation/rate"])
 
 
 def _channels(study: Study, kind: str) -> list[ChannelRecords]:
@@ -100,18 +139,21 @@ def _channels(study: Study, kind: str) -> list[ChannelRecords]:
     ]
 
 
-def _errors(study: Study, source: str, outputs: Sequence[ChannelRecords]) -> list[NDArray]:
-    """Measured minus simulated values (n, T) of each output."""
-    mean = study.arrays[f"simulation/{source}/mean"].astype(float)
+def _errors(study: Study, sources: Sequence[str]) -> list[OutputErrors]:
+    """The errors of each output, in the units that are shown."""
+    means = {name: study.arrays[f"simulation/{name}/mean"].astype(float) for name in sources}
+    outputs = _channels(study, "observed")
     units = study.results.outputs.units or [""] * len(outputs)
-    return [each.values - quantity(units[i])[0] * mean[..., i] for i, each in enumerate(outputs)]
+    made = []
+    for i, each in enumerate(outputs):
+        factor = quantity(units[i])[0]
+        errors = {name: each.values - factor * mean[..., i] for name, mean in means.items()}
+        made.append(OutputErrors(each, errors))
+    return made
 
 
 def _table(
-    errors: dict[str, list[NDArray]],
-    outputs: Sequence[ChannelRecords],
-    commands: Sequence[ChannelRecords],
-    rate: float,
+    study: Study, errors: list[OutputErrors], commands: list[ChannelRecords], outside: NDArray
 ) -> Table:
     heads = columns(
         "Source",
@@ -123,36 +165,33 @@ def _table(
         "RMSE outside the calibration",
     )
     rows: list[list[Cell]] = []
-    outside = _outside([*outputs, *commands])
-    for i, output in enumerate(outputs):
-        if len(outputs) > 1:
-            rows.append([Cell(with_unit(output.name, output.unit))])
-        for source, each in errors.items():
-            error = each[i]
-            own = autocorrelation(error)
-            lags = decorrelated_after(next(iter(errors.values()))[i])
-            crossed = [(u, cross_correlation(error, u.values, lags)) for u in commands]
-            command, cross = max(crossed, key=lambda pair: _excess(pair[1]))
-            (rms, mean), (beyond, _) = _moments(error), _moments(error[outside])
-            share = np.mean(outside[np.isfinite(error)]) if np.isfinite(rms) else 0.0
-            rows.append(
-                [
-                    Cell(source_name(source), source=source),
-                    Cell(number(rms)),
-                    Cell(number(mean, decimals(rms))),
-                    Cell(*_at_lag(own, rate)),
-                    Cell(p_value(ljung_box(own)[1])),
-                    Cell(*_at_lag(cross, rate, command.name)),
-                    Cell(number(beyond, decimals(rms)), f"{100 * share:.2g} % of the samples"),
-                ]
-            )
-    title = "Residuals of all sources"
-    return Table(title if len(outputs) > 1 else with_unit(title, outputs[0].unit), heads, rows)
+    for each in errors:
+        if len(errors) > 1:
+            rows.append([Cell(with_unit(each.output.name, each.output.unit))])
+        for source, error in each.by_source.items():
+            found = _row(error, commands, each.lags, outside, _rate(study))
+            rows.append([Cell(source_name(source), source=source), *found])
+    title, output = "Residuals of all sources", errors[0].output
+    return Table(title if len(errors) > 1 else with_unit(title, output.unit), heads, rows)
 
 
-def _outside(channels: Sequence[ChannelRecords]) -> NDArray:
-    """Whether any channel is outside its range in calibration (n, T)."""
-    return np.any([each.outside for each in channels], axis=0)
+def _row(
+    error: NDArray, commands: Iterable[ChannelRecords], lags: int, outside: NDArray, rate: float
+) -> list[Cell]:
+    """The cells of one source for one output."""
+    own = autocorrelation(error)
+    crossed = [(u, cross_correlation(error, u.values, lags)) for u in commands]
+    command, cross = max(crossed, key=lambda pair: _excess(pair[1]))
+    (rms, mean), (beyond, _) = _moments(error), _moments(error[outside])
+    share = np.mean(outside[np.isfinite(error)]) if np.isfinite(rms) else 0.0
+    return [
+        Cell(number(rms)),
+        Cell(number(mean, decimals(rms))),
+        Cell(*_at_lag(own, rate)),
+        Cell(p_value(ljung_box(own)[1])),
+        Cell(*_at_lag(cross, rate, command.name)),
+        Cell(number(beyond, decimals(rms)), f"{100 * share:.2g} % of the samples"),
+    ]
 
 
 def _moments(error: NDArray) -> tuple[float, float]:
@@ -177,159 +216,99 @@ def _at_lag(found: Correlogram, rate: float, command: str = "") -> tuple[str, st
     return number(found.values[i], 2), f"{where}; limit {number(found.limits[i], 2)}"
 
 
-def _autocorrelations(
-    errors: dict[str, list[NDArray]],
-    outputs: Sequence[ChannelRecords],
-    rate: float,
-    keys: list[Key],
-) -> Figure:
-    panels = []
-    for i, output in enumerate(outputs[:OUTPUTS]):
-        lags = decorrelated_after(next(iter(errors.values()))[i])
-        found = {s: _thinned(autocorrelation(each[i], lags)) for s, each in errors.items()}
-        first = next(iter(found.values()))
-        x = first.lags / rate
-        white = "95 % limits of white noise"
-        marks: list[Mark] = [Band(x, -first.limits, first.limits, white, "muted", 0.25)]
-        marks += [_line(x, each.values, source) for source, each in found.items()]
-        panels.append(
-            Panel(
-                Axis("lag", "s"),
-                [Row(Axis("autocorrelation", limits=(-1.05, 1.05), step=0.5), marks)],
-                f"Autocorrelation of the error of {output.name}",
-                output.name,
-                height=300,
-            )
-        )
-    keys = [*keys, Key("95 % limits of white noise", "muted", "bar")]
-    return Figure("autocorrelation", panels, keys)
+def _autocorrelation(errors: OutputErrors, rate: float) -> Panel:
+    found = {s: _thinned(autocorrelation(e, errors.lags)) for s, e in errors.by_source.items()}
+    first = next(iter(found.values()))
+    x = first.lags / rate
+    marks: list[Mark] = [Band(x, -first.limits, first.limits, WHITE.text, "muted", 0.25)]
+    marks += [_line(x, each.values, source) for source, each in found.items()]
+    return Panel(
+        Axis("lag", "s"),
+        [Row(Axis("autocorrelation", limits=(-1.05, 1.05), step=0.5), marks)],
+        f"Autocorrelation of the error of {errors.output.name}",
+        errors.output.name,
+        height=300,
+    )
 
 
-def _cross_correlations(
-    errors: dict[str, list[NDArray]],
-    outputs: Sequence[ChannelRecords],
-    commands: Sequence[ChannelRecords],
-    rate: float,
-    keys: list[Key],
-) -> Figure:
-    panels = []
-    for i, output in enumerate(outputs[:OUTPUTS]):
-        lags = decorrelated_after(next(iter(errors.values()))[i])
-        for command in commands[:COMMANDS]:
-            marks: list[Mark] = []
-            largest = 0.0
-            for source, each in errors.items():
-                found = _thinned(cross_correlation(each[i], command.values, lags))
-                x, colour = found.lags / rate, colour_of(source)
-                name = f"95 % limits, {source_name(source)}"
-                marks.append(Band(x, -found.limits, found.limits, name, colour, 0.18))
-                marks.append(_line(x, found.values, source))
-                both = np.concatenate([np.abs(found.values), found.limits])
-                largest = float(max(largest, *both[np.isfinite(both)], 0.0))
-            y = Axis("correlation", limits=(-1.1 * largest, 1.1 * largest) if largest > 0 else None)
-            panels.append(
-                Panel(
-                    Axis("time by which the command is earlier", "s"),
-                    [Row(y, marks)],
-                    f"Correlation of the error of {output.name} with {command.name}",
-                    f"{output.name}, {command.name}",
-                    height=300,
-                )
-            )
-    limits = [Key(f"95 % limits, {key.text}", key.colour, "bar") for key in keys]
-    return Figure("crosscorrelation", panels, [*keys, *limits])
+def _cross_correlation(errors: OutputErrors, command: ChannelRecords, rate: float) -> Panel:
+    marks: list[Mark] = []
+    largest = 0.0
+    for source, each in errors.by_source.items():
+        found = _thinned(cross_correlation(each, command.values, errors.lags))
+        x, colour = found.lags / rate, colour_of(source)
+        name = f"95 % limits, {source_name(source)}"
+        marks.append(Band(x, -found.limits, found.limits, name, colour, 0.18))
+        marks.append(_line(x, found.values, source))
+        both = np.concatenate([np.abs(found.values), found.limits])
+        largest = float(max(largest, *both[np.isfinite(both)], 0.0))
+    y = Axis("correlation", limits=(-1.1 * largest, 1.1 * largest) if largest > 0 else None)
+    return Panel(
+        Axis("time by which the command is earlier", "s"),
+        [Row(y, marks)],
+        f"Correlation of the error of {errors.output.name} with {command.name}",
+        f"{errors.output.name}, {command.name}",
+        height=300,
+    )
 
 
-def _spectra(
-    errors: dict[str, list[NDArray]],
-    outputs: Sequence[ChannelRecords],
-    rate: float,
-    keys: list[Key],
-) -> Figure:
-    panels = []
-    for i, output in enumerate(outputs[:OUTPUTS]):
-        series = [output.values, *(each[i] for each in errors.values())]
-        frequencies, (signal, *others) = spectra(series, rate)
-        if not len(frequencies):
-            continue
-        marks: list[Mark] = [Line(frequencies, np.sqrt(signal), "measured", "ink", width=1.4)]
-        for source, each in zip(errors, others, strict=True):
-            marks.append(_line(frequencies, np.sqrt(each), source))
-        unit = f"{output.unit}/√Hz" if output.unit else "1/√Hz"
-        panels.append(
-            Panel(
-                _log("frequency", "Hz", frequencies),
-                [Row(_log("spectral density", unit, np.sqrt([signal, *others])), marks)],
-                f"Spectrum of {output.name} and of its errors",
-                output.name,
-                height=340,
-            )
-        )
-    return Figure("spectra", panels, [Key("measured output", "ink"), *keys])
+def _spectrum(errors: OutputErrors, rate: float) -> Panel | None:
+    """None where no part of the records is measured without a hole."""
+    output = errors.output
+    frequencies, (signal, *others) = spectra([output.values, *errors.by_source.values()], rate)
+    if not len(frequencies):
+        return None
+    marks: list[Mark] = [Line(frequencies, np.sqrt(signal), "measured", "ink", width=1.4)]
+    for source, each in zip(errors.by_source, others, strict=True):
+        marks.append(_line(frequencies, np.sqrt(each), source))
+    unit = f"{output.unit}/√Hz" if output.unit else "1/√Hz"
+    return Panel(
+        _log("frequency", "Hz", frequencies),
+        [Row(_log("spectral density", unit, np.sqrt([signal, *others])), marks)],
+        f"Spectrum of {output.name} and of its errors",
+        output.name,
+        height=340,
+    )
 
 
-def _amplitudes(
-    errors: dict[str, list[NDArray]],
-    outputs: Sequence[ChannelRecords],
-    commands: Sequence[ChannelRecords],
-    keys: list[Key],
-) -> Figure:
-    panels = []
-    for i, output in enumerate(outputs[:OUTPUTS]):
-        for channel in [output, *commands[:COMMANDS]]:
-            ends = (channel.low, channel.high)
-            found = {
-                name: error_by_amplitude(each[i], channel.values, ends)
-                for name, each in errors.items()
-            }
-            bins = next(iter(found.values()))
-            if not len(bins.rms):
-                continue
-            least, most = float(bins.low.min()), float(bins.high.max())
-            beyond = [(least, min(channel.low, most))] * (least < channel.low)
-            beyond += [(max(channel.high, least), most)] * (channel.high < most)
-            marks: list[Mark] = [Spans(beyond)] if beyond else []
-            for source, each in found.items():
-                marks.append(_points(each.centre, each.rms, source))
-            y = _log("RMS error", output.unit, [each.rms for each in found.values()])
-            panels.append(
-                Panel(
-                    Axis(channel.name, channel.unit),
-                    [Row(y, marks)],
-                    f"Error of {output.name} by the value of {channel.name}",
-                    f"{output.name} by {channel.name}",
-                    height=320,
-                )
-            )
-    return Figure("amplitude", panels, [*keys, *([OUTSIDE] if _ranged(outputs) else [])])
+def _amplitudes(errors: OutputErrors, of: ChannelRecords) -> Panel | None:
+    """The error by the value of a channel; None where nothing was measured."""
+    ends = (of.low, of.high)
+    found = {s: error_by_amplitude(e, of.values, ends) for s, e in errors.by_source.items()}
+    bins = next(iter(found.values()))
+    if not len(bins.rms):
+        return None
+    least, most = float(bins.low.min()), float(bins.high.max())
+    beyond = [(least, min(of.low, most))] * (least < of.low)
+    beyond += [(max(of.high, least), most)] * (of.high < most)
+    marks: list[Mark] = [Spans(beyond)] if beyond else []
+    for source, each in found.items():
+        marks.append(_points(each.centre, each.rms, source))
+    name, unit = errors.output.name, errors.output.unit
+    return Panel(
+        Axis(of.name, of.unit),
+        [Row(_log("RMS error", unit, [each.rms for each in found.values()]), marks)],
+        f"Error of {name} by the value of {of.name}",
+        f"{name} by {of.name}",
+        height=320,
+    )
 
 
-def _times(
-    errors: dict[str, list[NDArray]],
-    outputs: Sequence[ChannelRecords],
-    commands: Sequence[ChannelRecords],
-    rate: float,
-    keys: list[Key],
-) -> Figure:
-    panels = []
-    outside: NDArray = np.any(_outside([*outputs, *commands]), axis=0)
-    for i, output in enumerate(outputs[:OUTPUTS]):
-        found = {source: rms_over_time(each[i], BLOCKS) for source, each in errors.items()}
-        edges = next(iter(found.values()))[0] / rate
-        marks: list[Mark] = [Spans(list(_runs(outside, edges, rate)))] if outside.any() else []
-        for source, (_, rms) in found.items():
-            marks.append(_line((edges[1:] + edges[:-1]) / 2, rms, source))
-        panels.append(
-            Panel(
-                Axis("time", "s", (0, edges[-1]), count=8),
-                [Row(_log("RMS error", output.unit, [rms for _, rms in found.values()]), marks)],
-                f"Error of {output.name} over time",
-                output.name,
-                height=300,
-            )
-        )
-    ranged = [OUTSIDE] if outside.any() else []
-    return Figure("overtime", panels, [*keys, *ranged], columns=1)
+def _over_time(errors: OutputErrors, outside: NDArray, rate: float) -> Panel:
+    """The error over time, and where a channel of any record is outside (T,)."""
+    found = {source: rms_over_time(e, BLOCKS) for source, e in errors.by_source.items()}
+    edges = next(iter(found.values()))[0] / rate
+    marks: list[Mark] = [Spans(list(_runs(outside, edges, rate)))] if outside.any() else []
+    for source, (_, rms) in found.items():
+        marks.append(_line((edges[1:] + edges[:-1]) / 2, rms, source))
+    y = _log("RMS error", errors.output.unit, [rms for _, rms in found.values()])
+    return Panel(
+        Axis("time", "s", (0, edges[-1]), count=8),
+        [Row(y, marks)],
+        f"Error of {errors.output.name} over time",
+        errors.output.name,
+        height=300,
+    )
 
 
 def _runs(outside: NDArray, edges: NDArray, rate: float) -> Iterator[tuple[float, float]]:
@@ -339,10 +318,6 @@ def _runs(outside: NDArray, edges: NDArray, rate: float) -> Iterator[tuple[float
     ends = np.flatnonzero(np.diff(np.concatenate([[0], held, [0]])))
     for first, last in ends.reshape(-1, 2).tolist():
         yield float(edges[first]), float(edges[last])
-
-
-def _ranged(channels: Sequence[ChannelRecords]) -> bool:
-    return any(np.isfinite([each.low, each.high]).any() for each in channels)
 
 
 def _thinned(found: Correlogram) -> Correlogram:
