@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retwin.checks import require
-from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.twins.twin import Twin
+from retwin.twins.wrapper import OfTwin
 from retwin.update.surrogate import Surrogate
 
 __all__ = ["ExactSurrogate", "exact_surrogate"]
 
 
-class ExactSurrogate:
+class ExactSurrogate(OfTwin):
     """A twin with the methods of a surrogate that corrections and residual models use.
 
     A twin that can be called with a tensor, such as a torch module or a `StateTwin`, is
@@ -36,27 +36,13 @@ class ExactSurrogate:
 
     """
 
+    twin: Twin
     memoryless = False
     """Whether an output depends on the command of its own sample only: of a twin it is unknown."""
 
     def __init__(self, twin: Twin, *, differences: bool) -> None:
         self.twin = twin
         self._warns = differences
-
-    @property
-    def inputs(self) -> Channels:
-        """Command channels."""
-        return self.twin.inputs
-
-    @property
-    def outputs(self) -> Channels:
-        """Output channels."""
-        return self.twin.outputs
-
-    @property
-    def rate(self) -> float:
-        """Sample rate in Hz."""
-        return self.twin.rate
 
     def predict(self, commands: NDArray, *, progress: Progress | None = None) -> NDArray:
         """The nominal outputs (n, T, d_y), float32, for commands (n, T, d_u)."""
