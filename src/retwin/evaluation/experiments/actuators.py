@@ -18,7 +18,7 @@ from retwin.inference.design import Knowledge
 from retwin.inference.solver import solve
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Chain, CommandSpace, Context, Discrepancy, sample_mask
-from retwin.update.corrections.command_inference import Belief, infer_with_belief
+from retwin.update.corrections.command_inference import Belief
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.delay_range import range_in_samples
 
@@ -61,14 +61,7 @@ class ActuatorKnowledge:
         observed = torch.tensor(calibration.observed)
         mask = sample_mask(correction, observed, torch.tensor(calibration.mask), context.rate)
         limits = range_in_samples(operator.delay_range, context, observed, mask)
-        found, belief = infer_with_belief(
-            context,
-            observed,
-            mask,
-            delay_range=limits,
-            max_samples=operator.max_samples,
-            identified_below=operator.identified_below,
-        )
+        found, belief = operator.infer_with_belief(context, observed, mask)
         require(
             belief is not None,
             "calibration",

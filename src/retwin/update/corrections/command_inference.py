@@ -34,7 +34,7 @@ from retwin.update.corrections.missed_segments import (
 from retwin.update.corrections.offset_features import OffsetFeatures
 from retwin.update.corrections.sample_noise import SampleNoise
 
-__all__ = ["Belief", "infer_commands", "infer_with_belief"]
+__all__ = ["Belief", "infer_commands"]
 
 MAX_ROUNDS = 12
 """Rounds of expectation-maximisation at most, with a search for missed segments in each."""
@@ -57,6 +57,7 @@ FLOOR = 1e-6
 """Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
 
+@one_thread()
 def infer_commands(
     context: Context,
     observed: Tensor,
@@ -65,10 +66,17 @@ def infer_commands(
     delay_range: tuple[float, float],
     max_samples: int,
     identified_below: float,
-) -> Discrepancy:
+) -> tuple[Discrepancy, Belief | None]:
     """z* (n, M, 1 + 2 d_u) for measured outputs (n, T, d_y), see `CommandSpace`.
 
     The range of delays is in samples.
+
+    Returns
+    -------
+    Discrepancy
+        z* and what is known of it.
+    Belief or None
+        What was learned of the prior; None without any segment.
 
     Raises
     ------
@@ -76,27 +84,6 @@ def infer_commands(
         A trajectory has no sample at which all outputs are measured, while another has one.
 
     """
-    return infer_with_belief(
-        context,
-        observed,
-        mask,
-        delay_range=delay_range,
-        max_samples=max_samples,
-        identified_below=identified_below,
-    )[0]
-
-
-@one_thread()
-def infer_with_belief(
-    context: Context,
-    observed: Tensor,
-    mask: Tensor,
-    *,
-    delay_range: tuple[float, float],
-    max_samples: int,
-    identified_below: float,
-) -> tuple[Discrepancy, Belief | None]:
-    """As `infer_commands`, and what was learned of the prior; None without any segment."""
     _require_samples(mask)
     problem = CommandProblem.of(
         context, observed, mask, delay_range=delay_range, max_samples=max_samples
