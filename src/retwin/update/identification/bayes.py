@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import warnings
 
 import numpy as np
@@ -12,7 +11,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
 from retwin.update.identification.mcmc import MCMC
-from retwin.update.identification.misfit import misfit_of
+from retwin.update.identification.misfit import Misfit, misfit_of
 from retwin.update.identification.npe import NPE
 from retwin.update.identification.posterior import Posterior, PosteriorTwin
 from retwin.update.identification.problem import BoxProblem
@@ -26,33 +25,22 @@ SIGNIFICANCE = 0.02
 """Prior predictive p-value of the measured data below which the twin counts as misspecified."""
 
 
-def infer_posterior(
-    twin: ParametricTwin,
-    observed: Trajectories,
-    method: MCMC | NPE,
-    *,
-    seed: int,
-    rate: float | None,
-    processes: int,
-    progress: Progress | None,
-) -> Posterior:
+def infer_posterior(misfit: Misfit, method: MCMC | NPE, progress: Progress | None) -> Posterior:
     """The posterior of a twin's parameters given measured outputs, p(θ | y_obs, u) (Eq. 3).
 
     A warning is given where the data lie outside the prior predictive distribution of the twin with
-    noise, and where chains are short. Arguments and errors are those of `identify`.
+    noise, and where chains are short.
     """
-    began = time.perf_counter()
-    with misfit_of(twin, observed, seed=seed, rate=rate, processes=processes) as misfit:
-        seeds = np.random.SeedSequence(seed).generate_state(4).tolist()
-        for_method, for_check, for_kept, for_prior = seeds
-        problem = BoxProblem(misfit, method.noise, for_prior)
-        points, figures, warning = method.sample(problem, seed=for_method, progress=progress)
-        p_value = _prior_predictive(problem, np.random.default_rng(for_check))
-        order = np.random.default_rng(for_kept).permutation(len(points))[:MAX_DRAWS]
-        samples, logs = problem.physical(points[order])
-        mean = samples.mean(axis=0)
-        figures["rms_after"] = misfit.rms_of(misfit.residuals(mean[None]))
-        figures["rms_before"] = misfit.rms
+    seeds = np.random.SeedSequence(misfit.seed).generate_state(4).tolist()
+    for_method, for_check, for_kept, for_prior = seeds
+    problem = BoxProblem(misfit, method.noise, for_prior)
+    points, figures, warning = method.sample(problem, seed=for_method, progress=progress)
+    p_value = _prior_predictive(problem, np.random.default_rng(for_check))
+    order = np.random.default_rng(for_kept).permutation(len(points))[:MAX_DRAWS]
+    samples, logs = problem.physical(points[order])
+    twin, mean = misfit.twin, samples.mean(axis=0)
+    figures["rms_after"] = misfit.rms_of(misfit.residuals(mean[None]))
+    figures["rms_before"] = misfit.rms
     found = [warning] if warning else []
     if p_value < SIGNIFICANCE:
         found.append(
@@ -68,7 +56,7 @@ def infer_posterior(
         logs,
         misfit.unit,
         misfit.stride,
-        observed.emulated,
+        misfit.observed.emulated,
     )
     return Posterior(
         twin=updated,
@@ -77,7 +65,7 @@ def infer_posterior(
         scales=dict(zip(method.noise.names, np.exp(logs).T, strict=True)),
         misspecified=p_value,
         twin_runs=misfit.twin_runs,
-        seconds=time.perf_counter() - began,
+        seconds=0.0,
         figures=figures,
         reason="; ".join([f"{type(method).__name__} drew {len(points)} samples", *found]),
     )

@@ -26,7 +26,7 @@ from retwin.update.identification.identifiability import (
     standard_errors,
 )
 from retwin.update.identification.mcmc import MCMC
-from retwin.update.identification.misfit import misfit_of
+from retwin.update.identification.misfit import Misfit, misfit_of
 from retwin.update.identification.npe import NPE
 from retwin.update.identification.posterior import Posterior
 from retwin.update.identification.search import (
@@ -186,36 +186,28 @@ def identify(
         got=repr(method),
         remedy="give the settings of one of these methods",
     )
-    if isinstance(method, MCMC | NPE):
-        return infer_posterior(
-            twin, observed, method, seed=seed, rate=rate, processes=processes, progress=progress
-        )
-    return _fit(
-        twin, observed, method, seed=seed, rate=rate, processes=processes, progress=progress
-    )
-
-
-def _fit(
-    twin: ParametricTwin,
-    observed: Trajectories,
-    method: LeastSquares | Evolution,
-    *,
-    seed: int,
-    rate: float | None,
-    processes: int,
-    progress: Progress | None,
-) -> Updated:
-    """The parameters that fit best; arguments are those of `identify`."""
-    began = time.perf_counter()
-    missing = unmeasured(observed) if isinstance(observed, Trajectories) else ""
-    observed = measured_only(observed) if missing else observed
+    began, missing = time.perf_counter(), ""
+    if isinstance(method, LeastSquares | Evolution) and isinstance(observed, Trajectories):
+        missing = unmeasured(observed)
+        observed = measured_only(observed) if missing else observed
+    found: Updated | Posterior
     with misfit_of(twin, observed, seed=seed, rate=rate, processes=processes) as misfit:
-        search = Search(misfit, method, progress)
-        before = misfit.rms
-        optima = search.run(np.random.default_rng(seed))
-        best, point = optima[0]
-        residual = misfit.residuals(np.array([best.values]))[0]
-        found, errors, agreeing = _identifiability(search, optima, point, residual)
+        if isinstance(method, MCMC | NPE):
+            found = infer_posterior(misfit, method, progress)
+        else:
+            found = _fitted(misfit, method, missing, progress)
+    return replace(found, seconds=time.perf_counter() - began)
+
+
+def _fitted(
+    misfit: Misfit, method: LeastSquares | Evolution, missing: str, progress: Progress | None
+) -> Updated:
+    """The parameters that fit best; `missing` describes outputs that were never measured."""
+    twin, search = misfit.twin, Search(misfit, method, progress)
+    optima = search.run(np.random.default_rng(misfit.seed))
+    best, point = optima[0]
+    residual = misfit.residuals(np.array([best.values]))[0]
+    found, errors, agreeing = _identifiability(search, optima, point, residual)
     # Starts draw all parameters; one without effect has no other value than the present one.
     kept = np.where(found.effects > 0, best.values, twin.values)
     if (kept != best.values).any():
@@ -223,7 +215,7 @@ def _fit(
         optima = [(best, point), *optima[1:]]
     for note in filter(None, [found.warning, missing]):
         warnings.warn(note, stacklevel=3)
-    count = len(observed)
+    count = len(misfit.observed)
     half = stats.t.ppf(0.975, max(count - 1, 1)) * errors
     values = np.array(best.values)
     unknown = ""
@@ -241,9 +233,9 @@ def _fit(
         starts=tuple(each for each, _ in optima),
         identifiability=found,
         twin_runs=misfit.twin_runs,
-        seconds=time.perf_counter() - began,
+        seconds=0.0,
         figures={
-            "rms_before": before,
+            "rms_before": misfit.rms,
             "rms_after": misfit.rms_of(residual),
             "measurements": float(misfit.seen.sum()),
             "independent": found.independent,
