@@ -95,7 +95,7 @@ _HOME = {
     "SampledSensor": "update.corrections",
     "Segments": "data.segments",
     "SequenceMixture": "update.residual",
-    "SimulationError": "twins.twin",
+    "SimulationError": "twins.collected",
     "StateSpace": "nets.networks",
     "Stuck": "twins.faults",
     "StudyData": "study",
@@ -184,13 +184,14 @@ if TYPE_CHECKING:
     from retwin.nets.training import Training
     from retwin.report import write_report
     from retwin.study import StudyData, StudyPlan, run_study
+    from retwin.twins.collected import SimulationError
     from retwin.twins.faults import ActuatorBias, Fault, Stuck
     from retwin.twins.fmu import FMUTwin
     from retwin.twins.function import FunctionTwin
     from retwin.twins.limits import Limits
     from retwin.twins.mujoco import MuJoCoTwin
     from retwin.twins.parametric import Parameter, ParametricTwin
-    from retwin.twins.twin import SimulationError, Twin
+    from retwin.twins.twin import Twin
     from retwin.update.corrected import CorrectedTwin, generate
     from retwin.update.corrections import (
         Additive,

@@ -45,7 +45,7 @@ _HOME = {
     "SensorDrift": "system_faults",
     "SensorFreeze": "system_faults",
     "Servo": "mujoco",
-    "SimulationError": "twin",
+    "SimulationError": "collected",
     "State": "state",
     "StateTwin": "state_twin",
     "StepWarning": "state_twin",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
@@ -10,22 +10,22 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.arrays import check_finite, is_finite
+from retwin.arrays import check_finite
 from retwin.checks import agree, instance, require, whole
 from retwin.data.measured import check_magnitude
 from retwin.data.segments import Segments
-from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Provenance, Trajectories
+from retwin.data.trajectories import HEALTHY, UNLABELLED, Channels, Trajectories
 from retwin.progress import Progress
 from retwin.threads import Turns, in_threads
 from retwin.times import stride_of
 from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_from, frozen_response
+from retwin.twins.collected import Collected
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.system_faults import check_faults, measured_with
 
 __all__ = [
     "Chunk",
-    "SimulationError",
     "Twin",
     "check_channels",
     "checked_commands",
@@ -34,31 +34,6 @@ __all__ = [
     "nominal_outputs",
     "simulate_in_chunks",
 ]
-
-
-class SimulationError(RuntimeError):
-    """Some trajectories could not be simulated; the others are attached.
-
-    Attributes
-    ----------
-    failed : dict of int to str
-        The reason of each failure, by the index of the trajectory.
-    finished : Trajectories
-        The trajectories that were simulated; their ids are their indices.
-
-    """
-
-    def __init__(self, failed: Mapping[int, str], finished: Trajectories) -> None:
-        self.failed = dict(failed)
-        self.finished = finished
-        named = "; ".join(f"trajectory {i}: {why}" for i, why in list(self.failed.items())[:5])
-        more = "; …" if len(self.failed) > 5 else ""
-        count = len(self.failed) + len(finished)
-        super().__init__(f"{len(self.failed)} of {count} simulations failed: {named}{more}")
-
-    def __reduce__(self) -> tuple:
-        """Keep both attributes when the error is sent to another process."""
-        return SimulationError, (self.failed, self.finished)
 
 
 @runtime_checkable
@@ -383,11 +358,10 @@ def simulate_in_chunks(
     segments = Segments.from_commands(commands)
     faults = [None] * len(commands) if faults is None else faults
     drawn = draw_faults(faults, segments, seed, rate=twin.rate)
-    nominal = np.empty((*commands.shape[:2], len(twin.outputs)), dtype=commands.dtype)
-    observed = np.empty_like(nominal)
+    collected = Collected.empty(commands, twin.outputs, twin.rate)
     turns = Turns()
 
-    def run_chunk(begin: int) -> tuple[Chunk, dict[int, str]]:
+    def run_chunk(begin: int) -> float:
         index = slice(begin, begin + size)
         own_commands, own_faults, own_segments = commands[index], drawn[index], segments[index]
         effective = faulty_commands(own_commands, own_faults, own_segments, rate=twin.rate)
@@ -396,61 +370,16 @@ def simulate_in_chunks(
             index, own_commands, effective, own_faults, own_segments, twin.rate, turn=turn
         )
         try:
-            nominal[index], healthy = run(chunk)
+            nominal, healthy = run(chunk)
         finally:
             turns.over(begin // size)
-        observed[index] = measured_with(healthy, own_faults, twin.rate)
-        return chunk, _not_finite(twin, nominal[index], observed[index]) | chunk.failed
+        observed = measured_with(healthy, own_faults, twin.rate)
+        collected.put(index, nominal, observed, chunk.failed, chunk.known)
+        return min(1.0, (begin + size) / len(commands))
 
-    failed: dict[int, str] = {}
-    known = np.full(len(commands), commands.shape[1])
-    begins = range(0, len(commands), size)
-    for chunk, reasons in (in_threads if threaded else map)(run_chunk, begins):
-        begin = chunk.index.start
-        failed |= {begin + i: reason for i, reason in sorted(reasons.items())}
-        for i, samples in chunk.known.items():
-            known[begin + i] = samples
+    for share in (in_threads if threaded else map)(run_chunk, range(0, len(commands), size)):
         if progress is not None:
-            progress(min(1.0, (begin + size) / len(commands)))
+            progress(share)
     labels = np.array([HEALTHY if fault is None else fault.label for fault in drawn])
-    good = np.setdiff1d(np.arange(len(commands)), list(failed)) if failed else slice(None)
-    mask = np.arange(commands.shape[1])[:, None] < known[good, None, None]
-    simulated = Trajectories(
-        commands=_kept(commands[good]),
-        nominal=nominal[good],
-        observed=observed[good],
-        mask=np.broadcast_to(mask, observed[good].shape),
-        ids=np.array([f"{i:05d}" for i in range(len(commands))], dtype=np.str_)[good],
-        labels=labels[good],
-        rate=twin.rate,
-        inputs=twin.inputs,
-        outputs=twin.outputs,
-        provenance=(Provenance(f"{type(twin).__name__} seed={seed}"),),
-        emulated=emulated,
-    )
-    if failed:
-        raise SimulationError(failed, simulated)
-    return simulated
-
-
-def _kept(commands: NDArray) -> NDArray:
-    """The commands, copied if the caller may change its own array afterwards."""
-    frozen = not commands.flags.writeable and getattr(commands.base, "base", None) is None
-    owner = commands if commands.base is None else commands.base
-    return commands if frozen and not owner.flags.writeable else commands.copy()
-
-
-def _not_finite(twin: Twin, nominal: NDArray, observed: NDArray) -> dict[int, str]:
-    """Trajectories with outputs that are not finite, and the first such output of each."""
-    reasons = {}
-    for outputs in (observed, nominal):
-        if is_finite(outputs):
-            continue
-        bad = ~np.isfinite(outputs)
-        for i in np.flatnonzero(bad.any(axis=(1, 2))):
-            sample, channel = np.argwhere(bad[i])[0]
-            reasons[int(i)] = (
-                f"{twin.outputs.names[channel]} is {outputs[i, sample, channel]} from "
-                f"{sample / twin.rate:g} s on"
-            )
-    return reasons
+    source = f"{type(twin).__name__} seed={seed}"
+    return collected.trajectories(labels, twin.inputs, source=source, emulated=emulated)

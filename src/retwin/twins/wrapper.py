@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from retwin.data.trajectories import Channels, Trajectories
+from retwin.twins.collected import SimulationError
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.system_faults import without_sensor_faults
-from retwin.twins.twin import Chunk, SimulationError, Twin
+from retwin.twins.twin import Chunk, Twin
 
 __all__ = ["OfTwin", "TwinWrapper", "chunk_generator", "simulate_chunk"]
 

@@ -12,7 +12,8 @@ from torch import Tensor
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
-from retwin.twins.twin import SimulationError, Twin
+from retwin.twins.collected import SimulationError
+from retwin.twins.twin import Twin
 from retwin.update.corrections import Context
 from retwin.update.corrections.warp import within
 from retwin.update.surrogate import Surrogate, known_samples

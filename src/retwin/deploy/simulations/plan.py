@@ -20,9 +20,10 @@ from retwin.data.io.header import CHUNKED_NAMES, FAILED
 from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError, place_of
 from retwin.progress import Progress
+from retwin.twins.collected import SimulationError
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
-from retwin.twins.twin import SimulationError, Twin, checked_commands
+from retwin.twins.twin import Twin, checked_commands
 
 if TYPE_CHECKING:  # a worker that simulates without torch need not load it
     from retwin.twins.samplers import CommandSampler

@@ -14,9 +14,10 @@ from retwin.checks import require, whole
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
 from retwin.processes import sendable_errors, worker_pool
+from retwin.twins.collected import SimulationError
 from retwin.twins.parametric import ParametricTwin
 from retwin.twins.state_twin import StepWarning
-from retwin.twins.twin import SimulationError, checked_seed, checked_stride
+from retwin.twins.twin import checked_seed, checked_stride
 
 __all__ = ["Misfit", "misfit_of"]
 

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from retwin.checks import at_least, require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.errors import InputError
+from retwin.twins.collected import SimulationError
 from retwin.twins.parametric import Parameter, ParametricTwin
 from retwin.twins.record_sampler import sampler_from
 from retwin.twins.samplers import CommandSampler, RecordedSampler
-from retwin.twins.twin import SimulationError, Twin, check_channels, checked_commands
+from retwin.twins.twin import Twin, check_channels, checked_commands
 
 __all__ = ["MIN_SIMULATIONS", "Simulations", "check_outputs", "drawn_parameters", "samplers_of"]
 

@@ -1,0 +1,147 @@
+"""`Collected`: what the chunks of a simulation give, put together; what failed is an error."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.arrays import is_finite
+from retwin.data.trajectories import Channels, Provenance, Trajectories
+
+__all__ = ["Collected", "SimulationError"]
+
+
+class SimulationError(RuntimeError):
+    """Some trajectories could not be simulated; the others are attached.
+
+    Attributes
+    ----------
+    failed : dict of int to str
+        The reason of each failure, by the index of the trajectory.
+    finished : Trajectories
+        The trajectories that were simulated; their ids are their indices.
+
+    """
+
+    def __init__(self, failed: Mapping[int, str], finished: Trajectories) -> None:
+        self.failed = dict(failed)
+        self.finished = finished
+        named = "; ".join(f"trajectory {i}: {why}" for i, why in list(self.failed.items())[:5])
+        more = "; …" if len(self.failed) > 5 else ""
+        count = len(self.failed) + len(finished)
+        super().__init__(f"{len(self.failed)} of {count} simulations failed: {named}{more}")
+
+    def __reduce__(self) -> tuple:
+        """Keep both attributes when the error is sent to another process."""
+        return SimulationError, (self.failed, self.finished)
+
+
+@dataclass(frozen=True, eq=False)
+class Collected:
+    """The outputs of all trajectories, and which of them failed or ended early.
+
+    Chunks may be put from several threads at a time.
+
+    Attributes
+    ----------
+    commands : ndarray, shape (n, T, d_u)
+        The clean commands.
+    outputs : Channels
+        The output channels.
+    rate : float
+        Sample rate in Hz.
+    nominal, observed : ndarray, shape (n, T, d_y)
+        The outputs of the chunks so far, in the precision of the commands.
+    known : ndarray of int, shape (n)
+        Samples that were simulated.
+    reasons : dict of int to str
+        Why trajectories failed, by their index, in any order.
+
+    """
+
+    commands: NDArray
+    outputs: Channels
+    rate: float
+    nominal: NDArray
+    observed: NDArray
+    known: NDArray
+    reasons: dict[int, str] = field(default_factory=dict)
+
+    @classmethod
+    def empty(cls, commands: NDArray, outputs: Channels, rate: float) -> Collected:
+        """Before the first chunk."""
+        nominal = np.empty((*commands.shape[:2], len(outputs)), dtype=commands.dtype)
+        known = np.full(len(commands), commands.shape[1])
+        return cls(commands, outputs, rate, nominal, np.empty_like(nominal), known)
+
+    def put(
+        self,
+        index: slice,
+        nominal: NDArray,
+        observed: NDArray,
+        failed: Mapping[int, str],
+        known: Mapping[int, int],
+    ) -> None:
+        """Enter a chunk; `failed` and `known` count its trajectories from 0, see `Chunk`."""
+        self.nominal[index], self.observed[index] = nominal, observed
+        for i, reason in {**self._not_finite(index), **failed}.items():
+            self.reasons[index.start + i] = reason
+        for i, samples in known.items():
+            self.known[index.start + i] = samples
+
+    def trajectories(
+        self, labels: NDArray, inputs: Channels, *, source: str, emulated: bool
+    ) -> Trajectories:
+        """All of them; `source` describes where they come from.
+
+        Raises
+        ------
+        SimulationError
+            Some failed; the others are attached.
+
+        """
+        every = np.arange(len(self.commands))
+        good = np.setdiff1d(every, list(self.reasons)) if self.reasons else slice(None)
+        observed = self.observed[good]
+        mask = np.arange(observed.shape[1])[:, None] < self.known[good, None, None]
+        made = Trajectories(
+            commands=_kept(self.commands[good]),
+            nominal=self.nominal[good],
+            observed=observed,
+            mask=np.broadcast_to(mask, observed.shape),
+            ids=np.array([f"{i:05d}" for i in every], dtype=np.str_)[good],
+            labels=labels[good],
+            rate=self.rate,
+            inputs=inputs,
+            outputs=self.outputs,
+            provenance=(Provenance(source),),
+            emulated=emulated,
+        )
+        if self.reasons:
+            raise SimulationError(dict(sorted(self.reasons.items())), made)
+        return made
+
+    def _not_finite(self, index: slice) -> dict[int, str]:
+        """Trajectories of a chunk with outputs that are not finite, and where each begins so."""
+        reasons = {}
+        for outputs in (self.observed[index], self.nominal[index]):
+            if is_finite(outputs):
+                continue
+            bad = ~np.isfinite(outputs)
+            for i in np.flatnonzero(bad.any(axis=(1, 2))):
+                sample, channel = np.argwhere(bad[i])[0]
+                reasons[int(i)] = (
+                    f"{self.outputs.names[channel]} is {outputs[i, sample, channel]} from "
+                    f"{sample / self.rate:g} s on"
+                )
+        return reasons
+
+
+def _kept(commands: NDArray) -> NDArray:
+    """The commands, copied if the caller may change its own array afterwards."""
+    frozen = not commands.flags.writeable and getattr(commands.base, "base", None) is None
+    owner = commands if commands.base is None else commands.base
+    return commands if frozen and not owner.flags.writeable else commands.copy()
