@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from typing import Any
 
-__all__ = ["names"]
-
 
 def names(
     package: str, homes: Mapping[str, str]

@@ -11,19 +11,6 @@ from retwin.checks import require
 from retwin.errors import InputError
 from retwin.threads import in_threads
 
-__all__ = [
-    "check_finite",
-    "check_shapes",
-    "floating",
-    "floats",
-    "held",
-    "interpolated",
-    "is_finite",
-    "measured",
-    "named",
-    "row_blocks",
-]
-
 BYTES_PER_BLOCK = 2**22
 """The size of a block of rows in bytes: it fits the cache of a processor."""
 

@@ -15,19 +15,6 @@ from typing import Any, TypeVar
 
 from retwin.errors import InputError
 
-__all__ = [
-    "agree",
-    "at_least",
-    "finite",
-    "instance",
-    "needs_extra",
-    "one_of",
-    "one_per",
-    "positive",
-    "require",
-    "whole",
-]
-
 T = TypeVar("T")
 
 

@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 
 from retwin.threads import available, in_threads
 
-__all__ = ["c_source", "call", "compiled", "compiled_files", "compilers"]
-
 FLAGS = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """Without contraction and reassociation, results are those of torch up to single roundings."""
 NATIVE = "-march=native"

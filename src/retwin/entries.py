@@ -10,22 +10,6 @@ from typing import Any, TypeVar
 from retwin.checks import one_of
 from retwin.modules import import_beside
 
-__all__ = [
-    "CaseEntry",
-    "Entry",
-    "Extra",
-    "FormatEntry",
-    "LogEntry",
-    "Metric",
-    "Need",
-    "PublicFile",
-    "SourceEntry",
-    "classes",
-    "lookup",
-    "make",
-    "resolve",
-]
-
 T = TypeVar("T")
 
 Need = tuple[str, str]

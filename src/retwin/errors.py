@@ -6,8 +6,6 @@ import sysconfig
 import traceback
 from pathlib import Path
 
-__all__ = ["InputError", "brief", "place_of"]
-
 
 class InputError(ValueError):
     """Bad input: the argument, what was expected, what came, and the remedy, in one line.

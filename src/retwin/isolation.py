@@ -17,8 +17,6 @@ from typing import Any
 
 from retwin.processes import begin_worker
 
-__all__ = ["IsolatedPool", "ProcessEnded", "Retired", "isolated_pool", "more_time"]
-
 START_TIME = 120.0
 """Duration in s after which a process that has not begun is ended. It is long, since a computer
 that is short of memory may need that long to import Python's packages."""

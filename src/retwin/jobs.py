@@ -21,8 +21,6 @@ from retwin.modules import add_known, known
 from retwin.processes import sendable_errors, worker_pool
 from retwin.progress import Progress
 
-__all__ = ["alone", "each", "on_cluster"]
-
 ATTEMPTS = 3
 """How often a chunk is begun while worker processes die, before that is an error."""
 

@@ -16,8 +16,6 @@ from importlib.util import find_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
 
-__all__ = ["add_known", "import_beside", "known"]
-
 
 def import_beside(name: str, folder: Path) -> ModuleType:
     """The module of that name: an installed one, or else the one in `folder`.

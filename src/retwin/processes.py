@@ -28,8 +28,6 @@ from pebble import ProcessPool
 from retwin.errors import place_of
 from retwin.modules import add_known, known
 
-__all__ = ["begin_worker", "scratch_folder", "sendable_errors", "worker_pool"]
-
 
 @contextmanager
 def worker_pool(

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-__all__ = ["FinishedStage", "Progress", "Report", "ResumedStage"]
-
 Progress = Callable[[float], None]
 """Called with the share of the work that is done, from 0 to 1."""
 

@@ -27,24 +27,6 @@ from retwin.checks import require
 from retwin.errors import InputError
 from retwin.serialisation.files import read_json
 
-__all__ = [
-    "SCHEMA",
-    "ChannelNames",
-    "Comparison",
-    "CurvePoint",
-    "Data",
-    "Dataset",
-    "FidelityFigure",
-    "FidelityResults",
-    "Interval",
-    "Number",
-    "OverlayInfo",
-    "Results",
-    "SourceResults",
-    "SurrogateError",
-    "read_results",
-]
-
 SCHEMA = 1
 """The version of the schema that every file states under `schema`."""
 

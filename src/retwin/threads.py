@@ -16,8 +16,6 @@ from typing import TypeVar
 
 from threadpoolctl import ThreadpoolController
 
-__all__ = ["Turns", "available", "in_threads", "one_thread"]
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 

@@ -7,8 +7,6 @@ from typing import Any
 
 from retwin.checks import positive, require
 
-__all__ = ["sample_rate", "stride_of", "to_samples"]
-
 LOWEST_RATE, HIGHEST_RATE = 1e-9, 1e12
 """Limits of sample rates in Hz: a sample in thirty years, and one per picosecond. Durations, and
 squares of frequencies, are then finite in single precision."""

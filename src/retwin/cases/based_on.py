@@ -14,8 +14,6 @@ from retwin.checks import one_of, require
 from retwin.serialisation.configs import at, from_settings, key, read_toml
 from retwin.twins.parametric import Parameter
 
-__all__ = ["merged", "parameters_of", "updated_built_in"]
-
 CONTENTS = "see docs/own_twin.md for what it holds"
 
 

@@ -26,8 +26,6 @@ from retwin.update.dynamics import Dynamics, state_names
 from retwin.update.residual import Density, Mixture, SequenceMixture
 from retwin.update.state_surrogate import StateSurrogate
 
-__all__ = ["Body", "Case"]
-
 
 class Body(Protocol):
     """A chain of points in space, moved by joints, by which a system is drawn.

@@ -20,8 +20,6 @@ from retwin.errors import InputError
 from retwin.serialisation.files import sha256
 from retwin.twins.twin import Twin
 
-__all__ = ["ColumnRecords", "Record", "number", "read_columns", "record_in"]
-
 
 @dataclass(frozen=True)
 class Record:

@@ -55,8 +55,6 @@ from retwin.update.dynamics import Dynamics
 from retwin.update.residual import Density, Mixture, SequenceMixture
 from retwin.update.state_surrogate import StateSurrogate
 
-__all__ = ["check_density", "read_case"]
-
 SAMPLERS: tuple[type, ...] = (RampSampler, HoldSampler, MultisineSampler, RecordedSampler)
 Records = Callable[[Path], tuple[Trajectories, Trajectories]]
 """A function that splits a file into calibration records and test records."""

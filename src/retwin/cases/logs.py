@@ -31,8 +31,6 @@ from retwin.progress import Progress
 from retwin.serialisation.sizes import Budget
 from retwin.twins.twin import Twin
 
-__all__ = ["Columns", "LogReader", "Logs", "read_logs"]
-
 ROUNDED = 1e-3
 """Relative accuracy to which a rate is rounded that is computed from times."""
 

@@ -11,8 +11,6 @@ from retwin.checks import require
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.twins.twin import Twin
 
-__all__ = ["matched"]
-
 
 def matched(
     found: Trajectories,

@@ -8,8 +8,6 @@ from retwin.checks import require
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
 from retwin.errors import InputError
 
-__all__ = ["usable"]
-
 LARGEST = 1e30
 """Magnitude from which a number is no measurement: programs write 3.4e38 for a missing one."""
 

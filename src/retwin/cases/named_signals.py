@@ -18,16 +18,6 @@ from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 from retwin.twins.twin import Twin
 
-__all__ = [
-    "check_named",
-    "check_there",
-    "has_times",
-    "mapping_by_names",
-    "missing_commands",
-    "resampling_of",
-    "signals_of",
-]
-
 ROUNDED = 1e-3
 """Relative difference of rates that count as equal."""
 LISTED = 12

@@ -23,8 +23,6 @@ from retwin.twins.mujoco import MuJoCoTwin, Servo
 from retwin.twins.parametric import Parameter, ParametricTwin
 from retwin.twins.twin import Twin
 
-__all__ = ["imported", "parametric_twin", "read_twin"]
-
 FILES: dict[str, Any] = {".fmu": FMUTwin, ".xml": MuJoCoTwin, ".urdf": MuJoCoTwin}
 """The kind of twin that a file of each suffix holds."""
 ELSEWHERE = ("path", "function", "inputs", "outputs", "sensors", "rate", "limits")

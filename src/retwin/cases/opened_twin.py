@@ -25,8 +25,6 @@ from retwin.twins.rebuilt import RebuiltTwin
 from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import Twin
 
-__all__ = ["Known", "OpenedTwin", "open_parametric"]
-
 SHOWN = 24
 """Parameters that a message lists, at most."""
 FORM = "NAME, NAME=LOW:HIGH or NAME=LOW:HIGH:START"

@@ -10,8 +10,6 @@ from retwin.progress import Progress
 from retwin.twins.twin import Twin
 from retwin.twins.wrapper import OfTwin
 
-__all__ = ["RecordedCase"]
-
 
 @dataclass(frozen=True)
 class RecordedCase(OfTwin):

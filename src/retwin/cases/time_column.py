@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from retwin.checks import one_of, positive, require
 from retwin.data.resampling import SAME, Resampling, longest_bridge, resampled
 
-__all__ = ["TimeColumn"]
-
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "iso": 1.0}
 """Units of times, in s."""
 WRONG_UNIT = 100.0

@@ -17,8 +17,6 @@ from retwin.data.trajectories import Channels, Trajectories
 from retwin.progress import Progress
 from retwin.twins import FILES
 
-__all__ = ["TwinData", "log_case"]
-
 
 @dataclass(frozen=True)
 class TwinData:

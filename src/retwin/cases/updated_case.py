@@ -18,8 +18,6 @@ from retwin.twins.parametric import ParametricTwin
 from retwin.twins.record_sampler import moves_and_rests
 from retwin.update.dynamics import state_names
 
-__all__ = ["updated_case"]
-
 HEADER = """\
 # Written by retwin identify. Each start is an identified value; low and high are the range in which
 # it was searched. Every command takes this file as its CASE.

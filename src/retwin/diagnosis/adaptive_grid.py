@@ -14,8 +14,6 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Integral", "integrated"]
-
 CELLS = {1: 48, 2: 12, 3: 8}
 """Cells along each side at first, by the number of quantities that are open."""
 NEGLIGIBLE = 8.0

@@ -25,8 +25,6 @@ from retwin.nets.networks import CNN, Network
 from retwin.nets.training import Training, isolated, train
 from retwin.progress import Progress
 
-__all__ = ["DANN"]
-
 
 @dataclass(frozen=True)
 class DANN:

@@ -14,8 +14,6 @@ from retwin.nets.training import Fit, Training
 from retwin.progress import Progress
 from retwin.serialisation.models import kind_of, refusing
 
-__all__ = ["Diagnoser", "FittedDiagnoser", "Method", "TrainedDiagnoser", "load_diagnoser"]
-
 
 @runtime_checkable
 class Diagnoser(Protocol):

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 
-__all__ = ["UNKNOWN", "Estimate", "ImplausibleError"]
-
 UNKNOWN = "unknown"
 """Name of what is none of the classes."""
 

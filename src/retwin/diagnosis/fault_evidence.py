@@ -30,8 +30,6 @@ from retwin.twins.system_faults import (
 from retwin.update.dynamics import DynamicsTwin
 from retwin.update.dynamics.prediction import root_of, whitened
 
-__all__ = ["NOTHING", "FaultEvidence"]
-
 COVERAGE = 0.9
 """Coverage of all intervals."""
 LEVELS = (0.03, 0.1, 0.3, 1.0)

@@ -17,8 +17,6 @@ from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels, Trajectories
 from retwin.times import sample_rate, stride_of
 
-__all__ = ["SETTLED", "Features", "class_index", "class_names", "class_order", "random_phase"]
-
 SETTLED = 2
 """Samples of the features, from the end of the first motion on, that are still hidden: one for the
 delay of the response, and one because a value interpolated between two sensor samples depends on

@@ -16,8 +16,6 @@ from retwin.diagnosis.network import NetworkDiagnoser
 from retwin.nets.training import Training, isolated, train
 from retwin.progress import Progress
 
-__all__ = ["FineTune"]
-
 FINE_TUNING = Training(max_epochs=10, batch_size=48, learning_rate=1e-3, weight_decay=1e-2)
 """The default training. Its learning rate is a third of the first training's; it was fixed in
 advance, because labelled trajectories are too few to choose it."""

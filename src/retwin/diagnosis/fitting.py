@@ -13,8 +13,6 @@ from retwin.nets.networks import CNN, Network
 from retwin.nets.training import Training
 from retwin.progress import Progress
 
-__all__ = ["Classifier", "fit_diagnoser"]
-
 Classifier = Network | Method
 """What `fit_diagnoser` can train: a network such as `CNN` or `LSTMClassifier`, or a method such as
 `Rocket`, `DANN` or `FineTune`."""

@@ -23,8 +23,6 @@ from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.missed_segments import LatentPrior
 from retwin.update.residual import ResidualModel
 
-__all__ = ["Hypotheses", "checked"]
-
 
 def checked(faults: Mapping[str, Fault | None]) -> dict[str, Fault | None]:
     """The faults of at least two classes.

@@ -40,8 +40,6 @@ from retwin.update.residual import ResidualModel
 from retwin.update.surrogate import Surrogate
 from retwin.update.training_range import outside_training
 
-__all__ = ["Diagnosis", "Inversion", "InversionDiagnoser", "invert"]
-
 TRAJECTORIES_PER_BATCH = 16
 """Trajectories inverted together, which bounds memory."""
 COVERAGE = 0.9

@@ -27,8 +27,6 @@ from retwin.update.residual import Residual, ResidualModel
 from retwin.update.surrogate import Surrogate
 from retwin.update.surrogate_error import surrogate_variance
 
-__all__ = ["fit_inversion", "lower_bound"]
-
 ROUNDS = 5
 """Rounds of expectation-maximisation of the noise."""
 

@@ -17,8 +17,6 @@ from retwin.update.corrections.delay_range import range_in_samples
 from retwin.update.corrections.missed_segments import LatentPrior
 from retwin.update.residual import ResidualModel
 
-__all__ = ["command_problem", "command_space", "healthy_prior"]
-
 DRAWS = 2000
 """Draws from a distribution whose covariance has no closed form."""
 

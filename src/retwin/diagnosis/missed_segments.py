@@ -24,8 +24,6 @@ from retwin.update.corrections.missed_segments import (
     searched,
 )
 
-__all__ = ["best_fit", "fitted_noise"]
-
 WORST = 2
 """Segments of a row that one search may try as missed: the worst explained ones."""
 

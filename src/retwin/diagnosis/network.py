@@ -19,8 +19,6 @@ from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
 
-__all__ = ["NetworkDiagnoser", "fit_network", "training_for"]
-
 TRAJECTORIES_PER_BATCH = 256
 """Trajectories that are classified together: activations of more would leave the cache."""
 

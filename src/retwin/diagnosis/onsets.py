@@ -17,8 +17,6 @@ from retwin.inference.noise import Noise
 from retwin.inference.solver import gauss_newton_step
 from retwin.update.corrections.missed_segments import fitted
 
-__all__ = ["Onsets"]
-
 COARSE = 25
 """Onsets of each segment that are evaluated first."""
 FINE = 8

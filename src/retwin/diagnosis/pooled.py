@@ -11,8 +11,6 @@ from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.diagnoser import Diagnoser
 
-__all__ = ["PooledDiagnoser", "pool_probabilities"]
-
 FLOOR = 1e-3
 """Lower bound of a member's probability, so that no member excludes a class alone.
 

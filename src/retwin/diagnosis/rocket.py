@@ -29,8 +29,6 @@ from retwin.nets.training import Fit, Training
 from retwin.progress import Progress
 from retwin.serialisation.models import read_model, write_model
 
-__all__ = ["Rocket", "RocketDiagnoser"]
-
 PATTERNS = 84
 """Kernels of MiniRocket without their dilations; it uses each of them equally often."""
 

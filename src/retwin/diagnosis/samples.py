@@ -15,8 +15,6 @@ from retwin.update.corrections import Context, sample_mask
 from retwin.update.residual import ResidualModel
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["DiagnosisInputs"]
-
 
 class Precise:
     """A surrogate in double precision: no output depends on the batch that it is computed in."""
@@ -28,6 +26,7 @@ class Precise:
         self.model = copy.deepcopy(surrogate).double()
 
     def __call__(self, commands: Tensor) -> Tensor:
+        """Outputs (n, T, d_y), computed in double precision and then rounded."""
         return self.model(commands.double()).to(commands.dtype)
 
 

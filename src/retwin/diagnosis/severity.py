@@ -18,8 +18,6 @@ from retwin.inference.noise import Noise
 from retwin.update.corrections.effective_commands import effective_commands
 from retwin.update.corrections.missed_segments import CommandFit
 
-__all__ = ["BiasDraws", "biases", "draw_biases", "stuck_level"]
-
 POINTS = 512
 """Points of the low-discrepancy set."""
 SMALLEST = 1e-300

@@ -12,8 +12,6 @@ from retwin.data.trajectories import Trajectories
 from retwin.diagnosis import Diagnoser
 from retwin.scores.classification import Scores, score
 
-__all__ = ["evaluate", "finite_probabilities", "scored"]
-
 
 def evaluate(diagnoser: Diagnoser, test: Trajectories) -> Scores:
     """Score a diagnoser on labelled trajectories.

@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["Knowledge", "chosen"]
-
 
 @dataclass(frozen=True, eq=False)
 class Knowledge:

@@ -6,8 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["added_evidence", "best_per_row"]
-
 
 def best_per_row(evidence: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
     """The rows among `rows` (k,), each once, and the index (·,) of the best alternative of each."""

@@ -18,8 +18,6 @@ from torch import Tensor
 from retwin.inference.priors import GaussianPrior, inverse
 from retwin.inference.solver import Solution
 
-__all__ = ["Design", "Hierarchy"]
-
 FREEDOM = 2.0
 """Degrees of freedom of the scaled inverse chi-squared hyperpriors: what a variance is expected to
 be counts as much as two observations."""

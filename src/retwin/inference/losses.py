@@ -8,8 +8,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-__all__ = ["Loss", "StudentT", "Tukey"]
-
 
 class Loss(Protocol):
     """A loss ρ of the squared length q of a standardised residual with `size` components."""

@@ -16,8 +16,6 @@ from torch import Tensor
 from retwin.inference.losses import Loss, StudentT
 from retwin.inference.problem import Problem
 
-__all__ = ["Noise", "correlation_time", "predicted_variance"]
-
 HEAVY_TAILED = StudentT()
 """The loss of noise by default: glitches hardly count."""
 MAX_CORRELATION = 0.95

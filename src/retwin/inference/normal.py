@@ -22,8 +22,6 @@ from retwin.inference.problem import Problem
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["compiled_objective", "compiled_step", "library"]
-
 
 def library() -> ctypes.CDLL | None:
     """The compiled kernel; None without a C compiler."""

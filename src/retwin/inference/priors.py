@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["GaussianPrior", "inverse"]
-
 ROUNDING = 1e-12
 """Added to the unit diagonal of a precision: what outputs without noise leave open may be lost in
 the rounding of what they determine."""

@@ -7,8 +7,6 @@ from typing import Protocol
 
 from torch import Tensor
 
-__all__ = ["CommonError", "Problem"]
-
 
 @dataclass(frozen=True, eq=False)
 class CommonError:

@@ -20,8 +20,6 @@ from retwin.inference.normal import compiled_objective, compiled_step
 from retwin.inference.priors import GaussianPrior, inverse
 from retwin.inference.problem import Problem
 
-__all__ = ["Bounds", "GaussNewtonStep", "Solution", "blocks", "gauss_newton_step", "solve"]
-
 TOLERANCE = 1e-4
 """Predicted decrease of the objective, in nats, below which a row has converged."""
 MAX_STEPS = 25

@@ -17,8 +17,6 @@ from retwin.checks import needs_extra
 if TYPE_CHECKING:
     from zuko.distributions import NormalizingFlow
 
-__all__ = ["FlowDistribution", "FlowHead"]
-
 
 class FlowDistribution(Distribution):
     """A normalising flow in physical units.

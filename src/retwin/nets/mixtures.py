@@ -17,15 +17,6 @@ from torch.distributions import (
     constraints,
 )
 
-__all__ = [
-    "PIT_RANGE",
-    "BernoulliHead",
-    "Bernoullis",
-    "Blocks",
-    "GaussianMixture",
-    "MixtureHead",
-]
-
 FLOOR = 0.05
 """Smallest standard deviation of a component, in standard units. It keeps a component from
 collapsing onto a single example, where its likelihood has no bound."""
@@ -170,26 +161,35 @@ class Block(Protocol):
     """A distribution that `Blocks` can join: torch's interface, `from_noise`, `normal_scores`."""
 
     @property
-    def batch_shape(self) -> torch.Size: ...
+    def batch_shape(self) -> torch.Size:
+        """Shape of a batch of distributions."""
 
     @property
-    def event_shape(self) -> torch.Size: ...
+    def event_shape(self) -> torch.Size:
+        """Shape of a value, (width,)."""
 
     @property
-    def mean(self) -> Tensor: ...
+    def mean(self) -> Tensor:
+        """Means (*batch, width)."""
 
     @property
-    def variance(self) -> Tensor: ...
+    def variance(self) -> Tensor:
+        """Variances (*batch, width)."""
 
-    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Block: ...
+    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Block:
+        """The same distributions for a larger batch."""
 
-    def log_prob(self, value: Tensor) -> Tensor: ...
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Logarithm of the density of values (*batch, width)."""
 
-    def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor: ...
+    def from_noise(self, uniform: Tensor, normal: Tensor) -> Tensor:
+        """Draws by uniform (*batch) and normal (*batch, width) noise."""
 
-    def normal_scores(self, value: Tensor) -> Tensor: ...
+    def normal_scores(self, value: Tensor) -> Tensor:
+        """Standard Gaussian scores of values (*batch, width) within their distribution."""
 
-    def widened(self, factor: Tensor) -> Block: ...
+    def widened(self, factor: Tensor) -> Block:
+        """The distributions with deviations from the mean times `factor` (width,)."""
 
 
 class Blocks(Distribution):

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-__all__ = ["StateSpace"]
-
 
 @dataclass(frozen=True)
 class StateSpace:

@@ -14,8 +14,6 @@ from torch.distributions import Distribution, constraints
 
 from retwin.nets.mixtures import PIT_RANGE, Block
 
-__all__ = ["Student", "shared_factor", "widening"]
-
 FACTORS = 64
 """Values of the factor, equally probable. 50 to 95 % intervals of a normal block are those of
 Student's t within 0.5 %, 99 % intervals within 6 %, from one degree of freedom on. The largest

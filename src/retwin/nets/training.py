@@ -25,8 +25,6 @@ from retwin.checks import finite, one_of, positive, whole
 from retwin.progress import Progress
 from retwin.threads import one_thread
 
-__all__ = ["Fit", "Loss", "Training", "isolated", "train"]
-
 Loss = Callable[[Any, tuple[Tensor, ...]], Tensor]
 """A function of the network and a batch whose value is the mean loss over the examples."""
 

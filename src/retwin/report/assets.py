@@ -6,8 +6,6 @@ from importlib import resources
 
 from markupsafe import Markup
 
-__all__ = ["asset", "plotly_js"]
-
 
 def asset(name: str) -> Markup:
     """The text of a file in `templates`."""

@@ -8,8 +8,6 @@ from typing import Any
 
 from retwin.report.figure import Figure, Matrices
 
-__all__ = ["Cell", "Column", "Forest", "Link", "Section", "Table", "columns"]
-
 
 @dataclass(frozen=True)
 class Forest:

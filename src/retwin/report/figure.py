@@ -12,26 +12,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "Axis",
-    "Band",
-    "Bars",
-    "Dimension",
-    "Figure",
-    "Heading",
-    "Key",
-    "Line",
-    "Mark",
-    "Matrices",
-    "Matrix",
-    "Panel",
-    "Points",
-    "Row",
-    "Spans",
-    "draw_bands",
-    "edges_of",
-]
-
 
 @dataclass(frozen=True)
 class Line:

@@ -13,8 +13,6 @@ from importlib import resources
 
 from markupsafe import Markup
 
-__all__ = ["explained"]
-
 UNTOUCHED = ("abbr", "button", "code", "h1", "h2", "h3", "option", "pre", "script", "select", "svg")
 """Elements whose text is left as it is."""
 

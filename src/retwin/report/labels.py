@@ -15,44 +15,6 @@ from retwin.results import Comparison
 from retwin.scores.bootstrap import MIN_RECORDS
 from retwin.scores.comparison import MIN_RUNS
 
-__all__ = [
-    "MAIN",
-    "MANY",
-    "SELECTED",
-    "behind",
-    "class_name",
-    "counted",
-    "decimals",
-    "difference",
-    "distinct",
-    "duration",
-    "in_sentence",
-    "latent_names",
-    "learned_name",
-    "mean_and_deviation",
-    "metric_name",
-    "metric_quantity",
-    "number",
-    "order",
-    "p_value",
-    "percent",
-    "percents",
-    "places",
-    "quantity",
-    "real_data",
-    "reason",
-    "scored",
-    "sentence",
-    "signed",
-    "source_in_sentence",
-    "source_name",
-    "span",
-    "stage_name",
-    "times",
-    "with_role",
-    "with_unit",
-]
-
 MANY = 5
 """Number of sources beyond which figures and tables show a selection."""
 MAIN = tuple(name for name, metric in METRICS.items() if metric.headline)

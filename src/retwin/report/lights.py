@@ -29,8 +29,6 @@ from retwin.scores.decisions import (
     healthy_needed,
 )
 
-__all__ = ["RATES", "Alarms", "Light", "Use", "alarms", "change_of", "lights", "uses", "worst"]
-
 RATES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
 """False-alarm rates that the page shows."""
 RATE = 0.05

@@ -22,8 +22,6 @@ from retwin.report.png import blank, dress
 from retwin.report.style import PALETTE, hexadecimal
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["log_picture"]
-
 MOST_ROWS = 16
 """Signals that are drawn at most."""
 POINTS = 3000

@@ -31,8 +31,6 @@ from retwin.scores.comparison import MIN_RUNS
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.places import check_place
 
-__all__ = ["FIGURES", "render", "write_report"]
-
 FIGURES = (
     "summary",
     "scores",

@@ -27,8 +27,6 @@ from retwin.report.figure import (
     Spans,
 )
 
-__all__ = ["panel_spec"]
-
 FORMATS = {"share": ".1f", "percent": ".0%"}
 HOVER = {"share": ".3f", "percent": ".1%"}
 MANY = 4000

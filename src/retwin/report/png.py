@@ -35,8 +35,6 @@ from retwin.report.figure import (
 )
 from retwin.report.style import CHROME, DASHES, colour_of, hexadecimal
 
-__all__ = ["blank", "draw", "dress", "png", "small"]
-
 STYLES: dict[str, Any] = dict(zip(DASHES, ("-", "--", ":", "-."), strict=True))
 SMALL = 0.5
 """Width of the pictures in the page, as a share of that of the files."""

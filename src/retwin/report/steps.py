@@ -13,8 +13,6 @@ from retwin.results import Comparison
 from retwin.scores.change import ErrorChange, needed_to_decide
 from retwin.scores.comparison import MIN_RUNS
 
-__all__ = ["Step", "next_steps"]
-
 
 @dataclass(frozen=True)
 class Step:

@@ -17,8 +17,6 @@ from retwin.errors import InputError
 from retwin.report.labels import order
 from retwin.results import Results, SourceResults, read_results
 
-__all__ = ["Study", "read_study"]
-
 AGAIN = "run `retwin study` with this folder as --out again"
 BANDS = ("nominal", "observed", "seen", "quantiles", "ids", "rate")
 """The arrays `bands/SOURCE/…`."""

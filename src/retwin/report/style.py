@@ -4,17 +4,6 @@ from __future__ import annotations
 
 from retwin.catalog import SOURCES
 
-__all__ = [
-    "CHROME",
-    "DASHES",
-    "PALETTE",
-    "colour_index",
-    "colour_of",
-    "dash",
-    "hexadecimal",
-    "symbol",
-]
-
 PALETTE = (
     ("#0068a8", "#62b6ee"),
     ("#d05a00", "#f29350"),

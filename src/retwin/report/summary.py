@@ -42,8 +42,6 @@ from retwin.report.verdict import headline, verdict
 from retwin.scores.intervals import grouped_share_interval, jackknife_interval
 from retwin.scores.segments import median_error_trajectory
 
-__all__ = ["summary"]
-
 MANY_OUTPUTS = 6
 """Number of outputs beyond which one pair of bars stands for all of them."""
 SEGMENTS = 10

@@ -14,8 +14,6 @@ from retwin.report.study import Study
 from retwin.results import Comparison, Results
 from retwin.scores.comparison import alike, outcome
 
-__all__ = ["headline", "outcome_of", "verdict"]
-
 
 def outcome_of(comparison: Comparison) -> str:
     """The outcome of a comparison, see `retwin.scores.comparison.outcome`."""

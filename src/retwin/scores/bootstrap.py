@@ -17,8 +17,6 @@ from scipy.special import ndtri, stdtrit
 from retwin.data.trajectories import HEALTHY
 from retwin.scores.classification import weighted_score
 
-__all__ = ["MIN_RECORDS", "Draws", "Resampling", "bootstrap_means"]
-
 MIN_RECORDS = 8
 """With this number of records or more, whole records are resampled; with fewer, blocks of them."""
 BLOCKS = 16

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BINS", "Reliability", "calibration_error", "calibration_floor", "reliability"]
-
 BINS = 10
 """Bins of equal mass of the expected calibration error."""
 PER_BIN = 5

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.scores.intervals import jackknife_interval
 
-__all__ = ["ErrorChange", "error_change", "needed_to_decide"]
-
 MAX_FACTOR = 20
 """Multiple of the present trajectories beyond which no number of them is given."""
 

@@ -12,8 +12,6 @@ from retwin.checks import one_of
 from retwin.data.trajectories import HEALTHY
 from retwin.scores.calibration import calibration_error
 
-__all__ = ["METRICS", "Scores", "confusion", "row_shares", "score", "weighted_score"]
-
 
 @dataclass(frozen=True)
 class Scores:

@@ -15,8 +15,6 @@ import numpy as np
 
 from retwin.scores.bootstrap import MIN_RECORDS
 
-__all__ = ["MIN_RUNS", "alike", "compare_runs", "compliance", "holm", "no_verdict", "outcome"]
-
 MIN_RUNS = 5
 """Least number of runs for a verdict: fewer do not show the randomness of training."""
 SIGNIFICANCE = 0.05

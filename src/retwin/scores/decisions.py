@@ -12,15 +12,6 @@ from scipy.special import bdtr, betainc, betaincinv
 from retwin.data.trajectories import HEALTHY
 from retwin.scores.intervals import share_interval
 
-__all__ = [
-    "Cost",
-    "Decision",
-    "certain_decision",
-    "decide",
-    "detection_difference",
-    "healthy_needed",
-]
-
 TAIL = 0.025
 """The probability beyond each end of an interval."""
 DRAWS = 2000

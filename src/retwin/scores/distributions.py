@@ -12,21 +12,6 @@ from numpy.typing import NDArray
 
 from retwin.checks import one_of
 
-__all__ = [
-    "LEVELS",
-    "central_band",
-    "crps",
-    "cumulative_counts",
-    "further_group_quantile",
-    "grouped_quantile",
-    "inside",
-    "ks_distance",
-    "log_score",
-    "pit_histograms",
-    "quantiles",
-    "share_as_far",
-]
-
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 """Levels of the quantiles that bound the central 50 and 90 % bands, and the median."""
 

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["energy_score"]
-
 
 @overload
 def energy_score(simulated: NDArray, observed: NDArray) -> float: ...

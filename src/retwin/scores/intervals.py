@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betaincinv, expit, logit, stdtrit
 
-__all__ = ["MIN_GROUPS", "grouped_share_interval", "jackknife_interval", "share_interval"]
-
 MIN_GROUPS = 5
 """Least number of trajectories for an interval over trajectories."""
 PSEUDO = 0.02

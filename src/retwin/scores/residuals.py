@@ -13,18 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, ndtri
 
-__all__ = [
-    "Binned",
-    "Correlogram",
-    "autocorrelation",
-    "cross_correlation",
-    "decorrelated_after",
-    "error_by_amplitude",
-    "ljung_box",
-    "rms_over_time",
-    "spectra",
-]
-
 LEVEL = 0.95
 """Probability of the limits of correlations."""
 BINS = 12

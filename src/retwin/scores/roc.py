@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Roc", "micro_roc"]
-
 GRID = np.linspace(0, 1, 201)
 """False positive rates at which the curves of all runs are averaged."""
 

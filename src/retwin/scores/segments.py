@@ -11,8 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["SegmentError", "clearest_segment", "median_error_trajectory"]
-
 
 @dataclass(frozen=True)
 class SegmentError:

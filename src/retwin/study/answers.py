@@ -20,8 +20,6 @@ from retwin.study.files import Job
 from retwin.study.work import Work
 from retwin.update.dynamics import DynamicsTwin, state_twin_of
 
-__all__ = ["Answers", "Diagnoses", "SimulatedRecords", "answers"]
-
 CURVES = 6
 """Curves of a discrepancy that the page has room for."""
 RESAMPLINGS = 10_000

@@ -17,8 +17,6 @@ from retwin.study.files import Roles
 from retwin.study.plan import StudyPlan
 from retwin.update.corrected import generate
 
-__all__ = ["StudyData", "real_data", "twin_data"]
-
 EMULATED_PER_CLASS = 10
 """Emulated trajectories per class where there are no real ones: 90 for the arm, as measured."""
 

@@ -12,8 +12,6 @@ from retwin.data.io import load
 from retwin.data.trajectories import Trajectories
 from retwin.serialisation.files import write_atomically
 
-__all__ = ["Files", "Job", "Roles"]
-
 
 @dataclass(frozen=True)
 class Roles:

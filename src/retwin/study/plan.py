@@ -16,9 +16,6 @@ from retwin.nets.training import Training
 from retwin.times import sample_rate
 from retwin.update.corrected import MAX_PER_CLASS
 
-__all__ = ["PAPER", "QUICK", "Preset", "StudyPlan"]
-
-
 MAX_RUNS = 1000
 """Runs beyond this number change no mean by more than 3 % of the spread between runs."""
 

@@ -22,8 +22,6 @@ from retwin.study.files import Job
 from retwin.study.progress import Stages
 from retwin.study.work import Work
 
-__all__ = ["run_jobs"]
-
 _messages: Any = None
 """Queue to the parent process, set in each worker when it starts."""
 

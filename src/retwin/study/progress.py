@@ -11,8 +11,6 @@ from retwin.progress import FinishedStage, Report, ResumedStage
 from retwin.study.files import Job
 from retwin.study.plan import StudyPlan
 
-__all__ = ["Stages", "expected_seconds"]
-
 WORKED = 0.97
 """The share that is done when all jobs are; the rest are the scores and the report."""
 SECONDS = {

@@ -25,8 +25,6 @@ from retwin.study.answers import Answers, answers
 from retwin.study.files import Job
 from retwin.study.work import Work
 
-__all__ = ["write_results"]
-
 
 def write_results(
     work: Work, out: Path, *, about: Mapping[str, Any], provenance: Mapping[str, Any]

@@ -22,8 +22,6 @@ from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics import DynamicsTwin, state_names
 from retwin.update.residual import ResidualModel, SequenceMixture
 
-__all__ = ["lacking", "not_installed"]
-
 
 def recorded_twin(trial: Trial) -> FittedDiagnoser:
     """The classifier, trained on the recorded trajectories of the twin."""

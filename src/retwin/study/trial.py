@@ -27,8 +27,6 @@ from retwin.update.identification import PosteriorTwin
 from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["SEES", "Trial"]
-
 SEES = {
     "none": (),
     "timing": ("timing",),

@@ -44,8 +44,6 @@ from retwin.update.identification import NPE, Posterior, Updated, identify
 from retwin.update.residual import Density, Mixture, Residual, SequenceMixture, fit_residual
 from retwin.update.surrogate import Surrogate, fit_surrogate
 
-__all__ = ["Work"]
-
 MIN_HEALTHY = 5
 """Least number of healthy calibration trajectories of which two can be held out to widen bands."""
 CURVE = (1, 2, 4, 6, 8, 12, 16, 24, 32)

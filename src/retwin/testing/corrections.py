@@ -25,8 +25,6 @@ if TYPE_CHECKING:  # the contract of twins needs no torch, which takes seconds t
 
     from retwin.update.corrections import Context, Correction, Discrepancy
 
-__all__ = ["CORRECTION_CHECKS", "CorrectionSubject", "check_correction"]
-
 
 @dataclass(frozen=True, eq=False)
 class CorrectionSubject:

@@ -23,8 +23,6 @@ from retwin.testing.suite import (
 if TYPE_CHECKING:  # torch takes seconds to load, and twins can be checked without it
     from retwin.diagnosis import Diagnoser
 
-__all__ = ["DIAGNOSER_CHECKS", "DiagnoserSubject", "check_diagnoser"]
-
 
 @dataclass(frozen=True, eq=False)
 class DiagnoserSubject:

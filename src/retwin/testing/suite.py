@@ -13,15 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.errors import InputError
 
-__all__ = [
-    "quiet_randomness",
-    "require",
-    "require_alike",
-    "require_refused",
-    "require_same",
-    "run_checks",
-]
-
 Subject = TypeVar("Subject")
 
 

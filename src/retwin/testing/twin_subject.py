@@ -15,8 +15,6 @@ from retwin.twins.applied_faults import draw_faults, faulty_commands, frozen_res
 from retwin.twins.faults import Fault, Stuck
 from retwin.twins.twin import Twin
 
-__all__ = ["TwinSubject"]
-
 
 @dataclass(frozen=True, eq=False)
 class TwinSubject:

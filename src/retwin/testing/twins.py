@@ -24,8 +24,6 @@ from retwin.twins.limits import Limits
 from retwin.twins.twin import Twin
 from retwin.twins.workers import keep_workers
 
-__all__ = ["TWIN_CHECKS", "check_twin"]
-
 
 def check_protocol(subject: TwinSubject) -> None:
     """It has inputs, outputs, rate and simulate."""

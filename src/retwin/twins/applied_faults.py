@@ -16,8 +16,6 @@ from retwin.times import to_samples
 from retwin.twins.compiled.commands import biased_references
 from retwin.twins.faults import ActuatorBias, Fault, Stuck
 
-__all__ = ["draw_faults", "faulty_commands", "frozen_from", "frozen_response"]
-
 
 def draw_faults(
     faults: Sequence[Fault | None], segments: Segments, seed: int, *, rate: float

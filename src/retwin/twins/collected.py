@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from retwin.arrays import is_finite
 from retwin.data.trajectories import Channels, Provenance, Trajectories
 
-__all__ = ["Collected", "SimulationError"]
-
 
 class SimulationError(RuntimeError):
     """Some trajectories could not be simulated; the others are attached.

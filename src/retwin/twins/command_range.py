@@ -17,8 +17,6 @@ from retwin.checks import one_per
 from retwin.data.trajectories import Channels
 from retwin.threads import in_threads
 
-__all__ = ["TOLERANCE", "CommandRange", "excess", "extremes", "power_spectra"]
-
 TOLERANCE = 0.02
 """How far a value may leave its range, as a share of the range's width."""
 BAND_SHARE = 0.999

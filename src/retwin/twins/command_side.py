@@ -26,8 +26,6 @@ from retwin.twins.twin import (
 )
 from retwin.twins.wrapper import TwinWrapper, simulate_chunk
 
-__all__ = ["DELAY", "CommandSide", "command_side_parameters"]
-
 DELAY = "delay"
 """Name of the parameter that is the delay."""
 OFFSET = "offset"

@@ -21,15 +21,6 @@ from retwin.data.segments import Segments
 from retwin.errors import InputError
 from retwin.times import to_samples
 
-__all__ = [
-    "ActuatorBias",
-    "Fault",
-    "Stuck",
-    "checked_onset",
-    "ends_of",
-    "onset_samples",
-]
-
 
 @runtime_checkable
 class Fault(Protocol):

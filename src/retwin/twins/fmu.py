@@ -40,8 +40,6 @@ from retwin.twins.time_step import steps_per_sample
 from retwin.twins.twin import Chunk, checked_commands, nominal_outputs, simulate_in_chunks
 from retwin.twins.workers import worker_processes
 
-__all__ = ["FMUTwin"]
-
 TRAJECTORIES_PER_CHUNK = 256
 """Number of trajectories per chunk: it bounds the tasks that wait for a process."""
 FORGETS = (

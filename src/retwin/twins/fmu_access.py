@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from retwin.twins.fmu_model import Scalar
 
-__all__ = ["Access", "VariableGroup"]
-
 
 @dataclass(frozen=True, eq=False)
 class VariableGroup:

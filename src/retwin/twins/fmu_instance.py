@@ -17,8 +17,6 @@ from retwin.isolation import Retired, more_time
 from retwin.twins.fmu_access import Access
 from retwin.twins.fmu_model import find_scalars
 
-__all__ = ["Instance", "Outcome", "RunSettings", "Start"]
-
 MAX_INSTANCES = 500
 """Largest number of instances that one process makes. Some FMUs crash at about the thousandth."""
 STATUS = ("ok", "warning", "discard", "error", "fatal", "pending")

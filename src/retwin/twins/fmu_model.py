@@ -18,17 +18,6 @@ from retwin.errors import InputError, brief
 from retwin.serialisation.sizes import Budget
 from retwin.twins.limits import Limits
 
-__all__ = [
-    "Scalar",
-    "adjustable",
-    "channels_of",
-    "extract",
-    "find_scalars",
-    "limits_of",
-    "read_description",
-    "start_column",
-]
-
 NUMBERS = ("Real", "Float32", "Float64")
 WHOLE = (
     "Integer",

@@ -25,8 +25,6 @@ from retwin.twins.limits import Limits
 from retwin.twins.twin import Chunk, simulate_in_chunks
 from retwin.twins.workers import worker_processes
 
-__all__ = ["FunctionTwin"]
-
 TRAJECTORIES_PER_CHUNK = 128
 """Number of trajectories that a vectorised function gets at once."""
 

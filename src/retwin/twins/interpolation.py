@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # describing a twin needs no torch, which takes seconds to import
     from torch import Tensor
 
-__all__ = ["INTERPOLATIONS", "TAPS", "cubic_coefficients"]
 
 INTERPOLATIONS = ("hold", "linear", "spline")
 """Held until the next sample, as by a digital-to-analogue converter; straight lines; the natural

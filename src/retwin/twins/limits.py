@@ -13,8 +13,6 @@ from retwin.checks import one_of, one_per, require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 
-__all__ = ["Limits"]
-
 UNLIMITED = "give -inf and inf where a channel has no limit"
 
 

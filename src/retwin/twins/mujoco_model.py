@@ -15,13 +15,6 @@ from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 from retwin.twins.mujoco_actuators import HINGE, control_unit
 
-__all__ = [
-    "Servo",
-    "compiled",
-    "input_channels",
-    "output_channels",
-]
-
 
 @dataclass(frozen=True)
 class Servo:

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.errors import InputError
 
-__all__ = ["parameter_value", "set_parameter", "suggested_parameters"]
-
 PLACE = re.compile(
     r"opt\.(?P<option>\w+)(\[(?P<at>\d+)\])?"
     r"|(?P<kind>actuator|body|geom|joint|site|tendon)\.(?P<name>[^\[\]]+)\.(?P<field>\w+)"

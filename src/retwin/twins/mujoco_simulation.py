@@ -18,8 +18,6 @@ from retwin.errors import InputError
 from retwin.twins.mujoco_actuators import FILTERS, joint_of, resting
 from retwin.twins.mujoco_parameters import set_parameter
 
-__all__ = ["MuJoCoSimulation", "Response"]
-
 LOCKED = 1e12
 """Damping in N m s/rad (N s/m) of a joint that is held. It is so high that the joint moves by less
 than 1 um under a load of tons."""

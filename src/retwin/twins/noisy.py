@@ -17,8 +17,6 @@ from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, Twin, simulate_in_chunks
 from retwin.twins.wrapper import TwinWrapper, chunk_generator, simulate_chunk
 
-__all__ = ["NoisyTwin", "residual_scale", "sensor_sample_count"]
-
 OUTPUT_NOISE = 4
 """The purpose of the random numbers that are the noise, see `chunk_generator`."""
 

@@ -9,8 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import require
 
-__all__ = ["values_per_simulation"]
-
 
 def values_per_simulation(
     parameters: Mapping[str, ArrayLike] | None, count: int, *, allowed: Sequence[str] | None = None

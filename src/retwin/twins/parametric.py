@@ -23,12 +23,6 @@ from retwin.twins.rebuilt import RebuiltTwin
 from retwin.twins.twin import Twin
 from retwin.twins.wrapper import TwinWrapper
 
-__all__ = [
-    "Parameter",
-    "ParametricTwin",
-    "TakesParameters",
-]
-
 
 class TakesParameters(Twin, Protocol):
     """A twin whose parameters can differ between simulations."""

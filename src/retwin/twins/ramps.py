@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from retwin.twins.compiled.commands import ramped
 
-__all__ = ["draw_onsets", "ramps_and_holds"]
-
 TRAJECTORIES_PER_BLOCK = 32
 """Number of trajectories that are computed together, so few that their samples stay in the
 processor's cache."""

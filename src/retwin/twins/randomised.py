@@ -15,9 +15,6 @@ from retwin.twins.parametric import ParametricTwin
 from retwin.twins.twin import Chunk, nominal_outputs, simulate_in_chunks
 from retwin.twins.wrapper import TwinWrapper, chunk_generator, simulate_chunk
 
-__all__ = ["RandomisedTwin", "simulate_with_parameters"]
-
-
 PARAMETERS = 3
 """The purpose of the random numbers that are the parameters, see `chunk_generator`."""
 

@@ -17,8 +17,6 @@ from retwin.twins.parameter_values import values_per_simulation
 from retwin.twins.twin import Chunk, Twin, checked_commands, simulate_in_chunks
 from retwin.twins.wrapper import TwinWrapper, simulate_chunk
 
-__all__ = ["RebuiltTwin"]
-
 TRAJECTORIES_PER_CHUNK = 512
 """Number of trajectories that are passed to the wrapped twin together."""
 

@@ -11,8 +11,6 @@ from retwin.twins.command_range import CommandRange, power_spectra
 from retwin.twins.limits import Limits
 from retwin.twins.samplers import MultisineSampler, RampSampler
 
-__all__ = ["moves_and_rests", "sampler_from"]
-
 MARGIN = 0.1
 """Share of the width of a record's range by which commands go beyond it, at either end."""
 BAND_MARGIN = 1.2

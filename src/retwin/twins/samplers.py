@@ -14,14 +14,6 @@ from retwin.times import sample_rate, to_samples
 from retwin.twins.ramps import draw_onsets, ramps_and_holds
 from retwin.twins.time_step import Timed
 
-__all__ = [
-    "CommandSampler",
-    "HoldSampler",
-    "MultisineSampler",
-    "RampSampler",
-    "RecordedSampler",
-]
-
 RAMP_SHARES = (0.3, 0.4, 0.5)
 """Default durations of ramps, as shares of a segment: half of it and more is left to settle."""
 HOLD_SHARES = (0.02, 0.2)

@@ -17,7 +17,6 @@ from retwin.twins.state import State
 if TYPE_CHECKING:  # describing a twin needs no torch, which takes seconds to import
     from retwin.twins.compiled.model import Model
 
-__all__ = ["equations_from", "equations_of"]
 
 Kind = TypeVar("Kind")
 

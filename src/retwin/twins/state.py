@@ -9,8 +9,6 @@ import numpy as np
 from retwin.checks import require
 from retwin.twins.parametric import Parameter
 
-__all__ = ["State"]
-
 
 @dataclass(frozen=True)
 class State:

@@ -32,7 +32,6 @@ if TYPE_CHECKING:  # describing a twin needs no torch, which takes seconds to im
     from retwin.twins.compiled.model import Model
     from retwin.twins.compiled.steps import Steps
 
-__all__ = ["StateTwin", "StepWarning"]
 
 SAMPLES_PER_CHUNK = 2**20
 """Number of samples, of all trajectories together, that are simulated at once: some 100 MB."""

@@ -8,8 +8,6 @@ from typing import Protocol
 from retwin.twins.faults import Fault
 from retwin.twins.samplers import CommandSampler
 
-__all__ = ["System"]
-
 
 class System(Protocol):
     """What `generate` requires of a system; a `Case` satisfies it."""

@@ -26,23 +26,6 @@ from retwin.twins.faults import (
     onset_samples,
 )
 
-__all__ = [
-    "FAULTS",
-    "ActuatorGain",
-    "ParameterDrift",
-    "ParameterFault",
-    "ParameterShift",
-    "SensorBias",
-    "SensorDrift",
-    "SensorFreeze",
-    "SizedFault",
-    "TimedFault",
-    "check_faults",
-    "measured_with",
-    "parameter_changes",
-    "without_sensor_faults",
-]
-
 
 @dataclass(frozen=True, kw_only=True)
 class TimedFault:

@@ -11,8 +11,6 @@ from retwin.checks import positive, require
 from retwin.serialisation.sizes import Budget
 from retwin.times import sample_rate, to_samples
 
-__all__ = ["Timed", "steps_per_sample"]
-
 TOLERANCE = 1e-5
 """Largest relative deviation of the steps from a whole number per sample, which covers steps that
 are written as rounded decimals."""

@@ -24,17 +24,6 @@ from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.system_faults import check_faults, measured_with
 
-__all__ = [
-    "Chunk",
-    "Twin",
-    "check_channels",
-    "checked_commands",
-    "checked_seed",
-    "checked_stride",
-    "nominal_outputs",
-    "simulate_in_chunks",
-]
-
 
 @runtime_checkable
 class Twin(Protocol):

@@ -8,8 +8,6 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-__all__ = ["keep_workers", "worker_processes"]
-
 Pool = TypeVar("Pool")
 
 

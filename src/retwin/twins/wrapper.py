@@ -15,8 +15,6 @@ from retwin.twins.limits import Limits
 from retwin.twins.system_faults import without_sensor_faults
 from retwin.twins.twin import Chunk, Twin
 
-__all__ = ["OfTwin", "TwinWrapper", "chunk_generator", "simulate_chunk"]
-
 INNER_TWIN = 1
 """The purpose of random numbers that is reserved for the seeds of the wrapped twin."""
 

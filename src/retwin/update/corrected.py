@@ -30,8 +30,6 @@ from retwin.update.residual import Residual, load_residual
 from retwin.update.surrogate import Surrogate
 from retwin.update.training_range import training_checked
 
-__all__ = ["MAX_PER_CLASS", "CorrectedTwin", "generate"]
-
 MAX_PER_CLASS = 10_000_000
 """Trajectories per class that are generated in memory at most: more fit into none."""
 

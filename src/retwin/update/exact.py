@@ -17,8 +17,6 @@ from retwin.twins.twin import Twin
 from retwin.twins.wrapper import OfTwin
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["ExactSurrogate", "exact_surrogate"]
-
 
 class ExactSurrogate(OfTwin):
     """A twin with the methods of a surrogate that corrections and residual models use.

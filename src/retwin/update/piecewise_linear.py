@@ -16,8 +16,6 @@ import torch
 from numpy.polynomial import chebyshev
 from torch import Tensor
 
-__all__ = ["distinct", "evaluate_piecewise_linear"]
-
 ROUNDINGS = 4
 """Deviation from a straight line that counts as rounding, in roundings of the larger end."""
 STRIDE = 4

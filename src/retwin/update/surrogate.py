@@ -29,8 +29,6 @@ from retwin.update.kernels.generation import along_pieces
 from retwin.update.piecewise_linear import evaluate_piecewise_linear
 from retwin.update.training_range import training_checked
 
-__all__ = ["Surrogate", "fit_surrogate", "surrogate_training"]
-
 TRAJECTORIES_PER_BATCH = 8
 """Trajectories per evaluation of a network with memory: more do not fit the cache."""
 SAMPLES_PER_BLOCK = 2**17

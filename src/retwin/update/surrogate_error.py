@@ -18,8 +18,6 @@ from retwin.update.corrections import Context
 from retwin.update.corrections.warp import within
 from retwin.update.surrogate import Surrogate, known_samples
 
-__all__ = ["surrogate_variance", "warn_of_error"]
-
 LARGEST_SHARE = 0.5
 """Share of the mean square of the residual above which the surrogate's error is warned of."""
 

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.twins.command_range import CommandRange
 
-__all__ = ["OutsideTrainingWarning", "checked_once", "outside_training", "training_checked"]
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 _CHECKED: ContextVar[bool] = ContextVar("checked", default=False)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
 
-__all__ = ["captioned"]
 
 INK = (27, 31, 36)
 MUTED = (90, 99, 110)

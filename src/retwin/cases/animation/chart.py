@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from retwin.cases.animation.shots import GHOST, PAPER, SOLID, UPDATED, Pictures, Shots
 
-__all__ = ["Chart", "Layout", "charted"]
-
 DPI = 100
 """Pixels per inch, by which matplotlib converts sizes."""
 VEIL = 0.88

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.serialisation.places import check_place
 
-__all__ = ["check_film", "write_film"]
-
 TICKS = 100
 """Units of time per second in a GIF."""
 

@@ -29,7 +29,6 @@ from retwin.processes import worker_pool
 if TYPE_CHECKING:
     from retwin.cases.case import Body
 
-__all__ = ["mujoco_pictures", "offscreen_backend"]
 
 BACKENDS = ("egl", "osmesa")
 """Backends that draw without a screen, tried in this order unless MUJOCO_GL names one."""

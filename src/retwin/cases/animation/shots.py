@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["GHOST", "PAPER", "RING", "SOLID", "UPDATED", "Pictures", "Shots", "rings"]
-
 Pictures = Iterable[NDArray]
 """Pictures (height, width, 3) of uint8."""
 

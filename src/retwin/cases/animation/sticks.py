@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from retwin.cases.animation.shots import GHOST, PAPER, RING, SOLID, UPDATED, Shots, rings
 
-__all__ = ["stick_pictures"]
-
 DPI = 100
 """Pixels per inch, by which matplotlib converts sizes."""
 

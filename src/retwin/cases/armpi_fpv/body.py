@@ -19,8 +19,6 @@ from retwin.cases.armpi_fpv.kinematics import YawPitchArm
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 
-__all__ = ["ArmBody", "nearest_poses"]
-
 MODEL = Path(__file__).with_name("armpi.xml")
 COMMAND_WEIGHT = 5e-4
 """Weight in m/rad of a joint's deviation from its command against the end-effector's error.

@@ -30,8 +30,6 @@ from retwin.twins.ramps import draw_onsets, ramps_and_holds
 from retwin.twins.time_step import Timed
 from retwin.update.corrections import Chain, CommandSpace, DelayOffset, SampledSensor
 
-__all__ = ["ArmSampler", "armpi"]
-
 # Table 1 and section 5 of the paper: 90 real trajectories, LSTM, 10 runs.
 PUBLISHED = {
     "dt": {

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from retwin.data.trajectories import HEALTHY
 
-__all__ = ["BIASED", "CLASSES", "STUCK"]
-
 STUCK = tuple(f"Motor_{i}_Stuck" for i in range(1, 5))
 """Classes in which motor i stops moving."""
 BIASED = tuple(f"Motor_{i}_Steady_state_error" for i in range(1, 5))

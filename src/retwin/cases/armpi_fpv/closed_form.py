@@ -15,8 +15,6 @@ from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.twin import Chunk, simulate_in_chunks
 
-__all__ = ["KinematicTwin", "ServoLag"]
-
 
 @dataclass(frozen=True)
 class ServoLag:

@@ -26,9 +26,6 @@ from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, Twin, simulate_in_chunks
 from retwin.twins.wrapper import TwinWrapper
 
-__all__ = ["EmulatedArmPi"]
-
-
 PROBABILITIES = ("missed", "glitch", "repeatable")
 """Settings whose range is 0 to 1."""
 TRAVEL = np.array([270.0, 170.0, 170.0, 170.0])

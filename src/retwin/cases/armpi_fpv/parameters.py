@@ -6,8 +6,6 @@ from retwin.cases.armpi_fpv.twin import KINEMATIC, STRAIGHT, ArmPiTwin
 from retwin.twins.command_side import CommandSide, command_side_parameters
 from retwin.twins.parametric import Parameter, ParametricTwin
 
-__all__ = ["armpi_parametric"]
-
 SERVOS = tuple(f"actuator.motor_{i}" for i in range(1, 6))
 GAIN, DAMPING = 0.008, 0.000082
 """Gains of the servos in `armpi.xml`, per command unit."""

@@ -11,8 +11,6 @@ from retwin.cases.armpi_fpv.search import free_chain
 from retwin.cases.armpi_fpv.twin import KINEMATIC, RAMPS, STRAIGHT
 from retwin.twins.ramps import ramps_and_holds
 
-__all__ = ["PathFit", "path_noise"]
-
 HALF_TURN = TURN // 2
 """Command units in half a turn."""
 ROUNDING = 1.5e-6

@@ -18,22 +18,6 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "COMBINATIONS",
-    "FLOOR",
-    "LIMIT",
-    "STEP",
-    "TIE",
-    "TURN",
-    "Plane",
-    "PlaneSolution",
-    "bends",
-    "forward",
-    "grid_chain",
-    "grid_postures",
-    "with_tip",
-]
-
 STEP = np.deg2rad(0.24)
 """Angle in rad of one command step."""
 TURN = 1500

@@ -13,8 +13,6 @@ from retwin.cases.recorded import RecordedCase
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 
-__all__ = ["RECORDED", "recover"]
-
 
 def recover(trajectories: Trajectories, progress: Progress | None = None) -> Trajectories:
     """Recover commands from the desired path; a warning names ambiguous trajectories.

@@ -23,8 +23,6 @@ from retwin.cases.armpi_fpv.path_fit import PathFit, path_noise
 from retwin.cases.armpi_fpv.twin import RAMPS, STRAIGHT
 from retwin.checks import require
 
-__all__ = ["Recovery", "recover_commands"]
-
 PATHS_PER_BATCH = 32
 """Number of paths that are solved together: they fit the cache, and every core has work."""
 LONGEST_STOP = 25

@@ -28,8 +28,6 @@ from retwin.cases.armpi_fpv.plane import (
     with_tip,
 )
 
-__all__ = ["free_chain"]
-
 REFINED_GUESSES = 8
 """Number of explanations per path that are refined where none is good."""
 KEPT_GUESSES = 4

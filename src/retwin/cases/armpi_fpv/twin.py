@@ -21,17 +21,6 @@ from retwin.twins.limits import Limits
 if TYPE_CHECKING:
     from retwin.twins.mujoco import MuJoCoTwin
 
-__all__ = [
-    "ARM",
-    "KINEMATIC",
-    "MODEL",
-    "RAMPS",
-    "RATE",
-    "SENSOR_RATE",
-    "STRAIGHT",
-    "UNIT",
-    "ArmPiTwin",
-]
 
 ARM = YawPitchArm(base=0.028505 + 0.0361, links=(0.10048, 0.094714, 0.05071))
 """Kinematics of the arm, with the lengths of its URDF."""

@@ -26,8 +26,6 @@ from retwin.twins.twin import Twin
 from retwin.update.corrections import Additive
 from retwin.update.residual import SequenceMixture
 
-__all__ = ["VOLTAGES", "benchmark", "tanks", "tanks_overflow"]
-
 OVERFLOWING = OVERFLOWING_TANKS.parametric().with_values(
     {
         "pump": 0.0648524,

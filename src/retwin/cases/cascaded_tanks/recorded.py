@@ -6,7 +6,5 @@ from retwin.cases.cascaded_tanks.twin import TANKS
 from retwin.cases.recorded import RecordedCase
 from retwin.data.trajectories import HEALTHY
 
-__all__ = ["RECORDED"]
-
 RECORDED = RecordedCase((HEALTHY,), TANKS)
 """What files of the tanks' trajectories need of their case."""

@@ -27,8 +27,6 @@ from retwin.twins.parametric import Parameter
 from retwin.twins.state import State
 from retwin.twins.state_twin import StateTwin
 
-__all__ = ["OVERFLOWING_TANKS", "RATE", "TANKS"]
-
 INPUTS = Channels(("pump",), ("V",))
 OUTPUTS = Channels(("level",), ("V",))
 RATE = 0.25

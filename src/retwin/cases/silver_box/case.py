@@ -16,8 +16,6 @@ from retwin.twins.samplers import MultisineSampler
 from retwin.update.corrections import Additive
 from retwin.update.residual import SequenceMixture
 
-__all__ = ["silverbox"]
-
 COLUMNS = {"input": "V1", "output": "V2"}
 TRANSIENT = 50 / SILVERBOX.rate
 """Duration in s at the begin of each record that the benchmark does not score."""

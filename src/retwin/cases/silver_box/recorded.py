@@ -6,7 +6,5 @@ from retwin.cases.recorded import RecordedCase
 from retwin.cases.silver_box.twin import SILVERBOX
 from retwin.data.trajectories import HEALTHY
 
-__all__ = ["RECORDED"]
-
 RECORDED = RecordedCase((HEALTHY,), SILVERBOX)
 """What files of the Silverbox's trajectories need of their case."""

@@ -21,8 +21,6 @@ from retwin.twins.parametric import Parameter
 from retwin.twins.state import State
 from retwin.twins.state_twin import StateTwin
 
-__all__ = ["SILVERBOX"]
-
 
 def _derivative(x: Any, u: Any, p: Any) -> tuple[Any, Any]:
     spring = p.stiffness * x.position + p.square * x.position**2 + p.cubic * x.position**3

@@ -27,8 +27,6 @@ from retwin.twins.system_faults import (
 from retwin.update.corrections import Additive
 from retwin.update.residual import SequenceMixture
 
-__all__ = ["WARM_UP", "incubator", "measurements"]
-
 COLUMNS: Mapping[str, str | tuple[str, ...]] = {
     "heater": "heater_on",
     "room": "t1",

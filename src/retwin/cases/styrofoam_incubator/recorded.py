@@ -6,7 +6,5 @@ from retwin.cases.recorded import RecordedCase
 from retwin.cases.styrofoam_incubator.twin import INCUBATOR
 from retwin.data.trajectories import HEALTHY
 
-__all__ = ["RECORDED"]
-
 RECORDED = RecordedCase((HEALTHY,), INCUBATOR)
 """What files of the incubator's trajectories need of their case."""

@@ -23,8 +23,6 @@ from retwin.twins.parametric import Parameter
 from retwin.twins.state import State
 from retwin.twins.state_twin import StateTwin
 
-__all__ = ["INCUBATOR"]
-
 POWER = 100.0
 """Power of the heater in W, assumed: no record has it, and all four parameters are proportional."""
 

@@ -22,8 +22,6 @@ from retwin.update.corrections.command_inference import Belief
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.delay_range import range_in_samples
 
-__all__ = ["ActuatorKnowledge"]
-
 
 @dataclass(frozen=True, eq=False)
 class ActuatorKnowledge:

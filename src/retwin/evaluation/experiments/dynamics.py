@@ -18,8 +18,6 @@ from retwin.checks import require
 from retwin.inference.design import Knowledge
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["DynamicsKnowledge"]
-
 MAX_PREDICTIONS = 2000
 """Outputs at most, evenly chosen from those of all reference trajectories."""
 

@@ -25,8 +25,6 @@ from retwin.update.corrections import Chain, CommandSpace, SampledSensor
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.residual import ResidualModel, infer_discrepancy
 
-__all__ = ["Expected", "Measured", "Proposal", "next_experiments"]
-
 MIN_TRAJECTORIES = 3
 """Healthy trajectories at least: fewer do not show how much segments scatter."""
 REFERENCES = 64

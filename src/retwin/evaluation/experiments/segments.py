@@ -21,8 +21,6 @@ from retwin.update.corrections import Chain, Context, Discrepancy, SampledSensor
 from retwin.update.residual import ResidualModel
 from retwin.update.residual.model import describe
 
-__all__ = ["SegmentKnowledge"]
-
 ROUNDS = 10
 """Rounds in which scatter and prior of the coefficients are estimated from each other."""
 FREEDOM = 4.0

@@ -30,8 +30,6 @@ from retwin.scores.distributions import (
 from retwin.scores.intervals import grouped_share_interval, jackknife_interval
 from retwin.serialisation.files import write_atomically
 
-__all__ = ["BINS", "Fidelity", "Figure"]
-
 BINS = 100
 """Bins of the PIT histograms, which are stored; pages show fewer."""
 SHOWN_BINS = 20

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from retwin.data.trajectories import Channels
 
-__all__ = ["shown_latents"]
-
 
 def shown_latents(latent: Channels, rate: float) -> tuple[Channels, NDArray]:
     """Names and units of z as shown, and the factor (k,) by which each component is multiplied."""

@@ -31,8 +31,6 @@ from retwin.update.corrections import Context, Correction, DelayOffset
 from retwin.update.residual import infer_discrepancy, segment
 from retwin.update.training_range import checked_once
 
-__all__ = ["measure_fidelity", "measure_widening"]
-
 DISCREPANCY = DelayOffset()
 """The correction by which delays and offsets of every twin are inferred, whatever the correction
 of its own residual model: so twins compare."""

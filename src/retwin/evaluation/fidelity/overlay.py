@@ -20,8 +20,6 @@ from retwin.update.corrected import CorrectedTwin
 from retwin.update.residual import infer_discrepancy, segment
 from retwin.update.training_range import checked_once
 
-__all__ = ["Overlay", "predictive_overlay"]
-
 _ARRAYS = ("ids", "bands", "z", "deviation", "times")
 
 

@@ -16,8 +16,6 @@ from retwin.serialisation.files import write_atomically
 from retwin.twins.twin import Twin
 from retwin.update.training_range import checked_once
 
-__all__ = ["Simulation", "record_means", "simulate_records", "simulation_scores"]
-
 _ARRAYS = ("ids", "observed", "mean", "bands", "crps", "nll")
 
 

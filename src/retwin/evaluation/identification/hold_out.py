@@ -8,8 +8,6 @@ from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.update.identification.identifiability import MIN_TRAJECTORIES
 
-__all__ = ["SHARE", "hold_out"]
-
 SHARE = 0.25
 """The share of the measurements that is held out by default."""
 

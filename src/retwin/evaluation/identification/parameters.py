@@ -15,16 +15,6 @@ from retwin.update.identification.identifiability import UNIFORM
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.posterior import Posterior
 
-__all__ = [
-    "WIDEST",
-    "Basis",
-    "Direction",
-    "ParameterEstimate",
-    "Uncertainty",
-    "estimates",
-    "uncertainty_of",
-]
-
 NEAR = 0.01
 """Distance from a bound, in widths of the range, within which draws count as on it."""
 CROWDED = 0.1

@@ -11,8 +11,6 @@ from scipy.special import ndtr
 from retwin.data.trajectories import Trajectories
 from retwin.scores.residuals import autocorrelation, cross_correlation, ljung_box
 
-__all__ = ["InputTest", "ResidualTest", "residual_tests"]
-
 NORMAL = 1.959964
 """The 97.5 % quantile of the normal distribution, which the limits of correlations contain."""
 NEGLIGIBLE = 1e-6

@@ -24,8 +24,6 @@ from retwin.twins.twin import checked_stride
 from retwin.update.identification.identify import Updated
 from retwin.update.identification.posterior import Posterior
 
-__all__ = ["Identification", "OutputError", "RMSError", "validate_identification"]
-
 BEGIN = 10
 """The begin of a trajectory is its part by this number."""
 

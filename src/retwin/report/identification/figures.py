@@ -15,8 +15,6 @@ from retwin.scores.residuals import (
     spectra,
 )
 
-__all__ = ["figures"]
-
 OUTPUTS, INPUTS = 6, 3
 """Outputs and inputs of which figures are drawn, at most."""
 SAMPLES = 1500

@@ -31,8 +31,6 @@ from retwin.report.labels import counted, duration, p_value
 from retwin.report.plotly_specs import panel_spec
 from retwin.report.style import CHROME, PALETTE, colour_of, symbol
 
-__all__ = ["identification_page"]
-
 STRONG = 0.9
 """Correlation from which a cell is emphasised."""
 DIRECTIONS = 8

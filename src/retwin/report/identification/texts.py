@@ -9,18 +9,6 @@ from retwin.evaluation.identification import Direction, Identification, Paramete
 from retwin.evaluation.identification.parameters import WIDEST
 from retwin.update.identification.posterior import Posterior
 
-__all__ = [
-    "change",
-    "combination",
-    "findings",
-    "interval",
-    "next_steps",
-    "percent",
-    "significant",
-    "state",
-    "value",
-]
-
 WHITE = 0.01
 """p-value below which a residual is not taken for white noise, or depends on an input."""
 SENTENCES = 4

@@ -15,8 +15,6 @@ from retwin.report.verdict import headline
 from retwin.results import ChannelNames, Dataset, FidelityFigure, Results
 from retwin.scores.classification import row_shares
 
-__all__ = ["card", "unlike"]
-
 SIGNIFICANT = 0.05
 """The p-value at or below which generated and observed values count as different."""
 POOR = 0.5

@@ -28,8 +28,6 @@ from retwin.report.study import Study
 from retwin.report.verdict import headline, outcome_of
 from retwin.results import Comparison
 
-__all__ = ["comparisons"]
-
 
 def comparisons(study: Study) -> Section | None:
     """Of many sources a matrix of differences, and the pairs with the headline's sources only."""

@@ -8,8 +8,6 @@ from retwin.report.labels import class_name, source_name
 from retwin.report.study import Study
 from retwin.scores.classification import row_shares
 
-__all__ = ["confusion"]
-
 
 def confusion(study: Study) -> Section | None:
     """The confusion matrices of all sources side by side."""

@@ -8,8 +8,6 @@ from retwin.report.blocks import Cell, Column, Section, Table, columns
 from retwin.report.labels import duration, real_data, source_name, stage_name
 from retwin.report.study import Study
 
-__all__ = ["PUBLISHED_BULK", "time"]
-
 PUBLISHED_BULK, BULK = 3600, 1000
 """The number of trajectories to which generation times refer: in the paper, and elsewhere."""
 

@@ -13,8 +13,6 @@ from retwin.report.study import Study
 from retwin.report.verdict import headline
 from retwin.scores.decisions import Decision, decide
 
-__all__ = ["decisions"]
-
 TRAJECTORIES, FAULTY, MISSED = 1000, 0.02, 50
 """The example: trajectories, share of faulty ones, cost of a missed fault in false alarms."""
 GROUP = f"Of {TRAJECTORIES}, {100 * FAULTY:.0f} % faulty"

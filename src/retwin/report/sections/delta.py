@@ -9,8 +9,6 @@ from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row
 from retwin.report.study import Study
 from retwin.report.style import colour_of
 
-__all__ = ["delta"]
-
 SOURCE = "dynamics"
 WIDTH = 1.6449
 """Standard deviations of a central 90 % interval."""

@@ -25,8 +25,6 @@ from retwin.report.style import colour_of
 from retwin.results import FidelityFigure
 from retwin.scores.histograms import Histogram, common_histogram
 
-__all__ = ["Latent", "detailed", "discrepancy", "figure_cell", "latents", "suffixes", "titled"]
-
 FEW = 3
 """The number of sources up to which all are shown in detail."""
 KINDS = {"tde": "delay", "tpe": "offset_", "noise": "noise_"}

@@ -16,8 +16,6 @@ from retwin.report.study import Study
 from retwin.report.style import DASHES, PALETTE, colour_index, colour_of
 from retwin.results import OverlayInfo
 
-__all__ = ["explorer", "packed"]
-
 MISSING = 65535
 """The code of a number that is not defined."""
 FINE, COARSE, POSE = 16000, 4000, 1500

@@ -26,8 +26,6 @@ from retwin.report.study import Study
 from retwin.report.style import colour_of
 from retwin.results import FidelityResults
 
-__all__ = ["fidelity"]
-
 RIVALS = {"mean_only": "Mean only", "single_gaussian": "One Gaussian"}
 """Titles of the simpler generators."""
 SHARES = {

@@ -12,8 +12,6 @@ from retwin.report.study import Study
 from retwin.report.style import colour_index, colour_of, dash, symbol
 from retwin.results import CurvePoint
 
-__all__ = ["learning"]
-
 Curves = dict[str, list[CurvePoint]]
 
 

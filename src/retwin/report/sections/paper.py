@@ -18,8 +18,6 @@ from retwin.report.labels import (
 from retwin.report.sections.costs import PUBLISHED_BULK
 from retwin.report.study import Study
 
-__all__ = ["paper"]
-
 TABLE1 = tuple(name for name in MAIN if not METRICS[name].simulated)
 """The metrics of the paper's Table 1."""
 PAPER, HERE = "the paper", "this study"

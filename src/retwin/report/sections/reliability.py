@@ -14,8 +14,6 @@ from retwin.report.study import Study
 from retwin.report.style import colour_of, symbol
 from retwin.scores import calibration
 
-__all__ = ["reliability"]
-
 
 def reliability(study: Study) -> Section | None:
     """A diagram for each of the selected sources."""

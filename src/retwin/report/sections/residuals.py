@@ -25,8 +25,6 @@ from retwin.scores.residuals import (
     spectra,
 )
 
-__all__ = ["residuals"]
-
 OUTPUTS = 3
 """Outputs of which figures are drawn, at most."""
 COMMANDS = 3

@@ -11,8 +11,6 @@ from retwin.report.study import Study
 from retwin.report.style import colour_of, dash
 from retwin.scores.roc import micro_roc
 
-__all__ = ["roc", "selected"]
-
 
 def roc(study: Study) -> Section | None:
     """The mean ROC curves over runs, with one standard deviation around them."""

@@ -32,8 +32,6 @@ from retwin.report.style import colour_of, symbol
 from retwin.results import Results, SourceResults
 from retwin.scores.calibration import calibration_floor
 
-__all__ = ["further_scores", "scores"]
-
 FURTHER = tuple(
     name for name, metric in METRICS.items() if not metric.headline and metric.unit == "1"
 )

@@ -15,8 +15,6 @@ from retwin.report.labels import number, quantity
 from retwin.report.study import Study
 from retwin.scores.segments import SegmentError, clearest_segment, median_error_trajectory
 
-__all__ = ["Segment", "segment", "segment_figure"]
-
 
 @dataclass(frozen=True)
 class Segment:

@@ -10,8 +10,6 @@ from retwin.report.labels import quantity, source_name
 from retwin.report.study import Study
 from retwin.report.style import colour_of, dash
 
-__all__ = ["simulation"]
-
 SHOWN = 2
 """Records that the figure shows, at most."""
 

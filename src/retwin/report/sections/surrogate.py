@@ -7,8 +7,6 @@ from retwin.report.labels import number, quantity, with_unit
 from retwin.report.sections.discrepancy import latents
 from retwin.report.study import Study
 
-__all__ = ["surrogate"]
-
 
 def surrogate(study: Study) -> Section | None:
     """RMSE, and NRMSE where it is known."""

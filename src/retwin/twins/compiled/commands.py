@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from retwin.compiler import call, compiled_files
 from retwin.data.segments import Segments
 
-__all__ = ["biased_references", "ramped"]
-
 
 def library() -> ctypes.CDLL | None:
     """The compiled functions; None without a C compiler."""

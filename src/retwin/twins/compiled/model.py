@@ -15,8 +15,6 @@ from retwin.twins.compiled.trace import traced
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["Model", "trace_model"]
-
 
 @dataclass(frozen=True, eq=False)
 class Model:

@@ -10,8 +10,6 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-__all__ = ["COMPARISONS", "OPERATIONS", "Node", "Program"]
-
 FUNCTIONS = (
     *("exp", "log", "log1p", "expm1", "sqrt", "erf", "sin", "cos", "tan", "asin", "acos", "atan"),
     *("sinh", "cosh", "tanh", "floor", "ceil"),

@@ -14,8 +14,6 @@ from retwin.compiler import call, compiled
 from retwin.twins.compiled.model import Model
 from retwin.twins.interpolation import cubic_coefficients
 
-__all__ = ["Steps"]
-
 
 @dataclass(frozen=True, eq=False)
 class Steps:

@@ -18,8 +18,6 @@ from torch import Tensor
 from retwin.errors import InputError
 from retwin.twins.compiled.program import COMPARISONS, OPERATIONS, Node, Program
 
-__all__ = ["traced"]
-
 ELEMENTWISE: dict[str, Callable[..., Node]] = {
     **{op: (lambda *args, op=op: args[0].program.node(op, *args)) for op in OPERATIONS},
     "square": lambda a: a * a,

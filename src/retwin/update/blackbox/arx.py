@@ -40,8 +40,6 @@ from retwin.update.blackbox.estimate import (
 from retwin.update.blackbox.lags import Lags, least_squares
 from retwin.update.dynamics.estimation import Point
 
-__all__ = ["Linear", "best_linear", "fit_arx"]
-
 MAX_ORDER = 8
 """Largest number of past samples that is tried."""
 START = 10.0

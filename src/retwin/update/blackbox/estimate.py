@@ -27,21 +27,6 @@ from retwin.update.dynamics.noise import widening
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 
-__all__ = [
-    "BlackBox",
-    "BlackBoxFit",
-    "best_order",
-    "check_records",
-    "coefficients_of",
-    "cross_validated",
-    "estimation_of",
-    "followed",
-    "held_out_errors",
-    "held_out_parts",
-    "states_within",
-    "with_best_prior",
-]
-
 FOLDS = 10
 """Parts of the calibration record, each made of blocks of all trajectories, that are held out."""
 MANY = 100_000

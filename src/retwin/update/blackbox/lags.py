@@ -15,8 +15,6 @@ from retwin.update.dynamics.corrected import Domain
 from retwin.update.dynamics.library import Library
 from retwin.update.dynamics.terms import Term
 
-__all__ = ["ROWS_PER_TERM", "Lags", "MeasuredRows", "Scales", "least_squares"]
-
 ROWS_PER_TERM = 10
 """Least number of samples per term."""
 

@@ -36,8 +36,6 @@ from retwin.update.blackbox.estimate import (
 from retwin.update.blackbox.lags import ROWS_PER_TERM, Lags, least_squares
 from retwin.update.dynamics.estimation import Estimation, Point
 
-__all__ = ["Polynomial", "fit_narx", "forward"]
-
 DEGREE = 3
 """Highest degree of the monomials; it is lowered for many variables, see `Library`."""
 MAX_ORDER = 4

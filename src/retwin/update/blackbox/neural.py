@@ -42,8 +42,6 @@ from retwin.update.blackbox.estimate import (
 from retwin.update.blackbox.lags import Lags
 from retwin.update.dynamics.estimation import Point
 
-__all__ = ["NeuralModel", "fit_neural_ss"]
-
 SAMPLES_PER_WEIGHT = 10
 """Measured samples per number of the network at least."""
 WIDTHS = (2, 16)

@@ -10,8 +10,6 @@ from torch import Tensor
 from retwin.data.trajectories import Channels
 from retwin.update.corrections.correction import Context, Discrepancy, Head
 
-__all__ = ["Additive"]
-
 
 @dataclass(frozen=True)
 class Additive:

@@ -22,15 +22,6 @@ from retwin.update.corrections.correction import (
 from retwin.update.corrections.sampled_sensor import SampledSensor
 from retwin.update.corrections.warp import gather_samples
 
-__all__ = [
-    "Chain",
-    "fit_correction",
-    "measured_outputs",
-    "measuring",
-    "sample_mask",
-    "sensor_of",
-]
-
 
 @dataclass(frozen=True)
 class Chain:

@@ -34,8 +34,6 @@ from retwin.update.corrections.missed_segments import (
 from retwin.update.corrections.offset_features import OffsetFeatures
 from retwin.update.corrections.sample_noise import SampleNoise
 
-__all__ = ["Belief", "infer_commands"]
-
 MAX_ROUNDS = 12
 """Rounds of expectation-maximisation at most, with a search for missed segments in each."""
 TOLERANCE = 0.02

@@ -20,8 +20,6 @@ from retwin.update.corrections.warp import gather_samples, interpolate, within
 from retwin.update.kernels.generation import jacobians, linearised_outputs
 from retwin.update.piecewise_linear import distinct
 
-__all__ = ["CommandProblem"]
-
 SURROGATE_STEP = 0.05
 """Step of finite differences of delays through a surrogate with memory, in samples: larger than the
 rounding of single precision."""

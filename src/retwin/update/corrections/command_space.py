@@ -22,8 +22,6 @@ from retwin.update.corrections.warp import gather_samples
 from retwin.update.kernels.generation import at_effective_commands
 from retwin.update.piecewise_linear import distinct
 
-__all__ = ["CommandSpace"]
-
 KINDS = ("offset", "missed")
 
 

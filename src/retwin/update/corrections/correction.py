@@ -13,15 +13,6 @@ from torch import Tensor
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
 
-__all__ = [
-    "Context",
-    "Correction",
-    "DifferentiableTwin",
-    "Discrepancy",
-    "Head",
-    "block_diagonal",
-]
-
 
 class DifferentiableTwin(Protocol):
     """The part of a surrogate that corrections use: a call with gradient, and one without.

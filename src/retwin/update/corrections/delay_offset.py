@@ -26,8 +26,6 @@ from retwin.update.corrections.delays import at_bound, first_delays
 from retwin.update.corrections.path_problem import PathProblem, path_at
 from retwin.update.kernels.generation import delayed_path
 
-__all__ = ["DelayOffset"]
-
 ROUNDS = 5
 """Times that the noise is estimated anew, and z with it."""
 TRAJECTORIES_PER_BATCH = 128

@@ -19,14 +19,6 @@ from retwin.update.corrections.delays import common_delay, first_delays
 from retwin.update.corrections.path_problem import PathProblem
 from retwin.update.corrections.warp import within
 
-__all__ = [
-    "bound_note",
-    "checked_range",
-    "plausible_delays",
-    "range_in_samples",
-    "range_in_seconds",
-]
-
 FEW = 0.05
 """Share of delays at a bound that needs no mention: a few segments are always missed."""
 ROUNDING = 1e-6

@@ -13,8 +13,6 @@ from retwin.inference.problem import Problem
 from retwin.inference.solver import Bounds
 from retwin.update.corrections.warp import within
 
-__all__ = ["DelayProblem", "at_bound", "common_delay", "delay_bounds", "first_delays"]
-
 GRID = 64
 """Intervals of a grid of delays at most, where those are not below one sample."""
 AT_BOUND = 1e-3

@@ -9,8 +9,6 @@ from retwin.data.segments import Segments
 from retwin.update.corrections.warp import Knots, gather_samples, interpolate
 from retwin.update.kernels.generation import effective_commands_at
 
-__all__ = ["effective_commands"]
-
 STILL = 1e-6
 """Largest change of a command, relative to its size, that counts as no change: rounding."""
 

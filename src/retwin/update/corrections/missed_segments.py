@@ -18,8 +18,6 @@ from retwin.inference.priors import GaussianPrior
 from retwin.inference.solver import Solution, solve
 from retwin.update.corrections.command_problem import CommandProblem
 
-__all__ = ["MARGIN", "SEARCHES", "CommandFit", "LatentPrior", "MissedSearch", "fitted", "searched"]
-
 SEARCHES = 3
 """Segments of a row at most of which one search may change whether they were missed."""
 MARGIN = 20.0

@@ -11,8 +11,6 @@ from retwin.inference.hierarchy import Design
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.effective_commands import STILL
 
-__all__ = ["OffsetFeatures"]
-
 OWN_FEATURES = 3
 """Features of an actuator's own motion: a constant, its direction, and its distance."""
 MAX_COEFFICIENTS = 500

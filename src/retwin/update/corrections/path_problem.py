@@ -15,8 +15,6 @@ from retwin.inference.solver import Bounds
 from retwin.update.corrections.delays import delay_bounds
 from retwin.update.corrections.warp import Knots, interpolate, within
 
-__all__ = ["PathProblem", "path_at"]
-
 MAX_STEP = 1 / 7
 """Largest change of a delay in one step, in widths of its range: the path is only piecewise smooth
 in it."""

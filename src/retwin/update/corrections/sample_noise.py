@@ -18,8 +18,6 @@ from torch import Tensor
 from retwin.inference.noise import Noise
 from retwin.update.corrections.command_problem import CommandProblem
 
-__all__ = ["SampleNoise"]
-
 HYPERPRIOR_SEGMENTS = 2.0
 """Segments that the hyperprior of an actuator's variance counts as much as."""
 SMALLEST = 1e-6

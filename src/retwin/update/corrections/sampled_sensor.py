@@ -21,8 +21,6 @@ from retwin.errors import InputError
 from retwin.update.corrections.warp import gather_samples
 from retwin.update.kernels.generation import joined_samples
 
-__all__ = ["SampledSensor"]
-
 LONGEST_PERIOD = 1000
 """Longest sampling period that is searched for, in time steps of the record: it bounds the time
 that the search takes. Other limits are shares of the record."""

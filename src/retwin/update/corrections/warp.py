@@ -10,8 +10,6 @@ from torch import Tensor
 
 from retwin.data.segments import Segments
 
-__all__ = ["Knots", "gather_samples", "interpolate", "within"]
-
 
 @dataclass(frozen=True, eq=False)
 class Knots:

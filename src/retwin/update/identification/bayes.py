@@ -17,8 +17,6 @@ from retwin.update.identification.posterior import Posterior, PosteriorTwin
 from retwin.update.identification.problem import BoxProblem
 from retwin.update.identification.summaries import Summaries, outlyingness
 
-__all__ = ["calibration_ranks", "infer_posterior"]
-
 MAX_DRAWS = 4000
 """Largest number of draws of the posterior that are kept."""
 SIGNIFICANCE = 0.02

@@ -7,15 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "CHI2_95",
-    "MIN_TRAJECTORIES",
-    "Identifiability",
-    "identifiability",
-    "noise_of",
-    "standard_errors",
-]
-
 RANK_TOLERANCE = 1e-5
 """Singular values below this share of the largest count as 0: finite differences are no better."""
 CHI2_95 = 3.84

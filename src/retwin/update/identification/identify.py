@@ -38,8 +38,6 @@ from retwin.update.identification.search import (
     Search,
 )
 
-__all__ = ["Updated", "identify"]
-
 
 @dataclass(frozen=True, eq=False)
 class Updated:

@@ -13,8 +13,6 @@ from retwin.update.identification.noise import Noise
 from retwin.update.identification.problem import BoxProblem
 from retwin.update.identification.search import LeastSquares, Search
 
-__all__ = ["MCMC"]
-
 INITIAL_DEVIATION = 0.02
 """Standard deviation of the walkers' initial points about the best fit, in widths of the bounds."""
 MIN_EFFECTIVE_SAMPLES = 200.0

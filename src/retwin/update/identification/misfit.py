@@ -19,8 +19,6 @@ from retwin.twins.parametric import ParametricTwin
 from retwin.twins.state_twin import StepWarning
 from retwin.twins.twin import checked_seed, checked_stride
 
-__all__ = ["Misfit", "misfit_of"]
-
 
 class Misfit:
     """Residuals of a twin on measured trajectories, at the samples that the sensor took.

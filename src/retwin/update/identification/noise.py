@@ -15,8 +15,6 @@ from scipy.stats import t as student
 
 from retwin.checks import require
 
-__all__ = ["Noise"]
-
 MIN_SCALE = 1e-5
 """Smallest scale of noise and discrepancy, over the standard deviation of the twin's outputs."""
 

@@ -14,8 +14,6 @@ from retwin.update.identification.noise import Noise
 from retwin.update.identification.problem import BoxProblem
 from retwin.update.identification.summaries import Summaries
 
-__all__ = ["NPE"]
-
 MARGIN = 0.25
 """Margin of the next round's box on either side, over the width of the posterior."""
 TAIL = 1e-3

@@ -25,8 +25,6 @@ from retwin.twins.twin import Chunk, simulate_in_chunks
 from retwin.twins.wrapper import TwinWrapper, chunk_generator
 from retwin.update.identification.noise import Noise
 
-__all__ = ["Posterior", "PosteriorTwin"]
-
 KIND = "posterior"
 """Kind of the saved model."""
 

@@ -11,8 +11,6 @@ from retwin.update.identification.misfit import Misfit
 from retwin.update.identification.noise import Noise
 from retwin.update.identification.summaries import Summaries
 
-__all__ = ["BoxProblem"]
-
 PRIOR_DRAWS = 200
 """Draws from the prior whose simulations the measured data are compared with."""
 NOISES = 32

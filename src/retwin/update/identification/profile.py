@@ -16,8 +16,6 @@ from retwin.update.identification.identify import Updated
 from retwin.update.identification.misfit import misfit_of
 from retwin.update.identification.search import LeastSquares, Search
 
-__all__ = ["Profile", "profile"]
-
 MARGIN = 2.0
 """Distance of the outermost values from the optimum, in halves of the 95 % interval."""
 

@@ -15,8 +15,6 @@ from retwin.checks import one_of, whole
 from retwin.progress import Progress
 from retwin.update.identification.misfit import Misfit
 
-__all__ = ["AT_BOUND", "Evolution", "LeastSquares", "Loss", "Optimum", "Search"]
-
 DIFFERENCE = 1e-3
 """Step of the finite differences, in widths of the bounds."""
 TOLERANCE = 1e-6

@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.covariance import LedoitWolf
 
-__all__ = ["Summaries", "outlyingness"]
-
 COMPONENTS = 20
 """Largest number of principal components."""
 RANK_TOLERANCE = 1e-4

@@ -19,17 +19,6 @@ from retwin.compiler import call, compiled_files
 from retwin.data.segments import Segments
 from retwin.update.piecewise_linear import TOLERANCE
 
-__all__ = [
-    "along_pieces",
-    "at_effective_commands",
-    "delayed_path",
-    "effective_commands_at",
-    "jacobians",
-    "joined_samples",
-    "library",
-    "linearised_outputs",
-]
-
 SOURCES = ("network.c", "pieces.c", "warp.c", "linearised.c")
 OUTPUTS = 6
 """Outputs of a layer that are computed together, as in `network.c`."""

@@ -13,8 +13,6 @@ from torch import Tensor
 from retwin.update.corrections import Chain, Context, measured_outputs, sensor_of
 from retwin.update.residual.residual import Residual
 
-__all__ = ["coverage", "coverage_figures"]
-
 DRAWS = 59
 """Draws of each trajectory: a measured sample has one of 60 ranks among them, all equally probable
 if the model is right."""

@@ -45,8 +45,6 @@ from retwin.update.surrogate import Surrogate
 from retwin.update.surrogate_error import surrogate_variance, warn_of_error
 from retwin.update.training_range import checked_once, training_checked
 
-__all__ = ["calibrating", "fit_residual", "infer_discrepancy"]
-
 R = TypeVar("R", bound=Residual)
 
 

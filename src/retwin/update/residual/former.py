@@ -10,8 +10,6 @@ from retwin.errors import InputError
 from retwin.serialisation.configs import Converted, from_config, to_config
 from retwin.update.corrections import Correction
 
-__all__ = ["read_correction", "written_correction"]
-
 TIMES = ("delay_range", "known_delay", "phases")
 """Settings that were in samples under the names that they have now."""
 

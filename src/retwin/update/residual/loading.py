@@ -8,8 +8,6 @@ from retwin.serialisation.models import kind_of, refusing
 from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.sequence import SequenceResidual
 
-__all__ = ["load_residual"]
-
 
 def load_residual(
     folder: str | Path, rate: float | None = None

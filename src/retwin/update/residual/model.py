@@ -18,8 +18,6 @@ from retwin.update.corrections import Context, Correction
 from retwin.update.residual.residual import Residual
 from retwin.update.residual.settings import Density
 
-__all__ = ["ResidualModel", "describe"]
-
 
 class ResidualModel(Residual):
     """The distribution of z (n, M, d_z) given a `Context`: call it to get a torch distribution.

@@ -11,8 +11,6 @@ from retwin.checks import require
 from retwin.data.trajectories import Channels
 from retwin.update.residual.residual import Residual
 
-__all__ = ["BOUND_MARGIN", "SMALLEST", "checked_bounds", "penalties"]
-
 SMALLEST = 1e-12
 """Smallest value taken for the largest |z*|: a millionth of it still has a square in float32."""
 BOUND_MARGIN = 1.25

@@ -25,8 +25,6 @@ from retwin.update.corrections import Context, measured_outputs
 from retwin.update.residual.model import ResidualModel, describe
 from retwin.update.residual.settings import Refinement
 
-__all__ = ["refine"]
-
 HELD_OUT_DRAWS = 64
 """Simulations of each held-out trajectory that the energy score before and after is estimated
 from. They are four times as many as in training by default, to halve the error of the estimate."""

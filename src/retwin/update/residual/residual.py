@@ -26,8 +26,6 @@ from retwin.update.corrections import Context, Correction
 from retwin.update.residual.former import read_correction, written_correction
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["Residual", "segment"]
-
 
 class Residual(nn.Module, ABC):
     """The distribution of z given a `Context`: call it to get a torch distribution.

@@ -21,8 +21,6 @@ from retwin.update.residual.model import ResidualModel
 from retwin.update.residual.penalties import BOUND_MARGIN, SMALLEST, checked_bounds, penalties
 from retwin.update.residual.targets import Targets
 
-__all__ = ["fit_segments"]
-
 HELD_OUT = 20
 """Trajectories to hold out at least, over all folds: a standard deviation from twenty values has a
 standard error of 16 %."""

@@ -25,8 +25,6 @@ from retwin.nets.training import Training
 from retwin.update.corrections import Context, Correction
 from retwin.update.residual.residual import Residual
 
-__all__ = ["Member", "SequenceMixture", "SequenceResidual", "past", "shrunk", "widened"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceMixture:

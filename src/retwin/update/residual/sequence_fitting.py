@@ -27,8 +27,6 @@ from retwin.update.residual.sequence import (
     widened,
 )
 
-__all__ = ["fit_sequence", "held_out_parts"]
-
 SPREADS = np.geomspace(0.5, 4.0, 85)
 """Candidates for the factor of the standard deviations, 2.5 % from one to the next."""
 QUANTILE90 = 1.6449

@@ -12,8 +12,6 @@ from retwin.nets.flows import FlowHead
 from retwin.nets.mixtures import MixtureHead
 from retwin.nets.training import Training
 
-__all__ = ["Density", "Flow", "Mixture", "Refinement"]
-
 
 @dataclass(frozen=True)
 class Refinement:

@@ -11,8 +11,6 @@ from retwin.nets.mixtures import BernoulliHead
 from retwin.update.corrections import Context, Discrepancy
 from retwin.update.residual.model import ResidualModel, describe
 
-__all__ = ["Targets"]
-
 DRAWS = 20
 """Draws of z per trajectory from its posterior. They represent the uncertainty that outputs leave;
 with twenty the error of a mean is below a quarter of a standard deviation."""

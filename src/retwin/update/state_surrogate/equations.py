@@ -31,8 +31,6 @@ from retwin.twins.parametric import Parameter
 from retwin.twins.state import State
 from retwin.twins.state_twin import StateTwin
 
-__all__ = ["ChannelScale", "Equations"]
-
 PAST = 10
 """Least number of past samples from which the first estimate of the states is made."""
 STABLE = 0.999

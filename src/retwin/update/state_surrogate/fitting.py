@@ -31,8 +31,6 @@ from retwin.update.state_surrogate.simulations import (
     samplers_of,
 )
 
-__all__ = ["FittedStateSurrogate", "StateSurrogate", "fit_state_surrogate"]
-
 KIND = "state_surrogate"
 MARGIN = 0.25
 """How far beyond the commands of the simulations the surrogate takes commands, in widths of their

@@ -20,8 +20,6 @@ from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.unknowns import unknowns_of
 from retwin.update.state_surrogate.equations import Equations
 
-__all__ = ["Found", "fitted", "relative_error", "searched"]
-
 STRONGEST, WEAKEST, STEP = 0.1, 1e-8, 10.0
 """Variances of the error that are assumed first and last, in those of the outputs, and the ratio of
 one to the next: from a prior so strong that the network begins near 0 to nearly none."""

@@ -19,8 +19,6 @@ from retwin.twins.record_sampler import sampler_from
 from retwin.twins.samplers import CommandSampler, RecordedSampler
 from retwin.twins.twin import Twin, check_channels, checked_commands
 
-__all__ = ["MIN_SIMULATIONS", "Simulations", "check_outputs", "drawn_parameters", "samplers_of"]
-
 MIN_SAMPLES = 20
 """Least number of samples of a simulation: fewer show hardly any memory."""
 MAX_SAMPLES = 100_000
