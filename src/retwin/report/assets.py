@@ -3,8 +3,40 @@
 from __future__ import annotations
 
 from importlib import resources
+from typing import Any
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
+from pydantic_core import from_json, to_json
+
+from retwin.report.style import CHROME, PALETTE, colour_of, symbol
+
+
+def environment() -> Environment:
+    """The templates, with what all pages have in common."""
+    made = Environment(
+        loader=PackageLoader("retwin.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters["one_line"] = lambda text: Markup(" ").join(text.split())
+    made.globals |= {
+        "colour_of": colour_of,
+        "symbol": symbol,
+        "colours": {**{f"c{place}": pair for place, pair in enumerate(PALETTE)}, **CHROME},
+        "style": asset("page.css"),
+        "script": asset("page.js"),
+    }
+    return made
+
+
+def script_json(value: Any) -> Markup:
+    """JSON for a script element, whatever its texts contain; numbers that it lacks are null."""
+    plain = from_json(to_json(value, inf_nan_mode="null"))
+    return htmlsafe_json_dumps(plain, ensure_ascii=False, separators=(",", ":"))
 
 
 def asset(name: str) -> Markup:

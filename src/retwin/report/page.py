@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 import base64
-import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from retwin.report import labels
-from retwin.report.assets import asset, plotly_js
+from retwin.report.assets import asset, environment, plotly_js, script_json
 from retwin.report.blocks import Section
-from retwin.report.figure import Figure, Matrices
 from retwin.report.glossary import explained
 from retwin.report.lights import RATE
-from retwin.report.plotly_specs import panel_spec
+from retwin.report.plotly_specs import figure_specs
 from retwin.report.png import png, small
 from retwin.report.sections import sections_of
 from retwin.report.study import Study, read_study
-from retwin.report.style import CHROME, PALETTE, colour_of, symbol
 from retwin.report.summary import picture, summary
 from retwin.report.verdict import outcome_of, verdict
 from retwin.scores.bootstrap import MIN_RECORDS
@@ -77,7 +69,6 @@ FILTERS = {
     "times": labels.times,
     "outcome": outcome_of,
     "reason": labels.reason,
-    "one_line": lambda text: Markup(" ").join(text.split()),
 }
 """What templates apply to values; see `retwin.report.labels`."""
 
@@ -126,36 +117,27 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
 
 def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes]) -> str:
     """The page as text; `images` take the place of the figures where scripts do not run."""
-    environment = Environment(
-        loader=PackageLoader("retwin.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    units = study.results.outputs.units
-    environment.filters |= FILTERS | {
+    units, templates = study.results.outputs.units, environment()
+    templates.filters |= FILTERS | {
         "scored": lambda value, metric: labels.scored(value, metric, units),
         "difference": lambda each: labels.difference(each, units)[0],
         "interval": lambda each: labels.difference(each, units)[1],
     }
-    environment.globals |= {
+    templates.globals |= {
         "results": study.results,
         "word": study.word,
         "min_runs": MIN_RUNS,
         "min_records": MIN_RECORDS,
         "anchors": {section.key for section in sections},
         "images": {name: base64.b64encode(small(data)).decode() for name, data in images.items()},
-        "colour_of": colour_of,
         "rate": RATE,
         "docs": DOCS,
         "corrections": f"{PAGES}corrections.html",
         "monitor": f"{PAGES}monitor.html",
-        "symbol": symbol,
     }
     bodies = {
         section.key: explained(
-            environment.get_template(f"{section.key}.html.j2").render(section.values)
+            templates.get_template(f"{section.key}.html.j2").render(section.values)
         )
         for section in sections
     }
@@ -163,49 +145,19 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
     front = [found["figure"]] if found and found["figure"] else []
     verdicts = verdict(study)
     first = (
-        environment.get_template("summary.html.j2").render(summary=found, verdict=verdicts)
+        templates.get_template("summary.html.j2").render(summary=found, verdict=verdicts)
         if found
         else ""
     )
-    specs = _specs([*front, *(figure for each in sections for figure in each.figures)])
+    specs = figure_specs([*front, *(figure for each in sections for figure in each.figures)])
     contents = {name: value for each in sections for name, value in each.scripts.items()}
-    return environment.get_template("page.html.j2").render(
+    return templates.get_template("page.html.j2").render(
         sections=sections,
         bodies=bodies,
         verdict=verdicts,
         summary=explained(first),
-        colours={**{f"c{place}": pair for place, pair in enumerate(PALETTE)}, **CHROME},
-        style=asset("page.css"),
-        script=asset("page.js"),
-        specs=_script_json(specs),
-        contents={name: _script_json(content) for name, content in contents.items()},
+        specs=script_json(specs),
+        contents={name: script_json(content) for name, content in contents.items()},
         scripts={name: asset(f"{name}.js") for name in contents},
         plotly=plotly_js() if specs or "explorer" in contents else "",
     )
-
-
-def _specs(figures: Sequence[Figure | Matrices]) -> dict[str, Any]:
-    """Plotly's data by the id of the element that shows them."""
-    return {
-        f"plot-{figure.name}-{place}": panel_spec(panel)
-        for figure in figures
-        if isinstance(figure, Figure)
-        for place, panel in enumerate(figure.panels)
-    }
-
-
-def _script_json(value: Any) -> Markup:
-    """JSON that may stand inside a script element whatever its texts contain."""
-    text = json.dumps(_finite(value), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    for sign in "<>&\u2028\u2029":
-        text = text.replace(sign, f"\\u{ord(sign):04x}")
-    return Markup(text)
-
-
-def _finite(value: Any) -> Any:
-    """The same value with null for numbers that JSON does not have."""
-    if isinstance(value, dict):
-        return {key: _finite(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

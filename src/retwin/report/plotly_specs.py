@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,9 +18,11 @@ from retwin.report.figure import (
     Band,
     Bars,
     Dimension,
+    Figure,
     Heading,
     Line,
     Mark,
+    Matrices,
     Panel,
     Points,
     Row,
@@ -33,6 +35,16 @@ MANY = 4000
 """Samples beyond which a line is drawn as the smallest and the largest value of groups."""
 UPPER, LOWER = [0.38, 1], [0, 0.3]
 """The parts of the height that two rows take."""
+
+
+def figure_specs(figures: Iterable[Figure | Matrices]) -> dict[str, Any]:
+    """Plotly's data by the id of the element that shows them."""
+    return {
+        f"plot-{figure.name}-{place}": panel_spec(panel)
+        for figure in figures
+        if isinstance(figure, Figure)
+        for place, panel in enumerate(figure.panels)
+    }
 
 
 def panel_spec(panel: Panel) -> dict[str, Any]:

@@ -7,13 +7,8 @@ from math import isfinite
 from types import SimpleNamespace
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from jinja2.utils import htmlsafe_json_dumps
-from markupsafe import Markup
-from pydantic_core import from_json, to_json
-
 from retwin.evaluation.identification import Identification, RMSError
-from retwin.report.assets import asset, plotly_js
+from retwin.report.assets import environment, plotly_js, script_json
 from retwin.report.blocks import Cell, Column, Table, columns
 from retwin.report.identification.figures import INPUTS, OUTPUTS, figures
 from retwin.report.identification.texts import (
@@ -28,8 +23,7 @@ from retwin.report.identification.texts import (
     value,
 )
 from retwin.report.labels import counted, duration, p_value
-from retwin.report.plotly_specs import panel_spec
-from retwin.report.style import CHROME, PALETTE, colour_of, symbol
+from retwin.report.plotly_specs import figure_specs
 
 STRONG = 0.9
 """Correlation from which a cell is emphasised."""
@@ -63,33 +57,19 @@ def identification_page(
         The folder in which the page lies, as it was given.
 
     """
-    environment = Environment(
-        loader=PackageLoader("retwin.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {
-        "one_line": lambda text: Markup(" ").join(text.split()),
+    templates = environment()
+    templates.filters |= {
         "counted": counted,
         "duration": duration,
         "significant": significant,
     }
-    environment.globals |= {
+    templates.globals |= {
         "results": SimpleNamespace(emulated=bool(values["emulated"])),
         "anchors": set(),
         "images": {},
-        "colour_of": colour_of,
-        "symbol": symbol,
     }
     drawn = figures(found)
-    specs = {
-        f"plot-{name}-{place}": panel_spec(panel)
-        for name, figure in drawn.items()
-        for place, panel in enumerate(figure.panels)
-    }
-    return environment.get_template("identification.html.j2").render(
+    return templates.get_template("identification.html.j2").render(
         found=found,
         values=values,
         start_values=start_values,
@@ -104,11 +84,7 @@ def identification_page(
         errors=_errors(found),
         tests=_tests(found),
         limited=len(found.outputs) > OUTPUTS or len(found.twin.inputs) > INPUTS,
-        colours={**{f"c{place}": pair for place, pair in enumerate(PALETTE)}, **CHROME},
-        style=asset("page.css"),
-        script=asset("page.js"),
-        # Plotly draws no point for null, which JSON has in place of NaN.
-        specs=htmlsafe_json_dumps(from_json(to_json(specs, inf_nan_mode="null"))),
+        specs=script_json(figure_specs(drawn.values())),
         plotly=plotly_js(),
     )
 
