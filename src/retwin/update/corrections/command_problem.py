@@ -15,10 +15,10 @@ from retwin.inference.problem import CommonError
 from retwin.inference.solver import Bounds
 from retwin.update.corrections.correction import Context, DifferentiableTwin
 from retwin.update.corrections.delays import delay_bounds
-from retwin.update.corrections.effective_commands import effective_commands
-from retwin.update.corrections.warp import gather_samples, interpolate, within
-from retwin.update.kernels.generation import jacobians, linearised_outputs
-from retwin.update.piecewise_linear import distinct
+from retwin.update.corrections.effective_commands import command_jacobians, effective_commands
+from retwin.update.corrections.surrogate_slopes import differences, outputs_at, slopes_at
+from retwin.update.corrections.warp import gather_samples, interpolate, thinned, within
+from retwin.update.kernels.generation import linearised_outputs
 
 SURROGATE_STEP = 0.05
 """Step of finite differences of delays through a surrogate with memory, in samples: larger than the
@@ -133,7 +133,7 @@ class CommandProblem:
         valid = torch.as_tensor(segments.valid)
         bent = (context.faulty_commands != context.commands).any(dim=1)[:, None]
         whole = mask.all(dim=-1)
-        sample, used = _thinned(whole, max_samples)
+        sample, used = thinned(whole, max_samples)
         unit = _unit(context, observed.double()[whole]) if unit is None else unit
         values = torch.where(whole[..., None], observed.double(), 0.0)
         settling = SETTLING * max(delay_range[1], 0.0)
@@ -297,7 +297,11 @@ class CommandProblem:
     @torch.no_grad()
     def gain(self) -> Tensor:
         """Change (n, S, d_y, d_u) of the outputs, in `unit`, by a constant change of a command."""
-        return torch.cat([part._gain() for part, _ in self._batches(self.zero)])
+        made = []
+        for part, zero in self._batches(self.zero):
+            steps = (GAIN_STEP * part.spread).tolist()
+            made.append(differences(part.predicted, part.commands(zero), steps))
+        return torch.cat(made) / self.unit[:, None]
 
     @property
     def _times(self) -> Tensor:
@@ -320,18 +324,6 @@ class CommandProblem:
         columns = values[..., None] if values.ndim == 3 else values
         return (self.whitening @ columns).view_as(values)
 
-    def _gain(self) -> Tensor:
-        commands = self.commands(self.zero)
-        columns = []
-        for actuator, step in enumerate((GAIN_STEP * self.spread).tolist()):
-            ends = []
-            for move in (-step, step):
-                moved = commands.clone()
-                moved[..., actuator] += move
-                ends.append(self.predicted(moved).double())
-            columns.append((ends[1] - ends[0]) / (2 * step))
-        return torch.stack(columns, dim=-1) / self.unit[:, None]
-
     @property
     def spread(self) -> Tensor:
         """Standard deviation (d_u,) of the commands' levels; of constant ones, their size."""
@@ -344,8 +336,7 @@ class CommandProblem:
         commands = self.commands(x)
         if self.memory:
             return self.observed - self.predicted(commands).double() / self.unit
-        different, place = distinct(commands)
-        return self.observed - self.surrogate(different[None])[0, place].double() / self.unit
+        return self.observed - outputs_at(self.surrogate, commands).double() / self.unit
 
     def _linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if self.memory:
@@ -356,8 +347,12 @@ class CommandProblem:
             columns = [(residual - self._residual(x + each)) / each.sum() for each in moves]
             return residual, torch.stack(columns, dim=-1)
         # Without memory the chain rule is local: the surrogate's Jacobian, sample by sample.
-        commands, delay, offset = self._command_jacobians(x)
-        residual, by_command = self._by_command(commands.float())
+        commands, delay, offset = command_jacobians(
+            self._effective, self.per_segment(x), self.missed.shape[2], COMMAND_STEP
+        )
+        outputs, slopes = slopes_at(self.surrogate, commands.float())
+        residual = self.observed - outputs.double() / self.unit
+        by_command = slopes.double() / self.unit[..., None]
         by_delay = torch.einsum("nsyu,nmsu->nsym", by_command, delay)[..., None]
         by_offset = torch.einsum("nsyu,nmsu->nsymu", by_command, offset)
         parts = [by_delay, by_offset]
@@ -386,40 +381,6 @@ class CommandProblem:
         outputs = self.surrogate(different[None])[0, place].double()
         return self.observed - outputs / self.unit, jacobian
 
-    def _by_command(self, commands: Tensor) -> tuple[Tensor, Tensor]:
-        """The residual (n, S, d_y), and the surrogate's Jacobian (n, S, d_y, d_u)."""
-        different, place = distinct(commands)
-        slopes = jacobians(self.surrogate, different)
-        if slopes is not None:
-            outputs = self.surrogate(different[None])[0, place].double()
-            return self.observed - outputs / self.unit, slopes[place].double() / self.unit[:, None]
-        with torch.enable_grad():
-            inputs = different[None].requires_grad_()
-            outputs = self.surrogate(inputs)
-            rows = [
-                torch.autograd.grad(each.sum(), inputs, retain_graph=True)[0]
-                for each in outputs.unbind(dim=-1)
-            ]
-        jacobian = torch.cat(rows).movedim(0, 1)[place].double() / self.unit[..., None]
-        return self.observed - outputs.detach()[0, place].double() / self.unit, jacobian
-
-    def _command_jacobians(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The commands (n, S, d_u), and their Jacobians (n, M, S, d_u) by delays and by offsets.
-
-        An actuator's command depends on its own offset only, so all are moved at once.
-        """
-        n, segments, width = self.missed.shape
-        step = torch.zeros(2, segments, segments, self.size, dtype=x.dtype)
-        index = torch.arange(segments)
-        step[0, index, index, 0] = COMMAND_STEP
-        step[1, index, index, 1 : 1 + width] = COMMAND_STEP
-        moves = torch.cat([torch.zeros_like(step[0, :1]), step.flatten(0, 1)])
-        rows = torch.arange(n).repeat_interleave(len(moves))
-        x = (self.per_segment(x)[:, None] + moves).flatten(0, 1)
-        commands = self._effective(x, rows).unflatten(0, (n, len(moves)))
-        delay, offset = ((commands[:, 1:] - commands[:, :1]) / COMMAND_STEP).split(segments, dim=1)
-        return commands[:, 0], delay, offset
-
     def _effective(self, x: Tensor, rows: Tensor) -> Tensor:
         """Effective commands for x (k, M, size) of the trajectories `rows` (k,), in order."""
         common, own = x.split([1 + self.missed.shape[2], self.size - 1 - self.missed.shape[2]], -1)
@@ -439,20 +400,3 @@ def _unit(context: Context, measured: Tensor) -> Tensor:
     if not len(measured):
         return unit
     return unit * (measured.std(dim=0, correction=0) / unit).mean().clamp_min(1e-12)
-
-
-def _thinned(measured: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """At most `count` evenly chosen samples of each row of `measured` (n, T) bool.
-
-    Each trajectory is thinned by itself: trajectories may be polled at different phases.
-
-    Returns the samples (n, S), where shorter rows repeat their last one, and which of them are no
-    such repetition (n, S) bool. A row without any measurement has only False.
-    """
-    rank = measured.cumsum(dim=1)
-    every = (-(-rank[:, -1:] // count)).clamp_min(1)
-    used = measured & ((rank - 1) % every == 0)
-    kept = used.sum(dim=1, keepdim=True)
-    column = torch.arange(int(kept.amax()) if len(kept) else 0)
-    order = used.byte().argsort(dim=1, descending=True, stable=True)
-    return order.gather(1, column.minimum((kept - 1).clamp_min(0))), column < kept

@@ -18,9 +18,9 @@ from retwin.update.corrections.command_inference import Belief, infer_commands
 from retwin.update.corrections.correction import Context, Discrepancy, Head
 from retwin.update.corrections.delay_range import checked_range, range_in_samples, range_in_seconds
 from retwin.update.corrections.effective_commands import effective_commands
+from retwin.update.corrections.surrogate_slopes import outputs_at
 from retwin.update.corrections.warp import gather_samples
 from retwin.update.kernels.generation import at_effective_commands
-from retwin.update.piecewise_linear import distinct
 
 KINDS = ("offset", "missed")
 
@@ -100,8 +100,7 @@ class CommandSpace:
         )
         if made is not None:
             return made
-        different, place = distinct(_commands(context, z, when))
-        return context.surrogate(different[None])[0, place]
+        return outputs_at(context.surrogate, _commands(context, z, when))
 
     def completed(self, context: Context, observed: Tensor, mask: Tensor) -> CommandSpace:
         """The operator with the range of delays that measured outputs show, where none is given."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -59,6 +61,45 @@ def effective_commands(
     free, stopped = moving.split([times.shape[1], reference.shape[2]], dim=1)
     held = stopped.diagonal(dim1=1, dim2=2)
     return torch.where(times[..., None] < since[:, None], free, held[:, None])
+
+
+def command_jacobians(
+    executed: Callable[[Tensor, Tensor], Tensor], x: Tensor, actuators: int, step: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Effective commands and their Jacobians by delays and by offsets, by differences of `step`.
+
+    An actuator's command depends on its own offset only, so all are moved at once.
+
+    Parameters
+    ----------
+    executed : callable
+        From latent variables (k, M, size) and their trajectories (k,), in order, to commands
+        (k, S, d_u).
+    x : Tensor, shape (n, M, size)
+        Delay and offsets first.
+    actuators : int
+        d_u.
+    step : float
+        Of delays in samples, of offsets in the unit of the commands.
+
+    Returns
+    -------
+    Tensor, shape (n, S, d_u)
+        The commands.
+    Tensor, Tensor, shape (n, M, S, d_u)
+        Their Jacobians by the delay and by the own offset of each segment.
+
+    """
+    n, segments, size = x.shape
+    moved = torch.zeros(2, segments, segments, size, dtype=x.dtype)
+    index = torch.arange(segments)
+    moved[0, index, index, 0] = step
+    moved[1, index, index, 1 : 1 + actuators] = step
+    moves = torch.cat([torch.zeros_like(moved[0, :1]), moved.flatten(0, 1)])
+    rows = torch.arange(n).repeat_interleave(len(moves))
+    commands = executed((x[:, None] + moves).flatten(0, 1), rows).unflatten(0, (n, len(moves)))
+    delay, offset = ((commands[:, 1:] - commands[:, :1]) / step).split(segments, dim=1)
+    return commands[:, 0], delay, offset
 
 
 def _one_by_one(

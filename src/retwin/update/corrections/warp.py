@@ -111,3 +111,20 @@ def within(samples: Tensor, begin: Tensor | NDArray, end: Tensor | NDArray) -> T
     begin, end = (torch.as_tensor(each)[..., None] for each in (begin, end))
     here = samples[..., None, :]
     return (here >= begin) & (here <= end)
+
+
+def thinned(measured: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """At most `count` evenly chosen samples of each row of `measured` (n, T) bool.
+
+    Each trajectory is thinned by itself: trajectories may be polled at different phases.
+
+    Returns the samples (n, S), where shorter rows repeat their last one, and which of them are no
+    such repetition (n, S) bool. A row without any measurement has only False.
+    """
+    rank = measured.cumsum(dim=1)
+    every = (-(-rank[:, -1:] // count)).clamp_min(1)
+    used = measured & ((rank - 1) % every == 0)
+    kept = used.sum(dim=1, keepdim=True)
+    column = torch.arange(int(kept.amax()) if len(kept) else 0)
+    order = used.byte().argsort(dim=1, descending=True, stable=True)
+    return order.gather(1, column.minimum((kept - 1).clamp_min(0))), column < kept
