@@ -17,7 +17,7 @@ from retwin.errors import InputError
 from retwin.serialisation.files import sha256
 
 STATES = {"ok", "warning", "missing", "broken"}
-BACKEND = "retwin.cases.animation.scene.offscreen_backend"
+BACKEND = "retwin.cases.animation.offscreen.offscreen_backend"
 
 
 @pytest.fixture

@@ -316,7 +316,7 @@ def _gpu(deep: bool) -> Check:
 
 
 def _rendering() -> Iterator[Check]:
-    from retwin.cases.animation.scene import offscreen_backend
+    from retwin.cases.animation.offscreen import offscreen_backend
 
     try:
         found = f"MuJoCo draws without a screen by {offscreen_backend().upper()}"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from retwin.cases.animation.captions import captioned
 from retwin.cases.animation.chart import Chart, Layout, charted
 from retwin.cases.animation.film import check_film, write_film
-from retwin.cases.animation.scene import mujoco_pictures
+from retwin.cases.animation.offscreen import mujoco_pictures
 from retwin.cases.animation.shots import Pictures, Shots
 from retwin.cases.animation.sticks import stick_pictures
 from retwin.checks import finite, one_of, require
