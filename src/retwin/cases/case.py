@@ -36,23 +36,19 @@ class Body(Protocol):
     @property
     def joints(self) -> tuple[str, ...]:
         """Names of the joints, as in `model`."""
-        ...
 
     @property
     def model(self) -> Path | None:
         """An MJCF file that has these joints, z upwards; None if only the chain is drawn."""
-        ...
 
     def poses(self, trajectories: Trajectories) -> tuple[NDArray, NDArray]:
         """Joint positions (n, T, joints) in rad or m, nominal and observed.
 
         The observed pose is the one nearest to the nominal pose that gives the observed outputs.
         """
-        ...
 
     def skeleton(self, joints: NDArray) -> NDArray:
         """Points (..., k, 3) in m along the chain, from its root to its tip."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,6 @@ class Diagnoser(Protocol):
     @property
     def classes(self) -> tuple[str, ...]:
         """Class names, in the order of the probabilities."""
-        ...
 
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
         """Class probabilities; labels of the trajectories have no effect.
@@ -43,7 +42,6 @@ class Diagnoser(Protocol):
             If the output channels or the sample rate differ from those of the training set.
 
         """
-        ...
 
 
 class FittedDiagnoser(Diagnoser, Protocol):
@@ -51,7 +49,6 @@ class FittedDiagnoser(Diagnoser, Protocol):
 
     def save(self, folder: str | Path) -> None:
         """Write a folder that `load_diagnoser` reads."""
-        ...
 
 
 class TrainedDiagnoser(FittedDiagnoser, Protocol):
@@ -60,7 +57,6 @@ class TrainedDiagnoser(FittedDiagnoser, Protocol):
     @property
     def fitted(self) -> Fit | None:
         """How its training ended."""
-        ...
 
 
 @runtime_checkable
@@ -89,7 +85,6 @@ class Method(Protocol):
         progress: Progress | None,
     ) -> TrainedDiagnoser:
         """Train a diagnoser; arguments are those of `fit_diagnoser`."""
-        ...
 
 
 def load_diagnoser(folder: str | Path) -> FittedDiagnoser:

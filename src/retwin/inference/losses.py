@@ -14,11 +14,9 @@ class Loss(Protocol):
 
     def value(self, square: Tensor, size: int) -> Tensor:
         """The loss ρ(q) in nats, 0 at q = 0."""
-        ...
 
     def weight(self, square: Tensor, size: int) -> Tensor:
         """The weight 2 ρ'(q) of the sample in reweighted least squares."""
-        ...
 
 
 @dataclass(frozen=True)

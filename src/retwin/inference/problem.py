@@ -46,26 +46,20 @@ class Problem(Protocol):
     @property
     def group(self) -> Tensor:
         """(R, K) long."""
-        ...
 
     @property
     def measured(self) -> Tensor:
         """(R, K)."""
-        ...
 
     @property
     def common(self) -> CommonError | None:
         """None without such an error."""
-        ...
 
     def __getitem__(self, rows: Tensor) -> Problem:
         """The problem of some rows, by their indices."""
-        ...
 
     def residual(self, x: Tensor) -> Tensor:
         """Measured minus predicted outputs (R, K, d) for x (R, P)."""
-        ...
 
     def linearised(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residual, and the Jacobian (R, K, d, P) of the predicted outputs."""
-        ...

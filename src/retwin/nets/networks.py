@@ -42,7 +42,6 @@ class Network(Protocol):
 
     def build(self, inputs: int, outputs: int) -> nn.Module:
         """A module with random initial weights, for so many input and output channels."""
-        ...
 
 
 class Standardise(nn.Module):

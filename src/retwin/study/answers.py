@@ -49,23 +49,18 @@ class Answers(Protocol):
     @property
     def records(self) -> int | None:
         """See `Answers`."""
-        ...
 
     def scores(self, source: str, healthy: int = 0) -> dict[str, list[float]]:
         """Each score of a source, with one value per run; `healthy` as in `Job`."""
-        ...
 
     def drawn(self, source: str, healthy: int = 0) -> dict[str, Draws]:
         """Draws of each compared score's mean over runs; paired between sources."""
-        ...
 
     def details(self, source: str) -> dict[str, Any]:
         """Other entries of a source in `results.json`."""
-        ...
 
     def arrays(self) -> dict[str, NDArray]:
         """Arrays for `arrays.npz`."""
-        ...
 
 
 def answers(work: Work) -> Answers:

@@ -29,7 +29,6 @@ class Fault(Protocol):
     @property
     def label(self) -> str:
         """Class name of the fault."""
-        ...
 
     def drawn(self, rng: np.random.Generator, *, steps: int, segments: int, rate: float) -> Fault:
         """Draw every open severity.
@@ -51,7 +50,6 @@ class Fault(Protocol):
             The same fault with fixed severities.
 
         """
-        ...
 
     def command(self, commands: NDArray, segments: Segments, rate: float) -> NDArray:
         """Reference that the actuators follow under the fault.
@@ -71,7 +69,6 @@ class Fault(Protocol):
             Effective commands.
 
         """
-        ...
 
     def response(self, response: NDArray, rate: float) -> NDArray:
         """Response of the actuators under the fault.
@@ -89,7 +86,6 @@ class Fault(Protocol):
             The response with the fault.
 
         """
-        ...
 
 
 def ends_of(value: Any) -> tuple[float, float]:

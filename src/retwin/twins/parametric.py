@@ -57,7 +57,6 @@ class TakesParameters(Twin, Protocol):
             As `Twin.simulate`, and for unknown parameters and values that are not finite.
 
         """
-        ...
 
 
 @dataclass(frozen=True)

@@ -26,12 +26,10 @@ class CommandSampler(Protocol):
     @property
     def rate(self) -> float:
         """Sample rate in Hz."""
-        ...
 
     @property
     def steps(self) -> int:
         """Samples per trajectory, T."""
-        ...
 
     def sample(
         self, count: int, *, rng: np.random.Generator, onsets: NDArray | None = None
@@ -54,7 +52,6 @@ class CommandSampler(Protocol):
             Commands in the units of the input channels.
 
         """
-        ...
 
 
 @dataclass(frozen=True)

@@ -15,14 +15,11 @@ class System(Protocol):
     @property
     def faults(self) -> Mapping[str, Fault | None]:
         """Fault of each class, None for the healthy class, in the fixed order of the classes."""
-        ...
 
     @property
     def classes(self) -> tuple[str, ...]:
         """Class names in their fixed order."""
-        ...
 
     @property
     def sampler(self) -> CommandSampler:
         """Distribution of the commands."""
-        ...

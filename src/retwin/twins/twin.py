@@ -38,17 +38,14 @@ class Twin(Protocol):
     @property
     def inputs(self) -> Channels:
         """Command channels."""
-        ...
 
     @property
     def outputs(self) -> Channels:
         """Output channels."""
-        ...
 
     @property
     def rate(self) -> float:
         """Sample rate in Hz."""
-        ...
 
     def simulate(
         self,
@@ -86,7 +83,6 @@ class Twin(Protocol):
             Some trajectories could not be simulated; it holds the others.
 
         """
-        ...
 
 
 def checked_commands(commands: ArrayLike, inputs: Channels) -> NDArray:

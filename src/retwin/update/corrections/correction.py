@@ -23,11 +23,9 @@ class DifferentiableTwin(Protocol):
 
     def __call__(self, commands: Tensor) -> Tensor:
         """Outputs (n, T, d_y) for commands (n, T, d_u), differentiable."""
-        ...
 
     def predict(self, commands: NDArray) -> NDArray:
         """The same without gradient."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -204,23 +202,18 @@ class Correction(Protocol):
     @property
     def resolution(self) -> str:
         """What has a z of its own: a "segment", or a "step" (a sample)."""
-        ...
 
     def latent(self, inputs: Channels, outputs: Channels) -> Channels:
         """Names and units of the components of z for a system with these channels."""
-        ...
 
     def heads(self, inputs: Channels, outputs: Channels) -> tuple[Head, ...]:
         """Blocks of z, in order, that the residual model draws independently of each other."""
-        ...
 
     def apply(self, context: Context, z: Tensor) -> Tensor:
         """The corrected output (n, T, d_y): `context.path` when z (n, M, d_z) is 0."""
-        ...
 
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """The z for which `apply` comes closest to `observed` (n, T, d_y) where `mask` is True."""
-        ...
 
 
 def block_diagonal(one: Tensor, other: Tensor) -> Tensor:

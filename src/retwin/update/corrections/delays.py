@@ -34,16 +34,13 @@ class DelayProblem(Problem, Protocol):
     @property
     def segments(self) -> Segments:
         """M at most."""
-        ...
 
     @property
     def sample(self) -> Tensor:
         """(K,) or (R, K)."""
-        ...
 
     def per_segment(self, x: Tensor) -> Tensor:
         """A view of x (R, P) by segment, (R, M, P / M), the delay first."""
-        ...
 
 
 def first_delays(problem: DelayProblem, x: Tensor, delay_range: tuple[float, float]) -> Tensor:
