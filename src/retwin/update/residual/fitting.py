@@ -190,17 +190,8 @@ def fit_residual(
     missing = unmeasured(used)
     if missing:
         warnings.warn(f"calibration: {missing}", stacklevel=2)
-    if isinstance(segments, str):
-        rule, parts = segments, segment(used.commands, used.nominal, segments)
-    else:
-        rule, parts = "commands", segments[keep]
-    require(
-        stepwise or parts.valid.any(),
-        "calibration",
-        expected="trajectories with segments of motion",
-        got="commands that never change",
-        remedy="give segments='path', or the segments themselves",
-    )
+    given = segments if isinstance(segments, str) else segments[keep]
+    rule, parts = _segmented(used, given, needed=not stepwise)
     with training_checked(surrogate, used.commands) as outside:
         context = _context(surrogate, used, parts, faults, twin)
         warn_of_error(context, used)
@@ -224,10 +215,28 @@ def fit_residual(
     model.fitted = _fit_per_segment(
         model, used, context, found, parts.valid, bounds=bounds, seed=seed, progress=progress
     )
-    model.emulated = used.emulated
     onsets = Segments.from_commands(calibration.commands)
     model.timing = np.where(onsets.valid, onsets.start, np.nan)
+    model.emulated = used.emulated
     return _noted(model.eval(), outside, missing)
+
+
+def _segmented(
+    used: Trajectories, segments: Segments | str, *, needed: bool
+) -> tuple[str, Segments]:
+    """The rule by which segments are found, and those of the trajectories, given or found."""
+    if isinstance(segments, str):
+        rule, parts = segments, segment(used.commands, used.nominal, segments)
+    else:
+        rule, parts = "commands", segments
+    require(
+        parts.valid.any() or not needed,
+        "calibration",
+        expected="trajectories with segments of motion",
+        got="commands that never change",
+        remedy="give segments='path', or the segments themselves",
+    )
+    return rule, parts
 
 
 def _fit_per_segment(
