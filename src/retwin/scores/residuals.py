@@ -56,6 +56,11 @@ class Correlogram:
         ratio = np.abs(self.values) / self.limits
         return int(np.argmax(np.nan_to_num(ratio)))
 
+    def thinned(self, count: int) -> Correlogram:
+        """The same at `count` lags at most, the first and the last among them."""
+        kept = np.unique(np.linspace(0, len(self.lags) - 1, count).round().astype(int))
+        return Correlogram(self.lags[kept], self.values[kept], self.limits[kept])
+
 
 @dataclass(frozen=True)
 class Binned:

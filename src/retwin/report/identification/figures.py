@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.evaluation.identification import Identification
 from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Row
 from retwin.scores.residuals import (
+    Correlogram,
     autocorrelation,
     cross_correlation,
     decorrelated_after,
@@ -136,64 +139,50 @@ def _useful(residual: NDArray) -> bool:
     return len(values) > 16 and bool(np.ptp(values) > 0)
 
 
-def _autocorrelations(measured: Trajectories, errors: list[NDArray], shown: list[int]) -> Figure:
-    panels = []
+def _pairs(errors: list[NDArray], shown: list[int]) -> Iterator[tuple[int, list[NDArray]]]:
+    """The useful residuals (n, T) of each output, before and after."""
     for i in shown:
         pair = [each[..., i] for each in errors]
-        if not all(map(_useful, pair)):
-            continue
+        if all(map(_useful, pair)):
+            yield i, pair
+
+
+def _autocorrelations(measured: Trajectories, errors: list[NDArray], shown: list[int]) -> Figure:
+    panels = []
+    for i, pair in _pairs(errors, shown):
         lags = decorrelated_after(pair[1])
         found = [autocorrelation(each, lags) for each in pair]
-        x = found[1].lags / measured.rate
-        at = _thinned(len(x))
-        marks: list[Mark] = [_limits(x[at], found[1].limits[at])]
-        marks += _lines(x[at], [each.values[at] for each in found])
-        panels.append(_correlation_panel(measured.outputs.names[i], "lag", marks))
+        panels.append(_correlation(measured.outputs.names[i], "lag", found, measured.rate))
     return Figure("autocorrelation", panels, [*KEYS, _LIMITS])
 
 
 def _cross_correlations(measured: Trajectories, errors: list[NDArray], shown: list[int]) -> Figure:
     panels = []
-    for i in shown:
-        pair = [each[..., i] for each in errors]
-        if not all(map(_useful, pair)):
-            continue
+    for i, pair in _pairs(errors, shown):
         for j, name in enumerate(measured.inputs.names[:INPUTS]):
             command = measured.commands[..., j].astype(float)
             if np.ptp(command) == 0:
                 continue
             found = [cross_correlation(each, command) for each in pair]
-            x = found[1].lags / measured.rate
-            at = _thinned(len(x))
-            marks: list[Mark] = [_limits(x[at], found[1].limits[at])]
-            marks += _lines(x[at], [each.values[at] for each in found])
             title = f"{measured.outputs.names[i]} with {name}"
-            panels.append(_correlation_panel(title, f"time after {name}", marks))
+            panels.append(_correlation(title, f"time after {name}", found, measured.rate))
     return Figure("crosscorrelation", panels, [*KEYS, _LIMITS])
 
 
 _LIMITS = Key("95 % limits without correlation", "grid", "bar")
 
 
-def _limits(x: NDArray, limits: NDArray) -> Band:
-    return Band(x, -limits, limits, "limits", "muted", 0.25)
-
-
-def _lines(x: NDArray, values: list[NDArray]) -> list[Mark]:
-    first, second = values
-    return [
-        Line(x, first, "before", BEFORE, "dash", 1.4),
-        Line(x, second, "after", AFTER, width=1.8),
+def _correlation(title: str, lag: str, found: list[Correlogram], rate: float) -> Panel:
+    """The correlations before and after, with the limits after."""
+    before, after = (each.thinned(POINTS) for each in found)
+    x = after.lags / rate
+    marks: list[Mark] = [
+        Band(x, -after.limits, after.limits, "limits", "muted", 0.25),
+        Line(x, before.values, "before", BEFORE, "dash", 1.4),
+        Line(x, after.values, "after", AFTER, width=1.8),
     ]
-
-
-def _correlation_panel(title: str, lag: str, marks: list[Mark]) -> Panel:
     y = Axis("correlation", "", (-1.05, 1.05), step=0.5)
     return Panel(Axis(lag, "s"), [Row(y, marks)], f"Correlation of {title}", title, height=280)
-
-
-def _thinned(count: int) -> NDArray:
-    return np.unique(np.linspace(0, count - 1, min(count, POINTS)).round().astype(int))
 
 
 def _spectra(measured: Trajectories, errors: list[NDArray], shown: list[int]) -> Figure:

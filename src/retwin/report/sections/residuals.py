@@ -215,7 +215,9 @@ def _at_lag(found: Correlogram, rate: float, command: str = "") -> tuple[str, st
 
 
 def _autocorrelation(errors: OutputErrors, rate: float) -> Panel:
-    found = {s: _thinned(autocorrelation(e, errors.lags)) for s, e in errors.by_source.items()}
+    found = {
+        s: autocorrelation(e, errors.lags).thinned(POINTS) for s, e in errors.by_source.items()
+    }
     first = next(iter(found.values()))
     x = first.lags / rate
     marks: list[Mark] = [Band(x, -first.limits, first.limits, WHITE.text, "muted", 0.25)]
@@ -233,7 +235,7 @@ def _cross_correlation(errors: OutputErrors, command: ChannelRecords, rate: floa
     marks: list[Mark] = []
     largest = 0.0
     for source, each in errors.by_source.items():
-        found = _thinned(cross_correlation(each, command.values, errors.lags))
+        found = cross_correlation(each, command.values, errors.lags).thinned(POINTS)
         x, colour = found.lags / rate, colour_of(source)
         name = f"95 % limits, {source_name(source)}"
         marks.append(Band(x, -found.limits, found.limits, name, colour, 0.18))
@@ -316,12 +318,6 @@ def _runs(outside: NDArray, edges: NDArray, rate: float) -> Iterator[tuple[float
     ends = np.flatnonzero(np.diff(np.concatenate([[0], held, [0]])))
     for first, last in ends.reshape(-1, 2).tolist():
         yield float(edges[first]), float(edges[last])
-
-
-def _thinned(found: Correlogram) -> Correlogram:
-    """The same at `POINTS` lags at most."""
-    kept = np.unique(np.linspace(0, len(found.lags) - 1, POINTS).round().astype(int))
-    return Correlogram(*(each[kept] for each in (found.lags, found.values, found.limits)))
 
 
 def _line(x: NDArray, y: NDArray, source: str) -> Line:
