@@ -12,6 +12,7 @@ from retwin.scores.distributions import (
     LEVELS,
     central_band,
     crps,
+    crps_normal,
     cumulative_counts,
     further_group_quantile,
     grouped_quantile,
@@ -61,6 +62,13 @@ def test_crps_is_that_of_scoringrules() -> None:
     observed, draws = RNG.normal(size=(7, 3)), RNG.normal(size=(40, 7, 3))
     wanted = scoringrules.crps_ensemble(observed, draws, m_axis=0, estimator="pwm")
     np.testing.assert_allclose(crps(observed, draws), wanted, rtol=1e-12)
+
+
+def test_crps_of_a_normal_is_that_of_scoringrules() -> None:
+    observed, mean, deviation = RNG.normal(size=(3, 7, 3)) * np.array([3, 1, 0]).reshape(3, 1, 1)
+    deviation = deviation + np.geomspace(1e-3, 1e3, 21).reshape(7, 3)
+    wanted = scoringrules.crps_normal(observed, mean, deviation)
+    np.testing.assert_allclose(crps_normal(observed, mean, deviation), wanted, rtol=1e-12)
 
 
 def test_the_pit_of_exchangeable_members_is_uniform_with_ties_too() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-import scoringrules
 from numpy.typing import NDArray
 
 from retwin.checks import require
@@ -19,6 +18,7 @@ from retwin.monitor.samples import SECOND
 from retwin.monitor.store import Store
 from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.monitor.trajectory_comparison import compared_trajectories
+from retwin.scores.distributions import crps_normal
 
 __all__ = ["compare"]
 
@@ -107,7 +107,7 @@ def _compared_streams(
         known = np.where(np.isfinite(seen[0].score) & np.isfinite(seen[1].score), measured, np.nan)
         unit = np.nanstd(measured, axis=1, keepdims=True)
         unit = np.where(unit > 0, unit, 1.0)
-        found = [scoringrules.crps_normal(known, each.mean, each.deviation) for each in seen]
+        found = [crps_normal(known, each.mean, each.deviation) for each in seen]
         scores.append([_mean((each / unit)[0]) for each in found])
         alarms += len(seen[1].alarms)
         if reference is not None:

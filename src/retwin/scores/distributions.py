@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from retwin.checks import one_of
 
@@ -82,6 +83,31 @@ def crps(observed: NDArray, draws: NDArray) -> NDArray:
     rank = np.arange(count).reshape(-1, *[1] * (draws.ndim - 1))
     spread = (rank * np.sort(draws, axis=0)).sum(axis=0) / (count * (count - 1.0))
     return np.abs(draws - observed).mean(axis=0) + draws.mean(axis=0) - 2 * spread
+
+
+def crps_normal(observed: NDArray, mean: NDArray, deviation: NDArray) -> NDArray:
+    """Continuous ranked probability score of each value for a normal distribution, in its unit.
+
+    Parameters
+    ----------
+    observed, mean, deviation : NDArray
+        Values (...), and the mean and the standard deviation that are predicted of each, above 0.
+
+    Returns
+    -------
+    NDArray
+        Scores (...), NaN where a value is missing.
+
+    References
+    ----------
+    Gneiting, Raftery, Westveld and Goldman, "Calibrated probabilistic forecasting using ensemble
+    model output statistics", Monthly Weather Review 133 (2005), equation 5.
+
+    """
+    distance = (observed - mean) / deviation
+    density = np.exp(-0.5 * distance**2) / np.sqrt(2 * np.pi)
+    unit: NDArray = distance * (2 * ndtr(distance) - 1) + 2 * density - 1 / np.sqrt(np.pi)
+    return deviation * unit
 
 
 def log_score(observed: NDArray, draws: NDArray) -> NDArray:
