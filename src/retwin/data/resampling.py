@@ -84,5 +84,4 @@ def _means(at: NDArray, values: NDArray, grid: NDArray, period: float) -> NDArra
     until = np.append(at, max(at[-1], grid[-1]) + period)
     area = np.concatenate([[0.0], np.cumsum(values * np.diff(until))])
     means = (np.interp(grid + period, until, area) - np.interp(grid, until, area)) / period
-    clipped: NDArray = np.clip(means, values.min(), values.max())  # against rounding
-    return clipped
+    return np.clip(means, values.min(), values.max())  # against rounding

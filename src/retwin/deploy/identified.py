@@ -132,8 +132,7 @@ def identification_values(found: Identification, opened: OpenedTwin, logs: Logs)
     else:
         about["loss"] = result.loss
         about["starts"] = [asdict(each) for each in result.starts]
-    made: dict[str, Any] = to_jsonable_python(_plain(about), inf_nan_mode="null")
-    return made
+    return to_jsonable_python(_plain(about), inf_nan_mode="null")
 
 
 def start_values(twin: ParametricTwin) -> dict[str, float]:

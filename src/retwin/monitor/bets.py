@@ -98,8 +98,7 @@ class Tails:
     def log_bet(self, score: NDArray, previous: float, kappa: float) -> NDArray:
         """Likelihood ratio of the contaminated Gaussian distribution."""
         wide = np.exp((1 - self.ratio**-2) / 2 * (score / kappa) ** 2) / self.ratio
-        made: NDArray = np.log1p(self.share * (wide - 1))
-        return made
+        return np.log1p(self.share * (wide - 1))
 
 
 @dataclass(frozen=True)
@@ -179,8 +178,7 @@ class Bets:
     def offset(self, which: NDArray, previous: NDArray) -> NDArray:
         """Where the edges of a class and of a score before begin."""
         level = np.rint(np.clip(previous, -LEVELS, LEVELS)).astype(np.intp) + LEVELS
-        made: NDArray = (which * (2 * LEVELS + 1) + level) * len(EDGES)
-        return made
+        return (which * (2 * LEVELS + 1) + level) * len(EDGES)
 
 
 def _bets(alternative: Alternative, slack: Slack, levels: NDArray) -> NDArray:

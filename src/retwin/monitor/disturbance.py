@@ -70,8 +70,7 @@ class Disturbance:
     @property
     def parameters(self) -> NDArray:
         """Number of estimated parameters (streams,) that shift predictions."""
-        made: NDArray = np.count_nonzero(self.coefficients, axis=1) + 2
-        return made
+        return np.count_nonzero(self.coefficients, axis=1) + 2
 
     def start(self) -> DisturbanceState:
         """The stationary state, before the first sample."""

@@ -285,8 +285,7 @@ class Monitor:
         low, high = domain.low[states:], domain.high[states:]
         largest = np.maximum(high - low, np.maximum(np.abs(low), np.abs(high)))
         far = IMPLAUSIBLE * np.where(largest > 0, largest, np.inf)
-        made: NDArray = np.isfinite(commands) & ((commands < low - far) | (commands > high + far))
-        return made
+        return np.isfinite(commands) & ((commands < low - far) | (commands > high + far))
 
     @cached_property
     def _filters(self) -> tuple[OnlineFilter, ...]:

@@ -187,5 +187,4 @@ def _degrees(errors: NDArray) -> NDArray:
 def _log_density(error: NDArray, degrees: float) -> NDArray:
     """Log density of Student's t with a variance of 1."""
     scale = np.sqrt(1 - 2 / degrees)
-    made: NDArray = student.logpdf(error / scale, degrees) - np.log(scale)
-    return made
+    return student.logpdf(error / scale, degrees) - np.log(scale)

@@ -57,8 +57,7 @@ class Predictor:
 
     def late(self, samples: NDArray, steps: int, rate: float) -> NDArray:
         """Whether evidence of the next samples (n, steps) counts, after so many before (n,)."""
-        made: NDArray = samples[:, None] + np.arange(steps) >= round(self.warm_up * rate)
-        return made
+        return samples[:, None] + np.arange(steps) >= round(self.warm_up * rate)
 
 
 def standardised(

@@ -170,8 +170,7 @@ def fit_scores(errors: ArrayLike, width: ArrayLike = 0.0) -> ConformalScores:
 
 def middle(low: NDArray, high: NDArray) -> NDArray:
     """Middles of intervals of scores, each end from -4 to 4: larger ones are not distinguished."""
-    made: NDArray = (np.clip(low, -FARTHEST, FARTHEST) + np.clip(high, -FARTHEST, FARTHEST)) / 2
-    return made
+    return (np.clip(low, -FARTHEST, FARTHEST) + np.clip(high, -FARTHEST, FARTHEST)) / 2
 
 
 def resolution(measured: ArrayLike) -> NDArray:

@@ -147,8 +147,7 @@ def effective_samples(scores: NDArray) -> NDArray:
     )
     ranks = np.where(np.isfinite(scores), np.clip(scores, -3, 3), np.nan)
     found = [_independent(each) for each in (ranks, np.abs(ranks))]
-    made: NDArray = np.minimum(*found)
-    return made
+    return np.minimum(*found)
 
 
 def _independent(values: NDArray) -> NDArray:
@@ -169,5 +168,4 @@ def _independent(values: NDArray) -> NDArray:
     limit = 2 * np.sqrt(2 / np.maximum(count, 1))[:, None]
     kept = np.logical_and.accumulate(paired > limit, axis=1)
     time = 1 + 2 * np.sum(np.where(kept, paired, 0.0), axis=1)
-    made: NDArray = count / time
-    return made
+    return count / time

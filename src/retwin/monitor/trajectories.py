@@ -223,8 +223,7 @@ class TrajectoryMonitor:
         """Whether trajectories (n,) were measured otherwise than those of the calibration."""
         fewest, most = self.measured
         other = (found.measured * COMPARABLE < fewest) | (found.measured > COMPARABLE * most)
-        made: NDArray = other.any(axis=1) & ~found.unmeasured
-        return made
+        return other.any(axis=1) & ~found.unmeasured
 
     def _factors(self, found: Compared) -> Iterator[tuple[NDArray | None, NDArray | None]]:
         """Per trajectory, factors of the evidence for faults and for biases; None for no news."""

@@ -73,8 +73,7 @@ class Compared:
     @property
     def unmeasured(self) -> NDArray:
         """Whether nothing was measured, (n,) bool."""
-        made: NDArray = np.asarray(~self.measured.any(axis=1))
-        return made
+        return np.asarray(~self.measured.any(axis=1))
 
 
 def checked(diagnoser: object) -> Inversion:
@@ -143,8 +142,7 @@ def factors(ratio: NDArray, kappa: float) -> NDArray:
     """Likelihood ratios for errors that may be `kappa` times as large, from their logarithms."""
     logs = np.clip(ratio / kappa**2, -np.inf, 1e300)  # infinite ones have no differences
     logs -= np.maximum(logs.max(axis=1, keepdims=True) - LARGEST_RATIO, 0.0)
-    made: NDArray = np.exp(logs)
-    return made
+    return np.exp(logs)
 
 
 def _diagnosed(

@@ -179,8 +179,7 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
     def _with(self, samples: Samples) -> NDArray:
         """The newest trajectories, with one more."""
         new = np.array([[*samples.times[[0, -1]], len(samples.times)]], dtype=np.int64)
-        made: NDArray = np.concatenate([self._known, new])[-REMEMBERED:]
-        return made
+        return np.concatenate([self._known, new])[-REMEMBERED:]
 
     def _alarm(self, found: Diagnosed, watched: WatchedTrajectories, number: int) -> dict[str, Any]:
         """An alarm with its cause, which is known at once."""

@@ -109,8 +109,7 @@ class Validity:
 
     def void(self, state: ValidityState) -> NDArray:
         """Whether the promise of each stream is void (streams,); it stays so."""
-        made: NDArray = state.highest >= 1 / self.alpha
-        return made
+        return state.highest >= 1 / self.alpha
 
     def step(
         self,

@@ -182,5 +182,4 @@ def to_nanoseconds(times: NDArray, unit: str, where: str) -> NDArray:
             got=f"{times[row]} {unit} in row {row}",
             remedy="check column and unit of [time] in the mapping",
         )
-    made: NDArray = scaled.astype(np.int64)
-    return made
+    return scaled.astype(np.int64)

@@ -97,8 +97,7 @@ def converted(values: NDArray, source: str, target: str, where: str) -> NDArray:
         got=repr(source),
         remedy="convert it before, or map another signal",
     )
-    made: NDArray = offset + slope * values
-    return made
+    return offset + slope * values
 
 
 def _unit(text: str) -> Any:

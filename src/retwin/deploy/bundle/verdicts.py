@@ -70,8 +70,7 @@ class Verdicts:
     @property
     def max_score(self) -> NDArray:
         """The largest score of each trajectory (n,), infinite if one is not finite."""
-        largest: NDArray = self._ordered.max(axis=1)
-        return largest
+        return self._ordered.max(axis=1)
 
     @property
     def verdict(self) -> NDArray:
@@ -338,8 +337,7 @@ def _subset(trajectories: Trajectories, rows: NDArray) -> Trajectories:
 def are_probabilities(values: NDArray) -> NDArray:
     """Flags (n,) of the rows (n, classes) that are between 0 and 1 and sum to 1; NaN is false."""
     between = np.all((values >= 0) & (values <= 1), axis=1)
-    sound: NDArray = between & (np.abs(values.sum(axis=1) - 1) <= SUM_TOLERANCE)
-    return sound
+    return between & (np.abs(values.sum(axis=1) - 1) <= SUM_TOLERANCE)
 
 
 def _excess(values: NDArray, low: Any, high: Any, mask: NDArray | None = None) -> NDArray:
@@ -348,8 +346,7 @@ def _excess(values: NDArray, low: Any, high: Any, mask: NDArray | None = None) -
     if mask is not None:
         values = np.where(mask, values, low)
     least, greatest, _ = extremes(values)
-    farthest: NDArray = excess(least, greatest, low, high).max(axis=1)
-    return farthest
+    return excess(least, greatest, low, high).max(axis=1)
 
 
 def _nonzero(sizes: NDArray) -> NDArray:

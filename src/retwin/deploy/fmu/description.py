@@ -268,5 +268,4 @@ def build_description(identifier: str) -> bytes:
 
 def _written(root: Element) -> bytes:
     indent(root)
-    made: bytes = tostring(root, encoding="UTF-8", xml_declaration=True)
-    return made
+    return tostring(root, encoding="UTF-8", xml_declaration=True)

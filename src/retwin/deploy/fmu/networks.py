@@ -119,5 +119,4 @@ def _gates(memory: nn.LSTM, layer: int) -> NDArray:
 
 def flat(values: Tensor) -> NDArray:
     """The numbers of a tensor, in double precision."""
-    made: NDArray = values.detach().double().flatten().numpy()
-    return made
+    return values.detach().double().flatten().numpy()
