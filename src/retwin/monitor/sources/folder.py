@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import glob
-import itertools
 import threading
-from collections.abc import Callable, Mapping
+from abc import abstractmethod
+from collections.abc import Callable, Collection, Mapping
+from itertools import takewhile
 from pathlib import Path
-
-import numpy as np
 
 from retwin.errors import InputError
 from retwin.monitor.gate import Gate
@@ -17,15 +16,66 @@ from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.mapped_tables import MappedLayout
 from retwin.monitor.sources.source import Source
 from retwin.monitor.sources.tables import Layout, Table
+from retwin.monitor.updates import LEAST
 
-__all__ = ["Folder", "base_of"]
+__all__ = ["Files", "Folder"]
 
 LATE = 60 * 10**9
 """Nanoseconds before the newest stored sample from which rows are sent again after a restart: what
 is older is not used any more, and what is stored already is recognised."""
 
 
-class Folder(Source):
+class Files(Source):
+    """The files of a pattern, of one machine or of several.
+
+    Parameters
+    ----------
+    kind : str
+        What lines that are reported begin with, before the pattern.
+    settings : FolderSource
+        Its pattern is absolute.
+    assets : collection of str
+        The machines.
+    newest : mapping of str to int
+        Time of the newest stored sample of each machine that has any, in ns.
+    report : callable
+        Takes a line about an event.
+
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        settings: FolderSource,
+        assets: Collection[str],
+        newest: Mapping[str, int],
+        report: Callable[[str], None],
+    ) -> None:
+        super().__init__(f"{kind} {settings.files}", report)
+        self._settings = settings
+        self._assets = assets
+        self._newest = newest
+
+    def run(self, gate: Gate, stop: threading.Event) -> None:
+        """Read the files again and again, until `stop` is set."""
+        while not stop.is_set():
+            for asset in self._assets:
+                pattern = self._settings.files.replace("{asset}", glob.escape(asset))
+                parts = Path(pattern).parts[:-1]
+                base = Path(*takewhile(lambda part: not glob.has_magic(part), parts))
+                if base.is_dir():
+                    self.back()
+                    self._read(asset, sorted(glob.glob(pattern, recursive=True)), gate, stop)
+                else:
+                    self.lost(f"there is no folder {base}")
+            stop.wait(self._settings.every)
+
+    @abstractmethod
+    def _read(self, asset: str, paths: list[str], gate: Gate, stop: threading.Event) -> None:
+        """Send what is new in the files of a machine."""
+
+
+class Folder(Files):
     """The files of a pattern, as samples of one machine or of several.
 
     Files of a machine are read in the order of their first unread rows. How far each was read is
@@ -51,33 +101,18 @@ class Folder(Source):
         newest: Mapping[str, int],
         report: Callable[[str], None],
     ) -> None:
-        super().__init__(f"folder {settings.files}", report)
-        self._settings = settings
+        super().__init__("folder", settings, layouts, newest, report)
         self._layouts = layouts
-        self._newest = newest
         self._tables: dict[tuple[str, str], Table] = {}
 
-    def run(self, gate: Gate, stop: threading.Event) -> None:
-        """Read the files again and again, until `stop` is set."""
-        while not stop.is_set():
-            for asset, layout in self._layouts.items():
-                pattern = self._settings.files.replace("{asset}", glob.escape(asset))
-                base = base_of(pattern)
-                if base.is_dir():
-                    self.back()
-                    self._read(asset, self._changed(asset, pattern, layout), gate, stop)
-                else:
-                    self.lost(f"there is no folder {base}")
-            stop.wait(self._settings.every)
-
-    def _changed(self, asset: str, pattern: str, layout: Layout | MappedLayout) -> list[Table]:
+    def _changed(self, asset: str, paths: list[str]) -> list[Table]:
         """The files of a machine that were written to, in the order of their new rows."""
-        paths = glob.glob(pattern, recursive=True)
         for key in [key for key in self._tables if key[0] == asset and key[1] not in paths]:
             del self._tables[key]
         found = []
-        for path in sorted(paths):
-            table = self._tables.setdefault((asset, path), layout.table(Path(path)))
+        for path in paths:
+            table = self._layouts[asset].table(Path(path))
+            table = self._tables.setdefault((asset, path), table)
             try:
                 if table.changed():
                     first = next((rows.times[0] for rows in table.rows() if len(rows.times)), None)
@@ -88,18 +123,13 @@ class Folder(Source):
                 self._refuse_file(error)
         return [table for _, _, table in sorted(found, key=lambda each: each[:2])]
 
-    def _read(self, asset: str, tables: list[Table], gate: Gate, stop: threading.Event) -> None:
-        for table in tables:
+    def _read(self, asset: str, paths: list[str], gate: Gate, stop: threading.Event) -> None:
+        for table in self._changed(asset, paths):
             try:
                 for rows in table.rows():
                     for reason in rows.bad:
                         self.refuse(reason)
-                    known = self._newest.get(asset)
-                    new = (
-                        np.ones(len(rows.times), bool)
-                        if known is None
-                        else rows.times > known - LATE
-                    )
+                    new = rows.times > self._newest.get(asset, LEAST + LATE) - LATE
                     samples = Samples(asset, rows.times[new], rows.values[new])
                     if new.any() and not self.stored(gate, samples, stop):
                         return
@@ -110,10 +140,3 @@ class Folder(Source):
     def _refuse_file(self, error: InputError) -> None:
         self.refused += 1
         self._report(f"{self.name}: {error}")
-
-
-def base_of(pattern: str) -> Path:
-    """The folder that a pattern begins with."""
-    parts = Path(pattern).parts[:-1]
-    fixed = itertools.takewhile(lambda part: not glob.has_magic(part), parts)
-    return Path(*fixed)

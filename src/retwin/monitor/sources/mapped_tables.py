@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from retwin.data.logs.text_tables import (
 from retwin.data.logs.units import same_unit
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError, brief
-from retwin.monitor.sources.tables import ROWS, TAIL, Rows, Table, TextTable
+from retwin.monitor.sources.tables import ROWS, Rows, Table, TextTable
 
 __all__ = ["MappedCsv", "MappedLayout", "MappedParquet", "mapped_layout"]
 
@@ -210,16 +211,6 @@ def _check_stream(mapping: LogMapping, rate: float) -> None:
     )
 
 
-@dataclass(frozen=True)
-class _Place:
-    """How far a table was read: bytes, those before, its layout, and `MappedLayout.known`."""
-
-    offset: int
-    tail: bytes
-    text: TextLayout
-    since: NDArray
-
-
 class MappedCsv(TextTable):
     """A text table of any separator, with units, decimal commas and lines above its header.
 
@@ -228,26 +219,22 @@ class MappedCsv(TextTable):
 
     layout: MappedLayout
 
-    def _parsed(self, text: bytes, place: _Place | None) -> Rows:
-        tail = ((place.tail if place else b"") + text)[-TAIL:]
-        offset = (place.offset if place else 0) + len(text)
-        layout = place.text if place else None
+    def _parsed(self, text: bytes, known: tuple[TextLayout, NDArray] | None) -> Rows | None:
+        layout, since = known or (None, np.full(self.layout.commands, NEVER))
         encoding = layout.encoding if layout else _encoding(text)
         lines = text.decode(encoding, "replace").removeprefix("\ufeff").split("\n")
         if layout is None:
             layout = self._begun(lines, encoding)
             if layout is None:
-                nothing = np.empty((0, len(self.layout.channels)))
-                return Rows(np.empty(0, np.int64), nothing, [], None)
+                return None
             lines = lines[layout.first :]
         rows, bad = self._cells(lines, layout)
         if not layout.comma and decimal_comma(rows, layout.separator):
             layout = replace(layout, comma=True)
         times, kept, odd = self._times(rows, layout)
         values, missing = self._values([rows[i] for i in kept], layout)
-        since = place.since if place else np.full(self.layout.commands, NEVER)
         values, since = self.layout.known(times, values, since)
-        return Rows(times, values, [*bad, *odd, *missing], _Place(offset, tail, layout, since))
+        return Rows(times, values, [*bad, *odd, *missing], (layout, since))
 
     def _begun(self, lines: Sequence[str], encoding: str) -> TextLayout | None:
         """How the table is written; None if it has titles and no row yet."""
@@ -323,22 +310,17 @@ class MappedCsv(TextTable):
         unit = layout.units[at] or unit_in(name)
         where = f"{self.path.name}, column {name!r}"
         cells = np.array([row[at] for row in rows], np.str_)
-        if not len(cells):
-            return np.empty(0, np.int64), [], []
-        try:
-            found, kept = row_times(cells, unit, clock, where), list(range(len(cells)))
-        except InputError:  # a row or more
-            parts, kept = [], []
-            bad = []
-            for row, cell in enumerate(cells):
-                try:
-                    parts.append(row_times(cells[row : row + 1], unit, clock, where))
-                    kept.append(row)
-                except InputError as error:
-                    bad.append(f"time {str(cell)[:80]!r} in {self.path.name} ({error.expected})")
-            found = np.concatenate([np.empty(0, np.int64), *parts])
-            return found + self.layout.offset, kept, bad
-        return found + self.layout.offset, kept, []
+        with suppress(InputError):  # of a row or more
+            found = row_times(cells, unit, clock, where)
+            return found + self.layout.offset, list(range(len(cells))), []
+        parts, kept, bad = [np.empty(0, np.int64)], [], []
+        for row, cell in enumerate(cells):
+            try:
+                parts.append(row_times(cells[row : row + 1], unit, clock, where))
+                kept.append(row)
+            except InputError as error:
+                bad.append(f"time {str(cell)[:80]!r} in {self.path.name} ({error.expected})")
+        return np.concatenate(parts) + self.layout.offset, kept, bad
 
     def _values(
         self, rows: Sequence[Sequence[str]], layout: TextLayout
@@ -360,15 +342,6 @@ class MappedParquet(Table):
     """A Parquet file, which is written anew when it grows."""
 
     layout: MappedLayout
-
-    def rows(self) -> Iterator[Rows]:
-        """New rows part by part; see `Table`."""
-        try:
-            yield from self._rows()
-        except Exception as error:  # of pyarrow, whose classes are many
-            if isinstance(error, InputError):
-                raise
-            raise self.refusing(error) from None
 
     def _rows(self) -> Iterator[Rows]:
         own = self.layout

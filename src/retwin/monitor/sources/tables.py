@@ -6,7 +6,7 @@ import csv
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
@@ -144,73 +144,68 @@ class Table(ABC):
         before, self._seen = self._seen, now
         return before != now
 
-    @abstractmethod
     def rows(self) -> Iterator[Rows]:
         """New rows part by part; after each, set `place` to its end to have read it.
 
         Where the file was replaced or truncated, or its begin was changed, all rows are new again.
         Raises InputError where it is no table, or lacks a column.
         """
+        try:
+            yield from self._rows()
+        except InputError:
+            raise
+        except Exception as error:  # of the libraries too, whose classes are many
+            raise InputError(
+                str(self.path),
+                expected=f"a table with columns {', '.join(self.layout.wanted)}",
+                got=f"{type(error).__name__}: {brief(error)}",
+                remedy="correct it, or name the columns as the file does",
+            ) from None
 
-    def refusing(self, error: Exception) -> InputError:
-        """The error about a file that cannot be read."""
-        return InputError(
-            str(self.path),
-            expected=f"a table with columns {', '.join(self.layout.wanted)}",
-            got=f"{type(error).__name__}: {brief(error)}",
-            remedy="correct it, or name the columns as the file does",
-        )
+    @abstractmethod
+    def _rows(self) -> Iterator[Rows]:
+        """See `rows`; any exception is turned into an InputError there."""
 
 
 @dataclass(frozen=True)
 class _Place:
-    """How far a CSV file was read: bytes, those before, and the number of cells' columns."""
+    """How far a text table was read: bytes, those before, and what is known of the table."""
 
-    offset: int
-    tail: bytes
-    header: tuple[str, ...]
+    offset: int = 0
+    tail: bytes = b""
+    known: Any = None
 
 
 class TextTable(Table):
-    """Rows of text. An incomplete last one waits for its end.
-
-    A place has the bytes that were read, `offset`, and those before, `tail`.
-    """
+    """Rows of text. An incomplete last one waits for its end."""
 
     @abstractmethod
-    def _parsed(self, text: bytes, place: Any) -> Rows:
-        """Complete lines from a place on; the end is None if they hold no row yet."""
+    def _parsed(self, text: bytes, known: Any) -> Rows | None:
+        """Complete lines, and what is known of the table after them as the end.
 
-    def rows(self) -> Iterator[Rows]:
-        """New rows part by part; see `Table`."""
-        try:
-            with self.path.open("rb") as file:
-                place = self._kept(file)
-                while True:
-                    file.seek(place.offset if place else 0)
-                    chunk = file.read(CHUNK)
-                    text = chunk[: chunk.rfind(b"\n") + 1]
-                    if not text:
-                        if len(chunk) == CHUNK:
-                            raise ValueError(f"a row of more than {CHUNK} bytes")
-                        return
-                    made = self._parsed(text, place)
-                    yield made
-                    place = made.end
-                    if place is None:
-                        return
-        except (OSError, ValueError, csv.Error) as error:
-            if isinstance(error, InputError):
-                raise
-            raise self.refusing(error) from None
+        `known` is None at the begin of the file. None is returned if the lines hold no row yet.
+        """
 
-    def _kept(self, file: Any) -> Any:
+    def _rows(self) -> Iterator[Rows]:
+        with self.path.open("rb") as file:
+            place = self._kept(file)
+            while True:
+                file.seek(place.offset)
+                chunk = file.read(CHUNK)
+                text = chunk[: chunk.rfind(b"\n") + 1]
+                if len(chunk) == CHUNK and not text:
+                    raise ValueError(f"a row of more than {CHUNK} bytes")
+                made = self._parsed(text, place.known) if text else None
+                if made is None:
+                    return
+                place = _Place(place.offset + len(text), (place.tail + text)[-TAIL:], made.end)
+                yield replace(made, end=place)
+
+    def _kept(self, file: Any) -> _Place:
         """How far the file was read, if it still is the same up to there."""
-        place = self.place
-        if place is None:
-            return None
+        place = self.place or _Place()
         file.seek(place.offset - len(place.tail))
-        return place if file.read(len(place.tail)) == place.tail else None
+        return place if file.read(len(place.tail)) == place.tail else _Place()
 
 
 class Csv(TextTable):
@@ -218,18 +213,15 @@ class Csv(TextTable):
 
     layout: Layout
 
-    def _parsed(self, text: bytes, place: _Place | None) -> Rows:
-        tail = ((place.tail if place else b"") + text)[-TAIL:]
-        offset = (place.offset if place else 0) + len(text)
+    def _parsed(self, text: bytes, known: tuple[str, ...] | None) -> Rows:
         lines = text.decode("utf-8", "replace").split("\n")
-        if place is None:
+        header = known or ()
+        if known is None:
             header = tuple(next(csv.reader([lines[0].removeprefix("\ufeff")])))
             missing = [each for each in self.layout.wanted if each not in header]
             if missing:
                 raise ValueError(f"no column {', '.join(missing)} in its header")
             lines = lines[1:]
-        else:
-            header = place.header
         at = {name: header.index(name) for name in self.layout.wanted}
         times: list[int] = []
         cells: list[list[float]] = []
@@ -249,8 +241,7 @@ class Csv(TextTable):
                 bad.append(f"{line[:80]!r} in {self.path.name} ({brief(error)})")
         table = np.array(cells, dtype=float).reshape(len(cells), len(at))
         values = self.layout.values(dict(zip(at, table.T, strict=True)))
-        stamps = np.array(times, dtype=np.int64)
-        return Rows(stamps, values, bad, _Place(offset, tail, header))
+        return Rows(np.array(times, dtype=np.int64), values, bad, header)
 
 
 class Parquet(Table):
@@ -258,24 +249,19 @@ class Parquet(Table):
 
     layout: Layout
 
-    def rows(self) -> Iterator[Rows]:
+    def _rows(self) -> Iterator[Rows]:
         parquet = needs_extra("pyarrow.parquet", "parquet", "reads Parquet files")
-        try:
-            with parquet.ParquetFile(self.path) as file:
-                clock = file.read(columns=[self.layout.time]).column(0)
-                done, last = self.place or (0, None)
-                if done > len(clock) or (done and clock[done - 1].as_py() != last):
-                    done = 0  # another file
-                first = 0
-                for batch in file.iter_batches(ROWS, columns=self.layout.wanted):
-                    first, begin = first + batch.num_rows, first
-                    if first > done:
-                        part = batch.slice(max(0, done - begin))
-                        yield self._converted(part, (first, clock[first - 1].as_py()))
-        except Exception as error:  # of pyarrow, whose classes are many
-            if isinstance(error, InputError):
-                raise
-            raise self.refusing(error) from None
+        with parquet.ParquetFile(self.path) as file:
+            clock = file.read(columns=[self.layout.time]).column(0)
+            done, last = self.place or (0, None)
+            if done > len(clock) or (done and clock[done - 1].as_py() != last):
+                done = 0  # another file
+            first = 0
+            for batch in file.iter_batches(ROWS, columns=self.layout.wanted):
+                first, begin = first + batch.num_rows, first
+                if first > done:
+                    part = batch.slice(max(0, done - begin))
+                    yield self._converted(part, (first, clock[first - 1].as_py()))
 
     def _converted(self, batch: Any, end: Any) -> Rows:
         cells = {

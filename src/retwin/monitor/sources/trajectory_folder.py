@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import os
 import threading
 import time
@@ -19,10 +18,10 @@ from retwin.errors import InputError
 from retwin.monitor.gate import Gate
 from retwin.monitor.samples import LONGEST, SECOND, Trajectory
 from retwin.monitor.settings import FolderSource
-from retwin.monitor.sources.folder import base_of
-from retwin.monitor.sources.source import Source
+from retwin.monitor.sources.folder import Files
 from retwin.monitor.sources.tables import layout_of
 from retwin.monitor.trajectories import TrajectoryMonitor
+from retwin.monitor.updates import LEAST
 from retwin.twins.twin import check_channels
 
 __all__ = ["Recorded", "TrajectoryFolder"]
@@ -36,7 +35,7 @@ class Recorded:
     case: Case | None = None
 
 
-class TrajectoryFolder(Source):
+class TrajectoryFolder(Files):
     """The files of a pattern, as trajectories of one machine or of several.
 
     A file is read once it is complete: its last change was `settle` seconds ago, by the clock or as
@@ -64,26 +63,11 @@ class TrajectoryFolder(Source):
         newest: Mapping[str, int],
         report: Callable[[str], None],
     ) -> None:
-        super().__init__(f"trajectories {settings.files}", report)
-        self._settings = settings
+        super().__init__("trajectories", settings, machines, newest, report)
         self._machines = machines
-        self._newest = newest
         self._seen: dict[tuple[str, str], tuple[tuple[int, ...], float]] = {}
         """What a file was, and since when."""
         self._done: dict[tuple[str, str], tuple[int, ...]] = {}
-
-    def run(self, gate: Gate, stop: threading.Event) -> None:
-        """Read files that are complete, until `stop` is set."""
-        while not stop.is_set():
-            for asset in self._machines:
-                pattern = self._settings.files.replace("{asset}", glob.escape(asset))
-                base = base_of(pattern)
-                if base.is_dir():
-                    self.back()
-                    self._read(asset, sorted(glob.glob(pattern, recursive=True)), gate, stop)
-                else:
-                    self.lost(f"there is no folder {base}")
-            stop.wait(self._settings.every)
 
     def _read(self, asset: str, paths: list[str], gate: Gate, stop: threading.Event) -> None:
         """Send the trajectories of complete files in the order of their begins."""
@@ -101,8 +85,8 @@ class TrajectoryFolder(Source):
             except (InputError, OSError) as error:  # it is read again when it has changed
                 self.refuse(error)
                 made = []
-            newest = self._newest.get(asset)
-            found += [(each.begin, each) for each in made if newest is None or each.begin > newest]
+            newest = self._newest.get(asset, LEAST)
+            found += [(each.begin, each) for each in made if each.begin > newest]
             read.append((path, now))
         for _, each in sorted(found, key=lambda each: each[0]):
             if not self.stored(gate, each, stop):
