@@ -14,7 +14,10 @@ import pytest
 
 from retwin.checks import (
     at_least,
+    at_most,
+    existing,
     finite,
+    given,
     instance,
     needs_extra,
     one_of,
@@ -109,6 +112,24 @@ def test_collections_are_counted() -> None:
     error = refused(one_per, "names", "abc", 2, "channel")
     assert (error.expected, error.got) == ("one per channel, 2", "3")
     assert error.remedy == "give one for each channel"
+
+
+def test_a_number_of_things_has_a_limit() -> None:
+    at_most("signals", 3, 3, "signals", remedy="name those that are wanted")
+    error = refused(at_most, "signals", 4, 3, "signals", remedy="name those that are wanted")
+    assert (error.expected, error.got) == ("at most 3 signals", "4")
+
+
+def test_a_missing_file_is_named() -> None:
+    existing("log", "run.csv", True)
+    error = refused(existing, "log", "run.csv", False, "a log")
+    assert (error.expected, error.got) == ("a log", "run.csv, where there is none")
+
+
+def test_a_value_that_is_needed() -> None:
+    assert given("rate", 0.0, "a rate in Hz", remedy="give it") == 0.0
+    error = refused(given, "rate", None, "a rate in Hz", remedy="give it")
+    assert (error.expected, error.got, error.remedy) == ("a rate in Hz", "none", "give it")
 
 
 def test_anything_else_is_a_condition() -> None:

@@ -148,6 +148,26 @@ def at_least(argument: str, values: Sized, least: int, what: str, *, remedy: str
     )
 
 
+def at_most(argument: str, count: int, most: int, what: str, *, remedy: str) -> None:
+    """Require no more than `most` of something, which `what` names in the plural."""
+    require(count <= most, argument, expected=f"at most {most} {what}", got=count, remedy=remedy)
+
+
+def existing(
+    argument: str, path: object, there: bool, what: str = "an existing file or folder"
+) -> None:
+    """Require what is at a path to be there, which `what` names."""
+    got = f"{path}, where there is none"
+    require(there, argument, expected=what, got=got, remedy="check the name")
+
+
+def given(argument: str, value: T | None, expected: str, *, got: object = "none", remedy: str) -> T:
+    """`value`, if it is not None."""
+    if value is None:
+        raise InputError(argument, expected=expected, got=str(got), remedy=remedy)
+    return value
+
+
 def one_per(argument: str, values: Sized, count: int, what: str, *, remedy: str = "") -> None:
     """Require a collection to have `count` members, one for each `what`."""
     require(

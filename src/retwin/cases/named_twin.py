@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from retwin import twins
-from retwin.checks import require
+from retwin.checks import existing, require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 from retwin.modules import import_beside
@@ -176,13 +176,7 @@ def _of_file(
     place: str,
 ) -> Twin:
     own, kind = key(place, "twin"), FILES[file.suffix.lower()]
-    require(
-        file.is_file(),
-        own,
-        expected="a file",
-        got=f"{file}, where there is none",
-        remedy="check the name",
-    )
+    existing(own, file, file.is_file(), "a file")
     for name, channels in (("inputs", inputs), ("outputs", outputs)):
         require(
             not (isinstance(channels, Mapping) and any(channels.values())),

@@ -9,10 +9,10 @@ from typing import Annotated
 
 import typer
 
+from retwin.checks import given
 from retwin.cli.options import CaseOption, Seed
 from retwin.cli.reading import read, updated_twin
 from retwin.cli.terminal import answer, bar
-from retwin.errors import InputError
 
 __all__ = ["animate"]
 
@@ -76,11 +76,6 @@ def animate(
 
 def _size(text: str) -> tuple[int, int]:
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
-    if found is None:
-        raise InputError(
-            "--size",
-            expected="WIDTHxHEIGHT in pixels",
-            got=repr(text),
-            remedy="give it like 640x480",
-        )
+    expected, remedy = "WIDTHxHEIGHT in pixels", "give it like 640x480"
+    found = given("--size", found, expected, got=repr(text), remedy=remedy)
     return int(found[1]), int(found[2])

@@ -10,7 +10,7 @@ import typer
 from retwin.checks import require
 from retwin.cli.commands import Commands
 from retwin.cli.options import Json, OtherCase, Seed, channel_names
-from retwin.cli.reading import updated_twin
+from retwin.cli.reading import system_of, updated_twin
 from retwin.cli.terminal import answer, bar, example, note, table
 from retwin.errors import InputError
 from retwin.serialisation.places import check_place
@@ -236,14 +236,5 @@ def _sampled(twin: Any, model: Path, case: str | None, seed: int) -> NDArray:
     """Commands of the sampler of the case, at whose segments z is drawn."""
     import numpy as np
 
-    from retwin import cases
-
-    require(
-        case or twin.case,
-        "case",
-        expected="the name of a case, whose commands are sampled",
-        got=f"none, and {model} was saved without one",
-        remedy="give --case",
-    )
-    sampler = cases.get(case or twin.case).sampler
+    sampler = system_of(twin, model, case).sampler
     return sampler.sample(TRAJECTORIES, rng=np.random.default_rng(seed))

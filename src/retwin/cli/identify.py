@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 from retwin import catalog
-from retwin.checks import one_of, require
+from retwin.checks import existing, one_of, require
 from retwin.cli.completion import complete_twins
 from retwin.cli.completion import one_of as completing
 from retwin.cli.options import (
@@ -133,7 +133,8 @@ def identify(
     settings = _method(method, loss, starts)
     columns = replace(_columns(column, time, transient), mapping=mapping)
     names = [channel_names(each) for each in (inputs, outputs)]
-    _check_there(logs)
+    for log in logs:
+        existing("LOG", log, log.exists())
     reader = LogReader(columns, max_bytes)
     opened, left_out = _opened(twin, logs, reader, free or (), names, rate)
     with keep_workers(), bar("identify") as show:
@@ -162,17 +163,6 @@ def identify(
         checked = room.validate_identification(found, opened.twin, used, held_out, seed=seed)
         values = save_identification(checked, opened, read, out, command=command_given())
     _print(checked, values, as_json=as_json)
-
-
-def _check_there(logs: Sequence[Path]) -> None:
-    for log in logs:
-        require(
-            log.exists(),
-            "LOG",
-            expected="an existing file or folder",
-            got=f"{log}, where there is none",
-            remedy="check the name",
-        )
 
 
 def _separated(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from retwin import catalog
-from retwin.checks import require
+from retwin.checks import given, require
 from retwin.cli.completion import one_of
 from retwin.cli.dynamics import fit_equations
 from retwin.cli.options import (
@@ -24,7 +24,7 @@ from retwin.cli.options import (
     Seed,
 )
 from retwin.cli.plans import Workers, carry_out
-from retwin.cli.reading import read, updated_twin
+from retwin.cli.reading import read, system_of, updated_twin
 from retwin.cli.terminal import answer, bar, note, table
 from retwin.data.io import check_target
 from retwin.data.trajectories import HEALTHY, Trajectories
@@ -209,8 +209,6 @@ def _measured(
     mapping: Path | None,
 ) -> Trajectories:
     """The real trajectories to calibrate on."""
-    import retwin as rt
-
     require(
         (real is None) != (data is None),
         "real data",
@@ -221,14 +219,8 @@ def _measured(
     if real is not None:
         return read(real, system, max_bytes=max_bytes, mapping=mapping)
     assert data is not None
-    if system.records is None:
-        raise rt.InputError(
-            "--data",
-            expected="a case that defines how its file is split",
-            got=f"{system.name!r}, which does not",
-            remedy="give --real FILE",
-        )
-    return system.records(data)[0]
+    expected, got = "a case that defines how its file is split", f"{system.name!r}, which does not"
+    return given("--data", system.records, expected, got=got, remedy="give --real FILE")(data)[0]
 
 
 def _simulated(system: Case, simulations: int, seed: int, measured: Trajectories) -> Trajectories:
@@ -333,14 +325,7 @@ def generate(
 
     kind = check_target(out)
     updated = updated_twin(model)
-    require(
-        case or updated.case,
-        "case",
-        expected="the name of a case",
-        got=f"none, and {model} was saved without one",
-        remedy="give --case",
-    )
-    system = rt.cases.get(case or updated.case)
+    system = system_of(updated, model, case)
     if kind == ".zarr" or workers is not None:
         n = per_class * len(system.faults)
         plan = rt.deploy.SimulationPlan(updated, system.sampler, seed, n, system.faults)

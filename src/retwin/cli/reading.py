@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from retwin.checks import require
+from retwin.checks import existing, given
 from retwin.cli.terminal import bar
 from retwin.data.io import DataCase, load
 from retwin.data.trajectories import Trajectories
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from retwin.cases.case import Case
     from retwin.update import CorrectedTwin, DynamicsTwin
 
-__all__ = ["case_named", "data_case", "read", "saved", "updated_twin"]
+__all__ = ["case_named", "data_case", "read", "saved", "system_of", "updated_twin"]
 
 
 def case_named(name: str | None) -> Case | None:
@@ -34,14 +34,17 @@ def data_case(name: str | None) -> DataCase | None:
 
 def saved(folder: Path) -> Path:
     """The folder of a saved model or bundle, which must be there."""
-    require(
-        folder.is_dir(),
-        "path",
-        expected="the folder of a saved model",
-        got=f"{folder}, where there is none",
-        remedy="check the name",
-    )
+    existing("path", folder, folder.is_dir(), "the folder of a saved model")
     return folder
+
+
+def system_of(twin: Any, folder: Path, name: str | None) -> Case:
+    """The case of that name, else the one that a twin of that folder was fitted for."""
+    from retwin import cases
+
+    got, remedy = f"none, and {folder} was saved without one", "give --case"
+    found = name or twin.case or None
+    return cases.get(given("case", found, "the name of a case", got=got, remedy=remedy))
 
 
 def updated_twin(folder: Path) -> CorrectedTwin | DynamicsTwin:

@@ -13,11 +13,11 @@ import typer
 from rich.table import Table
 
 from retwin import catalog
+from retwin.checks import given
 from retwin.cli.completion import complete_sources, one_of
 from retwin.cli.options import CaseArgument, Json, LogMapping, Seed
 from retwin.cli.plans import Scheduler
 from retwin.cli.terminal import answer, bar, command_given, note, plain, resumable, table
-from retwin.errors import InputError
 from retwin.progress import FinishedStage
 
 if TYPE_CHECKING:
@@ -165,8 +165,8 @@ def study(
     )
     if sources == "all":
         plan = replace(plan, sources=possible_sources(system, plan))
-    given = StudyData(twin_data, calibration, test, real, data, mapping)
-    _run(system, plan, given, out, processes, scheduler, as_json=as_json)
+    found = StudyData(twin_data, calibration, test, real, data, mapping)
+    _run(system, plan, found, out, processes, scheduler, as_json=as_json)
 
 
 def report(
@@ -202,15 +202,11 @@ def demo(
     folder = os.environ.get("RETWIN_DATA")
     if folder:
         arm = Path(folder) / "armpi"
-        given = [arm / name for name in ("real_a.mat", "my_dataset_test.mat")]
-        real = next((file for file in given if file.exists()), None)
-        if real is None:
-            raise InputError(
-                "RETWIN_DATA",
-                expected="a folder with armpi/real_a.mat or armpi/my_dataset_test.mat",
-                got=folder,
-                remedy="set it to the folder of the public data, or unset it",
-            )
+        names = [arm / name for name in ("real_a.mat", "my_dataset_test.mat")]
+        real = next((file for file in names if file.exists()), None)
+        expected = "a folder with armpi/real_a.mat or armpi/my_dataset_test.mat"
+        remedy = "set it to the folder of the public data, or unset it"
+        real = given("RETWIN_DATA", real, expected, got=folder, remedy=remedy)
         recorded = arm / "sim.mat"
         data = StudyData(twin=recorded if recorded.exists() else None, real=real)
     target = out or Path("demo", "real" if folder else "emulated")

@@ -10,11 +10,11 @@ import typer
 
 from retwin import twins
 from retwin.catalog import CASES, TWINS
-from retwin.checks import require
+from retwin.checks import given, require
 from retwin.cli.animate import animate
 from retwin.cli.commands import Commands
 from retwin.cli.completion import complete_faults, complete_twins, one_of
-from retwin.cli.options import Json, MaxBytes, Seed
+from retwin.cli.options import Json, MaxBytes, Seed, channel_names
 from retwin.cli.plans import Scheduler, Workers, carry_out
 from retwin.cli.reading import read, updated_twin
 from retwin.cli.terminal import answer, example, table
@@ -238,21 +238,23 @@ def _twin(
         from retwin import cases
 
         return cases.get(name).twin
-    return twins.get(name, inputs=_names(inputs), outputs=_names(outputs), rate=rate, **options)
+    return twins.get(
+        name, inputs=channel_names(inputs), outputs=channel_names(outputs), rate=rate, **options
+    )
 
 
-def _servo(given: str) -> tuple[str, Any]:
+def _servo(text: str) -> tuple[str, Any]:
     """A joint and its servo, from "JOINT=STIFFNESS,DAMPING"."""
     from retwin.twins.mujoco import Servo
 
-    joint, _, gains = given.rpartition("=")
+    joint, _, gains = text.rpartition("=")
     try:
         stiffness, damping = map(float, gains.split(","))
     except ValueError:
         raise InputError(
             "--servo",
             expected="JOINT=STIFFNESS,DAMPING in N m/rad and N m s/rad",
-            got=repr(given),
+            got=repr(text),
             remedy="write for instance --servo hip=500,40",
         ) from None
     return joint, Servo(stiffness, damping)
@@ -270,10 +272,6 @@ def _model(folder: Path) -> Twin:
     return updated_twin(folder)
 
 
-def _names(given: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in given.split(",") if name.strip())
-
-
 def _title(name: str, found: Twin) -> str:
     if name in TWINS:
         return f"{name}: {TWINS[name].title}"
@@ -285,7 +283,7 @@ def _title(name: str, found: Twin) -> str:
     return f"{Path(name).name} ({type(found).__name__}): {summary}"
 
 
-def _case(given: str | None, name: str, found: Twin) -> Case | None:
+def _case(named: str | None, name: str, found: Twin) -> Case | None:
     """The given case, that of the twin's name, or that a corrected twin was fitted for."""
     from retwin import cases
 
@@ -294,9 +292,9 @@ def _case(given: str | None, name: str, found: Twin) -> Case | None:
         own = name
     elif name in TWINS:
         own = name.partition("-")[0]
-    if not (given or own):
+    if not (named or own):
         return None
-    system = cases.get(given or own)
+    system = cases.get(named or own)
     require(
         (system.inputs, system.rate) == (found.inputs, found.rate),
         "--case",
@@ -339,13 +337,9 @@ def _sampler(system: Case | None, found: Twin, duration: float | None) -> Any:
         got="none",
         remedy="give --commands FILE, or --case NAME",
     )
-    if duration is None:
-        raise InputError(
-            "--duration",
-            expected="the duration of a trajectory in seconds, since no case draws commands",
-            got="none",
-            remedy="give --duration SECONDS, --commands FILE, or --case NAME",
-        )
+    expected = "the duration of a trajectory in seconds, since no case draws commands"
+    remedy = "give --duration SECONDS, --commands FILE, or --case NAME"
+    duration = given("--duration", duration, expected, remedy=remedy)
     import numpy as np
 
     from retwin.twins.samplers import RampSampler

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import given, require
 from retwin.monitor.cause import BEFORE
 from retwin.monitor.decision import MIN_SAMPLES, Decision, FalseAlarmTest, decide
 from retwin.monitor.gridded import gridded
@@ -58,15 +58,8 @@ def compare(store: Store, twin: str, number: int) -> Decision:
 
     """
     registry = Registry(store, twin)
-    active = registry.active
-    require(
-        active is not None,
-        "versions",
-        expected="an active version",
-        got="none",
-        remedy="promote the first version",
-    )
-    assert active is not None
+    remedy = "promote the first version"
+    active = given("versions", registry.active, "an active version", remedy=remedy)
     old, new = (load_monitor(registry.folder(each)) for each in (active.number, number))
     require(
         type(old) is type(new),

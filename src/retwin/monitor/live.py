@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from retwin.checks import finite, instance, require, whole
-from retwin.errors import InputError
+from retwin.checks import finite, given, instance, require, whole
 from retwin.monitor.audit import Entry
 from retwin.monitor.kinds import AnyMonitor, load_monitor
 from retwin.monitor.layout import Layout
@@ -376,11 +375,7 @@ class Live:
             listener(entries)
 
     def _one(self, name: str) -> StreamMachine | TrajectoryMachine:
-        found = self._machines.get(name)
-        if found is None:
-            one_asset(dict.fromkeys(self._machines, (0, 0)), name)
-        assert found is not None
-        return found
+        return one_asset(self._machines, name)
 
     def _machine(self, asset: Asset) -> StreamMachine | TrajectoryMachine:
         """A machine as the store has it, with the samples that wait for others."""
@@ -401,15 +396,8 @@ class Live:
         return machine
 
     def _active(self, twin: str) -> int:
-        active = Registry(self.store, twin).active
-        if active is None:
-            raise InputError(
-                "twin",
-                expected=f"an active version of {twin}",
-                got="none",
-                remedy="propose and promote one",
-            )
-        return active.number
+        active, expected = Registry(self.store, twin).active, f"an active version of {twin}"
+        return given("twin", active, expected, remedy="propose and promote one").number
 
     def _monitor(self, twin: str, version: int) -> tuple[AnyMonitor, str]:
         """A version, and the hash of its files."""

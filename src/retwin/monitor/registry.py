@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from retwin.checks import instance, require, whole
+from retwin.checks import given, instance, require, whole
 from retwin.errors import InputError
 from retwin.monitor.decision import Decision
 from retwin.monitor.store import Store
@@ -237,14 +237,8 @@ class Registry:
     def _version(self, number: int) -> Version:
         versions = self._read()[0]
         found = versions.get(whole("version", number, least=1))
-        if found is None:
-            raise InputError(
-                "version",
-                expected=f"one of {', '.join(map(str, versions)) or 'none'}",
-                got=str(number),
-                remedy="propose it first",
-            )
-        return found
+        known = f"one of {', '.join(map(str, versions)) or 'none'}"
+        return given("version", found, known, got=number, remedy="propose it first")
 
     def _step(self, step: str, number: int, *, first: bool = False, **more: Any) -> Version:
         version = self._version(number)

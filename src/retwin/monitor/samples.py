@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import at_most, require
 from retwin.errors import InputError, brief
 from retwin.monitor.updates import LEAST, MOST
 
@@ -130,13 +130,7 @@ def parse(
         given = given if isinstance(given, dict) else {}
         length = max(map(_length, given.values()), default=0)
         count += max(1, length)
-        require(
-            count <= LONGEST,
-            "samples",
-            expected=f"at most {LONGEST} in a document",
-            got="more",
-            remedy="send them in parts",
-        )
+        at_most("samples", count, LONGEST, "in a document", remedy="send them in parts")
         require(
             isinstance(each, dict) and needed <= each.keys() <= KEYS,
             place,

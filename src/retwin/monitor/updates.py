@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import require, whole
-from retwin.errors import InputError
+from retwin.checks import given, require, whole
 from retwin.monitor.audit import Entry
 from retwin.serialisation.files import refusing
 
 __all__ = ["LEAST", "MOST", "WORD", "Asset", "Committed", "Packed", "Update", "one_asset", "pack"]
+
+T = TypeVar("T")
 
 LEAST, MOST = -(2**63), 2**63 - 1
 """The earliest and the latest stream time, in nanoseconds."""
@@ -140,15 +141,8 @@ def pack(update: Update, known: Mapping[str, tuple[int, int]]) -> Packed:
     return Packed(update.asset, key, stamps, rows, (key, time, blob))
 
 
-def one_asset(known: Mapping[str, tuple[int, int]], name: str) -> tuple[int, int]:
-    """Key and channels of an asset; InputError if it is unknown."""
-    found = known.get(name)
-    if found is None:
-        listed = ", ".join(list(known)[:5]) or "none"
-        raise InputError(
-            "asset",
-            expected=f"one of the store's assets ({listed})",
-            got=repr(name)[:80],
-            remedy="add it first, with add_asset",
-        )
-    return found
+def one_asset(known: Mapping[str, T], name: str) -> T:
+    """What is known of an asset by its name; InputError if it is unknown."""
+    expected = f"one of the store's assets ({', '.join(list(known)[:5]) or 'none'})"
+    remedy = "add it first, with add_asset"
+    return given("asset", known.get(name), expected, got=repr(name)[:80], remedy=remedy)

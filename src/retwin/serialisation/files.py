@@ -18,7 +18,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from retwin.checks import require
+from retwin.checks import existing, require
 from retwin.errors import InputError, brief
 from retwin.serialisation.sizes import Budget
 
@@ -176,13 +176,7 @@ def sha256(path: str | os.PathLike[str]) -> str:
     if path.is_file():
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
-    require(
-        path.is_dir(),
-        "path",
-        expected="an existing file or folder",
-        got=f"{path}, where there is none",
-        remedy="check the name",
-    )
+    existing("path", path, path.is_dir())
     files = {file.relative_to(path).as_posix(): file for file in path.rglob("*") if file.is_file()}
     total = hashlib.sha256()
     for name in sorted(files):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import mujoco
 
-from retwin.checks import require
+from retwin.checks import existing, require
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 from retwin.twins.mujoco_actuators import HINGE, control_unit
@@ -98,13 +98,7 @@ def compiled(
         The file is missing or broken, or lacks one of the joints.
 
     """
-    require(
-        path.is_file(),
-        "model",
-        expected="an MJCF or URDF file",
-        got=f"{path}, where there is none",
-        remedy="check the name",
-    )
+    existing("model", path, path.is_file(), "an MJCF or URDF file")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         if not meshes:

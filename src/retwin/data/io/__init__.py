@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from retwin.catalog import FORMATS, LOGS, FormatEntry, resolve
-from retwin.checks import instance, require
+from retwin.checks import existing, instance, require
 from retwin.data.io.assembly import DataCase, settle
 from retwin.data.trajectories import Trajectories
 from retwin.errors import InputError
@@ -81,13 +81,7 @@ def load(
     path = recover(path)
     if rate is not None:
         rate = sample_rate("rate", rate)
-    require(
-        os.path.exists(path),
-        "path",
-        expected="an existing file or folder",
-        got=f"{path}, where there is none",
-        remedy="check the name",
-    )
+    existing("path", path, os.path.exists(path))
     if mapping is not None:
         from retwin.data.logs.mapped import read_mapped
 

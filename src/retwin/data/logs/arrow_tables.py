@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import needs_extra
+from retwin.checks import at_most, needs_extra
 from retwin.data.logs.signals import MAX_SIGNALS, UNWANTED, Clock, Signal, Skipped, named_unit
 from retwin.data.logs.tables import table_signals, time_column
-from retwin.errors import InputError
 
 __all__ = ["read"]
 
@@ -42,13 +41,8 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
         unit = unit or about.get(b"unit", b"").decode("utf-8", "replace")
         for own, leaf in _leaves(arrow, name, column, 0):
             columns[own], units[own] = leaf, unit
-            if len(columns) > MAX_SIGNALS:
-                raise InputError(
-                    path.name,
-                    expected=f"at most {MAX_SIGNALS} columns",
-                    got="more",
-                    remedy="write those that are wanted to a file of their own",
-                )
+            remedy = "write those that are wanted to a file of their own"
+            at_most(path.name, len(columns), MAX_SIGNALS, "columns", remedy=remedy)
 
     def numeric(name: str) -> tuple[NDArray, int] | str:
         kind = columns[name].type

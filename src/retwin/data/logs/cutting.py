@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import at_most, require
 from retwin.data.logs.mapping import Cut
 from retwin.data.logs.signals import Signal
 from retwin.errors import InputError
@@ -99,13 +99,8 @@ def pieces(
 
 
 def _check_count(count: int) -> None:
-    require(
-        count <= MAX_PIECES,
-        "cut",
-        expected=f"at most {MAX_PIECES} trajectories",
-        got=count,
-        remedy="give a longer gap or length, or another trigger",
-    )
+    remedy = "give a longer gap or length, or another trigger"
+    at_most("cut", count, MAX_PIECES, "trajectories", remedy=remedy)
 
 
 def _begun(piece: Piece, commands: Sequence[Signal]) -> Piece:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import given, require
 from retwin.data.io.assembly import DataCase, Raw, assemble
 from retwin.data.logs.channels import Channel, channels_of, in_order, signal_of, table_of
 from retwin.data.logs.cutting import Piece, pieces
@@ -265,15 +265,10 @@ def _finished(
 
 def _rate(mapping: Mapping, case: DataCase | None, rate: float | None) -> float:
     """The sample rate in Hz: the mapping's, the case's, or the one that is given."""
-    found = mapping.rate or (case.rate if case is not None else None) or rate
-    if not found:
-        raise InputError(
-            "mapping: rate",
-            expected="the sample rate of the trajectories in Hz",
-            got="none",
-            remedy="write rate = … in the mapping, or give the case",
-        )
-    return float(found)
+    found = mapping.rate or (case.rate if case is not None else None) or rate or None
+    expected = "the sample rate of the trajectories in Hz"
+    remedy = "write rate = … in the mapping, or give the case"
+    return float(given("mapping: rate", found, expected, remedy=remedy))
 
 
 def _check_dense(

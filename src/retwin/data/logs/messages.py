@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from retwin.checks import at_most, require
 from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Clock, Signal, Skipped
-from retwin.errors import InputError
 
 __all__ = ["Series", "Stamps", "Types"]
 
@@ -67,7 +67,7 @@ class Types:
         for own, (constants, fields) in found.items():
             for each in (*(c[0] for c in constants), *(f[0] for f in fields)):
                 _require_name(each.isidentifier() and not each.startswith("__"), each)
-            _require_name(TYPE_NAME.fullmatch(own) is not None, own)
+            _require_name(TYPE_NAME.fullmatch(own), own)
         new = {own: fields for own, fields in found.items() if own not in self._store.fielddefs}
         self._store.register(new)
         self._of_log |= set(found)
@@ -85,27 +85,15 @@ class Types:
         return store.deserialize_ros1(data, name) if ros1 else store.deserialize_cdr(data, name)
 
 
-def _require_name(fine: bool, name: str) -> None:
-    if not fine:
-        raise InputError(
-            "message definition",
-            expected="names of types and fields",
-            got=repr(name)[:60],
-            remedy="the log is damaged, or was made to do harm",
-        )
+def _require_name(fine: object, name: str) -> None:
+    expected, remedy = "names of types and fields", "the log is damaged, or was made to do harm"
+    require(fine, "message definition", expected=expected, got=repr(name)[:60], remedy=remedy)
 
 
 def _header_stamp(message: Any) -> int | None:
     """The stamp of a message's header in ns; None if it has none."""
-    header = (
-        message.get("header") if isinstance(message, Mapping) else getattr(message, "header", None)
-    )
-    if header is None:
-        return None
-    stamp = header.get("stamp") if isinstance(header, Mapping) else getattr(header, "stamp", None)
-    if stamp is None:
-        return None
-    parts = dict(_items(stamp))
+    header = dict(_items(message)).get("header")
+    parts = dict(_items(dict(_items(header)).get("stamp")))
     seconds = next((parts[each] for each in ("sec", "secs") if each in parts), None)
     rest = next((parts[each] for each in ("nanosec", "nsec", "nsecs") if each in parts), None)
     if not isinstance(seconds, int) or not isinstance(rest, int):
@@ -146,13 +134,8 @@ class Series:
                 continue
             times = self._times.get(name)
             if times is None:
-                if len(self._times) >= MAX_SIGNALS:
-                    raise InputError(
-                        topic,
-                        expected=f"at most {MAX_SIGNALS} signals",
-                        got="more",
-                        remedy="name those that are wanted in the mapping",
-                    )
+                remedy = "name those that are wanted in the mapping"
+                at_most(topic, len(self._times) + 1, MAX_SIGNALS, "signals", remedy=remedy)
                 times = self._times[name] = array("q")
                 self._values[name] = array("d")
             times.append(time)

@@ -76,15 +76,18 @@ class TextLayout:
     def cells(self, line: str) -> Sequence[str]:
         """The cells of a row; ValueError or csv.Error if it has more or less than the table."""
         if self.separator:
-            (row,) = csv.reader([line], delimiter=self.separator, strict=True)
+            (cells,) = csv.reader([line], delimiter=self.separator, strict=True)
         else:
-            row = line.split()
-        width = len(self.names)
-        if len(row) == width + 1 and not row[-1].strip():
-            row = row[:-1]  # a separator at the end of each line
-        if len(row) != width:
-            raise ValueError(f"{len(row)} of {width} cells")
+            cells = line.split()
+        row = trimmed(cells, len(self.names))
+        if len(row) != len(self.names):
+            raise ValueError(f"{len(row)} of {len(self.names)} cells")
         return row
+
+
+def trimmed(row: Sequence[str], width: int) -> Sequence[str]:
+    """The cells of a row, without an empty one behind a separator at the end of the line."""
+    return row[:-1] if len(row) == width + 1 and not row[-1].strip() else row
 
 
 def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Signal | Skipped]:
@@ -209,8 +212,7 @@ def _blocks(
         for number, row in enumerate(rows, layout.first + 1):
             if not row or not (empty or any(cell.strip() for cell in row)):
                 continue
-            if len(row) == width + 1 and not row[-1].strip():
-                row = row[:-1]  # a separator at the end of each line
+            row = trimmed(row, width)
             if len(row) != width:
                 raise InputError(
                     path.name,
@@ -332,7 +334,9 @@ def _head(rows: Sequence[Sequence[str]], width: int, path: Path) -> Sequence[Seq
 
     Raises InputError for one that seems to hold damaged numbers, which would be left out.
     """
-    full = [(number, row) for number, row in enumerate(rows, 1) if _cells(row, width) == width]
+    full = [
+        (number, row) for number, row in enumerate(rows, 1) if len(trimmed(row, width)) == width
+    ]
     for number, row in full[1:]:
         filled = [cell.strip() for cell in row if cell.strip()]
         if filled and all(STARTS.match(cell) for cell in filled):
@@ -343,11 +347,6 @@ def _head(rows: Sequence[Sequence[str]], width: int, path: Path) -> Sequence[Seq
                 remedy="repair or remove that line",
             )
     return [row for _, row in full]
-
-
-def _cells(row: Sequence[str], width: int) -> int:
-    """The cells of a row, without an empty one behind a last separator."""
-    return len(row) - 1 if len(row) == width + 1 and not row[-1].strip() else len(row)
 
 
 def _is_value(cell: str, comma: bool) -> bool:

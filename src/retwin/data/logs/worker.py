@@ -20,6 +20,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from retwin.catalog import LOGS, resolve
+from retwin.checks import at_most
 from retwin.data.logs.signals import MAX_SIGNALS, Clock, Signal
 from retwin.errors import InputError, brief
 
@@ -63,16 +64,9 @@ def _read(path: Path, request: dict[str, Any], out: BinaryIO) -> None:
     read = resolve(LOGS[request["format"]].reader)
     wanted = None if request["wanted"] is None else frozenset(request["wanted"])
     _send(out, {"begun": time.time()})
-    count = 0
-    for each in read(path, wanted, Clock(**request["clock"])):
-        count += 1
-        if count > MAX_SIGNALS:
-            raise InputError(
-                path.name,
-                expected=f"at most {MAX_SIGNALS} signals",
-                got="more",
-                remedy="name those that are wanted in the mapping",
-            )
+    remedy = "name those that are wanted in the mapping"
+    for count, each in enumerate(read(path, wanted, Clock(**request["clock"])), 1):
+        at_most(path.name, count, MAX_SIGNALS, "signals", remedy=remedy)
         if not isinstance(each, Signal):
             _send(out, {"skipped": each.name, "reason": each.reason})
             continue

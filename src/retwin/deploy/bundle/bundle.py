@@ -13,15 +13,14 @@ import torch
 
 from retwin._version import __version__
 from retwin.cases.case import Case
-from retwin.checks import require
+from retwin.checks import given, require
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Trajectories
 from retwin.deploy.bundle.facts import SAMPLERS, Facts
 from retwin.deploy.bundle.guard import Guard
 from retwin.deploy.bundle.seal import SCHEMAS, open_sealed, seal
-from retwin.deploy.bundle.verdicts import Prediction, no_diagnoser
+from retwin.deploy.bundle.verdicts import Prediction, present_diagnoser
 from retwin.diagnosis import FittedDiagnoser, load_diagnoser
-from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.models import read_model, refusing, write_model
 from retwin.update.corrected import CorrectedTwin, generate
@@ -127,13 +126,9 @@ class Bundle:
             If commands are drawn by code of the case, which a bundle cannot hold.
 
         """
-        if self.facts.sampler is None:
-            raise InputError(
-                "case",
-                expected=f"the case {self.facts.case!r} itself, whose code draws commands",
-                got="the bundle alone",
-                remedy="give the case (--case NAME)",
-            )
+        expected = f"the case {self.facts.case!r} itself, whose code draws commands"
+        got, remedy = "the bundle alone", "give the case (--case NAME)"
+        sampler = given("case", self.facts.sampler, expected, got=got, remedy=remedy)
         correction = self.twin.residual.correction
         return Case(
             name=self.facts.case,
@@ -141,7 +136,7 @@ class Bundle:
             faults=self.facts.faults,
             twin=self.twin,
             emulator=None,
-            sampler=self.facts.sampler,
+            sampler=sampler,
             correction=correction,
             output_correction=correction,
             sensor_rate=self.facts.sensor_rate,
@@ -167,12 +162,9 @@ class Bundle:
             If the bundle has no diagnoser, or if channels or rate are not those of the bundle.
 
         """
-        if self.diagnoser is None:
-            raise no_diagnoser()
+        diagnoser = present_diagnoser(self.diagnoser)
         verdicts = self.guard.assess(self.twin.surrogate, trajectories, steps=self.facts.steps)
-        return Prediction.of(
-            self.diagnoser.classes, verdicts, trajectories, self.diagnoser.predict_proba
-        )
+        return Prediction.of(diagnoser.classes, verdicts, trajectories, diagnoser.predict_proba)
 
     def generate(
         self,

@@ -7,15 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.arrays import floats
-from retwin.checks import agree, require
+from retwin.checks import agree, given, require
 from retwin.data.trajectories import Trajectories
-from retwin.errors import InputError
 from retwin.twins.command_range import TOLERANCE, excess, extremes
 from retwin.twins.twin import Twin
 
@@ -27,9 +26,10 @@ __all__ = [
     "Verdicts",
     "are_probabilities",
     "check_channels",
-    "no_diagnoser",
+    "present_diagnoser",
 ]
 
+T = TypeVar("T")
 CHECKS = (
     *("commands", "speed", "outputs", "nominal", "missing", "length", "residual"),
     "probabilities",
@@ -313,14 +313,10 @@ class Domain:
         }
 
 
-def no_diagnoser() -> InputError:
-    """The error of a bundle, or of its export, that has no diagnoser and is to predict."""
-    return InputError(
-        "bundle",
-        expected="one with a diagnoser",
-        got="one without",
-        remedy="train a diagnoser, then make the bundle and its export anew",
-    )
+def present_diagnoser(diagnoser: T | None) -> T:
+    """The diagnoser of a bundle, or of its export, that is to predict."""
+    remedy = "train a diagnoser, then make the bundle and its export anew"
+    return given("bundle", diagnoser, "one with a diagnoser", got="one without", remedy=remedy)
 
 
 def check_channels(trajectories: Trajectories, model: Twin) -> None:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retwin.checks import require
+from retwin.errors import InputError
 from retwin.nets.networks import LSTM, MLP, TCN, Network, StateSpace
 
 __all__ = ["CNetwork", "c_network", "dense_weights", "flat", "weights_of"]
@@ -70,14 +70,12 @@ def c_network(config: Network, inputs: int, outputs: int) -> CNetwork:
         case StateSpace(states, hidden):
             sizes = f"{inputs}, {states}, {hidden}, {outputs}"
             return CNetwork("state_space", sizes, states, max(states + hidden, outputs))
-    require(
-        False,
+    raise InputError(
         "model",
         expected="networks that exist in C: MLP, LSTM, TCN and StateSpace",
         got=repr(config),
         remedy="fit it with one of these",
     )
-    raise AssertionError
 
 
 def weights_of(config: Network, module: Any) -> NDArray:

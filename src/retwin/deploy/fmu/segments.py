@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.checks import require
+from retwin.checks import given
 from retwin.deploy.actuator.draws import causal_part, drawn, still_and_fastest
 from retwin.deploy.fmu.networks import flat
 from retwin.deploy.fmu.text import constants
@@ -41,18 +41,16 @@ def segment_parts(
 
     """
     operator = causal_part(twin, any_outputs=True)[1]
-    require(
-        commands is not None,
+    some = given(
         "commands",
-        expected=f"commands like those of the task, for {type(operator).__name__}: z of a segment "
-        "depends on where it ends, which is known only after it, so that z is drawn beforehand",
-        got="none",
+        commands,
+        f"commands like those of the task, for {type(operator).__name__}: z of a segment depends "
+        "on where it ends, which is known only after it, so that z is drawn beforehand",
         remedy="give those of the case's sampler, or recorded ones",
     )
-    assert commands is not None
-    given = checked_commands(commands, twin.inputs).astype(np.float32, copy=False)
-    found = drawn(twin, given, DRAWS, SEED, any_outputs=True)
-    still, fastest = still_and_fastest(given)
+    some = checked_commands(some, twin.inputs).astype(np.float32, copy=False)
+    found = drawn(twin, some, DRAWS, SEED, any_outputs=True)
+    still, fastest = still_and_fastest(some)
     delay = found.delay.double().numpy()[:, 0] * twin.rate
     sizes = {"DRAWS": len(delay), "ENSEMBLE": min(ENSEMBLE, len(delay))}
     sizes |= {"WIDTH": found.offset.shape[1], "LENGTH": math.floor(delay.max()) + 2}

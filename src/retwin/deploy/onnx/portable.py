@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +21,13 @@ from retwin.deploy.bundle.verdicts import (
     Prediction,
     are_probabilities,
     check_channels,
-    no_diagnoser,
+    present_diagnoser,
 )
 from retwin.deploy.onnx.session import Session, bounded_options
 from retwin.progress import Progress
 from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, checked_seed, simulate_in_chunks
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["Portable", "padded_times", "settled_at"]
 
@@ -207,9 +204,7 @@ class Portable:
             or if the output of a graph has another shape, is not finite, or is no probabilities.
 
         """
-        classifier = self.diagnoser
-        if classifier is None:
-            raise no_diagnoser()
+        classifier = present_diagnoser(self.diagnoser)
         check_channels(trajectories, self)
         verdicts = self.domain.assess(
             trajectories, self._mismatch, self._energy, steps=self.facts.steps

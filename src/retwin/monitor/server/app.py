@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pydantic_core import to_jsonable_python
 
 from retwin._version import __version__
-from retwin.checks import needs_extra, require
+from retwin.checks import at_most, needs_extra, require
 from retwin.errors import InputError
 from retwin.monitor.decision import Decision
 from retwin.monitor.explanations import Explanations
@@ -225,13 +225,8 @@ def _add_reading(
     @app.get("/events")
     async def events(request: fastapi.Request) -> Any:
         """Server-sent events: one with the revision whenever something has changed."""
-        require(
-            len(listeners) < LISTENERS,
-            "events",
-            expected=f"at most {LISTENERS} listeners",
-            got="more",
-            remedy="close pages that are not needed",
-        )
+        remedy = "close pages that are not needed"
+        at_most("events", len(listeners) + 1, LISTENERS, "listeners", remedy=remedy)
         return fastapi.responses.StreamingResponse(
             _revisions(live, listeners, request.app.state.closing), media_type="text/event-stream"
         )

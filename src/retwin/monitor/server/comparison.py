@@ -7,7 +7,7 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
-from retwin.checks import require
+from retwin.checks import at_most
 from retwin.monitor.comparison import compare
 from retwin.monitor.decision import Decision
 from retwin.monitor.store import Store
@@ -55,13 +55,8 @@ class Comparisons:
         with self._lock:
             self._made = {each: made for each, made in self._made.items() if now < made.until}
             if key not in self._made:
-                require(
-                    len(self._made) < QUEUE,
-                    "comparison",
-                    expected=f"at most {QUEUE} at a time",
-                    got="more",
-                    remedy="wait for a minute",
-                )
+                count = len(self._made) + 1
+                at_most("comparison", count, QUEUE, "at a time", remedy="wait for a minute")
                 made = _Made(self._worker.submit(compare, self._store, twin, number))
                 self._made[key] = made
                 made.future.add_done_callback(made.done)

@@ -8,8 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from retwin.checks import require
-from retwin.errors import InputError
+from retwin.checks import given, require
 from retwin.monitor.audit import Entry
 from retwin.monitor.samples import SECOND
 from retwin.monitor.store import Store
@@ -55,14 +54,8 @@ class Journal:
         """One alarm by its place in the log; InputError where none is there."""
         with self._read():
             found = self._alarms.get(sequence)
-        if found is None:
-            raise InputError(
-                "sequence",
-                expected=f"that of one of the newest {KEPT} alarms",
-                got=str(sequence)[:40],
-                remedy="see /alarms",
-            )
-        return found
+        expected = f"that of one of the newest {KEPT} alarms"
+        return given("sequence", found, expected, got=str(sequence)[:40], remedy="see /alarms")
 
     def open(self) -> dict[str, dict[str, Any]]:
         """The newest alarm of each asset that nobody has acknowledged."""

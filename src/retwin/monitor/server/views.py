@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from retwin.checks import require
+from retwin.checks import given, require
 from retwin.data.trajectories import Channels
-from retwin.errors import InputError
 from retwin.monitor.cause import possible_causes
 from retwin.monitor.explanations import Explanations
 from retwin.monitor.gridded import gridded
@@ -89,16 +88,14 @@ class Views:
     def asset(self, name: str, after: float | None) -> dict[str, Any]:
         """An asset with its newest samples, or those after a time."""
         found = {each.asset: each for each in self._live.status()}.get(name)
-        if found is None:
-            raise InputError(
-                "asset", expected="one that is watched", got=repr(name)[:80], remedy="see /assets"
-            )
+        got, remedy = repr(name)[:80], "see /assets"
+        status = given("asset", found, "one that is watched", got=got, remedy=remedy)
         monitor, twins = self._live.monitor(name), self._twins()
         recent = self._live.recent(name)
         times = recent.times / SECOND
         new = slice(0 if after is None else int(np.searchsorted(times, after, "right")), None)
         return {
-            "status": self._status(found, self.journal.open(), twins),
+            "status": self._status(status, self.journal.open(), twins),
             "arl": monitor.arl,
             "rate": pace(monitor),
             "kind": "scores" if isinstance(monitor, TrajectoryMonitor) else "samples",
