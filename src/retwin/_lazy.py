@@ -9,6 +9,12 @@ from importlib.util import find_spec
 from typing import Any
 
 
+def homes(modules: Mapping[str, str]) -> dict[str, str]:
+    """Public name to module, from each module and its public names, with blanks between."""
+    found = {name: module for module, listed in modules.items() for name in listed.split()}
+    return dict(sorted(found.items()))
+
+
 def names(
     package: str, homes: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:

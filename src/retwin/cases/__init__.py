@@ -10,31 +10,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from retwin import catalog
-from retwin._lazy import names
+from retwin._lazy import homes, names
 from retwin.errors import InputError
 
 if TYPE_CHECKING:
     from retwin.cases.case import Case
     from retwin.data.io import DataCase
 
-_HOME = {
-    "ArmPiTwin": "armpi_fpv.twin",
-    "Body": "case",
-    "Case": "case",
-    "ColumnRecords": "columns",
-    "Columns": "logs",
-    "EmulatedArmPi": "armpi_fpv.emulator",
-    "KinematicTwin": "armpi_fpv.closed_form",
-    "LogReader": "logs",
-    "Record": "columns",
-    "TimeColumn": "time_column",
-    "animate": "animation",
-    "armpi_parametric": "armpi_fpv.parameters",
-    "open_parametric": "opened_twin",
-    "read_case": "file",
-    "read_logs": "logs",
-    "recover_commands": "armpi_fpv.recovery",
-}
+_HOME = homes(
+    {
+        "animation": "animate",
+        "armpi_fpv.closed_form": "KinematicTwin",
+        "armpi_fpv.emulator": "EmulatedArmPi",
+        "armpi_fpv.parameters": "armpi_parametric",
+        "armpi_fpv.recovery": "recover_commands",
+        "armpi_fpv.twin": "ArmPiTwin",
+        "case": "Body Case",
+        "columns": "ColumnRecords Record",
+        "file": "read_case",
+        "logs": "Columns LogReader read_logs",
+        "opened_twin": "open_parametric",
+        "time_column": "TimeColumn",
+    }
+)
 _CASES = {
     name: entry.target.removeprefix(f"{__name__}.").partition(":")[0]
     for name, entry in catalog.CASES.items()

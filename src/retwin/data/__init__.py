@@ -6,25 +6,19 @@ scores.
 
 from __future__ import annotations
 
-from retwin._lazy import names
+from retwin._lazy import homes, names
 
-_HOME = {
-    "Channels": "trajectories",
-    "DataCase": "io",
-    "HEALTHY": "trajectories",
-    "Mapping": "logs.mapping",
-    "Provenance": "provenance",
-    "Sampling": "provenance",
-    "Segments": "segments",
-    "Trajectories": "trajectories",
-    "UNLABELLED": "trajectories",
-    "cache_folder": "download",
-    "fetch": "download",
-    "load": "io",
-    "propose_mapping": "logs.proposal",
-    "read_mapping": "logs.mapping",
-    "read_zarr": "io.zarr_folder",
-    "save": "io",
-}
+_HOME = homes(
+    {
+        "download": "cache_folder fetch",
+        "io": "DataCase load save",
+        "io.zarr_folder": "read_zarr",
+        "logs.mapping": "Mapping read_mapping",
+        "logs.proposal": "propose_mapping",
+        "provenance": "Provenance Sampling",
+        "segments": "Segments",
+        "trajectories": "Channels HEALTHY Trajectories UNLABELLED",
+    }
+)
 
 __getattr__, __dir__, __all__ = names(__name__, _HOME)

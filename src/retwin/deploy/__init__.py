@@ -6,28 +6,21 @@ folders. Not here: fitting.
 
 from __future__ import annotations
 
-from retwin._lazy import names
+from retwin._lazy import homes, names
 
-_HOME = {
-    "Bundle": "bundle.bundle",
-    "Domain": "bundle.verdicts",
-    "ExportedActuator": "actuator.export",
-    "ExportedActuatorNet": "actuator.torque_net",
-    "ExportedFMU": "fmu.export",
-    "Guard": "bundle.guard",
-    "Joint": "actuator.torque_net",
-    "Portable": "onnx.portable",
-    "Prediction": "bundle.verdicts",
-    "Simulated": "simulations",
-    "SimulationPlan": "simulations",
-    "Verdicts": "bundle.verdicts",
-    "export_actuator": "actuator.export",
-    "export_actuator_net": "actuator.torque_net",
-    "export_fmu": "fmu.export",
-    "export_onnx": "onnx.export",
-    "fit_guard": "bundle.guard",
-    "save_identification": "identified",
-    "simulate_to": "simulations",
-}
+_HOME = homes(
+    {
+        "actuator.export": "ExportedActuator export_actuator",
+        "actuator.torque_net": "ExportedActuatorNet Joint export_actuator_net",
+        "bundle.bundle": "Bundle",
+        "bundle.guard": "Guard fit_guard",
+        "bundle.verdicts": "Domain Prediction Verdicts",
+        "fmu.export": "ExportedFMU export_fmu",
+        "identified": "save_identification",
+        "onnx.export": "export_onnx",
+        "onnx.portable": "Portable",
+        "simulations": "Simulated SimulationPlan simulate_to",
+    }
+)
 
 __getattr__, __dir__, __all__ = names(__name__, _HOME)

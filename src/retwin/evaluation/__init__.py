@@ -6,25 +6,16 @@ and the choice of what is compared (see `study`).
 
 from __future__ import annotations
 
-from retwin._lazy import names
+from retwin._lazy import homes, names
 
-_HOME = {
-    "Fidelity": "fidelity",
-    "Figure": "fidelity",
-    "Identification": "identification",
-    "Overlay": "fidelity",
-    "Proposal": "experiments.propose",
-    "Simulation": "fidelity",
-    "evaluate": "diagnosers",
-    "hold_out": "identification",
-    "measure_fidelity": "fidelity",
-    "measure_widening": "fidelity",
-    "next_experiments": "experiments.propose",
-    "predictive_overlay": "fidelity",
-    "record_means": "fidelity",
-    "simulate_records": "fidelity",
-    "simulation_scores": "fidelity",
-    "validate_identification": "identification",
-}
+_HOME = homes(
+    {
+        "diagnosers": "evaluate",
+        "experiments.propose": "Proposal next_experiments",
+        "fidelity": "Fidelity Figure Overlay Simulation measure_fidelity measure_widening "
+        "predictive_overlay record_means simulate_records simulation_scores",
+        "identification": "Identification hold_out validate_identification",
+    }
+)
 
 __getattr__, __dir__, __all__ = names(__name__, _HOME)

@@ -6,27 +6,15 @@ method, twins, or a robot.
 
 from __future__ import annotations
 
-from retwin._lazy import names
+from retwin._lazy import homes, names
 
-_HOME = {
-    "BernoulliHead": "mixtures",
-    "Bernoullis": "mixtures",
-    "CNN": "networks",
-    "Fit": "training",
-    "FlowDistribution": "flows",
-    "FlowHead": "flows",
-    "GaussianMixture": "mixtures",
-    "LSTM": "networks",
-    "LSTMClassifier": "networks",
-    "MLP": "networks",
-    "MixtureHead": "mixtures",
-    "Network": "networks",
-    "Standardise": "networks",
-    "StateSpace": "networks",
-    "TCN": "networks",
-    "Training": "training",
-    "isolated": "training",
-    "train": "training",
-}
+_HOME = homes(
+    {
+        "flows": "FlowDistribution FlowHead",
+        "mixtures": "BernoulliHead Bernoullis GaussianMixture MixtureHead",
+        "networks": "CNN LSTM LSTMClassifier MLP Network Standardise StateSpace TCN",
+        "training": "Fit Training isolated train",
+    }
+)
 
 __getattr__, __dir__, __all__ = names(__name__, _HOME)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from retwin._lazy import names
+from retwin._lazy import homes, names
 from retwin.catalog import TWINS, resolve
 from retwin.checks import require
 from retwin.data.trajectories import Channels
@@ -20,48 +20,31 @@ from retwin.errors import InputError
 if TYPE_CHECKING:  # one kind of twin does not load what another kind needs
     from retwin.twins.twin import Twin
 
-_HOME = {
-    "ActuatorBias": "faults",
-    "ActuatorGain": "system_faults",
-    "Chunk": "twin",
-    "CommandSampler": "samplers",
-    "CommandSide": "command_side",
-    "FMUTwin": "fmu",
-    "Fault": "faults",
-    "FunctionTwin": "function",
-    "HoldSampler": "samplers",
-    "Limits": "limits",
-    "MuJoCoTwin": "mujoco",
-    "MultisineSampler": "samplers",
-    "NoisyTwin": "noisy",
-    "Parameter": "parametric",
-    "ParameterDrift": "system_faults",
-    "ParameterShift": "system_faults",
-    "ParametricTwin": "parametric",
-    "RampSampler": "samplers",
-    "RandomisedTwin": "randomised",
-    "RecordedSampler": "samplers",
-    "SensorBias": "system_faults",
-    "SensorDrift": "system_faults",
-    "SensorFreeze": "system_faults",
-    "Servo": "mujoco",
-    "SimulationError": "collected",
-    "State": "state",
-    "StateTwin": "state_twin",
-    "StepWarning": "state_twin",
-    "Stuck": "faults",
-    "System": "system",
-    "Twin": "twin",
-    "TwinWrapper": "wrapper",
-    "command_side_parameters": "command_side",
-    "draw_faults": "applied_faults",
-    "faulty_commands": "applied_faults",
-    "frozen_response": "applied_faults",
-    "keep_workers": "workers",
-    "residual_scale": "noisy",
-    "sampler_from": "record_sampler",
-    "simulate_in_chunks": "twin",
-}
+_HOME = homes(
+    {
+        "applied_faults": "draw_faults faulty_commands frozen_response",
+        "collected": "SimulationError",
+        "command_side": "CommandSide command_side_parameters",
+        "faults": "ActuatorBias Fault Stuck",
+        "fmu": "FMUTwin",
+        "function": "FunctionTwin",
+        "limits": "Limits",
+        "mujoco": "MuJoCoTwin Servo",
+        "noisy": "NoisyTwin residual_scale",
+        "parametric": "Parameter ParametricTwin",
+        "randomised": "RandomisedTwin",
+        "record_sampler": "sampler_from",
+        "samplers": "CommandSampler HoldSampler MultisineSampler RampSampler RecordedSampler",
+        "state": "State",
+        "state_twin": "StateTwin StepWarning",
+        "system": "System",
+        "system_faults": "ActuatorGain ParameterDrift ParameterShift SensorBias SensorDrift "
+        "SensorFreeze",
+        "twin": "Chunk Twin simulate_in_chunks",
+        "workers": "keep_workers",
+        "wrapper": "TwinWrapper",
+    }
+)
 
 __getattr__, __dir__, __all__ = names(__name__, _HOME)
 __all__ += ["get"]
