@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,7 +10,7 @@ import typer
 
 from retwin.cli.options import Json
 from retwin.cli.terminal import answer, bar, note, table
-from retwin.serialisation.files import write_atomically
+from retwin.serialisation.files import write_json
 from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:
@@ -41,8 +40,7 @@ def bench(
         found = run_bench(count=n, repeats=repeats, report=show)
     figures = found.about()
     if out is not None:
-        with write_atomically(out) as part:
-            part.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+        write_json(out, figures)
     made = [
         (
             way.what,

@@ -132,7 +132,7 @@ def identification_values(found: Identification, opened: OpenedTwin, logs: Logs)
     else:
         about["loss"] = result.loss
         about["starts"] = [asdict(each) for each in result.starts]
-    return to_jsonable_python(_plain(about), inf_nan_mode="null")
+    return to_jsonable_python(about, inf_nan_mode="null", fallback=np.generic.item)
 
 
 def start_values(twin: ParametricTwin) -> dict[str, float]:
@@ -172,17 +172,6 @@ def _correlations(names: Sequence[str], matrix: Any) -> list[list[Any]]:
 
 def _without_name(values: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in values.items() if key != "name"}
-
-
-def _plain(value: Any) -> Any:
-    """The same value with None for numbers that JSON does not have."""
-    if isinstance(value, dict):
-        return {key: _plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    return value
 
 
 def _write_json(path: Path, values: object) -> None:

@@ -65,23 +65,23 @@ class Entry:
     @property
     def line(self) -> bytes:
         """The entry as canonical JSON, with its hash and the end of the line."""
-        return _object(
-            data=self.text,
-            hash=json.dumps(self.hash),
-            kind=json.dumps(self.kind),
-            previous=json.dumps(self.previous),
-            sequence=str(self.sequence),
-        ) + b"\n"  # fmt: skip
+        return self._object(hash=json.dumps(self.hash)) + b"\n"
 
     def digest(self) -> str:
         """The hash that the entry must have: SHA-256 of its canonical JSON without the hash."""
-        covered = _object(
-            data=self.text,
-            kind=json.dumps(self.kind),
-            previous=json.dumps(self.previous),
-            sequence=str(self.sequence),
-        )
-        return hashlib.sha256(covered).hexdigest()
+        return hashlib.sha256(self._object()).hexdigest()
+
+    def _object(self, **more: str) -> bytes:
+        """The entry as canonical JSON; its parts are JSON already."""
+        parts = {
+            "data": self.text,
+            **more,
+            "kind": json.dumps(self.kind),
+            "previous": json.dumps(self.previous),
+            "sequence": str(self.sequence),
+        }
+        inside = ",".join(f'"{key}":{text}' for key, text in parts.items())
+        return f"{{{inside}}}".encode("utf-8", "surrogatepass")
 
 
 @dataclass(frozen=True)
@@ -292,12 +292,6 @@ def _chained_anew(entries: Iterable[Entry], kind: str, order: Sequence[str]) -> 
     for entry in chosen:
         last = append(last, kind, entry.data)
         yield last
-
-
-def _object(**parts: str) -> bytes:
-    """JSON of texts that are JSON already, whose keys are given in their order."""
-    inside = ",".join(f'"{key}":{text}' for key, text in parts.items())
-    return f"{{{inside}}}".encode("utf-8", "surrogatepass")
 
 
 def _check(value: Any, depth: int) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from retwin.checks import given, require
 from retwin.monitor.cause import BEFORE
-from retwin.monitor.decision import MIN_SAMPLES, Decision, FalseAlarmTest, decide
+from retwin.monitor.decision import MIN_SAMPLES, Decision, FalseAlarmTest, decide, padded
 from retwin.monitor.gridded import gridded
 from retwin.monitor.kinds import load_monitor
 from retwin.monitor.monitor import Monitor
@@ -113,19 +113,13 @@ def _compared_streams(
         got="fewer",
         remedy="compare the versions later",
     )
-    steps = max(len(pair[0]) for pair in scores)
-    padded = np.array(
-        [
-            [np.pad(each, (0, steps - len(each)), constant_values=np.nan) for each in pair]
-            for pair in scores
-        ]
-    )
-    samples = int(np.isfinite(padded[:, 1]).sum())
+    old_crps, new_crps = map(padded, zip(*scores, strict=True))
+    samples = int(np.isfinite(new_crps).sum())
     test = FalseAlarmTest(alarms, max(samples, 1), new.arl)
     beside = None
     if reference is not None:
         beside = FalseAlarmTest(of_reference, max(samples, 1), reference.arl)
-    return decide(padded[:, 0], padded[:, 1], test, reference=beside)
+    return decide(old_crps, new_crps, test, reference=beside)
 
 
 def _mean(scores: NDArray) -> NDArray:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import positive, require, whole
 from retwin.scores.bootstrap import BLOCKS, MIN_RECORDS, bootstrap_means
 
-__all__ = ["Decision", "FalseAlarmTest", "decide"]
+__all__ = ["Decision", "FalseAlarmTest", "decide", "padded"]
 
 SIGNIFICANCE = 0.05
 """Probability of the observed false alarms or more, below which the promise counts as broken."""
@@ -112,6 +113,14 @@ class Decision:
             f"{test.samples} {test.unit} where {test.samples / test.run_length:.3g} are promised "
             f"(p = {test.p:.2g}, at least {SIGNIFICANCE} needed){slow}"
         )
+
+
+def padded(records: Sequence[NDArray]) -> NDArray:
+    """Scores of records of any lengths as an array (records, T), NaN after the end of each."""
+    made = np.full((len(records), max(map(len, records))), np.nan)
+    for row, each in zip(made, records, strict=True):
+        row[: len(each)] = each
+    return made
 
 
 def decide(

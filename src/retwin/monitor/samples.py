@@ -139,13 +139,8 @@ def parse(
             remedy=REMEDY,
         )
         name = each.get("asset", asset)
-        require(
-            isinstance(name, str) and asset in (None, name),
-            f"{place}: asset",
-            expected="its name" if asset is None else repr(asset),
-            got=repr(name)[:60],
-            remedy=REMEDY,
-        )
+        if not isinstance(name, str) or asset not in (None, name):
+            raise _refused(f"{place}: asset", name, "its name" if asset is None else repr(asset))
         if name not in known:
             known[name] = {channel: i for i, channel in enumerate(channels(name))}
         if length:
@@ -171,10 +166,7 @@ def _objects(document: bytes | str) -> Iterator[Any]:
     """The objects of a document: one, those of an array, or one of each line."""
     try:
         text = document if isinstance(document, str) else document.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise _no_document(error) from None
-    lines = [each for each in text.split("\n") if each.strip()]
-    try:
+        lines = [each for each in text.split("\n") if each.strip()]
         try:
             whole = json.loads(text)
         except json.JSONDecodeError:
@@ -185,16 +177,17 @@ def _objects(document: bytes | str) -> Iterator[Any]:
         else:
             yield from whole if isinstance(whole, list) else [whole]
     except (ValueError, RecursionError) as error:
-        raise _no_document(error) from None
+        raise InputError(
+            "samples",
+            expected="a JSON object, an array of them, or one on each line",
+            got=f"{type(error).__name__}: {brief(error)}",
+            remedy=REMEDY,
+        ) from None
 
 
-def _no_document(error: Exception) -> InputError:
-    return InputError(
-        "samples",
-        expected="a JSON object, an array of them, or one on each line",
-        got=f"{type(error).__name__}: {brief(error)}",
-        remedy=REMEDY,
-    )
+def _refused(place: str, given: object, expected: str, remedy: str = REMEDY) -> InputError:
+    """The error about a part of a document."""
+    return InputError(place, expected=expected, got=repr(given)[:60], remedy=remedy)
 
 
 def _time(each: dict[str, Any], place: str) -> int:
@@ -214,12 +207,8 @@ def _time(each: dict[str, Any], place: str) -> int:
             made = round(given * SECOND)
     if made is not None and LEAST < made < MOST:
         return made
-    raise InputError(
-        f"{place}: time",
-        expected="seconds since the epoch, ISO 8601 with an offset, or whole time_ns",
-        got=repr(given)[:60],
-        remedy=REMEDY,
-    )
+    expected = "seconds since the epoch, ISO 8601 with an offset, or whole time_ns"
+    raise _refused(f"{place}: time", given, expected)
 
 
 def _length(value: Any) -> int:
@@ -244,20 +233,14 @@ def _row(values: Any, places: dict[str, int], place: str) -> list[float]:
     """The values of all channels; NaN where one is missing."""
     made = [np.nan] * len(places)
     if not isinstance(values, dict):
-        raise InputError(
-            f"{place}: values",
-            expected="an object of channels",
-            got=repr(values)[:60],
-            remedy=REMEDY,
-        )
+        raise _refused(f"{place}: values", values, "an object of channels")
     for name, value in values.items():
         if name not in places:
-            raise InputError(
-                f"{place}: values",
-                expected=f"channels among {', '.join(places)}",
-                got=repr(name)[:60],
-                remedy="leave it out, or correct its name",
+            expected, remedy = (
+                f"channels among {', '.join(places)}",
+                "leave it out, or correct its name",
             )
+            raise _refused(f"{place}: values", name, expected, remedy)
         if value is None:
             continue
         try:
@@ -265,10 +248,6 @@ def _row(values: Any, places: dict[str, int], place: str) -> list[float]:
                 raise TypeError
             made[places[name]] = float(value)
         except (TypeError, OverflowError):
-            raise InputError(
-                f"{place}: {name}",
-                expected="a number or null",
-                got=repr(value)[:60],
-                remedy="send numbers as JSON numbers",
-            ) from None
+            remedy = "send numbers as JSON numbers"
+            raise _refused(f"{place}: {name}", value, "a number or null", remedy) from None
     return made

@@ -12,7 +12,7 @@ from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.inversion import InversionDiagnoser
 from retwin.evaluation.fidelity.simulation import simulate_records
-from retwin.monitor.decision import Decision, FalseAlarmTest, decide
+from retwin.monitor.decision import Decision, FalseAlarmTest, decide, padded
 from retwin.monitor.gridded import gridded, record_of
 from retwin.monitor.store import Store
 from retwin.monitor.trajectories import TrajectoryMonitor
@@ -67,10 +67,7 @@ def compared_trajectories(
     for part in machines:
         pairs = np.array([[_crps(own, each, unit) for each in part] for own in twins])
         scores += np.array_split(pairs, max(1, len(part) // length), axis=1)
-    longest = max(each.shape[1] for each in scores)
-    old_crps, new_crps = np.full((2, len(scores), longest), np.nan)
-    for block, pairs in enumerate(scores):
-        old_crps[block, : pairs.shape[1]], new_crps[block, : pairs.shape[1]] = pairs
+    old_crps, new_crps = map(padded, zip(*scores, strict=True))
     beside = None if reference is None else _tested(reference, machines)
     return decide(old_crps, new_crps, _tested(new, machines), reference=beside)
 

@@ -18,8 +18,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from retwin.checks import existing, require
+from retwin.checks import existing
 from retwin.errors import InputError, brief
+from retwin.serialisation.places import refuse_others, unwritable
 from retwin.serialisation.sizes import Budget
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "refusing",
     "sha256",
     "write_atomically",
+    "write_json",
 ]
 
 AT_FDCWD, EXCHANGE = -100, 2
@@ -144,6 +146,12 @@ def parse_json(text: bytes, where: str) -> Any:
         raise ValueError(f"{where} is nested too deeply") from None
 
 
+def write_json(path: str | os.PathLike[str], values: Any) -> None:
+    """Write values as a JSON file, whole or not at all."""
+    with write_atomically(path) as part:
+        part.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+
+
 @contextmanager
 def refusing(file: str | os.PathLike[str], *, expected: str, remedy: str) -> Iterator[None]:
     """Turn every exception that reading untrusted contents raises into an InputError.
@@ -194,12 +202,7 @@ def _make_parent(target: Path, part: Path) -> None:
         part.unlink()
         target.exists()
     except OSError as error:
-        raise InputError(
-            "path",
-            expected="a place that can be written",
-            got=f"{target} ({error.strerror or type(error).__name__})",
-            remedy="give another folder or name",
-        ) from None
+        raise unwritable(target, error) from None
 
 
 def _check_kind(target: Path, *, folder: bool) -> None:
@@ -222,13 +225,7 @@ def _move(part: Path, target: Path) -> None:
     for former in _formers(target):
         shutil.rmtree(former, ignore_errors=True)
     others = {each.name for each in target.iterdir()} - {each.name for each in part.iterdir()}
-    require(
-        not others,
-        "path",
-        expected="a name that is free or a folder of the same kind to replace",
-        got=f"{target}, which also holds {min(others, default='')}",
-        remedy="give another name, so that nothing is lost",
-    )
+    refuse_others(target, others)
     if _exchanged(part, target):
         return
     # A kill between the two steps leaves no folder of that name: `recover` puts the former back.

@@ -11,7 +11,7 @@ from pathlib import Path
 from retwin.checks import require
 from retwin.errors import InputError
 
-__all__ = ["check_place", "in_use"]
+__all__ = ["check_place", "in_use", "refuse_others", "unwritable"]
 
 TOKEN = "-" * 16
 """As many characters as a name gets in addition while it is written, and one or two more."""
@@ -52,13 +52,22 @@ def check_place(
         )
         _try_to_write(target)
     except OSError as error:
-        raise InputError(
-            "path",
-            expected="a place that can be written",
-            got=f"{_shortened(target)} ({error.strerror or type(error).__name__})",
-            remedy="give another folder",
-        ) from None
-    others = present - set(present if holds is None else holds)
+        raise unwritable(target, error) from None
+    refuse_others(target, present - set(present if holds is None else holds))
+
+
+def unwritable(target: Path, error: OSError) -> InputError:
+    """The error about a place where the system does not let anything be written."""
+    return InputError(
+        "path",
+        expected="a place that can be written",
+        got=f"{_shortened(target)} ({error.strerror or type(error).__name__})",
+        remedy="give another folder or name",
+    )
+
+
+def refuse_others(target: Path, others: Collection[str]) -> None:
+    """Refuse to replace a folder that holds something else, which would be lost."""
     require(
         not others,
         "path",

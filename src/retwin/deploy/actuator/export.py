@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retwin.checks import needs_extra, positive, require, whole
+from retwin.checks import positive, require, whole
 from retwin.data.trajectories import Channels
 from retwin.deploy.actuator.draws import Draws, causal_part, drawn, still_and_fastest
 from retwin.deploy.actuator.module import AT_REST, Actuators, ActuatorStep
@@ -141,8 +141,9 @@ def export_actuator(
     files = ["model.json", "weights.safetensors", "actuator.pt", *(["actuator.onnx"] * onnx)]
     check_place(folder, folder=True, holds=files)
     if onnx:
-        for name in ("onnx", "onnxscript", "onnxruntime"):
-            needs_extra(name, "onnx", "writes and checks ONNX graphs")
+        from retwin.deploy.onnx.export import check_installed
+
+        check_installed()
     given = checked_commands(commands, twin.inputs).astype(np.float32, copy=False)
     found = drawn(twin, given, draws, seed)
     at_outputs = isinstance(operator, DelayOffset)

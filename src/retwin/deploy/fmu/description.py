@@ -134,9 +134,9 @@ CAUSALITY = {
     "noise": ("parameter", "tunable"),
     "outside": ("output", "discrete"),
 }
+"""Causality and variability by role."""
 OUTPUTS = ("output", "outside")
 """Roles of outputs."""
-"""Causality and variability by role."""
 
 
 def token_of(source: str) -> str:
@@ -205,15 +205,11 @@ def description(
         for place, (reference, each) in enumerate(shown, 1)
         if each.role in OUTPUTS
     ]
-    if two:
-        for part, tag in (("Outputs", "Unknown"), ("InitialUnknowns", "Unknown")):
-            held = SubElement(structure, part)
-            for index in outputs:
-                SubElement(held, tag, {"index": str(index)})
-    else:
-        for tag in ("Output", "InitialUnknown"):
-            for reference in outputs:
-                SubElement(structure, tag, {"valueReference": str(reference)})
+    for tag in ("Output", "InitialUnknown"):
+        held = SubElement(structure, f"{tag}s") if two else structure
+        for place in outputs:
+            reference_to = {"index" if two else "valueReference": str(place)}
+            SubElement(held, "Unknown" if two else tag, reference_to)
     return _written(root)
 
 
@@ -231,16 +227,12 @@ def _add_variable(listed: Element, reference: int, each: Variable, *, two: bool)
         )
         return
     causality, variability = CAUSALITY[each.role]
-    if kind in ("Integer", "Int32", "Boolean") and each.role == "noise":
-        variability = "tunable"
     common |= {"causality": causality, "variability": variability}
     if each.role in OUTPUTS:
         common["initial"] = "calculated"
     else:
-        start = {"Integer": "0", "Int32": "0", "Boolean": "false"}.get(
-            kind, repr(float(each.start))
-        )
-        values["start"] = start
+        starts = {"seed": "0", "noise": "false"}
+        values["start"] = starts.get(each.role, repr(float(each.start)))
     values |= _range(each)
     if two:
         SubElement(SubElement(listed, "ScalarVariable", common), kind, values)

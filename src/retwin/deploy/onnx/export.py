@@ -40,7 +40,7 @@ from retwin.update.corrections import SampledSensor
 from retwin.update.residual import Mixture, ResidualModel
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["PARITY", "export_onnx", "write_graph"]
+__all__ = ["PARITY", "check_installed", "export_onnx", "write_graph"]
 
 PARITY = 1e-5
 """Greatest difference between onnxruntime and torch, in standard units, of a graph."""
@@ -102,7 +102,7 @@ def export_onnx(
         or if a graph differs from torch by more than 1e-5.
 
     """
-    _check_installed()
+    check_installed()
     _check_exportable(bundle)
     graphs = _graphs(bundle)
     names = [f"{name}.onnx" for name in graphs]
@@ -125,7 +125,8 @@ def export_onnx(
     return parity
 
 
-def _check_installed() -> None:
+def check_installed() -> None:
+    """Require the libraries that write and run graphs."""
     for name in ("onnx", "onnxscript", "onnxruntime"):
         needs_extra(name, "onnx", "writes and checks ONNX graphs")
 
@@ -336,12 +337,6 @@ def _difference(graph: Graph, path: Path) -> float:
     return float(((torch.as_tensor(found) - expected) / graph.unit).abs().max())
 
 
-def _timing(sensor: SampledSensor, rate: float) -> dict[str, Any]:
-    """Settings of the sensor's graph, in samples."""
-    every, phases = sensor.timing(rate)
-    return {"every": every, "phases": phases}
-
-
 def _about(bundle: Bundle) -> dict[str, Any]:
     """The description that `Portable` needs beside the graphs."""
     twin, diagnoser = bundle.twin, bundle.diagnoser
@@ -353,7 +348,7 @@ def _about(bundle: Bundle) -> dict[str, Any]:
         "outputs": vars(twin.outputs),
         "rate": twin.rate,
         "emulated": twin.residual.emulated,
-        "sensor": None if sensor is None else _timing(sensor, twin.rate),
+        "sensor": sensor and dict(zip(("every", "phases"), sensor.timing(twin.rate), strict=True)),
         "domain": asdict(bundle.guard.domain),
         "stride": bundle.guard.stride(twin.surrogate),
         "diagnoser": None

@@ -32,7 +32,7 @@ from retwin.deploy.simulations.plan import Recorded, SimulatedChunk, SimulationP
 from retwin.errors import InputError
 from retwin.jobs import alone, each
 from retwin.progress import Progress
-from retwin.serialisation.files import write_atomically
+from retwin.serialisation.files import write_atomically, write_json
 from retwin.serialisation.identity import identity
 from retwin.serialisation.places import in_use
 from retwin.serialisation.sizes import Budget
@@ -175,7 +175,7 @@ class _Job:
                 if isinstance(plan.commands, Recorded):
                     np.save(new / "commands.npy", plan.commands.array)
                 create_chunked(new / "data", _header(plan, {}, []), plan.dtype)
-                _write_json(new / "plan.json", about)
+                write_json(new / "plan.json", about)
         require(
             (part / "plan.json").exists(),
             "path",
@@ -235,7 +235,7 @@ def _write(job: _Job, number: int, progress: Progress | None = None) -> int:
     made = simulate_chunk(job.plan, number, progress)
     digest = write_chunk(job.part / "data", number * job.plan.chunk, made.arrays)
     mark = {"sha256": digest, "emulated": made.emulated, "failed": made.failed}
-    _write_json(job.part / "done" / f"{number:08d}.json", mark)
+    write_json(job.part / "done" / f"{number:08d}.json", mark)
     return len(made.arrays["labels"])
 
 
@@ -342,8 +342,3 @@ def _remove(part: Path) -> None:
     """Remove the work on a plan, `plan.json` last, which identifies it until then."""
     for folder in (part / "data", part / "done", part):
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _write_json(path: Path, value: dict[str, Any]) -> None:
-    with write_atomically(path) as part:
-        part.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
