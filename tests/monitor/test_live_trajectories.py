@@ -29,7 +29,8 @@ from retwin.monitor.samples import SECOND, Trajectory, parse
 from retwin.monitor.server import create_app, listening, serving
 from retwin.monitor.settings import FolderSource, read_settings
 from retwin.monitor.sources.trajectory_folder import Recorded, TrajectoryFolder
-from retwin.monitor.trajectories import TrajectoryMonitor, fit_trajectory_monitor
+from retwin.monitor.trajectories import TrajectoryMonitor
+from retwin.monitor.trajectory_fitting import fit_trajectory_monitor
 from retwin.monitor.trajectory_machine import Diagnosed, TrajectoryMachine
 from retwin.twins import ParameterShift
 from retwin.update import Dynamics, Library, fit_dynamics

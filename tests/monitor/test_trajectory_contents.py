@@ -10,8 +10,9 @@ from retwin.data.trajectories import Trajectories
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.monitor.offsets import OffsetModel, fit_offsets
-from retwin.monitor.trajectories import TrajectoryMonitor, fit_trajectory_monitor
+from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.monitor.trajectory_evidence import checked
+from retwin.monitor.trajectory_fitting import fit_trajectory_monitor
 from retwin.monitor.trajectory_state import TrajectoryState
 from retwin.twins import ActuatorGain, ParameterShift
 from retwin.twins.faults import ActuatorBias

@@ -10,7 +10,8 @@ import pytest
 import retwin as rt
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
-from retwin.monitor.trajectories import TrajectoryMonitor, fit_trajectory_monitor
+from retwin.monitor.trajectories import TrajectoryMonitor
+from retwin.monitor.trajectory_fitting import fit_trajectory_monitor
 from retwin.twins import ActuatorGain, Parameter, ParameterShift, SensorBias, State, StateTwin
 from retwin.twins.faults import Fault
 from retwin.update import Dynamics, Library, fit_dynamics

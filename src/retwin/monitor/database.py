@@ -8,15 +8,28 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from retwin.checks import needs_extra, require
 from retwin.errors import InputError, brief
+from retwin.monitor.audit import Entry
 
 if TYPE_CHECKING:
     import sqlalchemy as sa
 else:
     sa = needs_extra("sqlalchemy", "monitor", "holds what the monitor stores")
 
-__all__ = ["SCHEMA", "Database", "assets", "log", "samples", "states"]
+__all__ = [
+    "SCHEMA",
+    "Database",
+    "assets",
+    "last_entry",
+    "log",
+    "present",
+    "samples",
+    "states",
+]
 
 SCHEMA = 1
 """The version of the tables."""
@@ -38,6 +51,8 @@ PRAGMAS = {
 SERVER = {"fsync": "on", "full_page_writes": "on", "synchronous_commit": "on"}
 """Settings of PostgreSQL without which a commit is not durable."""
 
+AT_ONCE = 500
+"""Times that are looked for at once; a query has a limit."""
 TABLES = sa.MetaData()
 meta = sa.Table(
     "retwin_meta",
@@ -271,6 +286,22 @@ class Database:
             got=", ".join(wrong),
             remedy=remedy,
         )
+
+
+def present(connection: Any, key: int, times: NDArray) -> NDArray:
+    """Those of the times that samples of an asset have; others between them are not read."""
+    found: list[int] = []
+    for first in range(0, len(times), AT_ONCE):
+        chosen = samples.c.time.in_(times[first : first + AT_ONCE].tolist())
+        own = sa.select(samples.c.time).where(samples.c.asset == key, chosen)
+        found += connection.execute(own).scalars().all()
+    return np.array(found, dtype=np.int64)
+
+
+def last_entry(connection: Any) -> Entry | None:
+    """The newest entry of the log; None if it has none."""
+    row = connection.execute(log.select().order_by(log.c.sequence.desc()).limit(1)).one_or_none()
+    return row and Entry(row.sequence, row.kind, row.text, row.previous, row.hash)
 
 
 def _address(url: str) -> Any:

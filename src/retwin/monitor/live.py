@@ -190,22 +190,7 @@ class Live:
     def status(self) -> list[AssetStatus]:
         """All machines, those with most evidence for a change first."""
         with self._lock:
-            made = [
-                AssetStatus(
-                    each.asset.name,
-                    each.asset.settings["twin"],
-                    each.asset.version or 0,
-                    each.newest,
-                    each.evidence / each.monitor.arl,
-                    each.alarms,
-                    each.last_alarm,
-                    each.void,
-                    each.outside,
-                    each.rate,
-                    vars(each.counts).copy(),
-                )
-                for each in self._machines.values()
-            ]
+            made = [AssetStatus.of(each, each.monitor.arl) for each in self._machines.values()]
         return sorted(made, key=lambda each: (-each.void, -each.ratio))
 
     def recent(self, asset: str) -> Recent:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -154,16 +155,12 @@ class Monitor:
             online.step(own, known, measured, seen)
             for online, own in zip(self._filters, state.filters, strict=True)
         ]
-        error, width = (
-            _by_stream(np.concatenate(each, axis=2))
-            for each in zip(
-                *(
-                    standardised(measured - mean, covariance, seen, self.resolution)
-                    for _, mean, covariance in predicted
-                ),
-                strict=True,
-            )
+        parts = (
+            standardised(measured - mean, covariance, seen, self.resolution)
+            for _, mean, covariance in predicted
         )
+        pairs = zip(*parts, strict=True)
+        error, width = (_by_stream(np.concatenate(each, axis=2)) for each in pairs)
         streams = self._streams(count)
         disturbance, error, scale = streams.disturbance.run(state.disturbance, error)
         width = width / scale
@@ -328,14 +325,11 @@ class Monitor:
             scores = ConformalScores.of_arrays(arrays, about["copies"])
             slack = tuple(Slack(*each) for each in about["slack"])
             twin = DynamicsTwin.load(Path(folder) / "twin")
-            numbers = {name: finite(name, about[name], least=0.0) for name in NUMBERS}
+            numbers: dict[str, Any] = {
+                name: finite(name, about[name], least=0.0) for name in NUMBERS
+            }
             given = about.get("predictors") or [[1.0, about["warm_up"]]]  # one, before version 0.2
-            predictors = tuple(
-                Predictor(
-                    finite("process", factor, least=0.0), finite("warm_up", warm_up, least=0.0)
-                )
-                for factor, warm_up in given
-            )
+            predictors = tuple(Predictor(*each) for each in given)
             streams = len(predictors) * len(twin.outputs)
             parts = (disturbance.mean, scores.independent, slack, arrays["resolution"])
             shapes = [len(each) for each in parts]
@@ -349,15 +343,8 @@ class Monitor:
                 got=shapes,
                 remedy="save the monitor again",
             )
-            return cls(
-                twin,
-                disturbance,
-                scores,
-                slack,
-                arrays["resolution"],
-                **numbers,
-                predictors=predictors,
-            )
+            numbers |= {"resolution": arrays["resolution"], "predictors": predictors}
+            return cls(twin, disturbance, scores, slack, **numbers)
 
 
 NUMBERS = ("arl", "blanking", "alpha")

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.checks import finite
 from retwin.monitor.detector import Detector
 from retwin.monitor.slack import Slack
 from retwin.update.dynamics.online import FilterState, OnlineFilter
@@ -47,6 +48,10 @@ class Predictor:
 
     process: float = 1.0
     warm_up: float = 0.0
+
+    def __post_init__(self) -> None:
+        finite("process", self.process, least=0.0)
+        finite("warm_up", self.warm_up, least=0.0)
 
     def filter(self, twin: DynamicsTwin) -> OnlineFilter:
         """Its filter."""

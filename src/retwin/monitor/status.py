@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-from retwin.monitor.machine import Counts
+from retwin.monitor.machine import Counts, Machine
 
 __all__ = ["AssetStatus", "Received"]
 
@@ -68,3 +69,20 @@ class AssetStatus:
     outside: bool
     rate: str
     counts: dict[str, int]
+
+    @classmethod
+    def of(cls, machine: Machine[Any], arl: float) -> AssetStatus:
+        """The status of a machine whose alarms have that threshold."""
+        return cls(
+            machine.asset.name,
+            machine.asset.settings["twin"],
+            machine.asset.version or 0,
+            machine.newest,
+            machine.evidence / arl,
+            machine.alarms,
+            machine.last_alarm,
+            machine.void,
+            machine.outside,
+            machine.rate,
+            vars(machine.counts).copy(),
+        )

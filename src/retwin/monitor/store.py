@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 from retwin.checks import instance, require, whole
 from retwin.monitor import database
 from retwin.monitor.audit import START, Entry, append, canonical
-from retwin.monitor.database import Database, assets, log, samples, states
+from retwin.monitor.database import (
+    Database,
+    assets,
+    last_entry,
+    log,
+    present,
+    samples,
+    states,
+)
 from retwin.monitor.updates import (
     LEAST,
     MOST,
@@ -45,8 +53,6 @@ FILE = "monitor.sqlite"
 """The database in the folder of the store, where no other is given."""
 ROWS = 4096
 """Rows that are read at once."""
-AT_ONCE = 500
-"""Times that are looked for at once; a query has a limit."""
 SURPLUS = 0.1
 """Share of `max_samples` by which an asset may exceed it, so that samples are removed in groups."""
 
@@ -269,7 +275,7 @@ class Store:
             return np.zeros(0, dtype=np.int64)
         key, _ = self._asset(asset)
         with self._reading() as connection:
-            return _present(connection, key, times)
+            return present(connection, key, times)
 
     def log(self, kind: str | None = None, after: int = LEAST) -> Iterator[Entry]:
         """The entries of the log in their order, or those of one kind, read part by part.
@@ -293,7 +299,7 @@ class Store:
     def head(self) -> str:
         """The hash of the last entry of the log: keep it elsewhere to detect a cut-off log."""
         with self._reading() as connection:
-            last = _last_entry(connection)
+            last = last_entry(connection)
         return START if last is None else last.hash
 
     def _asset(self, name: str) -> tuple[int, int]:
@@ -325,7 +331,7 @@ class Store:
             try:
                 with self._database.writer() as connection:
                     if self._database.stale:
-                        self._last = _last_entry(connection)
+                        self._last = last_entry(connection)
                         self._assets = None
                         self._held = {}
                         self._database.stale = False
@@ -345,7 +351,7 @@ class Store:
         else:
             new = np.zeros(len(times), dtype=bool)
             new[np.unique(times, return_index=True)[1]] = True
-            new &= ~np.isin(times, _present(connection, packed.key, times))
+            new &= ~np.isin(times, present(connection, packed.key, times))
         held.latest = max(held.latest, int(times.max()))
         held.count += int(new.sum())
         return new
@@ -389,18 +395,3 @@ class _Held:
 
     count: int
     latest: int
-
-
-def _present(connection: Any, key: int, times: NDArray) -> NDArray:
-    """Those of the times that samples of an asset have; others between them are not read."""
-    found: list[int] = []
-    for first in range(0, len(times), AT_ONCE):
-        chosen = samples.c.time.in_(times[first : first + AT_ONCE].tolist())
-        own = sa.select(samples.c.time).where(samples.c.asset == key, chosen)
-        found += connection.execute(own).scalars().all()
-    return np.array(found, dtype=np.int64)
-
-
-def _last_entry(connection: Any) -> Entry | None:
-    row = connection.execute(log.select().order_by(log.c.sequence.desc()).limit(1)).one_or_none()
-    return row and Entry(row.sequence, row.kind, row.text, row.previous, row.hash)
