@@ -71,7 +71,6 @@ class FirstScreen(Group):
 app = Commands(
     help="Update digital twins so that they behave like the real machine.",
     cls=FirstScreen,
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
 app.command(epilog=example("retwin demo"))(studies.demo)

@@ -36,7 +36,6 @@ __all__ = ["app"]
 app = Commands(
     help="Everything that was fitted, in one sealed folder.",
     epilog=example("retwin bundle predict bundle real.mat --case armpi"),
-    no_args_is_help=True,
 )
 
 Folder = Annotated[Path, typer.Argument(metavar="BUNDLE", help="Folder of a bundle.")]

@@ -52,7 +52,7 @@ class Commands(typer.Typer):
     """An application of such commands."""
 
     def __init__(self, *, cls: type[TyperGroup] = Group, **settings: Any) -> None:
-        super().__init__(cls=cls, **settings)
+        super().__init__(cls=cls, no_args_is_help=True, **settings)
 
     def command(
         self, name: str | None = None, *, cls: type[TyperCommand] | None = None, **settings: Any

@@ -46,7 +46,6 @@ SHOWN = 40
 app = Commands(
     help="Describe, map, convert, split and fetch trajectories.",
     epilog=example("retwin data info real.mat --case armpi"),
-    no_args_is_help=True,
 )
 
 File = Annotated[

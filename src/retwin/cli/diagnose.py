@@ -33,7 +33,6 @@ EMULATED = "These trajectories are EMULATED: no real measurements."
 app = Commands(
     help="Train a diagnoser, and use it.",
     epilog=example("retwin diagnose predict cnn real.mat --case armpi"),
-    no_args_is_help=True,
 )
 
 Out = Annotated[Path, typer.Option(metavar="FOLDER", help="Where to save the diagnoser.")]

@@ -29,7 +29,6 @@ TRAJECTORIES = 256
 app = Commands(
     help="Take an updated twin to other tools.",
     epilog=example("retwin export fmu model --out twin.fmu"),
-    no_args_is_help=True,
 )
 
 

@@ -41,7 +41,6 @@ Reading = Callable[..., Trajectories]
 app = Commands(
     help="Watch a machine with its corrected twin.",
     epilog=example("retwin monitor replay watch day1.npz"),
-    no_args_is_help=True,
 )
 
 

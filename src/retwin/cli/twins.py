@@ -36,7 +36,6 @@ __all__ = ["app"]
 app = Commands(
     help="List, describe and simulate twins.",
     epilog=example("retwin twin info armpi"),
-    no_args_is_help=True,
 )
 
 TwinName = Annotated[

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from retwin.twins.system_faults import (
 )
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["Cause", "find_causes", "possible_causes"]
+__all__ = ["Cause", "cause_data", "find_causes", "possible_causes"]
 
 BEFORE = 100
 """Samples before an alarm from which its cause is inferred."""
@@ -65,6 +66,28 @@ class Cause:
     size: tuple[float, float, float]
     onset: tuple[float, float, float]
     probabilities: dict[str, float]
+
+
+def cause_data(
+    name: str,
+    probability: float,
+    unknown: float,
+    probabilities: Mapping[str, float],
+    size: Sequence[float | None] = (None,) * 3,
+    onset: Sequence[float | None] = (None,) * 3,
+) -> dict[str, Any]:
+    """A cause as data of the log, None where there is no number; see `Cause`.
+
+    The onset is in nanoseconds.
+    """
+    return {
+        "name": name,
+        "probability": probability,
+        "unknown": unknown,
+        "size": list(size),
+        "onset": list(onset),
+        "probabilities": dict(probabilities),
+    }
 
 
 def possible_causes(

@@ -14,7 +14,7 @@ from retwin.checks import require
 from retwin.diagnosis.estimate import UNKNOWN
 from retwin.errors import InputError, brief
 from retwin.monitor.audit import Entry
-from retwin.monitor.cause import BEFORE, FEWEST, Cause, find_causes, possible_causes
+from retwin.monitor.cause import BEFORE, FEWEST, Cause, cause_data, find_causes, possible_causes
 from retwin.monitor.gridded import gridded, record_of
 from retwin.monitor.live import Live
 from retwin.monitor.monitor import Monitor
@@ -120,19 +120,10 @@ class Explanations:
     def _explain(self, entry: Entry, before: int) -> None:
         alarm = entry.data
         try:
-            found = _data(entry, self._found(alarm, before))
+            found = _data(*self._found(alarm, before))
         except Exception as error:  # Whatever fails is an entry, and the next alarm is explained.
-            found = {
-                "alarm": entry.sequence,
-                "asset": alarm["asset"],
-                "name": UNKNOWN,
-                "probability": 0.0,
-                "unknown": 1.0,
-                "size": [None] * 3,
-                "onset": [None] * 3,
-                "probabilities": {},
-                "note": brief(error),
-            }
+            found = cause_data(UNKNOWN, 0.0, 1.0, {}) | {"note": brief(error)}
+        found |= {"alarm": entry.sequence, "asset": alarm["asset"]}
         self._live.log([("cause", found)])
         try:
             self._report(alarm, found)
@@ -165,18 +156,9 @@ class Explanations:
         return cause, int(times[0])
 
 
-def _data(entry: Entry, found: tuple[Cause, int]) -> dict[str, Any]:
-    """A cause as data of the log: times in nanoseconds, None where there is no number."""
-    cause, first = found
-    return {
-        "alarm": entry.sequence,
-        "asset": entry.data["asset"],
-        "name": cause.name,
-        "probability": cause.probability,
-        "unknown": cause.unknown,
-        "size": [each if np.isfinite(each) else None for each in cause.size],
-        "onset": [
-            first + round(each * SECOND) if np.isfinite(each) else None for each in cause.onset
-        ],
-        "probabilities": cause.probabilities,
-    }
+def _data(cause: Cause, first: int) -> dict[str, Any]:
+    """A cause as data of the log, whose first sample was at a time in nanoseconds."""
+    size = [each if np.isfinite(each) else None for each in cause.size]
+    onset = [first + round(each * SECOND) if np.isfinite(each) else None for each in cause.onset]
+    shares = cause.probability, cause.unknown, cause.probabilities
+    return cause_data(cause.name, *shares, size, onset)

@@ -101,29 +101,21 @@ class Gate:
                 except queue.Empty:
                     break
             open_ = waiting is not None
-            self._submit(group)
+            active = [each for each in group if each[1].set_running_or_notify_cancel()]
+            if active:
+                self._submit(active)
 
     def _submit(self, group: Sequence[_Waiting]) -> None:
         """Submit a group, or, if it is refused, each of it alone."""
-        active = [each for each in group if each[1].set_running_or_notify_cancel()]
-        if not active:
-            return
         try:
-            found = self.live.submit([samples for samples, _ in active])
-        except InputError as error:
-            if len(active) == 1:
-                active[0][1].set_exception(error)
-                return
-            for samples, future in active:
-                try:
-                    (own,) = self.live.submit([samples])
-                except Exception as alone:
-                    future.set_exception(alone)
-                else:
-                    future.set_result(own)
+            found = self.live.submit([samples for samples, _ in group])
         except Exception as error:
-            for _, future in active:
+            if isinstance(error, InputError) and len(group) > 1:
+                for each in group:
+                    self._submit([each])
+                return
+            for _, future in group:
                 future.set_exception(error)
         else:
-            for (_, future), own in zip(active, found, strict=True):
+            for (_, future), own in zip(group, found, strict=True):
                 future.set_result(own)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from retwin.diagnosis.estimate import UNKNOWN
 from retwin.errors import InputError, brief
+from retwin.monitor.cause import cause_data
 from retwin.monitor.gridded import record_of
 from retwin.monitor.machine import KEPT, Machine, Recent
 from retwin.monitor.samples import Samples, Trajectory
@@ -184,14 +185,8 @@ class TrajectoryMachine(Machine[TrajectoryMonitor]):
     def _alarm(self, found: Diagnosed, watched: WatchedTrajectories, number: int) -> dict[str, Any]:
         """An alarm with its cause, which is known at once."""
         alarm, times = watched.alarms[number], found.samples.times
-        cause = {
-            "name": alarm.name,
-            "probability": alarm.probability,
-            "unknown": alarm.shares.get(UNKNOWN, 0.0),
-            "size": [None] * 3,
-            "onset": [None] * 3,
-            "probabilities": alarm.shares,
-        }
+        unknown = alarm.shares.get(UNKNOWN, 0.0)
+        cause = cause_data(alarm.name, alarm.probability, unknown, alarm.shares)
         return self.entry(
             int(times[-1]),
             sample=alarm.number,

@@ -15,7 +15,7 @@ from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["DataCase", "Raw", "assemble", "settle", "split_columns"]
+__all__ = ["DataCase", "Raw", "assemble", "settle"]
 
 RATE_TOLERANCE = 1e-3
 """Relative difference of sample rates that count as equal: files round their times."""
@@ -80,17 +80,26 @@ class Raw:
     id: str | None = None
     rate: float | None = None
 
+    @classmethod
+    def of_columns(
+        cls, block: NDArray, where: str, case: DataCase | None, label: str, name: str | None = None
+    ) -> Raw:
+        """One whose columns (T, k) are commands, nominal and observed, or these two alone.
 
-def split_columns(block: NDArray, where: str, case: DataCase | None) -> tuple[NDArray, ...]:
-    """Columns (T, k) as commands, nominal and observed; commands are (T, 0) if k = 2 d_y.
+        Raises
+        ------
+        InputError
+            The number of columns fits neither layout.
 
-    Raises
-    ------
-    InputError
-        The number of columns fits neither layout.
+        """
+        first, half = _widths(block.shape[1], where, case)
+        commands = block[:, :first] if first else None
+        nominal, observed = block[:, first : first + half], block[:, first + half :]
+        return cls(where, label, nominal, observed, commands, name)
 
-    """
-    width = block.shape[1]
+
+def _widths(width: int, where: str, case: DataCase | None) -> tuple[int, int]:
+    """The number of columns of commands, 0 if there are none, and of outputs."""
     if case is None:
         half, odd = divmod(width, 2)
         require(
@@ -111,7 +120,7 @@ def split_columns(block: NDArray, where: str, case: DataCase | None) -> tuple[ND
             got=f"{width} columns",
             remedy="give the case that the data belong to",
         )
-    return block[:, :first], block[:, first : first + half], block[:, first + half :]
+    return first, half
 
 
 def assemble(

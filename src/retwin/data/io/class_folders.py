@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import require
-from retwin.data.io.assembly import DataCase, Raw, assemble, split_columns
+from retwin.data.io.assembly import DataCase, Raw, assemble
 from retwin.data.io.mat import mat_variables, matrix
 from retwin.data.io.mat5 import Opaque
 from retwin.data.trajectories import Channels, Provenance, Trajectories
@@ -117,15 +117,8 @@ def _read_csv(file: Path, where: str, case: DataCase | None, budget: Budget) -> 
             block = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
     except Exception as error:
         raise _csv_error(file, where, brief(error)) from None
-    commands, nominal, observed = split_columns(block, where, case)
-    return Raw(
-        where=where,
-        label=file.parent.name,
-        nominal=nominal,
-        observed=observed,
-        commands=commands if commands.shape[1] else None,
-        id=f"{file.parent.name}/{file.stem}",
-    )
+    label = file.parent.name
+    return Raw.of_columns(block, where, case, label, f"{label}/{file.stem}")
 
 
 def _csv_error(file: Path, where: str, fallback: str) -> InputError:

@@ -141,13 +141,8 @@ def restore(header: Mapping[str, Any], arrays: Mapping[str, NDArray], where: str
 
     """
     for name in NAMES:
-        require(
-            header["arrays"][name]["sha256"] == _digest(arrays[name]),
-            where,
-            expected=f"the array {name!r} as it was written",
-            got="other bytes",
-            remedy="the file is damaged: get or make it again",
-        )
+        same = header["arrays"][name]["sha256"] == _digest(arrays[name])
+        _require_same(same, where, f"the array {name!r}", "file")
     return Trajectories(**{**arrays, **_read_about(header)})
 
 
@@ -183,13 +178,13 @@ def check_chunk(
         They are not those that were written.
 
     """
-    require(
-        header["chunks"][number] == chunk_digest(arrays),
-        where,
-        expected=f"chunk {number} as it was written",
-        got="other bytes",
-        remedy="the folder is damaged: get or make it again",
-    )
+    same = header["chunks"][number] == chunk_digest(arrays)
+    _require_same(same, where, f"chunk {number}", "folder")
+
+
+def _require_same(same: bool, where: str, what: str, kind: str) -> None:
+    expected, remedy = f"{what} as it was written", f"the {kind} is damaged: get or make it again"
+    require(same, where, expected=expected, got="other bytes", remedy=remedy)
 
 
 def _digest(array: NDArray) -> str:

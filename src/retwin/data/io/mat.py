@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import require
-from retwin.data.io.assembly import DataCase, Raw, assemble, split_columns
+from retwin.data.io.assembly import DataCase, Raw, assemble
 from retwin.data.io.mat5 import NewerMat, read_mat5
 from retwin.data.trajectories import Provenance, Trajectories
 from retwin.errors import InputError
@@ -67,16 +67,8 @@ def read_mat(
     raws = []
     for i, (cell, label) in enumerate(zip(blocks, labels, strict=True)):
         where = f"{path.name}: {x_name}, trajectory {i}"
-        commands, nominal, observed = split_columns(matrix(cell, where), where, case)
-        raws.append(
-            Raw(
-                where=where,
-                label=_text(label, f"{path.name}: {y_name}, trajectory {i}"),
-                nominal=nominal,
-                observed=observed,
-                commands=commands if commands.shape[1] else None,
-            )
-        )
+        text = _text(label, f"{path.name}: {y_name}, trajectory {i}")
+        raws.append(Raw.of_columns(matrix(cell, where), where, case, text))
     source = Provenance(path.name, sha256(path))
     return assemble(raws, source=source, case=case, rate=rate, budget=budget)
 

@@ -99,7 +99,7 @@ def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Si
         It is no table of numbers, or a row has another number of cells than the first one.
 
     """
-    layout = _layout(path)
+    layout = text_layout(*_begin(path), path)
     titles = dict(zip(layout.names, layout.units, strict=True))
     kept = set(titles) if wanted is None else {clock.column, *wanted} & set(titles)
     if wanted is not None and not clock.rate:  # the column of times may be found by its name
@@ -154,9 +154,7 @@ def read_cells(path: Path, wanted: Sequence[str]) -> tuple[dict[str, list[str]],
 
     """
     plain = {title.strip() for title in wanted}
-    encoding = _encoding(path)
-    with _opened(path, encoding) as file:
-        lines = list(islice(_lines(file, path), HEAD))
+    lines, encoding = _begin(path)
     tables = [(each, list(_rows(iter(lines), each, path))) for each in SEPARATORS]
     found = [
         (separator, rows, place)
@@ -258,11 +256,11 @@ def _rows(
         ) from None
 
 
-def _layout(path: Path) -> TextLayout:
+def _begin(path: Path) -> tuple[list[str], str]:
+    """The first lines, and the encoding."""
     encoding = _encoding(path)
     with _opened(path, encoding) as file:
-        lines = list(islice(_lines(file, path), HEAD))
-    return text_layout(lines, encoding, path)
+        return list(islice(_lines(file, path), HEAD)), encoding
 
 
 def text_layout(lines: Sequence[str], encoding: str, path: Path) -> TextLayout:
