@@ -15,8 +15,8 @@ from broker import free_port
 from certificates import Authority
 from collecting import CollectingGate, running, wait
 
+from retwin.data.logs.signals import nanoseconds
 from retwin.errors import InputError
-from retwin.monitor.samples import nanoseconds
 from retwin.monitor.settings import OpcUaSource
 from retwin.monitor.sources.assembly import Assembly
 from retwin.monitor.sources.opcua import OpcUa

@@ -166,14 +166,13 @@ class Trajectories:
                 remedy="name every column",
             )
         checked = (commands, nominal, observed, mask, labels, ids)
-        for name, array in zip(PER_TRAJECTORY, checked, strict=True):
-            array = array.view()
+        arrays = {name: each.view() for name, each in zip(PER_TRAJECTORY, checked, strict=True)}
+        for array in arrays.values():
             array.flags.writeable = False
-            object.__setattr__(self, name, array)
-        object.__setattr__(self, "rate", rate)
-        object.__setattr__(self, "inputs", inputs)
-        object.__setattr__(self, "outputs", outputs)
-        object.__setattr__(self, "provenance", tuple(self.provenance))
+        provenance = tuple(self.provenance)
+        self.__dict__.update(
+            arrays, rate=rate, inputs=inputs, outputs=outputs, provenance=provenance
+        )
 
     def __len__(self) -> int:
         return len(self.commands)

@@ -21,9 +21,8 @@ from retwin.monitor.machine import Counts, Recent
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import SECOND, Samples, Trajectory
 from retwin.monitor.status import AssetStatus, Received
-from retwin.monitor.stepping import step
 from retwin.monitor.store import Store
-from retwin.monitor.stream_machine import StreamMachine, Work
+from retwin.monitor.stream_machine import StreamMachine, Work, step
 from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.monitor.trajectory_machine import Diagnosed, TrajectoryMachine
 from retwin.monitor.updates import MOST, Asset, Update, one_asset

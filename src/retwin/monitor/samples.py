@@ -5,23 +5,23 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import at_most, require
+from retwin.data.logs.signals import nanoseconds
 from retwin.errors import InputError, brief
 from retwin.monitor.updates import LEAST, MOST
 
-__all__ = ["SECOND", "Samples", "Trajectory", "nanoseconds", "parse"]
+__all__ = ["SECOND", "Samples", "Trajectory", "parse"]
 
 SECOND = 10**9
 """Nanoseconds of a second."""
 LONGEST = 100_000
 """Samples of a document at most."""
-EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 KEYS = {"asset", "time", "time_ns", "values"}
 REMEDY = 'send {"asset": "line1", "time": 1700000000.0, "values": {"T1": 21.3}}'
 
@@ -156,12 +156,6 @@ def parse(
     ]
 
 
-def nanoseconds(time: datetime) -> int:
-    """A time with a time zone in nanoseconds since the epoch."""
-    since = time - EPOCH
-    return (since.days * 86400 + since.seconds) * SECOND + since.microseconds * 1000
-
-
 def _objects(document: bytes | str) -> Iterator[Any]:
     """The objects of a document: one, those of an array, or one of each line."""
     try:
@@ -236,10 +230,8 @@ def _row(values: Any, places: dict[str, int], place: str) -> list[float]:
         raise _refused(f"{place}: values", values, "an object of channels")
     for name, value in values.items():
         if name not in places:
-            expected, remedy = (
-                f"channels among {', '.join(places)}",
-                "leave it out, or correct its name",
-            )
+            expected = f"channels among {', '.join(places)}"
+            remedy = "leave it out, or correct its name"
             raise _refused(f"{place}: values", name, expected, remedy)
         if value is None:
             continue

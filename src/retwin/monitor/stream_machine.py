@@ -19,9 +19,9 @@ from retwin.monitor.machine import KEPT, Counts, Machine, Recent
 from retwin.monitor.monitor import Monitor
 from retwin.monitor.samples import SECOND, Samples
 from retwin.monitor.updates import LEAST, Asset
-from retwin.monitor.watched import Alarm
+from retwin.monitor.watched import Alarm, Watched
 
-__all__ = ["StreamMachine", "Work"]
+__all__ = ["StreamMachine", "Work", "step"]
 
 DEFAULT_WAIT = 2
 """Sample periods for which a place is waited for, unless it is given."""
@@ -335,3 +335,29 @@ class StreamMachine(Machine[Monitor]):
 
     def _log(self, kind: str, moment: int, **data: Any) -> None:
         self.entries.append((kind, self.entry(moment, **data)))
+
+
+def step(together: Sequence[tuple[StreamMachine, Work]]) -> dict[str, int]:
+    """Step machines of one monitor, each by as many samples; their numbers of alarms."""
+    machines = [each for each, _ in together]
+    monitor = machines[0].monitor
+    layout = machines[0].layout
+    before = layout.state(np.stack([machine.state_for(work) for machine, work in together]))
+    values = np.stack([work.values for _, work in together])
+    commands, measured = np.split(values, [len(monitor.twin.inputs)], axis=2)
+    names = [each.asset.name for each in machines]
+    after, watched = monitor.step(before, commands, measured, names)
+    states = layout.rows(after)
+    alarms: dict[str, list[Alarm]] = {name: [] for name in names}
+    for alarm in watched.alarms:
+        alarms[alarm.trajectory].append(alarm)
+    for i, (machine, work) in enumerate(together):
+        machine.stepped(work, states[i], _row(watched, i), alarms[machine.asset.name])
+    return {name: len(each) for name, each in alarms.items()}
+
+
+def _row(watched: Watched, i: int) -> dict[str, NDArray]:
+    return {
+        name: getattr(watched, name)[i]
+        for name in ("mean", "deviation", "evidence", "void", "outside")
+    }

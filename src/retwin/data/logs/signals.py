@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
@@ -26,6 +27,7 @@ __all__ = [
     "Skipped",
     "even_times",
     "named_unit",
+    "nanoseconds",
     "to_nanoseconds",
 ]
 
@@ -33,6 +35,7 @@ NANOSECOND = 1e-9
 """A nanosecond in s."""
 MAX_SIGNALS = 10_000
 """Signals that one log may hold: names that are different in every message would fill memory."""
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 LATEST = 2**63 - 1
 """The latest time in ns, in the year 2262."""
 UNWANTED = "not named in the mapping"
@@ -153,6 +156,12 @@ def named_unit(name: str) -> tuple[str, str]:
     if found is None or re.fullmatch(r"\d+|", unit := (found[2] or found[3] or "").strip()):
         return name.strip(), ""
     return found[1], unit
+
+
+def nanoseconds(time: datetime) -> int:
+    """A time in ns since 1970; UTC if it has no time zone."""
+    since = (time if time.tzinfo else time.replace(tzinfo=UTC)) - EPOCH
+    return (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000
 
 
 def even_times(count: int, rate: float, where: str) -> NDArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from datetime import UTC, datetime
+from datetime import datetime
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from retwin.data.logs.signals import (
     Signal,
     Skipped,
     even_times,
+    nanoseconds,
     to_nanoseconds,
 )
 from retwin.errors import InputError
@@ -129,15 +130,13 @@ def _known(times: NDArray, missing: NDArray, where: str) -> NDArray:
 def _parsed(cells: NDArray, form: str, where: str) -> NDArray:
     """Times in ns of ISO 8601 text, or of text in a format of `strptime`; UTC without a zone."""
     made = np.empty(len(cells), np.int64)
-    epoch = datetime(1970, 1, 1, tzinfo=UTC)
     for row, cell in enumerate(cells):
         text = str(cell).strip()
         try:
             time = datetime.strptime(text, form) if form else datetime.fromisoformat(text)
         except ValueError:
             raise _no_time(cells[row : row + 1], f"{where}, row {row}") from None
-        since = (time if time.tzinfo else time.replace(tzinfo=UTC)) - epoch
-        made[row] = (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000
+        made[row] = nanoseconds(time)
     return made
 
 

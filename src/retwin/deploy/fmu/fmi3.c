@@ -277,255 +277,74 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 step, fmi3Bo
     return fmi3OK;
 }
 
-/* What a model without events, clocks and continuous states does not have. */
+/* What a model without events, clocks and continuous states does not have; the parameters are those
+   of the standard, in its order. */
+#define MISSING(NAME, PARAMETERS, ...)                                                              \
+    fmi3Status fmi3##NAME PARAMETERS                                                               \
+    {                                                                                              \
+        __VA_ARGS__;                                                                               \
+        return refused(c, "fmi3" #NAME ": not provided");                                          \
+    }
 
-fmi3Status fmi3EnterEventMode(fmi3Instance c)
-{
-    return refused(c, "fmi3EnterEventMode: not provided");
-}
-
-fmi3Status fmi3GetBinary(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                         size_t nValueReferences, size_t valueSizes[], fmi3Binary values[],
-                         size_t nValues)
-{
-    (void)valueReferences, (void)nValueReferences, (void)valueSizes, (void)values, (void)nValues;
-    return refused(c, "fmi3GetBinary: not provided");
-}
-
-fmi3Status fmi3GetClock(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                        size_t nValueReferences, fmi3Clock values[])
-{
-    (void)valueReferences, (void)nValueReferences, (void)values;
-    return refused(c, "fmi3GetClock: not provided");
-}
-
-fmi3Status fmi3SetBinary(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                         size_t nValueReferences, const size_t valueSizes[],
-                         const fmi3Binary values[], size_t nValues)
-{
-    (void)valueReferences, (void)nValueReferences, (void)valueSizes, (void)values, (void)nValues;
-    return refused(c, "fmi3SetBinary: not provided");
-}
-
-fmi3Status fmi3SetClock(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                        size_t nValueReferences, const fmi3Clock values[])
-{
-    (void)valueReferences, (void)nValueReferences, (void)values;
-    return refused(c, "fmi3SetClock: not provided");
-}
-
-fmi3Status fmi3GetNumberOfVariableDependencies(fmi3Instance c, fmi3ValueReference valueReference,
-                                               size_t* nDependencies)
-{
-    (void)valueReference, (void)nDependencies;
-    return refused(c, "fmi3GetNumberOfVariableDependencies: not provided");
-}
-
-fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueReference dependent,
-                                       size_t elementIndicesOfDependent[],
-                                       fmi3ValueReference independents[],
-                                       size_t elementIndicesOfIndependents[],
-                                       fmi3DependencyKind dependencyKinds[],
-                                       size_t nDependencies)
-{
-    (void)dependent, (void)elementIndicesOfDependent, (void)independents;
-    (void)elementIndicesOfIndependents, (void)dependencyKinds, (void)nDependencies;
-    return refused(c, "fmi3GetVariableDependencies: not provided");
-}
-
-fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, const fmi3ValueReference unknowns[],
-                                        size_t nUnknowns, const fmi3ValueReference knowns[],
-                                        size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
-                                        fmi3Float64 sensitivity[], size_t nSensitivity)
-{
-    (void)unknowns, (void)nUnknowns, (void)knowns, (void)nKnowns, (void)seed, (void)nSeed;
-    (void)sensitivity, (void)nSensitivity;
-    return refused(c, "fmi3GetDirectionalDerivative: not provided");
-}
-
-fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, const fmi3ValueReference unknowns[],
-                                    size_t nUnknowns, const fmi3ValueReference knowns[],
-                                    size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
-                                    fmi3Float64 sensitivity[], size_t nSensitivity)
-{
-    (void)unknowns, (void)nUnknowns, (void)knowns, (void)nKnowns, (void)seed, (void)nSeed;
-    (void)sensitivity, (void)nSensitivity;
-    return refused(c, "fmi3GetAdjointDerivative: not provided");
-}
-
-fmi3Status fmi3EnterConfigurationMode(fmi3Instance c)
-{
-    return refused(c, "fmi3EnterConfigurationMode: not provided");
-}
-
-fmi3Status fmi3ExitConfigurationMode(fmi3Instance c)
-{
-    return refused(c, "fmi3ExitConfigurationMode: not provided");
-}
-
-fmi3Status fmi3GetIntervalDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                  size_t nValueReferences, fmi3Float64 intervals[],
-                                  fmi3IntervalQualifier qualifiers[])
-{
-    (void)valueReferences, (void)nValueReferences, (void)intervals, (void)qualifiers;
-    return refused(c, "fmi3GetIntervalDecimal: not provided");
-}
-
-fmi3Status fmi3GetIntervalFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                   size_t nValueReferences, fmi3UInt64 counters[],
-                                   fmi3UInt64 resolutions[], fmi3IntervalQualifier qualifiers[])
-{
-    (void)valueReferences, (void)nValueReferences, (void)counters, (void)resolutions;
-    (void)qualifiers;
-    return refused(c, "fmi3GetIntervalFraction: not provided");
-}
-
-fmi3Status fmi3GetShiftDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                               size_t nValueReferences, fmi3Float64 shifts[])
-{
-    (void)valueReferences, (void)nValueReferences, (void)shifts;
-    return refused(c, "fmi3GetShiftDecimal: not provided");
-}
-
-fmi3Status fmi3GetShiftFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                size_t nValueReferences, fmi3UInt64 counters[],
-                                fmi3UInt64 resolutions[])
-{
-    (void)valueReferences, (void)nValueReferences, (void)counters, (void)resolutions;
-    return refused(c, "fmi3GetShiftFraction: not provided");
-}
-
-fmi3Status fmi3SetIntervalDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                  size_t nValueReferences, const fmi3Float64 intervals[])
-{
-    (void)valueReferences, (void)nValueReferences, (void)intervals;
-    return refused(c, "fmi3SetIntervalDecimal: not provided");
-}
-
-fmi3Status fmi3SetIntervalFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                   size_t nValueReferences, const fmi3UInt64 counters[],
-                                   const fmi3UInt64 resolutions[])
-{
-    (void)valueReferences, (void)nValueReferences, (void)counters, (void)resolutions;
-    return refused(c, "fmi3SetIntervalFraction: not provided");
-}
-
-fmi3Status fmi3SetShiftDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                               size_t nValueReferences, const fmi3Float64 shifts[])
-{
-    (void)valueReferences, (void)nValueReferences, (void)shifts;
-    return refused(c, "fmi3SetShiftDecimal: not provided");
-}
-
-fmi3Status fmi3SetShiftFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                size_t nValueReferences, const fmi3UInt64 counters[],
-                                const fmi3UInt64 resolutions[])
-{
-    (void)valueReferences, (void)nValueReferences, (void)counters, (void)resolutions;
-    return refused(c, "fmi3SetShiftFraction: not provided");
-}
-
-fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance c)
-{
-    return refused(c, "fmi3EvaluateDiscreteStates: not provided");
-}
-
-fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean* discreteStatesNeedUpdate,
-                                    fmi3Boolean* terminateSimulation,
-                                    fmi3Boolean* nominalsOfContinuousStatesChanged,
-                                    fmi3Boolean* valuesOfContinuousStatesChanged,
-                                    fmi3Boolean* nextEventTimeDefined,
-                                    fmi3Float64* nextEventTime)
-{
-    (void)discreteStatesNeedUpdate, (void)terminateSimulation;
-    (void)nominalsOfContinuousStatesChanged, (void)valuesOfContinuousStatesChanged;
-    (void)nextEventTimeDefined, (void)nextEventTime;
-    return refused(c, "fmi3UpdateDiscreteStates: not provided");
-}
-
-fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c)
-{
-    return refused(c, "fmi3EnterContinuousTimeMode: not provided");
-}
-
-fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c,
-                                       fmi3Boolean noSetFMUStatePriorToCurrentPoint,
-                                       fmi3Boolean* enterEventMode,
-                                       fmi3Boolean* terminateSimulation)
-{
-    (void)noSetFMUStatePriorToCurrentPoint, (void)enterEventMode, (void)terminateSimulation;
-    return refused(c, "fmi3CompletedIntegratorStep: not provided");
-}
-
-fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time)
-{
-    (void)time;
-    return refused(c, "fmi3SetTime: not provided");
-}
-
-fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 continuousStates[],
-                                   size_t nContinuousStates)
-{
-    (void)continuousStates, (void)nContinuousStates;
-    return refused(c, "fmi3SetContinuousStates: not provided");
-}
-
-fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 derivatives[],
-                                             size_t nContinuousStates)
-{
-    (void)derivatives, (void)nContinuousStates;
-    return refused(c, "fmi3GetContinuousStateDerivatives: not provided");
-}
-
-fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 eventIndicators[],
-                                  size_t nEventIndicators)
-{
-    (void)eventIndicators, (void)nEventIndicators;
-    return refused(c, "fmi3GetEventIndicators: not provided");
-}
-
-fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 continuousStates[],
-                                   size_t nContinuousStates)
-{
-    (void)continuousStates, (void)nContinuousStates;
-    return refused(c, "fmi3GetContinuousStates: not provided");
-}
-
-fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 nominals[],
-                                             size_t nContinuousStates)
-{
-    (void)nominals, (void)nContinuousStates;
-    return refused(c, "fmi3GetNominalsOfContinuousStates: not provided");
-}
-
-fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t* nEventIndicators)
-{
-    (void)nEventIndicators;
-    return refused(c, "fmi3GetNumberOfEventIndicators: not provided");
-}
-
-fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t* nContinuousStates)
-{
-    (void)nContinuousStates;
-    return refused(c, "fmi3GetNumberOfContinuousStates: not provided");
-}
-
-fmi3Status fmi3EnterStepMode(fmi3Instance c)
-{
-    return refused(c, "fmi3EnterStepMode: not provided");
-}
-
-fmi3Status fmi3GetOutputDerivatives(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                    size_t nValueReferences, const fmi3Int32 orders[],
-                                    fmi3Float64 values[], size_t nValues)
-{
-    (void)valueReferences, (void)nValueReferences, (void)orders, (void)values, (void)nValues;
-    return refused(c, "fmi3GetOutputDerivatives: not provided");
-}
-
-fmi3Status fmi3ActivateModelPartition(fmi3Instance c, fmi3ValueReference clockReference,
-                                      fmi3Float64 activationTime)
-{
-    (void)clockReference, (void)activationTime;
-    return refused(c, "fmi3ActivateModelPartition: not provided");
-}
+MISSING(EnterEventMode, (fmi3Instance c), (void)0)
+MISSING(GetBinary, (fmi3Instance c, const fmi3ValueReference a[], size_t b, size_t d[],
+        fmi3Binary e[], size_t f), (void)a, (void)b, (void)d, (void)e, (void)f)
+MISSING(GetClock, (fmi3Instance c, const fmi3ValueReference a[], size_t b, fmi3Clock d[]), (void)a,
+        (void)b, (void)d)
+MISSING(SetBinary, (fmi3Instance c, const fmi3ValueReference a[], size_t b, const size_t d[],
+        const fmi3Binary e[], size_t f), (void)a, (void)b, (void)d, (void)e, (void)f)
+MISSING(SetClock, (fmi3Instance c, const fmi3ValueReference a[], size_t b, const fmi3Clock d[]),
+        (void)a, (void)b, (void)d)
+MISSING(GetNumberOfVariableDependencies, (fmi3Instance c, fmi3ValueReference a, size_t *b), (void)a,
+        (void)b)
+MISSING(GetVariableDependencies, (fmi3Instance c, fmi3ValueReference a, size_t b[],
+        fmi3ValueReference d[], size_t e[], fmi3DependencyKind f[], size_t g), (void)a, (void)b,
+        (void)d, (void)e, (void)f, (void)g)
+MISSING(GetDirectionalDerivative, (fmi3Instance c, const fmi3ValueReference a[], size_t b,
+        const fmi3ValueReference d[], size_t e, const fmi3Float64 f[], size_t g, fmi3Float64 h[],
+        size_t i), (void)a, (void)b, (void)d, (void)e, (void)f, (void)g, (void)h, (void)i)
+MISSING(GetAdjointDerivative, (fmi3Instance c, const fmi3ValueReference a[], size_t b,
+        const fmi3ValueReference d[], size_t e, const fmi3Float64 f[], size_t g, fmi3Float64 h[],
+        size_t i), (void)a, (void)b, (void)d, (void)e, (void)f, (void)g, (void)h, (void)i)
+MISSING(EnterConfigurationMode, (fmi3Instance c), (void)0)
+MISSING(ExitConfigurationMode, (fmi3Instance c), (void)0)
+MISSING(GetIntervalDecimal, (fmi3Instance c, const fmi3ValueReference a[], size_t b,
+        fmi3Float64 d[], fmi3IntervalQualifier e[]), (void)a, (void)b, (void)d, (void)e)
+MISSING(GetIntervalFraction, (fmi3Instance c, const fmi3ValueReference a[], size_t b,
+        fmi3UInt64 d[], fmi3UInt64 e[], fmi3IntervalQualifier f[]), (void)a, (void)b, (void)d,
+        (void)e, (void)f)
+MISSING(GetShiftDecimal, (fmi3Instance c, const fmi3ValueReference a[], size_t b, fmi3Float64 d[]),
+        (void)a, (void)b, (void)d)
+MISSING(GetShiftFraction, (fmi3Instance c, const fmi3ValueReference a[], size_t b, fmi3UInt64 d[],
+        fmi3UInt64 e[]), (void)a, (void)b, (void)d, (void)e)
+MISSING(SetIntervalDecimal, (fmi3Instance c, const fmi3ValueReference a[], size_t b,
+        const fmi3Float64 d[]), (void)a, (void)b, (void)d)
+MISSING(SetIntervalFraction, (fmi3Instance c, const fmi3ValueReference a[], size_t b,
+        const fmi3UInt64 d[], const fmi3UInt64 e[]), (void)a, (void)b, (void)d, (void)e)
+MISSING(SetShiftDecimal, (fmi3Instance c, const fmi3ValueReference a[], size_t b,
+        const fmi3Float64 d[]), (void)a, (void)b, (void)d)
+MISSING(SetShiftFraction, (fmi3Instance c, const fmi3ValueReference a[], size_t b,
+        const fmi3UInt64 d[], const fmi3UInt64 e[]), (void)a, (void)b, (void)d, (void)e)
+MISSING(EvaluateDiscreteStates, (fmi3Instance c), (void)0)
+MISSING(UpdateDiscreteStates, (fmi3Instance c, fmi3Boolean *a, fmi3Boolean *b, fmi3Boolean *d,
+        fmi3Boolean *e, fmi3Boolean *f, fmi3Float64 *g), (void)a, (void)b, (void)d, (void)e,
+        (void)f, (void)g)
+MISSING(EnterContinuousTimeMode, (fmi3Instance c), (void)0)
+MISSING(CompletedIntegratorStep, (fmi3Instance c, fmi3Boolean a, fmi3Boolean *b, fmi3Boolean *d),
+        (void)a, (void)b, (void)d)
+MISSING(SetTime, (fmi3Instance c, fmi3Float64 a), (void)a)
+MISSING(SetContinuousStates, (fmi3Instance c, const fmi3Float64 a[], size_t b), (void)a, (void)b)
+MISSING(GetContinuousStateDerivatives, (fmi3Instance c, fmi3Float64 a[], size_t b), (void)a,
+        (void)b)
+MISSING(GetEventIndicators, (fmi3Instance c, fmi3Float64 a[], size_t b), (void)a, (void)b)
+MISSING(GetContinuousStates, (fmi3Instance c, fmi3Float64 a[], size_t b), (void)a, (void)b)
+MISSING(GetNominalsOfContinuousStates, (fmi3Instance c, fmi3Float64 a[], size_t b), (void)a,
+        (void)b)
+MISSING(GetNumberOfEventIndicators, (fmi3Instance c, size_t *a), (void)a)
+MISSING(GetNumberOfContinuousStates, (fmi3Instance c, size_t *a), (void)a)
+MISSING(EnterStepMode, (fmi3Instance c), (void)0)
+MISSING(GetOutputDerivatives, (fmi3Instance c, const fmi3ValueReference a[], size_t b,
+        const fmi3Int32 d[], fmi3Float64 e[], size_t f), (void)a, (void)b, (void)d, (void)e,
+        (void)f)
+MISSING(ActivateModelPartition, (fmi3Instance c, fmi3ValueReference a, fmi3Float64 b), (void)a,
+        (void)b)

@@ -7,13 +7,13 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from datetime import UTC
 from typing import Any
 
 from retwin.checks import needs_extra, require
+from retwin.data.logs.signals import nanoseconds
 from retwin.errors import InputError, brief
 from retwin.monitor.gate import Gate
-from retwin.monitor.samples import Samples, nanoseconds
+from retwin.monitor.samples import Samples
 from retwin.monitor.settings import OpcUaSource, secret
 from retwin.monitor.sources.assembly import Assembly
 from retwin.monitor.sources.source import AGAIN, Source
@@ -222,11 +222,7 @@ class OpcUa(Source):
             self.back()
         given = data.monitored_item.Value
         stamp = given.SourceTimestamp or given.ServerTimestamp
-        at = (
-            0
-            if stamp is None
-            else nanoseconds(stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC))
-        )
+        at = 0 if stamp is None else nanoseconds(stamp)
         if at <= 0:
             return self.refuse(f"a value of {node} without a time")
         found = float("nan")

@@ -7,7 +7,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from retwin.cases.case import Case
 from retwin.cases.columns import ColumnRecords, number
 from retwin.checks import needs_extra, require
+from retwin.data.logs.signals import nanoseconds
 from retwin.errors import InputError, brief
-from retwin.monitor.samples import nanoseconds
 from retwin.monitor.settings import FolderSource
 
 __all__ = ["Layout", "Rows", "Table", "TextTable", "layout_of"]
@@ -49,8 +49,7 @@ class Layout:
     def nanoseconds(self, cell: str) -> int:
         """The time in a cell, from 1970 on; ValueError if it is none."""
         if self.unit == "iso":
-            time = datetime.fromisoformat(cell.strip())
-            return nanoseconds(time if time.tzinfo else time.replace(tzinfo=UTC))
+            return nanoseconds(datetime.fromisoformat(cell.strip()))
         found = Decimal(cell.strip()) * NANOSECONDS[self.unit]
         if not abs(found) < 2**63:
             raise ValueError("a time that is out of range")
