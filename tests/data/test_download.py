@@ -246,4 +246,3 @@ def test_the_registry_names_public_files_by_checksum():
         assert known.url.startswith("https://")
         assert len(bytes.fromhex(known.sha256)) == 32
         assert known.url.endswith(known.file.split("/")[-1])
-    assert set(download.__all__) <= set(vars(download))

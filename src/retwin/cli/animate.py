@@ -14,8 +14,6 @@ from retwin.cli.options import CaseOption, Seed
 from retwin.cli.reading import read, updated_twin
 from retwin.cli.terminal import answer, bar
 
-__all__ = ["animate"]
-
 
 class Renderer(StrEnum):
     """Renderers of the pictures."""

@@ -16,8 +16,6 @@ from retwin.serialisation.places import check_place
 if TYPE_CHECKING:
     from retwin.cli.benchmark import Benchmark
 
-__all__ = ["bench"]
-
 
 def bench(
     out: Annotated[

@@ -36,17 +36,6 @@ from retwin.update.corrected import MAX_PER_CLASS, CorrectedTwin, generate
 from retwin.update.residual import fit_residual
 from retwin.update.surrogate import fit_surrogate, surrogate_training
 
-__all__ = [
-    "Benchmark",
-    "Timing",
-    "generating",
-    "machine",
-    "median_seconds",
-    "memory_bandwidth",
-    "run_bench",
-    "timed",
-]
-
 COUNT = 3600
 """Trajectories of 10 s that times are given for, as in the paper."""
 REPEATS = 3

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from retwin.deploy.bundle.bundle import Bundle
     from retwin.deploy.onnx.portable import Portable
 
-__all__ = ["app"]
-
 app = Commands(
     help="Everything that was fitted, in one sealed folder.",
     epilog=example("retwin bundle predict bundle real.mat --case armpi"),

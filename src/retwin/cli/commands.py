@@ -12,8 +12,6 @@ from typer.core import TyperCommand, TyperGroup
 
 from retwin.errors import InputError
 
-__all__ = ["Commands", "Group"]
-
 GENERIC = ("path", "folder", "file")
 """Arguments of functions, as which readers name any file."""
 

@@ -10,14 +10,6 @@ import typer
 
 from retwin import catalog
 
-__all__ = [
-    "complete_faults",
-    "complete_files",
-    "complete_sources",
-    "complete_twins",
-    "one_of",
-]
-
 Complete = Callable[[str], list[str]]
 
 

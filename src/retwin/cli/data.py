@@ -38,8 +38,6 @@ from retwin.twins import FILES
 if TYPE_CHECKING:
     from retwin.data.logs.proposal import Proposal
 
-__all__ = ["app"]
-
 SHOWN = 40
 """Signals of a log that are listed."""
 

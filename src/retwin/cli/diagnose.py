@@ -26,8 +26,6 @@ from retwin.serialisation.places import check_place
 if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.diagnosis import Diagnoser
 
-__all__ = ["EMULATED", "app", "diagnoses", "write_probabilities"]
-
 EMULATED = "These trajectories are EMULATED: no real measurements."
 
 app = Commands(

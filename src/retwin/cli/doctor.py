@@ -37,8 +37,6 @@ from retwin.errors import InputError
 from retwin.serialisation.files import sha256
 from retwin.serialisation.sizes import container, memory
 
-__all__ = ["FOR_DEVELOPERS", "Check", "State", "doctor", "examine"]
-
 State = Literal["ok", "warning", "missing", "broken"]
 """As it should be; works with a drawback; absent and optional; absent and required."""
 COLOURS = {"ok": "green", "warning": "yellow", "missing": "cyan", "broken": "bold red"}

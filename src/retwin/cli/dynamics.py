@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from retwin.update import FittedStateSurrogate
     from retwin.update.dynamics import FittedDynamics, Prediction
 
-__all__ = ["fit_equations"]
-
 LARGEST = 8
 """Number of terms of the state equations that are printed."""
 SIGNIFICANT = 0.05

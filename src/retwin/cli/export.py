@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from retwin.deploy.actuator.export import ExportedActuator
     from retwin.deploy.actuator.torque_net import Joint
 
-__all__ = ["app"]
-
 TRAJECTORIES = 256
 """Trajectories of the case's sampler at whose segments z is drawn, or whose torques are learned."""
 

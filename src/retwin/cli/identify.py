@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from retwin.data.trajectories import Trajectories
     from retwin.evaluation.identification import Identification
 
-__all__ = ["identify"]
-
 UNRATED = (".fmu", ".xml", ".urdf")
 """Suffixes of twins that take any sample rate."""
 

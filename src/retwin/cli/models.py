@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from retwin.update.residual import ResidualModel, SequenceResidual
     from retwin.update.surrogate import Surrogate
 
-__all__ = ["fit", "generate"]
-
 data_option, model_option = (
     partial(typer.Option, rich_help_panel=panel)
     for panel in ("Data", "Model; by default the case's")

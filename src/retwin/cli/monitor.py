@@ -30,8 +30,6 @@ if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
     from retwin.cases.case import Case
     from retwin.monitor import Alarm, Cause, Monitor, Watched
 
-__all__ = ["app"]
-
 UNEXPLAINED = 0.5
 """Probability from which on it is printed that a cause does not explain all."""
 

@@ -12,27 +12,6 @@ from retwin.catalog import CASES
 from retwin.checks import whole
 from retwin.cli.completion import one_of
 
-__all__ = [
-    "TWIN",
-    "CaseArgument",
-    "CaseOption",
-    "Inputs",
-    "Json",
-    "LogMapping",
-    "MaxBytes",
-    "Measured",
-    "Model",
-    "OtherCase",
-    "Outputs",
-    "PerClass",
-    "Probabilities",
-    "Rate",
-    "Real",
-    "Seed",
-    "case_option",
-    "channel_names",
-]
-
 CASE = "Built-in case, case.toml, or module:object."
 case_option = partial(typer.Option, "--case", metavar="CASE", autocompletion=one_of(CASES))
 

@@ -13,8 +13,6 @@ from retwin.cli.terminal import FAILED, bar, complain, note, resumable
 if TYPE_CHECKING:
     from retwin.deploy.simulations import SimulationPlan
 
-__all__ = ["Scheduler", "Workers", "carry_out"]
-
 Workers = Annotated[
     int | None, typer.Option(metavar="N", help="Processes for *.zarr; else one per core.", min=1)
 ]

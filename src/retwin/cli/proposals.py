@@ -15,8 +15,6 @@ from retwin.data.io import check_target
 if TYPE_CHECKING:
     from retwin.evaluation.experiments.propose import Proposal
 
-__all__ = ["propose"]
-
 
 def propose(
     case: CaseArgument,

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from retwin.cases.case import Case
     from retwin.update import CorrectedTwin, DynamicsTwin
 
-__all__ = ["case_named", "data_case", "read", "saved", "system_of", "updated_twin"]
-
 
 def case_named(name: str | None) -> Case | None:
     """The case of that name, if one is given; it needs torch."""

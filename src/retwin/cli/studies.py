@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
     from retwin.results import Results
 
-__all__ = ["demo", "report", "study"]
-
 COLUMNS = {name: metric.head for name, metric in catalog.METRICS.items() if metric.head}
 """Scores that are shown, and the heads of their columns."""
 DEMO = ("dt", "ibg", "ibg_rg", "ibg_rg_command", "inversion")

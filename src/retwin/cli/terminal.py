@@ -28,29 +28,6 @@ from rich.text import Text
 from retwin.errors import place_of
 from retwin.progress import FinishedStage, ResumedStage
 
-__all__ = [
-    "BAD_INPUT",
-    "FAILED",
-    "INTERRUPTED",
-    "USAGE_ERROR",
-    "Interrupted",
-    "answer",
-    "bar",
-    "be_quiet",
-    "command_given",
-    "complain",
-    "complain_of_interruption",
-    "complain_of_usage",
-    "described",
-    "example",
-    "interrupted_by_term",
-    "note",
-    "plain",
-    "resumable",
-    "show_warnings",
-    "table",
-]
-
 USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
 """Click's UsageError, as a base class of Typer's, since newer Typers vendor their own Click."""
 

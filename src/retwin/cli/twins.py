@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from retwin.twins.limits import Limits
     from retwin.twins.twin import Twin
 
-__all__ = ["app"]
-
 app = Commands(
     help="List, describe and simulate twins.",
     epilog=example("retwin twin info armpi"),

@@ -19,8 +19,6 @@ from retwin.serialisation.files import sha256 as sha256_of
 from retwin.serialisation.places import check_place
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["MAX_BYTES", "cache_folder", "fetch"]
-
 CACHE_VARIABLE = "RETWIN_CACHE"
 """The environment variable that names the cache folder."""
 TIMEOUT = 30.0

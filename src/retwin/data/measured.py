@@ -7,8 +7,6 @@ import numpy as np
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
 
-__all__ = ["check_magnitude", "measured_only", "unmeasured"]
-
 MAX_RATIO, MAX_VALUE = 1e6, 1e18
 """Largest measurement, over the usual size of an output and in any case: float32 has seven digits,
 and the squares of larger numbers are infinite."""

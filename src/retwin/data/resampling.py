@@ -7,8 +7,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BRIDGED", "SAME", "Resampling", "longest_bridge", "resampled"]
-
 Resampling = Literal["hold", "linear", "none"]
 BRIDGED = 2.5
 """Longest interval that is bridged by default, in sample periods: one lost sample."""

@@ -18,8 +18,6 @@ from retwin.errors import InputError
 from retwin.threads import in_threads
 from retwin.times import sample_rate
 
-__all__ = ["Segments"]
-
 TRAJECTORIES_PER_BLOCK = 32
 """Trajectories per pass over the commands, few enough that their samples fit the cache."""
 

@@ -27,8 +27,6 @@ from retwin.twins.fmu import FMUTwin
 from retwin.twins.parametric import ParametricTwin
 from retwin.update.identification.posterior import Posterior
 
-__all__ = ["HOLDS", "identification_values", "save_identification", "start_values"]
-
 SCHEMA = 1
 """The version of identification.json."""
 HOLDS = ("identification.json", "logs.npz", "report.html", "start_values.json", "updated.toml")

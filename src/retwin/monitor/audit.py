@@ -20,8 +20,6 @@ from retwin.checks import require
 from retwin.errors import InputError, brief
 from retwin.serialisation.files import check_regular, refusing, write_atomically
 
-__all__ = ["START", "Audit", "Entry", "append", "canonical", "export_log", "read_log", "verify"]
-
 START = "0" * 64
 """The previous hash of the first entry."""
 MAX_LINE = 2**20

@@ -20,8 +20,6 @@ from scipy.special import ndtr
 
 from retwin.monitor.slack import Slack
 
-__all__ = ["ALTERNATIVES", "Alternative", "Bets", "Dependence", "Location", "Scale", "Tails"]
-
 CLIP = 4.0
 """Scores beyond this count as this: evidence of one sample is bounded, and of heavy tails only the
 probability beyond the clip matters, which may be 6e-5 at κ = 1 and 0.0014 at κ = 1.25."""

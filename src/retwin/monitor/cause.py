@@ -25,8 +25,6 @@ from retwin.twins.system_faults import (
 )
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["Cause", "cause_data", "find_causes", "possible_causes"]
-
 BEFORE = 100
 """Samples before an alarm from which its cause is inferred."""
 FEWEST = 10

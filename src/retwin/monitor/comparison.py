@@ -20,8 +20,6 @@ from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.monitor.trajectory_comparison import compared_trajectories
 from retwin.scores.distributions import crps_normal
 
-__all__ = ["compare"]
-
 MOST = 20_000
 """Newest samples of each asset that are compared, which bounds time and memory."""
 KINDS: Mapping[type, str] = {Monitor: "samples", TrajectoryMonitor: "trajectories"}

@@ -20,17 +20,6 @@ if TYPE_CHECKING:
 else:
     sa = needs_extra("sqlalchemy", "monitor", "holds what the monitor stores")
 
-__all__ = [
-    "SCHEMA",
-    "Database",
-    "assets",
-    "last_entry",
-    "log",
-    "present",
-    "samples",
-    "states",
-]
-
 SCHEMA = 1
 """The version of the tables."""
 WRITER = 0x72657477696E

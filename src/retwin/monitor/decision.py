@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.checks import positive, require, whole
 from retwin.scores.bootstrap import BLOCKS, MIN_RECORDS, bootstrap_means
 
-__all__ = ["Decision", "FalseAlarmTest", "decide", "padded"]
-
 SIGNIFICANCE = 0.05
 """Probability of the observed false alarms or more, below which the promise counts as broken."""
 MIN_SAMPLES = 10 * BLOCKS

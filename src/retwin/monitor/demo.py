@@ -31,8 +31,6 @@ from retwin.twins.samplers import HoldSampler
 from retwin.twins.system_faults import ActuatorGain, ParameterShift, SensorBias
 from retwin.update import Dynamics, Library, fit_dynamics
 
-__all__ = ["MACHINES", "announced", "demonstration", "emulated", "fitted"]
-
 CASE = "incubator"
 SPEED = 60.0
 """How much faster than the clock the machines run, while their time is behind it."""

@@ -13,8 +13,6 @@ from retwin.checks import at_least, instance, one_of, require, whole
 from retwin.monitor.bets import ALTERNATIVES, Alternative, Bets
 from retwin.monitor.slack import Slack
 
-__all__ = ["Detector", "DetectorState"]
-
 LARGEST = 1e280
 """Evidence counts up to this; one further factor does not overflow."""
 

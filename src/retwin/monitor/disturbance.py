@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from retwin.checks import require, whole
 
-__all__ = ["Disturbance", "DisturbanceState", "fit_disturbance"]
-
 GLITCH = 100.0
 """An error of so many standard deviations is scored, but the filter takes the sample as missing: a
 sample of 1e300 would else stay in its state. Where such samples persist, its uncertainty grows

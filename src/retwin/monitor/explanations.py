@@ -23,8 +23,6 @@ from retwin.monitor.samples import SECOND
 from retwin.monitor.watched import Alarm
 from retwin.twins.faults import Fault
 
-__all__ = ["Explanations"]
-
 Faults = Callable[[str], "dict[str, Fault | None] | None"]
 """The known faults of a twin by its name; None for any change."""
 

@@ -18,8 +18,6 @@ from retwin.monitor.scores import fit_scores, resolution
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["fit_monitor"]
-
 APART = 200
 """Missing samples that are put between two calibration records, so that neither predicts the
 other."""

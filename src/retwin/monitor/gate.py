@@ -13,8 +13,6 @@ from retwin.monitor.live import Live
 from retwin.monitor.samples import Samples, Trajectory
 from retwin.monitor.status import Received
 
-__all__ = ["Gate"]
-
 QUEUE = 10_000
 """Producers that may wait at the same time; further ones wait before they are taken."""
 GROUP = 50_000

@@ -14,8 +14,6 @@ from retwin.monitor.store import Store
 from retwin.monitor.updates import LEAST
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["gridded", "record_of"]
-
 
 def gridded(
     store: Store, asset: str, twin: DynamicsTwin, first: int, last: int

@@ -8,8 +8,6 @@ from retwin.monitor.monitor import Monitor
 from retwin.monitor.trajectories import KIND, TrajectoryMonitor
 from retwin.serialisation.models import kind_of
 
-__all__ = ["AnyMonitor", "load_monitor", "pace"]
-
 AnyMonitor = Monitor | TrajectoryMonitor
 
 

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from retwin.monitor.monitor import Monitor
 from retwin.monitor.monitor_state import MonitorState
 
-__all__ = ["Layout"]
-
 
 class Layout:
     """The states of machines of one monitor as rows (n, K) of numbers.

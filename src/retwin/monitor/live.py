@@ -27,8 +27,6 @@ from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.monitor.trajectory_machine import Diagnosed, TrajectoryMachine
 from retwin.monitor.updates import MOST, Asset, Update, one_asset
 
-__all__ = ["Live"]
-
 MOST_WAIT = 60.0
 """Seconds for which a place without a sample is waited for at most."""
 WHY = {

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from retwin.monitor.updates import Asset
 
-__all__ = ["KEPT", "Counts", "Machine", "Recent"]
-
 KEPT = 600
 """Newest samples or trajectories that are kept for pages."""
 Watching = TypeVar("Watching")

@@ -28,8 +28,6 @@ from retwin.twins.twin import check_channels
 from retwin.update.dynamics.online import FilterState, OnlineFilter
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["Monitor"]
-
 KIND = "monitor"
 """Kind of the saved model."""
 IMPLAUSIBLE = 100.0

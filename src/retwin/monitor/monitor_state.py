@@ -13,8 +13,6 @@ from retwin.monitor.disturbance import DisturbanceState
 from retwin.monitor.validity import ValidityState
 from retwin.update.dynamics.online import FilterState
 
-__all__ = ["MonitorState"]
-
 PARTS = {
     "disturbance": DisturbanceState,
     "detector": DetectorState,

@@ -19,8 +19,6 @@ from scipy.stats import t as student
 from retwin.checks import require
 from retwin.twins.faults import ActuatorBias, Fault
 
-__all__ = ["OffsetModel", "biases", "fit_offsets", "is_bias"]
-
 SIZES = (1 / 6, 1 / 2, 5 / 6)
 """Sizes of a bias that are tried, as shares of the way from its smallest to its largest size on a
 logarithmic scale: one of them is within a factor of 1.3 of the true one where these differ five

@@ -20,8 +20,6 @@ from retwin.update.dynamics.online import FilterState, OnlineFilter
 from retwin.update.dynamics.prediction import root_of, whitened
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["SLOWER", "Predictor", "agreeing", "settled", "standardised"]
-
 SLOWER = 1e-4
 """Factor of the variance of the process noise of the second model, whose filter needs about a
 hundred times as long to follow. Not 0: states that integrate would drift away for ever."""

@@ -44,8 +44,6 @@ from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.serialisation.files import sha256
 from retwin.twins.faults import Fault
 
-__all__ = ["described", "run"]
-
 INTERVAL = 0.5
 """Seconds after which new entries of the log are reported."""
 

@@ -11,8 +11,6 @@ from retwin.errors import InputError
 from retwin.monitor.slack import Slack
 from retwin.times import sample_rate
 
-__all__ = ["Promise", "duration", "false_alarms"]
-
 SECONDS = {
     "second": 1.0,
     "minute": 60.0,

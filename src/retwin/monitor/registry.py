@@ -23,8 +23,6 @@ from retwin.monitor.store import Store
 from retwin.serialisation.files import refusing, sha256, write_atomically
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["Registry", "Step", "Version", "damaged"]
-
 State = Literal["proposed", "shadow", "active", "retired", "rejected"]
 KIND = "version"
 """The kind of the registry's entries in the log."""

@@ -16,8 +16,6 @@ from retwin.data.logs.signals import nanoseconds
 from retwin.errors import InputError, brief
 from retwin.monitor.updates import LEAST, MOST
 
-__all__ = ["SECOND", "Samples", "Trajectory", "parse"]
-
 SECOND = 10**9
 """Nanoseconds of a second."""
 LONGEST = 100_000

@@ -12,8 +12,6 @@ from scipy.special import ndtr, ndtri
 from retwin.checks import require, whole
 from retwin.monitor.slack import Slack, effective_samples
 
-__all__ = ["ConformalScores", "fit_scores", "middle", "resolution"]
-
 FEWEST = 8
 """Calibration errors per stream, at least."""
 COPIES = 8

@@ -17,17 +17,6 @@ from retwin.checks import require
 from retwin.serialisation.files import refusing
 from retwin.serialisation.settings import Part, settings_of
 
-__all__ = [
-    "FolderSource",
-    "MonitorSettings",
-    "MqttSource",
-    "OpcUaSource",
-    "ServerSettings",
-    "TwinSettings",
-    "read_settings",
-    "secret",
-]
-
 PORT = 65535
 """The largest number of a port."""
 

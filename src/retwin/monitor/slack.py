@@ -10,8 +10,6 @@ from scipy.special import betaincinv, ndtri
 
 from retwin.checks import finite, require, whole
 
-__all__ = ["Slack", "effective_samples"]
-
 CENTRE = 2.0
 """Scores beyond this size may be as small as this: bounded and light-tailed noise is in the class,
 and bets on a smaller scale, which need few large scores, lose nothing."""

@@ -7,8 +7,6 @@ from typing import Any
 
 from retwin.monitor.machine import Counts, Machine
 
-__all__ = ["AssetStatus", "Received"]
-
 
 @dataclass(frozen=True)
 class Received:

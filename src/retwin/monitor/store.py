@@ -47,8 +47,6 @@ if TYPE_CHECKING:
 else:
     sa = database.sa
 
-__all__ = ["Store"]
-
 FILE = "monitor.sqlite"
 """The database in the folder of the store, where no other is given."""
 ROWS = 4096

@@ -21,8 +21,6 @@ from retwin.monitor.samples import SECOND, Samples
 from retwin.monitor.updates import LEAST, Asset
 from retwin.monitor.watched import Alarm, Watched
 
-__all__ = ["StreamMachine", "Work", "step"]
-
 DEFAULT_WAIT = 2
 """Sample periods for which a place is waited for, unless it is given."""
 LONGEST_GAP = 10_000

@@ -42,8 +42,6 @@ from retwin.monitor.watched_trajectories import TrajectoryAlarm, WatchedTrajecto
 from retwin.progress import Progress
 from retwin.serialisation.models import read_model, refusing, write_model
 
-__all__ = ["TrajectoryMonitor"]
-
 KIND = "trajectory_monitor"
 """Kind of the saved model."""
 SHOWN = 0.01

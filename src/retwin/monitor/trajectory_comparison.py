@@ -20,8 +20,6 @@ from retwin.scores.bootstrap import BLOCKS
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 
-__all__ = ["compared_trajectories"]
-
 FEWEST, MOST = 2 * BLOCKS, 6 * BLOCKS
 """Healthy trajectories of all assets together that are compared: at least, so that a block of the
 bootstrap has two, and at most, since diagnosing each may take seconds."""

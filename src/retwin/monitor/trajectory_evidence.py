@@ -22,17 +22,6 @@ from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.twins.twin import check_channels
 
-__all__ = [
-    "LARGEST_RATIO",
-    "Compared",
-    "Inversion",
-    "alternatives",
-    "checked",
-    "compared",
-    "factors",
-    "twin_of",
-]
-
 Inversion = InversionDiagnoser | StateInversionDiagnoser
 """Diagnosers whose evidence is that of a model."""
 LARGEST_RATIO = 300.0

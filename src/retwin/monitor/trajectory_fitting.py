@@ -17,8 +17,6 @@ from retwin.monitor.trajectory_evidence import Inversion, alternatives, checked,
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
 
-__all__ = ["fit_trajectory_monitor"]
-
 FEWEST = 8
 """Healthy trajectories of a calibration, at least."""
 FACTORS = np.arange(1.0, 10.005, 0.01)

@@ -24,8 +24,6 @@ from retwin.monitor.trajectory_state import TrajectoryState
 from retwin.monitor.updates import Asset, Update
 from retwin.monitor.watched_trajectories import REMARKS, WatchedTrajectories
 
-__all__ = ["Diagnosed", "TrajectoryMachine"]
-
 UNUSUAL = ("unmeasured", "unranked", "implausible")
 """What trajectories may be that is an event of the log when it begins and when it ends. Commands
 outside their range are a status of the machine."""

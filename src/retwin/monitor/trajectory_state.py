@@ -13,8 +13,6 @@ from retwin.monitor.detector import DetectorState
 from retwin.monitor.validity import ValidityState
 from retwin.serialisation.files import refusing
 
-__all__ = ["TrajectoryState"]
-
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryState:

@@ -13,8 +13,6 @@ from retwin.checks import given, require, whole
 from retwin.monitor.audit import Entry
 from retwin.serialisation.files import refusing
 
-__all__ = ["LEAST", "MOST", "WORD", "Asset", "Committed", "Packed", "Update", "one_asset", "pack"]
-
 T = TypeVar("T")
 
 LEAST, MOST = -(2**63), 2**63 - 1

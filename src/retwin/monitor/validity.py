@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.checks import finite, instance, positive, whole
 from retwin.monitor.detector import LARGEST, Detector
 
-__all__ = ["Validity", "ValidityState"]
-
 MOST_PER_BLOCK = 3.0
 """Evidence of a block of samples counts up to this, so that no short fault voids the promise."""
 MOST_PER_ALARM = 4.0

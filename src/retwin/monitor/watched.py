@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from numpy.typing import NDArray
 
-__all__ = ["Alarm", "Watched"]
-
 
 @dataclass(frozen=True)
 class Alarm:

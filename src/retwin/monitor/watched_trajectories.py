@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from numpy.typing import NDArray
 
-__all__ = ["REMARKS", "TrajectoryAlarm", "WatchedTrajectories"]
-
 REMARKS = {
     "unmeasured": "without measured samples, which are no evidence",
     "unranked": "measured otherwise than in the calibration, in which only faults of the diagnoser "

@@ -33,20 +33,6 @@ from retwin.checks import one_of, require
 from retwin.errors import InputError
 from retwin.serialisation.files import check_regular
 
-__all__ = [
-    "Converted",
-    "at",
-    "checked",
-    "fits",
-    "from_config",
-    "from_settings",
-    "key",
-    "plain_reason",
-    "read_toml",
-    "to_config",
-    "toml_text",
-]
-
 T = TypeVar("T")
 MAX_DEPTH = 100
 """The largest number of dots in a key; reading takes memory by the square of it."""

@@ -23,17 +23,6 @@ from retwin.errors import InputError, brief
 from retwin.serialisation.places import refuse_others, unwritable
 from retwin.serialisation.sizes import Budget
 
-__all__ = [
-    "check_regular",
-    "parse_json",
-    "read_json",
-    "recover",
-    "refusing",
-    "sha256",
-    "write_atomically",
-    "write_json",
-]
-
 AT_FDCWD, EXCHANGE = -100, 2
 """Arguments of `renameat2` in Linux; `EXCHANGE` also of `renamex_np` in macOS."""
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"

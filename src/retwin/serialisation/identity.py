@@ -16,8 +16,6 @@ import numpy as np
 
 from retwin.serialisation.files import sha256
 
-__all__ = ["identity"]
-
 MAX_DEPTH = 12
 """Levels of nested objects; of deeper ones only the class counts, which ends cycles."""
 

@@ -17,8 +17,6 @@ from retwin.serialisation.sizes import Budget
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["kind_of", "read_about", "read_model", "refusing", "write_model"]
-
 SCHEMA = 1
 """The version of the layout of model folders."""
 REMEDY = "give the folder of a saved model, or save it again"

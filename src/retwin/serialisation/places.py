@@ -11,8 +11,6 @@ from pathlib import Path
 from retwin.checks import require
 from retwin.errors import InputError
 
-__all__ = ["check_place", "in_use", "refuse_others", "unwritable"]
-
 TOKEN = "-" * 16
 """As many characters as a name gets in addition while it is written, and one or two more."""
 

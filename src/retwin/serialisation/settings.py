@@ -10,8 +10,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from retwin.errors import InputError
 from retwin.serialisation.configs import plain_reason, read_toml
 
-__all__ = ["Part", "settings_of"]
-
 M = TypeVar("M", bound=BaseModel)
 
 

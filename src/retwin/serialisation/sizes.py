@@ -9,8 +9,6 @@ from pathlib import Path
 
 from retwin.checks import require, whole
 
-__all__ = ["Budget", "container", "memory"]
-
 CGROUP = Path("/sys/fs/cgroup")
 """The folder with the limits of the container, where there are some."""
 MEMORY_SHARE = 0.5

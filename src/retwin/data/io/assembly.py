@@ -15,8 +15,6 @@ from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["DataCase", "Raw", "assemble", "settle"]
-
 RATE_TOLERANCE = 1e-3
 """Relative difference of sample rates that count as equal: files round their times."""
 

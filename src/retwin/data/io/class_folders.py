@@ -22,8 +22,6 @@ from retwin.progress import Progress
 from retwin.serialisation.files import sha256
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["read_class_folders"]
-
 Reader = Callable[[Path, str, "DataCase | None", Budget], Raw]
 COORDINATES = 3
 """Outputs per sample in the arm's authors' files: x, y and z."""

@@ -17,22 +17,6 @@ from numpy.typing import NDArray
 from retwin.checks import require
 from retwin.data.trajectories import Channels, Provenance, Trajectories
 
-__all__ = [
-    "CHUNKED",
-    "CHUNKED_NAMES",
-    "FAILED",
-    "NAMES",
-    "SCHEMA",
-    "arrays_of",
-    "check_chunk",
-    "check_header",
-    "chunk_digest",
-    "chunked_header",
-    "header_of",
-    "restore",
-    "restore_chunked",
-]
-
 FORMAT = "retwin-trajectories"
 SCHEMA = 1
 """The schema of sets that were saved as a whole."""

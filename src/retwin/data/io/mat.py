@@ -17,8 +17,6 @@ from retwin.errors import InputError
 from retwin.serialisation.files import check_regular, refusing, sha256
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["mat_variables", "matrix", "read_mat"]
-
 PAIRS = (("X_array", "y_array"), ("X_test_array", "y_test_array"))
 """The names of the variables that hold trajectories and class names."""
 

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["Damaged", "NewerMat", "Opaque", "read_mat5"]
-
 HEADER = 128
 """Bytes before the first variable."""
 INT32, UINT32, MATRIX, COMPRESSED = 5, 6, 14, 15

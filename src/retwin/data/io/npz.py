@@ -17,8 +17,6 @@ from retwin.data.trajectories import Trajectories
 from retwin.serialisation.files import parse_json, refusing
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["read_npz", "write_npz"]
-
 BYTES_PER_BLOCK, BYTES_PER_ENTRY = 2**20, 1024
 """Bytes of a file that are read together to count its entries, and the memory that one takes."""
 DATE = (1980, 1, 1, 0, 0, 0)

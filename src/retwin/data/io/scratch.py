@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 
-__all__ = ["Scratch"]
-
 
 class Scratch:
     """Rows of one array, appended to a temporary file and then mapped into memory.

@@ -36,15 +36,6 @@ from retwin.data.trajectories import Trajectories
 from retwin.serialisation.files import check_regular, read_json, refusing
 from retwin.serialisation.sizes import Budget
 
-__all__ = [
-    "create_chunked",
-    "read_header",
-    "read_zarr",
-    "seal_chunked",
-    "write_chunk",
-    "write_zarr",
-]
-
 TRAJECTORIES_PER_CHUNK = 128
 """The largest number of trajectories in one chunk: enough that a set has few files."""
 BYTES_PER_CHUNK = 2**23

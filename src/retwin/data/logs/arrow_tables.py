@@ -13,8 +13,6 @@ from retwin.checks import at_most, needs_extra
 from retwin.data.logs.signals import MAX_SIGNALS, UNWANTED, Clock, Signal, Skipped, named_unit
 from retwin.data.logs.tables import table_signals, time_column
 
-__all__ = ["read"]
-
 FILES = (b"ARROW1", b"FEA1\0\0")
 """How files of Arrow begin that are no streams."""
 MAX_DEPTH = 8

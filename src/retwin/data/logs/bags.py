@@ -13,8 +13,6 @@ from retwin.data.logs.messages import Series, Stamps, Types
 from retwin.data.logs.signals import Clock, Signal, Skipped
 from retwin.errors import InputError
 
-__all__ = ["read"]
-
 
 def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Signal | Skipped]:
     """The fields of all messages; see `data.logs.signals.Reader` and `messages`.

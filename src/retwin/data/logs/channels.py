@@ -18,8 +18,6 @@ from retwin.data.resampling import Resampling, longest_bridge, resampled
 from retwin.data.trajectories import Channels
 from retwin.errors import InputError
 
-__all__ = ["Channel", "channels_of", "in_order", "in_unit", "signal_of", "table_of"]
-
 DISORDER = 10.0
 """Longest step back in time, in median intervals, that is a matter of order: messages of several
 processes overtake each other. A longer one is a clock that was set."""

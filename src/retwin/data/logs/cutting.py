@@ -13,8 +13,6 @@ from retwin.data.logs.mapping import Cut
 from retwin.data.logs.signals import Signal
 from retwin.errors import InputError
 
-__all__ = ["Piece", "pieces", "union_of_times"]
-
 MAX_PIECES = 100_000
 """Trajectories that one log may be cut into: a level in the noise of a signal is crossed often."""
 

@@ -25,8 +25,6 @@ from retwin.errors import InputError
 from retwin.progress import Progress
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["Parts", "mapped", "parts_of", "read_mapped"]
-
 SPARSE = 100.0
 """Samples per value of a log from which its times, or the sample rate, are wrong."""
 

@@ -12,8 +12,6 @@ from retwin.data.logs.signals import Clock
 from retwin.data.resampling import Resampling
 from retwin.serialisation.settings import Part, settings_of
 
-__all__ = ["NO_NOMINAL", "ChannelMapping", "Cut", "Mapping", "TimeSettings", "read_mapping"]
-
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]

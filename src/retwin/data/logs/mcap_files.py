@@ -13,8 +13,6 @@ from retwin.data.logs.messages import Series, Stamps, Types
 from retwin.data.logs.signals import Clock, Signal, Skipped
 from retwin.errors import InputError
 
-__all__ = ["read"]
-
 DEFINED = {"ros2msg": False, "ros2idl": True, "ros1msg": False}
 """Encodings of definitions, and whether they are IDL."""
 

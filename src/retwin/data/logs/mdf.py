@@ -13,8 +13,6 @@ from retwin.checks import needs_extra
 from retwin.data.logs.signals import UNWANTED, Clock, Signal, Skipped, to_nanoseconds
 from retwin.errors import InputError
 
-__all__ = ["read"]
-
 
 def read(path: Path, wanted: frozenset[str] | None, clock: Clock) -> Iterator[Signal | Skipped]:
     """The channels by their names; see `data.logs.signals.Reader`.

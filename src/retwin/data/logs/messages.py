@@ -18,8 +18,6 @@ import numpy as np
 from retwin.checks import at_most, require
 from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Clock, Signal, Skipped
 
-__all__ = ["Series", "Stamps", "Types"]
-
 MAX_ELEMENTS = 64
 """Elements of an array that become signals; images and point clouds have more."""
 MAX_DEPTH = 12

@@ -11,8 +11,6 @@ from retwin.data.logs.signals import NO_STAMP, Log
 from retwin.data.logs.tables import TIMES
 from retwin.serialisation.configs import toml_text
 
-__all__ = ["Chosen", "Draft", "Fact", "mapping_text", "units_of"]
-
 MAX_LISTED = 200
 """Signals that are listed in comments."""
 SCHEMA = "https://retwin.readthedocs.io/mapping.schema.json"

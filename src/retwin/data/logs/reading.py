@@ -27,8 +27,6 @@ from retwin.progress import Progress
 from retwin.serialisation.files import sha256
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["is_log", "log_format", "read_log"]
-
 BAG = "metadata.yaml"
 """The file that every ROS 2 bag has."""
 BYTES_PER_VALUE = 16

@@ -14,23 +14,6 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 
-__all__ = [
-    "MAX_SIGNALS",
-    "NANOSECOND",
-    "NO_STAMP",
-    "UNIT_SECONDS",
-    "UNWANTED",
-    "Clock",
-    "Log",
-    "Reader",
-    "Signal",
-    "Skipped",
-    "even_times",
-    "named_unit",
-    "nanoseconds",
-    "to_nanoseconds",
-]
-
 NANOSECOND = 1e-9
 """A nanosecond in s."""
 MAX_SIGNALS = 10_000

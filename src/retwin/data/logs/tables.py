@@ -20,18 +20,6 @@ from retwin.data.logs.signals import (
 )
 from retwin.errors import InputError
 
-__all__ = [
-    "EVEN",
-    "MISSING",
-    "TIMES",
-    "TIME_NAMES",
-    "numbers",
-    "row_times",
-    "table_signals",
-    "time_column",
-    "unit_in",
-]
-
 TIME_NAMES = ("time", "timestamp", "timestamps", "t", "datetime", "date", "zeit", "stamp", "clock")
 """Names by which a column of times is found, the most certain first."""
 TIMES = "times"

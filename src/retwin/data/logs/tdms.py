@@ -14,8 +14,6 @@ from retwin.data.logs.signals import UNWANTED, Clock, Signal, Skipped, even_time
 from retwin.data.logs.tables import row_times, time_column, unit_in
 from retwin.errors import InputError
 
-__all__ = ["read"]
-
 UNITS = ("unit_string", "NI_UnitDescription", "unit")
 """Properties that may hold the unit of a channel."""
 

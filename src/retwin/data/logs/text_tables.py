@@ -17,17 +17,6 @@ from retwin.data.logs.signals import Clock, Signal, Skipped, named_unit
 from retwin.data.logs.tables import MISSING, TRUTH, numbers, table_signals, time_column
 from retwin.errors import InputError, brief
 
-__all__ = [
-    "AGREEING",
-    "HEAD",
-    "SEPARATORS",
-    "TextLayout",
-    "decimal_comma",
-    "read",
-    "read_cells",
-    "text_layout",
-]
-
 SEPARATORS = (";", "\t", ",", "|")
 """Separators in the order in which they are tried; blanks come last."""
 HEAD = 200

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from retwin.checks import needs_extra, require
 from retwin.errors import InputError, brief
 
-__all__ = ["compatible", "converted", "same_unit"]
-
 LONGEST = 40
 """Characters of a unit at most."""
 SAFE = re.compile(r"[\w°µμΩ%²³⁰¹⁴-⁹⁻·*/^ ().+-]*")

@@ -24,8 +24,6 @@ from retwin.checks import at_most
 from retwin.data.logs.signals import MAX_SIGNALS, Clock, Signal
 from retwin.errors import InputError, brief
 
-__all__ = ["FRAME", "main"]
-
 FRAME = struct.Struct("<I")
 """The length of a frame's text."""
 OVERHEAD = 2**29

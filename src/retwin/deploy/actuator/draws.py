@@ -16,8 +16,6 @@ from retwin.update.corrections.warp import gather_samples
 from retwin.update.residual import ResidualModel
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["Draws", "causal_part", "drawn", "still_and_fastest"]
-
 MAX_EARLY = 0.5
 """Share of draws at most whose delay is before the command; they get none."""
 NO_CHANGE = 1e-6

@@ -27,8 +27,6 @@ from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import DelayOffset
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["ExportedActuator", "Standard", "export_actuator", "write_script"]
-
 PARITY = 1e-5
 """Greatest difference between a written file and torch, relative to the range of each output."""
 MAX_DRAWS = 10_000_000

@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-__all__ = ["AT_REST", "ActuatorStep", "Actuators"]
-
 AT_REST = 1e6
 """Steps at rest with which an episode begins: more than any number of steps that counts as rest."""
 

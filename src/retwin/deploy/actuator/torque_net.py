@@ -29,8 +29,6 @@ from retwin.serialisation.places import check_place
 from retwin.twins.twin import Twin, checked_commands, checked_seed
 from retwin.update.surrogate import Surrogate, fit_surrogate
 
-__all__ = ["ExportedActuatorNet", "Joint", "export_actuator_net"]
-
 MAX_HISTORY = 1000
 """Steps into the past at most."""
 

@@ -25,8 +25,6 @@ from retwin.progress import Progress
 from retwin.serialisation.models import read_model, refusing, write_model
 from retwin.update.corrected import CorrectedTwin, generate
 
-__all__ = ["Bundle"]
-
 
 @dataclass(frozen=True, eq=False)
 class Bundle:

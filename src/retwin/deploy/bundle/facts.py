@@ -13,8 +13,6 @@ from retwin.twins.faults import Fault
 from retwin.twins.samplers import RampSampler
 from retwin.twins.system_faults import FAULTS
 
-__all__ = ["SAMPLERS", "Facts"]
-
 SAMPLERS = (RampSampler,)
 """Kinds of command samplers that a bundle can describe; others remain code of the case."""
 

@@ -38,8 +38,6 @@ from retwin.update.corrected import CorrectedTwin, generate
 from retwin.update.surrogate import Surrogate
 from retwin.update.training_range import training_checked
 
-__all__ = ["Guard", "fit_guard"]
-
 NETWORK = CNN(channels=(32, 64), dropout=0.1)
 TRAINING = Training(max_epochs=15, batch_size=64, learning_rate=3e-3, weight_decay=1e-2)
 ENERGY_QUANTILE = 0.99

@@ -17,8 +17,6 @@ from retwin.errors import InputError, brief
 from retwin.serialisation.files import check_regular, read_json, recover, refusing, sha256
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["SCHEMAS", "SUMS", "open_sealed", "read_sealed", "seal", "verify_seal"]
-
 SUMS = "SHA256SUMS"
 """Name of the file with the checksums, in the format of `sha256sum`."""
 SCHEMAS = {"bundle": 1, "portable": 2}

@@ -18,17 +18,6 @@ from retwin.data.trajectories import Trajectories
 from retwin.twins.command_range import TOLERANCE, excess, extremes
 from retwin.twins.twin import Twin
 
-__all__ = [
-    "CHECKS",
-    "OUTSIDE",
-    "Domain",
-    "Prediction",
-    "Verdicts",
-    "are_probabilities",
-    "check_channels",
-    "present_diagnoser",
-]
-
 T = TypeVar("T")
 CHECKS = (
     *("commands", "speed", "outputs", "nominal", "missing", "length", "residual"),

@@ -13,8 +13,6 @@ from retwin._version import __version__
 from retwin.data.trajectories import Channels
 from retwin.twins.parametric import Parameter
 
-__all__ = ["Variable", "build_description", "description", "variables_of"]
-
 EPOCH = datetime(1980, 1, 1, tzinfo=UTC)
 """The date in a file, which does not depend on when it was made."""
 

@@ -25,8 +25,6 @@ from retwin.update.corrected import CorrectedTwin
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["ExportedFMU", "export_fmu"]
-
 VERSIONS = ("2.0", "3.0")
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
 """As the compiled twin of Python, whose results it must have."""

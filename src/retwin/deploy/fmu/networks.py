@@ -13,8 +13,6 @@ from torch import Tensor, nn
 from retwin.errors import InputError
 from retwin.nets.networks import LSTM, MLP, TCN, Network, StateSpace
 
-__all__ = ["CNetwork", "c_network", "dense_weights", "flat", "weights_of"]
-
 
 @dataclass(frozen=True)
 class CNetwork:

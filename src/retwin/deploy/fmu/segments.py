@@ -15,8 +15,6 @@ from retwin.twins.twin import checked_commands
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Chain, DelayOffset
 
-__all__ = ["segment_parts"]
-
 DRAWS = 1024
 """Draws of z from which the seed of an instance selects one."""
 ENSEMBLE = 64

@@ -15,8 +15,6 @@ from retwin.twins.state_twin import StateTwin
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["states_text"]
-
 
 def states_text(twin: StateTwin | DynamicsTwin) -> Text:
     """A twin with state equations, or corrected dynamics, as C text.

@@ -20,8 +20,6 @@ from retwin.update.corrections import Additive, Chain, SampledSensor
 from retwin.update.residual import Residual, ResidualModel, SequenceResidual
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["surrogate_text"]
-
 
 def surrogate_text(twin: Surrogate | CorrectedTwin, commands: NDArray | None = None) -> Text:
     """A surrogate, with its residual model where it has one, as C text.

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike
 
 from retwin.deploy.fmu.description import Variable
 
-__all__ = ["Text", "constants"]
-
 DIGITS = {"double": (".17g", ""), "float": (".9g", "f"), "int": ("d", "")}
 """How all digits of a number are written, and the suffix of its type."""
 

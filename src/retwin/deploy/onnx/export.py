@@ -40,8 +40,6 @@ from retwin.update.corrections import SampledSensor
 from retwin.update.residual import Mixture, ResidualModel
 from retwin.update.surrogate import Surrogate
 
-__all__ = ["PARITY", "check_installed", "export_onnx", "write_graph"]
-
 PARITY = 1e-5
 """Greatest difference between onnxruntime and torch, in standard units, of a graph."""
 EXAMPLES = 3

@@ -18,16 +18,6 @@ from retwin.update.residual import ResidualModel
 from retwin.update.residual.model import describe
 from retwin.update.surrogate import Surrogate
 
-__all__ = [
-    "CorrectionGraph",
-    "DiagnoserGraph",
-    "FeaturesGraph",
-    "GuardGraph",
-    "ResidualGraph",
-    "SensorGraph",
-    "sensor_of",
-]
-
 
 @dataclass
 class TensorSegments:

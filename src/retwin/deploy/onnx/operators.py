@@ -7,8 +7,6 @@ from typing import Any
 
 import torch
 
-__all__ = ["translations"]
-
 
 def translations() -> dict[Callable[..., Any], Callable[..., Any]]:
     """Torch operator to the function that builds its ONNX nodes; needs onnxscript."""

@@ -29,8 +29,6 @@ from retwin.times import sample_rate
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Chunk, checked_commands, checked_seed, simulate_in_chunks
 
-__all__ = ["Portable", "padded_times", "settled_at"]
-
 GRAPHS = ("surrogate", "residual", "correction", "guard")
 """Names of the graphs that every export has."""
 

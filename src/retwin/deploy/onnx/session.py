@@ -15,8 +15,6 @@ from retwin.serialisation.sizes import Budget
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
-__all__ = ["Session", "bounded_options"]
-
 EXPECTED = "a graph that retwin bundle export wrote"
 REMEDY = "make it anew with retwin bundle export, or give it less at once if memory is short"
 

@@ -37,8 +37,6 @@ from retwin.serialisation.identity import identity
 from retwin.serialisation.places import in_use
 from retwin.serialisation.sizes import Budget
 
-__all__ = ["Simulated", "simulate_to"]
-
 SCHEMA = 2
 """The version of the plan's identity. Digests of the first, which has no such key, differ."""
 MAX_NPZ_BYTES = 2**29

@@ -28,8 +28,6 @@ from retwin.twins.twin import Twin, checked_commands
 if TYPE_CHECKING:  # a worker that simulates without torch need not load it
     from retwin.twins.samplers import CommandSampler
 
-__all__ = ["Recorded", "SimulatedChunk", "SimulationPlan", "simulate_chunk"]
-
 MAX_CHUNK = 2**31 - 1
 """Greatest number of trajectories in a chunk; the memory allows fewer of any length."""
 MAX_REASON_CHARACTERS = 200

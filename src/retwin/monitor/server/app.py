@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 else:
     fastapi = needs_extra("fastapi", "monitor", "answers requests")
 
-__all__ = ["create_app"]
-
 LEAST_TOKEN = 16
 """Characters of a token at least."""
 LISTENERS = 100

@@ -17,8 +17,6 @@ from retwin.twins.system_faults import (
     SensorFreeze,
 )
 
-__all__ = ["size_unit", "what_to_check"]
-
 SENTENCES: Mapping[type, Callable[[Any, AnyMonitor], str]] = {
     ParameterShift: lambda fault, monitor: (
         f"The parameter {fault.parameter} of the machine has changed. Look for what sets it: "

@@ -12,8 +12,6 @@ from retwin.monitor.comparison import compare
 from retwin.monitor.decision import Decision
 from retwin.monitor.store import Store
 
-__all__ = ["Comparisons"]
-
 FRESH, PATIENCE, QUEUE = 60.0, 20.0, 16
 """A comparison is kept for so many seconds, or for so many times as long as it took, whichever is
 longer; and comparisons that may be made or kept."""

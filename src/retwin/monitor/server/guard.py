@@ -10,8 +10,6 @@ from collections.abc import Collection
 from typing import Any
 from urllib.parse import urlsplit
 
-__all__ = ["MAX_BODY", "RequestGuard"]
-
 MAX_BODY = 2**22
 """Bytes of a request's body at most."""
 PATIENCE = 30.0

@@ -13,8 +13,6 @@ from retwin.monitor.audit import Entry
 from retwin.monitor.samples import SECOND
 from retwin.monitor.store import Store
 
-__all__ = ["Journal"]
-
 KEPT = 10_000
 """Newest alarms that are kept; all of them are in the log."""
 EVENTS = 50

@@ -10,8 +10,6 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
 from retwin.monitor.live import Live
 
-__all__ = ["Metrics"]
-
 BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Upper ends of the histogram of latencies in s; the contract is 5 ms in the median, 20 ms at
 99 %."""

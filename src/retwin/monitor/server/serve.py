@@ -11,8 +11,6 @@ from retwin.checks import needs_extra
 from retwin.errors import InputError, brief
 from retwin.monitor.server.guard import RequestGuard
 
-__all__ = ["PORT", "listening", "serving"]
-
 PORT = 8710
 """The port unless another one is given."""
 PATIENCE = 3

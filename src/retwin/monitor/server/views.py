@@ -27,8 +27,6 @@ from retwin.monitor.server.journal import Journal
 from retwin.monitor.status import AssetStatus
 from retwin.monitor.trajectories import TrajectoryMonitor
 
-__all__ = ["Views"]
-
 BAND = 1.645
 """Half the width of the 90 % band of a Gaussian, in its standard deviations."""
 SILENT = 20

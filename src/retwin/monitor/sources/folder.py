@@ -18,8 +18,6 @@ from retwin.monitor.sources.source import Source
 from retwin.monitor.sources.tables import Layout, Table
 from retwin.monitor.updates import LEAST
 
-__all__ = ["Files", "Folder"]
-
 LATE = 60 * 10**9
 """Nanoseconds before the newest stored sample from which rows are sent again after a restart: what
 is older is not used any more, and what is stored already is recognised."""

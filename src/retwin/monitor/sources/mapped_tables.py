@@ -32,8 +32,6 @@ from retwin.data.trajectories import Channels
 from retwin.errors import InputError, brief
 from retwin.monitor.sources.tables import ROWS, Rows, Table, TextTable
 
-__all__ = ["MappedCsv", "MappedLayout", "MappedParquet", "mapped_layout"]
-
 UTF16 = (b"\xff\xfe", b"\xfe\xff")
 """Marks of an encoding in which the end of a row is not found by its bytes."""
 REMEDY = "leave it out of the mapping of this source, or write complete logs"

@@ -18,8 +18,6 @@ from retwin.monitor.samples import Samples, Trajectory, parse
 from retwin.monitor.settings import MqttSource, secret
 from retwin.monitor.sources.source import Source
 
-__all__ = ["Mqtt"]
-
 KEEPALIVE = 10
 """Seconds without a word from the broker after which it is asked whether it is there."""
 RETRY = 1, 4

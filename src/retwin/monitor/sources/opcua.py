@@ -18,8 +18,6 @@ from retwin.monitor.settings import OpcUaSource, secret
 from retwin.monitor.sources.assembly import Assembly
 from retwin.monitor.sources.source import AGAIN, Source
 
-__all__ = ["OpcUa"]
-
 TIMEOUT = 4.0
 """Seconds in which the server must answer."""
 LONGEST = 1.0

@@ -13,8 +13,6 @@ from retwin.errors import InputError
 from retwin.monitor.gate import Gate
 from retwin.monitor.samples import Samples, Trajectory
 
-__all__ = ["AGAIN", "Source"]
-
 AGAIN = 2.0
 """Seconds after which what failed is tried again, so that a source is back within ten."""
 QUIET = 10.0

@@ -22,8 +22,6 @@ from retwin.data.logs.signals import nanoseconds
 from retwin.errors import InputError, brief
 from retwin.monitor.settings import FolderSource
 
-__all__ = ["Layout", "Rows", "Table", "TextTable", "layout_of"]
-
 CHUNK = 2**16
 """Bytes of a CSV file, and of one of its rows, that are read at once."""
 ROWS = 8192

@@ -24,8 +24,6 @@ from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.monitor.updates import LEAST
 from retwin.twins.twin import check_channels
 
-__all__ = ["Recorded", "TrajectoryFolder"]
-
 
 @dataclass(frozen=True)
 class Recorded:
