@@ -89,11 +89,15 @@ def opened(browser: Browser, file: Path, **options: Any) -> Opened:
     page.on("pageerror", lambda error: found.errors.append(str(error)))
     page.on("request", lambda request: found.requested.append(request.url))
     page.goto(file.as_uri())
+    page.locator("#plot-summary-0").scroll_into_view_if_needed()  # on a phone it is further down
     page.wait_for_selector("#plot-summary-0 .main-svg")
     found.ready = page.evaluate("performance.now()")
     page.evaluate("document.getElementById('unfold').click()")
-    page.wait_for_selector("#explore-outputs .main-svg")
-    page.wait_for_selector("#explore[data-ready]")
+    page.wait_for_selector("#explore[data-ready]", state="attached")
+    for place in page.locator(".picture").all():  # plots are drawn when they come near the screen
+        place.scroll_into_view_if_needed()
+        place.locator(".main-svg").first.wait_for(state="attached")
+    page.evaluate("scrollTo(0, 0)")
     return found
 
 
@@ -111,6 +115,7 @@ def phone(browser: Browser, study_page: Path) -> Opened:
 @pytest.fixture
 def dark(desk: Opened) -> Iterator[Page]:
     """The same page in the dark, once its pictures have followed."""
+    desk.page.evaluate("scrollTo(0, 0)")
     desk.page.emulate_media(color_scheme="dark")
     expect(desk.page.locator(".xtitle").first).to_have_css("fill", rgb(CHROME["muted"][1]))
     yield desk.page
@@ -151,6 +156,37 @@ def test_it_opens_from_a_file_without_network_and_without_errors(desk: Opened) -
     )
     assert len(sizes) > 10
     assert all(size and min(size) > 100 for size in sizes)
+
+
+def test_plots_are_drawn_when_they_come_near_the_screen(browser: Browser, study_page: Path) -> None:
+    with browser.new_context(offline=True, viewport=SCREEN) as context:
+        page = context.new_page()
+        page.set_default_timeout(PATIENCE)
+        page.goto(study_page.as_uri())
+        page.wait_for_selector("#plot-summary-0 .main-svg")
+        page.wait_for_selector("#explore[data-ready]", state="attached")
+        drawn = ".picture:has(.main-svg)"
+        assert page.locator(drawn).count() == page.locator("#figure-summary .picture").count()
+        page.click("nav a[href='#scores']")
+        page.wait_for_selector("#plot-scores-0 .main-svg")
+        page.pdf()
+        every = page.locator(".picture").count()
+        assert page.locator(drawn).count() == every, "paper shows all, and whoever looks next"
+
+
+def test_no_table_is_wider_than_a_desk(browser: Browser, study_page: Path) -> None:
+    with browser.new_context(offline=True, viewport={"width": 1440, "height": 900}) as context:
+        page = context.new_page()
+        page.set_default_timeout(PATIENCE)
+        page.goto(study_page.as_uri())
+        page.wait_for_selector("#explore[data-ready]", state="attached")
+        page.click("#unfold")
+        wide = page.eval_on_selector_all(
+            ".scroll",
+            "(all) => all.filter((each) => each.scrollWidth > each.clientWidth + 1)"
+            ".map((each) => each.getAttribute('aria-label'))",
+        )
+        assert wide == []
 
 
 def test_the_explorer_follows_the_mouse(desk: Opened) -> None:

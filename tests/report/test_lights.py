@@ -134,7 +134,7 @@ def test_few_healthy_trajectories_promise_no_rate(
     page = rendered(folder)
     assert "with 10 healthy runs the rate is not certain" in page
     assert "Record at least 36 healthy runs (10 now)" in page
-    assert "5 % cannot be promised by fewer than 19 healthy runs" in page
+    assert "5\u00a0% cannot be promised by fewer than 19 healthy runs" in page
 
 
 def test_a_plain_twin_that_finds_more_makes_detection_fail(study: Study, write: Write) -> None:

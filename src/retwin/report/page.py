@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import base64
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+from markupsafe import Markup
 
 from retwin.report import labels
 from retwin.report.assets import asset, environment, plotly_js, script_json
@@ -126,6 +129,7 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
     templates.globals |= {
         "results": study.results,
         "word": study.word,
+        "healthy_only": "healthy " if study.results.classes else "",
         "min_runs": MIN_RUNS,
         "min_records": MIN_RECORDS,
         "anchors": {section.key for section in sections},
@@ -136,7 +140,7 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         "monitor": f"{PAGES}monitor.html",
     }
     bodies = {
-        section.key: explained(
+        section.key: _dressed(
             templates.get_template(f"{section.key}.html.j2").render(section.values)
         )
         for section in sections
@@ -155,9 +159,14 @@ def render(study: Study, sections: Sequence[Section], images: Mapping[str, bytes
         sections=sections,
         bodies=bodies,
         verdict=verdicts,
-        summary=explained(first),
+        summary=_dressed(first),
         specs=script_json(specs),
         contents={name: script_json(content) for name, content in contents.items()},
         scripts={name: asset(f"{name}.js") for name in contents},
         plotly=plotly_js() if specs or "explorer" in contents else "",
     )
+
+
+def _dressed(markup: str) -> Markup:
+    """HTML with its terms explained, and no line break between a number and its percent sign."""
+    return Markup(re.sub(r"(?<=\d) (?=%)", "\u00a0", explained(markup)))

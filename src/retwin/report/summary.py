@@ -134,7 +134,10 @@ def _segment_rows(study: Study) -> list[tuple[str, _Row]]:
 
 
 def _held_out_rows(study: Study) -> list[tuple[str, _Row]]:
-    """Delay, and noise at rest of each output, measured and generated."""
+    """Delay, and noise at rest of each output, measured and generated.
+
+    Offsets too, where no others are known from every test trajectory.
+    """
     pair = headline(study.results)
     fidelity = study.results.fidelity.get(pair[0]) if pair else None
     if pair is None or fidelity is None:
@@ -145,9 +148,10 @@ def _held_out_rows(study: Study) -> list[tuple[str, _Row]]:
     if observed is None or predicted is None:
         return []
     units = [*fidelity.latent_units, *[""] * len(fidelity.latents)]
+    kinds = ("noise_", "delay", *([] if study.results.overlay else ["offset_"]))
     rows = []
     for column, name in enumerate(fidelity.latents):
-        if not name.startswith(("noise_", "delay")):
+        if not name.startswith(kinds):
             continue
         factor, unit = quantity(units[column])
         values, drawn = (factor * each[:, column].astype(float) for each in (observed, predicted))

@@ -34,6 +34,7 @@ def card(study: Study) -> Section:
         "confused": _confused(study, source),
         "missed": _missed(study, source),
         "unlike": unlike(study, source),
+        "compared": bool(results.classes) or source in results.fidelity,
         "notes": _notes(results),
         "data": _data(study),
         "protocol": results.data.protocol.rstrip("."),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -20,11 +21,11 @@ from retwin.report.figure import (
     draw_bands,
     edges_of,
 )
-from retwin.report.labels import number, order, quantity, source_name, span, with_unit
+from retwin.report.labels import number, order, places, quantity, source_name, span, with_unit
 from retwin.report.sections.discrepancy import detailed, figure_cell, suffixes, titled
 from retwin.report.study import Study
 from retwin.report.style import colour_of
-from retwin.results import FidelityResults
+from retwin.results import FidelityFigure, FidelityResults
 
 RIVALS = {"mean_only": "Mean only", "single_gaussian": "One Gaussian"}
 """Titles of the simpler generators."""
@@ -77,7 +78,7 @@ def _lengths(each: FidelityResults, energy: str) -> list[tuple[str, str, float, 
     """Key, title, factor and unit of the CRPS of each output; `energy` is put behind them."""
     units = [*each.units, *[""] * len(each.outputs)]
     rows = [(f"crps/{n}", f"CRPS {n}", u) for n, u in zip(each.outputs, units, strict=False)]
-    if energy:
+    if energy and len(each.outputs) > 1:
         rows.append(("crps", energy, ""))
     rows.append(("energy", "Energy score", units[0] if len(set(each.units)) == 1 else ""))
     return [(key, title, *quantity(unit)) for key, title, unit in rows]
@@ -90,14 +91,23 @@ def _overview(study: Study, sources: list[str]) -> Table:
     shown = [*lengths, *((key, title, 1.0, "") for key, title in SHARES.items())]
     shown = [each for each in shown if any(each[0] in figures for figures in known.values())]
     heads = columns("Source", *(with_unit(title, unit) for _, title, _, unit in shown))
+    digits = dict.fromkeys(SHARES, 2) | {
+        key: _digits((each.get(key) for each in known.values()), factor)
+        for key, _, factor, _ in lengths
+    }
     rows = [
         [
             Cell(source_name(name), source=name),
-            *(figure_cell(figures.get(key), 2, factor) for key, _, factor, _ in shown),
+            *(figure_cell(figures.get(key), digits[key], factor) for key, _, factor, _ in shown),
         ]
         for name, figures in known.items()
     ]
     return Table("Fidelity of all sources", heads, rows)
+
+
+def _digits(figures: Iterable[FidelityFigure | None], factor: float) -> int:
+    """Decimals with which the scores have three digits."""
+    return places(*(factor * each.value for each in figures if each is not None))
 
 
 def _scores(study: Study, source: str) -> Table:
@@ -110,9 +120,12 @@ def _scores(study: Study, source: str) -> Table:
     rows = []
     for key, title, factor, unit in _lengths(each, "CRPS, mean over outputs"):
         kind, *output = key.split("/", 1)
-        row = [Cell(with_unit(title, unit)), figure_cell(each.figures.get(key), 2, factor)]
-        for rival in each.rivals:
-            row.append(figure_cell(each.figures.get(f"{key}/{rival}"), 2, factor))
+        keys = (key, *(f"{key}/{rival}" for rival in each.rivals))
+        scored = [each.figures.get(name) for name in keys]
+        digits = _digits(scored, factor)
+        row = [Cell(with_unit(title, unit)), figure_cell(scored[0], digits, factor)]
+        for rival, theirs in zip(each.rivals, scored[1:], strict=True):
+            row.append(figure_cell(theirs, digits, factor))
             below = "/".join([f"{kind}_below", *output, rival])
             row.append(figure_cell(each.figures.get(below), 0, 100.0))
         rows.append(row)

@@ -1,14 +1,12 @@
 // The explorer: draws the trajectory that is picked, and moves through its time.
-(async () => {
+const explorer = async (place) => {
   "use strict";
-  const place = document.getElementById("explore");
-  if (!place) return;
   const content = JSON.parse(document.getElementById("explorer-content").textContent);
   const at = (name) => document.getElementById("explore-" + name);
 
   if (!window.DecompressionStream) {
     at("answer").textContent = "The explorer requires a browser of 2023 or later.";
-    return;
+    return () => {};
   }
   // See `packed` in explorer.py.
   const unpack = async (packed) => {
@@ -273,10 +271,22 @@
     place.scrollIntoView();
   };
   window.addEventListener("hashchange", follow);
-  page.drawn.push(draw);
   list();
   pick(sequence[0]);
   move(moment);
   follow();
   place.dataset.ready = "yes";
+  return draw;
+};
+// Its data are unpacked when it comes near the screen, or once nothing else is to be done, so that
+// it prints without having been opened.
+(() => {
+  "use strict";
+  const place = document.getElementById("explore");
+  if (!place) return;
+  let begun = null;
+  let draw = () => { begun ||= explorer(place).then((found) => { draw = found; }); };
+  page.near(place, () => draw());
+  const idle = window.requestIdleCallback || setTimeout;
+  window.addEventListener("load", () => idle(() => draw()));
 })();

@@ -1,4 +1,5 @@
-// Draws the plots in the page's colours, and again when these or the width change.
+// Draws each plot in the page's colours when it comes near the screen, and again when these or the
+// width change: text and first screen are there before anything is drawn.
 const page = (() => {
   "use strict";
   const specs = JSON.parse(document.getElementById("specs").textContent);
@@ -40,6 +41,15 @@ const page = (() => {
     displaylogo: false, scrollZoom: false, displayModeBar: root.clientWidth < 600 ? false : "hover",
     toImageButtonOptions: { format: "png", scale: 2 },
   };
+  // The plot library is most of the page's script: it is run when the first plot is drawn.
+  const library = () => {
+    if (!window.Plotly) {
+      const run = document.createElement("script");
+      run.textContent = document.getElementById("plotly").textContent;
+      document.head.append(run);
+    }
+    return window.Plotly;
+  };
   const plot = (place, data, layout) => {
     const style = getComputedStyle(root);
     const height = layout.height * (root.dataset.print ? 0.72 : 1);
@@ -48,27 +58,32 @@ const page = (() => {
     const buttons = data.some((each) => each.type === "scatter3d")
       ? ["toImage", "orbitRotation", "zoom3d", "pan3d", "resetCameraDefault3d"]
       : ["toImage", "zoom2d", "pan2d", "resetScale2d"];
-    Plotly.react(place, { data: paint(data, style), layout: painted, config: { ...config, modeBarButtons: [buttons] } });
+    library().react(place, { data: paint(data, style), layout: painted, config: { ...config, modeBarButtons: [buttons] } });
   };
-  // A plot is drawn when its section is opened, so that the first screen is there at once.
-  const visible = (place) => place && !place.closest("details.part:not([open])");
-  const drawn = [() => {
-    for (const [id, spec] of Object.entries(specs)) {
-      const place = document.getElementById(id);
-      if (!visible(place)) continue;
+  const visible = (place) => !place.closest("details.part:not([open])");
+  // The function that draws an element, called when that is near the screen; closed sections never are.
+  const pictures = new Map();
+  const observer = new IntersectionObserver((entries) => {
+    entries.filter((each) => each.isIntersecting).forEach(({ target }) => {
+      observer.unobserve(target);
+      pictures.get(target)();
+    });
+  }, { rootMargin: "400px" });
+  const near = (place, draw) => {
+    pictures.set(place, draw);
+    observer.observe(place);
+  };
+  const redraw = () => pictures.forEach((_, place) => observer.observe(place));
+  for (const [id, spec] of Object.entries(specs)) {
+    const place = document.getElementById(id);
+    if (place) near(place, () => {
       const given = { ...spec.layout, ...(place.clientWidth < 600 ? spec.narrow : {}) };
       const axes = Object.entries(given).filter(([key]) => key.includes("axis"));
       const dressed = Object.fromEntries(axes.map(([key, each]) => [key, styled(each)]));
       plot(place, spec.data, { ...layout, ...given, ...dressed, height: spec.height });
-    }
-  }];
-  const draw = () => drawn.forEach((each) => each());
+    });
+  }
   const parts = Array.from(document.querySelectorAll("details.part"));
-  const redraw = () => { cancelAnimationFrame(waiting); waiting = requestAnimationFrame(draw); };
-  let waiting = 0;
-
-  draw();
-  parts.forEach((part) => part.addEventListener("toggle", () => part.open && redraw()));
   // A link to a section, or to something within one, opens it.
   const unfold = () => {
     const name = location.hash.slice(1);
@@ -87,7 +102,7 @@ const page = (() => {
     all.setAttribute("aria-pressed", String(open));
     all.textContent = open ? "Close all sections" : "Open all sections";
   });
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   let width = root.clientWidth;
   window.addEventListener("resize", () => {
     if (root.clientWidth === width || root.dataset.print) return;
@@ -103,7 +118,7 @@ const page = (() => {
     root.dataset.print = "yes";
     folded = parts.filter((part) => !part.open);
     folded.forEach((part) => { part.open = true; });
-    draw();
+    pictures.forEach((draw) => draw());
     const first = document.getElementById("summary");
     if (first) first.style.zoom = Math.min(1, SHEET / first.offsetHeight);
     tables.forEach((table) => {
@@ -116,8 +131,8 @@ const page = (() => {
     if (first) first.style.zoom = "";
     tables.forEach((table) => { table.style.zoom = ""; });
     folded.forEach((part) => { part.open = false; });
-    draw();
+    redraw();
   });
 
-  return { axis, drawn, escaped, layout, plot, visible };
+  return { axis, escaped, layout, near, plot, visible };
 })();
