@@ -120,7 +120,11 @@ const page = (() => {
     folded.forEach((part) => { part.open = true; });
     pictures.forEach((draw) => draw());
     const first = document.getElementById("summary");
-    if (first) first.style.zoom = Math.min(1, SHEET / first.offsetHeight);
+    if (first) {
+      first.style.zoom = Math.min(1, SHEET / first.offsetHeight);
+      // Smaller print has room for wider plots.
+      pictures.forEach((draw, place) => first.contains(place) && draw());
+    }
     tables.forEach((table) => {
       table.style.zoom = Math.min(1, table.parentElement.clientWidth / table.offsetWidth);
     });
