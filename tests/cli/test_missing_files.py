@@ -12,6 +12,7 @@ import pytest
         ("study armpi --calibration no.npz --test other.npz --out made", "--calibration"),
         ("study no/case.toml --out made", "CASE"),
         ("fit armpi --real no.mat --out made", "--real"),
+        ("fit armpi --real no.mat --out m", "--real"),
         ("data info no.mat", "FILES"),
         ("data convert no.mat made.npz", "IN"),
         ("twin simulate armpi --commands no.npz --out made.npz", "--commands"),

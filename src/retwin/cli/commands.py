@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -82,9 +83,14 @@ def _naming(error: InputError, params: Iterable[Any], values: Mapping[str, Any])
                 continue
             if str(path) in (error.argument, error.argument.strip("'")):
                 return f"{option.strip('[].')} {error.argument}"
-            if error.argument in GENERIC and str(path) in error.got:
+            if error.argument in GENERIC and _names(error.got, path):
                 return str(option.strip("[]."))
     return ""
+
+
+def _names(text: str, path: Path) -> bool:
+    """Whether the text has this path, and not as a part of another one."""
+    return bool(re.search(rf"(?<![\w./-]){re.escape(str(path))}(?![\w/-]|\.\w)", text))
 
 
 def _paths(param: Any, value: Any) -> Iterator[Path]:

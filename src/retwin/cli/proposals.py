@@ -32,7 +32,7 @@ def propose(
     mapping: LogMapping = None,
     as_json: Json = False,
 ) -> None:
-    """Propose what to record next, and say whether there is enough."""
+    """Propose what to record next, and whether there is enough."""
     import numpy as np
 
     import retwin as rt

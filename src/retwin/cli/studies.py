@@ -65,7 +65,7 @@ Sources = Annotated[
     str | None,
     compared_option(
         metavar="NAMES",
-        help="Joined by commas, or all; else dt,ibg,ibg_rg.",
+        help="Joined by commas, or all; else dt (or twin), ibg, ibg_rg.",
         autocompletion=complete_sources,
     ),
 ]
