@@ -6,7 +6,7 @@ and over the posterior of the twin's parameters, on which predictions depend lin
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,9 +25,9 @@ from retwin.twins.system_faults import (
     SensorFreeze,
     SizedFault,
     TimedFault,
-    parameter_changes,
 )
 from retwin.update.dynamics import DynamicsTwin
+from retwin.update.dynamics.likelihood import NoiseVariances, Record, Variants
 from retwin.update.dynamics.prediction import root_of, whitened
 
 COVERAGE = 0.9
@@ -48,8 +48,9 @@ ROWS = 256
 NOTHING = np.full(3, np.nan)
 """The size, onset and end of no fault."""
 
-_Noise = tuple[NDArray | float, NDArray | float]
-_Given = tuple[NDArray, NDArray, NDArray, NDArray | None]
+_Noise = NoiseVariances
+_Hypothesis = tuple[TimedFault | None, NDArray]
+"""A fault with its size, onset and end, (3,), in samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,38 +59,36 @@ class FaultEvidence:
 
     Attributes
     ----------
-    twin : DynamicsTwin
-        The corrected dynamics.
-    commands, measured, seen : NDArray
-        (T, d_u), (T, d_y) and (T, d_y) bool.
-    known_start : bool
-        See `StateInversionDiagnoser.diagnose`.
+    record : Record
+        The commands and outputs of the trajectory, with the corrected dynamics.
 
     """
 
-    twin: DynamicsTwin
-    commands: NDArray
-    measured: NDArray
-    seen: NDArray
-    known_start: bool
+    record: Record
 
     @classmethod
     def of(cls, twin: DynamicsTwin, trajectory: Trajectories, known_start: bool) -> FaultEvidence:
         """That of one trajectory, whose outputs are 0 where they were not measured."""
         seen = trajectory.mask[0]
         measured = np.where(seen, trajectory.observed[0].astype(np.float64), 0.0)
-        return cls(twin, trajectory.commands[0].astype(np.float64), measured, seen, known_start)
+        commands = trajectory.commands[0].astype(np.float64)
+        return cls(Record(twin, commands, measured, seen, known_start))
+
+    @property
+    def twin(self) -> DynamicsTwin:
+        """The corrected dynamics."""
+        return self.record.twin
 
     def largest_error(self) -> float:
         """The largest error of a prediction for the healthy system, in standard deviations."""
-        given = (self.commands[None], self.measured[None], self.seen[None])
-        mean, covariance, _ = self.twin.filter(*given, known_start=self.known_start)
-        errors = whitened(self.measured - mean, root_of(covariance, given[2]), given[2])
+        measured, seen = self.record.measured[None], self.record.seen[None]
+        mean, covariance, _ = self.record.filtered(Variants())
+        errors = whitened(measured - mean, root_of(covariance, seen), seen)
         return float(np.abs(errors).max()) if np.isfinite(errors).all() else np.inf
 
     def integral(self, fault: TimedFault | None) -> Integral:
         """The evidence for a fault, and the posterior of its size, onset and end."""
-        steps, rate = len(self.commands), self.twin.rate
+        steps, rate = len(self.record.commands), self.twin.rate
         if fault is None:
             return Integral(float(self._under(None, NOTHING[None])[0]), *[NOTHING] * 4)
         sizes = ends_of(fault.size) if isinstance(fault, SizedFault) else (1.0, 1.0)
@@ -121,7 +120,7 @@ class FaultEvidence:
             return found
         states, outputs = self._effect(fault, found.best)
         noise = ((TOLERANCE * states) ** 2, (TOLERANCE * outputs) ** 2)
-        gain = self._gain(fault, found.best, noise, self._slopes(noise))
+        gain = self._gains([(fault, found.best)], noise)[0]
         return replace(found, evidence=found.evidence + float(np.logaddexp(0, gain) - np.log(2)))
 
     def unknown(self, faults: Iterable[TimedFault | None], found: Iterable[Integral]) -> float:
@@ -130,39 +129,36 @@ class FaultEvidence:
         It adds noise to what the twin predicts with the most probable size and times of the fault.
         """
         pairs = [each for each in zip(faults, found, strict=True) if np.isfinite(each[1].evidence)]
-        made = []
-        for noise in self._noises():
-            slopes = self._slopes(noise)
-            for fault, own in pairs:
-                made.append(own.evidence + self._gain(fault, own.best, noise, slopes))
-        return float(logsumexp(made) - np.log(len(made))) if made else -np.inf
+        points = [(fault, own.best) for fault, own in pairs]
+        evidence = np.array([own.evidence for _, own in pairs])
+        made = [evidence + self._gains(points, noise) for noise in self._noises()] if pairs else []
+        return float(logsumexp(made) - np.log(np.size(made))) if pairs else -np.inf
 
-    def _gain(
-        self, fault: TimedFault | None, point: NDArray, noise: _Noise, slopes: NDArray
-    ) -> float:
-        """By how much more noise, with the slopes of its filter, raises a log density."""
-        given, _ = self._inputs(fault, point[None])
-        more = self._log_density(*given, more=noise, slopes=slopes)
-        less = self._log_density(*given, slopes=self._by_parameters)
-        return float(more[0] - less[0]) if np.isfinite(more[0]) else -np.inf
+    def _gains(self, points: Sequence[_Hypothesis], noise: _Noise) -> NDArray:
+        """By how much more noise, with the slopes of its filter, raises log densities (J,)."""
+        slopes, own = self._slopes(noise), [self._inputs(fault, p[None])[0] for fault, p in points]
+        more = np.array([self.record.log_density(each, slopes, noise)[0] for each in own])
+        less = [self.record.log_density(each, self._by_parameters)[0] for each in own]
+        return np.where(np.isfinite(more), more - less, -np.inf)
 
     def _effect(self, fault: TimedFault, point: NDArray) -> tuple[NDArray, NDArray]:
         """Root mean square effects of a fault on states, per sample, and on measured outputs."""
-        twin = self.twin
-        (commands, measured, seen, changes), _ = self._inputs(fault, point[None])
-        x = twin.filter(commands, measured, seen, changes=changes, known_start=self.known_start)[2]
+        twin, record = self.twin, self.record
+        variants, _ = self._inputs(fault, point[None])
+        commands, measured, _, changes = record.inputs(variants)
+        x = record.filtered(variants)[2][0]
         own = None if changes is None else changes[0]
-        slopes = twin.slope(x[0], commands[0], own) - twin.slope(x[0], self.commands)
+        slopes = twin.slope(x, commands[0], own) - twin.slope(x, record.commands)
         steps = slopes if twin.equations.step else slopes / twin.rate
-        active = _fixed(fault, point, twin.rate).active(len(self.commands), twin.rate)
-        both = (steps[active], (measured[0] - self.measured)[active])
+        active = _active(point[None], len(record.commands))[0]
+        both = (steps[active], (measured[0] - record.measured)[active])
         return tuple(np.sqrt(np.mean(each**2, axis=0)) for each in both)
 
     def _noises(self) -> list[_Noise]:
         """Variances that are added to those of process or measurement noise."""
         twin = self.twin
         step = twin.domain.speed if twin.equations.step else twin.domain.speed / twin.rate
-        columns = zip(self.measured.T, self.seen.T, strict=True)
+        columns = zip(self.record.measured.T, self.record.seen.T, strict=True)
         usual = np.array([own[seen].std() if seen.any() else 0.0 for own, seen in columns])
         more: list[_Noise] = [((level * step) ** 2, 0.0) for level in LEVELS]
         return more + [(0.0, (level * usual) ** 2) for level in LEVELS]
@@ -171,28 +167,32 @@ class FaultEvidence:
         """Log likelihoods (J,) under a fault of these sizes, onsets and ends (J, 3), in samples."""
         made = []
         for rows in range(0, len(points), ROWS):
-            given, gain = self._inputs(fault, points[rows : rows + ROWS])
-            made.append(gain + self._log_density(*given, slopes=self._by_parameters))
+            variants, gain = self._inputs(fault, points[rows : rows + ROWS])
+            made.append(gain + self.record.log_density(variants, self._by_parameters))
         return np.concatenate(made)
 
-    def _inputs(self, fault: TimedFault | None, points: NDArray) -> tuple[_Given, NDArray]:
-        """What the filter takes under a fault at points (J, 3), and log densities (J,) besides."""
-        steps, rate = len(self.commands), self.twin.rate
-        shape = (len(points), 1, 1)
-        commands, measured = np.tile(self.commands, shape), np.tile(self.measured, shape)
-        seen, gain, changes = np.tile(self.seen, shape), np.zeros(len(points)), None
-        made = [_fixed(fault, point, rate) for point in points] if fault is not None else []
-        if isinstance(fault, ParameterFault):
-            changes = parameter_changes(made, self.twin.shiftable, steps, rate)
-        for i, each in enumerate(made):
-            match each:
-                case ActuatorGain(actuator=actuator):
-                    commands[i, :, actuator] *= 1 + each.profile(steps, rate)
-                case SensorFreeze(output=output):
-                    gain[i] = self._frozen(output, each.active(steps, rate), seen[i])
-                case SensorBias(output=output) | SensorDrift(output=output):
-                    measured[i, :, output] -= each.profile(steps, rate)
-        return (commands, measured, seen, changes), gain
+    def _inputs(self, fault: TimedFault | None, points: NDArray) -> tuple[Variants, NDArray]:
+        """What a fault changes of the record at points (J, 3), and log densities (J,) besides."""
+        record, none = self.record, np.zeros(len(points))
+        (size, onset, _), active = points.T, _active(points, len(record.commands))
+        match fault:
+            case ParameterFault(parameter=name):
+                change = fault.profiles(active, size, onset, self.twin.rate)
+                return Variants(change=change, parameter=self.twin.shiftable.index(name)), none
+            case ActuatorGain(actuator=place):
+                commands = np.tile(record.commands, (len(points), 1, 1))
+                commands[..., place] *= 1 + fault.profiles(active, size, onset, self.twin.rate)
+                return Variants(commands=commands), none
+            case SensorBias(output=place) | SensorDrift(output=place):
+                measured = np.tile(record.measured, (len(points), 1, 1))
+                measured[..., place] -= fault.profiles(active, size, onset, self.twin.rate)
+                return Variants(measured=measured), none
+            case SensorFreeze(output=place):
+                seen = np.tile(record.seen, (len(points), 1, 1))
+                pairs = zip(active, seen, strict=True)
+                gain = [self._frozen(place, own, each) for own, each in pairs]
+                return Variants(seen=seen), np.array(gain)
+        return Variants(), none
 
     def _frozen(self, output: int, active: NDArray, seen: NDArray) -> float:
         """Log density of a frozen sensor's samples, which are removed from those `seen` (T, d_y).
@@ -203,50 +203,14 @@ class FaultEvidence:
         places = np.flatnonzero(active & seen[:, output])
         if len(places) < 2:
             return 0.0
-        error = self.measured[places[1:], output] - self.measured[places[0], output]
+        measured, known = self.record.measured[:, output], self.record.seen[:, output]
+        error = measured[places[1:]] - measured[places[0]]
         seen[places[1:], output] = False
-        least = _digit(self.measured[self.seen[:, output], output]) / np.sqrt(12)
+        least = _digit(measured[known]) / np.sqrt(12)
         deviation = np.maximum(FROZEN * np.sqrt(self.twin.noise[output]), least)
         each = -0.5 * np.sum((error / deviation[:, None]) ** 2, axis=1)
         each -= len(error) * np.log(deviation * np.sqrt(2 * np.pi))
         return float(logsumexp(each) - np.log(len(FROZEN)))
-
-    def _log_density(
-        self,
-        commands: NDArray,
-        measured: NDArray,
-        seen: NDArray,
-        changes: NDArray | None,
-        *,
-        slopes: NDArray,
-        more: _Noise = (0.0, 0.0),
-    ) -> NDArray:
-        """Log densities (J,) of what was measured; minus infinity where they are not finite.
-
-        They are means over the posterior of the twin's parameters, on which the predictions depend
-        linearly, with `slopes` (T, d_y, r), those of the healthy system.
-        """
-        mean, covariance, _ = self.twin.filter(
-            commands, measured, seen, changes=changes, more=more, known_start=self.known_start
-        )
-        made, factor = np.full(len(commands), -np.inf), root_of(covariance, seen)
-        finite = np.isfinite(mean).all(axis=(1, 2)) & np.isfinite(factor).all(axis=(1, 2, 3))
-        good = np.flatnonzero(finite)
-        if not len(good):
-            return made
-        own, factor = seen[good], factor[good]
-        errors = whitened((measured - mean)[good], factor, own).reshape(len(good), -1)
-        slopes = np.where(own[..., None], slopes, 0.0)
-        slopes = np.linalg.solve(factor, slopes).reshape(len(good), errors.shape[1], -1)
-        curvature = np.eye(slopes.shape[2]) + slopes.swapaxes(1, 2) @ slopes
-        gradient = (slopes.swapaxes(1, 2) @ errors[..., None])[..., 0]
-        gain = np.sum(gradient * np.linalg.solve(curvature, gradient[..., None])[..., 0], axis=1)
-        gain -= np.linalg.slogdet(curvature)[1]
-        logs = 2 * np.log(np.diagonal(factor, axis1=2, axis2=3)).sum(axis=(1, 2))
-        constant = own.sum(axis=(1, 2)) * np.log(2 * np.pi)
-        with np.errstate(over="ignore", invalid="ignore"):
-            made[good] = 0.5 * (gain - np.sum(errors**2, axis=1) - logs - constant)
-        return np.where(np.isnan(made), -np.inf, made)
 
     @cached_property
     def _by_parameters(self) -> NDArray:
@@ -255,11 +219,12 @@ class FaultEvidence:
 
     def _slopes(self, more: _Noise) -> NDArray:
         """Derivatives (T, d_y, r) of predictions by the parameters, along r directions."""
-        given = tuple(each[None] for each in (self.commands, self.measured, self.seen))
-        made = self.twin.slopes(*given, more=more, known_start=self.known_start)[0]
-        made = np.where(self.seen[..., None], made, 0.0)
-        covariance = self.twin.filter(*given, more=more, known_start=self.known_start)[1]
-        factor = root_of(covariance[:1], self.seen[None])[0]
+        record = self.record
+        given = (each[None] for each in (record.commands, record.measured, record.seen))
+        made = self.twin.slopes(*given, more=more, known_start=record.known_start)[0]
+        made = np.where(record.seen[..., None], made, 0.0)
+        covariance = record.filtered(Variants(), more)[1]
+        factor = root_of(covariance, record.seen[None])[0]
         scaled = np.linalg.solve(factor, made).reshape(-1, made.shape[2])
         if not np.isfinite(scaled).all():
             return made[..., :0]
@@ -274,8 +239,9 @@ def _digit(values: NDArray) -> float:
     return float(steps.min()) if len(steps) else 0.0
 
 
-def _fixed(fault: TimedFault, point: NDArray, rate: float) -> TimedFault:
-    """The fault with the size, and from and to the samples, of a point (3,)."""
-    size, onset, end = point.tolist()
-    timed = replace(fault, onset=onset / rate, end=max(end, onset + 1) / rate)
-    return replace(timed, size=size) if isinstance(timed, SizedFault) else timed
+def _active(points: NDArray, steps: int) -> NDArray:
+    """Whether faults with the onsets and ends of points (J, 3), in samples, act: (J, T) bool."""
+    onset, end = points[:, 1:2], points[:, 2:]
+    index = np.arange(steps)
+    made: NDArray = (index >= onset) & (index < np.maximum(end, onset + 1))
+    return made

@@ -24,6 +24,7 @@ from retwin.diagnosis.fault_evidence import NOTHING, FaultEvidence
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
 from retwin.serialisation.models import read_model, write_model
+from retwin.threads import in_threads
 from retwin.twins.faults import Fault
 from retwin.twins.system_faults import FAULTS, TimedFault, check_faults
 from retwin.twins.twin import check_channels
@@ -171,22 +172,11 @@ class StateInversionDiagnoser:
             remedy="leave them out",
         )
         found = []
-        for i in range(len(trajectories)):
-            record = FaultEvidence.of(self.twin, trajectories[i : i + 1], known_start)
-            error = record.largest_error()
-            if not error < IMPLAUSIBLE:
-                raise ImplausibleError(
-                    "trajectories",
-                    expected="finite outputs that the twin's sensors could measure",
-                    got=f"one {error:.1g} standard deviations away in {trajectories.ids[i]}",
-                    remedy="check their units, and mask values that stand for missing ones",
-                )
-            row = [record.integral(fault) for fault in self.faults.values()]
-            unknown = record.unknown(self.faults.values(), row)
-            row = [record.tolerated(*each) for each in zip(self.faults.values(), row, strict=True)]
-            found.append([*row, Integral(unknown, *[NOTHING] * 4)])
+        single = [trajectories[i : i + 1] for i in range(len(trajectories))]
+        for row in in_threads(lambda each: self._integrals(each, known_start), single):
+            found.append(row)
             if progress is not None:
-                progress((i + 1) / len(trajectories))
+                progress(len(found) / len(trajectories))
         evidence = np.array([[each.evidence for each in row] for row in found])
         if not np.isfinite(evidence).any(axis=1).all():
             raise ImplausibleError(
@@ -209,6 +199,23 @@ class StateInversionDiagnoser:
             end,
             self.twin.outside(trajectories.commands),
         )
+
+    def _integrals(self, trajectory: Trajectories, known_start: bool) -> list[Integral]:
+        """Those of all faults for one trajectory, and of something else besides."""
+        record = FaultEvidence.of(self.twin, trajectory, known_start)
+        error = record.largest_error()
+        if not error < IMPLAUSIBLE:
+            raise ImplausibleError(
+                "trajectories",
+                expected="finite outputs that the twin's sensors could measure",
+                got=f"one {error:.1g} standard deviations away in {trajectory.ids[0]}",
+                remedy="check their units, and mask values that stand for missing ones",
+            )
+        faults = self.faults.values()
+        row = [record.integral(fault) for fault in faults]
+        unknown = record.unknown(faults, row)
+        row = [record.tolerated(*each) for each in zip(faults, row, strict=True)]
+        return [*row, Integral(unknown, *[NOTHING] * 4)]
 
     def save(self, folder: str | Path) -> None:
         """Write one folder with the twin inside, or nothing."""

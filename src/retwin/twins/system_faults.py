@@ -147,8 +147,14 @@ class SizedFault(TimedFault):
 
     def profile(self, steps: int, rate: float) -> NDArray:
         """The effect at each sample, (T,), for a fault of which nothing is open; 0 elsewhere."""
-        made = ends_of(self.size)[0] * self.active(steps, rate)
-        since = np.arange(steps) / rate - ends_of(self.onset)[0]
+        onset = self.onset_range(steps, rate)[0]
+        size = np.array([ends_of(self.size)[0]])
+        return self.profiles(self.active(steps, rate)[None], size, np.array([onset]), rate)[0]
+
+    def profiles(self, active: NDArray, size: NDArray, onset: NDArray, rate: float) -> NDArray:
+        """The effects (J, T) of sizes (J,) from onsets (J,) in samples on, where they act."""
+        made: NDArray = size[:, None] * active
+        since = np.arange(active.shape[1]) / rate - onset[:, None] / rate
         return made * since if self.grows else made
 
 

@@ -15,6 +15,10 @@ from retwin.twins.compiled.trace import traced
 if TYPE_CHECKING:
     from torch import Tensor
 
+EXPORTED = "#ifdef _WIN32\n#define EXPORT __declspec(dllexport)\n#else\n#define EXPORT\n#endif\n"
+LOOP = "for (int l = 0; l < LANES; l++)"
+"""The loop over simulations that are computed at a time."""
+
 
 @dataclass(frozen=True, eq=False)
 class Model:
@@ -74,17 +78,12 @@ class Model:
     @cached_property
     def source(self) -> str:
         """The model and its simulation in C99, without memory allocation."""
-        exported = (
-            "#ifdef _WIN32\n#define EXPORT __declspec(dllexport)\n#else\n#define EXPORT\n#endif\n"
-        )
-        return "\n".join([exported, self.steps_source, c_source(__package__, "simulate.c")])
+        return "\n".join([EXPORTED, self.steps_source, c_source(__package__, "simulate.c")])
 
     @cached_property
     def steps_source(self) -> str:
         """The model and its steps from sample to sample in C99, all static."""
-        x, u, p = (self.variables[name] for name in "xup")
-        sizes = {"NX": len(x), "NU": len(u), "NP": len(p), "NY": len(self.outputs)}
-        sizes |= {"NQ": len(p) + len(x), "DISCRETE": int(self.discrete)}
+        x, p = self.variables["x"], self.variables["p"]
         functions = []
         for name, nodes in (("slope", self.slope), ("output", self.outputs)):
             by = [[self.program.derivatives(nodes, each) for each in group] for group in (x, p)]
@@ -94,15 +93,34 @@ class Model:
             ]
             functions.append(self._function(name, [("f", nodes)]))
             functions.append(self._function(f"{name}_jacobian", [("f", nodes), *jacobians]))
-        parts = [
-            "#include <math.h>\n",
-            "".join(f"#define {name} {size}\n" for name, size in sizes.items()),
-            *functions,
-            c_source(__package__, "steps.c"),
-        ]
-        return "\n".join(parts)
+        sizes = {"NQ": len(p) + len(x)}
+        return "\n".join([*self._head(sizes), *functions, c_source(__package__, "steps.c")])
 
-    def _function(self, name: str, results: Sequence[tuple[str, Sequence[Node]]]) -> str:
+    def lanes_source(self, lanes: int) -> str:
+        """The model in C99 for several simulations at a time, with derivatives by the states.
+
+        All arrays have a last axis of `lanes` simulations, over which each operation is a loop.
+        """
+        x = self.variables["x"]
+        functions = []
+        for name, nodes in (("slope", self.slope), ("output", self.outputs)):
+            columns = [self.program.derivatives(nodes, each) for each in x]
+            by_state = [column[i] for i in range(len(nodes)) for column in columns]
+            results = [("f", nodes), ("fx", by_state)]
+            functions.append(self._function(f"{name}_jacobian", results, lanes=True))
+        return "\n".join([EXPORTED, *self._head({"LANES": lanes}), *functions])
+
+    def _head(self, sizes: dict[str, int]) -> list[str]:
+        """What stands above all functions: the sizes of the model, and others."""
+        x, u, p = (self.variables[name] for name in "xup")
+        own = {"NX": len(x), "NU": len(u), "NP": len(p), "NY": len(self.outputs)}
+        own |= {**sizes, "DISCRETE": int(self.discrete)}
+        lines = "".join(f"#define {name} {size}\n" for name, size in own.items())
+        return ["#include <math.h>\n", lines]
+
+    def _function(
+        self, name: str, results: Sequence[tuple[str, Sequence[Node]]], *, lanes: bool = False
+    ) -> str:
         """A C function that writes each of `results` to an array of that name."""
         arrays = "".join(f", double *{array}" for array, _ in results)
         lines = [
@@ -112,21 +130,31 @@ class Model:
         ]
         for node in self.program.needed(each for _, nodes in results for each in nodes):
             if node.op in OPERATIONS:
-                text = OPERATIONS[node.op].format(*map(_written, node.args))
-                lines.append(f"    const double v{node.index} = {text};")
+                text = OPERATIONS[node.op].format(*(_written(each, lanes) for each in node.args))
+                lines += _assigned(f"v{node.index}", text, lanes)
         for array, nodes in results:
-            lines += [f"    {array}[{i}] = {_written(node)};" for i, node in enumerate(nodes)]
+            for i, node in enumerate(nodes):
+                place = f"{array}[{i} * LANES + l]" if lanes else f"{array}[{i}]"
+                loop = f"{LOOP} " if lanes else ""
+                lines.append(f"    {loop}{place} = {_written(node, lanes)};")
         return "\n".join([*lines, "}\n"])
 
 
-def _written(node: Node) -> str:
+def _assigned(name: str, text: str, lanes: bool) -> list[str]:
+    """Lines of C that compute a number, or one per lane."""
+    if not lanes:
+        return [f"    const double {name} = {text};"]
+    return [f"    double {name}[LANES];", f"    {LOOP} {name}[l] = {text};"]
+
+
+def _written(node: Node, lanes: bool) -> str:
     """How C refers to a node."""
     if node.op == "variable":
-        return str(node.value)
+        return f"{str(node.value)[:-1]} * LANES + l]" if lanes else str(node.value)
     if node.op == "constant":
         number = repr(node.value).replace("inf", "INFINITY").replace("nan", "NAN")
         return f"({number})" if number[0] == "-" else number
-    return f"v{node.index}"
+    return f"v{node.index}[l]" if lanes else f"v{node.index}"
 
 
 def trace_model(
