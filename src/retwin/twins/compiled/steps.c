@@ -12,18 +12,24 @@ static void command(const double *c, double s, double *u)
 
 /* The state with its derivatives by `columns` numbers, z = x[NX], S[NX][columns], the first of which
  * are the model's parameters where `parameters` is not 0: dS = f_x S + f_p. */
-static void slope_with(const double *z, const double *u, const double *p, double *dz, int columns,
-                       int parameters)
+static void slope_with(const double *restrict z, const double *u, const double *p,
+                       double *restrict dz, int columns, int parameters)
 {
     double fx[NX * NX], fp[NX * NP + 1];
     slope_jacobian(z, u, p, dz, fx, fp);
-    for (int i = 0; i < NX; i++)
-        for (int q = 0; q < columns; q++) {
-            double sum = parameters && q < NP ? fp[i * NP + q] : 0.0;
-            for (int j = 0; j < NX; j++)
-                sum += fx[i * NX + j] * z[NX + j * columns + q];
-            dz[NX + i * columns + q] = sum;
+    for (int i = 0; i < NX; i++) {
+        double *sum = dz + NX + i * columns;
+        for (int q = 0; q < columns; q++)
+            sum[q] = 0.0;
+        for (int q = 0; parameters && q < NP; q++)
+            sum[q] = fp[i * NP + q];
+        for (int j = 0; j < NX; j++) {
+            const double factor = fx[i * NX + j], *own = z + NX + j * columns;
+            if (factor != 0.0) /* most equations have few of the states */
+                for (int q = 0; q < columns; q++)
+                    sum[q] += factor * own[q];
         }
+    }
 }
 
 static void slope_by_all(const double *z, const double *u, const double *p, double *dz)
