@@ -125,7 +125,9 @@ def test_it_has_the_distribution_and_the_draws_of_the_twin(
     np.testing.assert_allclose(mean / spread, behind(nominal[0], corrected) / spread, atol=1e-9)
 
     by_all = steps.sensitivities(u, theta)[1][0]
-    variance = corrected.noise_variance(u)[0] + ((by_all @ corrected.factor) ** 2).sum(axis=2)
+    variance = corrected.simulation.noise_variance(u)[0] + ((by_all @ corrected.factor) ** 2).sum(
+        axis=2
+    )
     starts = by_all[:, :, -2:] * corrected.start_deviation
     half = 1.6448536269514722 * corrected.widening * np.sqrt(variance + (starts**2).sum(axis=2))
     for suffix, sign in (("q05", -1), ("q95", 1)):

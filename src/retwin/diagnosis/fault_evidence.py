@@ -221,7 +221,7 @@ class FaultEvidence:
         """Derivatives (T, d_y, r) of predictions by the parameters, along r directions."""
         record = self.record
         given = (each[None] for each in (record.commands, record.measured, record.seen))
-        made = self.twin.slopes(*given, more=more, known_start=record.known_start)[0]
+        made = self.twin.filter.slopes(*given, more=more, known_start=record.known_start)[0]
         made = np.where(record.seen[..., None], made, 0.0)
         covariance = record.filtered(Variants(), more)[1]
         factor = root_of(covariance, record.seen[None])[0]

@@ -80,7 +80,7 @@ def test_the_kernel_agrees_with_the_filter(
 ) -> None:
     own = record(interpolation, proportional)
     given = variants(own, kind)
-    slopes = own.twin.slopes(own.commands[None], own.measured[None], own.seen[None])[0]
+    slopes = own.twin.filter.slopes(own.commands[None], own.measured[None], own.seen[None])[0]
     noises = ((0.0, 0.0), (np.array([1e-3, 0.0]), 0.0), (0.0, np.array([0.02, 0.01])))
     made = [own.log_density(given, slopes, more) for more in noises]
     monkeypatch.setattr(likelihood, "_library", lambda model: None)
@@ -92,7 +92,7 @@ def test_the_kernel_agrees_with_the_filter(
 def test_the_likelihood_is_that_of_parameters_that_are_drawn() -> None:
     """The mean over the posterior is that of many draws, where predictions are linear."""
     own = record()
-    slopes = 0.3 * own.twin.slopes(own.commands[None], own.measured[None], own.seen[None])[0]
+    slopes = 0.3 * own.twin.filter.slopes(own.commands[None], own.measured[None], own.seen[None])[0]
     mean, covariance, _ = own.filtered(Variants())
     draws = np.random.default_rng(3).normal(size=(20_000, slopes.shape[2]))
     errors = np.where(own.seen, own.measured - mean[0], 0.0) - np.where(

@@ -104,7 +104,7 @@ def test_simulations_spread_as_the_filter_predicts(twin: DynamicsTwin) -> None:
     sure = replace(twin, factor=0 * twin.factor, start_deviation=np.zeros(1), widening=np.ones(1))
     commands = record(PROPORTIONAL, count=1).commands
     made = sure.simulate(np.repeat(commands, 1000, axis=0), seed=0).observed
-    spread = sure.noise_variance(commands.astype(float))[0]
+    spread = sure.simulation.noise_variance(commands.astype(float))[0]
     np.testing.assert_allclose(made.var(axis=0), spread, rtol=0.25)
 
 

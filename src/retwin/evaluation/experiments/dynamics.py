@@ -60,8 +60,8 @@ class DynamicsKnowledge:
     def knowledge(self, commands: NDArray) -> Knowledge:
         """The knowledge about outputs in free simulation, in deviations by noise alone."""
         given = self._unseen(commands)
-        slopes = self.twin.slopes(*given)
-        scaled = slopes / np.sqrt(self.twin.noise_variance(given[0]))[..., None]
+        slopes = self.twin.filter.slopes(*given)
+        scaled = slopes / np.sqrt(self.twin.simulation.noise_variance(given[0]))[..., None]
         rows = scaled.reshape(-1, scaled.shape[-1])
         rows = rows[:: max(1, len(rows) // MAX_PREDICTIONS)]
         unit = torch.eye(rows.shape[1], dtype=torch.float64)
@@ -73,11 +73,11 @@ class DynamicsKnowledge:
         expected = self.twin.filter(*given)[0]
         seen = np.ones(expected.shape, dtype=bool)
         covariance = self.twin.filter(given[0], expected, seen)[1]
-        slopes = self.twin.slopes(given[0], expected, seen)
+        slopes = self.twin.filter.slopes(given[0], expected, seen)
         white = np.linalg.solve(np.linalg.cholesky(covariance), slopes)
         return torch.tensor(np.linalg.qr(white.reshape(len(white), -1, white.shape[-1]), mode="r"))
 
     def _unseen(self, commands: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Commands without measured outputs, as `DynamicsTwin.filter` takes them."""
+        """Commands without measured outputs, as `DynamicsFilter` takes them."""
         shape = (*commands.shape[:2], len(self.twin.outputs))
         return commands.astype(np.float64), np.zeros(shape), np.zeros(shape, dtype=bool)

@@ -74,7 +74,7 @@ class Record:
     commands, measured, seen : NDArray
         (T, d_u), (T, d_y), 0 where nothing was measured, and (T, d_y) bool.
     known_start : bool
-        See `DynamicsTwin.filter`.
+        See `DynamicsFilter`.
 
     """
 
@@ -102,7 +102,7 @@ class Record:
     def filtered(
         self, variants: Variants, more: NoiseVariances = (0.0, 0.0)
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Mean, covariance and states of each variant; see `DynamicsTwin.filter`."""
+        """Mean, covariance and states of each variant; see `DynamicsFilter`."""
         commands, measured, seen, changes = self.inputs(variants)
         known = self.known_start
         given = (commands, measured, seen)
@@ -166,7 +166,7 @@ class Record:
         if self.twin.proportional.any() and (own[0] is not None or own[4] is not None):
             commands, _, _, changes = self.inputs(variants)
             states = steps.run(commands, np.tile(self._theta, (count, 1)), changes=changes)[1]
-            own[1] = self.twin.process_variance(states) + more[0]
+            own[1] = self.twin.filter.process_variance(states) + more[0]
         common = [common[0], (process + more[0])[0], *common[1:]]
         first = _first_difference(own, [*common, np.zeros(1)], count, len(self.commands))
         order = np.argsort(first, kind="stable")
@@ -189,7 +189,7 @@ class Record:
 
     @cached_property
     def _start(self) -> tuple[NDArray, NDArray]:
-        theta, spread = self.twin.start(1, known_start=self.known_start)
+        theta, spread = self.twin.filter.start(1, known_start=self.known_start)
         return theta[0], spread[0]
 
     @property
@@ -220,7 +220,7 @@ class Record:
             return np.tile(self.twin.process, (len(self.commands), 1))
         steps = self.twin.equations.steps()
         states = steps.run(self.commands[None], self._theta[None])[1]
-        return self.twin.process_variance(states)[0]
+        return self.twin.filter.process_variance(states)[0]
 
     def _coefficients(self, commands: NDArray) -> NDArray:
         """Cubic polynomials (J, T, 4, d_u) of commands (J, T, d_u) between samples."""

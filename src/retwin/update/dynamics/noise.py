@@ -155,7 +155,7 @@ def widening(twin: DynamicsTwin, estimation: Estimation, held_out: HeldOut) -> N
 
     The share is that of held-out samples.
     """
-    deviation = np.sqrt(held_out.variances + twin.noise_variance(estimation.commands))
+    deviation = np.sqrt(held_out.variances + twin.simulation.noise_variance(estimation.commands))
     ratio, seen = np.abs(held_out.errors) / deviation, estimation.seen
     return np.array([needed_factor(ratio[..., i], seen[..., i]) for i in range(seen.shape[2])])
 

@@ -138,7 +138,7 @@ class Search:
     def _simulated(self) -> NDArray:
         """States (n, T, d_x) without noise, the same for all noise that is tried."""
         commands, twin = self._given[0], self.twin
-        theta = twin.start(len(commands), known_start=True)[0]
+        theta = twin.filter.start(len(commands), known_start=True)[0]
         return twin.equations.steps().run(commands, theta, changes=self._changes)[1]
 
     def visited(self, constant: NDArray | None = None) -> Visited:

@@ -72,7 +72,7 @@ class OnlineFilter:
 
     def start(self, count: int) -> FilterState:
         """What is known of so many systems before their first sample, which may be anywhere."""
-        theta, spread = self.twin.start(count, known_start=False)
+        theta, spread = self.twin.filter.start(count, known_start=False)
         earlier = TAPS if self.twin.equations.interpolation == "spline" else 1
         commands = np.full((count, earlier, len(self.twin.inputs)), np.nan)
         states = theta[:, -spread.shape[1] :]
@@ -124,7 +124,7 @@ class OnlineFilter:
         if self.twin.proportional.any():
             own = np.concatenate([theta[:, : -simulated.shape[1]], simulated], axis=1)
             course = steps.run(path, own, first=first)[1]
-            process, simulated = self.twin.process_variance(course), course[:, -1]
+            process, simulated = self.twin.filter.process_variance(course), course[:, -1]
         variances = process, self.twin.noise
         mean, covariance, states, spread = steps.filter(
             path, theta, given, state.spread, variances, first=first, gate=GATE

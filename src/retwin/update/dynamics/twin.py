@@ -22,16 +22,16 @@ from retwin.twins.wrapper import chunk_generator
 from retwin.update.dynamics.curves import Curve, axes_of, curve_of
 from retwin.update.dynamics.domain import Domain
 from retwin.update.dynamics.estimation import Estimation, root
+from retwin.update.dynamics.filtering import DynamicsFilter
 from retwin.update.dynamics.linearised import Point
 from retwin.update.dynamics.prediction import Prediction
 from retwin.update.dynamics.saved import read_fields, write_fields
+from retwin.update.dynamics.simulation import FreeSimulation
 from retwin.update.dynamics.unknowns import unknowns_of
 from retwin.update.training_range import OutsideTrainingWarning
 
 __all__ = ["DynamicsTwin"]
 
-STEP = 0.1
-"""Differences of parameters, in posterior deviations, by which predictions are differentiated."""
 BEYOND = 0.05
 """How far, in widths of the domain, states and commands may leave it without a warning."""
 
@@ -58,7 +58,7 @@ class DynamicsTwin:
         (d_x,), by which starts differ between trajectories.
     process, proportional, noise : NDArray
         (d_x,), (d_x,) and (d_y,). The variance of w is `process`, plus `proportional` times the
-        square of the change that the commands alone make in that sample (`process_variance`); that
+        square of the change that the commands alone make in that sample (`DynamicsFilter`); that
         of v is `noise`.
     free_process : NDArray
         (d_x,), the variance of w in free simulation, which is constant: errors that are new in each
@@ -115,6 +115,32 @@ class DynamicsTwin:
         """Parameters that can change during a simulation."""
         return self.equations.shiftable
 
+    @property
+    def filter(self) -> DynamicsFilter:
+        """The extended Kalman filter, on arrays."""
+        return DynamicsFilter(
+            self.equations,
+            self.values,
+            self.factor,
+            self.process,
+            self.proportional,
+            self.noise,
+            self.domain,
+        )
+
+    @property
+    def simulation(self) -> FreeSimulation:
+        """Simulations from commands alone, on arrays."""
+        return FreeSimulation(
+            self.equations,
+            self.values,
+            self.factor,
+            self.start_deviation,
+            self.free_process,
+            self.noise,
+            self.widening,
+        )
+
     def simulate(
         self,
         commands: NDArray,
@@ -138,12 +164,12 @@ class DynamicsTwin:
         def run(chunk: Chunk) -> tuple[NDArray, NDArray]:
             held = np.asarray(chunk.held_commands, np.float64)
             clean = np.asarray(chunk.commands, np.float64)
-            nominal, states = self._most_probable(clean)
+            nominal, states = self.simulation.most_probable(clean)
             np.maximum(beyond, self.domain.excess(states, clean), out=beyond)
             if chunk.index.start == 0 and np.isfinite(states[0]).all():
                 self.equations.check_accuracy(clean[:1], self.values[None], nominal[:1])
             changes = self.equations.changes(chunk.faults, clean.shape[1])
-            return nominal, self._drawn(held, changes, chunk_generator(seed, chunk, 2))
+            return nominal, self.simulation.drawn(held, changes, chunk_generator(seed, chunk, 2))
 
         checked = checked_commands(commands, self.inputs)
         size = max(1, SAMPLES_PER_CHUNK // checked.shape[1])
@@ -194,7 +220,7 @@ class DynamicsTwin:
             remedy="give the first samples of one record; bounds make a start unknown",
         )
         commands = record.commands.astype(np.float64)
-        variance = self.noise_variance(commands).mean(axis=(0, 1))
+        variance = self.simulation.noise_variance(commands).mean(axis=(0, 1))
         estimation = Estimation(self.equations, record, unknowns, record.mask, variance)
         start = Point(np.zeros(0), unknowns.start[None, unknowns.free])
         found = estimation.minimised(estimation.linearised(start))
@@ -239,7 +265,7 @@ class DynamicsTwin:
         """
         check_channels(self, record, "record")
         given = self._given(record)
-        made = Prediction(record, *self.filter(*given)).marginal(self.slopes(*given))
+        made = Prediction(record, *self.filter(*given)).marginal(self.filter.slopes(*given))
         parts = (made.mean, made.covariance, made.states)
         good = np.all([np.isfinite(each).reshape(len(record), -1).all(1) for each in parts], 0)
         require(
@@ -257,99 +283,6 @@ class DynamicsTwin:
         commands = checked_commands(record.commands, self.inputs).astype(np.float64)
         return commands, np.where(record.mask, record.observed, 0.0), record.mask
 
-    def filter(
-        self,
-        commands: NDArray,
-        measured: NDArray,
-        seen: NDArray,
-        *,
-        changes: NDArray | None = None,
-        more: tuple[NDArray | float, NDArray | float] = (0.0, 0.0),
-        known_start: bool = True,
-        moves: NDArray | float = 0.0,
-        simulated: NDArray | None = None,
-    ) -> tuple[NDArray, NDArray, NDArray]:
-        """The extended Kalman filter on arrays; nothing is checked.
-
-        Parameters
-        ----------
-        commands, measured, seen : ndarray, shapes (n, T, d_u), (n, T, d_y), (n, T, d_y)
-            Commands, outputs, and whether these were measured.
-        changes : ndarray, shape (n, T, q), optional
-            What is added to the parameters at each sample.
-        more : tuple of ndarray, default 0
-            Variances that are added to those of process and measurement noise.
-        known_start : bool, default True
-            Whether the first sample is the start of a record as in calibration; otherwise the
-            states may be anywhere in their range in calibration.
-        moves : ndarray, shape (n, q + d_x), optional
-            What is added to `values`.
-        simulated : ndarray, shape (n, T, d_x), optional
-            The states without noise, if they are known; otherwise they are simulated where process
-            noise is in proportion to them.
-
-        Returns
-        -------
-        mean, covariance, states : ndarray
-            See `Prediction`.
-
-        """
-        theta, spread = self.start(len(commands), known_start=known_start)
-        steps, theta, process = self.equations.steps(), theta + moves, self.process
-        if self.proportional.any():
-            if simulated is None:
-                simulated = steps.run(commands, theta, changes=changes)[1]
-            process = self.process_variance(simulated)
-        variances = (process + more[0], self.noise + more[1])
-        given = (commands, theta, (measured, seen), spread, variances, changes)
-        return steps.filter(*given)[:3]
-
-    def slopes(
-        self,
-        commands: NDArray,
-        measured: NDArray,
-        seen: NDArray,
-        *,
-        more: tuple[NDArray | float, NDArray | float] = (0.0, 0.0),
-        known_start: bool = True,
-    ) -> NDArray:
-        """Derivatives (n, T, d_y, r) of the filter's mean by the parameters, for `filter`'s arrays.
-
-        They are central differences along the columns of `factor`, in posterior deviations; 0 where
-        these are not finite.
-        """
-        moves = STEP * self.factor.T
-        if not known_start:
-            moves[:, -len(self.process) :] = 0.0
-        moves = moves[moves.any(axis=1)]
-        made = np.zeros((*measured.shape, len(moves)))
-        size = max(1, SAMPLES_PER_CHUNK // (2 * measured[..., 0].size))
-        for first in range(0, len(moves), size):
-            own = moves[first : first + size]
-            both = np.repeat(np.concatenate([own, -own]), len(commands), axis=0)
-            given = (np.tile(e, (2 * len(own), 1, 1)) for e in (commands, measured, seen))
-            mean = self.filter(*given, more=more, known_start=known_start, moves=both)[0]
-            up, down = mean.reshape(2, len(own), *measured.shape)
-            made[..., first : first + size] = np.moveaxis((up - down) / (2 * STEP), 0, -1)
-        return np.where(np.isfinite(made), made, 0.0)
-
-    def start(self, count: int, *, known_start: bool) -> tuple[NDArray, NDArray]:
-        """What the filter knows of `count` trajectories before their first sample.
-
-        Returns
-        -------
-        theta, spread : ndarray, shapes (n, q + d_x) and (n, d_x, d_x)
-            `values` with the expected states, and the covariance of these; see `filter`.
-
-        """
-        theta, states = np.tile(self.values, (count, 1)), len(self.process)
-        bounds = [(each.low or 0.0, each.high or 0.0) for each in self.equations.states]
-        low, high = np.array(bounds, dtype=float).T
-        if not known_start:
-            low, high = self.domain.low[:states], self.domain.high[:states]
-            theta[:, -states:] = (low + high) / 2
-        return theta, np.tile(np.diag((high - low) ** 2 / 12), (count, 1, 1))
-
     @property
     def bounds(self) -> tuple[NDArray, NDArray]:
         """Values (d_x + d_u,) of states and commands beyond which `simulate` warns."""
@@ -362,33 +295,6 @@ class DynamicsTwin:
         low, high = (each[len(self.process) :] for each in (self.domain.low, self.domain.high))
         margin = BEYOND * np.where(high > low, high - low, np.maximum(np.abs(high), 1.0))
         made: NDArray = ((commands < low - margin) | (commands > high + margin)).any(axis=(1, 2))
-        return made
-
-    def process_variance(self, states: NDArray) -> NDArray:
-        """Variances (n, T, d_x) of the process noise after each sample.
-
-        `states` (n, T, d_x) are simulated from commands alone, so that no measured deviation, as by
-        a fault, makes larger ones probable. Their change is at most their range in calibration.
-        """
-        count = len(self.process)
-        largest = self.domain.high[:count] - self.domain.low[:count]
-        with np.errstate(invalid="ignore"):
-            change = np.abs(np.diff(states, axis=1, append=states[:, -1:]))
-        made: NDArray = self.process + self.proportional * np.fmin(change, largest) ** 2
-        return made
-
-    def noise_variance(self, commands: NDArray) -> NDArray:
-        """Variances (n, T, d_y) of the outputs in free simulation by noise alone."""
-        theta = np.tile(self.values, (len(commands), 1))
-        shape = (*commands.shape[:2], len(self.noise))
-        states, steps = len(self.process), self.equations.steps()
-        known, unseen = (
-            np.zeros((len(commands), states, states)),
-            (np.zeros(shape), np.zeros(shape)),
-        )
-        variances = self.free_process, self.noise
-        found = steps.filter(commands, theta, unseen, known, variances)[1]
-        made: NDArray = np.diagonal(found, axis1=2, axis2=3)
         return made
 
     def slope(self, states: NDArray, commands: NDArray, changes: NDArray | None = None) -> NDArray:
@@ -446,46 +352,6 @@ class DynamicsTwin:
         posterior = (self.values[: -len(self.process)], self.factor[: -len(self.process)])
         axes = (equation, variable)
         return curve_of(self.equations, posterior, self.domain, self.corrected, axes, relative_to)
-
-    def _most_probable(self, commands: NDArray) -> tuple[NDArray, NDArray]:
-        """Outputs and states without noise; equal commands are simulated once."""
-        distinct, own = np.unique(commands, axis=0, return_inverse=True)
-        theta = np.tile(self.values, (len(distinct), 1))
-        outputs, states = self.equations.steps().run(distinct, theta)
-        return outputs[own.ravel()], states[own.ravel()]
-
-    def _drawn(self, commands: NDArray, changes: NDArray, rng: np.random.Generator) -> NDArray:
-        """Outputs (n, T, d_y) with drawn parameters, starts and noise.
-
-        The outputs are linear in the parameters about the most probable ones: so the distribution
-        is that of the approximation by which the posterior was found, and no draw diverges (Immer,
-        Korzepa and Bauer, "Improving predictions of Bayesian neural nets via local linearization",
-        2021). `changes` (n, T, q) of the parameters over time do not change these derivatives.
-        """
-        count, samples = commands.shape[:2]
-        states = len(self.process)
-        steps, theta = self.equations.steps(), np.tile(self.values, (count, 1))
-        kicks = np.sqrt(self.free_process) * rng.normal(size=(count, samples, states))
-        changed = np.array([each.any() for each in changes])
-        made = steps.run(commands, theta, kicks, changes if changed.any() else None)[0]
-        made += np.sqrt(self.noise) * rng.normal(size=made.shape)
-        moves = rng.normal(size=(count, self.factor.shape[1])) @ self.factor.T
-        moves[:, -states:] += self.start_deviation * rng.normal(size=(count, states))
-        distinct, own = np.unique(commands, axis=0, return_inverse=True)
-        for i, each in enumerate(distinct):
-            nominal, by_all = (
-                found[0] for found in steps.sensitivities(each[None], self.values[None])
-            )
-            rows = np.flatnonzero(own.ravel() == i)
-            centre = np.tile(nominal, (len(rows), 1, 1))
-            if changed[rows].any():
-                faulty = rows[changed[rows]]
-                centre[changed[rows]] = steps.run(
-                    commands[faulty], theta[faulty], changes=changes[faulty]
-                )[0]
-            moved = np.moveaxis(by_all @ moves[rows].T, -1, 0)
-            made[rows] = centre + self.widening * (made[rows] - centre + moved)
-        return made
 
     def _warn(self, beyond: NDArray) -> None:
         """Warn where a state or a command leaves the domain by so much (d_x + d_u,)."""
