@@ -13,6 +13,7 @@ from retwin.twins import Parameter, State, StateTwin
 from retwin.update.dynamics import estimation as module
 from retwin.update.dynamics.arrow import Arrow, trust_region_step
 from retwin.update.dynamics.estimation import Estimation
+from retwin.update.dynamics.left_out import errors_without, held_out
 from retwin.update.dynamics.linearised import Linearised, Point
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 
@@ -133,15 +134,23 @@ def test_estimates_do_not_depend_on_how_trajectories_are_divided(
 ) -> None:
     own, start = estimation(7, 25)
     folds = [own.seen[..., 0], ~own.seen[..., 0]]
-    whole = own.held_out(start, folds)
+    whole = held_out(own, start, folds)
     monkeypatch.setattr(module, "CHUNK", 3 * 25 * 2 * 4)
     for one, other in (
         (start, own.linearised(start.point)),
-        (whole, own.held_out(start, folds)),
+        (whole, held_out(own, start, folds)),
     ):
         for name, value in vars(one).items():
             if name != "point":
                 np.testing.assert_allclose(getattr(other, name), value, rtol=1e-9, atol=1e-12)
+
+
+def test_parts_that_overlap_are_left_out_one_by_one() -> None:
+    own, start = estimation(7, 25)
+    seen = own.seen[..., 0]
+    parts = [seen & (np.arange(25) < 15), seen & (np.arange(25) > 10), ~seen]
+    for part, errors in zip(parts, errors_without(own, start, parts), strict=True):
+        np.testing.assert_array_equal(errors, held_out(own, start, [part]).errors)
 
 
 def test_memory_is_proportional_to_the_number_of_trajectories() -> None:

@@ -47,6 +47,12 @@ class Arrow:
         own = np.diagonal(self.own, axis1=1, axis2=2)
         return np.concatenate([np.diag(self.shared), own.ravel()])
 
+    @property
+    def unit(self) -> NDArray:
+        """Units (k + n m,) of the unknowns in which the diagonal is 1."""
+        made: NDArray = 1 / np.sqrt(np.maximum(self.diagonal, 1e-300))
+        return made
+
     def plus(self, diagonal: NDArray) -> Arrow:
         """The sum with a diagonal matrix (k + n m,)."""
         shared, own = self._parted(diagonal)

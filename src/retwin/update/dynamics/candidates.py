@@ -14,6 +14,7 @@ from retwin.progress import Progress
 from retwin.twins.state_twin import StateTwin
 from retwin.update.dynamics.corrected import CorrectedEquations
 from retwin.update.dynamics.estimation import Estimation, correlation_time
+from retwin.update.dynamics.left_out import errors_without, held_out
 from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
 from retwin.update.dynamics.memory import Memory
 from retwin.update.dynamics.settings import Dynamics
@@ -63,13 +64,13 @@ class Candidate:
         far: Sequence[NDArray],
     ) -> Candidate:
         """The candidate, tried on parts (n, T) in time and on those at the edges of the domain."""
-        held_out = estimation.held_out(found, parts)
-        alone = [estimation.held_out(found, [part]).errors for part in far]
+        without = held_out(estimation, found, parts)
+        alone = errors_without(estimation, found, far)
         squares = (
-            _squares(estimation, [held_out.errors] * len(parts), parts),
+            _squares(estimation, [without.errors] * len(parts), parts),
             _squares(estimation, alone, far),
         )
-        return cls(equations, memory, estimation, found, held_out, squares)
+        return cls(equations, memory, estimation, found, without, squares)
 
 
 def without_discrepancy(

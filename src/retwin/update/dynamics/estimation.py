@@ -14,7 +14,7 @@ trajectories at a time, and only sums of their products are kept.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from retwin.data.trajectories import Trajectories
 from retwin.twins.state_twin import StateTwin
 from retwin.update.dynamics.arrow import Arrow, bounded_step, trust_region_step
-from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
+from retwin.update.dynamics.linearised import Linearised, Point
 from retwin.update.dynamics.unknowns import Unknowns
 
 __all__ = ["Estimation", "correlation_time", "root"]
@@ -179,19 +179,19 @@ class Estimation:
         if not flat.size:
             return at
         value, gradient, curvature = self._expanded(at)
-        unit = _unit(curvature)
+        unit = curvature.unit
         radius = WIDEST / 1e3
         for _ in range(steps):
             if np.linalg.norm(unit * gradient) < TOLERANCE:
                 break
             scaled = curvature.scaled(unit)
-            ends = ((each - flat) / unit for each in self._bounds)
+            ends = ((each - flat) / unit for each in self.bounds)
             step = bounded_step(scaled, unit * gradient, radius, *ends)
             expected = -float(step @ (unit * gradient + scaled.times(step) / 2))
             length = float(np.linalg.norm(step))
             if expected <= 0:
                 break
-            inside = np.clip(flat + unit * step, *self._bounds)
+            inside = np.clip(flat + unit * step, *self.bounds)
             tried = self.linearised(self.point(inside))
             found = self._expanded(tried)
             ratio = (value - found[0]) / expected
@@ -208,7 +208,7 @@ class Estimation:
         if not at.finite:
             return -np.inf
         _, gradient, curvature = self._expanded(at)
-        unit = _unit(curvature)
+        unit = curvature.unit
         scaled = curvature.scaled(unit)
         step = trust_region_step(scaled, unit * gradient, WIDEST)
         return -float(step @ (unit * gradient + scaled.times(step) / 2))
@@ -249,7 +249,7 @@ class Estimation:
 
     def _pressed(self, flat: NDArray, gradient: NDArray) -> NDArray:
         """Which coordinates (k + n m,) are at a bound beyond which the objective falls."""
-        low, high = self._bounds
+        low, high = self.bounds
         made: NDArray = ((flat <= low) & (gradient > 0)) | ((flat >= high) & (gradient < 0))
         return made
 
@@ -269,7 +269,7 @@ class Estimation:
         )
         return arrow.plus(self._prior[1])
 
-    def _bounded(self, at: Linearised) -> Arrow:
+    def bounded_curvature(self, at: Linearised) -> Arrow:
         """The curvature of a Gaussian approximation to the posterior within its bounds.
 
         At a bound that is pressed by the gradient g > 0, with a curvature h, the density of the
@@ -283,8 +283,8 @@ class Estimation:
 
     def covariance(self, at: Linearised) -> NDArray:
         """Posterior covariance (k + m, k + m) of coordinates and mean starts, by Laplace."""
-        curvature = self._bounded(at)
-        unit = _unit(curvature)
+        curvature = self.bounded_curvature(at)
+        unit = curvature.unit
         complement, follow, inverse = curvature.scaled(unit).reduced()
         k = len(complement)
         own = unit[k:].reshape(follow.shape[:2])[..., None]
@@ -298,56 +298,14 @@ class Estimation:
     def undetermined(self, at: Linearised) -> NDArray:
         """Which shared coordinates (k,) can change without a change of the objective."""
         curvature = self._curvature(at)
-        values, directions = np.linalg.eigh(curvature.scaled(_unit(curvature)).reduced()[0])
+        values, directions = np.linalg.eigh(curvature.scaled(curvature.unit).reduced()[0])
         free = np.abs(directions[:, values <= RESOLUTION * len(values)])
         made: NDArray = (free > np.sqrt(RESOLUTION)).any(axis=1)
         return made
 
-    def held_out(self, at: Linearised, folds: Sequence[NDArray]) -> HeldOut:
-        """The errors of each fold, and the estimates, without that fold.
-
-        One Gauss-Newton step from the optimum of all samples leads to that without a fold. The
-        starts stay: without the first samples of a trajectory hardly anything determines them.
-
-        Parameters
-        ----------
-        at : Linearised
-            The optimum.
-        folds : sequence of NDArray
-            Parts (n, T) of the samples.
-
-        """
-        k = self.unknowns.count
-        curvature = self._bounded(at)
-        unit = _unit(curvature)[:k]
-        by_unit = self.unknowns.matrix * unit
-        scale = 1 / np.sqrt(self.variance)
-
-        def parts() -> Iterator[tuple[int, slice, NDArray, NDArray]]:
-            for rows, error, slope in self.derivatives(at.point):
-                for i, fold in enumerate(folds):
-                    held = slope[fold[rows]][..., : len(by_unit)]
-                    yield i, rows, error[fold[rows]], held @ by_unit
-
-        left = np.tile(unit[:, None] * curvature.shared * unit, (len(folds), 1, 1))
-        gradients = np.zeros((len(folds), k))
-        for i, _, error, jacobian in parts():
-            weighted = (jacobian * scale[:, None]).reshape(-1, k)
-            left[i] -= weighted.T @ weighted
-            gradients[i] -= weighted.T @ (error * scale).ravel()
-        covariances = np.linalg.pinv(left, hermitian=True)
-        steps = np.einsum("fij,fj->fi", covariances, gradients)
-        ends = (each[:k] - at.point.shared for each in self._bounds)
-        steps = np.clip(unit * steps, *ends) / unit
-        errors, variances = at.residual.copy(), np.zeros(at.residual.shape)
-        for i, rows, error, jacobian in parts():
-            fold = folds[i][rows]
-            errors[rows][fold] = error - jacobian @ steps[i]
-            variances[rows][fold] = np.sum((jacobian @ covariances[i]) * jacobian, axis=-1)
-        return HeldOut(np.where(self.seen, errors, 0.0), variances, unit * steps)
-
     @cached_property
-    def _bounds(self) -> tuple[NDArray, NDArray]:
+    def bounds(self) -> tuple[NDArray, NDArray]:
+        """Lowest and highest values (k + n m,) of a flat point."""
         k, count = self.unknowns.count, len(self.observed)
         low, high = (
             np.concatenate([each[:k], np.tile(each[k:], count)])
@@ -362,12 +320,6 @@ class Estimation:
         mean = np.concatenate([unknowns.mean, np.tile(unknowns.start[unknowns.free], count)])
         own = np.tile(unknowns.start_deviation, count)
         return mean, 1 / np.concatenate([unknowns.deviation, own]) ** 2
-
-
-def _unit(curvature: Arrow) -> NDArray:
-    """Units (k + n m,) of the unknowns in which the diagonal of a curvature is 1."""
-    made: NDArray = 1 / np.sqrt(np.maximum(curvature.diagonal, 1e-300))
-    return made
 
 
 def root(covariance: NDArray) -> NDArray:

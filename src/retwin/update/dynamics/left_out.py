@@ -1,0 +1,91 @@
+"""Estimates without parts of the record, by a Gauss-Newton step from those of all samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.update.dynamics.estimation import Estimation
+from retwin.update.dynamics.linearised import HeldOut, Linearised
+
+__all__ = ["errors_without", "held_out"]
+
+
+def held_out(estimation: Estimation, at: Linearised, folds: Sequence[NDArray]) -> HeldOut:
+    """The errors of each fold, and the estimates, without that fold.
+
+    One Gauss-Newton step from the optimum of all samples leads to that without a fold. The
+    starts stay: without the first samples of a trajectory hardly anything determines them.
+
+    Parameters
+    ----------
+    estimation : Estimation
+        The unknowns and the outputs.
+    at : Linearised
+        The optimum.
+    folds : sequence of NDArray
+        Parts (n, T) of the samples.
+
+    """
+    steps, covariances, by_unit = _left_out(estimation, at, folds)
+    errors, variances = at.residual.copy(), np.zeros(at.residual.shape)
+    for i, rows, error, jacobian in _parts(estimation, at, folds, by_unit):
+        fold = folds[i][rows]
+        errors[rows][fold] = error - jacobian @ steps[i]
+        variances[rows][fold] = np.sum((jacobian @ covariances[i]) * jacobian, axis=-1)
+    unit = estimation.bounded_curvature(at).unit[: estimation.unknowns.count]
+    return HeldOut(np.where(estimation.seen, errors, 0.0), variances, unit * steps)
+
+
+def errors_without(
+    estimation: Estimation, at: Linearised, parts: Sequence[NDArray]
+) -> list[NDArray]:
+    """The errors (n, T, d_y) without each of some parts (n, T), which may overlap.
+
+    They are those of `held_out` with that part alone, and of all samples elsewhere.
+    """
+    steps, _, by_unit = _left_out(estimation, at, parts)
+    made = [at.residual.copy() for _ in parts]
+    for i, rows, error, jacobian in _parts(estimation, at, parts, by_unit):
+        made[i][rows][parts[i][rows]] = error - jacobian @ steps[i]
+    return [np.where(estimation.seen, each, 0.0) for each in made]
+
+
+def _left_out(
+    estimation: Estimation, at: Linearised, parts: Sequence[NDArray]
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Gauss-Newton steps to the estimates without each of K parts, in prior units.
+
+    Returns
+    -------
+    steps, covariances, by_unit : ndarray, shapes (K, k), (K, k, k) and (q, k)
+        Steps, posterior covariances there, and the parameters by coordinates in these units.
+
+    """
+    k = estimation.unknowns.count
+    curvature = estimation.bounded_curvature(at)
+    unit = curvature.unit[:k]
+    by_unit = estimation.unknowns.matrix * unit
+    scale = 1 / np.sqrt(estimation.variance)
+    left = np.tile(unit[:, None] * curvature.shared * unit, (len(parts), 1, 1))
+    gradients = np.zeros((len(parts), k))
+    for i, _, error, jacobian in _parts(estimation, at, parts, by_unit):
+        weighted = (jacobian * scale[:, None]).reshape(-1, k)
+        left[i] -= weighted.T @ weighted
+        gradients[i] -= weighted.T @ (error * scale).ravel()
+    covariances = np.linalg.pinv(left, hermitian=True)
+    steps = np.einsum("fij,fj->fi", covariances, gradients)
+    ends = (each[:k] - at.point.shared for each in estimation.bounds)
+    return np.clip(unit * steps, *ends) / unit, covariances, by_unit
+
+
+def _parts(
+    estimation: Estimation, at: Linearised, parts: Sequence[NDArray], by_unit: NDArray
+) -> Iterator[tuple[int, slice, NDArray, NDArray]]:
+    """For some trajectories and each part, its number, errors (m, d_y) and Jacobian."""
+    for rows, error, slope in estimation.derivatives(at.point):
+        for i, part in enumerate(parts):
+            held = slope[part[rows]][..., : len(by_unit)]
+            yield i, rows, error[part[rows]], held @ by_unit
