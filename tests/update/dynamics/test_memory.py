@@ -11,6 +11,8 @@ import pytest
 import retwin as rt
 from retwin.twins import Parameter, State, StateTwin
 from retwin.update import Dynamics, FittedDynamics, Library, fit_dynamics
+from retwin.update.dynamics.corrected import CorrectedEquations
+from retwin.update.dynamics.memory import Memory, with_memories
 
 RATE = 0.1
 SLOW = 600.0
@@ -93,6 +95,42 @@ def test_it_predicts_records_that_it_has_not_seen(fitted: FittedDynamics) -> Non
 def test_a_twin_that_lacks_nothing_gets_no_memory() -> None:
     found = fit_dynamics(room(), record(room()), CONSTANT)
     assert [each.name for each in found.twin.equations.states] == ["air"]
+
+
+@pytest.mark.parametrize("kind", ["derivative", "step"])
+def test_memories_without_weight_do_not_act_on_each_other(kind: str) -> None:
+    """Their effects on the outputs are those that each has alone."""
+
+    def slope(x, u, p):
+        own = 0.02 * u.heater - p.loss * x.air, 0.01 * (x.air - x.wall)
+        return own if kind == "derivative" else (x.air + 5 * own[0], x.wall + 5 * own[1])
+
+    twin = replace(
+        room(),
+        states=(State("air", "K"), State("wall", "K", 1.0)),
+        output=lambda x, u: x.air + x.wall**2,
+        **{"derivative": None, "step": None, kind: slope},
+    )
+    commands = record(room()).commands.astype(float)
+    known = Dynamics(Library(1, (), False), states=("air", "wall"))
+    visited = (twin.hidden(commands), commands)
+    equations = CorrectedEquations.distinct(twin, known.library, known, visited, np.eye(1))
+    both = [Memory("air", 300.0), Memory("wall", 900.0)]
+
+    def effects(memories: list[Memory], shift: float) -> np.ndarray:
+        """Of the weights, (n, T, 1, M), for time constants that differ by a factor."""
+        made = with_memories(equations, memories)
+        values = {each.coefficients[1].name: shift for each in memories}
+        slopes = made.sensitivities(commands, values)[1]
+        return slopes[..., [made.names.index(each.coefficients[0].name) for each in memories]]
+
+    for shift in (0.0, 1.5):
+        together = effects(both, shift)
+        assert np.abs(together).max() > 0
+        for i, memory in enumerate(both):
+            np.testing.assert_allclose(together[..., [i]], effects([memory], shift), rtol=1e-9)
+            moved = replace(memory, time=memory.time * np.exp(shift))
+            np.testing.assert_allclose(together[..., [i]], effects([moved], 0.0), rtol=1e-9)
 
 
 def test_a_twin_by_steps_gets_the_same_memory(fitted: FittedDynamics) -> None:

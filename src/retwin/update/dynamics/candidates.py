@@ -16,7 +16,7 @@ from retwin.update.dynamics.corrected import CorrectedEquations
 from retwin.update.dynamics.estimation import Estimation, correlation_time
 from retwin.update.dynamics.left_out import errors_without, held_out
 from retwin.update.dynamics.linearised import HeldOut, Linearised, Point
-from retwin.update.dynamics.memory import Memory
+from retwin.update.dynamics.memory import Memory, times_tried, with_memories
 from retwin.update.dynamics.settings import Dynamics
 from retwin.update.dynamics.unknowns import Unknowns
 
@@ -171,15 +171,15 @@ def _forms(alone: Estimation, point: Point, settings: Dynamics) -> Iterator[Corr
 
 
 def _with_discrepancy(
-    equations: CorrectedEquations, memory: Memory | None, alone: Estimation
+    equations: CorrectedEquations, memories: Sequence[Memory], alone: Estimation
 ) -> Estimation:
-    """The estimation of corrected equations, with a memory if it is given."""
-    more = memory.coefficients if memory else ()
+    """The estimation of corrected equations with memories."""
+    more = [each for memory in memories for each in memory.coefficients]
     unknowns = alone.unknowns.with_coefficients([*equations.coefficients, *more])
     return replace(
         alone,
-        twin=memory.added(equations) if memory else equations.corrected,
-        unknowns=replace(unknowns, start=np.append(unknowns.start, [0.0] if memory else [])),
+        twin=with_memories(equations, memories),
+        unknowns=replace(unknowns, start=np.append(unknowns.start, [0.0] * len(memories))),
         absorbed=_absorbed(equations, alone.unknowns.count),
     )
 
@@ -204,13 +204,24 @@ def _memory(
     equations: CorrectedEquations, alone: Estimation, estimation: Estimation, found: Linearised
 ) -> Memory:
     """The memory from which the fit without one would gain most, by a linear step."""
-    point = Point(np.pad(found.point.shared, (0, 2)), found.point.starts)
-
-    def gain(memory: Memory) -> float:
-        own = replace(_with_discrepancy(equations, memory, alone), variance=estimation.variance)
-        return own.gain(own.linearised(point))
-
-    return max(Memory.tried(equations, alone.observed.steps), key=gain)
+    states = equations.states
+    times = times_tried(alone.observed.steps, alone.twin.rate).tolist()
+    # Those of all states in one twin: with weights of 0, none acts on any other.
+    whole = _with_discrepancy(equations, [Memory(each, times[0]) for each in states], alone)
+    whole = replace(whole, variance=estimation.variance)
+    first, starts = estimation.unknowns.count, found.point.starts
+    gains: dict[Memory, float] = {}
+    for time in times:
+        mean = whole.unknowns.mean.copy()
+        mean[first + 1 :: 2] = np.log(time / times[0])
+        now = replace(whole, unknowns=replace(whole.unknowns, mean=mean))
+        shared = np.append(found.point.shared, mean[first:])
+        at = now.linearised(Point(shared, starts))
+        for i, state in enumerate(states):
+            kept = np.append(np.arange(first), first + 2 * i + np.arange(2))
+            own = replace(now, unknowns=now.unknowns.only(kept))
+            gains[Memory(state, time)] = own.gain(replace(at, point=Point(shared[kept], starts)))
+    return max(gains, key=lambda memory: gains[memory])
 
 
 def _followed(
@@ -237,7 +248,8 @@ def _followed(
         The first assumed variance, over that of `alone`.
 
     """
-    estimation, power = _with_discrepancy(equations, memory, alone), alone.variance
+    estimation = _with_discrepancy(equations, [memory] if memory else [], alone)
+    power = alone.variance
     begun = np.append(point.shared, estimation.unknowns.mean[len(point.shared) :])
     now = estimation.linearised(Point(begun, point.starts))
     states = len(equations.twin.states)

@@ -11,7 +11,7 @@ at the first sample: there the two are in balance, wherever x starts.
 from __future__ import annotations
 
 from collections import namedtuple
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,12 +25,19 @@ from retwin.twins.state_twin import StateTwin, with_parameters
 from retwin.update.dynamics.corrected import CorrectedEquations
 from retwin.update.dynamics.terms import WIDEST
 
-__all__ = ["Memory"]
+__all__ = ["Memory", "times_tried", "with_memories"]
 
 SHORTEST = 4
 """Shortest time constant that is tried, in samples."""
 RATIO = 4.0
 """Ratio of a time constant that is tried to the one before."""
+
+
+def times_tried(samples: int, rate: float) -> NDArray:
+    """Time constants in s up to a record of so many samples."""
+    count = int(np.log(max(samples / SHORTEST, 1.0)) / np.log(RATIO)) + 1
+    made: NDArray = SHORTEST * RATIO ** np.arange(count) / rate
+    return made
 
 
 @dataclass(frozen=True)
@@ -49,14 +56,6 @@ class Memory:
 
     state: str
     time: float
-
-    @classmethod
-    def tried(cls, equations: CorrectedEquations, samples: int) -> Iterator[Memory]:
-        """Memories of each corrected state, with times up to a record of so many samples."""
-        count = int(np.log(max(samples / SHORTEST, 1.0)) / np.log(RATIO)) + 1
-        for state in equations.states:
-            for time in SHORTEST * RATIO ** np.arange(count) / equations.twin.rate:
-                yield cls(state, float(time))
 
     @property
     def coefficients(self) -> tuple[Parameter, Parameter]:
@@ -82,39 +81,51 @@ class Memory:
     def _index(self, equations: CorrectedEquations) -> int:
         return [each.name for each in equations.twin.states].index(self.state)
 
-    def added(self, equations: CorrectedEquations) -> StateTwin:
-        """The corrected equations with this memory, whose parameters are the last two.
 
-        A coefficient of 1 is, for a difference of half the state's range, a term as large as the
-        root mean square of the state's time derivative.
-        """
-        twin, domain = equations.corrected, equations.domain
-        names = [each.name for each in twin.states]
-        parts = namedtuple("x", names, rename=True)  # type: ignore[misc]
-        own = namedtuple("p", [each.name for each in twin.parameters], rename=True)  # type: ignore[misc]
-        function, output = (
-            with_parameters(each) for each in (twin.derivative or twin.step, twin.output)
-        )
-        i, discrete = self._index(equations), twin.step is not None
-        weight = float(domain.speed[i] / domain.scale[i])
+def with_memories(equations: CorrectedEquations, memories: Sequence[Memory]) -> StateTwin:
+    """The corrected equations with memories, whose parameters are the last, two of each.
 
-        def slope(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
-            found = list(function(parts(*x[:-1]), u, own(*p[:-2])))
-            found[i] = found[i] + weight * p[-2] * x[-1]
-            decay = torch.exp(-p[-1]) / self.time
+    A coefficient of 1 is, for a difference of half the state's range, a term as large as the
+    root mean square of the state's time derivative.
+    """
+    twin, domain, more = equations.corrected, equations.domain, len(memories)
+    if not memories:
+        return twin
+    names = [each.name for each in twin.states]
+    parts = namedtuple("x", names, rename=True)  # type: ignore[misc]
+    own = namedtuple("p", [each.name for each in twin.parameters], rename=True)  # type: ignore[misc]
+    function, output = (
+        with_parameters(each) for each in (twin.derivative or twin.step, twin.output)
+    )
+    discrete = twin.step is not None
+    places = [names.index(each.state) for each in memories]
+
+    def slope(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
+        found = list(function(parts(*x[:-more]), u, own(*p[: -2 * more])))
+        hidden = []
+        for k, (i, memory) in enumerate(zip(places, memories, strict=True)):
+            weight, logarithm = p[2 * (k - more)], p[2 * (k - more) + 1]
+            found[i] = found[i] + float(domain.speed[i] / domain.scale[i]) * weight * x[k - more]
+            decay = torch.exp(-logarithm) / memory.time
             if discrete:
-                return *found, found[i] - x[i] + torch.exp(-decay / twin.rate) * x[-1]
-            return *found, found[i] - decay * x[-1]
+                kept = torch.exp(-decay / twin.rate) * x[k - more]
+                hidden.append(found[i] - x[i] + kept)
+            else:
+                hidden.append(found[i] - decay * x[k - more])
+        return *found, *hidden
 
-        taken = {*names, *twin.inputs.names}
-        name = f"memory_{self.state}"
+    taken, hidden = {*names, *twin.inputs.names}, []
+    for i in places:
+        name = f"memory_{names[i]}"
         while name in taken:
             name += "_"
-        unit = twin.states[i].unit
-        changed = replace(twin, step=slope) if discrete else replace(twin, derivative=slope)
-        return replace(
-            changed,
-            states=(*twin.states, State(name, unit)),
-            output=lambda x, u, p: output(parts(*x[:-1]), u, own(*p[:-2])),
-            parameters=(*twin.parameters, *self.coefficients),
-        )
+        taken.add(name)
+        hidden.append(State(name, twin.states[i].unit))
+    changed = replace(twin, step=slope) if discrete else replace(twin, derivative=slope)
+    coefficients = [each for memory in memories for each in memory.coefficients]
+    return replace(
+        changed,
+        states=(*twin.states, *hidden),
+        output=lambda x, u, p: output(parts(*x[:-more]), u, own(*p[: -2 * more])),
+        parameters=(*twin.parameters, *coefficients),
+    )

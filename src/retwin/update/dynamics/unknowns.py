@@ -69,6 +69,21 @@ class Unknowns:
             high=np.insert(self.high, k, [each.high for each in coefficients]),
         )
 
+    def only(self, kept: NDArray) -> Unknowns:
+        """The same with some of the shared coordinates, the others held at their means."""
+        held = np.setdiff1d(np.arange(self.count), kept)
+        both = np.append(kept, np.arange(self.count, len(self.low)))
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in kept),
+            offset=self.offset + self.matrix[:, held] @ self.mean[held],
+            matrix=self.matrix[:, kept],
+            mean=self.mean[kept],
+            deviation=self.deviation[kept],
+            low=self.low[both],
+            high=self.high[both],
+        )
+
 
 def state_names(twin: object) -> tuple[str, ...]:
     """Names of the states of a `StateTwin`, or of a `ParametricTwin` of one; none of others."""
