@@ -23,6 +23,7 @@ from retwin.twins.state_twin import StateTwin
 from retwin.twins.twin import checked_stride
 from retwin.update.dynamics.estimation import Estimation, Point, correlation_time
 from retwin.update.dynamics.fitting import assembled
+from retwin.update.dynamics.left_out import held_out
 from retwin.update.dynamics.noise import widening
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
@@ -121,7 +122,7 @@ class BlackBoxFit:
         speed, whole = np.where(speed > 0, speed, 1.0), [np.full(estimation.seen.shape[:2], True)]
         unmoved = np.zeros((1, estimation.unknowns.count))
         made = assembled(estimation, found, tuple(corrected), speed, whole, unmoved)
-        uncertain = estimation.held_out(found, held_out_parts(estimation.seen))
+        uncertain = held_out(estimation, found, held_out_parts(estimation.seen))
         made = replace(
             made, widening=widening(made, self._tested, replace(uncertain, errors=self.errors))
         )

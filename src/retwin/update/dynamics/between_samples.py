@@ -75,12 +75,14 @@ def chosen(
     first, *others = INTERPOLATIONS if is_open else (base.interpolation,)
     held, fitted = without_discrepancy(replace(base, interpolation=first), observed, unknowns)
     progress(0.05)
-    far = edges(held.simulated(fitted.point)[1], held.commands, settings.folds)
+    # The same states for all interpolations, so that their equations are compiled once.
+    visited = held.simulated(fitted.point)[1]
+    far = edges(visited, held.commands, settings.folds)
 
     def reported(done: float) -> None:
         progress(0.05 + share * done)
 
-    tried = searched(held, fitted.point, settings, parts, far, reported)
+    tried = searched(held, fitted.point, settings, visited, parts, far, reported)
     best = (held, fitted, best_of(tried))
     for other in others:
         if not any(_shown(each, other, parts) for each in tried):
@@ -89,7 +91,8 @@ def chosen(
             own, at = without_discrepancy(replace(base, interpolation=other), observed, unknowns)
         except InputError:  # its simulation is not finite
             continue
-        found = best_of(searched(own, at.point, settings, parts, far, lambda done: None))
+        given = (settings, visited, parts, far, lambda done: None)
+        found = best_of(searched(own, at.point, *given))
         if better(found, best[2]):
             best = (own, at, found)
     return best

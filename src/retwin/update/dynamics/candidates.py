@@ -97,6 +97,7 @@ def searched(
     alone: Estimation,
     point: Point,
     settings: Dynamics,
+    visited: NDArray,
     parts: Sequence[NDArray],
     far: Sequence[NDArray],
     progress: Progress,
@@ -111,6 +112,8 @@ def searched(
         Its optimum.
     settings : Dynamics
         The forms that are tried.
+    visited : NDArray
+        States (n, T, d_x) over which terms are scaled and compared.
     parts, far : sequence of NDArray
         Parts (n, T) of the samples that are held out in turn, in time and at the edges.
     progress : callable
@@ -118,7 +121,7 @@ def searched(
 
     """
     tried: list[Candidate] = []
-    for number, equations in enumerate(_forms(alone, point, settings)):
+    for number, equations in enumerate(_forms(alone, point, settings, visited)):
         own, found = _followed(equations, None, alone, point, STRONGEST)
         tried.append(Candidate.tested(equations, None, own, found, parts, far))
         if settings.remembers(equations.form):
@@ -161,13 +164,15 @@ def _with_starts(base: StateTwin, unknowns: Unknowns, point: Point) -> StateTwin
     return replace(base, parameters=tuple(parameters))
 
 
-def _forms(alone: Estimation, point: Point, settings: Dynamics) -> Iterator[CorrectedEquations]:
+def _forms(
+    alone: Estimation, point: Point, settings: Dynamics, visited: NDArray
+) -> Iterator[CorrectedEquations]:
     """The corrected equations with each form that is tried, at the parameters of a point."""
     unknowns = alone.unknowns
     twin = _with_starts(alone.twin, unknowns, point)
-    visited = (alone.simulated(point)[1], alone.commands)
+    both = (visited, alone.commands)
     for form in settings.forms:
-        yield CorrectedEquations.distinct(twin, form, settings, visited, unknowns.matrix)
+        yield CorrectedEquations.distinct(twin, form, settings, both, unknowns.matrix)
 
 
 def _with_discrepancy(
