@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from retwin.twins.state_twin import SAMPLES_PER_CHUNK, StateTwin
 from retwin.update.dynamics.domain import Domain
 
-__all__ = ["DynamicsFilter"]
-
 STEP = 0.1
 """Differences of parameters, in posterior deviations, by which predictions are differentiated."""
 

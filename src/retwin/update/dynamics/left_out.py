@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from retwin.update.dynamics.estimation import Estimation
 from retwin.update.dynamics.linearised import HeldOut, Linearised
 
-__all__ = ["errors_without", "held_out"]
-
 
 def held_out(estimation: Estimation, at: Linearised, folds: Sequence[NDArray]) -> HeldOut:
     """The errors of each fold, and the estimates, without that fold.

@@ -21,8 +21,6 @@ from retwin.twins.interpolation import cubic_coefficients
 from retwin.update.dynamics.prediction import root_of, whitened
 from retwin.update.dynamics.twin import DynamicsTwin
 
-__all__ = ["NoiseVariances", "Record", "Variants"]
-
 LANES = 8
 """Variants that are computed at a time: numbers in a register of the widest processors."""
 COMPILED = 64

@@ -25,8 +25,6 @@ from retwin.twins.state_twin import StateTwin, with_parameters
 from retwin.update.dynamics.corrected import CorrectedEquations
 from retwin.update.dynamics.terms import WIDEST
 
-__all__ = ["Memory", "times_tried", "with_memories"]
-
 SHORTEST = 4
 """Shortest time constant that is tried, in samples."""
 RATIO = 4.0

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from retwin.twins.state_twin import StateTwin
 
-__all__ = ["FreeSimulation"]
-
 
 @dataclass(frozen=True, eq=False)
 class FreeSimulation:
