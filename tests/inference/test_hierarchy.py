@@ -85,6 +85,24 @@ def test_coefficients_have_their_closed_form() -> None:
     torch.testing.assert_close(found.covariance, torch.linalg.inv(information), rtol=0.1, atol=2e-3)
 
 
+def test_what_exact_measurements_leave_open_is_that_of_nearly_exact_ones() -> None:
+    """Measured are the sum of the first two variables, and the others: curvatures of 1e6, 1e14."""
+    data = drawn(30, seed=3)
+    sums = torch.tensor([[1.0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]).double()
+    first = Hierarchy.of(data.design, torch.ones(2).double(), torch.zeros(4).double())
+    prior = first.prior(data.design)
+    found = []
+    for noise in (1e-3, 1e-7):
+        # In closed form from the distribution of the sums, which has no large numbers.
+        gain = sums.T @ torch.linalg.inv(sums @ sums.T + noise**2 * torch.eye(3).double())
+        x = prior.mean + (data.x - prior.mean) @ sums.T @ gain.T
+        curvature = (prior.precision + sums.T @ sums / noise**2).expand(30, 4, 4)
+        solution = Solution(x, x[:, 0], curvature, x[:, 0])
+        found.append(first.learned(data.design, solution, torch.ones(2).double()))
+    torch.testing.assert_close(found[1].variance, found[0].variance, rtol=0.02, atol=0)
+    torch.testing.assert_close(found[1].coefficients, found[0].coefficients, rtol=0.02, atol=0.01)
+
+
 def test_intervals_from_few_rows_cover() -> None:
     """Nominal 90 %: 8 rows, 200 sets. A binomial share of 6400 has a deviation of 0.004; variables
     of a set are correlated, so its 200 means are what counts, with a deviation of about 0.01."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from retwin.inference.priors import GaussianPrior, inverse
+from retwin.inference.priors import ROUNDING, GaussianPrior, inverse
 from retwin.inference.solver import Solution
 
 FREEDOM = 2.0
@@ -131,12 +131,11 @@ class Hierarchy:
 
         """
         prior = self.prior(design)
-        # The likelihood of the linearised problem: its curvature, and its slope at x = 0.
-        curvature = solution.curvature - prior.precision
-        slope = (curvature @ solution.x[..., None])[..., 0] + prior.gradient(solution.x)
+        # The likelihood of the linearised problem: its curvature, and its slope at the solution.
+        curvature, slope = solution.curvature - prior.precision, prior.gradient(solution.x)
         found = self
         for _ in range(MAX_STEPS):
-            before, found = found, found._step(design, curvature, slope, expected)
+            before, found = found, found._step(design, curvature, solution.x, slope, expected)
             if (found.variance / before.variance).log().abs().amax() < TOLERANCE:
                 break
         return found
@@ -145,18 +144,28 @@ class Hierarchy:
         return self.variance[design.group] * design.wider.square()
 
     def _step(
-        self, design: Design, curvature: Tensor, slope: Tensor, expected: Tensor
+        self, design: Design, curvature: Tensor, x: Tensor, slope: Tensor, expected: Tensor
     ) -> Hierarchy:
         """One step: the posterior of coefficients and x, then the variances."""
-        features, precision = design.features, self._variances(design).reciprocal()
-        covariance = inverse(curvature + torch.diag_embed(precision))
+        features, variances = design.features, self._variances(design)
+        precision = variances.reciprocal()
+        # In prior standard deviations: what exact outputs leave open keeps the prior's precision
+        # beside what they determine, which is larger by many orders.
+        scale = variances.sqrt()[:, :, None] * variances.sqrt()[:, None, :]
+        identity = torch.eye(curvature.shape[1], dtype=curvature.dtype)
+        covariance = torch.linalg.inv(curvature * scale + identity) * scale
+        covariance = (covariance + covariance.mT) / 2
         weighted = features * precision[..., None]
         # With x integrated out, β has this precision, and the errors ε depend on β by -left.
         left = features - covariance @ weighted
         own = self.relative[design.kind] * self.variance[design.owner]
         own = torch.where(design.kind == FLAT, torch.inf, own)
         information = (weighted.mT @ left).sum(dim=0) + torch.diag(own.reciprocal())
-        mean = (covariance @ slope[..., None])[..., 0]
+        # Where nothing is measured, nothing is known of coefficients that are not shrunk.
+        known = (weighted * features).sum(dim=(0, 1))  # of each coefficient, were x measured
+        information = information + torch.diag(ROUNDING * known)
+        # As the product of the covariance and the slope at x = 0, without its large numbers.
+        mean = x + (covariance @ (slope - precision * x)[..., None])[..., 0]
         uncertain = inverse(information[None])[0]
         beta = uncertain @ (weighted * mean[..., None]).sum(dim=(0, 1))
         error = mean - left @ beta
