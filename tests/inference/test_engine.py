@@ -168,6 +168,21 @@ def test_bounds_hold_and_unmeasured_samples_do_not_count() -> None:
     torch.testing.assert_close(found.evidence, torch.zeros(2).double(), rtol=0, atol=1e-3)
 
 
+def test_the_gradient_is_that_of_the_objective_at_a_limit() -> None:
+    problem, prior = replace(Linear.drawn(3, 20, seed=4), curve=0.5), prior_of(3, seed=5)
+    noise = noise_of(0.5, StudentT(4.0))
+    infinite = torch.full((3,), torch.inf, dtype=torch.float64)
+    low = torch.tensor([0.9, -torch.inf, -torch.inf], dtype=torch.float64)
+    start = torch.ones(3, 3, dtype=torch.float64)
+    found = solve(problem, prior, noise, start, bounds=Bounds(low, infinite, infinite))
+    x = found.x.clone().requires_grad_()
+    objective = noise.misfit(problem, problem.residual(x)).sum() + prior.energy(x).sum()
+    (expected,) = torch.autograd.grad(objective, x)
+    torch.testing.assert_close(found.gradient, expected, rtol=1e-6, atol=1e-6)
+    assert (found.gradient[:, 0] > 1).all(), "each row is kept from its optimum"
+    assert not solve(problem, prior, noise, start).gradient.any()
+
+
 def test_rows_do_not_depend_on_each_other() -> None:
     problem, prior = replace(Linear.drawn(5, 20, seed=6), curve=0.5), prior_of(5, seed=7)
     noise = noise_of(0.3, StudentT(4.0))

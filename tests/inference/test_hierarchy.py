@@ -33,7 +33,7 @@ class Drawn:
         curvature = prior.precision + torch.diag_embed(self.precision)
         right = self.precision * self.measured + (prior.precision @ prior.mean[..., None])[..., 0]
         x = torch.linalg.solve(curvature, right)
-        return Solution(x, x[:, 0], curvature, x[:, 0])
+        return Solution(x, x[:, 0], curvature, x[:, 0], torch.zeros_like(x))
 
 
 def drawn(rows: int, seed: int) -> Drawn:
@@ -97,7 +97,7 @@ def test_what_exact_measurements_leave_open_is_that_of_nearly_exact_ones() -> No
         gain = sums.T @ torch.linalg.inv(sums @ sums.T + noise**2 * torch.eye(3).double())
         x = prior.mean + (data.x - prior.mean) @ sums.T @ gain.T
         curvature = (prior.precision + sums.T @ sums / noise**2).expand(30, 4, 4)
-        solution = Solution(x, x[:, 0], curvature, x[:, 0])
+        solution = Solution(x, x[:, 0], curvature, x[:, 0], torch.zeros_like(x))
         found.append(first.learned(data.design, solution, torch.ones(2).double()))
     torch.testing.assert_close(found[1].variance, found[0].variance, rtol=0.02, atol=0)
     torch.testing.assert_close(found[1].coefficients, found[0].coefficients, rtol=0.02, atol=0.01)

@@ -132,7 +132,8 @@ class Hierarchy:
         """
         prior = self.prior(design)
         # The likelihood of the linearised problem: its curvature, and its slope at the solution.
-        curvature, slope = solution.curvature - prior.precision, prior.gradient(solution.x)
+        curvature = solution.curvature - prior.precision
+        slope = prior.gradient(solution.x) - solution.gradient
         found = self
         for _ in range(MAX_STEPS):
             before, found = found, found._step(design, curvature, solution.x, slope, expected)

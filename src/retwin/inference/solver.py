@@ -73,6 +73,8 @@ class Solution:
     evidence : Tensor
         (R,), Laplace's log evidence, up to the density of the noise at 0; -inf for a row that was
         given up.
+    gradient : Tensor
+        (R, P), of the objective: 0, except where a limit of x keeps it from its optimum.
 
     """
 
@@ -80,12 +82,13 @@ class Solution:
     objective: Tensor
     curvature: Tensor
     evidence: Tensor
+    gradient: Tensor
 
     @classmethod
     def of_prior(cls, prior: GaussianPrior, x: Tensor) -> Solution:
         """At x (R, P), without any measured output."""
         energy = prior.energy(x)
-        return cls(x, energy, prior.precision, -energy)
+        return cls(x, energy, prior.precision, -energy, prior.gradient(x))
 
     def __getitem__(self, rows: Tensor) -> Solution:
         """The solution of some rows."""
@@ -219,9 +222,9 @@ def solve(
     x, linearised = start, problem.linearised(start)
     energy = _objective(problem, prior, noise, x, linearised[0])
     size = x.shape[1]
-    found = Solution(
-        x, energy, x.new_full((len(x), size, size), torch.nan), torch.full_like(energy, -torch.inf)
-    )
+    unknown = x.new_full((len(x), size, size), torch.nan)
+    nowhere = torch.full_like(energy, -torch.inf)
+    found = Solution(x, energy, unknown, nowhere, torch.zeros_like(x))
     rows, damping = torch.arange(len(x)), torch.full_like(energy, DAMPING)
     before = torch.zeros_like(x)
     for count in range(MAX_STEPS + 1):
@@ -243,7 +246,13 @@ def solve(
             hopeless = torch.zeros_like(done)
         ended = (done & ~hopeless).nonzero()[:, 0]
         if len(ended):
-            part = Solution(x, energy, step.curvature, occam - energy)
+            gradient = torch.zeros_like(x)
+            if bounds is not None:
+                held = ((x <= bounds.lower) | (x >= bounds.upper)).any(dim=1) & done
+                gradient[held] = _gradient(
+                    problem, prior, noise, x, linearised, held.nonzero()[:, 0]
+                )
+            part = Solution(x, energy, step.curvature, occam - energy, gradient)
             found = found.put(rows[ended], part[ended])
         going = (~done & ~hopeless).nonzero()[:, 0]
         if not len(going):
@@ -280,6 +289,21 @@ def _objective(
     if made is not None:
         return made
     return noise.misfit(problem, residual).sum(dim=1) + prior.energy(x)
+
+
+def _gradient(
+    problem: Problem,
+    prior: GaussianPrior,
+    noise: Noise,
+    x: Tensor,
+    linearised: tuple[Tensor, Tensor],
+    rows: Tensor,
+) -> Tensor:
+    """Gradient (k, P) of the objective at x (R, P), of some rows (k,)."""
+    residual, jacobian = (each[rows] for each in linearised)
+    weighted = (residual * noise.precision(problem[rows], residual)).flatten(1)
+    slope = (jacobian.flatten(1, 2).mT @ weighted[..., None])[..., 0]
+    return prior[rows].gradient(x[rows]) - slope
 
 
 def _extrapolation(move: Tensor, before: Tensor, metric: Tensor) -> Tensor:

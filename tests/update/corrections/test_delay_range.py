@@ -89,6 +89,7 @@ def test_a_range_that_ends_too_soon_is_said(operator: type) -> None:
     mask = torch.ones(outputs.shape, dtype=torch.bool)
     found = operator(delay_range=(-0.01, 0.06)).infer(context, outputs, mask)
     assert found.at_bound.float().mean() > 0.8
+    assert found.z[..., 0].max() < 500.0 * 0.06 + 1, "as far as the bound, and not beyond"
     assert not found.identified[..., 0][found.at_bound].any()
 
 
