@@ -147,9 +147,14 @@ def test_the_page_on_identification(folder: Path, monkeypatch: pytest.MonkeyPatc
     assert checked.outputs[0].validation.after < 0.25
 
 
-def test_the_page_on_scale() -> None:
-    """The same code with 60 trajectories in place of a million; the one for Slurm compiles."""
-    here, slurm, reading = blocks(DOCS / "scale.md", "python")
+def test_the_page_on_scale(updated: rt.CorrectedTwin, case: rt.Case) -> None:
+    """With 60 trajectories in place of a million, and no GPU; the code for Slurm compiles."""
+    here, slurm, on_gpu, reading = blocks(DOCS / "scale.md", "python")
+    updated.save("twin")
+    commands = case.sampler.sample(9, rng=np.random.default_rng(0))
+    sent = {"commands": commands, "faults": list(case.faults.values())}
+    made = run("scale.md", sent, on_gpu.replace('"cuda"', '"cpu"'))
+    assert made["observed"].shape == (9, 1000, 3)
     small = here.replace("n=1_000_000", "n=60")
     assert small != here
     run("scale.md", {"__name__": "__main__"}, small)

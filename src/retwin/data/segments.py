@@ -208,10 +208,33 @@ class Segments:
 
         `speed` gives the speeds of trajectories in steps, for arrays of their indices.
         """
-        n, steps = moving.shape[0], moving.shape[1] + 1
         padded = np.pad(moving, ((0, 0), (1, 1)))
-        # padded[:, i] is True if step i - 1 -> i moves: such steps begin and end in turn.
+        # padded[:, i] is True if step i - 1 -> i moves.
         row, edge = np.nonzero(padded[:, 1:] != padded[:, :-1])
+        return cls.from_edges(len(moving), moving.shape[1] + 1, row, edge, speed)
+
+    @classmethod
+    def from_edges(
+        cls,
+        n: int,
+        steps: int,
+        row: NDArray,
+        edge: NDArray,
+        speed: Callable[[NDArray, NDArray], NDArray],
+    ) -> Segments:
+        """Segments of n trajectories from the samples at which they begin and cease to move.
+
+        Parameters
+        ----------
+        n, steps : int
+            Trajectories, and samples of each.
+        row, edge : (k,) array of int
+            Trajectories in order, and samples of each in order: where a motion begins, then where
+            it ends, in turn.
+        speed : callable
+            From arrays of trajectories and of samples to the speeds from each sample to the next.
+
+        """
         row, first, last = row[::2], edge[::2], edge[1::2]
         order = np.arange(len(row)) - np.searchsorted(row, row)
         count = int(order.max(initial=-1)) + 1

@@ -41,7 +41,7 @@ class FlowDistribution(Distribution):
         self.flow = flow
         self.shift = shift
         self.scale = scale
-        self.wider = torch.as_tensor(wider, dtype=scale.dtype)
+        self.wider = torch.as_tensor(wider, dtype=scale.dtype, device=scale.device)
         super().__init__(flow.batch_shape, flow.event_shape, validate_args=False)
 
     def expand(

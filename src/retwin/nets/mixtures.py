@@ -287,7 +287,7 @@ class MixtureHead(nn.Module):
         raw = self.linear(encoded).unflatten(-1, (self.components, -1))
         logits, mean, lower = raw.split([1, self.width, self.lower], dim=-1)
         factor = raw.new_zeros(*raw.shape[:-1], self.width, self.width)
-        row, column = torch.tril_indices(self.width, self.width)
+        row, column = torch.tril_indices(self.width, self.width, device=raw.device)
         factor[..., row, column] = lower
         diagonal = nn.functional.softplus(factor.diagonal(dim1=-2, dim2=-1)) + FLOOR
         factor = factor.tril(-1) + torch.diag_embed(diagonal)

@@ -115,7 +115,7 @@ def widening(degrees: float) -> float:
 @cache
 def _factors(degrees: float) -> Tensor:
     """(FACTORS,) quantiles of √(ν / χ²_ν) at equally probable levels, ascending."""
-    if np.isinf(degrees):
-        return torch.ones(FACTORS)
     levels = (np.arange(FACTORS) + 0.5) / FACTORS
-    return torch.as_tensor(np.sqrt(degrees / stats.chi2.isf(levels, degrees)), dtype=torch.float32)
+    finite = not np.isinf(degrees)
+    factors = np.sqrt(degrees / stats.chi2.isf(levels, degrees)) if finite else np.ones(FACTORS)
+    return torch.from_numpy(factors).float()

@@ -85,7 +85,7 @@ class CommandRange:
         change = rate * steps.max(axis=0)
         mean = np.add.reduce(list(_of_spectra(lambda each: each.sum(axis=0), commands, rate)))
         frequency = _frequencies(commands, rate)
-        below = mean.cumsum(axis=0) / len(_chosen(len(commands)))
+        below = mean.cumsum(axis=0) / len(chosen_for_spectra(len(commands)))
         index = (below < BAND_SHARE * below[-1]).sum(axis=0)
         band, power, resolution = frequency[index], below[-1], rate / commands.shape[1]
         limit = band + LEAKAGE * resolution
@@ -137,9 +137,8 @@ class CommandRange:
             limit = tolerance * np.where(speed > 0, speed, inf)
             found[rows, 1] = rate * steps / limit
         if np.isfinite(self.band).all():
-            found[_chosen(len(commands)), 2] = self.shares(commands, rate) / (
-                (1 + self.chance) * np.array(self.share) + POWER_TOLERANCE
-            )
+            shares = self.shares(commands, rate)
+            found[chosen_for_spectra(len(commands)), 2] = shares / self.largest_share
         return found
 
     @property
@@ -154,11 +153,24 @@ class CommandRange:
         fastest = (1 + SPEED_TOLERANCE) * (1 + 2 * self.chance) * np.where(speed > 0, speed, inf)
         return low - margin, high + margin, fastest
 
+    @property
+    def largest_share(self) -> NDArray:
+        """Share (d_u,) of a trajectory's power above `band_limit` that is within the range."""
+        limit: NDArray = (1 + self.chance) * np.array(self.share) + POWER_TOLERANCE
+        return limit
+
+    def band_limit(self, resolution: float) -> NDArray:
+        """Frequency (d_u,) in Hz above which power is not that of the band, in spectra of a step.
+
+        `resolution` is that step in Hz: the peak of a sine is as wide as some of them.
+        """
+        limit: NDArray = np.array(self.band) + LEAKAGE * max(self.resolution, resolution)
+        return limit
+
     def shares(self, commands: NDArray, rate: float) -> NDArray:
         """Share of the power of each trajectory's commands that lies above the band, (n, d_u)."""
         frequency = _frequencies(commands, rate)
-        limit = np.array(self.band) + LEAKAGE * max(self.resolution, rate / commands.shape[1])
-        power = np.array(self.power)
+        limit, power = self.band_limit(rate / commands.shape[1]), np.array(self.power)
         above = _of_spectra(lambda each: _above(frequency, each, limit, power), commands, rate)
         return np.concatenate(list(above))
 
@@ -255,7 +267,7 @@ def _of_spectra(
     function: Callable[[NDArray], NDArray], commands: NDArray, rate: float
 ) -> Iterator[NDArray]:
     """A function of the power spectra (n, F, d_u) of the chosen trajectories, block by block."""
-    chosen = _chosen(len(commands))
+    chosen = chosen_for_spectra(len(commands))
     window = windows.hann(commands.shape[1] + 2)[1:-1, None].astype(np.float32)
     scale = 2 / len(window) / np.sum(window**2)
 
@@ -275,6 +287,6 @@ def _above(frequency: NDArray, spectra: NDArray, limit: NDArray, power: NDArray)
     return np.divide(above, whole, out=np.zeros_like(above), where=power > 0)
 
 
-def _chosen(count: int) -> NDArray:
+def chosen_for_spectra(count: int) -> NDArray:
     """Indices of at most a thousand trajectories, evenly chosen."""
     return np.unique(np.linspace(0, count - 1, min(count, MAX_SPECTRA)).round().astype(int))

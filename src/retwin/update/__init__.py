@@ -14,6 +14,7 @@ _HOME = homes(
         "corrected": "CorrectedTwin generate",
         "corrections": "Additive Chain CommandSpace Context Correction DelayOffset Discrepancy "
         "Head SampledSensor command_space fit_correction measured_outputs sample_mask",
+        "device": "DeviceTwin Records",
         "dynamics": "Curve Dynamics DynamicsTwin FittedDynamics Library Prediction TanhNetwork "
         "fit_dynamics",
         "identification": "Evolution LeastSquares MCMC NPE Noise Optimum Posterior PosteriorTwin "

@@ -86,7 +86,7 @@ def distinct(commands: Tensor) -> tuple[Tensor, Tensor]:
         (k, d_u), and the row of it that each sample equals, (n, T).
 
     """
-    changed = torch.ones(commands.shape[:2], dtype=torch.bool)
+    changed = torch.ones(commands.shape[:2], dtype=torch.bool, device=commands.device)
     changed[:, 1:] = (commands[:, 1:] != commands[:, :-1]).any(dim=-1)
     index = changed.flatten().nonzero()[:, 0]
     place = changed.flatten().cumsum(dim=0) - 1

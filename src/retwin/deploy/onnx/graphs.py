@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
@@ -14,21 +13,10 @@ from retwin.diagnosis import NetworkDiagnoser
 from retwin.diagnosis.features import Features
 from retwin.nets.student import shared_factor
 from retwin.update.corrections import Chain, Context, Correction, SampledSensor
+from retwin.update.corrections.tensor_segments import TensorSegments
 from retwin.update.residual import ResidualModel
 from retwin.update.residual.model import describe
 from retwin.update.surrogate import Surrogate
-
-
-@dataclass
-class TensorSegments:
-    """`Segments` with tensors for times, and without its checks, which a graph cannot hold."""
-
-    start: Tensor
-    settle: Tensor
-    stop: Tensor
-    valid: Tensor
-    steps: int
-    max_count: int
 
 
 class ResidualGraph(nn.Module):

@@ -88,7 +88,8 @@ class CommandSpace:
 
     def apply(self, context: Context, z: Tensor) -> Tensor:
         """ỹ = G_φ(T_z(u)), differentiable in z; a frozen actuator stays where z had brought it."""
-        times = torch.arange(context.faulty_commands.shape[1])
+        commands = context.faulty_commands
+        times = torch.arange(commands.shape[1], device=commands.device)
         return context.surrogate(_commands(context, z, times))
 
     def at(self, context: Context, z: Tensor, when: Tensor) -> Tensor:

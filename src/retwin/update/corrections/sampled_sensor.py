@@ -185,10 +185,11 @@ class SampledSensor:
     def polls(self, count: int, steps: int, generator: torch.Generator, rate: float) -> Tensor:
         """Time steps (count, R) at which records of that length are sampled, within the record."""
         every, phases = self.timing(rate)
-        choice = torch.tensor(phases or range(every))
-        phase = choice[torch.randint(len(choice), (count,), generator=generator)]
-        samples = -(-steps // every)
-        return (phase[:, None] + every * torch.arange(samples)).clamp_max(steps - 1)
+        device = generator.device
+        choice = torch.tensor(phases or range(every), device=device)
+        phase = choice[torch.randint(len(choice), (count,), generator=generator, device=device)]
+        samples = torch.arange(-(-steps // every), device=device)
+        return (phase[:, None] + every * samples).clamp_max(steps - 1)
 
     def record(self, values: Tensor, when: Tensor, steps: int, rate: float) -> Tensor:
         """The record (n, steps, d_y) of outputs (n, R, d_y), errors included, at `polls` (n, R)."""
@@ -203,29 +204,32 @@ class SampledSensor:
         if made is not None:
             return made
         last = (steps - 1 - phase) // every
-        following = (torch.arange(values.shape[1]) + 1).minimum(last)
+        time = torch.arange(max(steps, values.shape[1]), device=values.device)
+        following = (time[: values.shape[1]] + 1).minimum(last)
         ends = torch.stack([values, gather_samples(values, following) - values])
         # Linear interpolation between sampled values; as a matrix product it is fast.
-        share = torch.arange(every).to(values) / every
+        share = torch.arange(every, device=values.device).to(values) / every
         join = torch.stack([torch.ones_like(share), share], dim=1)
         lines = torch.einsum("ek,knrd->nred", join, ends).flatten(1, 2)
-        return gather_samples(lines, (torch.arange(steps) - phase).clamp_min(0))
+        return gather_samples(lines, (time[:steps] - phase).clamp_min(0))
 
     def errors(
         self, shape: tuple[int, ...], dtype: torch.dtype, generator: torch.Generator
     ) -> Tensor:
         """Errors of sampled values (n, R, d_y), which is the shape."""
-        error = torch.zeros(shape, dtype=dtype)
+        device = generator.device
+        error = torch.zeros(shape, dtype=dtype, device=device)
         if self.noise is not None:
-            level = torch.rand(shape, generator=generator, dtype=torch.float64)
+            level = torch.rand(shape, generator=generator, dtype=torch.float64, device=device)
             for j, quantiles in enumerate(self.noise):
                 quantile = level.new_tensor(quantiles)
                 place = level[..., j] * (len(quantile) - 1)
                 left = place.long().clamp_max(len(quantile) - 2)
                 error[..., j] = torch.lerp(quantile[left], quantile[left + 1], place - left)
         if self.glitch_probability and self.glitch_size is not None:
-            hit = torch.rand(shape[:2], generator=generator) < self.glitch_probability
-            size = torch.randn(shape, generator=generator).to(dtype)
+            level = torch.rand(shape[:2], generator=generator, device=device)
+            size = torch.randn(shape, generator=generator, device=device).to(dtype)
+            hit = level < self.glitch_probability
             error = error + hit[..., None] * error.new_tensor(self.glitch_size) * size
         return error
 

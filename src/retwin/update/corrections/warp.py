@@ -54,7 +54,8 @@ class Knots:
         # A segment cannot begin before the previous motion has ended, however the delays differ.
         target = (source + shift).cummax(dim=1).values
         last = (2 * valid.sum(dim=1, keepdim=True) - 1).clamp_min(0)
-        time = torch.arange(segments.steps, dtype=delay.dtype) if times is None else times
+        every = torch.arange(segments.steps, dtype=delay.dtype, device=delay.device)
+        time = every if times is None else times
         time = time.expand(len(target), -1).contiguous()
         right = torch.searchsorted(target.detach(), time.detach(), right=True).minimum(last + 1)
         begin = target.gather(1, (right - 1).clamp_min(0))

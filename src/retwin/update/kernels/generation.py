@@ -93,7 +93,8 @@ def effective_commands_at(
     """The effective commands (n, S, d_u) in double precision; see `effective_commands`."""
     kernel, tensors = library(), (reference, z, times, frozen)
     graded = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
-    if kernel is None or graded or z.dtype != torch.float64 or not times.numel():
+    suits = z.dtype == torch.float64 and z.is_cpu
+    if kernel is None or graded or not suits or not times.numel():
         return None
     if bool((times[:, 1:] < times[:, :-1]).any()):  # the kernel takes times in order
         return None
@@ -188,9 +189,7 @@ def joined_samples(values: Tensor, phase: Tensor, steps: int, every: int) -> Ten
 def _plain(*tensors: Tensor) -> bool:
     """Whether no gradient is wanted, and all are in single precision on the processor."""
     graded = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
-    return not graded and all(
-        each.dtype == torch.float32 and each.device.type == "cpu" for each in tensors
-    )
+    return not graded and all(each.dtype == torch.float32 and each.is_cpu for each in tensors)
 
 
 def _packed(surrogate: Any) -> tuple[NDArray, NDArray, NDArray] | None:

@@ -139,15 +139,15 @@ class ResidualModel(Residual):
         correlate by `persistence`, and they share the factor of `Student`. The marginal
         distribution of each segment's z is unchanged. Draws are differentiable.
         """
-        shape = distribution.batch_shape
-        uniform = torch.rand(*shape, len(distribution.blocks), generator=generator).to(self.bounds)
-        own = torch.randn(*shape, len(self.latent), generator=generator).to(self.bounds)
+        (count, segments), blocks = distribution.batch_shape, len(distribution.blocks)
+        made: Any = {"generator": generator, "device": generator.device}
+        uniform = torch.rand(count, segments, blocks, **made).to(self.bounds)
+        own = torch.randn(count, segments, len(self.latent), **made).to(self.bounds)
         if self.persistence.any():
-            common = torch.randn(shape[0], 1, len(self.latent), generator=generator).to(own)
+            common = torch.randn(count, 1, len(self.latent), **made).to(own)
             own = self.persistence.sqrt() * common + (1 - self.persistence).sqrt() * own
         if self.heavy_tailed:
-            shared = torch.rand(shape[0], 1, len(distribution.blocks), generator=generator)
-            uniform = shared_factor(shared.to(own), uniform)
+            uniform = shared_factor(torch.rand(count, 1, blocks, **made).to(own), uniform)
         return distribution.from_noise(uniform, own).clamp(-self.bounds, self.bounds)
 
 

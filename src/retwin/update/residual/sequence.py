@@ -230,16 +230,15 @@ class SequenceResidual(Residual):
         """
         members = list(self.distributions(past(context)))
         n, steps = members[0][0].batch_shape
-        chosen = torch.randint(len(members), (n,), generator=generator)
+        made: Any = {"generator": generator, "device": generator.device}
+        chosen = torch.randint(len(members), (n,), **made)
         drawn_from = Blocks(
             [_picked([each[block] for each in members], chosen) for block in range(len(self.sizes))]
         )
         first = torch.stack([part[0] for part in self.persistence.split(self.sizes)])
-        of_components = _autoregressive(
-            torch.randn(n, steps, len(first), generator=generator), first
-        )
+        of_components = _autoregressive(torch.randn(n, steps, len(first), **made), first)
         of_values = _autoregressive(
-            torch.randn(n, steps, len(self.latent), generator=generator), self.persistence
+            torch.randn(n, steps, len(self.latent), **made), self.persistence
         )
         z = drawn_from.from_noise(torch.special.ndtr(of_components), of_values)
         return z.clamp(-self.bounds, self.bounds)
@@ -282,7 +281,7 @@ def _pooled(members: Sequence[GaussianMixture]) -> GaussianMixture:
 
 def _picked(members: Sequence[GaussianMixture], chosen: Tensor) -> GaussianMixture:
     """For each trajectory the mixture of the member `chosen` (n,)."""
-    row = torch.arange(len(chosen))
+    row = torch.arange(len(chosen), device=chosen.device)
     parts: Any = zip(
         *((each.mixture_distribution.logits, each.means, each.factor) for each in members),
         strict=True,
@@ -292,8 +291,8 @@ def _picked(members: Sequence[GaussianMixture], chosen: Tensor) -> GaussianMixtu
 
 def _autoregressive(noise: Tensor, coefficients: Tensor) -> Tensor:
     """A stationary first-order autoregression of unit variance from white noise (n, T, d)."""
-    made = noise.numpy().astype(np.float64)
+    made = noise.cpu().numpy().astype(np.float64)
     for component, coefficient in enumerate(coefficients.double().tolist()):
         made[:, 1:, component] *= np.sqrt(1 - coefficient**2)
         made[..., component] = lfilter([1.0], [1.0, -coefficient], made[..., component], axis=1)
-    return torch.as_tensor(made).to(noise)
+    return torch.from_numpy(made).to(noise)
