@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.twins.command_range import CommandRange
+from retwin.twins.command_range import CommandRange, part_of
 
 RATE, STEPS = 610.0, 610
 INPUTS = rt.Channels(("a", "b"), ("V", "1"))
@@ -61,6 +61,15 @@ def test_a_weak_signal_of_other_frequencies_is_outside(trained: CommandRange) ->
     scores = trained.scores(weak, RATE)
     assert (scores[:, :2] <= 1).all()
     assert (scores[:, 2] > 1).all()
+
+
+def test_of_a_part_as_many_spectra_are_compared_as_of_the_whole(trained: CommandRange) -> None:
+    weak = 0.03 * sines(40, 68.0, 0)
+    assert ((trained.scores(weak, RATE) > 1).any(axis=(1, 2))).sum() == 40
+    for whole, compared in ((400, 40), (4000, 10), (1_000_000, 1)):
+        with part_of(whole):
+            scores = trained.scores(weak, RATE)
+        assert ((scores > 1).any(axis=(1, 2))).sum() == compared
 
 
 def test_rounding_and_constants_are_no_frequencies(trained: CommandRange) -> None:

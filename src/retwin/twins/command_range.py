@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
-from math import inf
+from math import ceil, inf
 from typing import Any
 
 import numpy as np
@@ -287,6 +289,20 @@ def _above(frequency: NDArray, spectra: NDArray, limit: NDArray, power: NDArray)
     return np.divide(above, whole, out=np.zeros_like(above), where=power > 0)
 
 
+_WHOLE: ContextVar[int] = ContextVar("whole", default=0)
+
+
+@contextmanager
+def part_of(count: int) -> Iterator[None]:
+    """In this block commands are a part of `count` such, of which a thousand spectra are enough."""
+    token = _WHOLE.set(count)
+    try:
+        yield
+    finally:
+        _WHOLE.reset(token)
+
+
 def chosen_for_spectra(count: int) -> NDArray:
-    """Indices of at most a thousand trajectories, evenly chosen."""
-    return np.unique(np.linspace(0, count - 1, min(count, MAX_SPECTRA)).round().astype(int))
+    """Indices of at most a thousand trajectories, evenly chosen; of fewer in `part_of` a set."""
+    share = min(1.0, MAX_SPECTRA / max(count, _WHOLE.get(), 1))
+    return np.unique(np.linspace(0, count - 1, ceil(share * count)).round().astype(int))

@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from retwin.arrays import is_finite
 from retwin.checks import at_least, one_of, require, whole
 from retwin.data.io.header import CHUNKED_NAMES, FAILED
 from retwin.data.trajectories import HEALTHY, Channels, Provenance, Trajectories
 from retwin.errors import InputError, place_of
 from retwin.progress import Progress
 from retwin.twins.collected import SimulationError
+from retwin.twins.command_range import part_of
 from retwin.twins.faults import Fault
 from retwin.twins.limits import Limits
 from retwin.twins.twin import Twin, checked_commands
@@ -270,7 +272,7 @@ def _simulated(
     classes = rows % len(plan.faults)
     faults = list(plan.faults.values())
     # With more threads sums would have another order, hence other bytes, and workers would compete.
-    with threadpool_limits(limits=1):
+    with threadpool_limits(limits=1), part_of(plan.count):
         commands = plan.drawn(rows, np.random.default_rng(for_commands))
         try:
             made = plan.twin.simulate(
@@ -308,7 +310,10 @@ def _stored(
     )
     given = {name: getattr(made, name) for name in ("commands", "nominal", "observed")}
     with np.errstate(over="ignore"):
-        given = {name: array.astype(plan.dtype) for name, array in given.items()}
+        given = {name: array.astype(plan.dtype, copy=False) for name, array in given.items()}
+    given["mask"] = made.mask
+    if not failed and all(map(is_finite, given.values())):
+        return SimulatedChunk(given | {"labels": classes.astype(np.int16)}, {}, made.emulated)
     finite = np.all([np.isfinite(array).all(axis=(1, 2)) for array in given.values()], axis=0)
     failed |= {int(i): f"a value is too large for {plan.dtype}" for i in good[~finite]}
     arrays = {
@@ -318,7 +323,7 @@ def _stored(
         "mask": np.zeros((len(commands), plan.steps, width), dtype=bool),
         "labels": np.full(len(commands), FAILED, np.int16),
     }
-    for name, values in (given | {"mask": made.mask}).items():
+    for name, values in given.items():
         arrays[name][good[finite]] = values[finite]
     arrays["labels"][good[finite]] = classes[good[finite]]
     assert tuple(arrays) == CHUNKED_NAMES
