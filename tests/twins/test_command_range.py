@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import retwin as rt
-from retwin.twins.command_range import CommandRange, part_of
+from retwin.twins.command_range import CommandRange, extremes, part_of
+from retwin.twins.compiled import commands as compiled_commands
 
 RATE, STEPS = 610.0, 610
 INPUTS = rt.Channels(("a", "b"), ("V", "1"))
@@ -88,6 +89,20 @@ def test_a_constant_channel_has_no_tolerance_in_its_unit() -> None:
     zero = CommandRange.of(np.zeros((3, 50, 2)), RATE)
     assert "b is -1e-06" in zero.outside(np.full((2, 50, 2), -1e-6), RATE, INPUTS)
     assert zero.outside(np.zeros((2, 50, 2)), RATE, INPUTS) == ""
+
+
+@pytest.mark.parametrize("shape", [(5, 1, 3), (3, 2, 1), (7, 1000, 4), (2, 77, 256), (3, 9, 300)])
+def test_compiled_extremes_are_those_of_numpy(
+    shape: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = np.random.default_rng(0).normal(size=shape).astype(np.float32)
+    unknown = values.copy()
+    unknown[-1, -1, -1] = np.nan
+    found = [extremes(values), extremes(unknown)]
+    monkeypatch.setattr(compiled_commands, "library", lambda: None)
+    for made, given in zip(found, (values, unknown), strict=True):
+        np.testing.assert_array_equal(made, extremes(given))
+    assert np.isnan(found[1][0]).any()
 
 
 def test_a_single_sample_has_a_range() -> None:

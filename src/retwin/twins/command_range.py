@@ -18,6 +18,7 @@ from retwin.arrays import floats, row_blocks
 from retwin.checks import one_per
 from retwin.data.trajectories import Channels
 from retwin.threads import in_threads
+from retwin.twins.compiled import commands as compiled_commands
 
 TOLERANCE = 0.02
 """How far a value may leave its range, as a share of the range's width."""
@@ -220,6 +221,9 @@ ARRAYS = ("low", "high", "speed", "band", "share", "power")
 def extremes(values: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Least and greatest value, and greatest change by one sample, (n, d) each, of (n, T, d)."""
     series = np.asarray(values)
+    made = compiled_commands.extremes(series)
+    if made is not None:
+        return tuple(each.astype(np.float64) for each in made)  # type: ignore[return-value]
     if series.dtype.kind != "f" or series.dtype.itemsize < 4:
         series = series.astype(np.float64)
     change = np.abs(series[:, 1:] - series[:, :-1])
@@ -276,7 +280,8 @@ def _of_spectra(
     def of_block(rows: slice) -> NDArray:
         values = np.asarray(commands[chosen[rows]], np.float32)
         values = (values - values.mean(axis=1, keepdims=True)) * window
-        spectra = np.abs(fft.rfft(np.ascontiguousarray(np.moveaxis(values, 1, 2)), axis=2)) ** 2
+        found = fft.rfft(np.ascontiguousarray(np.moveaxis(values, 1, 2)), axis=2)
+        spectra = found.real**2 + found.imag**2
         return function(np.moveaxis(spectra, 2, 1) * scale)
 
     return in_threads(of_block, list(row_blocks(commands, len(chosen))))

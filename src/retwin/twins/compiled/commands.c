@@ -1,5 +1,6 @@
-/* Ramps and holds, and biased references; `ramps.py` and `faults.py` in `retwin.twins` are the same
-   in numpy, to the last digit, and explain them. */
+/* Ramps and holds, biased references, and extremes; `ramps.py`, `faults.py` and `command_range.py` in
+   `retwin.twins` are the same in numpy, to the last digit, and explain them. */
+#define LANES 256 /* values that are compared with as many others at once, whole samples of them */
 
 static i64 bounded(double t, i64 low, i64 high)
 {
@@ -93,5 +94,51 @@ EXPORT void biases(i64 n, i64 steps, i64 segments, i64 d, double unused, const i
             before = level;
         }
         for (; filled < steps; filled++) biased[filled * d] = (float)(clean[filled * d] + held);
+    }
+}
+
+/* Least and greatest value and greatest change by one sample, (n, d) each, of values (n, T, d) with
+   d up to LANES. Of a trajectory with NaN, `done` is 0. */
+EXPORT void extremes(i64 n, i64 steps, i64 d, double unused, const float *values, float *least,
+                     float *greatest, float *change, unsigned char *done)
+{
+    (void)unused;
+    i64 lanes = LANES / d * d, size = steps * d;
+    for (i64 row = 0; row < n; row++, values += size) {
+        float low[LANES], high[LANES], step[LANES];
+        int unknown = 0;
+        for (i64 j = 0; j < lanes; j++) {
+            low[j] = high[j] = values[j % d];
+            step[j] = 0.0f;
+        }
+        i64 i = 0;
+        for (; i + lanes + d <= size; i += lanes) {
+            const float *here = values + i, *next = here + d;
+            for (i64 j = 0; j < lanes; j++) {
+                float value = here[j], moved = fabsf(next[j] - value);
+                low[j] = value < low[j] ? value : low[j];
+                high[j] = value > high[j] ? value : high[j];
+                step[j] = moved > step[j] ? moved : step[j];
+                unknown |= value != value;
+            }
+        }
+        for (; i < size; i++) {
+            float value = values[i], moved = i + d < size ? fabsf(values[i + d] - value) : 0.0f;
+            i64 c = i % d;
+            low[c] = value < low[c] ? value : low[c];
+            high[c] = value > high[c] ? value : high[c];
+            step[c] = moved > step[c] ? moved : step[c];
+            unknown |= value != value;
+        }
+        for (i64 j = d; j < lanes; j++) {
+            i64 c = j % d;
+            low[c] = low[j] < low[c] ? low[j] : low[c];
+            high[c] = high[j] > high[c] ? high[j] : high[c];
+            step[c] = step[j] > step[c] ? step[j] : step[c];
+        }
+        memcpy(least + row * d, low, d * sizeof(float));
+        memcpy(greatest + row * d, high, d * sizeof(float));
+        memcpy(change + row * d, step, d * sizeof(float));
+        done[row] = !unknown;
     }
 }

@@ -1,4 +1,4 @@
-"""Ramps and holds, and biased references, in one compiled pass: `commands.c`.
+"""Ramps and holds, biased references, and extremes, in one compiled pass: `commands.c`.
 
 Results are those of the same functions in numpy, to the last digit. A function that does not apply,
 without a C compiler or for another precision, gives None.
@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 
 from retwin.compiler import call, compiled_files
 from retwin.data.segments import Segments
+
+LANES = 256
+"""Channels at most of `extremes`, as in `commands.c`."""
 
 
 def library() -> ctypes.CDLL | None:
@@ -73,3 +76,20 @@ def biased_references(
     sizes = (*commands.shape[:2], segments.max_count, commands.shape[2])
     call(kernel, "biases", sizes, 0.0, (), (*given, np.ascontiguousarray(commands), out))
     return True
+
+
+def extremes(values: NDArray) -> tuple[NDArray, NDArray, NDArray] | None:
+    """Least and greatest value and greatest change, (n, d) each; see `command_range.extremes`.
+
+    None also where a value is NaN.
+    """
+    kernel = library()
+    n, steps, width = values.shape
+    suits = values.dtype == np.float32 and steps and 0 < width <= LANES
+    if kernel is None or not suits:
+        return None
+    found = tuple(np.empty((n, width), np.float32) for _ in range(3))
+    done = np.empty(n, np.uint8)
+    rows = (np.ascontiguousarray(values), *found, done)
+    call(kernel, "extremes", (n, steps, width), 0.0, (), rows)
+    return found if done.all() else None  # type: ignore[return-value]
