@@ -246,12 +246,7 @@ def solve(
             hopeless = torch.zeros_like(done)
         ended = (done & ~hopeless).nonzero()[:, 0]
         if len(ended):
-            gradient = torch.zeros_like(x)
-            if bounds is not None:
-                held = ((x <= bounds.lower) | (x >= bounds.upper)).any(dim=1) & done
-                gradient[held] = _gradient(
-                    problem, prior, noise, x, linearised, held.nonzero()[:, 0]
-                )
+            gradient = _gradient_at_limits(problem, prior, noise, x, linearised, bounds, done)
             part = Solution(x, energy, step.curvature, occam - energy, gradient)
             found = found.put(rows[ended], part[ended])
         going = (~done & ~hopeless).nonzero()[:, 0]
@@ -291,19 +286,27 @@ def _objective(
     return noise.misfit(problem, residual).sum(dim=1) + prior.energy(x)
 
 
-def _gradient(
+def _gradient_at_limits(
     problem: Problem,
     prior: GaussianPrior,
     noise: Noise,
     x: Tensor,
     linearised: tuple[Tensor, Tensor],
-    rows: Tensor,
+    bounds: Bounds | None,
+    done: Tensor,
 ) -> Tensor:
-    """Gradient (k, P) of the objective at x (R, P), of some rows (k,)."""
-    residual, jacobian = (each[rows] for each in linearised)
-    weighted = (residual * noise.precision(problem[rows], residual)).flatten(1)
-    slope = (jacobian.flatten(1, 2).mT @ weighted[..., None])[..., 0]
-    return prior[rows].gradient(x[rows]) - slope
+    """The gradient (R, P) of a `Solution` at x: of rows (R,) that are done and at a limit."""
+    gradient = torch.zeros_like(x)
+    if bounds is None:
+        return gradient
+    beyond = (x <= bounds.lower) | (x >= bounds.upper)
+    rows = (beyond.any(dim=1) & done).nonzero()[:, 0]
+    if len(rows):
+        residual, jacobian = (each[rows] for each in linearised)
+        weighted = (residual * noise.precision(problem[rows], residual)).flatten(1)
+        slope = (jacobian.flatten(1, 2).mT @ weighted[..., None])[..., 0]
+        gradient[rows] = prior[rows].gradient(x[rows]) - slope
+    return gradient
 
 
 def _extrapolation(move: Tensor, before: Tensor, metric: Tensor) -> Tensor:
