@@ -30,7 +30,7 @@ from retwin.update.corrections.tensor_segments import TensorSegments
 from retwin.update.surrogate import Surrogate
 from retwin.update.training_range import training_checked
 
-CHUNK = 1024
+TRAJECTORIES = 1024
 """Trajectories that are simulated together by default."""
 
 
@@ -95,7 +95,7 @@ class DeviceTwin:
         *,
         faults: Sequence[Fault | None] | None = None,
         seed: int,
-        chunk: int = CHUNK,
+        chunk: int = TRAJECTORIES,
     ) -> Records:
         """Simulate as `CorrectedTwin.simulate` does, with noise of the device's own generator.
 
@@ -224,8 +224,8 @@ def segments_of(commands: Tensor, tolerance: float = 1e-6) -> Segments:
     extent = commands.amax(dim=(0, 1)) - commands.amin(dim=(0, 1))
     smallest = tolerance * torch.where(extent > 0, extent.double(), 1.0)
     edges = []
-    for begin in range(0, len(commands), CHUNK):
-        some = commands[begin : begin + CHUNK]
+    for begin in range(0, len(commands), TRAJECTORIES):
+        some = commands[begin : begin + TRAJECTORIES]
         moving = (some.diff(dim=1).abs() > smallest.to(some)).any(dim=2)
         padded = torch.nn.functional.pad(moving, (1, 1))
         rows, samples = (padded[:, 1:] != padded[:, :-1]).nonzero().cpu().numpy().T
