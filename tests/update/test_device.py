@@ -246,8 +246,10 @@ def test_what_cannot_be_simulated_is_refused() -> None:
             made.records(given, seed=0)
     with pytest.raises(rt.InputError, match="chunk"):
         made.records(commands, seed=0, chunk=0)
-    with pytest.raises(rt.InputError, match="faults"):
-        made.records(commands, faults=[None], seed=0)
+    few: tuple[list[Fault | None], ...] = ([None], [], [Stuck(9, 1.0), None])
+    for faults in few:
+        with pytest.raises(rt.InputError, match="faults"):
+            made.records(commands, faults=faults, seed=0)
     with pytest.raises(rt.InputError, match="seed"):
         made.records(commands, seed=-1)
 

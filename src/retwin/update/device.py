@@ -132,10 +132,11 @@ class DeviceTwin:
         sent, twin = self._sent(commands), self.twin
         generator = torch.Generator(self.device).manual_seed(checked_seed(seed))
         size = whole("chunk", chunk, least=1, remedy="leave it out")
-        check_faults(faults or (), len(twin.inputs), len(twin.outputs), ())
+        faults = [None] * len(sent) if faults is None else faults
+        check_faults(faults, len(twin.inputs), len(twin.outputs), ())
         self._check_range(sent)
         segments = segments_of(sent)
-        drawn = draw_faults(faults or [None] * len(sent), segments, seed, rate=twin.rate)
+        drawn = draw_faults(faults, segments, seed, rate=twin.rate)
         shape = *sent.shape[:2], len(twin.outputs)
         made = Records(sent.new_empty(shape), sent.new_empty(shape))
         for begin in range(0, len(sent), size):
