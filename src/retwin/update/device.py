@@ -276,7 +276,8 @@ def may_be_outside(trained: CommandRange, commands: Tensor, rate: float) -> bool
 def _usable(device: str | torch.device) -> torch.device:
     """The device, if torch has a generator and double precision there."""
     try:
-        torch.zeros(1, dtype=torch.float64, device=torch.Generator(device).device)
+        found = torch.device(device)
+        torch.zeros(1, dtype=torch.float64, device=torch.Generator(found).device)
     except (AssertionError, NotImplementedError, RuntimeError, TypeError) as error:
         raise InputError(
             "device",
@@ -284,7 +285,7 @@ def _usable(device: str | torch.device) -> torch.device:
             got=f"{device} ({brief(error)})",
             remedy="give 'cpu', or install torch for that device",
         ) from error
-    return torch.device(device)
+    return found
 
 
 def _check_finite(made: Records) -> None:
