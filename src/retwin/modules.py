@@ -43,9 +43,11 @@ def import_beside(name: str, folder: Path) -> ModuleType:
     top = name.partition(".")[0]
     if top and top not in sys.modules:
         _FINDER.paths.pop(top, None)
-        if find_spec(top) is None:
+        spec = find_spec(top)
+        # A folder on the path is a package without __init__.py, which any module goes before.
+        if spec is None or not spec.origin:
             package, module = folder.resolve() / top, folder.resolve() / f"{top}.py"
-            candidates = (package / "__init__.py", module, package)
+            candidates = (package / "__init__.py", module, *[package] * (spec is None))
             found = next((each for each in candidates if each.exists()), None)
             if found is not None:
                 _FINDER.paths[top] = str(found)
@@ -63,7 +65,7 @@ def add_known(paths: Mapping[str, str]) -> None:
 
 
 class _Finder(MetaPathFinder):
-    """Finds modules by their paths; the last one that Python asks."""
+    """Finds modules by their paths; asked first, before a folder of that name is taken."""
 
     def __init__(self) -> None:
         self.paths: dict[str, str] = {}
@@ -108,4 +110,4 @@ class _Loader(SourceFileLoader):
 
 
 _FINDER = _Finder()
-sys.meta_path.append(_FINDER)
+sys.meta_path.insert(0, _FINDER)

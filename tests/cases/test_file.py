@@ -441,6 +441,17 @@ def test_a_module_beside_the_case_is_found_alone(
     assert made.observed.min() == made.observed.max() == 2
 
 
+def test_a_folder_of_that_name_is_not_taken(
+    read: Callable[..., rt.Case], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As for a project whose folder has the name of its module, with its parent on the path."""
+    (tmp_path / "above" / "toy_project").mkdir(parents=True)
+    (tmp_path / "toy_project.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(str(tmp_path / "above"))
+    case = read(BASE.replace("toy_module:", "toy_project:"))
+    assert case.twin.simulate(np.ones((1, 9, 2)), seed=0).observed.min() == 3
+
+
 def test_another_module_of_that_name_is_not_taken(
     read: Callable[..., rt.Case], tmp_path: Path
 ) -> None:
