@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from retwin.checks import require
 from retwin.data.trajectories import Trajectories
@@ -13,6 +14,13 @@ and the squares of larger numbers are infinite."""
 USUAL = 0.99
 """Quantile of the magnitudes of measurements that is their usual size: a file has fewer values that
 stand for a missing measurement, or they are the measurements."""
+
+REPEATED, DISTINCT, FAR = 3, 10, 10.0
+"""A value stands for a missing measurement if it occurs REPEATED times at least, and is FAR times
+further from all others, of which DISTINCT at least differ, than these are from each other. Codes
+such as -9999 are; sensors have noise, and hardly repeat a value so far away."""
+ROUNDED = 1e-6
+"""Relative difference of values that are one: resampling and float32 round."""
 
 
 def check_magnitude(argument: str, trajectories: Trajectories, *, ideal: bool = False) -> None:
@@ -67,6 +75,52 @@ def unmeasured(trajectories: Trajectories) -> str:
     return (
         f"nothing was measured in {', '.join(trajectories.ids[none].tolist())}, which are not used"
     )
+
+
+def stand_in(values: NDArray) -> tuple[float, int] | None:
+    """The value that seems to stand for a missing measurement, and how often it occurs.
+
+    Parameters
+    ----------
+    values : NDArray
+        (n,) of one channel; NaN where nothing was measured.
+
+    Returns
+    -------
+    tuple of float and int, or None
+        None if no value is so far from all others.
+
+    """
+    known = values[np.isfinite(values)]
+    for extreme in (known.min, known.max) if len(known) else ():
+        value = float(extreme())
+        others = known[~np.isclose(known, value, rtol=ROUNDED, atol=0.0)]
+        if len(others) <= DISTINCT or len(known) - len(others) < REPEATED:
+            continue
+        low, high = float(others.min()), float(others.max())
+        away = min(abs(low - value), abs(high - value))
+        if away > FAR * (high - low) and len(np.unique(others[: 100 * DISTINCT])) > DISTINCT:
+            return value, len(known) - len(others)
+    return None
+
+
+def doubtful(trajectories: Trajectories) -> list[str]:
+    """Notes about outputs from whose measurements nothing, or something wrong, is learned.
+
+    They never changed, or hold a value that seems to stand for a missing measurement.
+    """
+    notes = []
+    for k, name in enumerate(trajectories.outputs.names):
+        values = trajectories.observed[..., k][trajectories.mask[..., k]]
+        if len(values) > 1 and values.min() == values.max():
+            notes.append(f"{name} never changes, so that it shows no dynamics: check its sensor")
+        coded = stand_in(values)
+        if coded:
+            notes.append(
+                f"{name} is {coded[0]:g} at {coded[1]} samples, far from all others: replace it "
+                "by NaN if it stands for a missing measurement"
+            )
+    return notes
 
 
 def measured_only(trajectories: Trajectories) -> Trajectories:

@@ -13,6 +13,7 @@ from retwin.checks import require
 from retwin.data.logs.mapping import ChannelMapping
 from retwin.data.logs.signals import MAX_SIGNALS, NO_STAMP, UNWANTED, Log, Signal
 from retwin.data.logs.units import converted, same_unit
+from retwin.data.measured import stand_in
 from retwin.data.provenance import Sampling
 from retwin.data.resampling import Resampling, longest_bridge, resampled
 from retwin.data.trajectories import Channels
@@ -144,6 +145,12 @@ def _channel(
     signal, notes = in_order(_mean_of(log, own.signals), log.name)
     if signal.unreadable:
         notes.append(f"{signal.unreadable} values are no numbers")
+    coded = stand_in(signal.values)
+    if coded:
+        notes.append(
+            f"{coded[1]} values are {coded[0]:g}, far from all others: make them empty or NaN if "
+            "they stand for missing ones"
+        )
     topics = [topic for topic, why in log.skipped.items() if why == NO_STAMP]
     if any(
         signal.name == each or signal.name.startswith((f"{each}.", f"{each}[")) for each in topics

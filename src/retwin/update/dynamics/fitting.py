@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from retwin.checks import require
-from retwin.data.measured import unmeasured
+from retwin.data.measured import doubtful, unmeasured
 from retwin.data.trajectories import Trajectories
 from retwin.progress import Progress
 from retwin.twins.parametric import ParametricTwin
@@ -67,8 +67,8 @@ class FittedDynamics:
     seconds : float
         Duration.
     reason : str
-        What the result does not cover: parameters and starts that are at bounds, and parameters
-        that the record does not determine.
+        What the result does not cover: parameters and starts that are at bounds, parameters
+        that the record does not determine, and measurements that are doubtful.
 
     """
 
@@ -126,8 +126,9 @@ def fit_dynamics(
     Warns
     -----
     UserWarning
-        A parameter, or the start of a state, is at its bound, or the record does not determine a
-        parameter.
+        A parameter, or the start of a state, is at its bound, the record does not determine a
+        parameter, or an output never changes or holds a value that seems to stand for a missing
+        measurement.
 
     """
     began = time.perf_counter()
@@ -147,9 +148,8 @@ def fit_dynamics(
     made = replace(made, widening=widening(made, estimation, held_out))
     report(1.0)
     unknown = estimation.undetermined(found)[: unknowns.count]
-    notes = "; ".join(
-        filter(None, [_notes(estimation, found.point, unknown), unmeasured(observed)])
-    )
+    own = [_notes(estimation, found.point, unknown), unmeasured(observed), *doubtful(observed)]
+    notes = "; ".join(filter(None, own))
     if notes:
         warnings.warn(notes, stacklevel=2)
     k, count = unknowns.count, len(found.point.shared)
