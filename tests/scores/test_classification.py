@@ -78,6 +78,12 @@ def test_classes_that_do_not_occur_do_not_count() -> None:
     assert got.balanced_accuracy == pytest.approx(0.75)
 
 
+def test_what_is_not_defined_is_called_so() -> None:
+    shown = str(score(np.array([0]), np.array([[0.8, 0.2]]), ("Healthy", "leak")))
+    assert "auroc undefined" in shown
+    assert "nan" not in shown
+
+
 def test_shares_of_rows() -> None:
     np.testing.assert_array_equal(row_shares([[1, 3], [0, 0]]), [[0.25, 0.75], [0, 0]])
 

@@ -61,7 +61,11 @@ class Scores:
     n: int
 
     def __str__(self) -> str:
-        values = ", ".join(f"{name} {getattr(self, name):.3f}" for name in METRICS)
+        found = {name: getattr(self, name) for name in METRICS}
+        values = ", ".join(
+            f"{name} {each:.3f}" if np.isfinite(each) else f"{name} undefined"
+            for name, each in found.items()
+        )
         return f"{values} ({self.n} trajectories)"
 
 
