@@ -99,7 +99,15 @@ class Slack:
             Rounded up to multiples of 0.01.
 
         """
-        count = finite("samples", samples, least=8, remedy="calibrate on a longer healthy record")
+        require(
+            8 <= samples < np.inf,
+            "samples",
+            expected="an effective number of at least 8 independent errors of prediction",
+            got=f"{samples:.3g}",
+            remedy="calibrate on longer healthy records; where errors persist for most of a long "
+            "one, the twin does not follow that machine: fit it to the machine first",
+        )
+        count = float(samples)
         finite("confidence", confidence, least=0.5, most=0.9999)
         variance = (np.pi / 2 + whole("parameters", parameters)) / count
         shift = ndtri((1 + confidence) / 2) * np.sqrt(variance)
