@@ -87,6 +87,8 @@ def test_state_equations_are_fitted_and_generate(folder: Path, tmp_path: Path, c
     assert (code, len(rt.load(tmp_path / "g.npz"))) == (0, 4), err
     code, printed, _ = call("twin", "info", out)
     assert (code, "level" in printed) == (0, True)
+    code, _, err = call("bundle", "save", out, tmp_path / "g.npz", "--out", tmp_path / "bundle")
+    assert (code, "retwin export fmu" in err) == (2, True)
 
 
 FUNCTION = """

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from retwin.checks import require
 from retwin.cli.commands import Commands
 from retwin.cli.diagnose import EMULATED, diagnoses, write_probabilities
 from retwin.cli.options import (
@@ -22,7 +23,7 @@ from retwin.cli.options import (
     Real,
     Seed,
 )
-from retwin.cli.reading import case_named, data_case, read, saved
+from retwin.cli.reading import case_named, data_case, read, saved, updated_twin
 from retwin.cli.terminal import answer, bar, command_given, example, note, table
 from retwin.data.io import check_target
 from retwin.serialisation.places import check_place
@@ -59,7 +60,14 @@ def save(
     from retwin.deploy.bundle.seal import SUMS
 
     check_place(out, folder=True, holds=("model.json", SUMS, "twin", "guard", "diagnoser"))
-    twin = rt.CorrectedTwin.load(saved(model))
+    twin = updated_twin(model)
+    require(
+        isinstance(twin, rt.CorrectedTwin),
+        "MODEL",
+        expected="a corrected surrogate, of `retwin fit`",
+        got=f"corrected dynamics, {model}",
+        remedy="fit without --dynamics, or make an FMU of it: retwin export fmu",
+    )
     system = rt.cases.get(case or twin.case)
     classifier = None if diagnoser is None else rt.load_diagnoser(diagnoser)
     calibration = read(real, system, max_bytes=max_bytes, mapping=mapping)

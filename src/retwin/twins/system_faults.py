@@ -371,5 +371,8 @@ def check_faults(
                 if shiftable
                 else "a twin whose parameters can change during a simulation",
                 got=fault,
-                remedy="check the spelling" if shiftable else "write the twin as a StateTwin",
+                remedy="check the spelling"
+                if shiftable
+                else "take a StateTwin, or its corrected dynamics (retwin fit --dynamics): other "
+                "twins, and surrogates, have no such parameters",
             )

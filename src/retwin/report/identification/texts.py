@@ -157,7 +157,8 @@ def _begins(found: Identification) -> Iterator[str]:
         yield (
             f"The error is larger in the first tenth of the trajectories than later: {shown}. "
             "Probably the system did not begin in the state in which the twin starts, as after a "
-            "pause of the log: leave that time out (--transient), or free the start of the state."
+            "pause of the log: leave that time out (--transient), or free the start of the state, "
+            "which is then one for all trajectories."
         )
 
 
