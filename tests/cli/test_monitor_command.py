@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 import retwin as rt
+from retwin.cli.monitor import _written
+from retwin.monitor import Alarm
+from retwin.monitor.cause import Cause
 from retwin.twins import ParameterShift
 from retwin.update import DynamicsTwin
 
@@ -23,6 +26,14 @@ def test_a_monitor_is_calibrated_and_its_promise_printed(watched: Path, call, tm
     assert "86400 measured samples (1 day)" in found["promises"]["level"]
     code, printed, _ = call("monitor", "replay", out, watched / "healthy.npz", "--case", "none")
     assert code == 2
+
+
+def test_an_alarm_without_a_cause_is_written_without_its_time() -> None:
+    nothing, alarm = (np.nan,) * 3, Alarm("tank", 3, 3.0, "level", "higher than predicted", 1e6)
+    named = {"leaking": 0.3, "Healthy": 0.7}
+    assert _written(Cause(alarm, "Healthy", 0.7, 0.9, nothing, nothing, named)) == "no known fault"
+    onset = (2.0, 1.0, 3.0)
+    assert _written(Cause(alarm, "leaking", 0.7, 0.0, onset, onset, named)) == "leaking from 2 s"
 
 
 def test_a_leak_is_reported_with_its_time_and_cause(watched: Path, call) -> None:

@@ -196,7 +196,9 @@ def test_what_is_wrong_is_refused_before_the_store_is_made(tmp_path: Path, call)
         (SETTINGS.replace('"watch"', '"none"'), "none"),
         (SETTINGS.replace("[assets.tank1]", "[assets]"), "assets.twin"),
         (SETTINGS + SERVER, "token"),
+        (SETTINGS + SERVER.replace('"token"', '"short"'), "at least 16 ASCII characters"),
     ):
+        (tmp_path / "short").write_text("short")
         (tmp_path / "monitor.toml").write_text(text)
         code, printed, err = call("monitor", "run", "--config", tmp_path / "monitor.toml")
         assert (code, printed, err.count("\n"), message in err) == (2, "", 1, True), err

@@ -11,6 +11,7 @@ import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -357,8 +358,11 @@ def _causes(
 
 def _written(cause: Cause) -> str:
     """A cause with its onset, and whether there is more to it."""
-    more = ", and more than that" if cause.unknown > UNEXPLAINED else ""
-    return f"{cause.name} from {cause.onset[0]:.6g} s{more}"
+    from retwin.monitor.cause import cause_title
+
+    since = "" if isnan(cause.onset[0]) else f" from {cause.onset[0]:.6g} s"
+    more = ", and more than that" if since and cause.unknown > UNEXPLAINED else ""
+    return f"{cause_title(cause.name)}{since}{more}"
 
 
 def _summary(file: Path, record: Trajectories, watched: Watched) -> str:

@@ -66,6 +66,11 @@ class Cause:
     probabilities: dict[str, float]
 
 
+def cause_title(name: str) -> str:
+    """A cause as it is shown: an alarm that the healthy class explains best has no known cause."""
+    return "no known fault" if name == HEALTHY else name
+
+
 def cause_data(
     name: str,
     probability: float,

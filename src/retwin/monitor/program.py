@@ -17,6 +17,7 @@ from retwin.checks import require
 from retwin.data.logs.mapping import read_mapping
 from retwin.errors import InputError
 from retwin.monitor.audit import Entry
+from retwin.monitor.cause import cause_title
 from retwin.monitor.explanations import Explanations
 from retwin.monitor.gate import Gate
 from retwin.monitor.kinds import AnyMonitor, load_monitor
@@ -24,6 +25,7 @@ from retwin.monitor.live import Live
 from retwin.monitor.registry import Registry
 from retwin.monitor.samples import SECOND
 from retwin.monitor.server import create_app, listening, serving
+from retwin.monitor.server.app import check_token
 from retwin.monitor.settings import (
     FolderSource,
     MonitorSettings,
@@ -75,6 +77,7 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
     """
     with ExitStack() as opened:
         bound = settings.server and opened.enter_context(_bound(settings.server))
+        token = check_token(_token(settings.server)) if settings.server else ""
         for twin in settings.twins.values():
             load_monitor(twin.monitor)
         store = Store(settings.store, settings.url, max_samples=settings.max_samples)
@@ -100,7 +103,7 @@ def run(settings: MonitorSettings, report: Callable[[str], None], stop: threadin
             app = create_app(
                 live,
                 gate,
-                token=_token(settings.server),
+                token=token,
                 hosts=settings.server.hosts,
                 explanations=explanations,
                 sources={each.name: partial(getattr, each, "connected") for each in sources},
@@ -128,7 +131,7 @@ def described(entry: Entry) -> str:
         onset = data["onset"][0]
         since = "" if onset is None else f" from {_moment(onset)}"
         more = ", and more than that" if data["unknown"] > UNEXPLAINED else ""
-        text = f"cause of alarm {data['alarm']}: {data['name']}{since}{more}"
+        text = f"cause of alarm {data['alarm']}: {cause_title(data['name'])}{since}{more}"
         return f"{data['asset']}: {text} (probability {data['probability']:.2f})"
     texts = {
         "alarm": "ALARM {sequence}: {output}, {change}",
@@ -139,7 +142,8 @@ def described(entry: Entry) -> str:
         return ""
     text = texts[entry.kind].format(sequence=entry.sequence, **data)
     if "cause" in data:
-        text += f", cause: {data['cause']['name']}, probability {data['cause']['probability']:.2f}"
+        name, probability = cause_title(data["cause"]["name"]), data["cause"]["probability"]
+        text += f", cause: {name}, probability {probability:.2f}"
     return f"{data['asset']}: {text} ({_moment(data['time'])})"
 
 

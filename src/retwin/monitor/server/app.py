@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pydantic_core import to_jsonable_python
 
 from retwin._version import __version__
-from retwin.checks import at_most, needs_extra, require
+from retwin.checks import at_most, needs_extra
 from retwin.errors import InputError
 from retwin.monitor.decision import Decision
 from retwin.monitor.explanations import Explanations
@@ -78,6 +78,18 @@ class Step(BaseModel):
     reason: str = Field("", max_length=2000)
 
 
+def check_token(token: str | None) -> str:
+    """The token, if it is long enough; another one is an `InputError`."""
+    if not isinstance(token, str) or len(token) < LEAST_TOKEN or not token.isascii():
+        raise InputError(
+            "token",
+            expected=f"at least {LEAST_TOKEN} ASCII characters",
+            got="another one",
+            remedy="make one: python -c 'import secrets; print(secrets.token_urlsafe())'",
+        )
+    return token
+
+
 def create_app(
     live: Live,
     gate: Gate,
@@ -113,13 +125,7 @@ def create_app(
         The token is shorter, or a package of the extra is missing.
 
     """
-    require(
-        isinstance(token, str) and len(token) >= LEAST_TOKEN and token.isascii(),
-        "token",
-        expected=f"at least {LEAST_TOKEN} ASCII characters",
-        got="another one",
-        remedy="make one: python -c 'import secrets; print(secrets.token_urlsafe())'",
-    )
+    check_token(token)
     # The pages of the documentation that FastAPI has would load scripts from elsewhere.
     app = fastapi.FastAPI(
         title="retwin monitor", version=__version__, docs_url=None, redoc_url=None
