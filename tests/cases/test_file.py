@@ -67,6 +67,22 @@ leak = rt.ActuatorBias(1, (1.0, 2.0))
 TWIN = rt.FunctionTwin(turned, rt.Channels(("a", "b"), ("V", "V")), rt.Channels(("y",), ("m",)), 10)
 """
 
+STATES = """
+import retwin as rt
+from retwin.twins import Parameter, State, StateTwin
+
+tank = StateTwin(
+    (State("level", "m"),),
+    lambda x, u: x.level,
+    rt.Channels(("valve",), ("1",)),
+    rt.Channels(("level",), ("m",)),
+    1.0,
+    derivative=lambda x, u, p: (u.valve - p.leak * x.level,),
+    parameters=(Parameter("leak", "1/s", 0.01, 0.1, 0.05),),
+    limits=rt.Limits((0,), (1,)),
+)
+"""
+
 BODY = """
 name = "toy"
 twin = "toy_module:turned"
@@ -362,6 +378,19 @@ def test_a_twin_object_has_its_own_channels(read: Callable[..., rt.Case]) -> Non
     assert arm.inputs.names[0] == "motor_1"
     with pytest.raises(rt.InputError, match=r"case\.toml: low: expected a value|commands\.low"):
         read('name = "toy"\ntwin = "toy_module:TWIN"\n' + times)
+
+
+def test_a_parameter_that_state_equations_lack_is_no_free_one(
+    read: Callable[..., rt.Case], tmp_path: Path
+) -> None:
+    (tmp_path / "toy_states.py").write_text(STATES)
+    sampler = "kind = 'HoldSampler'\nduration = 9\nhold_durations = [1, 3]\n"
+    read("name = 'toy'\ntwin = 'toy_states:tank'\n[commands]\n" + sampler)
+    case = str(tmp_path / "case.toml")
+    opened = rt.cases.open_parametric(case, ["start_level=0:1"])
+    assert opened.twin.names == ("start_level",)
+    with pytest.raises(rt.InputError, match=r"--free: expected some of leak.*got spare;"):
+        rt.cases.open_parametric(case, ["spare=0:1"])
 
 
 def test_a_model_and_an_fmu_lie_beside_the_file(

@@ -249,12 +249,13 @@ def _freed(twin: Twin, chosen: Sequence[Parameter]) -> ParametricTwin:
         if isinstance(twin, MuJoCoTwin):
             chosen = [_started(each, twin) for each in chosen]
         return parametric_twin(twin, chosen, "--free")
-    made = twin.freed(chosen)
-    defaults = set(twin.twin.defaults) if isinstance(twin.twin, RebuiltTwin) else None
+    made, own = twin.freed(chosen), None
+    if isinstance(twin.twin, RebuiltTwin):
+        own = set(twin.twin.defaults)
+    elif isinstance(twin.twin, StateTwin):
+        own = set(twin.twin.names)
     unknown = [
-        each.name
-        for each in made.parameters
-        if defaults is not None and set(each.places) - defaults
+        each.name for each in made.parameters if own is not None and set(each.places) - own
     ]
     require(
         not unknown,

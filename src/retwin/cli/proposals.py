@@ -110,8 +110,8 @@ def _verdict(made: Proposal) -> str:
         for each, what in ((made.needed, "chosen"), (made.needed_random, "random"))
     ]
     return (
-        f"Not enough: bands are {now:.1%} wider than with any number of trajectories. Within "
-        f"{made.tolerance:.0%} are they after {parts[0]} or {parts[1]} ones, as expected."
+        f"Not enough: bands are {now:.1%} wider than with any number of trajectories. They "
+        f"are expected to be within {made.tolerance:.0%} after {parts[0]} or {parts[1]} ones."
     )
 
 

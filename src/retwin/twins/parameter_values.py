@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retwin.checks import require
+from retwin.checks import one_of, require
 
 
 def values_per_simulation(
@@ -36,17 +36,18 @@ def values_per_simulation(
 
     """
     values = {}
-    names = "" if allowed is None else f" for {', '.join(allowed)}"
     for name, given in (parameters or {}).items():
+        if allowed is not None:
+            one_of("parameters", name, allowed)
         array = np.asarray(given)
-        shape = f"{array.dtype} of shape {array.shape}" if array.ndim else repr(given)
+        shape = f"{array.dtype} of shape {array.shape}" if array.ndim else repr(array.item())
         numbers = array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
         require(
-            (allowed is None or name in allowed) and numbers and array.shape in ((), (count,)),
+            numbers and array.shape in ((), (count,)),
             "parameters",
-            expected=f"finite numbers{names}: one for all, or one per trajectory, {count}",
+            expected=f"finite numbers: one for all, or one per trajectory, {count}",
             got=f"{name}: {shape}",
-            remedy="check the spelling; give as many values as there are trajectories",
+            remedy="give as many values as there are trajectories",
         )
         values[name] = np.broadcast_to(array.astype(float), count)
     return values
