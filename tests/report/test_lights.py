@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 from retwin.report.lights import lights, uses, worst
+from retwin.report.page import render
+from retwin.report.sections import sections_of
 from retwin.report.sections.decisions import decisions
 from retwin.report.study import read_study
 from retwin.report.summary import learned, summary
@@ -190,6 +192,20 @@ def test_the_next_steps_follow_from_what_is_missing(single: Study, write: Write)
     steps = {each.key: each.values for each in found["steps"]}
     assert steps["correction"]["worse"]
     assert steps["record"]["error"] is None, "more trajectories would not change it"
+
+
+def test_a_test_set_without_healthy_runs_asks_for_some(study: Study, write: Write) -> None:
+    test = study[0]["data"]["test"]
+    test["labels"] = ["Motor_1_Stuck" if each == "Healthy" else each for each in test["labels"]]
+    whole = read_study(write(study))
+    assert not whole.healthy.any()
+    states = {each.key: each.state for each in lights(whole)}
+    assert states["error"] == states["false_alarms"] == "not measured"
+    found = summary(whole)
+    assert found is not None
+    assert {each.key: each.values for each in found["steps"]}["record"]["now"] == 0
+    page = render(whole, sections_of(whole), {})
+    assert "Test on healthy runs too: there are none now" in page
 
 
 def test_what_was_not_measured_is_not_met(study: Study, write: Write) -> None:

@@ -254,9 +254,7 @@ def _freed(twin: Twin, chosen: Sequence[Parameter]) -> ParametricTwin:
         own = set(twin.twin.defaults)
     elif isinstance(twin.twin, StateTwin):
         own = set(twin.twin.names)
-    unknown = [
-        each.name for each in made.parameters if own is not None and set(each.places) - own
-    ]
+    unknown = [each.name for each in made.parameters if own is not None and set(each.places) - own]
     require(
         not unknown,
         "--free",

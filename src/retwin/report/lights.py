@@ -149,6 +149,8 @@ def change_of(study: Study) -> tuple[ErrorChange, str] | None:
     if overlay is None or overlay.source != pair[0] or "portrait/bands" not in study.arrays:
         return _simulated_change(study, pair, units)
     healthy = study.healthy
+    if not healthy.any():
+        return None
     parts = {
         name: study.arrays[f"portrait/{name}"][healthy].astype(float)
         for name in ("nominal", "observed", "bands")

@@ -70,7 +70,10 @@ def next_steps(
 
 
 def _record(study: Study, lights: Mapping[str, Light]) -> Step | None:
-    """How many healthy trajectories decide what is undecided; None where more decide nothing."""
+    """How many healthy trajectories decide what is undecided; None where more decide nothing.
+
+    Where none is healthy, some are needed.
+    """
     test = study.results.data.test
     now = int(study.healthy.sum()) if study.results.classes else test.size
     chosen: Alarms | None = None
@@ -81,7 +84,8 @@ def _record(study: Study, lights: Mapping[str, Light]) -> Step | None:
     error = None
     if lights["error"].state == "undecided" and change is not None and study.results.classes:
         error = needed_to_decide(change)
-    if not (alarms or error or any(each.state == "undecided" for each in lights.values())):
+    undecided = any(each.state == "undecided" for each in lights.values())
+    if now and not (alarms or error or undecided):
         return None
     rate = chosen.rate if chosen is not None and math.isfinite(chosen.rate) else None
     return Step("record", {"now": now, "alarms": alarms, "rate": rate, "error": error})

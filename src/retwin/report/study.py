@@ -161,7 +161,7 @@ class Study:
     def healthy(self) -> NDArray:
         """Whether each test trajectory is healthy, shape (n,); all are where there is no class."""
         labels = np.array(self.results.data.test.labels, dtype=str)
-        if HEALTHY not in labels:
+        if not (self.results.classes and len(labels)):
             test = self.results.data.test
             return np.ones(len(test.ids) or test.size, dtype=bool)
         return labels == HEALTHY

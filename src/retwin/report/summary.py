@@ -122,7 +122,7 @@ class _Row:
 def _segment_rows(study: Study) -> list[tuple[str, _Row]]:
     """Delays, offsets and missed segments, inferred from every healthy test trajectory."""
     overlay, values = study.results.overlay, study.arrays.get("portrait/z")
-    if overlay is None or values is None:
+    if overlay is None or values is None or not study.healthy.any():
         return []
     units = [*overlay.latent_units, *[""] * len(overlay.latents)]
     rows = []
