@@ -34,3 +34,21 @@ def test_real_sets_may_be_logs_with_a_mapping(tmp_path: Path) -> None:
         real_data(case, rt.StudyPlan(), rt.StudyData(real=tmp_path / "log.csv"), lambda *_: None)
     with pytest.raises(InputError, match="mapping: expected real sets that are logs"):
         rt.StudyData(records=tmp_path / "log.csv", mapping=tmp_path / "m.toml")
+
+
+def test_a_trajectory_in_both_sets_is_refused(tmp_path: Path) -> None:
+    """Also under another name: its measurements would be known before the test."""
+    case = rt.cases.get("tanks")
+    commands = case.sampler.sample(3, rng=np.random.default_rng(0))
+    made = case.twin.simulate(commands, seed=0)
+    rt.save(made[:2].replace(ids=np.array(["a", "b"])), tmp_path / "first.npz")
+    rt.save(made[1:].replace(ids=np.array(["c", "d"])), tmp_path / "second.npz")
+    rt.save(made[2:].replace(ids=np.array(["e"])), tmp_path / "third.npz")
+
+    def read(test: str) -> int:
+        given = rt.StudyData(calibration=tmp_path / "first.npz", test=tmp_path / test)
+        return len(real_data(case, rt.StudyPlan(), given, lambda *_: None)[0])
+
+    assert read("third.npz") == 3
+    with pytest.raises(InputError, match="got c, which is b of the calibration; leave"):
+        read("second.npz")

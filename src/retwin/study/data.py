@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -134,9 +135,32 @@ def _records(case: Case, path: Path) -> tuple[Trajectories, Trajectories]:
 
 
 def _in_two(calibration: Trajectories, test: Trajectories) -> tuple[Trajectories, Roles]:
-    """Both sets as one, with their roles."""
+    """Both sets as one, with their roles; InputError if a trajectory is in both."""
+    known = dict(zip(_contents(calibration), calibration.ids.tolist(), strict=True))
+    shared = [
+        f"{own}, which is {known[content]} of the calibration"
+        for content, own in zip(_contents(test), test.ids.tolist(), strict=True)
+        if content in known
+    ]
+    require(
+        not shared,
+        "test",
+        expected="measurements that are in no calibration trajectory",
+        got="; ".join(shared[:3]) + (f"; {len(shared)} in all" if len(shared) > 3 else ""),
+        remedy="leave them out of one of both sets",
+    )
     both = Trajectories.concatenate([calibration, test])
     return both, Roles.of([(range(len(calibration)), range(len(calibration), len(both)))])
+
+
+def _contents(trajectories: Trajectories) -> list[bytes]:
+    """What was commanded and measured in each trajectory, in bytes that are compared."""
+    measured = np.where(trajectories.mask, trajectories.observed, np.nan)
+    values = np.concatenate([trajectories.commands, measured], axis=2).astype(np.float32)
+    lengths = trajectories.lengths
+    return [
+        sha256(row[:length].tobytes()).digest() for row, length in zip(values, lengths, strict=True)
+    ]
 
 
 def _labelled(trajectories: Trajectories, case: Case, name: str) -> Trajectories:
