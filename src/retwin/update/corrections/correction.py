@@ -13,6 +13,9 @@ from torch import Tensor
 from retwin.data.segments import Segments
 from retwin.data.trajectories import Channels
 
+CONSTANT = 1e-6
+"""Standard deviation of a constant output, relative to its size: the rounding of numbers."""
+
 
 class DifferentiableTwin(Protocol):
     """The part of a surrogate that corrections use: a call with gradient, and one without.
@@ -73,6 +76,8 @@ class Context:
     surrogate_variance : Tensor, optional
         (n, M, d_y), mean square of the surrogate's own error in each segment, in the outputs' units
         squared; None for a surrogate without error.
+    scale : Tensor, optional
+        (d_y,), what outputs are divided by to be compared, for a surrogate without `unit`.
 
     """
 
@@ -85,6 +90,7 @@ class Context:
     rate: float
     corrected: Tensor | None = None
     surrogate_variance: Tensor | None = None
+    scale: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.commands)
@@ -109,7 +115,8 @@ class Context:
     @property
     def unit(self) -> Tensor:
         """Unit (d_y,) by which outputs are divided to be compared; 1 if not known."""
-        return getattr(self.surrogate, "unit", self.nominal.new_ones(self.nominal.shape[2]))
+        own = getattr(self.surrogate, "unit", self.scale)
+        return self.nominal.new_ones(self.nominal.shape[2]) if own is None else own
 
     def __getitem__(self, index: slice | NDArray) -> Context:
         """The context of some of the trajectories."""
@@ -138,6 +145,7 @@ class Context:
     ) -> Context:
         """The context of those commands, without faults by default."""
         clean = torch.tensor(commands, dtype=torch.float32)
+        nominal = torch.as_tensor(surrogate.predict(commands))
         return cls(
             surrogate,
             commands=clean,
@@ -147,10 +155,29 @@ class Context:
             frozen=torch.full((len(clean), clean.shape[2]), clean.shape[1])
             if frozen is None
             else torch.as_tensor(frozen),
-            nominal=torch.as_tensor(surrogate.predict(commands)),
+            nominal=nominal,
             segments=segments,
             rate=rate,
+            scale=_scale(surrogate, nominal),
         )
+
+
+def _scale(surrogate: DifferentiableTwin, nominal: Tensor) -> Tensor | None:
+    """Divisors (d_y,) of outputs with the standard deviations of nominal ones (n, T, d_y).
+
+    Outputs of one physical unit have the same divisor, as those of a `Surrogate`; that of a
+    constant output is 1. None for a surrogate that names no outputs: their units are not known.
+    """
+    outputs = getattr(surrogate, "outputs", None)
+    if not isinstance(outputs, Channels):
+        return None
+    values = nominal.double().flatten(0, 1)
+    tiny = CONSTANT * values.abs().amax(dim=0)
+    spread = values.std(dim=0, correction=0)
+    spread = torch.where(spread > tiny, spread, 1.0)
+    if outputs.comparable:
+        spread = spread.mean().expand_as(spread)
+    return spread.to(nominal)
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,7 +87,7 @@ def plausible_delays(context: Context, observed: Tensor, mask: Tensor) -> tuple[
     """Smallest and largest plausible delay of a segment, in samples.
 
     The range of the delays that single segments show in the motion of the outputs, with a margin on
-    either side that is as large as the largest of them.
+    either side that is as large as the largest of them, up to the length of the trajectories.
 
     Parameters
     ----------
@@ -121,7 +121,11 @@ def plausible_delays(context: Context, observed: Tensor, mask: Tensor) -> tuple[
             break
         half *= 2
     margin = max(abs(low), abs(high), high - low, least)
-    return float(math.floor(low - margin)), float(math.ceil(high + margin))
+    longest = segments.steps
+    return (
+        float(max(math.floor(low - margin), -longest)),
+        float(min(math.ceil(high + margin), longest)),
+    )
 
 
 def _moves(problem: PathProblem) -> Tensor:

@@ -39,15 +39,18 @@ class OffsetFeatures:
 
     @classmethod
     def of(cls, problem: CommandProblem) -> OffsetFeatures:
-        """The scales of the commands of `problem`; 1 where an actuator never moves."""
+        """The scales of the commands of `problem`; 1 where an actuator never moves.
+
+        Where all targets are the same, as in a single segment, distances stand for their spread.
+        """
         first, last = (each[problem.valid] for each in problem.levels)
         centre = last.mean(dim=0)
         spread, travel = (
             each.square().mean(dim=0).sqrt() for each in (last - centre, last - first)
         )
-        still = travel <= STILL * problem.reference.abs().amax(dim=(0, 1))
-        one = torch.ones_like(travel)
-        return cls(centre, *(torch.where(still, one, each) for each in (spread, travel)))
+        smallest = STILL * problem.reference.abs().amax(dim=(0, 1))
+        travel = torch.where(travel <= smallest, 1.0, travel)
+        return cls(centre, torch.where(spread <= smallest, travel, spread), travel)
 
     def design(self, problem: CommandProblem) -> Design:
         """The regression of x on a common delay, and on the features of the offsets.

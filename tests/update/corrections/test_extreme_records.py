@@ -1,0 +1,91 @@
+"""Records at the limits of what z can be inferred from: a single segment, units of any size."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+import retwin as rt
+
+RATE = 50.0
+OPERATORS = (rt.DelayOffset, rt.CommandSpace)
+
+
+class Plane(torch.nn.Module):
+    """Two outputs of two actuators, without memory, in units of any size."""
+
+    memoryless = True
+    rate = RATE
+    inputs = rt.Channels(("u", "v"), ("V", "V"))
+
+    def __init__(self, sizes: tuple[float, float] = (1.0, 1.0)) -> None:
+        super().__init__()
+        self.matrix = torch.tensor([[1.0, 0.4], [-0.5, 0.8]]).double()
+        self.matrix = self.matrix * torch.tensor(sizes).double()[:, None]
+        units = ("m", "m") if sizes[0] == sizes[1] else ("m", "Pa")
+        self.outputs = rt.Channels(("x", "y"), units)
+
+    def forward(self, commands: torch.Tensor) -> torch.Tensor:
+        return (commands.double() @ self.matrix.T).to(commands.dtype)
+
+    def predict(self, commands: NDArray) -> NDArray:
+        return self(torch.tensor(commands, dtype=torch.float32)).numpy()
+
+
+def commands_of(count: int, *, segments: int = 4, seed: int = 0) -> NDArray:
+    """Ramps and holds."""
+    sampler = rt.twins.RampSampler((-1, -1), (1, 1), RATE, 1.5 * segments, segments=segments)
+    return sampler.sample(count, rng=np.random.default_rng(seed))
+
+
+def measured(
+    twin: Plane, commands: NDArray, *, noise: float = 0.005
+) -> tuple[rt.Context, torch.Tensor, torch.Tensor]:
+    """The context, z of `CommandSpace` and outputs: delays of about 4 samples, and offsets."""
+    rng = np.random.default_rng(1)
+    context = rt.Context.of(twin, commands, rt.Segments.from_commands(commands), rate=RATE)
+    shape = context.segments.start.shape
+    parts = rng.normal(4, 0.2, (*shape, 1)), rng.normal(0, 0.03, (*shape, 2)), np.zeros((*shape, 2))
+    z = torch.tensor(np.concatenate(parts, axis=-1))
+    outputs = rt.CommandSpace().apply(context, z).double()
+    size = twin.matrix.norm(dim=1)
+    return context, z, outputs + noise * size * torch.tensor(rng.normal(size=outputs.shape))
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_actuators_with_one_target_have_finite_hyperparameters(count: int) -> None:
+    """All segments end at the same target, as that of a record with a single one does."""
+    commands = np.repeat(commands_of(1, segments=1), count, axis=0)
+    context, z, outputs = measured(Plane(), commands)
+    found = rt.CommandSpace().infer(context, outputs, torch.ones(outputs.shape).bool())
+    assert torch.isfinite(found.covariance).all()
+    assert found.identified[..., 1:3].all()
+    torch.testing.assert_close(found.z[..., 1:3], z[..., 1:3], rtol=0, atol=0.005)
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_units_of_a_twin_in_place_of_a_surrogate_do_not_matter(operator: type) -> None:
+    """Without the unit that a surrogate has, outputs of different units weigh the same."""
+    found, sizes = [], torch.tensor([1e-6, 1e6]).double()
+    for twin in (Plane(), Plane((1e-6, 1e6))):
+        context, _, outputs = measured(twin, commands_of(5))
+        found.append(operator().infer(context, outputs, torch.ones(outputs.shape).bool()))
+    one, other = (each.covariance.diagonal(dim1=-2, dim2=-1).sqrt() for each in found)
+    if operator is rt.DelayOffset:
+        other[..., 1:] /= sizes
+    torch.testing.assert_close(other[..., :3], one[..., :3], rtol=0.35, atol=0)
+
+
+def test_outputs_that_never_follow_need_no_delay_beyond_the_trajectory() -> None:
+    """Delays of single segments may then be anything, but an operator takes what it chose."""
+    sampler = rt.twins.RampSampler((-1, -1), (1, 1), RATE, 8.0, segments=1)
+    commands = sampler.sample(4, rng=np.random.default_rng(0))
+    segments = rt.Segments.from_commands(commands)
+    context = rt.Context.of(Plane(), commands, segments, rate=RATE)
+    noise = torch.tensor(np.random.default_rng(0).normal(0, 0.005, context.nominal.shape))
+    outputs, mask = context.nominal[:, :1] + noise, torch.ones(noise.shape).bool()
+    made = rt.DelayOffset().completed(context, outputs, mask)
+    assert np.abs(made.delay_range).max() <= 8.0
+    assert made.completed(context, outputs, mask) == made
