@@ -78,6 +78,17 @@ def test_an_output_that_never_changes_is_fitted(level: float) -> None:
     assert is_finite(found.twin)
 
 
+def test_a_machine_at_rest_is_fitted() -> None:
+    """No command ever moves it: nothing acts at the start of the search, and something later."""
+    twin = lag(lambda x, u, p: (u.u - p.rate * x.x,), Parameter("rate", "1/s", 0.1, 9.0, 2.0))
+    record = twin.simulate(0 * COMMANDS, seed=0)
+    noise = 0.01 * np.random.default_rng(1).normal(size=record.observed.shape)
+    with pytest.warns(UserWarning, match="rate"):
+        found = fit_dynamics(twin, record.replace(observed=record.observed + noise), QUICK)
+    assert np.isfinite(found.twin.widening).all()
+    assert found.figures["rms_after"] < 0.011
+
+
 def test_an_output_that_was_never_measured_is_refused() -> None:
     twin = StateTwin(
         (State("x", "m"),),

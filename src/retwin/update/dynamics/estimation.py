@@ -201,6 +201,8 @@ class Estimation:
                 radius = max(radius, min(2 * length, WIDEST))
             if ratio > ACCEPTED:
                 at, flat, (value, gradient, curvature) = tried, inside, found
+                # What did not act at the start may act now, and its unit was without meaning.
+                unit = np.where(unit > WIDEST * curvature.unit, curvature.unit, unit)
         return at
 
     def gain(self, at: Linearised) -> float:
