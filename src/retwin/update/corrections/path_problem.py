@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -13,6 +14,7 @@ from retwin.inference.losses import Tukey
 from retwin.inference.noise import Noise, correlation_time
 from retwin.inference.solver import Bounds
 from retwin.update.corrections.delays import delay_bounds
+from retwin.update.corrections.sampled_sensor import lattice_step
 from retwin.update.corrections.warp import Knots, interpolate, within
 
 MAX_STEP = 1 / 7
@@ -23,6 +25,8 @@ AROUND = (1 / 7, 2 / 7)
 timing is not exactly known."""
 MAX_CORRELATION = 0.999
 """Largest lag-one autocorrelation of residuals: slow drift makes nearly all samples one."""
+COMMON = ("delay_range", "rounding")
+"""Fields of `PathProblem` that all trajectories share."""
 
 
 def path_at(segments: Segments, path: Tensor, z: Tensor) -> Tensor:
@@ -60,6 +64,8 @@ class PathProblem:
         (n, T) long.
     delay_range : tuple of float
         Smallest and largest delay, in samples.
+    rounding : float
+        Standard deviation of the error of a sample by rounding, of all outputs together.
 
     """
 
@@ -71,6 +77,7 @@ class PathProblem:
     factor: Tensor
     group: Tensor
     delay_range: tuple[float, float]
+    rounding: float = 0.0
     common: ClassVar[None] = None
 
     @classmethod
@@ -88,7 +95,14 @@ class PathProblem:
         group = (2 * torch.arange(len(path)))[:, None].expand(path.shape[:2])
         # What was not measured may be any number, NaN included.
         observed = torch.where(available, observed, 0.0)
-        return cls(segments, path, observed, available, measured, factor, group, delay_range)
+        steps = [
+            lattice_step(each[seen].numpy())
+            for each, seen in zip(observed.flatten(0, 1).T, available.flatten(0, 1).T, strict=True)
+        ]
+        rounding = math.hypot(*steps) / math.sqrt(12)
+        return cls(
+            segments, path, observed, available, measured, factor, group, delay_range, rounding
+        )
 
     def with_motion(self, delay: Tensor) -> PathProblem:
         """The same with motion where segments delayed by (n, M) samples are under way."""
@@ -102,7 +116,7 @@ class PathProblem:
 
     def __getitem__(self, rows: Tensor) -> PathProblem:
         """The problem of some trajectories."""
-        parts = {name: each[rows] for name, each in vars(self).items() if name != "delay_range"}
+        parts = {name: each[rows] for name, each in vars(self).items() if name not in COMMON}
         return replace(self, **parts)
 
     @property
@@ -191,9 +205,14 @@ class PathProblem:
             within = torch.where((self.measured > 0) & part, length, torch.nan)
             median = 1.4826 * torch.nanmedian(within, dim=1).values
             scales.append(torch.nan_to_num(median).maximum(1e-4 * extent))
-        rest = scales[1].maximum(0.01 * scales[0])
+        rest = scales[1].maximum(0.01 * scales[0]).clamp_min(self.rounding)
         scale = torch.stack([rest, scales[0].maximum(rest)], dim=1).flatten()[:, None]
         noise = Noise(scale, torch.ones_like(scale[:, 0]), Tukey())
         kept = residual * noise.precision(self, residual).sqrt()
         time = correlation_time(kept, self.measured, rows=True, limit=MAX_CORRELATION)
-        return replace(noise, thinning=time.repeat_interleave(2))
+        # Samples at rest are all rounded the same way, unless their noise is as large.
+        same = (self.rounding / rest).square() * (self.measured * ~moving).sum(dim=1)
+        segments = torch.as_tensor(self.segments.valid).sum(dim=1).clamp_min(1)
+        return replace(
+            noise, thinning=torch.stack([time.maximum(same / segments), time], dim=1).flatten()
+        )

@@ -134,7 +134,7 @@ class SampledSensor:
         if made.steps is not None:
             return made
         sampled = observed[made.sample_mask(observed, mask, rate).all(dim=-1)].double().numpy()
-        return replace(made, steps=tuple(_step(values) for values in sampled.T))
+        return replace(made, steps=tuple(lattice_step(values) for values in sampled.T))
 
     def fitted(
         self, observed: Tensor, mask: Tensor, explained: Tensor, segments: Segments, rate: float
@@ -281,7 +281,7 @@ def _phases(kinks: Tensor) -> Tensor:
     return own if not plain.any() else torch.where(plain, own, own[plain].mode().values)
 
 
-def _step(samples: NDArray) -> float:
+def lattice_step(samples: NDArray) -> float:
     """The distance of neighbouring values of one output, 0 where there is no lattice."""
     values = np.unique(samples)
     if len(values) < 3 or 4 * len(values) > len(samples):
