@@ -230,7 +230,8 @@ def test_what_the_outputs_do_not_tell_is_said(exact, commands: np.ndarray) -> No
     assert share[0] > 0.95, "the yaw is seen, but where the record ends with the motion"
     assert share[1:].min() < 1.0, "one of the others is not, somewhere"
     deviation = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    assert deviation[..., 4].mean() > 3 * deviation[..., 1].mean()
+    # Near its own axis the tip hardly shows the yaw: of some segments alone.
+    assert deviation[..., 4].median() > 3 * deviation[..., 1].median()
 
 
 def test_a_fault_does_not_pass_for_a_discrepancy(exact, commands: np.ndarray) -> None:

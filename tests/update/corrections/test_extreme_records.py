@@ -108,3 +108,18 @@ def test_intervals_of_rounded_outputs_cover(noise: float) -> None:
     covered = (found.z - torch.tensor(z)).abs() <= 1.645 * deviation
     assert covered[found.identified].double().mean() > 0.85
     assert deviation[..., 1:].max() < step, "no wider than what rounding leaves"
+
+
+def test_few_samples_do_not_pass_for_exact_ones() -> None:
+    """With hardly more measured values than components of z, residuals are z's, not the noise."""
+    context, z, outputs = measured(Plane(), commands_of(12), noise=0.02)
+    covered, scales = [], []
+    for every in (1, 20):
+        mask = torch.zeros(outputs.shape).bool()
+        mask[:, ::every] = True
+        found = rt.CommandSpace().infer(context, outputs, mask)
+        deviation = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()[..., 1:3]
+        covered.append(((found.z - z)[..., 1:3].abs() <= 1.645 * deviation).double().mean())
+        scales.append(found.noise.mean())
+    assert min(covered) > 0.8
+    assert scales[1] > 0.8 * scales[0]

@@ -51,6 +51,8 @@ OUTLYING_SHARE = 0.3
 """Share of outliers above which a segment is suspect."""
 FIRST_JITTER = 1 / 35
 """Standard deviation of a delay at first, beyond what first delays show, in widths of its range."""
+SMALLEST_SHARE = 0.1
+"""Smallest share of the samples that is taken to be left after z* has been fitted to them."""
 FLOOR = 1e-6
 """Smallest noise scale, in standard deviations of the outputs: the rounding of single precision."""
 
@@ -226,8 +228,17 @@ class Belief:
             self.hierarchy.learned(self.features.design(problem), solution, expected),
             ((missed + 0.5) / (problem.healthy.sum() + 20.0)).logit(),
             samples,
-            white.learned_noise(self.noise, white.residual(x), floor=FLOOR),
+            self._noise(white, solution),
         )
+
+    def _noise(self, white: CommandProblem, solution: Solution) -> Noise:
+        """The noise of residuals, of which z* has fitted a part: few samples seem too exact."""
+        learned = white.learned_noise(self.noise, white.residual(solution.x), floor=FLOOR)
+        open_ = (self.prior(white).gaussian.precision * solution.covariance).sum()
+        fitted = solution.x.numel() - open_  # components of x that the outputs determine
+        count = white.measured.sum() * white.observed.shape[2]
+        left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
+        return replace(learned, scale=learned.scale / left.sqrt())
 
     def near(self, other: Belief) -> bool:
         """Whether all standard deviations are about those of `other`."""
