@@ -28,7 +28,7 @@ TOLERANCE = 1e-3
 MAX_STEPS = 200
 """Steps of expectation-maximisation at most."""
 FLAT = 0
-"""The kind of coefficients that are not shrunk."""
+"""The kind of coefficients that are not shrunk to 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +74,8 @@ class Hierarchy:
         (F,), posterior mean.
     covariance : Tensor
         (F, F), posterior covariance of the coefficients.
+    flat : tuple of float
+        Mean and variance of the prior of coefficients of kind 0, infinite if nothing is known.
 
     """
 
@@ -81,9 +83,16 @@ class Hierarchy:
     relative: Tensor
     coefficients: Tensor
     covariance: Tensor
+    flat: tuple[float, float] = (0.0, torch.inf)
 
     @classmethod
-    def of(cls, design: Design, variance: Tensor, coefficients: Tensor) -> Hierarchy:
+    def of(
+        cls,
+        design: Design,
+        variance: Tensor,
+        coefficients: Tensor,
+        flat: tuple[float, float] = (0.0, torch.inf),
+    ) -> Hierarchy:
         """The hyperparameters to begin with: variances (G,), certain coefficients (F,)."""
         kinds = int(design.kind.amax()) + 1
         count = len(coefficients)
@@ -92,6 +101,7 @@ class Hierarchy:
             variance.new_full((kinds,), RELATIVE),
             coefficients,
             variance.new_zeros(count, count),
+            flat,
         )
 
     def prior(self, design: Design) -> GaussianPrior:
@@ -160,7 +170,8 @@ class Hierarchy:
         # With x integrated out, β has this precision, and the errors ε depend on β by -left.
         left = features - covariance @ weighted
         own = self.relative[design.kind] * self.variance[design.owner]
-        own = torch.where(design.kind == FLAT, torch.inf, own)
+        own = torch.where(design.kind == FLAT, self.flat[1], own)
+        centre = torch.where(design.kind == FLAT, self.flat[0], torch.zeros_like(own))
         information = (weighted.mT @ left).sum(dim=0) + torch.diag(own.reciprocal())
         # Where nothing is measured, nothing is known of coefficients that are not shrunk.
         known = (weighted * features).sum(dim=(0, 1))  # of each coefficient, were x measured
@@ -168,7 +179,7 @@ class Hierarchy:
         # As the product of the covariance and the slope at x = 0, without its large numbers.
         mean = x + (covariance @ (slope - precision * x)[..., None])[..., 0]
         uncertain = inverse(information[None])[0]
-        beta = uncertain @ (weighted * mean[..., None]).sum(dim=(0, 1))
+        beta = uncertain @ ((weighted * mean[..., None]).sum(dim=(0, 1)) + centre / own)
         error = mean - left @ beta
         spread = covariance.diagonal(dim1=1, dim2=2) + ((left @ uncertain) * left).sum(dim=-1)
         second = (error.square() + spread) / design.wider.square() * design.used

@@ -123,3 +123,20 @@ def test_few_samples_do_not_pass_for_exact_ones() -> None:
         scales.append(found.noise.mean())
     assert min(covered) > 0.8
     assert scales[1] > 0.8 * scales[0]
+
+
+def test_delays_that_no_output_shows_stay_within_their_range() -> None:
+    """A machine that stands still: the common delay has no likelihood, but limits."""
+    sampler = rt.twins.RampSampler((-1, -1), (1, 1), RATE, 8.0, segments=1)
+    commands = sampler.sample(4, rng=np.random.default_rng(0))
+    segments = rt.Segments.from_commands(commands)
+    context = rt.Context.of(Plane(), commands, segments, rate=RATE)
+    noise = torch.tensor(np.random.default_rng(0).normal(0, 0.005, context.nominal.shape))
+    outputs = context.nominal[:, :1] + noise
+    for limits in ((0.0, 0.2), None):
+        operator = rt.CommandSpace(delay_range=limits)
+        found = operator.infer(context, outputs, torch.ones(noise.shape).bool())
+        width = RATE * (0.2 if limits else 16.0)
+        assert torch.isfinite(found.z).all()
+        assert found.covariance[..., 0, 0].sqrt().max() < width
+        assert not found.identified[..., 0].any()

@@ -196,9 +196,11 @@ class Belief:
         coefficients[0] = delay.median()
         variance = torch.cat([jitter[None], offset, jitter[None]]).square()
         one = torch.ones(2, dtype=torch.float64)
+        # Within its range a common delay may be anything, as by a uniform distribution.
+        limits = problem.delay_range
         return cls(
             features,
-            Hierarchy.of(design, variance, coefficients),
+            Hierarchy.of(design, variance, coefficients, (sum(limits) / 2, problem.width**2 / 12)),
             -4.0 * one[0],
             SampleNoise.of(problem),
             Noise(scale, one),
