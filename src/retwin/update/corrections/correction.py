@@ -166,10 +166,10 @@ def _scale(surrogate: DifferentiableTwin, nominal: Tensor) -> Tensor | None:
     """Divisors (d_y,) of outputs with the standard deviations of nominal ones (n, T, d_y).
 
     Outputs of one physical unit have the same divisor, as those of a `Surrogate`; that of a
-    constant output is 1. None for a surrogate that names no outputs: their units are not known.
+    constant output is 1. None for one that has `unit`, or no `outputs` whose units were known.
     """
     outputs = getattr(surrogate, "outputs", None)
-    if not isinstance(outputs, Channels):
+    if hasattr(surrogate, "unit") or not isinstance(outputs, Channels):
         return None
     values = nominal.double().flatten(0, 1)
     tiny = CONSTANT * values.abs().amax(dim=0)
