@@ -144,7 +144,7 @@ def test_records_are_those_of_simulate(way: str) -> None:
     found = DeviceTwin(twin, "cpu").records(commands, faults=faults, seed=3, chunk=128)
     for made, reference in zip(found, (expected.nominal, expected.observed), strict=True):
         assert made.dtype == torch.float32
-        # 6e-7 in most ways; the splines of a flow, and a slope, enlarge what rounding does.
+        # The splines of a flow, and a slope, enlarge what rounding does.
         assert np.max(np.abs(made.numpy() - reference) / UNIT.numpy()) < 1e-4
 
 

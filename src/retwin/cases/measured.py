@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from retwin.checks import require
-from retwin.data.measured import stand_in
+from retwin.data.measured import stand_ins
 from retwin.data.trajectories import HEALTHY, UNLABELLED, Trajectories
 from retwin.errors import InputError
 
@@ -42,13 +42,8 @@ def usable(found: Trajectories, notes: dict[str, list[str]], transient: float) -
     constant = ", ".join(_constant(joined))
     if constant:
         notes[f"{constant}: constant in all logs, so that they show no dynamics of it."] = []
-    for k, name in enumerate(joined.outputs.names):
-        coded = stand_in(joined.observed[..., k][joined.mask[..., k]])
-        if coded:
-            notes[
-                f"{name} is {coded[0]:g} at {coded[1]} samples, far from all others: replace it by "
-                "NaN if it stands for a missing measurement."
-            ] = []
+    for each in stand_ins(joined):
+        notes[f"{each}."] = []
     return joined
 
 

@@ -114,7 +114,14 @@ def doubtful(trajectories: Trajectories) -> list[str]:
         values = trajectories.observed[..., k][trajectories.mask[..., k]]
         if len(values) > 1 and values.min() == values.max():
             notes.append(f"{name} never changes, so that it shows no dynamics: check its sensor")
-        coded = stand_in(values)
+    return notes + stand_ins(trajectories)
+
+
+def stand_ins(trajectories: Trajectories) -> list[str]:
+    """Notes about outputs with a value that seems to stand for a missing measurement."""
+    notes = []
+    for k, name in enumerate(trajectories.outputs.names):
+        coded = stand_in(trajectories.observed[..., k][trajectories.mask[..., k]])
         if coded:
             notes.append(
                 f"{name} is {coded[0]:g} at {coded[1]} samples, far from all others: replace it "

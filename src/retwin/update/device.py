@@ -296,5 +296,5 @@ def _check_finite(made: Records) -> None:
         expected="commands for which the twin's outputs are finite",
         got=f"NaN or an infinite output in {int(wrong.sum())} of {len(wrong)} trajectories, first "
         f"in trajectory {int(wrong.byte().argmax())}",
-        remedy="simulate it with CorrectedTwin.simulate, which says when and in which output",
+        remedy="simulate it with CorrectedTwin.simulate, which names the output and the time",
     )
