@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -104,6 +106,21 @@ def test_the_likelihood_is_that_of_parameters_that_are_drawn() -> None:
     each = -0.5 * np.sum(white**2, axis=(1, 2)) - logs - own.seen.sum() * np.log(2 * np.pi) / 2
     expected = np.logaddexp.reduce(each) - np.log(len(each))
     assert abs(own.log_density(Variants(), slopes)[0] - expected) < 0.05
+
+
+def test_the_likelihood_of_nearly_exact_outputs_is_right_to_all_digits() -> None:
+    """Without process noise, each factor of the noise adds as much to its logarithm."""
+    own = record()
+    outputs = own.twin.equations.steps().run(own.commands[None], own.twin.values[None])[0][0]
+    own = replace(own, measured=outputs, seen=np.ones(outputs.shape, dtype=bool))
+
+    def logs(noise: float) -> np.ndarray:
+        twin = replace(own.twin, noise=np.full(2, noise), process=np.zeros(2))
+        exact = replace(own, twin=twin)
+        return exact.log_density(variants(exact, "seen"), np.zeros((SAMPLES, 2, 0)))
+
+    first, second, third = logs(1e-8), logs(1e-16), logs(1e-24)
+    np.testing.assert_allclose(third - second, second - first, rtol=1e-7)
 
 
 def test_a_variant_with_which_the_filter_diverges_has_no_likelihood() -> None:

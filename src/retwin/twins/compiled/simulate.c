@@ -62,7 +62,23 @@ EXPORT void sensitivities(long long n, long long samples, long long substeps, do
     }
 }
 
-/* Extended Kalman filter. Variances of the measurement noise r[NY], and of the process noise
+/* The lower factor S of P = S S^T; columns are 0 where P is singular. */
+static void factor(double P[NX][NX], double S[NX][NX])
+{
+    for (int j = 0; j < NX; j++)
+        for (int i = 0; i < NX; i++) {
+            double sum = i < j ? 0.0 : P[i][j];
+            for (int k = 0; k < j && i >= j; k++)
+                sum -= S[i][k] * S[j][k];
+            if (i == j)
+                sum = sum <= 0.0 ? 0.0 : sqrt(sum);
+            S[i][j] = i <= j ? sum : S[j][j] == 0.0 ? 0.0 : sum / S[j][j];
+        }
+}
+
+/* Extended Kalman filter, with factors of covariances, which stay positive however exact outputs are
+ * (Potter's update; Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, section
+ * II.8). Variances of the measurement noise r[NY], and of the process noise
  * q[n][samples][NX] after each sample; covariance of the states spread[n][NX][NX], at the first sample
  * before it is measured, which becomes that after the last one; outputs with an error of more than
  * *gate standard deviations are not used; measured y[n][samples][NY], of which seen[n][samples][NY] is not 0; to
@@ -74,8 +90,8 @@ EXPORT void filter(long long n, long long samples, long long substeps, double pe
                    const double *changes, double *spread, double *mean, double *covariance,
                    double *x)
 {
-    double z[NX * (1 + NX)], u[NU + 1], hx[NY * NX], hp[NY * NP + 1], P[NX][NX], g[NX], FP[NX][NX];
-    double changed[NP + 1];
+    double z[NX * (1 + NX)], u[NU + 1], hx[NY * NX], hp[NY * NP + 1], P[NX][NX], FP[NX][NX];
+    double changed[NP + 1], S[NX][NX], HS[NY][NX], f[NX], g[NX];
     double *F = z + NX;
     for (long long row = 0; row < n; row++, p += NP, start += NX) {
         for (int i = 0; i < NX; i++) {
@@ -87,35 +103,52 @@ EXPORT void filter(long long n, long long samples, long long substeps, double pe
             const double *now = at_present(p, &changes, changed);
             command(c, 0.0, u);
             output_jacobian(z, u, now, mean, hx, hp);
+            factor(P, S);
+            for (int a = 0; a < NY; a++)
+                for (int j = 0; j < NX; j++) {
+                    HS[a][j] = 0.0;
+                    for (int i = 0; i < NX; i++)
+                        HS[a][j] += hx[a * NX + i] * S[i][j];
+                }
             for (int a = 0; a < NY; a++)
                 for (int b = 0; b < NY; b++) {
                     double sum = a == b ? r[a] : 0.0;
-                    for (int i = 0; i < NX; i++)
-                        for (int j = 0; j < NX; j++)
-                            sum += hx[a * NX + i] * P[i][j] * hx[b * NX + j];
+                    for (int j = 0; j < NX; j++)
+                        sum += HS[a][j] * HS[b][j];
                     covariance[a * NY + b] = sum;
                 }
             for (int i = 0; i < NX; i++)
                 x[i] = z[i];
+            int used = 0;
             for (int a = 0; a < NY; a++) {
                 if (!seen[a])
                     continue;
                 double variance = r[a], error = y[a] - mean[a];
                 for (int i = 0; i < NX; i++) {
-                    g[i] = 0.0;
-                    for (int j = 0; j < NX; j++)
-                        g[i] += P[i][j] * hx[a * NX + j];
-                    variance += hx[a * NX + i] * g[i];
+                    f[i] = 0.0;
+                    for (int k = 0; k < NX; k++)
+                        f[i] += hx[a * NX + k] * S[k][i];
+                    variance += f[i] * f[i];
                     error -= hx[a * NX + i] * (x[i] - z[i]);
                 }
                 if (fabs(error) > *gate * sqrt(variance))
                     continue;
+                used = 1;
                 for (int i = 0; i < NX; i++) {
+                    g[i] = 0.0;
+                    for (int j = 0; j < NX; j++)
+                        g[i] += S[i][j] * f[j];
                     x[i] += g[i] * error / variance;
                     for (int j = 0; j < NX; j++)
-                        P[i][j] -= g[i] * g[j] / variance;
+                        S[i][j] -= g[i] * f[j] / (variance + sqrt(r[a] * variance));
                 }
             }
+            for (int i = 0; used && i < NX; i++)
+                for (int j = 0; j < NX; j++) {
+                    P[i][j] = 0.0;
+                    for (int k = 0; k < NX; k++)
+                        P[i][j] += S[i][k] * S[j][k];
+                }
             if (t + 1 < samples) {
                 for (int i = 0; i < NX; i++) {
                     z[i] = x[i];

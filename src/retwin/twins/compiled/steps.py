@@ -168,16 +168,21 @@ class Steps:
                 return torch.cat(self._advanced(c[None, t], list(z[:, None].unbind(0)), p))
 
             slope = torch.autograd.functional.jacobian(output, x)
-            mean, predicted = output(x), slope @ spread @ slope.T + torch.diag(noise)
-            centre = x
+            factor = _factor(spread)
+            by = slope @ factor
+            mean, predicted = output(x), by @ by.T + torch.diag(noise)
+            centre, used = x, False
             for h, r, error in zip(slope[known], noise[known], (y - mean)[known], strict=True):
-                column = spread @ h
-                variance = h @ column + r
+                f = h @ factor
+                variance = f @ f + r
                 error = error - h @ (x - centre)
                 if error.abs() > gate * variance.sqrt():
                     continue
+                column, used = factor @ f, True
                 x = x + column * error / variance
-                spread = spread - torch.outer(column, column) / variance
+                factor = factor - torch.outer(column, f) / (variance + (r * variance).sqrt())
+            if used:
+                spread = factor @ factor.T
             made.append((mean, predicted, x))
             if t + 1 < len(outputs):
                 forward = torch.autograd.functional.jacobian(after, x)
@@ -272,3 +277,11 @@ class Steps:
 
 def _double(values: NDArray) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
+
+
+def _factor(covariance: Tensor) -> Tensor:
+    """A factor S of S S^T, which may be singular; NaN where the covariance is not finite."""
+    if not covariance.isfinite().all():
+        return torch.full_like(covariance, torch.nan)
+    values, vectors = torch.linalg.eigh(covariance)
+    return vectors * values.clamp_min(0.0).sqrt()

@@ -128,14 +128,33 @@ static void add(const double *mean, const double *covariance, const inputs *in, 
                 EACH sum[l] += white[(a * width + i) * LANES + l] * white[(a * width + j) * LANES + l];
 }
 
-/* The filter from the sample `first` until before `last`. */
+/* The lower factor S[NX][NX] of P = S S^T; columns are 0 where P is singular. */
+static void factor(const double *P, double *S)
+{
+    for (int j = 0; j < NX; j++)
+        for (int i = 0; i < NX; i++) {
+            double sum[LANES];
+            EACH sum[l] = i < j ? 0.0 : P[AT(i * NX + j)];
+            for (int k = 0; k < j && i >= j; k++)
+                EACH sum[l] -= S[AT(i * NX + k)] * S[AT(j * NX + k)];
+            if (i == j)
+                EACH sum[l] = sum[l] <= 0.0 ? 0.0 : sqrt(sum[l]);
+            if (i > j)
+                EACH sum[l] = S[AT(j * NX + j)] == 0.0 ? 0.0 : sum[l] / S[AT(j * NX + j)];
+            EACH S[AT(i * NX + j)] = sum[l];
+        }
+}
+
+/* The filter from the sample `first` until before `last`. Covariances are updated by their factors, as
+ * in the filter of one record. */
 static void follow(position *now, const inputs *in, long long first, long long last,
                    long long samples, long long substeps, double period, const double *p,
                    const double *r, const double *slopes, long long width, long long parameter,
                    double *white)
 {
     double z[SIZE * LANES], u[(NU + 1) * LANES], hx[NY * NX * LANES], mean[NY * LANES];
-    double covariance[NY * NY * LANES], g[NX * LANES], FP[NX * NX * LANES], own[(NP + 1) * LANES];
+    double covariance[NY * NY * LANES], FP[NX * NX * LANES], own[(NP + 1) * LANES];
+    double S[NX * NX * LANES], HS[NY * NX * LANES], f[NX * LANES], g[NX * LANES];
     double *x = now->x, *P = now->P, *F = z + NX * LANES;
     for (long long t = first; t < last; t++) {
         for (int i = 0; i < NP; i++)
@@ -146,38 +165,57 @@ static void follow(position *now, const inputs *in, long long first, long long l
         for (int i = 0; i < NX; i++)
             EACH z[AT(i)] = x[AT(i)];
         output_jacobian(z, u, own, mean, hx);
+        factor(P, S);
+        for (int a = 0; a < NY; a++)
+            for (int j = 0; j < NX; j++) {
+                EACH HS[AT(a * NX + j)] = 0.0;
+                for (int i = 0; i < NX; i++)
+                    EACH HS[AT(a * NX + j)] += hx[AT(a * NX + i)] * S[AT(i * NX + j)];
+            }
         for (int a = 0; a < NY; a++)
             for (int b = 0; b < NY; b++) {
                 double sum[LANES];
                 EACH sum[l] = a == b ? r[a] : 0.0;
-                for (int i = 0; i < NX; i++)
-                    for (int j = 0; j < NX; j++)
-                        EACH sum[l] += hx[AT(a * NX + i)] * P[AT(i * NX + j)] * hx[AT(b * NX + j)];
+                for (int j = 0; j < NX; j++)
+                    EACH sum[l] += HS[AT(a * NX + j)] * HS[AT(b * NX + j)];
                 EACH covariance[AT(a * NY + b)] = sum[l];
             }
         add(mean, covariance, in, t, slopes + NY * width * t, width, white, now->sums);
         for (int a = 0; a < NY; a++) {
-            double variance[LANES], error[LANES], used[LANES];
+            double variance[LANES], error[LANES], gain[LANES], narrowed[LANES];
             EACH {
-                used[l] = in->seen[l][NY * t + a] != 0.0 ? 1.0 : 0.0;
                 variance[l] = r[a];
                 error[l] = in->y[l][NY * t + a] - mean[AT(a)];
             }
             for (int i = 0; i < NX; i++) {
-                EACH g[AT(i)] = 0.0;
-                for (int j = 0; j < NX; j++)
-                    EACH g[AT(i)] += P[AT(i * NX + j)] * hx[AT(a * NX + j)];
+                EACH f[AT(i)] = 0.0;
+                for (int k = 0; k < NX; k++)
+                    EACH f[AT(i)] += hx[AT(a * NX + k)] * S[AT(k * NX + i)];
                 EACH {
-                    variance[l] += hx[AT(a * NX + i)] * g[AT(i)];
+                    variance[l] += f[AT(i)] * f[AT(i)];
                     error[l] -= hx[AT(a * NX + i)] * (x[AT(i)] - z[AT(i)]);
                 }
             }
+            EACH {
+                const int used = in->seen[l][NY * t + a] != 0.0;
+                gain[l] = used ? error[l] / variance[l] : 0.0;
+                narrowed[l] = used ? 1.0 / (variance[l] + sqrt(r[a] * variance[l])) : 0.0;
+            }
             for (int i = 0; i < NX; i++) {
-                EACH x[AT(i)] += used[l] != 0.0 ? g[AT(i)] * error[l] / variance[l] : 0.0;
+                EACH g[AT(i)] = 0.0;
                 for (int j = 0; j < NX; j++)
-                    EACH P[AT(i * NX + j)] -= used[l] != 0.0 ? g[AT(i)] * g[AT(j)] / variance[l] : 0.0;
+                    EACH g[AT(i)] += S[AT(i * NX + j)] * f[AT(j)];
+                EACH x[AT(i)] += g[AT(i)] * gain[l];
+                for (int j = 0; j < NX; j++)
+                    EACH S[AT(i * NX + j)] -= g[AT(i)] * f[AT(j)] * narrowed[l];
             }
         }
+        for (int i = 0; i < NX; i++)
+            for (int j = 0; j < NX; j++) {
+                EACH P[AT(i * NX + j)] = 0.0;
+                for (int k = 0; k < NX; k++)
+                    EACH P[AT(i * NX + j)] += S[AT(i * NX + k)] * S[AT(j * NX + k)];
+            }
         if (t + 1 == samples)
             return;
         for (int i = 0; i < NX; i++)

@@ -101,22 +101,23 @@ class Prediction:
 
         """
         mean, covariance, seen = self.mean.copy(), self.covariance.copy(), self.record.mask
-        count, samples, outputs, width = slopes.shape
-        centre, spread = np.zeros((count, width)), np.tile(np.eye(width), (count, 1, 1))
+        count, samples, _, width = slopes.shape
+        factor = root_of(covariance, seen)
+        white = np.linalg.solve(factor, np.where(seen[..., None], slopes, 0.0))
+        errors = whitened(self.record.observed - mean, factor, seen)
+        centre, root = np.zeros((count, width)), np.tile(np.eye(width), (count, 1, 1))
         for t in range(samples):
-            h = slopes[:, t]
-            column = spread @ h.swapaxes(1, 2)
-            mean[:, t] += (h @ centre[..., None])[..., 0]
-            covariance[:, t] += h @ column
-            used = seen[:, t]
-            if used.any():
-                own, unit = covariance[:, t], np.eye(outputs)
-                both = used[:, :, None] & used[:, None, :]
-                column = np.where(used[:, None, :], column, 0.0)
-                gain = column @ np.linalg.inv(np.where(both, own, unit))
-                error = np.where(used, self.record.observed[:, t] - mean[:, t], 0.0)
-                centre = centre + (gain @ error[..., None])[..., 0]
-                spread = spread - gain @ column.swapaxes(1, 2)
+            mean[:, t] += (slopes[:, t] @ centre[..., None])[..., 0]
+            h = slopes[:, t] @ root
+            covariance[:, t] += h @ h.swapaxes(1, 2)
+            # Potter's update of a factor of the covariance, which rounding cannot make negative.
+            for own, error in zip(white[:, t].swapaxes(0, 1), errors[:, t].T, strict=True):
+                f = (own[:, None] @ root)[:, 0]
+                variance = 1 + np.sum(f**2, axis=1)
+                gain = (root @ f[..., None])[..., 0] / variance[:, None]
+                centre = centre + gain * (error - np.sum(own * centre, axis=1))[:, None]
+                narrowed = gain / (1 + 1 / np.sqrt(variance))[:, None]
+                root = root - narrowed[..., None] * f[:, None]
         return replace(self, mean=mean, covariance=covariance)
 
     def log_density(self) -> NDArray:
