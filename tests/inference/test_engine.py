@@ -15,7 +15,7 @@ from retwin.inference import solver
 from retwin.inference.em import expectation_maximisation
 from retwin.inference.evidence import added_evidence, best_per_row
 from retwin.inference.losses import StudentT, Tukey
-from retwin.inference.noise import Noise, correlation_time
+from retwin.inference.noise import Noise, common_rounding, correlation_time
 from retwin.inference.priors import GaussianPrior
 from retwin.inference.solver import Bounds, Solution, solve
 
@@ -239,6 +239,16 @@ def test_a_group_without_samples_keeps_its_scale() -> None:
     found = noise.learned(problem, residual, common=0.0, blocks=1)
     assert (found.scale[0] > 1.5).all()
     assert found.scale[1].tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.1, 0.2, 0.4])
+def test_what_noise_leaves_of_a_rounding_error_is_that_of_simulations(noise: float) -> None:
+    rng = np.random.default_rng(0)
+    constant = rng.uniform(size=3000)
+    samples = np.round(constant[:, None] + noise * rng.normal(size=(3000, 1500)))
+    common = float(np.mean((samples.mean(axis=1) - constant) ** 2))
+    within = torch.tensor(samples.var(axis=1).mean())
+    assert abs(float(common_rounding(within, 1 / 12)) - common) < 0.004
 
 
 def test_correlation_of_rows_or_of_all() -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +21,8 @@ HEAVY_TAILED = StudentT()
 """The loss of noise by default: glitches hardly count."""
 MAX_CORRELATION = 0.95
 """Largest lag-one autocorrelation that is learned: beyond it the estimate is too uncertain."""
+LEVELS = 201
+"""Levels of noise at which the common error of rounded values is computed, and terms of its sum."""
 SMALLEST_SHARE = 1e-6
 """Smallest scale relative to the largest one: it keeps exact outputs from infinite weight."""
 
@@ -97,6 +100,7 @@ class Noise:
         *,
         common: float,
         blocks: float,
+        rounding: tuple[float, ...] = (),
         variance: Tensor | float = 0.0,
         floor: float = 1e-18,
     ) -> Noise:
@@ -115,6 +119,9 @@ class Noise:
             of a sample: it does not average out, however many samples a block has.
         blocks : float
             The number of blocks in all rows together, at least 1.
+        rounding : tuple of float
+            Variance of the error by rounding in each group, where values do not change in a block:
+            the part of it that noise does not average out is common to the block too.
         variance : Tensor | float
             (R, K, d), the posterior variance of the predicted outputs.
         floor : float
@@ -136,13 +143,44 @@ class Noise:
                 thinning.append(self.thinning[k])
                 continue
             variances = (square * part).sum(dim=(0, 1)) / count
+            lattice = rounding[k] if rounding else 0.0
+            shared = common_rounding(variances.mean(), lattice)
+            variances = variances.clamp_min(lattice)
             scale.append((variances if len(self.scale[k]) > 1 else variances.mean(0, True)).sqrt())
             kept = residual / self.scale[k] * (weights * part).sqrt()
             time = correlation_time(kept, part[..., 0], rows=False, limit=MAX_CORRELATION)
-            thinning.append(time + common * count / blocks)
+            share = (shared / scale[-1].square().mean()).clamp_min(common)
+            thinning.append(time + share * count / blocks)
         scales = torch.stack(scale)
         smallest = max(floor, SMALLEST_SHARE * float(scales.amax()))
         return Noise(scales.clamp_min(smallest), torch.stack(thinning), self.loss)
+
+
+def common_rounding(within: Tensor, rounding: float) -> Tensor:
+    """Variance of the rounding error of a constant value that its noise does not average out.
+
+    A constant value with Gaussian noise of deviation s is rounded to multiples of d. The mean of
+    many samples has an error of variance d²/(2 π²) Σ exp(-4 π² k² s²/d²)/k², over all constants
+    (Widrow and Kollár, Quantization Noise, 2008, chapter 9): d²/12, the whole one, without noise,
+    and next to none from s = d/2 on. Samples differ from their mean by the rest of s² + d²/12.
+
+    Parameters
+    ----------
+    within : Tensor
+        (...,), variances of the samples about their mean, from which s is found.
+    rounding : float
+        Variance d²/12 of the error of a sample; 0 for no lattice.
+
+    """
+    if rounding <= 0:
+        return torch.zeros_like(within)
+    step = (12 * rounding) ** 0.5
+    noise = np.linspace(0.0, step, LEVELS)
+    terms = np.arange(1, LEVELS)
+    waves = np.exp(-((2 * np.pi * terms * noise[:, None] / step) ** 2)) / terms**2
+    common = step**2 / (2 * np.pi**2) * waves.sum(axis=1)
+    left = noise**2 + rounding - common
+    return within.new_tensor(np.interp(within.numpy(), left, common))
 
 
 def correlation_time(values: Tensor, counted: Tensor, *, rows: bool, limit: float) -> Tensor:

@@ -16,6 +16,7 @@ from retwin.inference.solver import Bounds
 from retwin.update.corrections.correction import Context, DifferentiableTwin
 from retwin.update.corrections.delays import delay_bounds
 from retwin.update.corrections.effective_commands import command_jacobians, effective_commands
+from retwin.update.corrections.sampled_sensor import lattice_step
 from retwin.update.corrections.surrogate_slopes import differences, outputs_at, slopes_at
 from retwin.update.corrections.warp import gather_samples, interpolate, thinned, within
 from retwin.update.kernels.generation import linearised_outputs
@@ -39,7 +40,7 @@ GAIN_STEP = 5e-3
 """Step of the finite differences of the gain, in standard deviations of a command."""
 TRAJECTORIES_PER_BATCH = 64
 """Trajectories linearised together, which bounds memory."""
-COMMON = ("surrogate", "unit", "delay_range", "own_delays")
+COMMON = ("surrogate", "unit", "rounding", "delay_range", "own_delays")
 """Fields of `CommandProblem` that all trajectories share."""
 
 
@@ -72,6 +73,8 @@ class CommandProblem:
         (n, S, d_y), in `unit`.
     unit : Tensor
         (d_y,), the unit of the residual in that of the outputs.
+    rounding : Tensor
+        (d_y,), variance of the error of a sample by rounding, in `unit` squared.
     valid : Tensor
         (n, M) bool, segments that exist.
     healthy : Tensor
@@ -103,6 +106,7 @@ class CommandProblem:
     group: Tensor
     observed: Tensor
     unit: Tensor
+    rounding: Tensor
     valid: Tensor
     healthy: Tensor
     faulty: Tensor
@@ -135,6 +139,7 @@ class CommandProblem:
         whole = mask.all(dim=-1)
         sample, used = thinned(whole, max_samples)
         unit = _unit(context, observed.double()[whole]) if unit is None else unit
+        steps = [lattice_step(each) for each in observed.double()[whole].numpy().T]
         values = torch.where(whole[..., None], observed.double(), 0.0)
         settling = SETTLING * max(delay_range[1], 0.0)
         near = within(sample, segments.start + delay_range[0], segments.settle + settling)
@@ -149,6 +154,7 @@ class CommandProblem:
             group=(near & valid[..., None]).any(dim=1).long(),
             observed=gather_samples(values, sample) / unit,
             unit=unit,
+            rounding=(unit.new_tensor(steps) / unit).square() / 12,
             valid=valid,
             healthy=healthy,
             faulty=bent & valid[..., None],
@@ -239,12 +245,19 @@ class CommandProblem:
     def learned_noise(
         self, noise: Noise, residual: Tensor, variance: Tensor | float = 0.0, floor: float = 1e-18
     ) -> Noise:
-        """The noise at rest and in motion, see `Noise.learned`: a block of samples is a segment."""
+        """The noise at rest and in motion, see `Noise.learned`: a block of samples is a segment.
+
+        In motion the errors by rounding are as good as independent.
+        """
+        rounding = self.rounding
+        if self.whitening is not None:
+            rounding = self.whitening.square()[self.measured > 0].mean(dim=0) @ rounding
         return noise.learned(
             self,
             residual,
             common=COMMON_ERROR,
             blocks=max(1.0, float(self.valid.sum())),
+            rounding=(float(rounding.mean()), 0.0),
             variance=variance,
             floor=floor,
         )

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from retwin.data.segments import Segments
 from retwin.inference.losses import Tukey
-from retwin.inference.noise import Noise, correlation_time
+from retwin.inference.noise import Noise, common_rounding, correlation_time
 from retwin.inference.solver import Bounds
 from retwin.update.corrections.delays import delay_bounds
 from retwin.update.corrections.sampled_sensor import lattice_step
@@ -211,7 +211,8 @@ class PathProblem:
         kept = residual * noise.precision(self, residual).sqrt()
         time = correlation_time(kept, self.measured, rows=True, limit=MAX_CORRELATION)
         # Samples at rest are all rounded the same way, unless their noise is as large.
-        same = (self.rounding / rest).square() * (self.measured * ~moving).sum(dim=1)
+        common = common_rounding(scales[1].square(), self.rounding**2) / rest.square()
+        same = common * (self.measured * ~moving).sum(dim=1)
         segments = torch.as_tensor(self.segments.valid).sum(dim=1).clamp_min(1)
         return replace(
             noise, thinning=torch.stack([time.maximum(same / segments), time], dim=1).flatten()
