@@ -82,6 +82,9 @@ class StateTwin:
         they are held, and `fit_dynamics` chooses by the calibration record.
     limits : Limits, optional
         Range of the commands.
+    learned : bool, default False
+        Whether the equations were learned from simulations, so that the coordinates of their
+        states are arbitrary; `fit_dynamics` then leaves to the parameters all that they explain.
 
     Raises
     ------
@@ -116,6 +119,7 @@ class StateTwin:
     substeps: int = 1
     interpolation: str | None = None
     limits: Limits | None = None
+    learned: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "states", tuple(self.states))

@@ -37,8 +37,8 @@ COMPARED = 5000
 DISTINCT = 1e-5
 """Norm of what a term of norm 1 has beyond others, below which it is a combination of them."""
 ABSORBED = 1e-3
-"""Standard deviation of what a network has in common with the effects of parameters, in the root
-mean square of the states' time derivatives: so small that it is theirs."""
+"""Standard deviation of what a discrepancy has in common with the effects of parameters, in the
+root mean square of the states' time derivatives: so small that it is theirs."""
 SHARED = 1.0
 """The same for equations with a known sign, whose discrepancy may be impossible without any: as
 much as a coefficient's."""
@@ -278,15 +278,17 @@ class CorrectedEquations:
         return np.array([each for _, own, _ in found for each in own], dtype=int)
 
     def absorbed(self, coefficients: NDArray) -> tuple[NDArray, NDArray]:
-        """What the parameters could explain of a network, (r,), and its derivatives (r, k).
+        """What the parameters could explain of the discrepancy, (r,), and its derivatives (r, k).
 
         It is the component of each discrepancy in the span of the effects of the parameters on all
         state equations, over the visited states, in the standard deviation that it may have.
-        Nothing (0,) for a library, whose terms have a meaning of their own.
+        Nothing (0,) for a library over the states of a model, whose terms have a meaning of their
+        own. Those over learned states have none: together they imitate the parameters' effects.
         """
         import torch
 
-        if isinstance(self.form, Library) or not self._effects.size:
+        named = isinstance(self.form, Library) and not self.twin.learned
+        if named or not self._effects.size:
             return np.zeros(0), np.zeros((0, len(coefficients)))
         psi = torch.tensor(coefficients, requires_grad=True)
         scaled, basis = self._scaled(*self.visited), torch.tensor(self._effects)

@@ -192,6 +192,7 @@ class Equations:
             step=next_state,
             parameters=parameters,
             limits=limits,
+            learned=True,
         )
 
     def _states(self, starts: NDArray | None = None) -> list[State]:
