@@ -185,9 +185,11 @@ class CorrectedEquations:
             places = sorted({*used} if given else {i, *used})
             own = [everything[place] for place in places]
             signs = settings.signs(state, own)
+            zeros = [float(rest[place]) for place in places]
+            count = sum(place < len(names) for place in places)
             terms = [
                 term
-                for term in self.form.terms(own, sum(place < len(names) for place in places), signs)
+                for term in self.form.terms(own, count, signs, zeros)
                 if f"{state}: {term.name}" not in self.dropped
             ]
             zero = float(rest[i]) if state in settings.passive else None

@@ -33,6 +33,9 @@ MAX_STEPS = 60
 """Steps of the trust-region method at most."""
 TOLERANCE = 1e-2
 """Norm of the gradient, in nats per prior or posterior deviation, at which the search ends."""
+IDLE = (5, 0.03)
+"""Number of successive steps, each of which gains less than so many nats, at which the search ends:
+of inner coefficients of terms that hardly matter next to nothing is known."""
 WIDEST = 1e6
 """Largest trust region, in posterior deviations at the start of the search."""
 RESOLUTION = 1e-12
@@ -180,9 +183,9 @@ class Estimation:
             return at
         value, gradient, curvature = self._expanded(at)
         unit = curvature.unit
-        radius = WIDEST / 1e3
+        radius, idle = WIDEST / 1e3, 0
         for _ in range(steps):
-            if np.linalg.norm(unit * gradient) < TOLERANCE:
+            if np.linalg.norm(unit * gradient) < TOLERANCE or idle == IDLE[0]:
                 break
             scaled = curvature.scaled(unit)
             ends = ((each - flat) / unit for each in self.bounds)
@@ -200,6 +203,7 @@ class Estimation:
             elif ratio > 0.75:
                 radius = max(radius, min(2 * length, WIDEST))
             if ratio > ACCEPTED:
+                idle = idle + 1 if value - found[0] < IDLE[1] else 0
                 at, flat, (value, gradient, curvature) = tried, inside, found
                 # What did not act at the start may act now, and its unit was without meaning.
                 unit = np.where(unit > WIDEST * curvature.unit, curvature.unit, unit)

@@ -13,12 +13,21 @@ import torch
 
 from retwin.arrays import floats
 from retwin.checks import one_of, require, whole
+from retwin.twins.parametric import Parameter
 from retwin.update.dynamics.terms import Term, allowed
 
 __all__ = ["Library"]
 
-STEEPNESS = 0.05
-"""Width of the smooth sign function of Coulomb friction, in half ranges of its variable."""
+WIDTH = 0.05
+"""Usual width of the smooth sign function of Coulomb friction, in half ranges of its variable."""
+WIDTHS = (-4.0, 3.0)
+"""Bounds of the logarithm of its ratio to the usual one: from a thousandth of the half range to all
+of it."""
+SHIFT = 0.2
+"""Usual distance of a hinge from its knot, in half ranges of its variable: half of that between two
+knots."""
+SHIFTS = (-2.0, 2.0)
+"""Bounds of its ratio to the usual one: those of the next knots."""
 SIMPLE = 2
 """Degree up to which libraries of monomials alone are tried before the whole one."""
 MAX_MONOMIALS = 200
@@ -37,11 +46,13 @@ class Library:
         Highest degree of the monomials, which include products of different variables. It is
         lowered for equations of so many variables that there would be more than 200.
     knots : sequence of float
-        Places of hinges max(0, v - knot) and max(0, -v - knot) of each variable v, from 0 to 1: a
-        piecewise linear function, for saturation, dead zones and overflow. They are 0 in the
-        middle, where the twin's own equations hold best.
+        Usual places of hinges max(0, v - knot) and max(0, -v - knot) of each variable v, from 0 to
+        1: a piecewise linear function, for saturation, dead zones and overflow. They are 0 in the
+        middle, where the twin's own equations hold best. The places are estimated, but one of 0.
     friction : bool, default True
-        Whether Coulomb and quadratic friction, sign(v) and v |v|, of each state are included.
+        Whether Coulomb and quadratic friction, sign(v) and v |v|, of each state are included. They
+        change sign where the state is 0, in its own unit. The sign function is smooth; its width,
+        which is that of a motion near 0 or of lubrication, is estimated.
 
     """
 
@@ -71,10 +82,17 @@ class Library:
         smooth = [Library(degree, (), False) for degree in range(min(self.degree, SIMPLE) + 1)]
         return [*(each for each in smooth if each != self), self]
 
-    def terms(self, variables: Sequence[str], states: int, signs: Sequence[int] = ()) -> list[Term]:
+    def terms(
+        self,
+        variables: Sequence[str],
+        states: int,
+        signs: Sequence[int] = (),
+        zeros: Sequence[float] = (),
+    ) -> list[Term]:
         """The terms of an equation with such variables, of which the first `states` are states.
 
-        `signs` are those of `allowed`, by default all free.
+        `signs` are those of `allowed`, by default all free. `zeros` are the scaled variables where
+        these are 0 in their own units, by default in the middle.
         """
         places = range(len(variables))
         degree = self.degree
@@ -94,10 +112,16 @@ class Library:
             for sign, knot in product((1, -1), self.knots):
                 shifted = f"{'-' if sign < 0 else ''}{name}{f' - {knot:g}' if knot else ''}"
                 hinge = partial(_hinge, i=i, sign=sign, knot=knot)
-                found.append(Term(f"max(0, {shifted})", hinge, [sign * each for each in only]))
+                shift = Parameter(f"shift of max(0, {shifted})", "1", *SHIFTS, 0.0)
+                directions, inner = [sign * each for each in only], (shift,) if knot else ()
+                found.append(Term(f"max(0, {shifted})", hinge, directions, inner))
             if self.friction and i < states:
-                found.append(Term(f"sign({name})", partial(_sign, i=i), only))
-                found.append(Term(f"{name} |{name}|", partial(_quadratic, i=i), only))
+                zero = zeros[i] if zeros else 0.0
+                width = Parameter(f"log width of sign({name})", "1", *WIDTHS, 0.0)
+                coulomb = partial(_sign, i=i, zero=zero)
+                found.append(Term(f"sign({name})", coulomb, only, (width,)))
+                quadratic = partial(_quadratic, i=i, zero=zero)
+                found.append(Term(f"{name} |{name}|", quadratic, only))
         return list(allowed(found, signs or [0] * len(variables)))
 
 
@@ -113,16 +137,16 @@ def _direction(chosen: Sequence[int], i: int) -> int | None:
     return 1 if chosen.count(i) % 2 and all(others) else None
 
 
-def _hinge(v: Sequence[Any], i: int, sign: int, knot: float) -> Any:
-    return torch.relu(sign * v[i] - knot)
+def _hinge(v: Sequence[Any], shift: Any = 0.0, *, i: int, sign: int, knot: float) -> Any:
+    return torch.relu(sign * v[i] - knot - SHIFT * shift)
 
 
-def _sign(v: Sequence[Any], i: int) -> Any:
-    return torch.tanh(v[i] / STEEPNESS)
+def _sign(v: Sequence[Any], width: Any, i: int, zero: float) -> Any:
+    return torch.tanh((v[i] - zero) / (WIDTH * torch.exp(torch.as_tensor(width).double())))
 
 
-def _quadratic(v: Sequence[Any], i: int) -> Any:
-    return v[i] * torch.abs(v[i])
+def _quadratic(v: Sequence[Any], i: int, zero: float) -> Any:
+    return (v[i] - zero) * torch.abs(v[i] - zero)
 
 
 def _product(variables: Sequence[str], chosen: Sequence[int]) -> str:

@@ -43,8 +43,14 @@ class TanhNetwork:
         whole("hidden", self.hidden, least=1)
         whole("seed", self.seed, least=0)
 
-    def terms(self, variables: Sequence[str], states: int, signs: Sequence[int]) -> list[Term]:
-        """The constant and the units, see `Library.terms`.
+    def terms(
+        self,
+        variables: Sequence[str],
+        states: int,
+        signs: Sequence[int],
+        zeros: Sequence[float] = (),
+    ) -> list[Term]:
+        """The constant and the units, see `Library.terms`; `zeros` do not matter.
 
         tanh is odd, so that a unit may have a positive weight without loss of generality. A network
         of such units is monotone in a variable whose inner weights have one sign (Sill, "Monotonic
