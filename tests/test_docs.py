@@ -97,6 +97,14 @@ def test_the_code_of_a_page_runs(page: str, module: ModuleType) -> None:
         assert 0.8 < names["fidelity"].figures["coverage90"].value < 1.0
 
 
+def test_the_functions_that_pages_place_in_files_are_there() -> None:
+    """Such as "`update/corrected.py`: `CorrectedTwin`", the table of equations above all."""
+    for page in DOCS.glob("*.md"):
+        for file, name in re.findall(r"`((?:\w+/)+\w+\.py)`: `(\w+)", page.read_text("utf-8")):
+            source = (ROOT / "src" / "retwin" / file).read_text("utf-8")
+            assert re.search(rf"^ *(def|class) {name}\b", source, re.MULTILINE), (file, name)
+
+
 def test_what_cannot_be_told_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.warns(UserWarning, match="not identified: motor, gear"):
         names = run("pitfalls.md", {})
