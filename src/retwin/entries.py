@@ -248,7 +248,7 @@ def resolve(target: str) -> Any:
     Raises
     ------
     ImportError, AttributeError
-        There is no such module or object; for each entry of this module there is one.
+        There is no such module or object; for each entry of the catalog there is one.
 
     """
     module, _, attribute = target.partition(":")

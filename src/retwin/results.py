@@ -357,7 +357,7 @@ class Results(ResultsPart):
         The paper's figures of a source, by metric.
     comparisons : list of Comparison
         Every pair of sources on every metric that is compared.
-    fidelity : dict of str to Fidelity
+    fidelity : dict of str to FidelityResults
         By source.
 
     """

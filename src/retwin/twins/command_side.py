@@ -36,9 +36,9 @@ class CommandSide(TwinWrapper):
     """Any twin whose commands are delayed and offset: parameters `delay` and `offset.CHANNEL`.
 
     The transport delay in s is the same for all actuators. Each actuator has an offset in its
-    command unit, constant from the first sample on. Both act after
-    the faults of the reference and before a stuck actuator is held; the result is clipped to the
-    twin's limits. Other parameters are passed to the wrapped twin.
+    command unit, constant from the first sample on. Both act after the faults of the reference and
+    before a stuck actuator is held; the result is clipped to the twin's limits. Other parameters
+    are passed to the wrapped twin.
 
     Parameters
     ----------

@@ -64,7 +64,7 @@ def free_chain(plane: Plane, effort: int = 1) -> PlaneSolution:
 
     Returns
     -------
-    Solution
+    PlaneSolution
         The best explanation of each path.
 
     """

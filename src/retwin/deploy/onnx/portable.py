@@ -93,7 +93,7 @@ class Portable:
 
     Attributes
     ----------
-    graphs : mapping of str to Graph
+    graphs : mapping of str to Session
         Functions from named arrays to an array.
     facts : Facts
         The values of the case that are kept.

@@ -41,8 +41,6 @@ SCHEMA = 2
 """The version of the plan's identity. Digests of the first, which has no such key, differ."""
 MAX_NPZ_BYTES = 2**29
 """Greatest size of an NPZ's arrays, which are held in memory."""
-
-
 COPIES = 3
 """Arrays of a chunk that are in memory together: simulated, stored and packed. Zarr takes memory
 for a whole chunk, also where the last one is shorter."""

@@ -2,10 +2,9 @@
 
 The statistical unit is the trajectory, because samples within one are correlated: intervals are
 Student's over trajectories, on the scale of the logarithm for scores and of the logit for shares.
-Some figures would not be at their ideal value even for a
-perfect generator, because there are few trajectories. For these, each of the twin's draws takes
-the place of the measured trajectory in turn, which gives the distribution under a perfect
-generator.
+Some figures would not be at their ideal value even for a perfect generator, because there are few
+trajectories. For these, each of the twin's draws takes the place of the measured trajectory in
+turn, which gives the distribution under a perfect generator.
 """
 
 from __future__ import annotations

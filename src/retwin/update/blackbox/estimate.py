@@ -274,7 +274,7 @@ def with_best_prior(start: Callable[[NDArray], BlackBoxFit], seen: NDArray) -> B
 
     Returns
     -------
-    Fit or None
+    BlackBoxFit or None
         None where the simulation diverges at the start.
 
     """

@@ -85,7 +85,7 @@ class Equations:
         A, B, c, C, D, e, V, b, W and Y, in scaled units.
     speed : NDArray
         (d_x,), root mean square of the steps of the states, s.
-    given, outputs : Scale
+    given, outputs : ChannelScale
         Of commands and parameters, and of outputs.
 
     """
