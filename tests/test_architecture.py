@@ -34,6 +34,7 @@ ROOMS = (
         "serialisation",
         "entries",
         "catalog",
+        "source_results",
         "results",
     ),
     ("data",),

@@ -9,9 +9,9 @@ from typing import Any
 
 from retwin.report.lights import Alarms, Light, Use
 from retwin.report.study import Study
-from retwin.results import Comparison
 from retwin.scores.change import ErrorChange, needed_to_decide
 from retwin.scores.comparison import MIN_RUNS
+from retwin.source_results import Comparison
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ from retwin.checks import require
 from retwin.data.trajectories import HEALTHY
 from retwin.errors import InputError
 from retwin.report.labels import order
-from retwin.results import Results, SourceResults, read_results
+from retwin.results import Results, read_results
+from retwin.source_results import SourceResults
 
 AGAIN = "run `retwin study` with this folder as --out again"
 BANDS = ("nominal", "observed", "seen", "quantiles", "ids", "rate")

@@ -26,7 +26,7 @@ from retwin.report.labels import (
 )
 from retwin.report.study import Study
 from retwin.report.verdict import headline, outcome_of
-from retwin.results import Comparison
+from retwin.source_results import Comparison
 
 
 def comparisons(study: Study) -> Section | None:

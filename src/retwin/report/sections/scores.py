@@ -29,8 +29,9 @@ from retwin.report.labels import (
 )
 from retwin.report.study import Study
 from retwin.report.style import colour_of, symbol
-from retwin.results import Results, SourceResults
+from retwin.results import Results
 from retwin.scores.calibration import calibration_floor
+from retwin.source_results import SourceResults
 
 FURTHER = tuple(
     name for name, metric in METRICS.items() if not metric.headline and metric.unit == "1"
