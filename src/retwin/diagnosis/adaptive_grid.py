@@ -18,13 +18,13 @@ CELLS = {1: 48, 2: 12, 3: 8}
 """Cells along each side at first, by the number of quantities that are open."""
 NEGLIGIBLE = 8.0
 """How many nats below the largest contribution a cell is refined no further: 3e-4 of it."""
-LEAST = 12
+MIN_REFINED = 12
 """Number of cells that are refined at least, since a maximum may lie off all centres."""
-MOST = 500
+MAX_REFINED = 500
 """Number of cells that are refined at most, for likelihoods that hardly depend on anything."""
 TOLERANCE = 0.05
 """Change of the log integral in nats, below which there is no further round."""
-LARGEST = 0.03
+MAX_CELL_SHARE = 0.03
 """Share of one cell, below which there is no further round: intervals are no finer than a cell."""
 ROUNDS = 30
 """Rounds at most."""
@@ -101,17 +101,17 @@ def integrated(
         best = cells[np.argmax(mass)]
         # The likelihood may end abruptly, so that a maximum lies at the edge of a poor cell.
         beside = ((cells[..., 0] <= best[:, 1]) & (cells[..., 1] >= best[:, 0])).all(axis=1)
-        lowest = min(np.sort(mass)[-min(LEAST, len(mass))], mass.max() - NEGLIGIBLE)
+        lowest = min(np.sort(mass)[-min(MIN_REFINED, len(mass))], mass.max() - NEGLIGIBLE)
         order = np.argsort(np.where(beside, -np.inf, -mass))
         wanted = beside | ((mass >= lowest) & np.isfinite(mass))
-        chosen = order[: min(int(wanted.sum()), MOST)]
+        chosen = order[: min(int(wanted.sum()), MAX_REFINED)]
         parts = np.concatenate([_halves(each, whole) for each in cells[chosen]])
         if len(parts) == len(chosen):
             break
         cells = np.concatenate([np.delete(cells, chosen, axis=0), parts])
         mass = np.concatenate([np.delete(mass, chosen), log_mass(parts)])
         before, total = total, _total(mass)
-        if abs(total - before) < TOLERANCE and mass.max() < total + np.log(LARGEST):
+        if abs(total - before) < TOLERANCE and mass.max() < total + np.log(MAX_CELL_SHARE):
             break
     if not np.isfinite(total):
         return Integral(-np.inf, *[np.full(len(limits), np.nan)] * 4)

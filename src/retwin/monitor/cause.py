@@ -27,7 +27,7 @@ from retwin.update.dynamics.twin import DynamicsTwin
 
 BEFORE = 100
 """Samples before an alarm from which its cause is inferred."""
-FEWEST = 10
+MIN_WINDOW = 10
 """Samples of a window, at least; the one of an earlier alarm is left out where more remain."""
 
 PARTS = ("value", "low", "high")
@@ -179,7 +179,7 @@ def find_causes(
         Faults that cannot be inverted (`fit_inversion`), or an alarm of another record.
 
     """
-    whole("before", before, least=FEWEST)
+    whole("before", before, least=MIN_WINDOW)
     ids, found, last = record.ids.tolist(), [], dict[str, int]()
     for alarm in alarms:
         require(
@@ -190,7 +190,7 @@ def find_causes(
             remedy="give the record that was watched",
         )
         first = max(0, alarm.sample - before)
-        if alarm.sample - last.get(alarm.trajectory, -1) > FEWEST:
+        if alarm.sample - last.get(alarm.trajectory, -1) > MIN_WINDOW:
             first = max(first, last.get(alarm.trajectory, -1) + 1)
         last[alarm.trajectory] = alarm.sample
         begin, end = first / record.rate, (alarm.sample + 1) / record.rate

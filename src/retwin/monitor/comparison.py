@@ -20,7 +20,7 @@ from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.monitor.trajectory_comparison import compared_trajectories
 from retwin.scores.distributions import crps_normal
 
-MOST = 20_000
+MAX_SAMPLES = 20_000
 """Newest samples of each asset that are compared, which bounds time and memory."""
 KINDS: Mapping[type, str] = {Monitor: "samples", TrajectoryMonitor: "trajectories"}
 
@@ -137,7 +137,7 @@ def _healthy(store: Store, twin: str, monitor: Monitor) -> Iterator[NDArray]:
         newest = store.state(asset.name)
         if asset.settings.get("twin") == twin and newest is not None:
             period = SECOND / monitor.twin.rate
-            first = newest[0] - round(MOST * period)
+            first = newest[0] - round(MAX_SAMPLES * period)
             times, rows = gridded(store, asset.name, monitor.twin, first, newest[0])
             ends = np.searchsorted(times, sorted(alarms.get(asset.name, [])))
             ends = np.unique(np.concatenate([[0], ends[ends > 0], [len(times) + BEFORE]]))

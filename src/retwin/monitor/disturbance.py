@@ -24,7 +24,7 @@ ROUNDS = 14
 RATIOS = (-12.0, 12.0)
 BLOCK = 1000
 """A longer record is estimated as independent blocks of so many samples, all at once."""
-FEWEST = 50
+MIN_RESIDUALS = 50
 """Measured residuals per stream, at least."""
 
 
@@ -152,9 +152,9 @@ def fit_disturbance(residual: ArrayLike, *, max_order: int = 3, folds: int = 4) 
     given = np.where(np.abs(given) < 1e100, given, np.nan)
     seen = ~np.isnan(given)
     require(
-        given.ndim == 2 and given.size and seen.sum(axis=-1).min() >= FEWEST,
+        given.ndim == 2 and given.size and seen.sum(axis=-1).min() >= MIN_RESIDUALS,
         "residual",
-        expected=f"an array (streams, T) with at least {FEWEST} residuals per stream",
+        expected=f"an array (streams, T) with at least {MIN_RESIDUALS} residuals per stream",
         got=f"shape {given.shape}" + (f" with {seen.sum(axis=-1).min()}" if given.size else ""),
         remedy="calibrate on a longer healthy record",
     )
@@ -168,10 +168,11 @@ def fit_disturbance(residual: ArrayLike, *, max_order: int = 3, folds: int = 4) 
     )
     folded = np.array_split(np.arange(given.shape[1]), folds)
     fewest = min((seen.sum(axis=1) - seen[:, each].sum(axis=1)).min() for each in folded)
+    enough = MIN_RESIDUALS // 2
     require(
-        fewest >= FEWEST // 2,
+        fewest >= enough,
         "residual",
-        expected=f"at least {FEWEST // 2} residuals outside each of {folds} parts of the record",
+        expected=f"at least {enough} residuals outside each of {folds} parts of the record",
         got=str(fewest),
         remedy="leave out the parts of the record in which nothing was measured",
     )

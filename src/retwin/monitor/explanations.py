@@ -14,7 +14,7 @@ from retwin.checks import require
 from retwin.diagnosis.estimate import UNKNOWN
 from retwin.errors import InputError, brief
 from retwin.monitor.audit import Entry
-from retwin.monitor.cause import BEFORE, FEWEST, Cause, cause_data, find_causes, possible_causes
+from retwin.monitor.cause import BEFORE, MIN_WINDOW, Cause, cause_data, find_causes, possible_causes
 from retwin.monitor.gridded import gridded, record_of
 from retwin.monitor.live import Live
 from retwin.monitor.monitor import Monitor
@@ -135,7 +135,7 @@ class Explanations:
         monitor = Monitor.load(Registry(store, twin).folder(alarm["version"]))
         period = SECOND / monitor.twin.rate
         window = round(min(BEFORE, alarm["sample"]) * period)
-        if alarm["time"] - before > FEWEST * period:
+        if alarm["time"] - before > MIN_WINDOW * period:
             window = min(window, alarm["time"] - before - round(period / 2))
         half = round(period / 2)
         begin, end = alarm["time"] - window - half, alarm["time"] + half

@@ -11,7 +11,7 @@ from retwin.arrays import held
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.samples import SECOND
 from retwin.monitor.store import Store
-from retwin.monitor.updates import LEAST
+from retwin.monitor.updates import EARLIEST
 from retwin.update.dynamics.twin import DynamicsTwin
 
 
@@ -40,7 +40,7 @@ def gridded(
     """
     commands = len(twin.inputs)
     times, values = [np.zeros(0, dtype=np.int64)], [np.zeros((0, commands + len(twin.outputs)))]
-    for part, rows in store.samples(asset, max(LEAST, first - 1)):
+    for part, rows in store.samples(asset, max(EARLIEST, first - 1)):
         times.append(part[part <= last])
         values.append(rows[part <= last])
         if part[-1] > last:

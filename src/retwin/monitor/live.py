@@ -25,9 +25,9 @@ from retwin.monitor.store import Store
 from retwin.monitor.stream_machine import StreamMachine, Work, step
 from retwin.monitor.trajectories import TrajectoryMonitor
 from retwin.monitor.trajectory_machine import Diagnosed, TrajectoryMachine
-from retwin.monitor.updates import MOST, Asset, Update, one_asset
+from retwin.monitor.updates import LATEST, Asset, Update, one_asset
 
-MOST_WAIT = 60.0
+MAX_WAIT = 60.0
 """Seconds for which a place without a sample is waited for at most."""
 WHY = {
     "late": "it begins before the newest one ends",
@@ -72,9 +72,9 @@ class Live:
     ) -> None:
         self.store = instance("store", store, Store, remedy="open one with Store(folder)")
         if wait is not None:
-            finite("wait", wait, least=0.0, most=MOST_WAIT, unit="s")
+            finite("wait", wait, least=0.0, most=MAX_WAIT, unit="s")
         self._wait = wait
-        self._ahead = finite("ahead", ahead, least=0.0, most=MOST / SECOND, unit="s")
+        self._ahead = finite("ahead", ahead, least=0.0, most=LATEST / SECOND, unit="s")
         self._clock = clock
         self._lock = threading.RLock()
         self._diagnosing = threading.Lock()

@@ -23,7 +23,7 @@ SIZES = (1 / 6, 1 / 2, 5 / 6)
 """Sizes of a bias that are tried, as shares of the way from its smallest to its largest size on a
 logarithmic scale: one of them is within a factor of 1.3 of the true one where these differ five
 times."""
-MOST = np.log(5.0)
+MAX_LOG_RATIO = np.log(5.0)
 """Nats by which one offset may be evidence for a bias: a bias shows in many, and a single one may
 be an outlier, of which the calibration has too few to know how often they come."""
 FARTHEST = 1e6
@@ -102,7 +102,7 @@ class OffsetModel:
         for share in SIZES:
             size = low ** (1 - share) * high**share
             signs = [_log_density(error + sign * size, self.degrees[1]) for sign in (-1, 1)]
-            gain = np.minimum(np.logaddexp(*signs) - np.log(2) - healthy, MOST)
+            gain = np.minimum(np.logaddexp(*signs) - np.log(2) - healthy, MAX_LOG_RATIO)
             made.append(np.where(np.isfinite(offsets), gain, 0.0).sum(axis=1))
         return np.stack(made, axis=1)
 

@@ -21,7 +21,7 @@ SECONDS = {
     "year": 31557600.0,
 }
 """Seconds of each unit of time: a year has 365.25 days, and a month is its twelfth part."""
-LEAST, MOST = 10.0, 1e15
+MIN_RUN_LENGTH, MAX_RUN_LENGTH = 10.0, 1e15
 """Limits of an average run length in samples: below ten samples every second alarm would be false
 at common rates, and above 1e15 the sums of a detector no longer count single samples."""
 NUMBER = r"(\d+(?:\.\d*)?(?:e[+-]?\d+)?)"
@@ -84,8 +84,8 @@ def false_alarms(wanted: str | float, rate: float) -> float:
     return finite(
         "false_alarms",
         samples,
-        least=LEAST,
-        most=MOST,
+        least=MIN_RUN_LENGTH,
+        most=MAX_RUN_LENGTH,
         unit="samples from one false alarm to the next, on average",
         remedy=f"{remedy}; a bare number counts samples",
     )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from retwin.checks import at_most, require
 from retwin.data.logs.signals import nanoseconds
 from retwin.errors import InputError, brief
-from retwin.monitor.updates import LEAST, MOST
+from retwin.monitor.updates import EARLIEST, LATEST
 
 SECOND = 10**9
 """Nanoseconds of a second."""
@@ -86,7 +86,7 @@ class Trajectory:
     def samples(self, rate: float) -> Samples:
         """Its samples at that rate in Hz; times end before they are out of range."""
         period = SECOND / rate
-        times = [min(self.begin + round(k * period), MOST) for k in range(len(self.values))]
+        times = [min(self.begin + round(k * period), LATEST) for k in range(len(self.values))]
         return Samples(self.asset, np.array(times, dtype=np.int64), self.values)
 
 
@@ -195,9 +195,9 @@ def _time(each: dict[str, Any], place: str) -> int:
                 made = None
         elif isinstance(given, int) and not isinstance(given, bool):
             made = given if "time_ns" in each else given * SECOND
-        elif isinstance(given, float) and "time" in each and abs(given) < MOST:
+        elif isinstance(given, float) and "time" in each and abs(given) < LATEST:
             made = round(given * SECOND)
-    if made is not None and LEAST < made < MOST:
+    if made is not None and EARLIEST < made < LATEST:
         return made
     expected = "seconds since the epoch, ISO 8601 with an offset, or whole time_ns"
     raise _refused(f"{place}: time", given, expected)

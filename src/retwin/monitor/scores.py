@@ -12,7 +12,7 @@ from scipy.special import ndtr, ndtri
 from retwin.checks import require, whole
 from retwin.monitor.slack import Slack, effective_samples
 
-FEWEST = 8
+MIN_ERRORS = 8
 """Calibration errors per stream, at least."""
 COPIES = 8
 """Places inside a rounding interval that stand for a rounded error."""
@@ -146,9 +146,9 @@ def fit_scores(errors: ArrayLike, width: ArrayLike = 0.0) -> ConformalScores:
     widths = np.broadcast_to(np.asarray(width, dtype=float), given.shape)
     seen = np.isfinite(given) & np.isfinite(widths)
     require(
-        given.ndim == 2 and given.size and seen.sum(axis=-1).min() >= FEWEST,
+        given.ndim == 2 and given.size and seen.sum(axis=-1).min() >= MIN_ERRORS,
         "errors",
-        expected=f"an array (streams, T) with at least {FEWEST} finite errors per stream",
+        expected=f"an array (streams, T) with at least {MIN_ERRORS} finite errors per stream",
         got=f"shape {given.shape}" + (f" with {seen.sum(axis=-1).min()}" if given.size else ""),
         remedy="calibrate on a longer healthy record",
     )

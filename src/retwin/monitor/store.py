@@ -29,8 +29,8 @@ from retwin.monitor.database import (
     states,
 )
 from retwin.monitor.updates import (
-    LEAST,
-    MOST,
+    EARLIEST,
+    LATEST,
     WORD,
     Asset,
     Committed,
@@ -239,7 +239,7 @@ class Store:
 
         """
         key, channels = self._asset(asset)
-        low = LEAST if after is None else whole("after", after, least=LEAST, most=MOST)
+        low = EARLIEST if after is None else whole("after", after, least=EARLIEST, most=LATEST)
         chosen = samples.select().where(samples.c.asset == key).order_by(samples.c.time)
         inclusive = after is None
         while True:
@@ -275,10 +275,10 @@ class Store:
         with self._reading() as connection:
             return present(connection, key, times)
 
-    def log(self, kind: str | None = None, after: int = LEAST) -> Iterator[Entry]:
+    def log(self, kind: str | None = None, after: int = -1) -> Iterator[Entry]:
         """The entries of the log in their order, or those of one kind, read part by part.
 
-        With `after`, only those whose sequence is larger.
+        With `after`, only those whose sequence, from 0 on, is larger.
         """
         chosen = log.select().order_by(log.c.sequence).limit(ROWS)
         if kind is not None:
@@ -362,7 +362,7 @@ class Store:
             if self._max_samples is not None:
                 counted = sa.select(sa.func.count()).select_from(samples).where(own)
                 count = connection.execute(counted).scalar_one()
-            self._held[key] = _Held(count, LEAST if latest is None else latest)
+            self._held[key] = _Held(count, EARLIEST if latest is None else latest)
         return self._held[key]
 
     def _remove_surplus(self, connection: Any, key: int) -> None:

@@ -18,7 +18,7 @@ from retwin.monitor.layout import Layout
 from retwin.monitor.machine import KEPT, Counts, Machine, Recent
 from retwin.monitor.monitor import Monitor
 from retwin.monitor.samples import SECOND, Samples
-from retwin.monitor.updates import LEAST, Asset
+from retwin.monitor.updates import EARLIEST, Asset
 from retwin.monitor.watched import Alarm, Watched
 
 DEFAULT_WAIT = 2
@@ -103,7 +103,7 @@ class StreamMachine(Machine[Monitor]):
     def stepped_time(self) -> int:
         """A time in nanoseconds after which are all samples that were not stepped."""
         assert self._origin is not None
-        return max(LEAST, self._origin + round((self._done - 0.5) * self._period))
+        return max(EARLIEST, self._origin + round((self._done - 0.5) * self._period))
 
     def unsure(self, times: NDArray) -> NDArray:
         """Those times that may be of samples which are stored already."""

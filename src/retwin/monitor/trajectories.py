@@ -23,7 +23,7 @@ from retwin.diagnosis.diagnoser import load_diagnoser
 from retwin.diagnosis.estimate import UNKNOWN
 from retwin.monitor.detector import LARGEST, Detector
 from retwin.monitor.offsets import OffsetModel, is_bias
-from retwin.monitor.promise import LEAST, MOST, duration
+from retwin.monitor.promise import MAX_RUN_LENGTH, MIN_RUN_LENGTH, duration
 from retwin.monitor.scores import ConformalScores, middle
 from retwin.monitor.slack import Slack
 from retwin.monitor.trajectory_evidence import (
@@ -299,7 +299,7 @@ class TrajectoryMonitor:
                 scores,
                 Slack(*about["slack"]),
                 finite("kappa", about["kappa"], least=1.0),
-                finite("arl", about["arl"], least=LEAST, most=MOST),
+                finite("arl", about["arl"], least=MIN_RUN_LENGTH, most=MAX_RUN_LENGTH),
                 positive("duration", about["duration"], unit="s"),
                 measured,
                 OffsetModel.of_arrays(arrays, len(twin.inputs)),

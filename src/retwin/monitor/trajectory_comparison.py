@@ -20,7 +20,7 @@ from retwin.scores.bootstrap import BLOCKS
 from retwin.twins.twin import Twin
 from retwin.update.corrected import CorrectedTwin
 
-FEWEST, MOST = 2 * BLOCKS, 6 * BLOCKS
+MIN_TRAJECTORIES, MAX_TRAJECTORIES = 2 * BLOCKS, 6 * BLOCKS
 """Healthy trajectories of all assets together that are compared: at least, so that a block of the
 bootstrap has two, and at most, since diagnosing each may take seconds."""
 BEFORE = 10
@@ -52,9 +52,10 @@ def compared_trajectories(
     machines = [[record_of(old.twin, each) for each in part] for part in _healthy(store, twin, old)]
     every = [each for part in machines for each in part]
     require(
-        len(every) >= FEWEST,
+        len(every) >= MIN_TRAJECTORIES,
         "trajectories",
-        expected=f"at least {FEWEST} healthy ones that are stored, of all machines together",
+        expected=f"at least {MIN_TRAJECTORIES} healthy ones that are stored, of all machines "
+        "together",
         got=len(every),
         remedy="compare the versions later",
     )
@@ -101,7 +102,7 @@ def _healthy(store: Store, twin: str, monitor: TrajectoryMonitor) -> Iterator[li
         begins = np.concatenate([[0], ends + 1])
         lasts = np.maximum(np.concatenate([ends - BEFORE, [len(known)]]), begins)
         longest = int(np.argmax(lasts - begins))
-        part = known[begins[longest] : lasts[longest]][-max(1, MOST // len(assets)) :]
+        part = known[begins[longest] : lasts[longest]][-max(1, MAX_TRAJECTORIES // len(assets)) :]
         made = []
         for begin, last, count in part.tolist():
             _, rows = gridded(store, asset, monitor.twin, begin, last)

@@ -17,7 +17,7 @@ from retwin.monitor.trajectory_evidence import Inversion, alternatives, checked,
 from retwin.progress import Progress
 from retwin.twins.faults import Fault
 
-FEWEST = 8
+MIN_TRAJECTORIES = 8
 """Healthy trajectories of a calibration, at least."""
 FACTORS = np.arange(1.0, 10.005, 0.01)
 """Factors of the errors of which the smallest is taken with which the calibration agrees."""
@@ -73,9 +73,9 @@ def fit_trajectory_monitor(
     found = compared(diagnoser, healthy, progress)
     used = np.isfinite(found.error) & ~found.outside
     require(
-        used.sum() >= FEWEST,
+        used.sum() >= MIN_TRAJECTORIES,
         "healthy",
-        expected=f"at least {FEWEST} trajectories",
+        expected=f"at least {MIN_TRAJECTORIES} trajectories",
         got=f"{len(healthy)}, of which {int(found.unmeasured.sum())} without measured samples, "
         f"{int(found.implausible.sum())} with implausible readings and "
         f"{int(found.outside.sum())} with commands outside their range in training",

@@ -15,7 +15,7 @@ from retwin.serialisation.files import refusing
 
 T = TypeVar("T")
 
-LEAST, MOST = -(2**63), 2**63 - 1
+EARLIEST, LATEST = -(2**63), 2**63 - 1
 """The earliest and the latest stream time, in nanoseconds."""
 WORD = np.dtype("<f8")
 """How a value is stored."""
@@ -135,7 +135,7 @@ def pack(update: Update, known: Mapping[str, tuple[int, int]]) -> Packed:
     if update.state is None:
         return Packed(update.asset, key, stamps, rows, None)
     time = update.time if update.time is not None else max(stamps.tolist(), default=None)
-    whole(f"time of the state of {update.asset}", time, least=LEAST, most=MOST)
+    whole(f"time of the state of {update.asset}", time, least=EARLIEST, most=LATEST)
     return Packed(update.asset, key, stamps, rows, (key, time, blob))
 
 

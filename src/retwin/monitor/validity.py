@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from retwin.checks import finite, instance, positive, whole
 from retwin.monitor.detector import LARGEST, Detector
 
-MOST_PER_BLOCK = 3.0
+MAX_PER_BLOCK = 3.0
 """Evidence of a block of samples counts up to this, so that no short fault voids the promise."""
-MOST_PER_ALARM = 4.0
+MAX_PER_ALARM = 4.0
 """The same for a run length: four very short ones in a row void the promise at α = 0.01."""
 
 
@@ -172,7 +172,7 @@ class Validity:
     def _with_alarms(self, state: ValidityState, alarm: NDArray) -> ValidityState:
         """After alarms in some streams: their run lengths are evidence."""
         value = np.sqrt(self.arl / np.maximum(state.length, 1)) / 2
-        runs = np.minimum(state.runs * np.minimum(value, MOST_PER_ALARM), LARGEST)
+        runs = np.minimum(state.runs * np.minimum(value, MAX_PER_ALARM), LARGEST)
         return replace(
             state,
             runs=np.where(alarm, runs, state.runs),
@@ -183,7 +183,7 @@ class Validity:
         """After the last sample of a block in some streams."""
         weighted = (state.products * self.detector.bets.weights).T
         value = np.add.accumulate(weighted, axis=0)[-1]
-        most = np.where(state.alarmed > 0, 1.0, MOST_PER_BLOCK)
+        most = np.where(state.alarmed > 0, 1.0, MAX_PER_BLOCK)
         factor = (1 + np.minimum(value, most)) / 2
         weight = 1 / ((state.blocks + 1) * (state.blocks + 2))
         quiet = np.minimum((state.quiet + weight) * factor, LARGEST)

@@ -22,7 +22,7 @@ from retwin.report.png import blank, dress
 from retwin.report.style import PALETTE, hexadecimal
 from retwin.serialisation.sizes import Budget
 
-MOST_ROWS = 16
+MAX_ROWS = 16
 """Signals that are drawn at most."""
 POINTS = 3000
 """Points of a line from which it is drawn by the extremes of its parts."""
@@ -56,7 +56,7 @@ def log_picture(log: Log, mapping: Mapping | None, *, case: DataCase | None = No
         rows = [(name, kind, i) for i, (name, kind) in enumerate(zip(names, kinds, strict=True))]
     else:
         rows = [(name, OUTPUT, None) for name in log.signals]
-    left, rows = len(rows) - MOST_ROWS, rows[:MOST_ROWS]
+    left, rows = len(rows) - MAX_ROWS, rows[:MAX_ROWS]
     canvas = blank(11, 1.2 + 1.1 * len(rows))
     every = np.atleast_1d(canvas.subplots(len(rows), 1, sharex=True))
     names = list(log.signals)

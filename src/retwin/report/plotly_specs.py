@@ -31,7 +31,7 @@ from retwin.report.figure import (
 
 FORMATS = {"share": ".1f", "percent": ".0%"}
 HOVER = {"share": ".3f", "percent": ".1%"}
-MANY = 4000
+MAX_POINTS = 4000
 """Samples beyond which a line is drawn as the smallest and the largest value of groups."""
 UPPER, LOWER = [0.38, 1], [0, 0.3]
 """The parts of the height that two rows take."""
@@ -96,10 +96,10 @@ def _traces(row: Row, x: Axis) -> list[dict[str, Any]]:
 
 def _reduced(mark: Mark) -> Mark:
     """A line or a band of very many samples as its envelope, so that no peak is lost."""
-    if not isinstance(mark, Line | Band) or len(np.asarray(mark.x)) <= MANY or _breaks(mark):
+    if not isinstance(mark, Line | Band) or len(np.asarray(mark.x)) <= MAX_POINTS or _breaks(mark):
         return mark
     x = np.asarray(mark.x, dtype=float)
-    starts = np.linspace(0, len(x), MANY // 2 + 1).astype(int)[:-1]
+    starts = np.linspace(0, len(x), MAX_POINTS // 2 + 1).astype(int)[:-1]
     if isinstance(mark, Band):
         low = np.fmin.reduceat(np.asarray(mark.low, dtype=float), starts)
         high = np.fmax.reduceat(np.asarray(mark.high, dtype=float), starts)

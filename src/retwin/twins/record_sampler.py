@@ -23,7 +23,7 @@ DURATIONS = (0.1, 0.5, 0.9)
 """Quantiles of the durations of a record's ramps that the ramps of drawn commands have."""
 CORNER_SHARE = 0.95
 """Share of the power that lies below the frequency up to which the amplitude is full."""
-LEAST_WEAK = 0.1
+MIN_WEAK = 0.1
 """Least amplitude of the higher frequencies, relative to the full one."""
 
 
@@ -78,7 +78,7 @@ def sampler_from(
         steps / rate,
         (lowest, max(highest, lowest)),
         corner=corner,
-        weak=min(max(weak, LEAST_WEAK), 1.0),
+        weak=min(max(weak, MIN_WEAK), 1.0),
         mean=floats(mean),
         deviation=floats(deviation),
     )

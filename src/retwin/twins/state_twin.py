@@ -38,7 +38,7 @@ SAMPLES_PER_CHUNK = 2**20
 ACCURACY = 0.01
 """Largest error of the steps through time, in standard deviations of an output, that passes without
 a warning. It should be small compared with a discrepancy that is worth modelling."""
-MOST_SUBSTEPS = 10_000
+MAX_SUBSTEPS = 10_000
 """Sub-steps of a sample, above which equations are too stiff for an explicit method."""
 FINER = 16
 """How many times more sub-steps are tried before a simulation that is not finite is given up."""
@@ -141,7 +141,7 @@ class StateTwin:
             remedy="the start of a state is the parameter start_NAME; rename the other",
         )
         sample_rate("rate", self.rate)
-        whole("substeps", self.substeps, least=1, most=MOST_SUBSTEPS)
+        whole("substeps", self.substeps, least=1, most=MAX_SUBSTEPS)
         if self.interpolation is not None:
             one_of("interpolation", self.interpolation, INTERPOLATIONS)
         require(

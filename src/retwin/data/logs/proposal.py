@@ -49,7 +49,7 @@ ALIKE = 0.72
 """Least score of a name that is taken for a channel's."""
 STAMPED = (".mcap", "", ".db3", ".bag")
 """Formats whose messages may have header stamps."""
-LATE = 60.0
+MAX_STAMP_AGE = 60.0
 """Median time in s from stamp to recording at which the stamps are those of another clock."""
 PAUSE, PAUSE_PERIODS = 1.0, 20.0
 """The shortest pause in s, and in sample periods, between two trajectories."""
@@ -172,7 +172,7 @@ def _stamped(
         or [np.array([-1.0])]
     )
     found = float(np.median(delays))
-    return (other, found) if 0 <= found < LATE else None
+    return (other, found) if 0 <= found < MAX_STAMP_AGE else None
 
 
 def facts_of(log: Log) -> list[Fact]:

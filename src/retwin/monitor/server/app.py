@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 else:
     fastapi = needs_extra("fastapi", "monitor", "answers requests")
 
-LEAST_TOKEN = 16
+MIN_TOKEN_LENGTH = 16
 """Characters of a token at least."""
 LISTENERS = 100
 """Pages that may listen to events at the same time."""
@@ -80,10 +80,10 @@ class Step(BaseModel):
 
 def check_token(token: str | None) -> str:
     """The token, if it is long enough; another one is an `InputError`."""
-    if not isinstance(token, str) or len(token) < LEAST_TOKEN or not token.isascii():
+    if not isinstance(token, str) or len(token) < MIN_TOKEN_LENGTH or not token.isascii():
         raise InputError(
             "token",
-            expected=f"at least {LEAST_TOKEN} ASCII characters",
+            expected=f"at least {MIN_TOKEN_LENGTH} ASCII characters",
             got="another one",
             remedy="make one: python -c 'import secrets; print(secrets.token_urlsafe())'",
         )

@@ -16,9 +16,9 @@ from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.mapped_tables import MappedLayout
 from retwin.monitor.sources.source import Source
 from retwin.monitor.sources.tables import Layout, Table
-from retwin.monitor.updates import LEAST
+from retwin.monitor.updates import EARLIEST
 
-LATE = 60 * 10**9
+OVERLAP = 60 * 10**9
 """Nanoseconds before the newest stored sample from which rows are sent again after a restart: what
 is older is not used any more, and what is stored already is recognised."""
 
@@ -127,7 +127,7 @@ class Folder(Files):
                 for rows in table.rows():
                     for reason in rows.bad:
                         self.refuse(reason)
-                    new = rows.times > self._newest.get(asset, LEAST + LATE) - LATE
+                    new = rows.times > self._newest.get(asset, EARLIEST + OVERLAP) - OVERLAP
                     samples = Samples(asset, rows.times[new], rows.values[new])
                     if new.any() and not self.stored(gate, samples, stop):
                         return

@@ -21,7 +21,7 @@ from retwin.monitor.settings import FolderSource
 from retwin.monitor.sources.folder import Files
 from retwin.monitor.sources.tables import layout_of
 from retwin.monitor.trajectories import TrajectoryMonitor
-from retwin.monitor.updates import LEAST
+from retwin.monitor.updates import EARLIEST
 from retwin.twins.twin import check_channels
 
 
@@ -83,7 +83,7 @@ class TrajectoryFolder(Files):
             except (InputError, OSError) as error:  # it is read again when it has changed
                 self.refuse(error)
                 made = []
-            newest = self._newest.get(asset, LEAST)
+            newest = self._newest.get(asset, EARLIEST)
             found += [(each.begin, each) for each in made if each.begin > newest]
             read.append((path, now))
         for _, each in sorted(found, key=lambda each: each[0]):

@@ -30,7 +30,7 @@ from retwin.update.dynamics.unknowns import state_twin_of, unknowns_of
 
 FOLDS = 10
 """Parts of the calibration record, each made of blocks of all trajectories, that are held out."""
-MANY = 100_000
+MAX_REFITTED_SAMPLES = 100_000
 """Samples that are fitted again and again, without each part in turn; of longer records fewer
 parts are held out."""
 WORTH = 0.99
@@ -201,7 +201,7 @@ def held_out_parts(seen: NDArray) -> list[NDArray]:
     trajectories, samples, _ = seen.shape
     block = np.arange(samples) * (FOLDS + 1) // samples
     own = (block - 1 + np.arange(trajectories)[:, None]) % FOLDS
-    count = int(np.clip(MANY // max(1, seen.sum()), 1, FOLDS))
+    count = int(np.clip(MAX_REFITTED_SAMPLES // max(1, seen.sum()), 1, FOLDS))
     return [(own == part) & (block > 0) for part in range(count)]
 
 

@@ -23,7 +23,7 @@ FEW = 0.05
 """Share of delays at a bound that needs no mention: a few segments are always missed."""
 ROUNDING = 1e-6
 """Difference in samples that is only the rounding of numbers."""
-ENOUGH = 20
+MAX_TRAJECTORIES = 20
 """Trajectories that are used at most."""
 EARLIEST, LATEST = -0.5, 1.0
 """Limits of the wide grid, in median lengths of a segment."""
@@ -97,8 +97,8 @@ def plausible_delays(context: Context, observed: Tensor, mask: Tensor) -> tuple[
         Measured outputs (n, T, d_y), and where they were measured.
 
     """
-    if len(context) > ENOUGH:
-        some = np.linspace(0, len(context) - 1, ENOUGH).round().astype(int)
+    if len(context) > MAX_TRAJECTORIES:
+        some = np.linspace(0, len(context) - 1, MAX_TRAJECTORIES).round().astype(int)
         context, observed, mask = context[some], observed[some], mask[some]
     unit, segments = context.unit.double(), context.segments
     if not segments.valid.any():

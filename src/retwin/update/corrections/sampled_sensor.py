@@ -24,7 +24,7 @@ from retwin.update.kernels.generation import joined_samples
 LONGEST_PERIOD = 1000
 """Longest sampling period that is searched for, in time steps of the record: it bounds the time
 that the search takes. Other limits are shares of the record."""
-FEWEST = 20
+MIN_VALUES = 20
 """Fewest sampled values of a record from which their period is estimated."""
 PLAIN = 0.2
 """Largest bend at the next most bent phase, relative to that at the sampling phase."""
@@ -238,7 +238,7 @@ def _timing(observed: Tensor, mask: Tensor) -> tuple[int, tuple[int, ...]]:
     """Sampling period and phases: the longest period with plain kinks."""
     measured = int(mask.any(dim=-1).any(dim=0).sum())
     bends = _bends(observed, mask)
-    for every in range(min(LONGEST_PERIOD, measured // FEWEST), 1, -1):
+    for every in range(min(LONGEST_PERIOD, measured // MIN_VALUES), 1, -1):
         kinks = _kinks(bends, every)
         plain = _plain(kinks)
         if 2 * plain.sum() > (kinks.amax(dim=1) > 0).sum():
