@@ -18,7 +18,7 @@ from retwin.inference.design import Knowledge
 from retwin.inference.solver import solve
 from retwin.update.corrected import CorrectedTwin
 from retwin.update.corrections import Chain, CommandSpace, Context, Discrepancy, sample_mask
-from retwin.update.corrections.command_inference import Belief
+from retwin.update.corrections.command_inference import Hyperparameters
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.delay_range import range_in_samples
 
@@ -33,7 +33,7 @@ class ActuatorKnowledge:
         With `CommandSpace`, alone or before a sensor.
     operator : CommandSpace
         With its range of delays.
-    belief : Belief
+    hyperparameters : Hyperparameters
         Learned from the calibration trajectories.
     unit : Tensor
         (d_y,), the unit of its noise.
@@ -44,7 +44,7 @@ class ActuatorKnowledge:
 
     twin: CorrectedTwin
     operator: CommandSpace
-    belief: Belief
+    hyperparameters: Hyperparameters
     unit: Tensor
     context: Context
     found: Discrepancy
@@ -59,43 +59,43 @@ class ActuatorKnowledge:
         observed = torch.tensor(calibration.observed)
         mask = sample_mask(correction, observed, torch.tensor(calibration.mask), context.rate)
         limits = range_in_samples(operator.delay_range, context, observed, mask)
-        found, belief = operator.infer_with_belief(context, observed, mask)
+        found, learned = operator.infer_with_hyperparameters(context, observed, mask)
         require(
-            belief is not None,
+            learned is not None,
             "calibration",
             expected="trajectories with segments of motion",
             got="commands that never change",
             remedy="give those that the twin was calibrated on",
         )
-        assert belief is not None
+        assert learned is not None
         seen = CommandProblem.of(
             context, observed, mask, delay_range=limits, max_samples=operator.max_samples
         )
         timed = (limits[0] / context.rate, limits[1] / context.rate)
-        return cls(twin, replace(operator, delay_range=timed), belief, seen.unit, context, found)
+        return cls(twin, replace(operator, delay_range=timed), learned, seen.unit, context, found)
 
     def knowledge(self, commands: NDArray) -> Knowledge:
         """The knowledge about delays and offsets, in units of their scatter, at the segments."""
-        problem = self._problem(commands)
-        design = self.belief.features.design(problem)
+        problem, learned = self._problem(commands), self.hyperparameters
+        design = learned.features.design(problem)
         n, segments, width = problem.missed.shape
         used = torch.zeros(n, segments, problem.size, dtype=torch.bool)
         used[..., : 1 + width] = problem.valid[..., None]
         rows = used.flatten(1)
-        scatter = self.belief.hierarchy.scatter(design)
-        return Knowledge(self.belief.hierarchy.covariance, design.features[rows], scatter[rows])
+        scatter = learned.hierarchy.scatter(design)
+        return Knowledge(learned.hierarchy.covariance, design.features[rows], scatter[rows])
 
     @torch.no_grad()
     def roots(self, commands: NDArray) -> Tensor:
         """(n, F, F) roots of the information that outputs of commands would give."""
-        problem = self._problem(commands)
-        prior = self.belief.prior(problem).gaussian
+        problem, learned = self._problem(commands), self.hyperparameters
+        prior = learned.prior(problem).gaussian
         # Outputs as expected: the solution is the mean of the prior, only its curvature is new.
         expected = problem.observed - problem.residual(prior.mean)
-        samples = replace(self.belief.samples, gain=problem.gain())
+        samples = replace(learned.samples, gain=problem.gain())
         problem = replace(problem, observed=expected, whitening=samples.whitening())
-        found = solve(problem, prior, self.belief.noise, prior.mean, bounds=problem.bounds)
-        information = self.belief.hierarchy.information(self.belief.features.design(problem), found)
+        found = solve(problem, prior, learned.noise, prior.mean, bounds=problem.bounds)
+        information = learned.hierarchy.information(learned.features.design(problem), found)
         values, vectors = torch.linalg.eigh((information + information.mT) / 2)
         return (vectors * values.clamp_min(0).sqrt()[..., None, :]).mT
 
@@ -103,7 +103,7 @@ class ActuatorKnowledge:
         """The mean z (n, M, d_z) of the segments of commands, none of which is missed."""
         context = self.twin.residual.context(self.twin.surrogate, commands)
         problem = self._problem_of(context)
-        mean = problem.per_segment(self.belief.prior(problem).gaussian.mean)
+        mean = problem.per_segment(self.hyperparameters.prior(problem).gaussian.mean)
         width = problem.missed.shape[2]
         return torch.cat([mean[..., : 1 + width], torch.zeros_like(problem.missed)], dim=-1)
 

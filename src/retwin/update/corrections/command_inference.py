@@ -66,7 +66,7 @@ def infer_commands(
     delay_range: tuple[float, float],
     max_samples: int,
     identified_below: float,
-) -> tuple[Discrepancy, Belief | None]:
+) -> tuple[Discrepancy, Hyperparameters | None]:
     """z* (n, M, 1 + 2 d_u) for measured outputs (n, T, d_y), see `CommandSpace`.
 
     The range of delays is in samples.
@@ -75,8 +75,8 @@ def infer_commands(
     -------
     Discrepancy
         z* and what is known of it.
-    Belief or None
-        What was learned of the prior; None without any segment.
+    Hyperparameters or None
+        What was learned of the prior and the noise; None without any segment.
 
     Raises
     ------
@@ -94,31 +94,31 @@ def infer_commands(
     uncertain, problem = problem, problem.where_certain
     start = problem.zero
     problem.per_segment(start)[..., 0] = first_delays(problem, start, problem.delay_range)
-    first = Belief.of(problem, start)
+    first = Hyperparameters.of(problem, start)
 
-    def infer(found: MissedSearch, belief: Belief) -> MissedSearch:
-        white, prior, noise = belief.whitened(problem), belief.prior(problem), belief.noise
+    def infer(found: MissedSearch, given: Hyperparameters) -> MissedSearch:
+        white, prior, noise = given.whitened(problem), given.prior(problem), given.noise
         return searched(white, prior, noise, found.fit, partial(_suspects, white, prior, noise))
 
-    def learn(found: MissedSearch, belief: Belief) -> Belief:
-        return belief.learned(problem.with_missed(found.fit.missed), found.fit.solution)
+    def learn(found: MissedSearch, given: Hyperparameters) -> Hyperparameters:
+        return given.learned(problem.with_missed(found.fit.missed), found.fit.solution)
 
     fit = CommandFit.of_prior(problem, first.prior(problem), start)
-    found, belief = expectation_maximisation(
+    found, learned = expectation_maximisation(
         MissedSearch(fit, fit.missed, fit.evidence),
         first,
         infer=infer,
         learn=learn,
         rounds=MAX_ROUNDS,
-        converged=Belief.near,
+        converged=Hyperparameters.near,
     )
     if uncertain.common is not None:
         problem = uncertain
-        found = infer(MissedSearch(fit, fit.missed, fit.evidence), belief)
-    problem = belief.whitened(problem).with_missed(found.fit.missed)
-    last = fitted(problem, belief.prior(problem), belief.noise, found.fit.x)
-    made = _discrepancy(problem, last.solution, found.probability, belief, identified_below)
-    return made, belief
+        found = infer(MissedSearch(fit, fit.missed, fit.evidence), learned)
+    problem = learned.whitened(problem).with_missed(found.fit.missed)
+    last = fitted(problem, learned.prior(problem), learned.noise, found.fit.x)
+    made = _discrepancy(problem, last.solution, found.probability, learned, identified_below)
+    return made, learned
 
 
 def _require_samples(mask: Tensor) -> None:
@@ -171,18 +171,33 @@ def _suspects(
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
-    """Hyperparameters of the prior and the noise, learned from all trajectories together."""
+class Hyperparameters:
+    """Hyperparameters of the prior and the noise, learned from all trajectories together.
+
+    Attributes
+    ----------
+    features : OffsetFeatures
+        What the mean of an offset depends on.
+    hierarchy : Hierarchy
+        The prior of delays and offsets.
+    odds : Tensor
+        (), log odds that an actuator misses a segment.
+    samples : SampleNoise
+        Covariance of a sample's error, up to a factor.
+    noise : Noise
+        Size of that error, in `CommandProblem.unit`.
+
+    """
 
     features: OffsetFeatures
-    hierarchy: Hierarchy  # of delays and offsets
-    odds: Tensor  # () log odds that an actuator misses a segment
-    samples: SampleNoise  # the shape of a sample's error
-    noise: Noise  # its size, in `CommandProblem.unit`
+    hierarchy: Hierarchy
+    odds: Tensor
+    samples: SampleNoise
+    noise: Noise
 
     @classmethod
-    def of(cls, problem: CommandProblem, start: Tensor) -> Belief:
-        """Wide, from first delays only."""
+    def of(cls, problem: CommandProblem, start: Tensor) -> Hyperparameters:
+        """Those before anything is inferred: wide, from first delays only."""
         delay = problem.per_segment(start)[..., 0][problem.valid]
         jitter = 1.4826 * (delay - delay.median()).abs().median() + FIRST_JITTER * problem.width
         measured = problem.measured > 0
@@ -215,7 +230,7 @@ class Belief:
         gaussian = self.hierarchy.prior(self.features.design(problem))
         return LatentPrior(gaussian, self.odds.expand(problem.missed.shape))
 
-    def learned(self, problem: CommandProblem, solution: Solution) -> Belief:
+    def learned(self, problem: CommandProblem, solution: Solution) -> Hyperparameters:
         """The most probable hyperparameters, given what was inferred and how certain that is."""
         white, x = self.whitened(problem), solution.x
         samples = self.samples.learned(white, self.noise, x)
@@ -225,7 +240,7 @@ class Belief:
         spread, variance = self.features.spread.square(), self.hierarchy.variance
         share, delay = (variance[1:-1] / spread).mean(), variance.new_tensor([DELAY_VARIANCE])
         expected = torch.cat([delay, share * spread, delay])
-        return Belief(
+        return Hyperparameters(
             self.features,
             self.hierarchy.learned(self.features.design(problem), solution, expected),
             ((missed + 0.5) / (problem.healthy.sum() + 20.0)).logit(),
@@ -242,7 +257,7 @@ class Belief:
         left = (1 - fitted / count.clamp_min(1.0)).clamp(SMALLEST_SHARE, 1.0)
         return replace(learned, scale=learned.scale / left.sqrt())
 
-    def near(self, other: Belief) -> bool:
+    def near(self, other: Hyperparameters) -> bool:
         """Whether all standard deviations are about those of `other`."""
         pairs = (
             (self.hierarchy.variance.sqrt(), other.hierarchy.variance.sqrt()),
@@ -255,19 +270,21 @@ def _discrepancy(
     problem: CommandProblem,
     solution: Solution,
     probability: Tensor,
-    belief: Belief,
+    hyperparameters: Hyperparameters,
     identified_below: float,
 ) -> Discrepancy:
     """z*, each segment's covariance, and which components the outputs identify."""
     missed, segments = problem.missed, problem.missed.shape[1]
-    prior, design = belief.prior(problem).gaussian, belief.features.design(problem)
+    hierarchy = hyperparameters.hierarchy
+    design = hyperparameters.features.design(problem)
+    prior = hyperparameters.prior(problem).gaussian
     common = _common(problem)
     x, mean = (
         (common @ problem.per_segment(each)[..., None])[..., 0] for each in (solution.x, prior.mean)
     )
     inner, wide = (
         common @ blocks(each, segments) @ common.mT
-        for each in (belief.hierarchy.posterior_covariance(design, solution), prior.covariance)
+        for each in (hierarchy.posterior_covariance(design, solution), prior.covariance)
     )
     left, wide = inner.diagonal(dim1=-2, dim2=-1), wide.diagonal(dim1=-2, dim2=-1)
     severity = torch.where(problem.faulty, (x - mean)[..., 1:], 0.0)
@@ -279,14 +296,14 @@ def _discrepancy(
     bounded = at_bound(delay, problem.delay_range) & problem.valid
     known[..., 0] &= ~bounded
     known[..., 1:] &= missed < 0.5
-    own = torch.cat([wide[..., :1], belief.hierarchy.variance[1:-1].expand_as(severity)], dim=-1)
+    own = torch.cat([wide[..., :1], hierarchy.variance[1:-1].expand_as(severity)], dim=-1)
     inner = inner * learned[..., None] * learned[..., None, :]
     inner = inner + torch.diag_embed(own * (1 - learned))
     covariance = block_diagonal(inner, torch.diag_embed(probability * (1 - probability)))
     seen = problem.inside.any(dim=-1)[..., None] & problem.healthy
     identified = torch.cat([known, seen], dim=-1) & problem.valid[..., None]
     z = torch.cat([torch.where(learned > 0, x, mean), missed], dim=-1) * problem.valid[..., None]
-    noise = (belief.noise.scale[0, 0] * problem.unit.mean()).expand(len(x))
+    noise = (hyperparameters.noise.scale[0, 0] * problem.unit.mean()).expand(len(x))
     return Discrepancy(z, covariance, identified, noise, severity, True, bounded)
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from retwin.data.trajectories import Channels
-from retwin.update.corrections.command_inference import Belief, infer_commands
+from retwin.update.corrections.command_inference import Hyperparameters, infer_commands
 from retwin.update.corrections.correction import Context, Discrepancy, Head
 from retwin.update.corrections.delay_range import checked_range, range_in_samples, range_in_seconds
 from retwin.update.corrections.effective_commands import effective_commands
@@ -110,12 +110,12 @@ class CommandSpace:
 
     def infer(self, context: Context, observed: Tensor, mask: Tensor) -> Discrepancy:
         """z* and its covariance from outputs alone; see `command_inference`."""
-        return self.infer_with_belief(context, observed, mask)[0]
+        return self.infer_with_hyperparameters(context, observed, mask)[0]
 
-    def infer_with_belief(
+    def infer_with_hyperparameters(
         self, context: Context, observed: Tensor, mask: Tensor
-    ) -> tuple[Discrepancy, Belief | None]:
-        """As `infer`, and what was learned of the prior; None without any segment."""
+    ) -> tuple[Discrepancy, Hyperparameters | None]:
+        """As `infer`, with what was learned of prior and noise; None without any segment."""
         return infer_commands(
             context,
             observed,

@@ -145,15 +145,15 @@ class DelayOffset:
         z[..., 0] = first_delays(problem, z.flatten(1), limits)
         problem = problem.with_motion(z[..., 0])
         bounds = problem.bounds
-        belief = _learned(problem, problem.residual(z.flatten(1)))
+        learned = _learned(problem, problem.residual(z.flatten(1)))
         # A fast motion half a sample beside the grid is beyond the cutoff of Tukey's loss, and the
         # rounding of the few samples that count would decide where its delay goes from there.
-        first = replace(belief[0], loss=StudentT()), belief[1]
-        solution, belief = expectation_maximisation(
-            Solution.of_prior(belief[1], z.flatten(1)),
+        first = replace(learned[0], loss=StudentT()), learned[1]
+        solution, learned = expectation_maximisation(
+            Solution.of_prior(learned[1], z.flatten(1)),
             first,
-            infer=lambda found, belief: solve(
-                problem, belief[1], belief[0], found.x, bounds=bounds, reweightings=1
+            infer=lambda found, given: solve(
+                problem, given[1], given[0], found.x, bounds=bounds, reweightings=1
             ),
             learn=lambda found, _: _learned(problem, problem.residual(found.x)),
             rounds=ROUNDS,
@@ -161,7 +161,7 @@ class DelayOffset:
         known = KNOWN_DELAY * problem.width
         if self.known_delay is not None:
             known = self.known_delay * context.rate
-        found = _discrepancy(problem, solution, *belief, unit, known)
+        found = _discrepancy(problem, solution, *learned, unit, known)
         if context.surrogate_variance is None:
             return found
         # At rest the surrogate's error is an offset.
