@@ -87,6 +87,7 @@ CASES: Mapping[str, CaseEntry] = {
         "retwin.cases.styrofoam_incubator.recorded:RECORDED",
     ),
 }
+"""The built-in cases, by the names that `retwin.cases.get` and the command line take."""
 
 TWINS: Mapping[str, Entry] = {
     "armpi": Entry(
@@ -147,6 +148,7 @@ CORRECTIONS: Mapping[str, Entry] = {
         ),
     ),
 }
+"""Correction operators g, by the names that case files and `--correction` take."""
 
 DENSITIES: Mapping[str, Entry] = {
     "mixture": Entry("retwin.update.residual:Mixture", "Gaussian mixture per segment (Eq. 6)"),
@@ -155,6 +157,7 @@ DENSITIES: Mapping[str, Entry] = {
         "retwin.update.residual:SequenceMixture", "autoregressive mixture per sample"
     ),
 }
+"""Families of distributions of z, by the names that case files and `--density` take."""
 
 NETWORKS: Mapping[str, Entry] = {
     "mlp": Entry("retwin.nets.networks:MLP", "multi-layer perceptron, without memory"),
@@ -248,6 +251,7 @@ DOWNLOADS: Mapping[str, PublicFile] = {
         file="armpi/my_dataset_test.mat",
     ),
 }
+"""Public files, by the names that `retwin.data.fetch` takes."""
 
 _SURROGATE = ("surrogate", "")
 _OUTPUT = ("residual", "output")
@@ -463,6 +467,7 @@ METRICS: Mapping[str, Metric] = {
         simulated=True,
     ),
 }
+"""Scores of diagnoses, and of simulations, in the order in which they are shown."""
 
 
 def metrics_with(*marks: str, simulated: bool) -> tuple[str, ...]:

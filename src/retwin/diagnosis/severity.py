@@ -29,14 +29,18 @@ def biases(rows: Hypotheses, fit: CommandFit, coverage: float) -> tuple[Tensor, 
 
     Parameters
     ----------
+    rows : Hypotheses
+        R of them.
+    fit : CommandFit
+        Their most probable z.
     coverage : float
-        Of the interval.
+        Probability of the interval, between 0 and 1.
 
     Returns
     -------
     tuple of Tensor
-        (R, M, 3), NaN where there is no bias; (R,), log evidence that the limits add; and (R,), the
-        information about the bias, see `BiasDraws`.
+        (R, M, 3), in the unit of the biased actuator's command, NaN where there is no bias; (R,),
+        log evidence that the limits add; and (R,), the information about the bias, see `BiasDraws`.
 
     """
     place = rows.offset_index
@@ -66,12 +70,23 @@ def biases(rows: Hypotheses, fit: CommandFit, coverage: float) -> tuple[Tensor, 
 def stuck_level(
     rows: Hypotheses, fit: CommandFit, onset: Tensor, noise: Noise
 ) -> tuple[Tensor, Tensor]:
-    """Where the faulty actuator is in the end (R,), in its command's unit, and the deviation.
+    """Where the faulty actuator stands at the end, in its command's unit.
 
     Parameters
     ----------
+    rows : Hypotheses
+        R of them.
+    fit : CommandFit
+        Their most probable z.
     onset : Tensor
         (R,), the sample from which it is stuck.
+    noise : Noise
+        What a healthy sample leaves unexplained, in the outputs' units.
+
+    Returns
+    -------
+    level, deviation : Tensor
+        (R,), the posterior mean and its standard deviation.
 
     """
     problem = rows.problem.with_missed(fit.missed)

@@ -29,12 +29,14 @@ LEVELS = 3
 """The score before, on which bets on dependence depend, is rounded to -3, …, 3."""
 FLOOR = 1e-6
 """Least value of a bet before its division: a product never becomes 0."""
-
 EDGES = np.concatenate(
     [[-np.inf], np.arange(-CLIP * PER_UNIT, CLIP * PER_UNIT + 1) / PER_UNIT, [np.inf]]
 )
+"""Edges of the cells of the grid of scores, of which the outermost two are unbounded."""
 CENTRES = np.clip((EDGES[1:] + EDGES[:-1]) / 2, -CLIP, CLIP)
+"""The score of each cell at which bets are evaluated."""
 MASS = np.diff(ndtr(EDGES))
+"""Standard Gaussian probability of each cell."""
 
 
 class Alternative(Protocol):

@@ -71,6 +71,13 @@ class Detector:
     alternatives : tuple of tuple of Alternative
         Families of alternatives.
 
+    Attributes
+    ----------
+    bets : Bets
+        The bets on all alternatives against each different class of `slack`.
+    which : NDArray
+        (streams,) or (1,), the number of each stream's class among these.
+
     """
 
     slack: Slack | Sequence[Slack] = field(default_factory=Slack)

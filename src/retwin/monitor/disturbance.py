@@ -22,6 +22,7 @@ of the ratio of variances of measurement and process noise."""
 ROUNDS = 14
 """Rounds of the pattern search; a failed one halves the step of a stream."""
 RATIOS = (-12.0, 12.0)
+"""Limits of that logarithm, beyond which one of the noises is negligible."""
 BLOCK = 1000
 """A longer record is estimated as independent blocks of so many samples, all at once."""
 MIN_RESIDUALS = 50

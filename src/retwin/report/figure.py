@@ -151,7 +151,8 @@ class Row:
 class Panel:
     """One or two rows of marks above a common x axis; `height` in pixels of the page.
 
-    Where there is little room, the tick labels of the y axis are left out if `narrow_bare`.
+    `alt` describes the panel to readers who do not see it. Where there is little room, the tick
+    labels of the y axis are left out if `narrow_bare`.
     """
 
     x: Axis
@@ -179,6 +180,10 @@ class Figure:
     ----------
     name : str
         That of its PNG, and of its element on the page.
+    panels : sequence of Panel
+        The panels, in the order in which they are read.
+    keys : sequence of Key
+        The entries of the legend; none for a figure without a legend.
     source : str
         The source that it is about; "" for several.
     columns : int

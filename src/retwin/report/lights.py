@@ -108,7 +108,7 @@ def lights(study: Study) -> list[Light]:
     pair = headline(study.results)
     if pair is None:
         return []
-    found = [_error(study, pair)]
+    found = [_error(study)]
     if study.results.classes:
         found += [_false_alarms(study, pair[0]), _detection(study, pair)]
     return [*found, _realism(study, pair[0])]
@@ -189,7 +189,7 @@ def _simulated_change(
     return found, shown
 
 
-def _error(study: Study, pair: tuple[str, str]) -> Light:
+def _error(study: Study) -> Light:
     found = change_of(study)
     if found is None:
         return Light("error", "not measured", {"change": None, "unit": ""})

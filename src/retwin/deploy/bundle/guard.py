@@ -39,7 +39,9 @@ from retwin.update.surrogate import Surrogate
 from retwin.update.training_range import training_checked
 
 NETWORK = CNN(channels=(32, 64), dropout=0.1)
+"""The network of the energy: two classes need a smaller one than a diagnoser."""
 TRAINING = Training(max_epochs=15, batch_size=64, learning_rate=3e-3, weight_decay=1e-2)
+"""Settings of its training, unless others are given."""
 ENERGY_QUANTILE = 0.99
 """Share of held-out generated trajectories whose energy is within the limit."""
 MISMATCH_FACTOR = 2.0

@@ -107,8 +107,7 @@ def simulate_to(
     InputError
         If the plan cannot be carried out; if the disk has no room for it, or the memory none for a
         chunk; if the folder holds another plan's work or anything else; if another process works
-        on it;
-        if an NPZ would exceed 512 MB or workers are given for it; or if both workers and a
+        on it; if an NPZ would exceed 512 MB or workers are given for it; or if both workers and a
         scheduler are given.
     SimulationError
         If all trajectories of the first chunk failed.

@@ -46,6 +46,8 @@ class Views:
     ----------
     live : Live
         The monitor.
+    explanations : Explanations, optional
+        What explains alarms, for the kinds of faults; by default any change of the machine.
 
     """
 

@@ -23,6 +23,7 @@ from retwin.update.corrections.warp import gather_samples
 from retwin.update.kernels.generation import at_effective_commands
 
 KINDS = ("offset", "missed")
+"""What z has for every actuator, besides the common delay, in this order."""
 
 
 @dataclass(frozen=True)
