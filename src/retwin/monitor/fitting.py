@@ -18,7 +18,7 @@ from retwin.monitor.scores import fit_scores, resolution
 from retwin.twins.twin import check_channels
 from retwin.update.dynamics.twin import DynamicsTwin
 
-APART = 200
+SEPARATION = 200
 """Missing samples that are put between two calibration records, so that neither predicts the
 other."""
 
@@ -113,11 +113,11 @@ def _calibrated(
     if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
         return None
     warm_up = settled(online, start, (*given, healthy.mask), covariance)
-    late = (np.arange(healthy.steps) >= warm_up)[None, :, None]
+    counted = (np.arange(healthy.steps) >= warm_up)[None, :, None]
     error, width = (
-        np.pad(each, [(0, 0), (0, APART), (0, 0)], constant_values=np.nan)
+        np.pad(each, [(0, 0), (0, SEPARATION), (0, 0)], constant_values=np.nan)
         .reshape(-1, measured.shape[2])
         .T
-        for each in standardised(measured - mean, covariance, healthy.mask & late, steps)
+        for each in standardised(measured - mean, covariance, healthy.mask & counted, steps)
     )
     return replace(predictor, warm_up=warm_up / twin.rate), error, width

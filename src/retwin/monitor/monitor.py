@@ -165,7 +165,7 @@ class Monitor:
         low, high = self.scores.score(_by_output(error, count), _by_output(width, count))
         low, high = (_by_stream(_by_machine(each, count)) for each in (low, high))
         outputs, rate = len(self.twin.outputs), self.twin.rate
-        counted = np.stack([p.late(state.samples, samples, rate) for p in self.predictors], axis=1)
+        counted = np.stack([p.used(state.samples, samples, rate) for p in self.predictors], axis=1)
         counted = np.repeat(counted, outputs, axis=1).reshape(low.shape)
         low, high = (np.where(counted, each, np.nan) for each in (low, high))
         filters = tuple(

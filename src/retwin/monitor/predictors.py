@@ -58,8 +58,8 @@ class Predictor:
         process, proportional = (each * self.process for each in (twin.process, twin.proportional))
         return OnlineFilter(replace(twin, process=process, proportional=proportional))
 
-    def late(self, samples: NDArray, steps: int, rate: float) -> NDArray:
-        """Whether evidence of the next samples (n, steps) counts, after so many before (n,)."""
+    def used(self, samples: NDArray, steps: int, rate: float) -> NDArray:
+        """Whether evidence of the next samples (n, steps) is used, after so many before (n,)."""
         return samples[:, None] + np.arange(steps) >= round(self.warm_up * rate)
 
 
@@ -78,13 +78,17 @@ def standardised(
 def settled(
     online: OnlineFilter, start: FilterState, given: tuple[NDArray, ...], covariance: NDArray
 ) -> int:
-    """Number of samples (n, T, d_y, d_y) until the start of the filter does not matter."""
-    surer = replace(start, spread=start.spread / 4)
-    other = online.step(surer, *given)[2]
+    """Number of samples after which the start of the filter does not matter.
+
+    `covariance` (n, T, d_y, d_y) is that of its predictions of the samples `given`; 0 is returned
+    where the start never mattered, and at most half of the samples count.
+    """
+    certain = replace(start, spread=start.spread / 4)
+    other = online.step(certain, *given)[2]
     ratio = np.diagonal(covariance / other, axis1=2, axis2=3)
-    late = (np.abs(np.log(ratio)) > 2 * np.log(SETTLED)).any(axis=(0, 2))
-    half = covariance.shape[1] // 2
-    return int(np.flatnonzero(late[:half])[-1]) + 1 if late[:half].any() else 0
+    differs = (np.abs(np.log(ratio)) > 2 * np.log(SETTLED)).any(axis=(0, 2))
+    differs = differs[: covariance.shape[1] // 2]
+    return int(np.flatnonzero(differs)[-1]) + 1 if differs.any() else 0
 
 
 def agreeing(

@@ -19,7 +19,7 @@ MIN_RUNS = 5
 """Least number of runs for a verdict: fewer do not show the randomness of training."""
 SIGNIFICANCE = 0.05
 """Adjusted p-value up to which a difference is decided."""
-APART = ("transductive", "labelled")
+LIKE_ONLY = ("transductive", "labelled")
 """Real data whose use makes a source comparable only with sources that use the same."""
 
 
@@ -85,7 +85,7 @@ def holm(p: Sequence[float]) -> list[float]:
 
 def alike(*real_data: str | None) -> bool:
     """Whether sources that see these real data may be compared: like with like only."""
-    return len({kind if kind in APART else "" for kind in real_data}) == 1
+    return len({kind if kind in LIKE_ONLY else "" for kind in real_data}) == 1
 
 
 def no_verdict(*, runs: int, records: int | None, real_data: Sequence[str]) -> str:

@@ -34,7 +34,7 @@ SMALLEST_POWER = 1e-4
 hundredth of the amplitude. Its spectrum is that of rounding."""
 ROUNDING = 1e-6
 """Relative difference of equal values at most: that of numbers in single precision."""
-CHANCE = 3.0
+MARGIN_OF_ONE = 3.0
 """A further draw of n leaves their range by more than 3 / n of its width in one of twenty cases at
 most: 1 - 0.05 ** (1 / n), for uniform values."""
 LEAKAGE = 2.0
@@ -115,9 +115,9 @@ class CommandRange:
         return cls(**parts, resolution=float(values["resolution"]), count=int(values["count"]))
 
     @property
-    def chance(self) -> float:
-        """Share by which others like these trajectories may leave their range by chance."""
-        return min(1.0, CHANCE / self.count) if self.count else 0.0
+    def sampling_margin(self) -> float:
+        """Share of its width by which other draws like these trajectories may leave the range."""
+        return min(1.0, MARGIN_OF_ONE / self.count) if self.count else 0.0
 
     def scores(self, commands: NDArray, rate: float) -> NDArray:
         """How far commands (n, T, d_u) leave the range in value, speed and spectrum, (n, 3, d_u).
@@ -127,7 +127,7 @@ class CommandRange:
         low, high, speed = (np.array(each) for each in (self.low, self.high, self.speed))
         found = np.zeros((len(commands), 3, len(low)))
         still = high <= low
-        tolerated = TOLERANCE / (TOLERANCE + self.chance)
+        tolerated = TOLERANCE / (TOLERANCE + self.sampling_margin)
         blocks = list(row_blocks(commands))
         ends = in_threads(lambda rows: extremes(commands[rows]), blocks)
         for rows, (least, greatest, steps) in zip(blocks, ends, strict=True):
@@ -136,7 +136,7 @@ class CommandRange:
             beyond = excess(least, greatest, low, high)
             found[rows, 0] = np.where(still, np.where(changed, inf, 0.0), beyond * tolerated)
             # Both the distance and the duration of a motion are drawn.
-            tolerance = (1 + SPEED_TOLERANCE) * (1 + 2 * self.chance)
+            tolerance = (1 + SPEED_TOLERANCE) * (1 + 2 * self.sampling_margin)
             limit = tolerance * np.where(speed > 0, speed, inf)
             found[rows, 1] = rate * steps / limit
         if np.isfinite(self.band).all():
@@ -151,15 +151,17 @@ class CommandRange:
         See `scores`, which compares the spectrum too.
         """
         low, high, speed = (np.array(each) for each in (self.low, self.high, self.speed))
-        margin = (TOLERANCE + self.chance) * (high - low)
+        margin = (TOLERANCE + self.sampling_margin) * (high - low)
         margin = np.where(high > low, margin, ROUNDING * np.abs(low))
-        fastest = (1 + SPEED_TOLERANCE) * (1 + 2 * self.chance) * np.where(speed > 0, speed, inf)
+        fastest = (
+            (1 + SPEED_TOLERANCE) * (1 + 2 * self.sampling_margin) * np.where(speed > 0, speed, inf)
+        )
         return low - margin, high + margin, fastest
 
     @property
     def largest_share(self) -> NDArray:
         """Share (d_u,) of a trajectory's power above `band_limit` that is within the range."""
-        limit: NDArray = (1 + self.chance) * np.array(self.share) + POWER_TOLERANCE
+        limit: NDArray = (1 + self.sampling_margin) * np.array(self.share) + POWER_TOLERANCE
         return limit
 
     def band_limit(self, resolution: float) -> NDArray:

@@ -62,10 +62,10 @@ def hold_out(
         seen = np.any(measured.mask, axis=2)
         last = measured.steps - np.argmax(seen[:, ::-1], axis=1)
         first = np.asarray(np.round((1 - share) * last))[:, None, None]
-        late = np.arange(measured.steps)[None, :, None] >= first
+        after = np.arange(measured.steps)[None, :, None] >= first
         parts = (
-            measured.replace(mask=measured.mask & ~late),
-            measured.replace(mask=measured.mask & late),
+            measured.replace(mask=measured.mask & ~after),
+            measured.replace(mask=measured.mask & after),
         )
     require(
         all(each.mask.any() for each in parts),
