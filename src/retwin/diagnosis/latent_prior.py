@@ -11,7 +11,7 @@ from retwin.errors import InputError
 from retwin.inference.priors import GaussianPrior
 from retwin.nets.mixtures import Bernoullis, GaussianMixture
 from retwin.nets.student import Student
-from retwin.update.corrections import Chain, CommandSpace, Context, Correction, SampledSensor
+from retwin.update.corrections import CommandSpace, Context, Correction, before_sensor
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.delay_range import range_in_samples
 from retwin.update.corrections.missed_segments import LatentPrior
@@ -30,9 +30,7 @@ def command_space(correction: Correction) -> CommandSpace:
         The correction does something else to outputs.
 
     """
-    operator = correction
-    if isinstance(correction, Chain) and isinstance(correction.second, SampledSensor):
-        operator = correction.first
+    operator = before_sensor(correction)
     if isinstance(operator, CommandSpace):
         return operator
     raise InputError(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from retwin.checks import require
 from retwin.update.corrected import CorrectedTwin
-from retwin.update.corrections import Chain, CommandSpace, Context, DelayOffset, SampledSensor
+from retwin.update.corrections import Chain, CommandSpace, Context, DelayOffset, before_sensor
 from retwin.update.corrections.warp import gather_samples
 from retwin.update.residual import ResidualModel
 from retwin.update.surrogate import Surrogate
@@ -85,9 +85,7 @@ def causal_part(
         other,
     )
     assert isinstance(twin, CorrectedTwin)
-    residual, operator = twin.residual, twin.residual.correction
-    if isinstance(operator, Chain) and isinstance(operator.second, SampledSensor):
-        operator = operator.first  # the sensor is not part of the actuator
+    residual, operator = twin.residual, before_sensor(twin.residual.correction)
     _refuse(
         isinstance(operator, Chain),
         "a Chain of operators: what stands behind the actuators is no actuator",

@@ -16,7 +16,7 @@ from retwin.deploy.fmu.text import Text, constants
 from retwin.nets.mixtures import FLOOR
 from retwin.nets.networks import Network
 from retwin.update.corrected import CorrectedTwin
-from retwin.update.corrections import Additive, Chain, SampledSensor
+from retwin.update.corrections import Additive, Chain, before_sensor, sensor_of
 from retwin.update.residual import Residual, ResidualModel, SequenceResidual
 from retwin.update.surrogate import Surrogate
 
@@ -115,8 +115,9 @@ def _per_sample(residual: Residual, rate: float) -> SequenceResidual:
     other = "fit Additive with a SequenceMixture, or the state equations (retwin fit --dynamics)"
     correction = residual.correction
     assert isinstance(residual, SequenceResidual)
-    if isinstance(correction, Chain) and isinstance(correction.second, SampledSensor):
-        every = 0 if correction.second.period is None else correction.second.timing(rate)[0]
+    sensor = sensor_of(correction)
+    if sensor is not None:
+        every = 0 if sensor.period is None else sensor.timing(rate)[0]
         reason = "the errors of its samples have no C text"
         if every > 1:
             reason = "a record joins sampled values by straight lines: it depends on the next one"
@@ -125,7 +126,7 @@ def _per_sample(residual: Residual, rate: float) -> SequenceResidual:
             f"{_named(correction)}: {reason}",
             "fit the correction without SampledSensor, at the rate of the sensor",
         )
-        correction = correction.first
+        correction = before_sensor(correction)
     _refuse(
         type(correction) is not Additive,
         f"{_named(correction)}, an operator that has no C text",

@@ -25,7 +25,7 @@ from retwin.deploy.onnx.graphs import (
     GuardGraph,
     ResidualGraph,
     SensorGraph,
-    sensor_of,
+    sampling_sensor,
 )
 from retwin.deploy.onnx.operators import translations
 from retwin.deploy.onnx.portable import padded_times
@@ -179,7 +179,7 @@ def _graphs(bundle: Bundle) -> dict[str, Graph]:
         "surrogate": Graph(surrogate, {"commands": commands}, unit, any_length=("commands",)),
         **_correction_graphs(bundle, commands, nominal, generator),
     }
-    sensor = sensor_of(twin.residual.correction)
+    sensor = sampling_sensor(twin.residual.correction)
     if sensor is not None:
         graphs["sensor"] = _sensor_graph(sensor, nominal, unit, twin.rate, generator)
     return graphs | _assessment_graphs(bundle, nominal, generator)
@@ -338,7 +338,7 @@ def _difference(graph: Graph, path: Path) -> float:
 def _about(bundle: Bundle) -> dict[str, Any]:
     """The description that `Portable` needs beside the graphs."""
     twin, diagnoser = bundle.twin, bundle.diagnoser
-    sensor = sensor_of(twin.residual.correction)
+    sensor = sampling_sensor(twin.residual.correction)
     return {
         "schema": SCHEMAS["portable"],
         **bundle.facts.about(),

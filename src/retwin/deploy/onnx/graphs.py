@@ -12,7 +12,7 @@ from retwin.data.segments import Segments
 from retwin.diagnosis import NetworkDiagnoser
 from retwin.diagnosis.features import Features
 from retwin.nets.student import shared_factor
-from retwin.update.corrections import Chain, Context, Correction, SampledSensor
+from retwin.update.corrections import Context, Correction, SampledSensor, sensor_of
 from retwin.update.corrections.tensor_segments import TensorSegments
 from retwin.update.residual import ResidualModel
 from retwin.update.residual.model import describe
@@ -246,10 +246,10 @@ class SensorGraph(nn.Module):
         return left + (place - below) * (right - left)
 
 
-def sensor_of(correction: Correction) -> SampledSensor | None:
-    """The sensor at the end of a chain of operators, None if there is none."""
-    last = correction.second if isinstance(correction, Chain) else None
-    return last if isinstance(last, SampledSensor) and last.period is not None else None
+def sampling_sensor(correction: Correction) -> SampledSensor | None:
+    """The sensor at the end of a chain, if it has a sampling period; None otherwise."""
+    sensor = sensor_of(correction)
+    return None if sensor is None or sensor.period is None else sensor
 
 
 class FeaturesGraph(nn.Module):

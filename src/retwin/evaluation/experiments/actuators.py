@@ -17,7 +17,7 @@ from retwin.data.trajectories import Trajectories
 from retwin.inference.design import Knowledge
 from retwin.inference.solver import solve
 from retwin.update.corrected import CorrectedTwin
-from retwin.update.corrections import Chain, CommandSpace, Context, Discrepancy, sample_mask
+from retwin.update.corrections import CommandSpace, Context, Discrepancy, before_sensor, sample_mask
 from retwin.update.corrections.command_inference import Hyperparameters
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.delay_range import range_in_samples
@@ -53,7 +53,7 @@ class ActuatorKnowledge:
     def of(cls, twin: CorrectedTwin, calibration: Trajectories) -> ActuatorKnowledge:
         """The information in healthy trajectories."""
         correction = twin.residual.correction
-        operator = correction.first if isinstance(correction, Chain) else correction
+        operator = before_sensor(correction)
         assert isinstance(operator, CommandSpace)
         context = twin.residual.context(twin.surrogate, calibration.commands)
         observed = torch.tensor(calibration.observed)

@@ -21,7 +21,7 @@ from retwin.progress import Progress
 from retwin.twins.samplers import CommandSampler
 from retwin.twins.twin import checked_seed
 from retwin.update.corrected import CorrectedTwin
-from retwin.update.corrections import Chain, CommandSpace, SampledSensor
+from retwin.update.corrections import CommandSpace, before_sensor
 from retwin.update.dynamics.twin import DynamicsTwin
 from retwin.update.residual import ResidualModel, infer_discrepancy
 
@@ -293,9 +293,7 @@ def _known(
     if isinstance(twin, DynamicsTwin):
         return DynamicsKnowledge.of(twin), ()
     correction = twin.residual.correction
-    sensed = isinstance(correction, Chain) and isinstance(correction.second, SampledSensor)
-    operator = correction.first if isinstance(correction, Chain) and sensed else correction
-    if isinstance(operator, CommandSpace):
+    if isinstance(before_sensor(correction), CommandSpace):
         actuators = ActuatorKnowledge.of(twin, healthy)
         own = SegmentKnowledge.of(twin, actuators.context, actuators.found, references)
         return actuators, _measured_curve(own, rng)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from retwin.inference.design import Knowledge
 from retwin.update.corrected import CorrectedTwin
-from retwin.update.corrections import Chain, Context, Discrepancy, SampledSensor
+from retwin.update.corrections import Context, Correction, Discrepancy, before_sensor, sensor_of
 from retwin.update.residual import ResidualModel
 from retwin.update.residual.model import describe
 
@@ -169,22 +169,19 @@ class SegmentKnowledge:
         return torch.einsum("nmt,ntij->nmij", inside, products) / self.noise**2
 
 
-def _applied(correction: Any, context: Context, z: Tensor, times: Tensor) -> Tensor:
+def _applied(correction: Correction, context: Context, z: Tensor, times: Tensor) -> Tensor:
     """Corrected outputs (n, S, d_y) at some samples."""
-    chained = isinstance(correction, Chain) and isinstance(correction.second, SampledSensor)
-    operator = correction.first if chained else correction
+    operator = before_sensor(correction)
     at = getattr(operator, "at", None)
     if at is None:
         return operator.apply(context, z)[:, times]
     return at(context, z, times.expand(len(context), -1))
 
 
-def _stride(correction: Any, rate: float) -> int:
+def _stride(correction: Correction, rate: float) -> int:
     """Samples per sample of the sensor."""
-    last = correction.second if isinstance(correction, Chain) else None
-    if not isinstance(last, SampledSensor) or last.period is None:
-        return 1
-    return last.timing(rate)[0]
+    sensor = sensor_of(correction)
+    return 1 if sensor is None or sensor.period is None else sensor.timing(rate)[0]
 
 
 def _features(context: Context) -> Tensor:

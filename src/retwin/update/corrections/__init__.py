@@ -5,6 +5,7 @@ from __future__ import annotations
 from retwin.update.corrections.additive import Additive
 from retwin.update.corrections.chain import (
     Chain,
+    before_sensor,
     fit_correction,
     measured_outputs,
     measuring,
@@ -26,6 +27,7 @@ __all__ = [
     "Discrepancy",
     "Head",
     "SampledSensor",
+    "before_sensor",
     "command_space",
     "fit_correction",
     "measured_outputs",

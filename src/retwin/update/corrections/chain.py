@@ -172,6 +172,13 @@ def sensor_of(correction: Correction) -> SampledSensor | None:
     return last if isinstance(last, SampledSensor) else None
 
 
+def before_sensor(correction: Correction) -> Correction:
+    """The operator whose outputs the sensor at the end of a chain records; itself without one."""
+    if isinstance(correction, Chain) and isinstance(correction.second, SampledSensor):
+        return correction.first
+    return correction
+
+
 def fit_correction(
     correction: Correction, context: Context, observed: Tensor, mask: Tensor
 ) -> tuple[Correction, Discrepancy]:
