@@ -2,8 +2,9 @@
 
 A diagnosis by inversion estimates the offset of each actuator in each segment. A bias that is not
 larger than the offsets of a healthy machine is improbable in none of them, and its evidence is lost
-where the spread of the prior, which few trajectories have taught, is too large. Estimated offsets
-of the monitor's own calibration have the spread that matters, whatever the outputs show of them.
+where the spread of the prior, which is learned from few trajectories, is too large. Estimated
+offsets of the monitor's own calibration have the spread that matters, whatever the outputs show of
+them.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ RANDOM = 32
 ORDERS = 10
 """Random orders of the calibration trajectories, for the learning curve."""
 FURTHER = 60
-"""Further trajectories at most of which it is said how many are needed."""
+"""Largest number of further trajectories that is reported as needed."""
 LEVEL = 0.9
 """Probability of the intervals."""
 BAND = float(norm.ppf(0.975))

@@ -72,8 +72,8 @@ def fit_sequence(
     SequenceResidual
         Its `fitted.figures` are of held-out parts, each predicted by the member that did not train
         on it: `rmse_NAME` in the output's unit, `rmse_NAME/constant` of the mean of z as the
-        prediction, `trust_NAME`, `nll`, `coverage90` and `spread`. Trust and spread are chosen on
-        the same parts, so the figures are slightly optimistic.
+        prediction, `trust_NAME`, the factor by which means are shrunk, `nll`, `coverage90` and
+        `spread`. Both factors are chosen on the same parts, so the figures are slightly optimistic.
 
     Raises
     ------
@@ -235,7 +235,7 @@ def _objective(model: SequenceResidual) -> Loss:
 
 @torch.no_grad()
 def _calibrate(model: SequenceResidual, data: _Records, held_out: Tensor) -> dict[str, float]:
-    """Set trust, spread and persistence from held-out parts; the figures of these parts."""
+    """Set shrinkage, spread and persistence from held-out parts; the figures of these parts."""
     model.eval()
     held_out = held_out & data.identified
     predicted = [model.predict(member, data.features) for member in model.members]
