@@ -36,7 +36,8 @@ _HOME = homes(
         "record_sampler": "sampler_from",
         "samplers": "CommandSampler HoldSampler MultisineSampler RampSampler RecordedSampler",
         "state": "State",
-        "state_twin": "StateTwin StepWarning",
+        "state_twin": "StateTwin",
+        "step_error": "StepWarning",
         "system": "System",
         "system_faults": "ActuatorGain ParameterDrift ParameterShift SensorBias SensorDrift "
         "SensorFreeze",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
@@ -23,6 +22,7 @@ from retwin.twins.parameter_values import values_per_simulation
 from retwin.twins.parametric import Parameter, ParametricTwin
 from retwin.twins.saved_equations import equations_from, equations_of
 from retwin.twins.state import State
+from retwin.twins.step_error import warn_of_coarse_steps
 from retwin.twins.system_faults import parameter_changes
 from retwin.twins.twin import Chunk, checked_commands, simulate_in_chunks
 
@@ -35,17 +35,10 @@ if TYPE_CHECKING:  # describing a twin needs no torch, which takes seconds to im
 
 SAMPLES_PER_CHUNK = 2**20
 """Number of samples, of all trajectories together, that are simulated at once: some 100 MB."""
-ACCURACY = 0.01
-"""Largest error of the steps through time, in standard deviations of an output, that passes without
-a warning. It should be small compared with a discrepancy that is worth modelling."""
 MAX_SUBSTEPS = 10_000
 """Sub-steps of a sample, above which equations are too stiff for an explicit method."""
 FINER = 16
 """How many times more sub-steps are tried before a simulation that is not finite is given up."""
-
-
-class StepWarning(UserWarning):
-    """The steps through time are too coarse for the equations."""
 
 
 @dataclass(frozen=True)
@@ -381,22 +374,9 @@ class StateTwin:
             See the class.
 
         """
-        if self.step is not None:
-            return
-        finer = self.steps(2 * self.substeps).run(commands, values)[0][0]
-        error = np.sqrt(np.mean((outputs[0] - finer) ** 2, axis=0))
-        # An output that hardly varies is compared with its size, of which rounding is a fraction.
-        allowed = ACCURACY * np.maximum(finer.std(axis=0), 1e-6 * np.abs(finer).max(axis=0))
-        worst = int(np.argmax(error - allowed))
-        if error[worst] <= allowed[worst]:
-            return
-        unit = self.outputs.units[worst]
-        warnings.warn(
-            f"{self.outputs.names[worst]} has an error of {error[worst]:.1g} {unit} with "
-            f"substeps={self.substeps}, over 1 % of its standard deviation; give more substeps",
-            StepWarning,
-            stacklevel=2,
-        )
+        if self.step is None:
+            finer, _ = self.steps(2 * self.substeps).run(commands, values)
+            warn_of_coarse_steps(outputs[0], finer[0], self.outputs, self.substeps)
 
 
 def with_parameters(function: Callable[..., Any] | None) -> Callable[..., Any]:

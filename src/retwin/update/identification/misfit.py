@@ -16,7 +16,7 @@ from retwin.errors import InputError
 from retwin.processes import sendable_errors, worker_pool
 from retwin.twins.collected import SimulationError
 from retwin.twins.parametric import ParametricTwin
-from retwin.twins.state_twin import StepWarning
+from retwin.twins.step_error import StepWarning
 from retwin.twins.twin import checked_seed, checked_stride
 
 
