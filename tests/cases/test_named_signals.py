@@ -53,6 +53,15 @@ def test_iso_times_with_a_zone_and_pauses_between_three_runs(tmp_path: Path) -> 
     assert any("No log holds level" in note for note in found.notes)
 
 
+def test_times_that_step_back_or_repeat_are_named(tmp_path: Path) -> None:
+    at = np.round(np.arange(400) / 10 - 0.3 * (np.arange(400) >= 200), 1)  # a clock set back
+    rows = [f"{t:.1f},{k // 50},{k}" for k, t in enumerate(at)]
+    found = read_logs([table(tmp_path / "a.csv", "time,valve,speed", rows)], TWIN)
+    (note,) = [each for each in found.notes if "put in order" in each]
+    assert note.startswith("a.csv: valve, speed: 2 values put in order, up to 0.2 s earlier")
+    assert "3 values with the time of another left out" in note
+
+
 def test_rows_that_are_left_out_are_no_pause(tmp_path: Path) -> None:
     """A row in five lost: the record was cut into eight, each from the twin's start on."""
     keep = np.sort(np.random.default_rng(0).permutation(400)[:320])
@@ -113,7 +122,7 @@ def test_topics_at_several_rates_are_found_by_their_last_names(tmp_path: Path) -
         ("time,valve,level", "{t},{k},{k}", {"level": "depth"}, "expected a column 'depth'"),
         ("time,valve,level", "{t},,{k}", {}, "a number for every command"),
         ("time,valve,level", "{t},on or off,{k}", {}, "numbers in columns valve, got text"),
-        ("time,valve,level", "0.0,{k},{k}", {}, "two samples at least"),
+        ("time,valve,level", "0.0,{k},{k}", {}, "29 of 30 at the time of the one before"),
     ],
 )
 def test_what_is_not_certain_is_refused(

@@ -292,10 +292,27 @@ def test_times_out_of_order() -> None:
     swapped = at.copy()
     swapped[[20, 21]] = swapped[[21, 20]]
     twice = np.append(at, at[-1])
-    assert in_order(Signal("y", swapped, at), "a")[1] == ["1 values put in order"]
+    (note,) = in_order(Signal("y", swapped, at), "a")[1]
+    assert note == "1 value put in order, up to 0.01 s earlier than one before"
     assert len(in_order(Signal("y", twice, twice), "a")[0].times) == 100
     with pytest.raises(InputError, match=r"a step back of 0\.5 s at 0\.99 s"):
         in_order(Signal("y", np.concatenate([at, at + 0.49]), np.zeros(200)), "a")
+
+
+def test_a_clock_that_is_coarser_than_the_samples_is_refused() -> None:
+    """Of most values nobody knows the time."""
+    at = np.arange(0, 10, 0.1)
+    with pytest.raises(InputError, match="got 90 of 100 at the time of the one before"):
+        in_order(Signal("y", np.floor(at), at), "a")
+
+
+def test_rows_of_several_topics_may_have_the_same_time() -> None:
+    """Each holds a value of one of them: an empty cell replaces no value."""
+    at = np.repeat(np.arange(0, 10, 0.1), 2)
+    values = np.where(np.arange(200) % 2 == 0, at, np.nan)
+    found, notes = in_order(Signal("y", at, values), "a")
+    np.testing.assert_array_equal(found.values, at[::2])
+    assert notes == []
 
 
 @pytest.mark.slow

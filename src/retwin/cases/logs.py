@@ -33,6 +33,8 @@ from retwin.twins.twin import Twin
 
 ROUNDED = 1e-3
 """Relative accuracy to which a rate is rounded that is computed from times."""
+CHANGED = ("no number", " to ", "put in order", "with the time of another")
+"""Words of notes about a channel whose values or times are not those of the log."""
 
 
 @dataclass(frozen=True)
@@ -317,9 +319,12 @@ def _add_notes(
         nothing = whole and note.startswith("100.0%")
         if note != NO_NOMINAL and not nothing:  # the twin simulates them
             notes.setdefault(note, []).append(name)
+    channels: dict[str, list[str]] = {}
     for each in found.provenance[0].sampling:
-        if each.note and ("no numbers" in each.note or " to " in each.note):
-            notes.setdefault(f"{each.channel}: {each.note}", []).append(name)
+        if any(words in each.note for words in CHANGED):
+            channels.setdefault(each.note, []).append(each.channel)
+    for note, own in channels.items():
+        notes.setdefault(f"{', '.join(own)}: {note}", []).append(name)
 
 
 def _sentences(notes: Mapping[str, Sequence[str]]) -> Iterator[str]:

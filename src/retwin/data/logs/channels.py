@@ -144,12 +144,15 @@ def _channel(
 ) -> Channel:
     signal, notes = in_order(_mean_of(log, own.signals), log.name)
     if signal.unreadable:
-        notes.append(f"{signal.unreadable} values are no numbers")
+        one = signal.unreadable == 1
+        notes.append(
+            "1 value is no number" if one else f"{signal.unreadable} values are no numbers"
+        )
     coded = stand_in(signal.values)
     if coded:
         notes.append(
-            f"{coded[1]} values are {coded[0]:g}, far from all others: make them empty or NaN if "
-            "they stand for missing ones"
+            f"{_values(coded[1])} of {coded[0]:g}, far from all others: leave the cells empty, or "
+            "write NaN, if they stand for missing ones"
         )
     topics = [topic for topic, why in log.skipped.items() if why == NO_STAMP]
     if any(
@@ -249,30 +252,55 @@ def signal_of(log: Log, name: str) -> Signal:
 def in_order(signal: Signal, where: str) -> tuple[Signal, list[str]]:
     """The signal with times that increase, and notes of what was done for that.
 
+    Where times are not in order, only values that are there count: in a table of several topics,
+    rows with the same time each hold a value of one of them.
+
     Raises
     ------
     InputError
-        A step back in time is no matter of order.
+        A step back in time is no matter of order, or most values have the time of another.
 
     """
-    steps = np.diff(signal.times)
-    if (steps > 0).all():
+    if (np.diff(signal.times) > 0).all():
         return signal, []
-    typical = float(np.median(np.abs(steps)))
+    known = np.isfinite(signal.values)
+    times, values = signal.times[known], signal.values[known]
+    steps = np.diff(times)
+    if (steps > 0).all():
+        return replace(signal, times=times, values=values), []
+    place, typical = f"{where}, {signal.name}", float(np.median(np.abs(steps)))
+    same = int((steps == 0).sum())
+    require(
+        typical > 0,
+        place,
+        expected="values at times of their own",
+        got=f"{same} of {len(times)} at the time of the one before",
+        remedy="name a column of finer times in [time] of a mapping, or give rate = … in its "
+        "place for even rows",
+    )
     worst = int(np.argmin(steps))
     require(
         -steps[worst] <= DISORDER * typical,
-        f"{where}, {signal.name}",
+        place,
         expected="times that increase",
-        got=f"a step back of {-steps[worst]:g} s at {signal.times[worst]:g} s",
-        remedy='split the log there, or use the times of recording: stamps = "log" in [time]',
+        got=f"a step back of {-steps[worst]:g} s at {times[worst]:g} s",
+        remedy="split the log there, or give other times in [time] of a mapping: rate = … in "
+        'place of column for even rows, stamps = "log" for messages',
     )
-    order = np.argsort(signal.times, kind="stable")
-    times, values = signal.times[order], signal.values[order]
+    early = np.maximum.accumulate(times) - times
+    order = np.argsort(times, kind="stable")
+    times, values = times[order], values[order]
     last = np.append(np.diff(times) > 0, True)  # of values with the same time the last one counts
     notes = []
     if (steps < 0).any():
-        notes.append(f"{int((steps < 0).sum())} values put in order")
+        notes.append(
+            f"{_values(int((early > 0).sum()))} put in order, up to {early.max():g} s "
+            "earlier than one before"
+        )
     if not last.all():
-        notes.append(f"{int((~last).sum())} values with the time of another left out")
+        notes.append(f"{_values(int((~last).sum()))} with the time of another left out")
     return replace(signal, times=times[last], values=values[last]), notes
+
+
+def _values(count: int) -> str:
+    return f"{count} {'value' if count == 1 else 'values'}"
