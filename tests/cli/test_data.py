@@ -221,6 +221,26 @@ def test_a_log_is_mapped_drawn_and_described(bench, call):
     assert "linear" in out
 
 
+@pytest.mark.parametrize(
+    ("back", "remark"),
+    [
+        (0.0, "1 trajectory at 50 Hz: 100.0% of the log's"),
+        (0.06, "pump_cmd, level: 2 values put in order, up to 0.04 s earlier than one before"),
+        (3.0, "makes no trajectories yet: bench.csv, pump_cmd: expected times that increase"),
+    ],
+)
+def test_what_a_mapping_makes_of_a_log_is_said(back, remark, tmp_path, call):
+    at = np.arange(0, 10, 0.02)
+    at[250:] -= back
+    rows = [f"{t:.2f},{int(t) % 2},{t:.2f}" for t in at]
+    log, out = tmp_path / "bench.csv", tmp_path / "mapping.toml"
+    log.write_text("\n".join(["time,pump_cmd,level", *rows]))
+    code, made, err = call("data", "map", str(log), "--out", str(out), "--json")
+    assert code == 0
+    assert any(remark in each for each in json.loads(made)["notes"])
+    assert remark in " ".join(err.split())
+
+
 def test_a_log_is_mapped_to_the_channels_of_a_twin(bench, call):
     robot = bench.with_name("robot.xml")
     robot.write_text(

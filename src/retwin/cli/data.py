@@ -36,6 +36,7 @@ from retwin.times import sample_rate
 from retwin.twins import FILES
 
 if TYPE_CHECKING:
+    from retwin.data.logs.mapped import Parts
     from retwin.data.logs.proposal import Proposal
 
 SHOWN = 40
@@ -101,6 +102,7 @@ def map_log(
     as_json: Json = False,
 ) -> None:
     """Propose what a log's signals stand for, and draw it with the trajectories they make."""
+    from retwin.data.logs.mapped import tried
     from retwin.data.logs.mapping import TimeSettings
     from retwin.data.logs.proposal import propose_mapping
     from retwin.report.log_picture import log_picture
@@ -126,19 +128,28 @@ def map_log(
             progress=lambda share: show(log.name, share),
             max_bytes=max_bytes,
         )
-        drawn = log_picture(made.log, made.mapping, case=system)
+        parts = tried(made.log, made.mapping, case=system)
+        drawn = log_picture(made.log, parts)
     for place, contents in ((out, made.text.encode()), (picture, drawn)):
         with write_atomically(place) as part:
             part.write_bytes(contents)
-    signals = [asdict(each) for each in made.facts]
+    remarks = _remarks(made, parts)
     answer(
-        {"signals": signals, "channels": made.channels, "open": made.open_channels},
+        {
+            "signals": [asdict(each) for each in made.facts],
+            "channels": made.channels,
+            "open": made.open_channels,
+            "notes": remarks,
+        },
         _seen(made),
         as_json=as_json,
     )
     note(f"Wrote {out} and {picture}: check them, then give --mapping {out}")
     if made.open_channels:
-        note(f"No signal was found for {', '.join(made.open_channels)}: name it in {out}")
+        lacking = ", ".join(made.open_channels)
+        note(f"No signal that changes was found for {lacking}: name it in {out}")
+    for each in remarks:
+        note(each)
 
 
 @app.command(epilog=example("retwin data convert sim.mat sim.npz --case armpi"))
@@ -238,6 +249,15 @@ def _channels_of(
     from retwin.cases.twin_data import log_case
 
     return log_case(name, inputs=names[0], outputs=names[1], mapping=mapping)
+
+
+def _remarks(made: Proposal, tried: Parts | str) -> list[str]:
+    """What the proposed mapping makes of a log, a sentence each."""
+    if isinstance(tried, str):
+        return [f"The mapping makes no trajectories yet: {tried}"]
+    count = len(tried.blocks)
+    what = f"{count} {'trajectory' if count == 1 else 'trajectories'} at {tried.rate:g} Hz"
+    return [f"{what}: {'; '.join(tried.notes(made.log))}", *tried.changes()]
 
 
 def _seen(made: Proposal) -> Table:

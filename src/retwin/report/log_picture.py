@@ -13,14 +13,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from retwin.data.io.assembly import DataCase
-from retwin.data.logs.mapped import Parts, parts_of
-from retwin.data.logs.mapping import Mapping
+from retwin.data.logs.mapped import Parts
 from retwin.data.logs.signals import Log
-from retwin.errors import InputError
 from retwin.report.png import blank, dress
 from retwin.report.style import PALETTE, hexadecimal
-from retwin.serialisation.sizes import Budget
 
 MAX_ROWS = 16
 """Signals that are drawn at most."""
@@ -30,7 +26,7 @@ COMMAND, OUTPUT = PALETTE[1][0], PALETTE[0][0]
 
 
 @rc_context({"text.parse_math": False})  # a name with $ is no formula
-def log_picture(log: Log, mapping: Mapping | None, *, case: DataCase | None = None) -> bytes:
+def log_picture(log: Log, tried: Parts | str) -> bytes:
     """The signals of a log as PNG, above each other, with the trajectories that a mapping makes.
 
     Trajectories are shaded, and their samples are drawn over the values of the log. Samples that
@@ -40,13 +36,11 @@ def log_picture(log: Log, mapping: Mapping | None, *, case: DataCase | None = No
     ----------
     log : Log
         The signals.
-    mapping : Mapping or None
-        What makes trajectories of them; without, the first signals are drawn alone.
-    case : DataCase, optional
-        As for `data.load`; it may have more channels than the mapping, which is tried as it is.
+    tried : Parts or str
+        The trajectories; or why there are none, and the first signals are drawn alone.
 
     """
-    parts, reason = _parts(log, mapping, case)
+    parts, reason = (None, tried) if isinstance(tried, str) else (tried, "")
     rows: list[tuple[str, str, int | None]] = []
     if parts is not None:
         kinds = [COMMAND] * len(parts.commands) + [OUTPUT] * (
@@ -76,19 +70,6 @@ def log_picture(log: Log, mapping: Mapping | None, *, case: DataCase | None = No
     file = io.BytesIO()
     drawn.print_png(file, metadata={"Software": None})
     return file.getvalue()
-
-
-def _parts(log: Log, mapping: Mapping | None, case: DataCase | None) -> tuple[Parts | None, str]:
-    """The trajectories, or why there are none."""
-    if mapping is None:
-        return None, "no signal is mapped to an output"
-    complete = case is not None and set(mapping.commands) == set(case.inputs.names)
-    complete = complete and case is not None and set(mapping.outputs) == set(case.outputs.names)
-    try:
-        made = parts_of(log, mapping, budget=Budget(log.name), case=case if complete else None)
-    except InputError as error:
-        return None, str(error)
-    return made, "" if made.blocks else "no trajectory is left"
 
 
 def _row(axes: Axes, parts: Parts, column: int, colour: str) -> None:

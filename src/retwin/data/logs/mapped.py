@@ -125,6 +125,33 @@ def parts_of(
     return found
 
 
+def tried(log: Log, mapping: Mapping | None, *, case: DataCase | None = None) -> Parts | str:
+    """The parts of a log that a proposed mapping makes trajectories, or why there are none.
+
+    Parameters
+    ----------
+    log : Log
+        The signals.
+    mapping : Mapping or None
+        What is proposed.
+    case : DataCase, optional
+        As for `mapped`; it may have more channels than the mapping, which is tried as it is.
+
+    """
+    if mapping is None:
+        return "no signal is mapped to an output"
+    complete = (
+        case is not None
+        and set(mapping.commands) == set(case.inputs.names)
+        and set(mapping.outputs) == set(case.outputs.names)
+    )
+    try:
+        made = parts_of(log, mapping, budget=Budget(log.name), case=case if complete else None)
+    except InputError as error:
+        return str(error)
+    return made if made.blocks else "no part has all commands and a measurement"
+
+
 @dataclass
 class Parts:
     """Trajectories as they are found, and what was left out."""
@@ -221,6 +248,14 @@ class Parts:
             parts = "part" if self.unmeasured == 1 else "parts"
             notes.append(f"{self.unmeasured} {parts} had no measurement")
         return notes
+
+    def changes(self) -> list[str]:
+        """What was done to the values and times of channels, each after those to which it was."""
+        channels: dict[str, list[str]] = {}
+        for each in self.every:
+            for note in each.notes:
+                channels.setdefault(note, []).append(each.name)
+        return [f"{', '.join(own)}: {note}" for note, own in channels.items()]
 
 
 def _finished(

@@ -220,12 +220,15 @@ def proposed(
     Raises
     ------
     InputError
-        No signal changes, or none occurs twice.
+        No signal changes, or none at times of its own.
 
     """
     facts = facts_of(log)
     moving = [each for each in facts if _moves(each)]
     if not moving:
+        for each in facts:
+            if not each.constant:
+                in_order(log.signals[each.name], log.name)  # its times repeat: says so
         raise InputError(
             log.name,
             expected="signals that change",

@@ -132,7 +132,7 @@ def mapping_text(
             if fact is None:
                 # The outputs that a mapping lacks are not compared by identify.
                 more = ", or delete this table" if _spare(case, table) else ""
-                lines += [f'signal = "" # none has such a name: choose one of those below{more}']
+                lines += [f'signal = "" # none that changes has such a name: see below{more}']
                 lines += _units_wanted(name, "", case)
                 continue
             own = tables[table][name]
