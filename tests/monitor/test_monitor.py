@@ -231,6 +231,17 @@ def test_other_channels_and_too_few_samples_are_refused(
         fit_monitor(TANK, record(1, 0))  # type: ignore[arg-type]
 
 
+def test_values_that_no_healthy_machine_gives_are_named(twin: DynamicsTwin) -> None:
+    healthy = record(1, 1)
+    huge, frozen = healthy.observed.copy(), healthy.observed.copy()
+    huge[0, 300, 1] = 1e300
+    with pytest.raises(InputError, match=r"got 1e\+300 of pressure"):
+        fit_monitor(twin, replace(healthy, observed=huge))
+    frozen[..., 1] = 1.0
+    with pytest.warns(UserWarning, match="healthy: pressure never changes"):
+        fit_monitor(twin, replace(healthy, observed=frozen))
+
+
 def test_the_cause_of_an_alarm_is_named_with_its_onset_and_size(
     twin: DynamicsTwin, monitor: Monitor
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retwin.checks import finite, instance, require
+from retwin.data.measured import check_magnitude, doubtful, unmeasured
 from retwin.data.trajectories import Trajectories
 from retwin.monitor.disturbance import fit_disturbance
 from retwin.monitor.monitor import Monitor
@@ -55,13 +57,18 @@ def fit_monitor(
     Raises
     ------
     InputError
-        Other channels or another rate than those of the twin, or too few samples.
+        Other channels or another rate than those of the twin, too few samples, or a value that no
+        sensor gives.
 
     """
     instance("twin", twin, DynamicsTwin, remedy="fit it by fit_dynamics")
     check_channels(twin, healthy, "healthy")
+    check_magnitude("healthy", healthy)
     arl = false_alarms(false_alarms_at_most, twin.rate)
     finite("blanking", blanking, least=0.0, unit="s")
+    notes = "; ".join(filter(None, [unmeasured(healthy), *doubtful(healthy)]))
+    if notes:
+        warnings.warn(f"healthy: {notes}", stacklevel=2)
     measured = np.where(healthy.mask, healthy.observed, np.nan).astype(float)
     steps = resolution(np.moveaxis(measured, 2, 0).reshape(measured.shape[2], -1))
     first = _calibrated(twin, Predictor(), healthy, measured, steps)
