@@ -28,3 +28,11 @@ def test_a_missing_file_is_named_by_its_option(call, words, named, tmp_path, mon
     assert err.startswith(f"error: {named}")
     assert ": expected " in err
     assert not any(tmp_path.iterdir())
+
+
+def test_a_missing_mapping_is_named_in_plain_words(call, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "log.csv").write_text("time,level\n0,1\n1,2\n")
+    code, _, err = call("data", "info", "log.csv", "--mapping", "no.toml")
+    assert code == 2
+    assert "no.toml: expected a mapping.toml, got no file of that name; check the name" in err

@@ -306,6 +306,21 @@ def test_a_clock_that_is_coarser_than_the_samples_is_refused() -> None:
         in_order(Signal("y", np.floor(at), at), "a")
 
 
+@pytest.mark.parametrize(
+    ("cells", "message"),
+    [
+        (["0.0", "0.1", "time", "0.3"], r"row 2: expected times.*got 'time'; repair or remove"),
+        (["0.0", "0.1", "nan", "0.3"], r"got nan s in row 2; remove that row"),
+    ],
+)
+def test_a_row_without_a_time_is_named(cells: list[str], message: str, tmp_path: Path) -> None:
+    rows = [f"{cell},{place}" for place, cell in enumerate(cells)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(["time,level", *rows, ""]))
+    with pytest.raises(InputError, match=message):
+        read_log(path, budget=Budget("a"))
+
+
 def test_rows_of_several_topics_may_have_the_same_time() -> None:
     """Each holds a value of one of them: an empty cell replaces no value."""
     at = np.repeat(np.arange(0, 10, 0.1), 2)

@@ -91,6 +91,9 @@ def read_toml(path: Path, *, expected: str, remedy: str) -> dict[str, Any]:
         if max(part.count(".") for part in re.split(r"[=,{}\n]", text)) > MAX_DEPTH:
             raise ValueError("a key is nested too deeply")
         return tomllib.loads(text)
+    except FileNotFoundError:
+        got, remedy = "no file of that name", "check the name"
+        raise InputError(str(path), expected=expected, got=got, remedy=remedy) from None
     except (OSError, ValueError, RecursionError) as error:
         got = f"{type(error).__name__}: {error}"
         raise InputError(str(path), expected=expected, got=got, remedy=remedy) from None

@@ -172,6 +172,6 @@ def to_nanoseconds(times: NDArray, unit: str, where: str) -> NDArray:
             where,
             expected="a time in every row, before the year 2262",
             got=f"{times[row]} {unit} in row {row}",
-            remedy="check column and unit of [time] in the mapping",
+            remedy="remove that row, or check column and unit of [time] in the mapping",
         )
     return scaled.astype(np.int64)

@@ -82,17 +82,26 @@ def row_times(values: NDArray, unit: str, clock: Clock, where: str) -> NDArray:
     if values.dtype.kind in "OUS":
         if clock.format or clock.unit == "iso":
             return _parsed(values, clock.format, where)
-        try:
-            values = np.array([float(str(cell).replace(",", ".")) for cell in values])
-        except ValueError:
-            if clock.unit:
-                raise _no_time(values, where) from None
+        found = np.array([_number(cell) for cell in values.tolist()], dtype=object)
+        text = np.array([each is None for each in found], dtype=bool)
+        if text.any():
+            row = int(np.argmax(text))
+            if clock.unit or row:  # the others are numbers
+                raise _no_time(values[row : row + 1], f"{where}, row {row}")
             return _parsed(values, "", where)
+        values = found.astype(float)
     stated = clock.unit or {"sec": "s", "seconds": "s", "µs": "us", "μs": "us"}.get(unit, unit)
     if stated not in UNIT_SECONDS:
         size = float(np.nanmax(np.abs(values), initial=0.0)) if len(values) else 0.0
         stated = next((name for least, name in EPOCHS if size > least), "s")
     return to_nanoseconds(values, stated, where)
+
+
+def _number(cell: object) -> float | None:
+    try:
+        return float(str(cell).replace(",", "."))
+    except ValueError:
+        return None
 
 
 def _increases(cells: NDArray) -> bool:
@@ -133,7 +142,8 @@ def _no_time(cells: NDArray, where: str) -> InputError:
         where,
         expected="times: numbers, ISO 8601, or text in the format of [time] in the mapping",
         got=repr(str(cells[0]))[:60] if len(cells) else "none",
-        remedy='name column and unit, or give format = "%d.%m.%Y %H:%M:%S" in [time]',
+        remedy="repair or remove that row, name column and unit, or give "
+        'format = "%d.%m.%Y %H:%M:%S", in [time]',
     )
 
 
