@@ -12,7 +12,7 @@ import torch
 
 import retwin as rt
 from retwin.errors import InputError
-from retwin.evaluation.experiments.propose import Proposal
+from retwin.evaluation.experiments.propose import Proposal, _joined
 from retwin.evaluation.experiments.segments import _regression
 from retwin.inference.design import Knowledge, chosen
 
@@ -49,6 +49,34 @@ def test_each_choice_accounts_for_those_before() -> None:
     assert picked[1] == int(rest.argmax())
     excess = [known.excess, *(each.excess for each in after)]
     assert all(a > b > 0 for a, b in pairwise(excess))
+
+
+def test_commands_of_different_numbers_of_segments_are_compared() -> None:
+    known, roots = knowledge(), experiments(6)
+    parts = [roots[:2, :1], roots[2:]]
+    gains = torch.cat([known.gains(part) for part in parts])
+    torch.testing.assert_close(known.gains(_joined(parts)), gains)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::retwin.update.OutsideTrainingWarning")
+def test_trajectories_may_differ_in_their_number_of_segments(
+    updated: rt.CorrectedTwin, emulated: rt.Trajectories, case: rt.Case
+) -> None:
+    """Candidates of one part had fewer segments than those of another: a RuntimeError."""
+
+    class Resting:
+        rate = case.sampler.rate
+
+        def sample(self, count: int, *, rng: np.random.Generator) -> np.ndarray:
+            made = case.sampler.sample(count, rng=rng).copy()
+            rests = np.linspace(300, made.shape[1] - 1, count).astype(int)
+            for commands, at in zip(made, rests, strict=True):
+                commands[at:] = commands[at]
+            return made
+
+    made = rt.next_experiments(updated, emulated, Resting(), seed=3, count=1, candidates=20)
+    assert made.gains[0] > 0
 
 
 def test_what_moves_no_prediction_earns_nothing() -> None:

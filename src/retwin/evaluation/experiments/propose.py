@@ -192,7 +192,7 @@ def next_experiments(
     show(0.6)
     now = known.knowledge(references)
     drawn = sampler.sample(candidates, rng=rng)
-    roots = torch.cat([known.roots(part) for part in np.array_split(drawn, PARTS) if len(part)])
+    roots = _joined([known.roots(part) for part in np.array_split(drawn, PARTS) if len(part)])
     show(0.9)
     picked, after = chosen(now, roots, max(count, min(FURTHER, candidates)))
     every = [now, *after]
@@ -239,6 +239,17 @@ def _check(twin: object, sampler: CommandSampler, count: int, candidates: int) -
         expected=f"commands at the rate of the twin, {twin.rate:g} Hz",
         got=f"{sampler.rate:g} Hz",
         remedy="give the sampler of the case that the twin was fitted for",
+    )
+
+
+def _joined(parts: list[torch.Tensor]) -> torch.Tensor:
+    """Roots (n, r, F) of all parts, whose r differs with the segments of their commands.
+
+    Rows of zeros, which hold no information, fill up the shorter ones.
+    """
+    longest = max(each.shape[1] for each in parts)
+    return torch.cat(
+        [torch.nn.functional.pad(each, (0, 0, 0, longest - each.shape[1])) for each in parts]
     )
 
 
