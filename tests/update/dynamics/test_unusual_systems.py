@@ -129,6 +129,47 @@ def test_parameters_that_the_record_does_not_determine_have_no_error_of_zero() -
     assert is_finite(found.twin)
 
 
+HIDDEN = {"pole": 0.8, "gain": 0.4, "mix": 0.3}
+"""Parameters of a system whose hidden state may have any scale."""
+
+
+def hidden_state(missing: float = 0.0) -> StateTwin:
+    """A hidden state of which only the product of what leads to it and from it shows."""
+
+    def step(x, u, p):
+        own = p.pole * x.a + p.gain * u.u + missing * x.a**2
+        return own, 0.9 * x.b + p.mix * x.a
+
+    ranges = {"pole": (0.1, 0.99, 0.7), "gain": (0.01, 5, 0.5), "mix": (0.01, 2, 0.3)}
+    return StateTwin(
+        (State("a", "1"), State("b", "1")),
+        lambda x, u: x.b,
+        rt.Channels(("u",), ("1",)),
+        rt.Channels(("b",), ("1",)),
+        1.0,
+        step=step,
+        parameters=[Parameter(name, "1", *each) for name, each in ranges.items()],
+    )
+
+
+def hidden_record(seed: int, missing: float = 0.0) -> rt.Trajectories:
+    """One record, with noise of 0.02."""
+    rng = np.random.default_rng(seed)
+    commands = np.repeat(rng.uniform(-2, 2, size=(1, 200, 1)), 5, axis=1)
+    made = hidden_state(missing).simulate(commands, seed=0, parameters=HIDDEN)
+    return made.replace(observed=made.observed + 0.02 * rng.normal(size=made.observed.shape))
+
+
+CONSTANT = Dynamics(library=Library(0, (), False), memory=False)
+
+
+def test_what_is_not_determined_is_no_noise() -> None:
+    """A step along it to the estimates without a part is rounding, and would seem to be noise."""
+    with pytest.warns(UserWarning, match="not determined by the record: gain, mix"):
+        found = fit_dynamics(hidden_state(), hidden_record(4), CONSTANT)
+    assert np.sqrt(found.twin.noise[0]) > 0.01
+
+
 @pytest.fixture(scope="module")
 def fitted() -> DynamicsTwin:
     known = lag(lambda x, u: (u.u - 2 * x.x,))

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.update.dynamics.estimation import Estimation
+from retwin.update.dynamics.estimation import RESOLUTION, Estimation
 from retwin.update.dynamics.linearised import HeldOut, Linearised
 
 
@@ -73,7 +73,8 @@ def _left_out(
         weighted = (jacobian * scale[:, None]).reshape(-1, k)
         left[i] -= weighted.T @ weighted
         gradients[i] -= weighted.T @ (error * scale).ravel()
-    covariances = np.linalg.pinv(left, hermitian=True)
+    # What the record does not determine stays, as a step along it would be rounding alone.
+    covariances = np.linalg.pinv(left, RESOLUTION * max(k, 1), hermitian=True)
     steps = np.einsum("fij,fj->fi", covariances, gradients)
     ends = (each[:k] - at.point.shared for each in estimation.bounds)
     return np.clip(unit * steps, *ends) / unit, covariances, by_unit
