@@ -170,6 +170,15 @@ def test_what_is_not_determined_is_no_noise() -> None:
     assert np.sqrt(found.twin.noise[0]) > 0.01
 
 
+def test_what_only_one_part_determines_is_no_noise() -> None:
+    """The transient at the begin alone separates two constants, and is predicted without them."""
+    with pytest.warns(UserWarning, match="not determined by the record: gain, mix"):
+        found = fit_dynamics(hidden_state(), hidden_record(5), CONSTANT)
+    assert np.sqrt(found.twin.noise[0]) == pytest.approx(0.02, rel=0.1)
+    errors = found.twin.predictive(hidden_record(5)).whiteness()[0][0]
+    assert np.abs(errors.values[errors.largest]) < 0.1
+
+
 @pytest.fixture(scope="module")
 def fitted() -> DynamicsTwin:
     known = lag(lambda x, u: (u.u - 2 * x.x,))

@@ -254,12 +254,17 @@ def assembled(
 def _trusted(
     estimation: Estimation, found: Point, held_out: HeldOut, parts: Sequence[NDArray]
 ) -> NDArray:
-    """The moves (K, k) of the estimates without each part; 0 where they are no linear step.
+    """The moves (K, k) of the estimates without each part; 0 where they show no noise.
 
-    The errors of the simulation itself then differ from those of the linear step.
+    Either they are no linear step, so that the errors of the simulation itself differ from those of
+    the linear step. Or the other parts leave open more than the errors of this one: without a
+    transient, what it alone determines may be anything, and would seem to be noise.
     """
     moves = np.zeros(held_out.moves.shape)
+    share = estimation.seen * held_out.variances / estimation.power(estimation.residual(found))
     for k, (part, move) in enumerate(zip(parts, held_out.moves, strict=True)):
+        if share[part].sum() > estimation.seen[part].sum():
+            continue
         residual = estimation.residual(Point(found.shared + move, found.starts))[part]
         linear = held_out.errors[part]
         if np.sum(residual**2) <= NONLINEAR**2 * np.sum(linear**2):
