@@ -129,6 +129,21 @@ def test_parameters_that_the_record_does_not_determine_have_no_error_of_zero() -
     assert is_finite(found.twin)
 
 
+def test_errors_at_the_edges_are_relative_to_the_whole_range() -> None:
+    """With outputs in two units; where one is at its end, it does not vary much."""
+    twin = StateTwin(
+        (STATE,),
+        lambda x, u: (x.x, 2 * x.x),
+        INPUT,
+        rt.Channels(("y", "z"), ("m", "V")),
+        20.0,
+        derivative=lambda x, u, p: (u.u - p.rate * x.x,),
+        parameters=(Parameter("rate", "1/s", 0.1, 9.0, 2.0),),
+    )
+    figures = fit_dynamics(twin, measured(twin, 0.01), QUICK).figures
+    assert figures["held_out_edges"] == pytest.approx(figures["held_out"], rel=0.2)
+
+
 HIDDEN = {"pole": 0.8, "gain": 0.4, "mix": 0.3}
 """Parameters of a system whose hidden state may have any scale."""
 

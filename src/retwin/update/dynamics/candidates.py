@@ -280,9 +280,8 @@ def _squares(
     """Mean squares of errors (n, T, d_y), one each for parts (n, T) where all is measured."""
     made = []
     for each, part in zip(errors, parts, strict=True):
-        seen = estimation.seen & part[..., None]
-        if seen.any(axis=(0, 1)).all():
-            made.append(replace(estimation, seen=seen).rms(np.where(seen, each, 0.0)) ** 2)
+        if (estimation.seen & part[..., None]).any(axis=(0, 1)).all():
+            made.append(estimation.rms(each, part) ** 2)
     return np.array(made or [0.0])
 
 

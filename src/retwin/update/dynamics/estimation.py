@@ -158,20 +158,24 @@ class Estimation:
         made: NDArray = np.where(variance > RESOLUTION * square, variance, constant)
         return made
 
-    def power(self, residual: NDArray) -> NDArray:
-        """Mean squares (d_y,) of a residual (n, T, d_y), above 0."""
-        count = np.maximum(self.seen.sum(axis=(0, 1)), 1)
+    def power(self, residual: NDArray, seen: NDArray | None = None) -> NDArray:
+        """Mean squares (d_y,), above 0, of a residual (n, T, d_y) that is 0 where not `seen`."""
+        count = np.maximum((self.seen if seen is None else seen).sum(axis=(0, 1)), 1)
         made: NDArray = np.maximum(
             np.sum(residual**2, axis=(0, 1)) / count, RESOLUTION * self.spread
         )
         return made
 
-    def rms(self, residual: NDArray) -> float:
-        """Root mean square of a residual, relative where the outputs have several units."""
-        power = self.power(residual)
+    def rms(self, residual: NDArray, part: NDArray | None = None) -> float:
+        """Root mean square of a residual, relative where the outputs have several units.
+
+        It is that of a part (n, T) of the samples, if given, relative to all of them alike.
+        """
+        seen = self.seen if part is None else self.seen & part[..., None]
+        power = self.power(np.where(seen, residual, 0.0), seen)
         if len(set(self.observed.outputs.units)) > 1:
             power = power / self.spread
-        return float(np.sqrt(np.average(power, weights=self.seen.sum(axis=(0, 1)))))
+        return float(np.sqrt(np.average(power, weights=seen.sum(axis=(0, 1)))))
 
     def minimised(self, at: Linearised, steps: int = MAX_STEPS) -> Linearised:
         """The most probable point, from a start at which the simulation is finite.
