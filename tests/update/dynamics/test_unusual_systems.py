@@ -194,6 +194,17 @@ def test_what_only_one_part_determines_is_no_noise() -> None:
     assert np.abs(errors.values[errors.largest]) < 0.1
 
 
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_discrepancy_does_not_determine_what_the_twin_leaves_open(seed: int) -> None:
+    """By its prior alone, it would give a hidden state a scale, and that a small error."""
+    curved = Dynamics(library=Library(2, (), False), memory=False)
+    with pytest.warns(UserWarning, match="not determined by the record: gain, mix"):
+        found = fit_dynamics(hidden_state(), hidden_record(seed, missing=0.015), curved)
+    assert np.isinf([found.errors["gain"], found.errors["mix"]]).all()
+    assert found.parameters["pole"] == pytest.approx(0.8, abs=4 * found.errors["pole"])
+    assert found.figures["rms_after"] < 0.021 < 0.2 < found.figures["rms_before"]
+
+
 @pytest.fixture(scope="module")
 def fitted() -> DynamicsTwin:
     known = lag(lambda x, u: (u.u - 2 * x.x,))

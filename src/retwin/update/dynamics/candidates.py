@@ -33,6 +33,9 @@ CONSISTENT = 0.9
 DECIDED = 2.0
 """Number of standard errors by which a memory, or commands that are not held between samples, must
 lower the logarithms of held-out errors."""
+HELD = 1e-3
+"""Standard deviation of what the outputs of the twin alone do not determine, in those of the
+parameters if each were the only one: a discrepancy would determine it by its prior alone."""
 MAX_STRENGTHS = 30
 """Number of variances at most."""
 ERROR_STEPS = 2
@@ -76,7 +79,7 @@ class Candidate:
 def without_discrepancy(
     base: StateTwin, observed: Trajectories, unknowns: Unknowns
 ) -> tuple[Estimation, Linearised]:
-    """The fit of the twin itself."""
+    """The fit of the twin itself, and what it leaves open: held there by `absorbed`."""
     starts = np.tile(unknowns.start[unknowns.free], (len(observed), 1))
     estimation = Estimation(base, observed, unknowns, observed.mask, np.ones(len(base.outputs)))
     found = estimation.linearised(Point(unknowns.mean, starts))
@@ -90,7 +93,13 @@ def without_discrepancy(
     for _ in range(ERROR_STEPS):
         estimation = replace(estimation, variance=estimation.power(found.residual))
         found = estimation.minimised(found)
-    return replace(estimation, variance=estimation.power(found.residual)), found
+    estimation = replace(estimation, variance=estimation.power(found.residual))
+    combinations, there = estimation.confounded(found) / HELD, found.point.shared
+
+    def held(shared: NDArray) -> tuple[NDArray, NDArray]:
+        return combinations @ (shared - there), combinations
+
+    return replace(estimation, absorbed=held if len(combinations) else None), found
 
 
 def searched(
@@ -185,22 +194,28 @@ def _with_discrepancy(
         alone,
         twin=with_memories(equations, memories),
         unknowns=replace(unknowns, start=np.append(unknowns.start, [0.0] * len(memories))),
-        absorbed=_absorbed(equations, alone.unknowns.count),
+        absorbed=_absorbed(equations, alone),
     )
 
 
 def _absorbed(
-    equations: CorrectedEquations, first: int
+    equations: CorrectedEquations, alone: Estimation
 ) -> Callable[[NDArray], tuple[NDArray, NDArray]]:
     """What the discrepancy absorbs of the parameters, by all shared coordinates.
 
-    Its own coefficients begin at the number `first` of these.
+    What the twin alone leaves open is held besides.
     """
+    first = alone.unknowns.count
     last = first + len(equations.coefficients)
 
     def absorbed(shared: NDArray) -> tuple[NDArray, NDArray]:
         error, slope = equations.absorbed(shared[first:last])
-        return error, np.pad(slope, ((0, 0), (first, len(shared) - last)))
+        slope = np.pad(slope, ((0, 0), (first, len(shared) - last)))
+        if alone.absorbed is None:
+            return error, slope
+        held, by_own = alone.absorbed(shared[:first])
+        by_own = np.pad(by_own, ((0, 0), (0, len(shared) - first)))
+        return np.append(error, held), np.concatenate([slope, by_own])
 
     return absorbed
 
@@ -264,7 +279,7 @@ def _followed(
         # What a network has in common with parameters is that over the states that it leads to.
         visited = estimation.simulated(now.point)[1][..., :states]
         equations = equations.visiting(visited, estimation.commands)
-        absorbed = _absorbed(equations, alone.unknowns.count)
+        absorbed = _absorbed(equations, alone)
         estimation = replace(estimation, absorbed=absorbed)
         ratio = np.mean(estimation.power(now.residual) / power)
         observed = correlation_time(now.residual) * float(ratio)

@@ -313,6 +313,23 @@ class Estimation:
         made: NDArray = (free > np.sqrt(RESOLUTION)).any(axis=1)
         return made
 
+    def confounded(self, at: Linearised) -> NDArray:
+        """Combinations (r, k) of shared coordinates, each of which acts, that act together on none.
+
+        Such are the scale of a hidden state, or the ratio of two factors. They have norm 1 in the
+        units in which each coordinate's own curvature is 1.
+        """
+        curvature = self._curvature(at)
+        unit = curvature.unit[: self.unknowns.count]
+        complement = curvature.scaled(curvature.unit).reduced()[0]
+        acts = np.flatnonzero(np.diag(curvature.shared) > 0)
+        values, directions = np.linalg.eigh(complement[np.ix_(acts, acts)])
+        count = int(np.sum(values <= RESOLUTION * len(complement)))
+        made = np.zeros((count, len(unit)))
+        made[:, acts] = directions[:, :count].T
+        made[np.abs(made) <= np.sqrt(RESOLUTION)] = 0.0
+        return made / unit
+
     @cached_property
     def bounds(self) -> tuple[NDArray, NDArray]:
         """Lowest and highest values (k + n m,) of a flat point."""

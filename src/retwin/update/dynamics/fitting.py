@@ -148,6 +148,8 @@ def fit_dynamics(
     made = replace(made, widening=widening(made, estimation, held_out))
     report(1.0)
     unknown = estimation.undetermined(found)[: unknowns.count]
+    if alone.absorbed is not None:
+        unknown |= (alone.absorbed(fitted.point.shared)[1] != 0).any(axis=0)
     own = [_notes(estimation, found.point, unknown), unmeasured(observed), *doubtful(observed)]
     notes = "; ".join(filter(None, own))
     if notes:
