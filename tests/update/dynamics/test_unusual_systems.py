@@ -11,6 +11,7 @@ from safetensors.torch import load_file, save_file
 import retwin as rt
 from retwin.twins import Parameter, State, StateTwin
 from retwin.update import Dynamics, DynamicsTwin, Library, fit_dynamics
+from retwin.update.training_range import OutsideTrainingWarning
 
 INPUT = rt.Channels(("u",), ("V",))
 OUTPUT = rt.Channels(("y",), ("m",))
@@ -203,6 +204,28 @@ def test_a_discrepancy_does_not_determine_what_the_twin_leaves_open(seed: int) -
     assert np.isinf([found.errors["gain"], found.errors["mix"]]).all()
     assert found.parameters["pole"] == pytest.approx(0.8, abs=4 * found.errors["pole"])
     assert found.figures["rms_after"] < 0.021 < 0.2 < found.figures["rms_before"]
+
+
+@pytest.mark.parametrize("level", [-2e-6, 0.0, 1e5])
+def test_a_command_that_was_constant_may_change_a_little_in_any_unit(level: float) -> None:
+    twin = StateTwin(
+        (STATE,),
+        lambda x, u: x.x,
+        rt.Channels(("u", "ambient"), ("V", "kg/s")),
+        OUTPUT,
+        20.0,
+        derivative=lambda x, u: (u.u - 2 * x.x + u.ambient / (abs(level) or 1.0),),
+    )
+    commands = np.concatenate([COMMANDS, np.full(COMMANDS.shape, level)], axis=2)
+    made = twin.simulate(commands, seed=0)
+    found = fit_dynamics(
+        twin, made.replace(observed=made.observed + 1e-3 * RNG.normal(size=(2, 120, 1))), QUICK
+    ).twin
+    change = np.array([0.0, abs(level) or 1.0])
+    assert not found.outside(commands + 0.04 * change).any()
+    assert found.outside(commands + 0.06 * change).all()
+    with pytest.warns(OutsideTrainingWarning, match="ambient leaves the range"):
+        found.simulate(commands + change, seed=0)
 
 
 @pytest.fixture(scope="module")

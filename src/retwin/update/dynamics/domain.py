@@ -56,6 +56,12 @@ class Domain:
         half = np.maximum(self.high - self.centre, self.centre - self.low)
         return np.where(half > 0, half, 1.0)
 
+    @cached_property
+    def width(self) -> NDArray:
+        """Widths (d_x + d_u,) of the ranges; that of a constant is its size, or 1 if it is 0."""
+        size = np.where(self.high != 0, np.abs(self.high), 1.0)
+        return np.where(self.high > self.low, self.high - self.low, size)
+
     def scaled(self, variables: Sequence[Any]) -> list[Any]:
         """States and commands, tensors, as variables of the discrepancy."""
         beyond = EXTRAPOLATED * (self.high - self.low)
@@ -78,7 +84,6 @@ class Domain:
         if not finite.any():
             return np.zeros(len(self.low))
         both = np.concatenate([states[finite], commands[finite]], axis=2)
-        width = np.where(self.high > self.low, self.high - self.low, self.scale)
         beyond = np.maximum(both.max(axis=(0, 1)) - self.high, self.low - both.min(axis=(0, 1)))
-        made: NDArray = np.maximum(beyond, 0.0) / width
+        made: NDArray = np.maximum(beyond, 0.0) / self.width
         return made

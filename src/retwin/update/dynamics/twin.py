@@ -286,15 +286,13 @@ class DynamicsTwin:
     @property
     def bounds(self) -> tuple[NDArray, NDArray]:
         """Values (d_x + d_u,) of states and commands beyond which `simulate` warns."""
-        low, high = self.domain.low, self.domain.high
-        margin = BEYOND * np.where(high > low, high - low, self.domain.scale)
-        return low - margin, high + margin
+        margin = BEYOND * self.domain.width
+        return self.domain.low - margin, self.domain.high + margin
 
     def outside(self, commands: NDArray) -> NDArray:
         """Whether commands (n, T, d_u) leave the range that they had in calibration: (n,) bool."""
-        low, high = (each[len(self.process) :] for each in (self.domain.low, self.domain.high))
-        margin = BEYOND * np.where(high > low, high - low, np.maximum(np.abs(high), 1.0))
-        made: NDArray = ((commands < low - margin) | (commands > high + margin)).any(axis=(1, 2))
+        low, high = (each[len(self.process) :] for each in self.bounds)
+        made: NDArray = ((commands < low) | (commands > high)).any(axis=(1, 2))
         return made
 
     def slope(self, states: NDArray, commands: NDArray, changes: NDArray | None = None) -> NDArray:
