@@ -183,6 +183,21 @@ def test_the_gradient_is_that_of_the_objective_at_a_limit() -> None:
     assert not solve(problem, prior, noise, start).gradient.any()
 
 
+def test_the_gradient_is_that_of_the_objective_where_steps_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Hyperparameters are learned from it, and took what had not converged for an optimum."""
+    monkeypatch.setattr(solver, "MAX_STEPS", 1)
+    problem, prior = replace(Linear.drawn(3, 20, seed=4), curve=0.9), prior_of(3, seed=5)
+    noise, start = noise_of(0.01, StudentT(4.0)), torch.ones(3, 3, dtype=torch.float64)
+    found = solve(problem, prior, noise, start)
+    x = found.x.clone().requires_grad_()
+    objective = noise.misfit(problem, problem.residual(x)).sum() + prior.energy(x).sum()
+    (expected,) = torch.autograd.grad(objective, x)
+    assert expected.abs().max() > 1
+    torch.testing.assert_close(found.gradient, expected)
+
+
 def test_rows_do_not_depend_on_each_other() -> None:
     problem, prior = replace(Linear.drawn(5, 20, seed=6), curve=0.5), prior_of(5, seed=7)
     noise = noise_of(0.3, StudentT(4.0))

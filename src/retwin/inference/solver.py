@@ -74,7 +74,8 @@ class Solution:
         (R,), Laplace's log evidence, up to the density of the noise at 0; -inf for a row that was
         given up.
     gradient : Tensor
-        (R, P), of the objective: 0, except where a limit of x keeps it from its optimum.
+        (R, P), of the objective: 0, except where limits of x, damping or too few steps keep it from
+        its optimum.
 
     """
 
@@ -246,7 +247,9 @@ def solve(
             hopeless = torch.zeros_like(done)
         ended = (done & ~hopeless).nonzero()[:, 0]
         if len(ended):
-            gradient = _gradient_at_limits(problem, prior, noise, x, linearised, bounds, done)
+            # So much damping that steps gain nothing, or no more steps, are no optimum.
+            open_ = _at_limits(x, bounds) | (damping > DAMPING) | (count == MAX_STEPS)
+            gradient = _gradient(problem, prior, noise, x, linearised, done & open_)
             part = Solution(x, energy, step.curvature, occam - energy, gradient)
             found = found.put(rows[ended], part[ended])
         going = (~done & ~hopeless).nonzero()[:, 0]
@@ -286,21 +289,24 @@ def _objective(
     return noise.misfit(problem, residual).sum(dim=1) + prior.energy(x)
 
 
-def _gradient_at_limits(
+def _at_limits(x: Tensor, bounds: Bounds | None) -> Tensor:
+    """Rows (R,) of x (R, P) that a limit keeps from an optimum."""
+    if bounds is None:
+        return x.new_zeros(len(x), dtype=torch.bool)
+    return ((x <= bounds.lower) | (x >= bounds.upper)).any(dim=1)
+
+
+def _gradient(
     problem: Problem,
     prior: GaussianPrior,
     noise: Noise,
     x: Tensor,
     linearised: tuple[Tensor, Tensor],
-    bounds: Bounds | None,
-    done: Tensor,
+    some: Tensor,
 ) -> Tensor:
-    """The gradient (R, P) of a `Solution` at x: of rows (R,) that are done and at a limit."""
+    """The gradient (R, P) of a `Solution` at x of the rows `some` (R,) bool, 0 of the others."""
     gradient = torch.zeros_like(x)
-    if bounds is None:
-        return gradient
-    beyond = (x <= bounds.lower) | (x >= bounds.upper)
-    rows = (beyond.any(dim=1) & done).nonzero()[:, 0]
+    rows = some.nonzero()[:, 0]
     if len(rows):
         residual, jacobian = (each[rows] for each in linearised)
         weighted = (residual * noise.precision(problem[rows], residual)).flatten(1)
