@@ -8,6 +8,7 @@ import retwin as rt
 from retwin import catalog
 from retwin.cases.armpi_fpv.twin import KINEMATIC
 from retwin.serialisation.configs import from_config, to_config
+from retwin.update.corrections.path_problem import PathProblem
 from retwin.update.kernels import generation
 
 KINDS = catalog.classes(catalog.CORRECTIONS)
@@ -116,6 +117,20 @@ def test_delays_of_fast_motions_between_samples_are_found(monkeypatch: pytest.Mo
     again = rt.DelayOffset().infer(context_of(surrogate, commands), observed, everything(observed))
     deviation = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     assert float(((again.z - found.z).abs() / deviation).max()) < 0.01
+
+
+def test_the_jacobian_is_that_of_the_path_also_before_it_begins(context: rt.Context) -> None:
+    """A first segment may begin at the first sample, before which the path is held."""
+    rng, path, segments = np.random.default_rng(0), context.path[:3].double(), context.segments[:3]
+    assert segments.start[:, 0].max() < 1e-3
+    problem = PathProblem.of(segments, path, path, everything(path), (-5.0, 30.0))
+    x = torch.tensor(rng.normal([4, 0.01, 0.01, 0.01], 0.01, (3, 5, 4))).flatten(1)
+    jacobian = problem.linearised(x)[1]
+    for column in range(x.shape[1]):
+        step = torch.zeros_like(x)
+        step[:, column] = 1e-6
+        difference = (problem.residual(x - step) - problem.residual(x + step)) / 2e-6
+        torch.testing.assert_close(jacobian[..., column], difference, rtol=1e-5, atol=1e-7)
 
 
 def test_glitches_do_not_move_z(context: rt.Context, z: torch.Tensor) -> None:

@@ -169,7 +169,9 @@ class PathProblem:
         # The derivative between two samples is exactly their difference.
         slope = self.path.diff(dim=1, append=self.path[:, -1:])
         below = times.floor().long().clamp(0, self.path.shape[1] - 1)
-        slope = slope.gather(1, below[..., None].expand_as(path)) + knots.slope(values)
+        # Before its first sample the path is held; after the last one the difference is 0.
+        slope = slope.gather(1, below[..., None].expand_as(path)) * (times >= 0)[..., None]
+        slope = slope + knots.slope(values)
         unit = torch.eye(segments, dtype=z.dtype).expand(n, -1, -1)
         of_offset = knots.between(knots.spread(unit))  # (n, T, M)
         of_delay = knots.between(unit.repeat_interleave(2, dim=1))
