@@ -145,3 +145,28 @@ def test_delays_that_no_output_shows_stay_within_their_range() -> None:
         assert torch.isfinite(found.z).all()
         assert found.covariance[..., 0, 0].sqrt().max() < width
         assert not found.identified[..., 0].any()
+
+
+def delayed_and_offset(noise: float, seed: int) -> tuple[rt.Context, torch.Tensor, torch.Tensor]:
+    """The context, z of `DelayOffset` and outputs; the first segment begins at the first sample."""
+    commands, rng = commands_of(10, seed=seed), np.random.default_rng(seed)
+    segments = rt.Segments.from_commands(commands)
+    context = rt.Context.of(Plane(), commands, segments, rate=RATE)
+    assert segments.start[:, 0].max() < 0.01
+    shape = segments.start.shape
+    z = np.concatenate([rng.normal(4, 0.3, (*shape, 1)), rng.normal(0, 0.03, (*shape, 2))], axis=-1)
+    outputs = rt.DelayOffset().apply(context, torch.tensor(z)).double()
+    return context, torch.tensor(z), outputs + noise * torch.tensor(rng.normal(size=outputs.shape))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_intervals_of_exact_outputs_cover(seed: int) -> None:
+    """Residuals are the rounding of single precision, and offsets are not as small as they are."""
+    context, z, outputs = delayed_and_offset(0.0, seed)
+    found = rt.DelayOffset().infer(context, outputs, torch.ones(outputs.shape).bool())
+    deviation = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    known = found.identified
+    assert known.double().mean() > 0.9
+    covered = (found.z - z).abs() <= 1.645 * deviation
+    assert covered[known].double().mean() > 0.9
+    assert (found.z - z)[known].abs().max() < 1e-3

@@ -171,7 +171,9 @@ class DelayOffset:
 
 def _learned(problem: PathProblem, residual: Tensor) -> tuple[Noise, GaussianPrior]:
     """The noise, and a prior much wider than anything plausible: what is not seen stays 0."""
-    largest = residual.norm(dim=-1).amax(dim=1)
+    # Residuals may be as good as exact, offsets are not: they are as large as they are without z.
+    plain = problem.factor * (problem.observed - problem.path)
+    largest = plain.norm(dim=-1).amax(dim=1).maximum(residual.norm(dim=-1).amax(dim=1))
     wide = (WIDE * largest + 1e-9)[:, None].repeat(1, 1 + residual.shape[-1])
     wide[:, 0] = WIDE * problem.width
     wide = wide.repeat(1, problem.segments.max_count)

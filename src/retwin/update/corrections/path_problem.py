@@ -25,6 +25,8 @@ AROUND = (1 / 7, 2 / 7)
 timing is not exactly known."""
 MAX_CORRELATION = 0.999
 """Largest lag-one autocorrelation of residuals: slow drift makes nearly all samples one."""
+SINGLE = torch.finfo(torch.float32).eps
+"""Relative distance of neighbouring numbers in single precision."""
 COMMON = ("delay_range", "rounding")
 """Fields of `PathProblem` that all trajectories share."""
 
@@ -95,9 +97,13 @@ class PathProblem:
         group = (2 * torch.arange(len(path)))[:, None].expand(path.shape[:2])
         # What was not measured may be any number, NaN included.
         observed = torch.where(available, observed, 0.0)
+        # Paths are computed in single precision, whose rounding is the same at rest too.
+        single = SINGLE * path.abs().amax(dim=(0, 1))
         steps = [
-            lattice_step(each[seen].numpy())
-            for each, seen in zip(observed.flatten(0, 1).T, available.flatten(0, 1).T, strict=True)
+            max(lattice_step(each[seen].numpy()), float(least))
+            for each, seen, least in zip(
+                observed.flatten(0, 1).T, available.flatten(0, 1).T, single, strict=True
+            )
         ]
         rounding = math.hypot(*steps) / math.sqrt(12)
         return cls(
