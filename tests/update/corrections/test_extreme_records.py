@@ -170,3 +170,22 @@ def test_intervals_of_exact_outputs_cover(seed: int) -> None:
     covered = (found.z - z).abs() <= 1.645 * deviation
     assert covered[known].double().mean() > 0.9
     assert (found.z - z)[known].abs().max() < 1e-3
+
+
+@pytest.mark.parametrize(("noise", "share"), [(0.05, (0.8, 1.0)), (1.0, (0.0, 0.4)), (4.0, (0, 0))])
+def test_delays_that_noise_could_have_made_are_not_identified(
+    noise: float, share: tuple[float, float]
+) -> None:
+    """Offsets of noise are a step between any two segments, and a step has a place."""
+    known, covered = [], []
+    for seed in range(4):
+        context, z, outputs = delayed_and_offset(noise, seed)
+        found = rt.DelayOffset().infer(context, outputs, torch.ones(outputs.shape).bool())
+        identified = found.identified[..., 0]
+        inside = (found.z - z)[..., 0].abs() <= 1.645 * found.covariance[..., 0, 0].sqrt()
+        known.append(identified.double().mean())
+        covered.append(inside[identified])
+    assert share[0] <= torch.stack(known).mean() <= share[1]
+    # With 20 of 160 or more, 0.8 has a probability above 0.01 where 0.9 is true.
+    if share[1]:
+        assert torch.cat(covered).double().mean() >= 0.8

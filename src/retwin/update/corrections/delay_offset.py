@@ -24,6 +24,7 @@ from retwin.update.corrections.correction import Context, Discrepancy, Head
 from retwin.update.corrections.delay_range import checked_range, range_in_samples, range_in_seconds
 from retwin.update.corrections.delays import at_bound, first_delays
 from retwin.update.corrections.path_problem import PathProblem, path_at
+from retwin.update.corrections.warp import within
 from retwin.update.kernels.generation import delayed_path
 
 ROUNDS = 5
@@ -38,6 +39,9 @@ UNSEEN = 0.1
 KNOWN_DELAY = 1 / 8
 """Standard deviation above which a delay is not identified by default, in widths of its range: less
 than half of that of a delay of which nothing is known."""
+SIGNIFICANT = 3.0
+"""Way of a motion, in standard deviations of the step between its offsets, below which noise could
+have made it: its delay is then not identified."""
 MEASURED_MOTION = 0.5
 """Share of a motion that must be measured for its delay to be identified."""
 
@@ -196,9 +200,8 @@ def _discrepancy(
     wide = problem.per_segment(prior.deviation)
     valid = torch.as_tensor(problem.segments.valid)
     bounded = at_bound(z[..., 0], problem.delay_range) & valid
-    delay = (
-        (deviation[..., 0] <= known_delay) & ~bounded & (problem.motion_measured >= MEASURED_MOTION)
-    )
+    delay = (deviation[..., 0] <= known_delay) & _moves(problem, z, deviation) & ~bounded
+    delay &= problem.motion_measured >= MEASURED_MOTION
     offset = deviation[..., 1:] <= UNSEEN * wide[..., 1:]
     identified = torch.cat([delay[..., None], offset], dim=-1)
     identified = identified & valid[..., None]
@@ -211,3 +214,19 @@ def _discrepancy(
         steady.amin(dim=1) * unit.mean(),
         at_bound=bounded,
     )
+
+
+def _moves(problem: PathProblem, z: Tensor, deviation: Tensor) -> Tensor:
+    """Whether the outputs move in a segment by more than its offsets are uncertain, (n, M).
+
+    A step between two offsets has a place, and so a delay, also where noise alone made it.
+    """
+    start, settle = (
+        torch.as_tensor(getattr(problem.segments, each)) for each in ("start", "settle")
+    )
+    way = path_at(problem.segments, problem.path, z).diff(dim=1, prepend=problem.path[:, :1])
+    inside = within(problem.sample, start + z[..., 0], settle + z[..., 0] + 1)
+    ways = (inside * way.norm(dim=-1)[:, None]).sum(dim=-1)
+    variance = deviation[..., 1:].square().sum(dim=-1)
+    before = torch.cat([torch.zeros_like(variance[:, :1]), variance[:, :-1]], dim=1)
+    return ways > SIGNIFICANT * (variance + before).sqrt()
