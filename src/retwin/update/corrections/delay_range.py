@@ -111,7 +111,7 @@ def plausible_delays(context: Context, observed: Tensor, mask: Tensor) -> tuple[
     x[..., 1:] = problem.first_offset(length)
     x = x.flatten(1)
     common = common_delay(problem, x, limits)
-    moves = _moves(problem)
+    moves = _moves(problem, x)
     least = max(math.ceil(SHORTEST * motion), 2)
     half = max(abs(common), least)
     while True:
@@ -128,11 +128,19 @@ def plausible_delays(context: Context, observed: Tensor, mask: Tensor) -> tuple[
     )
 
 
-def _moves(problem: PathProblem) -> Tensor:
-    """Whether the outputs move enough in a segment, and are measured, to show its delay (n, M)."""
+def _moves(problem: PathProblem, x: Tensor) -> Tensor:
+    """Whether the outputs move enough in a segment, and are measured, to show its delay (n, M).
+
+    An offset in x (n, P) undoes a part of the way: all of it where actuators missed a segment.
+    """
     way = problem.path.diff(dim=1, prepend=problem.path[:, :1]).norm(dim=-1)
     inside = within(problem.sample, problem.segments.start, problem.segments.settle + 1)
     ways = (inside * way[:, None]).sum(dim=-1)
     valid = torch.as_tensor(problem.segments.valid) & (problem.motion_measured > 0)
-    moves = valid & (ways > STILL * ways[valid].median())
-    return moves if moves.any() else torch.as_tensor(problem.segments.valid)
+    offset = problem.per_segment(x)[..., 1:]
+    undone = offset.diff(dim=1, prepend=torch.zeros_like(offset[:, :1])).norm(dim=-1)
+    enough = STILL * ways[valid].median()
+    for moves in (valid & (ways - undone > enough), valid & (ways > enough)):
+        if moves.any():
+            return moves
+    return torch.as_tensor(problem.segments.valid)
