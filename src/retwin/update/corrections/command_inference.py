@@ -24,6 +24,7 @@ from retwin.threads import one_thread
 from retwin.update.corrections.command_problem import CommandProblem
 from retwin.update.corrections.correction import Context, Discrepancy, block_diagonal
 from retwin.update.corrections.delays import at_bound, first_delays
+from retwin.update.corrections.first_missed import first_missed
 from retwin.update.corrections.missed_segments import (
     CommandFit,
     LatentPrior,
@@ -49,6 +50,10 @@ OUTLYING = 3.0
 """Noise scales beyond which a sample is an outlier."""
 OUTLYING_SHARE = 0.3
 """Share of outliers above which a segment is suspect."""
+FIRST_OFFSET = 0.05
+"""Standard deviation of an offset at first, in that of the commands' targets."""
+FIRST_ODDS = -4.0
+"""Log odds at first that an actuator misses a segment: about one in fifty."""
 FIRST_JITTER = 1 / 35
 """Standard deviation of a delay at first, beyond what first delays show, in widths of its range."""
 SMALLEST_SHARE = 0.1
@@ -92,7 +97,8 @@ def infer_commands(
     if not problem.valid.shape[1]:
         return _empty(problem), None
     uncertain, problem = problem, problem.where_certain
-    start = problem.zero
+    start, spread = problem.zero, OffsetFeatures.of(problem).spread
+    problem = problem.with_missed(first_missed(problem, FIRST_OFFSET * spread, FIRST_ODDS))
     problem.per_segment(start)[..., 0] = first_delays(problem, start, problem.delay_range)
     first = Hyperparameters.of(problem, start)
 
@@ -164,7 +170,7 @@ def _suspects(
     outlying = noise.square(part, part.residual(x)) > OUTLYING**2
     share = (part.inside * outlying[:, None]).sum(dim=-1) / part.inside.sum(dim=-1).clamp_min(1)
     suspect = far.any(dim=-1) | (share > OUTLYING_SHARE)
-    moving = part.distance > MOVING * width
+    moving = part.way > MOVING * width
     flips = suspect[..., None] & moving & part.healthy | (part.missed > 0.5)
     row, segment, actuator = flips.nonzero().unbind(dim=1)
     return rows[row], segment, actuator
@@ -198,14 +204,16 @@ class Hyperparameters:
     @classmethod
     def of(cls, problem: CommandProblem, start: Tensor) -> Hyperparameters:
         """Those before anything is inferred: wide, from first delays only."""
-        delay = problem.per_segment(start)[..., 0][problem.valid]
+        moved = (problem.distance * (1 - problem.missed) > 0).any(dim=-1) & problem.valid
+        shown = moved if moved.any() else problem.valid
+        delay = problem.per_segment(start)[..., 0][shown]
         jitter = 1.4826 * (delay - delay.median()).abs().median() + FIRST_JITTER * problem.width
         measured = problem.measured > 0
         # The median of nothing is NaN.
         length = problem.residual(start).norm(dim=-1)[measured].median().nan_to_num(1.0)
         scale = length.clamp_min(FLOOR).expand(2, 1)
         features = OffsetFeatures.of(problem)
-        offset = 0.05 * features.spread
+        offset = FIRST_OFFSET * features.spread
         design = features.design(problem)
         coefficients = torch.zeros(len(design.owner), dtype=torch.float64)
         coefficients[0] = delay.median()
@@ -216,7 +224,7 @@ class Hyperparameters:
         return cls(
             features,
             Hierarchy.of(design, variance, coefficients, (sum(limits) / 2, problem.width**2 / 12)),
-            -4.0 * one[0],
+            _odds(problem),
             SampleNoise.of(problem),
             Noise(scale, one),
         )
@@ -235,7 +243,6 @@ class Hyperparameters:
         white, x = self.whitened(problem), solution.x
         samples = self.samples.learned(white, self.noise, x)
         white = replace(white, whitening=samples.whitening())
-        missed = (problem.missed * problem.healthy).sum()
         # Offsets are expected to be a share of what the actuators travel, the same for all.
         spread, variance = self.features.spread.square(), self.hierarchy.variance
         share, delay = (variance[1:-1] / spread).mean(), variance.new_tensor([DELAY_VARIANCE])
@@ -243,7 +250,7 @@ class Hyperparameters:
         return Hyperparameters(
             self.features,
             self.hierarchy.learned(self.features.design(problem), solution, expected),
-            ((missed + 0.5) / (problem.healthy.sum() + 20.0)).logit(),
+            _odds(problem),
             samples,
             self._noise(white, solution),
         )
@@ -300,11 +307,19 @@ def _discrepancy(
     inner = inner * learned[..., None] * learned[..., None, :]
     inner = inner + torch.diag_embed(own * (1 - learned))
     covariance = block_diagonal(inner, torch.diag_embed(probability * (1 - probability)))
+    # What was hardly to move shows neither that it did nor that it did not.
     seen = problem.inside.any(dim=-1)[..., None] & problem.healthy
+    seen &= problem.way > MOVING * wide[..., 1:].sqrt()
     identified = torch.cat([known, seen], dim=-1) & problem.valid[..., None]
     z = torch.cat([torch.where(learned > 0, x, mean), missed], dim=-1) * problem.valid[..., None]
     noise = (hyperparameters.noise.scale[0, 0] * problem.unit.mean()).expand(len(x))
     return Discrepancy(z, covariance, identified, noise, severity, True, bounded)
+
+
+def _odds(problem: CommandProblem) -> Tensor:
+    """Log odds () that an actuator misses a segment, given those that were missed."""
+    missed = (problem.missed * problem.healthy).sum()
+    return ((missed + 0.5) / (problem.healthy.sum() + 20.0)).logit()
 
 
 def _common(problem: CommandProblem) -> Tensor:

@@ -283,6 +283,19 @@ class CommandProblem:
         first, last = self.levels
         return (last - first).abs()
 
+    @property
+    def way(self) -> Tensor:
+        """How far each actuator is from its target when a segment begins, (n, M, d_u).
+
+        An actuator that missed segments is still where it was before them.
+        """
+        first, last = self.levels
+        ways, place = torch.zeros_like(last), first[:, 0]
+        for m in range(last.shape[1]):
+            ways[:, m] = (last[:, m] - place).abs()
+            place = torch.where(self.missed[:, m] > 0.5, place, last[:, m])
+        return ways
+
     def commands(self, x: Tensor) -> Tensor:
         """Effective commands, single precision, at `sample`; with memory, at every sample."""
         return self._effective(self.per_segment(x), torch.arange(len(self))).float()
