@@ -33,6 +33,8 @@ def first_missed(problem: CommandProblem, deviation: Tensor, odds: float) -> Ten
 
     """
     missed, rest = problem.missed.clone(), _rest(problem)
+    if not rest.any():
+        return missed
     precision = _precision(problem, rest, deviation)
 
     def cost(rows: Tensor, missed: Tensor, m: int) -> Tensor:
