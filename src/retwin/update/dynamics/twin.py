@@ -292,8 +292,8 @@ class DynamicsTwin:
     def outside(self, commands: NDArray) -> NDArray:
         """Whether commands (n, T, d_u) leave the range that they had in calibration: (n,) bool."""
         low, high = (each[len(self.process) :] for each in self.bounds)
-        made: NDArray = ((commands < low) | (commands > high)).any(axis=(1, 2))
-        return made
+        beyond: NDArray = (commands < low) | (commands > high)
+        return np.asarray(beyond.any(axis=(1, 2)))
 
     def slope(self, states: NDArray, commands: NDArray, changes: NDArray | None = None) -> NDArray:
         """Most probable time derivatives of the states, or the states one sample later.
