@@ -217,16 +217,15 @@ def _discrepancy(
 
 
 def _moves(problem: PathProblem, z: Tensor, deviation: Tensor) -> Tensor:
-    """Whether the outputs move in a segment by more than its offsets are uncertain, (n, M).
+    """Whether an output moves in a segment by more than its offsets are uncertain, (n, M).
 
     A step between two offsets has a place, and so a delay, also where noise alone made it.
     """
     start, settle = (
         torch.as_tensor(getattr(problem.segments, each)) for each in ("start", "settle")
     )
-    way = path_at(problem.segments, problem.path, z).diff(dim=1, prepend=problem.path[:, :1])
+    way = path_at(problem.segments, problem.path, z).diff(dim=1, prepend=problem.path[:, :1]).abs()
     inside = within(problem.sample, start + z[..., 0], settle + z[..., 0] + 1)
-    ways = (inside * way.norm(dim=-1)[:, None]).sum(dim=-1)
-    variance = deviation[..., 1:].square().sum(dim=-1)
+    variance = deviation[..., 1:].square()
     before = torch.cat([torch.zeros_like(variance[:, :1]), variance[:, :-1]], dim=1)
-    return ways > SIGNIFICANT * (variance + before).sqrt()
+    return (inside.to(way) @ way > SIGNIFICANT * (variance + before).sqrt()).any(dim=-1)
