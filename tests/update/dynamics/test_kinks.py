@@ -10,7 +10,7 @@ import torch
 
 import retwin as rt
 from retwin.twins import Parameter, State, StateTwin
-from retwin.update import fit_dynamics
+from retwin.update import FittedDynamics, Library, fit_dynamics
 
 VOLTAGE = rt.Channels(("voltage",), ("V",))
 SPEED = rt.Channels(("speed",), ("rad/s",))
@@ -26,13 +26,15 @@ class Kink:
     friction: float = 0.0
     saturation: float = 100.0
     stop: float = 100.0
+    cubic: float = 0.0
 
 
 def motor(kink: Kink = Kink(), substeps: int = 4) -> StateTwin:
     def derivative(x, u, p):
         torque = p.gain * torch.clamp(u.voltage, -kink.saturation, kink.saturation)
         friction = p.damping * x.speed + kink.friction * torch.tanh(x.speed / 0.05)
-        return (torque - friction - 40 * torch.relu(x.speed - kink.stop),)
+        more = 40 * torch.relu(x.speed - kink.stop) + kink.cubic * x.speed**3
+        return (torque - friction - more,)
 
     return StateTwin(
         (State("speed", "rad/s", 0.0),),
@@ -54,6 +56,12 @@ def levels(low: float, high: float, count: int, rng: np.random.Generator) -> np.
     return np.repeat(rng.uniform(low, high, size=(count, 20, 1)), 30, axis=1)
 
 
+def fitted(real: StateTwin, low: float, rng: np.random.Generator) -> FittedDynamics:
+    made = real.simulate(levels(low, 6.0, 2, rng), seed=0, parameters=TRUTH)
+    noise = NOISE * rng.normal(size=made.observed.shape)
+    return fit_dynamics(motor(), made.replace(observed=made.observed + noise))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kink", "low", "term"),
@@ -68,11 +76,24 @@ def test_a_kink_is_learned_where_it_is(kink: Kink, low: float, term: str) -> Non
     """The error of a fresh record is below the noise; terms at fixed places had 0.1 rad/s."""
     rng = np.random.default_rng(1)
     real = motor(kink, substeps=20)
-    made = real.simulate(levels(low, 6.0, 2, rng), seed=0, parameters=TRUTH)
-    noise = NOISE * rng.normal(size=made.observed.shape)
-    found = fit_dynamics(motor(), made.replace(observed=made.observed + noise))
+    found = fitted(real, low, rng)
     fresh = real.simulate(levels(0.8 * low, 4.8, 1, rng), seed=0, parameters=TRUTH)
     error = found.twin.simulate(fresh.commands, seed=0).nominal - fresh.observed
     assert np.sqrt(np.mean(error**2)) < 0.75 * NOISE
     assert term in str(list(found.terms)[:3])
     assert abs(found.parameters["gain"] / TRUTH["gain"] - 1) < 0.1
+
+
+@pytest.mark.slow
+def test_a_cube_needs_no_hinges() -> None:
+    """Hinges and friction beside it would make the parameters uncertain."""
+    found = fitted(motor(Kink(cubic=0.04), substeps=8), -6.0, np.random.default_rng(1))
+    assert found.form == Library(3, (), False)
+    for name, value in TRUTH.items():
+        assert abs(found.parameters[name] / value - 1) < 4 * found.errors[name] / value < 0.02
+
+
+def test_the_assumed_error_of_an_exact_twin_is_that_of_its_outputs() -> None:
+    """Half of it made standard errors a third too small."""
+    found = fitted(motor(), -6.0, np.random.default_rng(1))
+    assert 0.9 < found.figures["strength"] < 1.2

@@ -286,6 +286,8 @@ def _followed(
         if observed >= CONSISTENT * strength:
             break
         strength = float(np.clip(observed, strength / STEP[1], strength / STEP[0]))
+    # The last step may have led below what is observed.
+    estimation = replace(estimation, variance=max(observed, strength) * power)
     return estimation, estimation.minimised(now)
 
 

@@ -28,8 +28,6 @@ SHIFT = 0.2
 knots."""
 SHIFTS = (-2.0, 2.0)
 """Bounds of its ratio to the usual one: those of the next knots."""
-SIMPLE = 2
-"""Degree up to which libraries of monomials alone are tried before the whole one."""
 MAX_MONOMIALS = 200
 """Number of monomials of an equation above which their degree is lowered."""
 
@@ -79,7 +77,7 @@ class Library:
 
     def nested(self) -> list[Library]:
         """Libraries of which each contains the one before; the last is this one."""
-        smooth = [Library(degree, (), False) for degree in range(min(self.degree, SIMPLE) + 1)]
+        smooth = [Library(degree, (), False) for degree in range(self.degree + 1)]
         return [*(each for each in smooth if each != self), self]
 
     def terms(
