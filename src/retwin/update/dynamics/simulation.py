@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from retwin.arrays import distinct_rows
 from retwin.twins.state_twin import StateTwin
 
 
@@ -27,10 +28,10 @@ class FreeSimulation:
 
     def most_probable(self, commands: NDArray) -> tuple[NDArray, NDArray]:
         """Outputs and states without noise; equal commands are simulated once."""
-        distinct, own = np.unique(commands, axis=0, return_inverse=True)
+        distinct, own = distinct_rows(commands)
         theta = np.tile(self.values, (len(distinct), 1))
         outputs, states = self.equations.steps().run(distinct, theta)
-        return outputs[own.ravel()], states[own.ravel()]
+        return outputs[own], states[own]
 
     def drawn(self, commands: NDArray, changes: NDArray, rng: np.random.Generator) -> NDArray:
         """Outputs (n, T, d_y) with drawn parameters, starts and noise.
@@ -49,12 +50,12 @@ class FreeSimulation:
         made += np.sqrt(self.noise) * rng.normal(size=made.shape)
         moves = rng.normal(size=(count, self.factor.shape[1])) @ self.factor.T
         moves[:, -states:] += self.start_deviation * rng.normal(size=(count, states))
-        distinct, own = np.unique(commands, axis=0, return_inverse=True)
+        distinct, own = distinct_rows(commands)
         for i, each in enumerate(distinct):
             nominal, by_all = (
                 found[0] for found in steps.sensitivities(each[None], self.values[None])
             )
-            rows = np.flatnonzero(own.ravel() == i)
+            rows = np.flatnonzero(own == i)
             centre = np.tile(nominal, (len(rows), 1, 1))
             if changed[rows].any():
                 faulty = rows[changed[rows]]
