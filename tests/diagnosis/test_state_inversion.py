@@ -253,6 +253,11 @@ def test_records_of_another_system_are_refused(diagnoser, records) -> None:
         StateInversionDiagnoser(diagnoser.twin, late).diagnose(records[0][:1])
 
 
+def test_a_twin_of_which_no_distribution_is_known_is_refused(records) -> None:
+    with pytest.raises(InputError, match="give fit_dynamics"):
+        rt.fit_inversion(TWIN, None, records[0], FAULTS)
+
+
 def test_the_page_of_faults() -> None:
     page = (Path(__file__).parents[2] / "docs" / "faults.md").read_text("utf-8")
     names: dict = {"__name__": "shown"}

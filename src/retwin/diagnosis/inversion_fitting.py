@@ -21,7 +21,7 @@ from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError
 from retwin.twins.faults import Fault
 from retwin.twins.twin import Twin
-from retwin.update.dynamics import DynamicsTwin
+from retwin.update.dynamics import DynamicsTwin, state_names
 from retwin.update.exact import exact_surrogate
 from retwin.update.residual import Residual, ResidualModel
 from retwin.update.surrogate import Surrogate
@@ -101,7 +101,9 @@ def fit_inversion(
             "residual",
             expected="a residual model with one z per segment",
             got=type(residual).__name__,
-            remedy="fit it with CommandSpace",
+            remedy="give fit_dynamics(twin, calibration).twin as the surrogate, which needs none"
+            if state_names(surrogate)
+            else "fit it with CommandSpace",
         )
     faults = checked(faults)  # before the noise is fitted, which takes a minute
     remedy = "give those that the residual model was fitted to"
