@@ -149,7 +149,8 @@ class Noise:
             scale.append((variances if len(self.scale[k]) > 1 else variances.mean(0, True)).sqrt())
             kept = residual / self.scale[k] * (weights * part).sqrt()
             time = correlation_time(kept, part[..., 0], rows=False, limit=MAX_CORRELATION)
-            share = (shared / scale[-1].square().mean()).clamp_min(common)
+            # Exact outputs have a scale of 0.
+            share = (shared / scale[-1].square().mean().clamp_min(1e-300)).clamp_min(common)
             thinning.append(time + share * count / blocks)
         scales = torch.stack(scale)
         smallest = max(floor, SMALLEST_SHARE * float(scales.amax()))

@@ -78,6 +78,14 @@ def test_units_of_a_twin_in_place_of_a_surrogate_do_not_matter(operator: type) -
     torch.testing.assert_close(other[..., :3], one[..., :3], rtol=0.35, atol=0)
 
 
+def test_outputs_that_never_change_identify_no_delay() -> None:
+    context, _, outputs = measured(Plane(), commands_of(5))
+    found = rt.CommandSpace().infer(context, 0 * outputs + 1, torch.ones(outputs.shape).bool())
+    assert torch.isfinite(found.covariance).all()
+    assert torch.isfinite(found.z).all()
+    assert not found.identified[..., 0].any()
+
+
 def test_outputs_that_never_follow_need_no_delay_beyond_the_trajectory() -> None:
     """Delays of single segments may then be anything, but an operator takes what it chose."""
     sampler = rt.twins.RampSampler((-1, -1), (1, 1), RATE, 8.0, segments=1)

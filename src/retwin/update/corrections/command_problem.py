@@ -421,8 +421,12 @@ class CommandProblem:
 
 
 def _unit(context: Context, measured: Tensor) -> Tensor:
-    """`context.unit` times a number for which the standard deviation of (k, d_y) is about 1."""
+    """`context.unit` times a number for which the standard deviation of (k, d_y) is about 1.
+
+    The same unit where nothing is measured, or outputs never change.
+    """
     unit = context.unit.double()
     if not len(measured):
         return unit
-    return unit * (measured.std(dim=0, correction=0) / unit).mean().clamp_min(1e-12)
+    ratio = (measured.std(dim=0, correction=0) / unit).mean()
+    return unit * ratio if ratio > 1e-12 else unit
