@@ -65,4 +65,4 @@ def test_a_log_notes_the_code(tmp_path: Path) -> None:
     (tmp_path / "mapping.toml").write_text(mapping)
     found = rt.load(tmp_path / "log.csv", mapping=tmp_path / "mapping.toml")
     level = {each.channel: each for each in found.provenance[0].sampling}["level"]
-    assert "29 values are -9999, far from all others" in str(level)
+    assert "29 values of -9999, far from all others" in str(level)
