@@ -145,6 +145,8 @@ def learned(simulated: Content) -> Content:
             "delta/deviation": 0.1 * np.ones_like(grid),
             "delta/range": np.array([[0.0, 1.0]]),
             "delta/about": np.array([["level", "level", "V", "V/s"]]),
+            "delta/parameters": np.array([["pump", "V/s", "level: 1"], ["leak", "1", ""]]),
+            "delta/estimates": np.array([[0.1, 0.1234, 0.0021, -0.8], [0.2, 0.3, np.nan, np.nan]]),
         }
     )
     return simulated
@@ -164,7 +166,23 @@ def test_the_learned_curve_has_a_band_and_the_ends_of_its_domain(
     assert all(f'<section id="{name}">' in page for name in ("residuals", "delta"))
 
 
-@pytest.mark.parametrize("name", ["simulation/range", "delta/range", "delta/about"])
+def test_parameters_stand_beside_what_was_learned(
+    learned: Content, write: Callable[[Content], Path], rendered: Callable[[Path], str]
+) -> None:
+    section = delta(study_of(learned))
+    assert section is not None
+    rows = [[cell.text for cell in row] for row in section.values["parameters"].rows]
+    assert rows == [
+        ["pump", "0.100", "0.12340", "0.00210", "−0.80 with level: 1"],
+        ["leak", "0.200", "not determined", "–", "–"],
+    ]
+    assert "Parameters beside the discrepancy" in rendered(write(learned))
+
+
+NAMES = ["simulation/range", "delta/range", "delta/about", "delta/parameters", "delta/estimates"]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_arrays_that_do_not_fit_are_refused(learned: Content, name: str) -> None:
     learned[1][name] = learned[1][name][..., :-1]
     with pytest.raises(InputError, match=name):

@@ -141,6 +141,10 @@ class Study:
                 self._require(f"delta/{name}", values.shape, needed=True)
             self._require("delta/range", (len(values), 2), needed=True)
             self._require("delta/about", (len(values), 4), needed=True)
+        parameters = self.arrays.get("delta/parameters")
+        if parameters is not None:
+            self._require("delta/parameters", (None, 3))
+            self._require("delta/estimates", (len(parameters), 4), needed=True)
 
     @property
     def sources(self) -> dict[str, SourceResults]:

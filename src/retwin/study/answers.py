@@ -16,6 +16,7 @@ from retwin.diagnosis.pooled import pool_probabilities
 from retwin.evaluation.fidelity import Simulation, record_means, simulation_scores
 from retwin.scores.bootstrap import Draws, Resampling, bootstrap_means
 from retwin.scores.classification import METRICS, confusion, score
+from retwin.study.estimates import read_estimates
 from retwin.study.files import Job
 from retwin.study.work import Work
 from retwin.update.dynamics import DynamicsTwin, state_twin_of
@@ -151,7 +152,9 @@ class SimulatedRecords:
     With the source `dynamics` there are the curves of the first run and fold of what it learned,
     compared with the twin as given, at most `CURVES`: `delta/values`, `/discrepancy`, `/deviation`
     (c, K), `/range` (c, 2), and `/about` (c, 4), which are equation, variable and the units of
-    `values` and `discrepancy`.
+    `values` and `discrepancy`. `delta/parameters` (k, 3) are names and units of the estimated
+    parameters, and what each is most correlated with; `delta/estimates` (k, 4) are their values as
+    given, their estimates, errors and that correlation, NaN for none.
     """
 
     work: Work
@@ -233,8 +236,9 @@ class SimulatedRecords:
 
     def _curves(self) -> dict[str, NDArray]:
         """See `SimulatedRecords`; those that vary most, over the usual derivative of a state."""
-        twin = DynamicsTwin.load(self.work.files.path(Job("update", 0, 0, "dynamics")))
-        base, _, values = state_twin_of(self.work.case.twin)  # type: ignore[arg-type]  # checked
+        folder = self.work.files.path(Job("update", 0, 0, "dynamics"))
+        twin = DynamicsTwin.load(folder)
+        base, free, values = state_twin_of(self.work.case.twin)  # type: ignore[arg-type]  # checked
         given = {each.name: values[each.name] for each in base.parameters}
         states = [each.name for each in base.states]
         curves = [twin.curve(*axes, relative_to=given) for axes in twin.axes]
@@ -249,4 +253,7 @@ class SimulatedRecords:
         }
         arrays["range"] = np.array([[each.low, each.high] for each in shown], dtype=np.float32)
         arrays["about"] = np.array([[c.equation, c.variable, *c.units] for c in shown])
+        units = {each.name: each.unit for each in (*free, *base.parameters)}
+        known = {each.name: float(each.start or 0.0) for each in free} | given
+        arrays |= read_estimates(folder, known, units)
         return {f"delta/{name}": each for name, each in arrays.items()}

@@ -32,6 +32,7 @@ from retwin.evaluation.fidelity import (
 from retwin.progress import Progress
 from retwin.serialisation.files import write_atomically
 from retwin.serialisation.models import write_model
+from retwin.study.estimates import write_estimates
 from retwin.study.files import Files, Job, Roles
 from retwin.study.plan import StudyPlan
 from retwin.study.trial import Trial
@@ -248,6 +249,7 @@ class Work:
                 progress=trial.progress,
             )
             made.twin.save(path)
+            write_estimates(path, made)
             return {"notes": made.reason}
         bayes = trial.job.name == "pi_bayes"
         found = _bayes(trial, path) if bayes else _least_squares(trial, path)

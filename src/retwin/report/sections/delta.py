@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from retwin.report.blocks import Section
+from retwin.report.blocks import Cell, Section, Table, columns
 from retwin.report.figure import Axis, Band, Figure, Key, Line, Mark, Panel, Row, Spans
+from retwin.report.labels import number, places, signed
 from retwin.report.study import Study
 from retwin.report.style import colour_of
 
@@ -47,4 +50,31 @@ def delta(study: Study) -> Section | None:
         Key("outside the range of the calibration", "grid", "bar"),
     ]
     figure = Figure("delta", panels, keys, SOURCE)
-    return Section("delta", "What was learned", {"figure": figure}, [figure])
+    values = {"figure": figure, "parameters": _parameters(study)}
+    return Section("delta", "What was learned", values, [figure])
+
+
+def _parameters(study: Study) -> Table | None:
+    """The estimated parameters, with errors and the strongest correlation of each."""
+    arrays = study.arrays
+    if "delta/parameters" not in arrays:
+        return None
+    rows = []
+    for (name, unit, other), estimates in zip(
+        arrays["delta/parameters"].tolist(), arrays["delta/estimates"].tolist(), strict=True
+    ):
+        given, estimate, error, correlation = estimates
+        known = math.isfinite(error)
+        digits = places(error) if known else places(estimate)
+        strongest = f"{signed(correlation, 2)} with {other}" if math.isfinite(correlation) else "–"
+        rows.append(
+            [
+                Cell(name, below=unit if unit != "1" else ""),
+                Cell(number(given, places(given)) if math.isfinite(given) else "–"),
+                Cell(number(estimate, digits) if known else "not determined"),
+                Cell(number(error, digits) if known else "–"),
+                Cell(strongest),
+            ]
+        )
+    heads = ("As given", "Estimate", "Standard error", "Strongest correlation")
+    return Table("Parameters beside the discrepancy", columns("Parameter", *heads), rows)
