@@ -49,7 +49,8 @@ class FittedDynamics:
     parameters, errors : dict of str to float
         The twin's own parameters theta, and their standard errors, which allow for errors of the
         outputs that are correlated within the parts that are held out; infinite for those that
-        the record does not determine.
+        the record does not determine. They hold for the chosen form of the discrepancy, in which a
+        parameter takes what it explains: its value is then that of the equations beside the terms.
     correlations : dict of (str, str) to float
         Posterior correlations of the parameters, with each other and with the coefficients of the
         terms; the strongest first. Those of parameters that are not determined are left out.
