@@ -105,10 +105,8 @@ def _state_surrogate(system: Case, measured: Trajectories, seed: int) -> FittedS
 
 def _strongest(found: FittedDynamics, parameter: str) -> str:
     """The strongest correlation of a parameter, and with what."""
-    pairs = ((pair, each) for pair, each in found.correlations.items() if parameter in pair)
-    pair, value = next(pairs, ((parameter, parameter), 0.0))
-    other = pair[pair[0] == parameter]
-    return f"{value:+.2f} with {other}" if other != parameter else "–"
+    strongest = found.strongest(parameter)
+    return f"{strongest[1]:+.2f} with {strongest[0]}" if strongest else "–"
 
 
 def _white(prediction: Prediction) -> dict[str, dict[str, float]]:

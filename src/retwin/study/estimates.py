@@ -20,10 +20,8 @@ def write_estimates(folder: Path, made: FittedDynamics) -> None:
     """Write the estimates beside the twin."""
     rows = []
     for name, value in made.parameters.items():
-        pairs = ((pair, each) for pair, each in made.correlations.items() if name in pair)
-        pair, correlation = next(pairs, ((name, ""), None))
+        other, correlation = made.strongest(name) or ("", None)
         error = made.errors[name]
-        other = pair[pair[0] == name]
         rows.append([name, value, error if np.isfinite(error) else None, other, correlation])
     write_json(folder / FILE, rows)
 

@@ -83,6 +83,13 @@ class FittedDynamics:
     seconds: float
     reason: str
 
+    def strongest(self, parameter: str) -> tuple[str, float] | None:
+        """What a parameter is most correlated with, and how much; None where nothing is known."""
+        for pair, value in self.correlations.items():
+            if parameter in pair:
+                return pair[pair[0] == parameter], value
+        return None
+
 
 def fit_dynamics(
     twin: StateTwin | ParametricTwin,
