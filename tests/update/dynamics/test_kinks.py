@@ -94,6 +94,6 @@ def test_a_cube_needs_no_hinges() -> None:
 
 
 def test_the_assumed_error_of_an_exact_twin_is_that_of_its_outputs() -> None:
-    """Half of it made standard errors a third too small."""
+    """With 0.6 of it, standard errors were a fifth too small."""
     found = fitted(motor(), -6.0, np.random.default_rng(1))
     assert 0.9 < found.figures["strength"] < 1.2
