@@ -127,7 +127,7 @@ def predict(
     bundle = _opened(folder)
     trajectories = read(file, data_case(case), max_bytes=max_bytes, mapping=mapping)
     found = bundle.predict(trajectories)
-    diagnosed = diagnoses(trajectories, found.classes, found.probabilities)
+    diagnosed = diagnoses(trajectories, found.classes, found.probabilities, found.diagnosis)
     verdicts = zip(found.verdicts.verdict.tolist(), found.verdicts.reason.tolist(), strict=True)
     for each, (verdict, reason) in zip(diagnosed, verdicts, strict=True):
         each |= {"guard": verdict, "because_of": reason}
@@ -148,7 +148,7 @@ def predict(
         as_json=as_json,
     )
     if out is not None:
-        write_probabilities(out, found.classes, diagnosed, ("guard", "because_of"))
+        write_probabilities(out, found.classes, diagnosed, ("diagnosis", "guard", "because_of"))
 
 
 @app.command(epilog=example("retwin bundle generate bundle --out made.npz"))

@@ -24,7 +24,7 @@ from retwin.serialisation.files import write_atomically
 from retwin.serialisation.places import check_place
 
 if TYPE_CHECKING:  # printing help needs no torch, which takes seconds to import
-    from retwin.diagnosis import Diagnoser
+    from retwin.diagnosis import Conclusion, Diagnoser
 
 EMULATED = "These trajectories are EMULATED: no real measurements."
 
@@ -136,58 +136,67 @@ def predict(
 ) -> None:
     """Diagnose trajectories, and score the diagnoses if the labels are known."""
     import retwin as rt
+    from retwin.diagnosis import conclude
     from retwin.evaluation.diagnosers import scored
 
     if out is not None:
         check_place(out)
     diagnoser = rt.load_diagnoser(saved(model))
     trajectories = read(file, data_case(case), max_bytes=max_bytes, mapping=mapping)
-    probabilities, severities = _diagnosed(diagnoser, trajectories)
+    with bar("diagnose") as show:
+        concluded = conclude(diagnoser, trajectories, progress=lambda share: show("faults", share))
+    probabilities, severities = concluded.probabilities, _severities(concluded)
     _check_finite(trajectories, probabilities)
     labels = trajectories.labels.tolist()
     labelled = bool(trajectories.known_labels) and "" not in labels
     classes = diagnoser.classes
     scores = scored(trajectories, probabilities, classes) if labelled else None
-    diagnosed = diagnoses(trajectories, diagnoser.classes, probabilities)
+    diagnosed = diagnoses(trajectories, classes, probabilities, concluded.labels)
     outside = _outside(diagnoser, trajectories).tolist()
-    for each, label, beyond, own in zip(diagnosed, labels, outside, severities, strict=True):
+    rest = zip(labels, outside, severities, concluded.reason.tolist(), strict=True)
+    for each, (label, beyond, own, reason) in zip(diagnosed, rest, strict=True):
+        each["reason"] = reason
         each["label"] = label or None
         each["commands"] = "outside" if beyond else "ok"
         each |= own
     columns = {"trajectory": "id", "diagnosis": "diagnosis", "probability": "probability"}
-    columns |= {name: name for name in (*severities[0], "label", *["commands"] * any(outside))}
+    more = ["commands"] * any(outside) + ["reason"] * any(each["reason"] for each in diagnosed)
+    columns |= {name: name for name in (*severities[0], "label", *more)}
     rows = [[_shown(each[name]) for name in columns.values()] for each in diagnosed]
     numbers = ("probability", *severities[0])
     answer(
-        {"emulated": trajectories.emulated, "trajectories": diagnosed, "scores": scores},
+        {
+            "emulated": trajectories.emulated,
+            "remark": concluded.remark,
+            "trajectories": diagnosed,
+            "scores": scores,
+        },
         table(tuple(columns), rows, numbers=numbers),
         *([EMULATED] if trajectories.emulated else []),
         *([str(scores)] if scores is not None else []),
         as_json=as_json,
     )
+    note(concluded.remark)
     if out is not None:
-        write_probabilities(out, diagnoser.classes, diagnosed)
+        more = ["diagnosis", "reason", *["unknown"] * (concluded.found is not None)]
+        write_probabilities(out, classes, diagnosed, more)
 
 
-def _diagnosed(
-    diagnoser: Diagnoser, trajectories: Trajectories
-) -> tuple[NDArray, list[dict[str, float | None]]]:
-    """Class probabilities, and what an inversion gives besides for the most probable class."""
-    from retwin.diagnosis import InversionDiagnoser, StateDiagnosis, StateInversionDiagnoser
+def _severities(concluded: Conclusion) -> list[dict[str, float | None]]:
+    """What an inversion gives besides for the most probable class of each trajectory."""
+    from retwin.diagnosis import StateDiagnosis
 
-    if not isinstance(diagnoser, InversionDiagnoser | StateInversionDiagnoser):
-        return diagnoser.predict_proba(trajectories), [{} for _ in range(len(trajectories))]
-    with bar("diagnose") as show:
-        found = diagnoser.diagnose(trajectories, progress=lambda share: show("faults", share))
+    found, count = concluded.found, len(concluded.labels)
+    if found is None:
+        return [{} for _ in range(count)]
     columns = {"unknown": found.unknown}
     if isinstance(found, StateDiagnosis):
-        own = (np.arange(len(trajectories)), found.probabilities.argmax(axis=1))
+        own = (np.arange(count), found.probabilities.argmax(axis=1))
         columns |= {"size": found.size.value[own], "onset in s": found.onset.value[own]}
-    made = [
+    return [
         {name: None if np.isnan(each[i]) else float(each[i]) for name, each in columns.items()}
-        for i in range(len(trajectories))
+        for i in range(count)
     ]
-    return found.probabilities, made
 
 
 def _outside(diagnoser: Diagnoser, trajectories: Trajectories) -> NDArray:
@@ -208,20 +217,21 @@ def _shown(value: object) -> str:
 
 
 def diagnoses(
-    trajectories: Trajectories, classes: Sequence[str], probabilities: NDArray
+    trajectories: Trajectories, classes: Sequence[str], probabilities: NDArray, labels: NDArray
 ) -> list[dict[str, Any]]:
-    """The most probable class of each trajectory, and the probability of every class.
+    """The diagnosis of each trajectory, and the probability of every class.
 
-    A trajectory with a probability that is not finite has no class, and None for each probability.
+    A trajectory with a probability that is not finite has None for each probability.
     """
     made = []
-    for name, row in zip(trajectories.ids.tolist(), probabilities, strict=True):
+    rows = zip(trajectories.ids.tolist(), labels.tolist(), probabilities, strict=True)
+    for name, label, row in rows:
         finite = bool(np.isfinite(row).all())
         values = row.tolist() if finite else [None] * len(classes)
         made.append(
             {
                 "id": name,
-                "diagnosis": classes[row.argmax()] if finite else "",
+                "diagnosis": label,
                 "probability": float(row.max()) if finite else None,
                 "probabilities": dict(zip(classes, values, strict=True)),
             }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -75,6 +77,21 @@ def unmeasured(trajectories: Trajectories) -> str:
     return (
         f"nothing was measured in {', '.join(trajectories.ids[none].tolist())}, which are not used"
     )
+
+
+def unmeasured_outputs(trajectories: Trajectories, needed: Collection[str] = ()) -> NDArray:
+    """Why there is no evidence in each trajectory (n,); "" where there is.
+
+    Nothing was measured in it, or not all outputs that are `needed`.
+    """
+    names = np.array(trajectories.outputs.names, dtype=np.str_)
+    made = []
+    for row in trajectories.mask:
+        seen = row.any(axis=0)
+        lost = [name for name in names[~seen].tolist() if name in needed]
+        reason = f"{', '.join(lost)} never measured" if lost else ""
+        made.append(reason if seen.any() else "nothing was measured")
+    return np.array(made, dtype=np.str_)
 
 
 def stand_in(values: NDArray) -> tuple[float, int] | None:

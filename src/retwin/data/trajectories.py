@@ -22,6 +22,8 @@ PER_SAMPLE = ("commands", "nominal", "observed", "mask")
 """The fields with one entry per sample."""
 UNLABELLED = ""
 """The label of trajectories whose class is not known."""
+UNKNOWN = "unknown"
+"""The diagnosis of what is none of the classes."""
 HEALTHY = "Healthy"
 """The label of trajectories without a fault."""
 

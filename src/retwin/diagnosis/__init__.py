@@ -7,6 +7,7 @@ Belongs here: one file per kind of diagnoser, and what they share. Not here: the
 from __future__ import annotations
 
 from retwin.diagnosis.adversarial import DANN
+from retwin.diagnosis.conclusion import Conclusion, conclude
 from retwin.diagnosis.diagnoser import (
     Diagnoser,
     FittedDiagnoser,
@@ -14,7 +15,7 @@ from retwin.diagnosis.diagnoser import (
     TrainedDiagnoser,
     load_diagnoser,
 )
-from retwin.diagnosis.estimate import Estimate
+from retwin.diagnosis.estimate import Calibration, Estimate
 from retwin.diagnosis.features import Features
 from retwin.diagnosis.fine_tuning import FineTune
 from retwin.diagnosis.fitting import Classifier, fit_diagnoser
@@ -27,7 +28,9 @@ from retwin.diagnosis.state_inversion import StateDiagnosis, StateInversionDiagn
 
 __all__ = [
     "DANN",
+    "Calibration",
     "Classifier",
+    "Conclusion",
     "Diagnoser",
     "Diagnosis",
     "Estimate",
@@ -43,6 +46,7 @@ __all__ = [
     "StateDiagnosis",
     "StateInversionDiagnoser",
     "TrainedDiagnoser",
+    "conclude",
     "fit_diagnoser",
     "fit_inversion",
     "load_diagnoser",

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from retwin.errors import InputError
 
-UNKNOWN = "unknown"
-"""Name of what is none of the classes."""
+FEW = 3
+"""Healthy trajectories below which their spread tells next to nothing of a further one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,6 +19,43 @@ class Estimate:
     value: NDArray
     low: NDArray
     high: NDArray
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the answer "unknown" of an inversion rests on.
+
+    Parameters
+    ----------
+    runs : int, default 0
+        Healthy trajectories from which its bound comes; 0 if that was not written.
+    false_rate : float, default 0.01
+        The largest share of healthy trajectories that is to be called unknown.
+    outputs : tuple of str
+        The outputs that were measured, without which a trajectory is unknown.
+
+    """
+
+    runs: int = 0
+    false_rate: float = 0.01
+    outputs: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        if not self.runs:
+            return "nothing is known of how often it calls a healthy trajectory unknown"
+        needed = round(1 / self.false_rate) - 1
+        text = (
+            f"at most {self.false_rate:.2g} of healthy trajectories are to be called unknown, by "
+            f"{self.runs} of calibration and {needed} that the corrected twin simulated"
+        )
+        if self.runs < needed:
+            text += f"; fewer than {needed} real ones cannot show it"
+        if self.runs < FEW:
+            text += (
+                f". From {self.runs} of them foreign data cannot be recognised unless its errors "
+                "are several times those in calibration"
+            )
+        return text
 
 
 class ImplausibleError(InputError):

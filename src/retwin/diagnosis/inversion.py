@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from scipy.special import expit
 from torch import Tensor
 
-from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.estimate import UNKNOWN, Estimate
+from retwin.data.measured import unmeasured_outputs
+from retwin.data.trajectories import UNKNOWN, Trajectories
+from retwin.diagnosis.estimate import Calibration, Estimate
 from retwin.diagnosis.hypotheses import Hypotheses, checked
 from retwin.diagnosis.latent_prior import command_space
 from retwin.diagnosis.missed_segments import best_fit
@@ -42,6 +43,8 @@ from retwin.update.training_range import outside_training
 
 TRAJECTORIES_PER_BATCH = 16
 """Trajectories inverted together, which bounds memory."""
+UNEXPLAINED = "no class explains the outputs nearly as well as in calibration"
+"""The reason for which a trajectory is unknown although it was measured."""
 COVERAGE = 0.9
 """Coverage of all intervals."""
 
@@ -76,6 +79,8 @@ class Diagnosis:
         (n, M, d_u), the most probable offset of each actuator in each segment, from the mean of its
         prior and in its command's unit, if the machine is healthy (if several classes are, as the
         first of them); NaN where there is no such segment, or none was executed.
+    reason : NDArray
+        (n,), why a trajectory is unknown; "" where it is not.
 
     """
 
@@ -89,6 +94,7 @@ class Diagnosis:
     outside: NDArray
     unknown: NDArray
     offset: NDArray
+    reason: NDArray
 
     @property
     def labels(self) -> NDArray:
@@ -162,6 +168,8 @@ class InversionDiagnoser:
     bound : float, optional
         Evidence per measured sample below which a trajectory is unknown (see `lower_bound`); by
         default none is.
+    calibration : Calibration, optional
+        What that bound rests on.
 
     Raises
     ------
@@ -180,6 +188,7 @@ class InversionDiagnoser:
         noise: Noise,
         surrogate_variance: Tensor | None = None,
         bound: float = -np.inf,
+        calibration: Calibration = Calibration(),  # noqa: B008 - frozen
     ) -> None:
         self.surrogate = exact_surrogate(surrogate)
         self.residual = residual
@@ -188,6 +197,7 @@ class InversionDiagnoser:
         none = torch.zeros(len(residual.outputs), dtype=torch.float64)
         self.surrogate_variance = none if surrogate_variance is None else surrogate_variance
         self.bound = bound
+        self.calibration = calibration
         command_space(residual.correction)
 
     @property
@@ -204,6 +214,7 @@ class InversionDiagnoser:
             noise=self.noise,
             surrogate_variance=self.surrogate_variance,
             bound=self.bound,
+            calibration=self.calibration,
         )
 
     def predict_proba(self, trajectories: Trajectories) -> NDArray:
@@ -240,7 +251,10 @@ class InversionDiagnoser:
             np.concatenate(each) for each in zip(*parts, strict=True)
         )
         share = np.exp(evidence - evidence.max(axis=1, keepdims=True))
+        missing = unmeasured_outputs(trajectories, self.calibration.outputs)
         measured = given.mask.any(dim=2).sum(dim=1).clamp_min(1).numpy()
+        unknown = expit(self.bound * measured - explained.max(axis=1))
+        unknown = np.where(missing == "", unknown, 1.0)
         severities = (level, onset / trajectories.rate, bias)
         levels, onsets, offsets = (Estimate(*np.moveaxis(each, -1, 0)) for each in severities)
         return Diagnosis(
@@ -252,8 +266,9 @@ class InversionDiagnoser:
             onsets,
             offsets,
             outside_training(self.surrogate, trajectories),
-            expit(self.bound * measured - explained.max(axis=1)),
+            unknown,
             offset,
+            np.where((missing == "") & (unknown > 0.5), UNEXPLAINED, missing),
         )
 
     def save(self, folder: str | Path) -> None:
@@ -262,7 +277,7 @@ class InversionDiagnoser:
             [name, None if fault is None else to_config(fault, FAULTS)]
             for name, fault in self.faults.items()
         ]
-        about = {"faults": faults}
+        about = {"faults": faults, "calibration": to_config(self.calibration, (Calibration,))}
         learned = {
             "scale": self.noise.scale,
             "thinning": self.noise.thinning,
@@ -292,6 +307,9 @@ class InversionDiagnoser:
             # Development versions before 0.1.0 did not write it.
             surrogate_variance=weights.get("surrogate_variance"),
             bound=float(weights.get("bound", -np.inf)),
+            calibration=from_config(about["calibration"], (Calibration,))
+            if "calibration" in about
+            else Calibration(),
         )
 
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from retwin.checks import require
-from retwin.data.trajectories import Trajectories
+from retwin.data.trajectories import UNKNOWN, Trajectories
 from retwin.diagnosis.adaptive_grid import Integral
-from retwin.diagnosis.estimate import UNKNOWN, Estimate, ImplausibleError
+from retwin.diagnosis.estimate import Estimate, ImplausibleError
 from retwin.diagnosis.fault_evidence import NOTHING, FaultEvidence
 from retwin.progress import Progress
 from retwin.serialisation.configs import from_config, to_config
@@ -32,6 +32,8 @@ from retwin.update.dynamics import DynamicsTwin
 
 __all__ = ["StateDiagnosis", "StateInversionDiagnoser"]
 
+UNEXPLAINED = "larger noise than in calibration explains the outputs better than every class"
+"""The reason for which a trajectory is unknown."""
 IMPLAUSIBLE = 1e6
 """Error of a prediction, in standard deviations, from which on an output is no measurement."""
 KINDS = tuple(kind for kind in FAULTS if issubclass(kind, TimedFault))
@@ -75,6 +77,11 @@ class StateDiagnosis:
         names = np.array([*self.classes, UNKNOWN])
         made: NDArray = names[self.evidence.argmax(axis=1)]
         return made
+
+    @property
+    def reason(self) -> NDArray:
+        """Why each trajectory is unknown (n,); "" where it is not."""
+        return np.where(self.labels == UNKNOWN, UNEXPLAINED, "")
 
 
 class StateInversionDiagnoser:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from retwin.checks import require
-from retwin.diagnosis.estimate import UNKNOWN
+from retwin.data.trajectories import UNKNOWN
 from retwin.errors import InputError, brief
 from retwin.monitor.audit import Entry
 from retwin.monitor.cause import BEFORE, MIN_WINDOW, Cause, cause_data, find_causes, possible_causes

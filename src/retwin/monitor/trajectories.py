@@ -18,9 +18,8 @@ import torch
 from numpy.typing import NDArray
 
 from retwin.checks import finite, positive, require, whole
-from retwin.data.trajectories import Trajectories
+from retwin.data.trajectories import UNKNOWN, Trajectories
 from retwin.diagnosis.diagnoser import load_diagnoser
-from retwin.diagnosis.estimate import UNKNOWN
 from retwin.monitor.detector import LARGEST, Detector
 from retwin.monitor.offsets import OffsetModel, is_bias
 from retwin.monitor.promise import MAX_RUN_LENGTH, MIN_RUN_LENGTH, duration

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.data.trajectories import Trajectories
-from retwin.diagnosis.estimate import UNKNOWN, ImplausibleError
+from retwin.data.trajectories import UNKNOWN, Trajectories
+from retwin.diagnosis.estimate import ImplausibleError
 from retwin.diagnosis.inversion import InversionDiagnoser
 from retwin.diagnosis.state_inversion import StateInversionDiagnoser
 from retwin.errors import InputError

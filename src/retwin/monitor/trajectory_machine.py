@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retwin.diagnosis.estimate import UNKNOWN
+from retwin.data.trajectories import UNKNOWN
 from retwin.errors import InputError, brief
 from retwin.monitor.cause import cause_data
 from retwin.monitor.gridded import record_of

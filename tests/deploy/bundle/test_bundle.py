@@ -286,7 +286,7 @@ def test_the_commands(call: Call, bundle: Bundle, saved: Path, tmp_path: Path) -
         *("id", "diagnosis", "probability", "probabilities", "guard", "because_of")
     }
     rows = (tmp_path / "found.csv").read_text().splitlines()
-    assert rows[0].split(",")[:4] == ["trajectory", "guard", "because_of", "Healthy"]
+    assert rows[0].split(",")[:4] == ["trajectory", "diagnosis", "guard", "because_of"]
     assert len(rows) == 1 + len(made)
 
 

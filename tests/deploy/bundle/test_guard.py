@@ -97,7 +97,7 @@ def test_nothing_measured_and_another_length_are_outside() -> None:
 def test_what_is_no_distribution_gives_no_class(row: list[float]) -> None:
     given = np.array([[0.2, 0.8], row])
     found = Prediction(("a", "b"), given, Verdicts(np.zeros((2, len(CHECKS)))))
-    assert found.diagnosis.tolist() == ["b", ""]
+    assert found.diagnosis.tolist() == ["b", "unknown"]
     assert found.verdicts.verdict.tolist() == ["ok", "outside"]
     assert found.verdicts.reason.tolist() == ["", "probabilities"]
     np.testing.assert_array_equal(found.probabilities, [[0.2, 0.8], [np.nan, np.nan]])

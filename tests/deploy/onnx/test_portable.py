@@ -262,7 +262,7 @@ def test_a_sentinel_is_outside_with_torch_and_without(
         found = each.predict(odd)
         assert found.verdicts.verdict[1:].tolist() == ["outside"] * 3
         assert found.verdicts.reason[1:].tolist() == ["outputs", "nominal", "missing"]
-        assert found.diagnosis[1:].tolist() == [""] * 3
+        assert found.diagnosis[1:].tolist() == ["unknown"] * 3
         assert np.isnan(found.probabilities[1:]).all()
         alone = each.predict(emulated[:1])
         np.testing.assert_allclose(found.probabilities[0], alone.probabilities[0], atol=1e-6)
@@ -290,7 +290,7 @@ def test_a_diagnoser_or_a_guard_with_nan_weights_is_no_diagnosis(
         found = broken.predict(emulated[:3])
         assert found.verdicts.verdict.tolist() == ["outside"] * 3
         assert found.verdicts.reason.tolist() == [reason] * 3
-        assert found.diagnosis.tolist() == [""] * 3
+        assert found.diagnosis.tolist() == ["unknown"] * 3
 
 
 @pytest.mark.parametrize(
@@ -516,7 +516,7 @@ def test_the_commands_export_and_predict(
         assert first["probability"] is None
         assert set(first["probabilities"].values()) == {None}
         rows = (tmp_path / "odd.csv").read_text().splitlines()
-        assert rows[1].split(",")[1:] == ["outside", "outputs", *[""] * 9]
+        assert rows[1].split(",")[1:] == ["unknown", "outside", "outputs", *[""] * 9]
         assert len(rows) == 1 + len(emulated)
         assert call(*odd)[0] == 0
     words = ("bundle", "export", saved, "--onnx", tmp_path / "again", "--json")

@@ -10,17 +10,18 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from retwin._version import __version__
 from retwin.cases.case import Case
 from retwin.checks import given
 from retwin.data.segments import Segments
-from retwin.data.trajectories import Trajectories
+from retwin.data.trajectories import UNKNOWN, Trajectories
 from retwin.deploy.bundle.facts import SAMPLERS, Facts
 from retwin.deploy.bundle.guard import Guard
 from retwin.deploy.bundle.seal import SCHEMAS, open_sealed, seal
 from retwin.deploy.bundle.verdicts import Prediction, present_diagnoser
-from retwin.diagnosis import FittedDiagnoser, load_diagnoser
+from retwin.diagnosis import FittedDiagnoser, conclude, load_diagnoser
 from retwin.progress import Progress
 from retwin.serialisation.models import read_model, refusing, write_model
 from retwin.update.corrected import CorrectedTwin, generate
@@ -148,7 +149,7 @@ class Bundle:
         -------
         Prediction
             Probabilities and verdicts; a trajectory that is outside has no diagnosis, and its
-            probabilities are NaN.
+            probabilities are NaN. So is one that the diagnoser calls unknown.
 
         Raises
         ------
@@ -158,7 +159,13 @@ class Bundle:
         """
         diagnoser = present_diagnoser(self.diagnoser)
         verdicts = self.guard.assess(self.twin.surrogate, trajectories, steps=self.facts.steps)
-        return Prediction.of(diagnoser.classes, verdicts, trajectories, diagnoser.predict_proba)
+
+        def probabilities(some: Trajectories) -> NDArray:
+            found = conclude(diagnoser, some)
+            rest: NDArray = np.where(found.labels == UNKNOWN, np.nan, 1.0)
+            return found.probabilities * rest[:, None]
+
+        return Prediction.of(diagnoser.classes, verdicts, trajectories, probabilities)
 
     def generate(
         self,

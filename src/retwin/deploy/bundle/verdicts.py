@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from retwin.arrays import floats
 from retwin.checks import agree, given, require
-from retwin.data.trajectories import Trajectories
+from retwin.data.trajectories import UNKNOWN, Trajectories
 from retwin.twins.command_range import TOLERANCE, excess, extremes
 from retwin.twins.twin import Twin
 
@@ -120,22 +120,14 @@ class Prediction:
         rows = verdicts.verdict != "outside"
         found = np.full((len(trajectories), len(classes)), np.nan)
         if rows.any():
-            made = np.asarray(probabilities(_subset(trajectories, rows)))
-            require(
-                made.dtype.kind in "biuf" and made.shape == found[rows].shape,
-                "diagnoser",
-                expected=f"probabilities of {len(classes)} classes",
-                got=f"{made.dtype} of shape {made.shape}",
-                remedy="make the bundle anew, with another diagnoser",
-            )
-            found[rows] = made
+            found[rows] = probabilities(_subset(trajectories, rows))
         return cls(classes, found, verdicts)
 
     @property
     def diagnosis(self) -> NDArray:
-        """The most probable class of each trajectory (n,); "" if it is outside."""
+        """The most probable class of each trajectory (n,); "unknown" if it is outside."""
         best = np.array(self.classes)[self.probabilities.argmax(axis=1)]
-        return np.where(self.verdicts.verdict == "outside", "", best)
+        return np.where(self.verdicts.verdict == "outside", UNKNOWN, best)
 
 
 @dataclass(frozen=True)

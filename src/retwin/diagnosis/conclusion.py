@@ -1,0 +1,72 @@
+"""`conclude`: what a diagnoser of any kind says of each trajectory, "unknown" included."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retwin.checks import require
+from retwin.data.measured import unmeasured_outputs
+from retwin.data.trajectories import UNKNOWN, Trajectories
+from retwin.diagnosis.diagnoser import Diagnoser
+from retwin.diagnosis.inversion import Diagnosis, InversionDiagnoser
+from retwin.diagnosis.state_inversion import StateDiagnosis, StateInversionDiagnoser
+from retwin.progress import Progress
+
+
+@dataclass(frozen=True, eq=False)
+class Conclusion:
+    """What a diagnoser says of n trajectories.
+
+    Attributes
+    ----------
+    probabilities : NDArray
+        (n, C), see `Diagnoser`.
+    labels : NDArray
+        (n,), the most probable class, or "unknown".
+    reason : NDArray
+        (n,), why a trajectory is unknown; "" where it is not.
+    remark : str
+        What "unknown" rests on, and what cannot be recognised.
+    found : Diagnosis or StateDiagnosis or None
+        All that an inversion infers; None for other diagnosers.
+
+    """
+
+    probabilities: NDArray
+    labels: NDArray
+    reason: NDArray
+    remark: str = ""
+    found: Diagnosis | StateDiagnosis | None = None
+
+
+def conclude(
+    diagnoser: Diagnoser, trajectories: Trajectories, *, progress: Progress | None = None
+) -> Conclusion:
+    """Diagnose trajectories by a diagnoser of any kind.
+
+    Raises
+    ------
+    InputError
+        See `Diagnoser.predict_proba`.
+
+    """
+    if isinstance(diagnoser, InversionDiagnoser | StateInversionDiagnoser):
+        found = diagnoser.diagnose(trajectories, progress=progress)
+        remark = str(getattr(diagnoser, "calibration", ""))
+        return Conclusion(found.probabilities, found.labels, found.reason, remark, found)
+    probabilities = np.asarray(diagnoser.predict_proba(trajectories))
+    shape = len(trajectories), len(diagnoser.classes)
+    require(
+        probabilities.dtype.kind in "biuf" and probabilities.shape == shape,
+        "diagnoser",
+        expected=f"probabilities of {shape[1]} classes",
+        got=f"{probabilities.dtype} of shape {probabilities.shape}",
+        remedy="train it anew, or give another one",
+    )
+    reason = unmeasured_outputs(trajectories)
+    labels = np.array(diagnoser.classes)[probabilities.argmax(axis=1)]
+    remark = "only trajectories without any measurement are called unknown; a bundle has a guard"
+    return Conclusion(probabilities, np.where(reason == "", labels, UNKNOWN), reason, remark)
